@@ -11,17 +11,22 @@ each rendered at one seed with and without; beside them, how often another seed 
 The last row is a search over cameras, whose steps render nothing where light on surfaces predicts them: milliseconds of
 a predicted picture, the gain over a rendered one (squared error x time), and how far both are off, in levels of 255.
 With `--predicted` it is all that is measured.
+
+First every number of every setting is fixed at both ends of its range, alone, and those of one material in all
+combinations of ends: the picture with everything left out against `--no-specialise`, and against a control that has
+the same values, each of the same seed. With `--ends` that is all that is done.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import math
 import statistics
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,12 +34,17 @@ import torch
 
 from advsearch import seeds
 from advsearch.config import AttackConfig
+from advsearch.controls import CONTROLS, OWN, make_space
+from advsearch.controls.base import Parameter
 from advsearch.engine.attack_parts import problem_from_config
 from advsearch.engine.gradients import inside, smooth_loss
+from advsearch.engine.loading import as_controls, framed, load_scene, make_renderer
 from advsearch.engine.planning import bounces_of
 from advsearch.engine.problem import Problem
 from advsearch.engine.surface_light import CHECK_SPP, levels_off
-from advsearch.scene.formation import NOTHING
+from advsearch.errors import InputError
+from advsearch.scene.formation import EVERYTHING, NOTHING
+from advsearch.scene.settings import FAMILIES, MATERIAL, SETTINGS
 from advsearch.scene.surface.renderer import SurfaceRenderer
 
 PAIRS = (
@@ -45,6 +55,8 @@ PAIRS = (
     ("bowl", "noon", "camera"),
     ("bottle", "kitchen", "pose"),
 )
+SAME = 0.3
+"""Levels of 255 by which pictures of one seed may differ: a metal of 0.999 for one of 1, and rounding."""
 REFERENCES = 4
 """Gradients of each kind behind a reference."""
 
@@ -58,7 +70,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--configurations", type=int, default=200)
     parser.add_argument("--json", type=Path)
     parser.add_argument("--predicted", action="store_true", help="the row of light on surfaces alone")
+    parser.add_argument(
+        "--ends", action="store_true", help="the pictures with numbers at the ends of their range alone"
+    )
     args = parser.parse_args(argv)
+    if args.ends:
+        return battery()
     if args.predicted:
         print(predicted(args.size, args.spp, args.repeats))
         return 0
@@ -84,7 +101,71 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     if args.json:
         args.json.write_text(json.dumps({"rows": rows, "mean": mean, "mean_cut": with_cut, "verdicts": verdicts}))
-    return int(mean < 2.0 or min(row["gain"] for row in rows) < 1.0)
+    wrong = battery()
+    return int(wrong or mean < 2.0 or min(row["gain"] for row in rows) < 1.0)
+
+
+def battery() -> int:
+    """Compare pictures with numbers at the ends of their range; 1 if some are not the same."""
+    cases: list[tuple[dict[str, Any], dict[str, Any]]] = []
+    for family, some in FAMILIES.items():
+        cases += [({f"{family}.{one.name}": end}, {}) for one in some for end in ends(one)]
+    names = [f"material.{one.name}" for one in MATERIAL]
+    cases += [(dict(zip(names, each, strict=True)), {}) for each in itertools.product((0.0, 1.0), repeat=len(names))]
+    for kind in sorted(OWN):
+        parameters = [one for one in CONTROLS[kind].parameters if f"{kind}.{one.name}" not in SETTINGS]
+        cases += [({}, {kind: {one.name: end}}) for one in parameters if not one.shape for end in ends(one)]
+    worst, asked = 0.0, 0
+    for fixed, controls in cases:
+        try:
+            found = ends_apart("ball", fixed, controls)
+        except InputError as error:
+            print(f"  {fixed or controls}: refused: {str(error).splitlines()[0][:90]}")
+            continue
+        asked, worst = asked + 1, max(worst, found)
+        if not found <= SAME:
+            print(f"  {fixed or controls}: {found:.3f} levels apart", flush=True)
+    print(f"{asked} of {len(cases)} cases of numbers at the ends of their range: at most {worst:.4f} levels apart")
+    return int(not worst <= SAME)
+
+
+def ends(one: Parameter) -> list[float | str]:
+    """The ends of a setting's range, inside what can be rendered; every option of a choice."""
+    if one.options:
+        return list(one.options)
+    return list(one.search or (one.low, one.high))
+
+
+def ends_apart(thing: str, fixed: Mapping[str, Any], controls: Mapping[str, Any], size: int = 24) -> float:
+    """By how much the pictures of fixed numbers differ, in levels of 255: with everything left out and with nothing;
+    where all are of a material, also where a control has the values."""
+    ways, environment = (EVERYTHING, NOTHING), "studio"
+    still = {**controls, "lens": controls.get("lens", {})}
+    found = [picture(thing, environment, fixed, still, leave, size) for leave in ways]
+    if fixed and all(name.startswith("material.") for name in fixed):
+        moved = {"material": {name.partition(".")[2]: [0.0, 1.0] for name in fixed}}
+        found += [picture(thing, environment, fixed, moved, leave, size) for leave in ways]
+        other = {name: 1.0 - float(value) for name, value in fixed.items()}  # where the search starts, and goes away
+        found += [picture(thing, environment, other, moved, leave, size, fixed) for leave in ways]
+    return max(255.0 * float((one - found[0]).square().mean().sqrt()) for one in found)
+
+
+def picture(
+    thing: str,
+    environment: str,
+    settings: Mapping[str, Any],
+    controls: Mapping[str, Any],
+    leave_out: Collection[str],
+    size: int,
+    at: Mapping[str, Any] | None = None,
+) -> torch.Tensor:
+    """The picture (H, W, 3) of a scene with settings, as it is, or with a control `at` other values."""
+    scene = framed(load_scene(thing, environment, settings=dict(settings)).description, size)
+    space = make_space(as_controls(dict(controls)), scene)
+    renderer = make_renderer(scene, space, size, "none", 0, None, leave_out=leave_out)
+    u = renderer.start if at is None else torch.tensor([float(at[group.name]) for group in space.groups])
+    with torch.no_grad():
+        return renderer(u, 3, 64)
 
 
 def measured(pair: tuple[str, str, str], size: int, spp: int, repeats: int) -> dict[str, Any]:

@@ -26,12 +26,6 @@ from advsearch.scene.settings import CHANNELS, MATERIAL, colors
 
 OWN = "own"
 NUMBERS = tuple(one.name for one in MATERIAL)
-RENDERED = {"metallic": (0.0, 0.999), "specular": (0.02, 1.0), "clearcoat": (1e-4, 1.0)}
-"""What is really rendered: a value beyond is moved to the nearest of these, where the adjoint is right.
-
-Measured (docs/controls/material.md): at a metallic of exactly 1 the adjoint has the wrong sign, at a clearcoat of
-exactly 0 it is 0, and towards a specular of 0 it grows without bound (the refractive index goes with the root).
-"""
 
 
 class MaterialControl(NumberControl):
@@ -77,9 +71,7 @@ class MaterialControl(NumberControl):
         inputs: dict[str, Tensor] = {}
         for name in NUMBERS:
             if self._varies(name):
-                value = values[name]
-                low, high = RENDERED.get(name, (0.0, 1.0))
-                inputs[f"{self.mesh}.{name}"] = (value + (value.clamp(low, high) - value).detach()).reshape(1)
+                inputs[f"{self.mesh}.{name}"] = values[name].reshape(1)
             elif self._names != (OWN,):
                 inputs[f"{self.mesh}.{name}"] = values["which"].new_tensor([float(getattr(own, name))])
         if self._colours():

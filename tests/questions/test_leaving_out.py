@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from advsearch import attack, load_scene
 from advsearch.attacks import Query
 from advsearch.cli.output import shown_text as answer
 from advsearch.config import AttackConfig
-from advsearch.controls import LightControl, TextureControl
+from advsearch.controls import CameraControl, LightControl, MaterialControl, TextureControl
 from advsearch.engine.attack_parts import problem_from_config
 from advsearch.engine.gradients import inside, smooth_loss
 from advsearch.engine.planning import BOUND, measured_bounces
@@ -227,3 +228,34 @@ def test_lamps_that_shine_or_may_shine_are_sampled() -> None:
         return [float(parameters[key]) for key in sorted(parameters.keys()) if key.endswith("sampling_weight")]
 
     assert sorted(weights(two_lamps(0.0)))[:2] == [0.0, 1.0] and min(weights(two_lamps(1.0))) == 1.0
+
+
+NUMBERS = ("roughness", "metallic", "specular", "clearcoat")
+ENDS = [dict(zip(NUMBERS, values, strict=True)) for values in product((0.0, 1.0), repeat=len(NUMBERS))]
+QUICK = [ENDS[int("".join(map(str, ends)), 2)] for ends in ((1, 1, 0, 0), (0, 0, 1, 1), (1, 0, 0, 1))]
+
+
+@pytest.mark.parametrize("ends", only(QUICK, ENDS), ids=lambda one: "".join(f"{end:g}" for end in one.values()))
+def test_a_material_looks_the_same_however_its_numbers_come_and_whatever_is_left_out(ends: dict[str, float]) -> None:
+    """Fixed, searched, and searched from the other ends, at both ends of every number."""
+    searched = MaterialControl(**{name: [0.0, 1.0] for name in NUMBERS})  # type: ignore[arg-type]
+    other = {name: 1.0 - value for name, value in ends.items()}
+    pictures = []
+    for control, start in ((CameraControl(exposure=[0, 1]), ends), (searched, ends), (searched, other)):
+        settings = {f"material.{name}": value for name, value in start.items()}
+        renderer = load_scene("ball", "studio", settings=settings).renderer([control], resolution=24, denoise="none")
+        u = torch.tensor(list(ends.values())) if control is searched else renderer.start
+        with torch.no_grad():
+            pictures += [renderer(u, 3, 16), renderer.like(renderer.scene.like(leave_out=NOTHING))(u, 3, 16)]
+    assert max(float((one - pictures[0]).abs().mean()) for one in pictures) < 1e-3
+
+
+def test_a_metal_looks_the_same_whatever_reflection_paint_would_have() -> None:
+    """Mitsuba's own metal is black at a specular of exactly 0."""
+    pictures = []
+    for specular in (0.0, 0.5):
+        settings = {"material.metallic": 1.0, "material.specular": specular, "material.clearcoat": 0.0}
+        renderer = load_scene("ball", "studio", settings=settings).renderer("camera", resolution=24, denoise="none")
+        with torch.no_grad():
+            pictures.append(renderer(renderer.start, 3, 16))
+    assert float((pictures[0] - pictures[1]).abs().mean()) < 1e-3 < float(pictures[0].mean())

@@ -24,12 +24,25 @@ POSITIONS, NORMALS, TEXCOORDS, FACES = "vertex_positions", "vertex_normals", "ve
 LEAST = 0.2
 """See `sampling_weights`."""
 
+RENDERED: Mapping[str, tuple[float, float]] = {
+    "metallic": (0.0, 0.999),
+    "specular": (1e-3, 1.0),
+    "clearcoat": (1e-4, 1.0),
+}
+"""Numbers of the principled surface that Mitsuba renders or differentiates wrongly at an end of their range: a value
+beyond is moved to the nearest of these, wherever it comes from (docs/controls/material.md)."""
+
+DARK: Mapping[str, tuple[float, float]] = {"specular": (0.0, RENDERED["specular"][0]), "eta": (1.0, 1.001)}
+"""Of principled surfaces of the user's: at the first value metal would be black. Mitsuba takes the second in its place
+where the value is set later, but not where a file has it."""
+
 
 def principled(part: MeshPart, extra: Plugin | None = None) -> Plugin:
     """A two-sided principled BSDF with the base colour as a bilinear texture of linear reflectance.
 
     Args:
-        part: the mesh whose surface it is, with cut-outs and normal map. A clearcoat of 0 leaves the lobe out.
+        part: the mesh whose surface it is, with cut-outs and normal map. A clearcoat of 0 leaves the lobe out; a control
+            that raises it brings the lobe back.
         extra: further entries of the plugin's dictionary.
     """
     material = part.material
@@ -37,18 +50,24 @@ def principled(part: MeshPart, extra: Plugin | None = None) -> Plugin:
         "type": "principled",
         "base_color": _texture(srgb_to_linear(part.base_color)),
         "roughness": material.roughness,
-        "metallic": material.metallic,
-        "specular": material.specular,
+        "metallic": rendered("metallic", material.metallic),
+        "specular": rendered("specular", material.specular),
         **(extra or {}),
     }
     if material.clearcoat > 0.0:
-        surface["clearcoat"] = material.clearcoat
+        surface["clearcoat"] = rendered("clearcoat", material.clearcoat)
     found: Plugin = {"type": "twosided", "bsdf": surface}
     if part.normal_map is not None:
         found = {"type": "normalmap", "normalmap": _texture(part.normal_map), "bsdf": found}
     if part.opacity is not None:
         found = {"type": "mask", "opacity": _texture(part.opacity[:, :, None]), "bsdf": found}
     return found
+
+
+def rendered(name: str, value: float) -> float:
+    """Return the value that is rendered for a number of the principled surface."""
+    low, high = RENDERED.get(name, (0.0, 1.0))
+    return min(max(value, low), high)
 
 
 def emitter(part: MeshPart) -> Plugin | None:
@@ -144,9 +163,9 @@ def mitsuba_mesh(name: str, mesh: Mesh, to_world: Doubles, bsdf: Plugin, light: 
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     uvs = np.stack([mesh.uvs[:, 0], 1.0 - mesh.uvs[:, 1]], axis=1)
     properties = mi.Properties()
-    properties["bsdf"] = mi.load_dict(bsdf)
+    properties["bsdf"] = mi.load_dict(bsdf, optimize=False)  # which makes equal numbers one: both would change
     if light is not None:
-        properties["emitter"] = mi.load_dict(light)
+        properties["emitter"] = mi.load_dict(light, optimize=False)
     result = mi.Mesh(
         name,
         vertex_count=len(vertices),
@@ -167,8 +186,8 @@ def mitsuba_mesh(name: str, mesh: Mesh, to_world: Doubles, bsdf: Plugin, light: 
 
 
 def loadable(plugin: Mapping[str, object]) -> Plugin:
-    """Return a dictionary with Mitsuba's transforms for arrays (4, 4) and (3, 3), and its bitmaps for pictures
-    (H, W, C)."""
+    """Return a dictionary with Mitsuba's transforms for arrays (4, 4) and (3, 3), its bitmaps for pictures (H, W, C),
+    and principled surfaces without what is `DARK`."""
 
     def made(value: object) -> object:
         if isinstance(value, Mapping):
@@ -178,7 +197,10 @@ def loadable(plugin: Mapping[str, object]) -> Plugin:
             return transform(value) if transform else mi.Bitmap(np.ascontiguousarray(value, dtype=np.float32))
         return value
 
-    return {key: made(value) for key, value in plugin.items()}
+    found = {key: made(value) for key, value in plugin.items()}
+    if found.get("type") == "principled":
+        found |= {name: least for name, (dark, least) in DARK.items() if found.get(name) == dark}
+    return found
 
 
 def plain(plugin: Mapping[str, object]) -> Plugin:

@@ -24,6 +24,7 @@ from advsearch.scene.grounds import paved
 from advsearch.scene.mitsuba_backend.meshes import (
     NORMALS,
     POSITIONS,
+    RENDERED,
     base_texture,
     emitter,
     loadable,
@@ -103,6 +104,7 @@ class SceneInput:
         interior: the interior adjoint (`prb`) differentiates it correctly.
         shape: of the tensor; None takes it from Mitsuba's own value.
         owner: Mitsuba's object that has the parameter, where `key` alone may mean several.
+        within: the range that is rendered; a value beyond is moved to its nearer end, and keeps its derivative.
     """
 
     name: str
@@ -111,6 +113,12 @@ class SceneInput:
     interior: bool = False
     shape: tuple[int, ...] | None = None
     owner: Any = None
+    within: tuple[float, float] | None = None
+
+    def rendered(self, value: Tensor) -> Tensor:
+        """Return what is set for a value: float32 with memory in order."""
+        value = value.detach().to(torch.float32).contiguous()
+        return value.clamp(*self.within) if self.within else value
 
 
 def key_of(parameters: Any, one: SceneInput) -> str | None:
@@ -131,6 +139,10 @@ def key_of(parameters: Any, one: SceneInput) -> str | None:
     return str(found[0]) if found else None
 
 
+SURFACE_KEYS = {"roughness": "roughness.value", "metallic": "metallic.value", "clearcoat": "clearcoat.value"} | {
+    "specular": "specular"
+}
+"""Where the principled surface has its numbers."""
 ABSENT = {"type": "uniform", "value": 0.0}
 IDLE_LOBES: Plugin = {name: ABSENT for name in ("clearcoat", "sheen")}
 """Entries of the principled surface that give it lobes of strength 0."""
@@ -173,18 +185,16 @@ def mesh_translation(part: MeshPart, lobes: Plugin | None = None) -> Translation
     )
     if part.surface is None:
         surface = principled(part, lobes)
-        inputs += (
-            SceneInput(f"{name}.base_color", f"{name}.*.base_color.data", interior=True),
-            SceneInput(f"{name}.roughness", f"{name}.*.roughness.value", number, True, (1,)),
-            SceneInput(f"{name}.metallic", f"{name}.*.metallic.value", number, True, (1,)),
-            SceneInput(f"{name}.specular", f"{name}.*.specular", number, True, (1,)),
-            SceneInput(f"{name}.clearcoat", f"{name}.*.clearcoat.value", number, True, (1,)),
+        inputs += (SceneInput(f"{name}.base_color", f"{name}.*.base_color.data", interior=True),)
+        inputs += tuple(
+            SceneInput(f"{name}.{one}", f"{name}.*.{key}", number, True, (1,), within=RENDERED.get(one))
+            for one, key in SURFACE_KEYS.items()
         )
     else:
         textures = []
 
         def fill(options: Mapping[str, object]) -> object:
-            textures.append(mi.load_dict(base_texture(part.base_color, options)))
+            textures.append(mi.load_dict(base_texture(part.base_color, options), optimize=False))
             return textures[-1]
 
         surface = own_surface(part.surface, fill)
@@ -217,6 +227,7 @@ def _numbers(part: PluginNumbers) -> Translation:
             plain_number if one.plain else color if len(one.values) == 3 else number,
             "adjoint" in one.valid,
             (len(one.values),),
+            within=RENDERED.get(next((name for name, key in SURFACE_KEYS.items() if one.key.endswith(f".{key}")), "")),
         )
         for one in part.numbers
         if one.input.startswith(f"{part.name}.")
@@ -269,7 +280,7 @@ def _ball(part: BallLamp) -> Translation:
 def _haze(part: HazePart) -> Translation:
     """Mitsuba's medium only holds density and albedo for the integrator: no shape refers to it."""
     name, albedo = part.name, _rgb(part.albedo)
-    medium = mi.load_dict({"type": "homogeneous", "albedo": albedo, "sigma_t": part.density})
+    medium = mi.load_dict({"type": "homogeneous", "albedo": albedo, "sigma_t": part.density}, optimize=False)
     population.keep(medium)
     inputs = (
         SceneInput(f"{name}.density", f"{name}.sigma_t.value.value", number, True, (1,)),

@@ -292,8 +292,8 @@ class MitsubaScene:
                     key, one = self.declared[name]
                     own = self.parameters[key]
                     held[key] = type(own)(own)
-                    value = inputs[name] if name in inputs else as_torch(own)
-                    tracked[name] = mi.TensorXf(value.detach().to(torch.float32).contiguous())
+                    value = one.rendered(inputs[name]) if name in inputs else as_torch(own)
+                    tracked[name] = mi.TensorXf(value)
                     dr.enable_grad(tracked[name])
                     self.parameters[key] = one.write(tracked[name]) if one.write else tracked[name]
                 self.parameters.update()
@@ -394,7 +394,7 @@ class MitsubaScene:
             self._applied.clear()
         wanted: dict[str, Tensor | None] = dict.fromkeys([name for name in self._applied if name not in inputs])
         for name, tensor in inputs.items():
-            value, applied = tensor.detach().to(torch.float32).contiguous(), self._applied.get(name)
+            value, applied = self.declared[name][1].rendered(tensor), self._applied.get(name)
             if applied is None or applied.shape != value.shape or not torch.equal(applied, value):
                 wanted[name] = value
         population.changes += not self._literals.isdisjoint(wanted)
