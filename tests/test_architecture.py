@@ -24,6 +24,7 @@ SOURCES = {"advsearch": ROOT / "advsearch", "advsearch.bundled": ROOT / "scenes"
 
 RENDERER = {"mitsuba", "drjit", "mitsuba_oidn"}
 COMMON = {
+    "copies",
     "described",
     "errors",
     "files",

@@ -15,7 +15,8 @@ Norm = Literal["linf", "l2", "box"]
 NORMS: tuple[str, ...] = get_args(Norm)
 
 TOLERANCE = 2e-6
-"""How far outside its budget float32 rounding may put a configuration, absolute in u and relative to the radius."""
+"""How far outside its budget float32 rounding may put a configuration, absolute in u and relative to the radius; beside
+`Block.rounding`, which adds up in an l2 norm."""
 
 
 @dataclass(frozen=True)
@@ -89,6 +90,12 @@ class Block:
             return 0.5 * width * math.sqrt(self.size) if self.reach is None else self.reach
         reach = width if self.norm == "linf" else width * math.sqrt(self.size)
         return min(float(self.epsilon or 0.0), reach)
+
+    @property
+    def rounding(self) -> float:
+        """What rounding all elements of u to float32 may add to the l2 norm: half of the last bit of 1 for each, all
+        the same way where a texture has one colour."""
+        return 0.5 * torch.finfo(torch.float32).eps * math.sqrt(self.size)
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,14 +215,14 @@ class Domain:
     def violation(self, u: Tensor) -> float:
         """Return how far u lies outside: 0 inside, infinity where u has NaN or infinite elements.
 
-        The largest of the distances past a bound, and of the excess of an l2 norm over its radius (divided by the
-        radius where that is over 1).
+        The largest of the distances past a bound, and of the excess of an l2 norm over its radius and what rounding
+        may add (divided by the radius where that is over 1).
         """
         excess = float(torch.maximum(self.lower - u, u - self.upper).amax())
         for block, part in self.parts():
             if block.norm == "l2" and block.epsilon is not None:
-                norm = math.sqrt(float((u[part] - self.start[part]).square_().sum()))
-                excess = max(excess, (norm - block.epsilon) / max(1.0, block.epsilon))
+                norm = math.sqrt(float((u[part] - self.start[part]).square_().sum(dtype=torch.float64)))
+                excess = max(excess, (norm - block.epsilon - block.rounding) / max(1.0, block.epsilon))
         return math.inf if math.isnan(excess) else max(0.0, excess)
 
     def contains(self, u: Tensor, tolerance: float = TOLERANCE) -> bool:
@@ -337,15 +344,16 @@ def project_l2_box(u: Tensor, centre: Tensor, radius: float, low: float = 0.0, h
         low, high: the box's bounds.
 
     Returns:
-        (d,) float32. Points inside come back bit for bit; projecting again changes at most the last bits.
+        (d,) float32, rounded towards the centre, so that rounding leaves no ball. Points inside come back bit for bit;
+        projecting again changes at most the last bits.
     """
     squares, rooms = [], []
     full = inside = 0.0
     for part, middle in zip(torch.split(u, CHUNK), torch.split(centre, CHUNK), strict=True):
         squares.append((part - middle).square_())
         rooms.append(part.clamp(low, high).sub_(middle).square_())
-        full += float(squares[-1].sum())
-        inside += float(rooms[-1].sum())
+        full += float(squares[-1].sum(dtype=torch.float64))
+        inside += float(rooms[-1].sum(dtype=torch.float64))
     if inside <= (radius * (1.0 + SLACK)) ** 2:
         return u.clamp(low, high)
     t = math.sqrt(_multiplier(squares, rooms, radius**2, radius**2 / full))
@@ -353,7 +361,9 @@ def project_l2_box(u: Tensor, centre: Tensor, radius: float, low: float = 0.0, h
     for out, part, middle in zip(
         torch.split(projected, CHUNK), torch.split(u, CHUNK), torch.split(centre, CHUNK), strict=True
     ):
-        torch.lerp(middle, part, t, out=out).clamp_(low, high)
+        torch.lerp(middle, part, t, out=out)
+        outwards = (out - middle).abs() > ((part - middle) * t).abs()
+        torch.where(outwards, torch.nextafter(out, middle), out, out=out).clamp_(low, high)
     return projected
 
 
@@ -364,7 +374,7 @@ def _multiplier(squares: list[Tensor], rooms: list[Tensor], target: float, s: fl
         for square, room in zip(squares, rooms, strict=True):
             scaled = square * s
             slope += float(torch.dot(square, (scaled < room).to(square.dtype)))
-            value += float(torch.minimum(scaled, room).sum())
+            value += float(torch.minimum(scaled, room).sum(dtype=torch.float64))
         better = s + (target - value) / slope if slope > 0.0 else s
         if better <= s * (1.0 + 1e-7):
             break

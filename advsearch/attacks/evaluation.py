@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from advsearch.attacks.domain import Distribution, Domain
+from advsearch.copies import hand_copies
 from advsearch.described import Value
 from advsearch.seeds import stream
 from advsearch.tasks import Judgement
@@ -222,6 +223,10 @@ class Policy(ABC, Generic[State]):
 
     name: ClassVar[str]
     handles_choices: ClassVar[bool] = False
+
+    def __init_subclass__(cls, **more: Any) -> None:
+        super().__init_subclass__(**more)
+        hand_copies(cls, start=slice(1), update=slice(1, None))
 
     @property
     @abstractmethod

@@ -16,7 +16,7 @@ labels)` as losses of torch are, and asks for more by the names of further ones.
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, final
 
@@ -26,6 +26,7 @@ from torch import Tensor, nn
 from advsearch.attacks import objective_functions as functions
 from advsearch.attacks.objective_functions import ReadFeatures
 from advsearch.attacks.objective_functions import margin as margin  # for objectives of plugins, docs/extending.md
+from advsearch.copies import copied
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.options import told
 from advsearch.registry import Registry
@@ -102,16 +103,17 @@ def checked(function: Callable[..., Tensor]) -> Objective:
     """Wrap a user's function: a scalar becomes (1,), and a wrong type, shape or a lost gradient is an InputError.
 
     The function returns (N,), or a scalar, for which it is called with one picture at a time. A label set of one class
-    comes as (N,) int64, as torch's losses take it. What it raises itself passes through. NaN values pass too: a search
-    has a rule for them.
+    comes as (N,) int64, as torch's losses take it. It gets copies, which it may write into. What it raises itself
+    passes through. NaN values pass too: a search has a rule for them.
     """
     name, form = name_of(function), form_of(function)
 
     def objective(output: Any, images: Tensor, truth: Any, more: More = nothing_more, /) -> Tensor:
         asked, count = {one: more(one) for one in form.asked}, images.shape[0]
         given = (output, images, labels_of(truth, output, count))
+        handed, handed_by_name = copied(given if form.images else given[::2]), copied(asked)
         try:
-            values = function(*(given if form.images else given[::2]), **asked)
+            values = function(*handed, **handed_by_name)
         except TypeError as error:
             if not (isinstance(given[2], tuple) and "not tuple" in str(error)):
                 raise
@@ -123,6 +125,9 @@ def checked(function: Callable[..., Tensor]) -> Objective:
             each = [objective(output[k : k + 1], images[k : k + 1], truth, _part(asked, k)) for k in range(count)]
             values = torch.cat(each)
         values = _values(name, values, count)
+        if values.requires_grad and any(one._version for one in _tensors((handed, handed_by_name))):
+            read = [one for one in _tensors((output, asked)) if one.requires_grad]
+            _check_in_place(name, values, read or [images])
         seen = [one for one in (images, output, *asked.values()) if isinstance(one, Tensor)]
         wanted = torch.is_grad_enabled() and any(one.requires_grad for one in seen)
         if wanted and not values.requires_grad:
@@ -133,6 +138,28 @@ def checked(function: Callable[..., Tensor]) -> Objective:
         return values
 
     return objective
+
+
+def _tensors(value: Any) -> list[Tensor]:
+    """Those that an objective was handed, in tuples, lists and mappings."""
+    if isinstance(value, Tensor):
+        return [value]
+    parts = value.values() if isinstance(value, dict) else value if isinstance(value, (list, tuple)) else ()
+    return [one for part in parts for one in _tensors(part)]
+
+
+def _check_in_place(name: str, values: Tensor, given: Sequence[Tensor]) -> None:
+    """Refuse what a function has written into, where torch can't differentiate it any more."""
+    try:
+        torch.autograd.grad(values.sum(), given, retain_graph=True, allow_unused=True)
+    except RuntimeError as error:
+        if "inplace" not in str(error):
+            raise
+        raise InputError(
+            f"objective {name!r}: it writes into what it is given, and then torch can't differentiate what it has "
+            "computed before; use the operation that makes a new tensor (`scatter` for `scatter_`, "
+            "`logits.clone()` before `logits[...] = ...`)"
+        ) from None
 
 
 def name_of(function: Callable[..., Any]) -> str:
@@ -225,6 +252,15 @@ def _plain(function: Callable[[Any, Tensor, Any], Tensor]) -> Objective:
         return function(output, images, truth)
 
     return plain
+
+
+def _handed(objective: Objective) -> Objective:
+    """The objective of another package, called with copies."""
+
+    def handed(output: Any, images: Tensor, truth: Any, more: More = nothing_more, /) -> Tensor:
+        return objective(*copied((output, images, truth)), lambda name: copied(more(name)))
+
+    return handed
 
 
 def _score_of(task: Task) -> Objective:
@@ -325,7 +361,7 @@ def get_objective(
     if kind is None:
         found = checked(objective)  # type: ignore[arg-type]
     elif kind.of_task is not None:
-        return kind.of_task(task)
+        return kind.of_task(task) if _OWN.get(kind.name) is kind else _handed(kind.of_task(task))
     elif kind.of_features is not None:
         if features is None or clean is None:
             raise InputError(
@@ -333,6 +369,7 @@ def get_objective(
                 "get_objective(name, features=advsearch.models.features.features_of(model), clean=picture)"
             )
         found = _plain(kind.of_features(features, clean))
+        found = found if _OWN.get(kind.name) is kind else _handed(found)
     else:
         form = kind.form(targeted=targeted)
         found = _plain(form) if _OWN.get(kind.name) is kind else checked(form)

@@ -28,6 +28,7 @@ from advsearch.attacks.evaluation import (
     usable,
 )
 from advsearch.attacks.policies.choices import with_choices
+from advsearch.copies import copied
 from advsearch.attacks.verification import Ending
 from advsearch.errors import InputError
 from advsearch.interrupts import interruptible
@@ -235,7 +236,7 @@ class _Log:
         first, begun = len(self.records), time.perf_counter()
         queries = [
             Query(
-                one.u,
+                one.u.clone(),
                 seed=stream(self.noise, self.kind, index),
                 kind=self.kind,
                 number=first + place,
@@ -275,7 +276,7 @@ class _Log:
             )
             self._compare(evaluation.gradient)
             if self.on_step is not None:
-                self.on_step(self.records[-1], proposal.u, evaluation)
+                self.on_step(self.records[-1], *copied((proposal.u, evaluation)))
             yield evaluation
             begun = time.perf_counter()
 
@@ -305,7 +306,8 @@ def _explore(log: _Log, policy: Policy[Any], steps: int, seed: int, late: Late) 
         for proposal in proposals:
             _check_inside(proposal, log.domain, name)
             if left > 0:
-                batch.append(affordable(proposal, log.domain, left))
+                own = replace(proposal, u=proposal.u.clone())  # a policy may write into its own later
+                batch.append(affordable(own, log.domain, left))
                 left -= batch[-1].cost(log.domain)
         log.state, log.told, over, first = state, [], False, len(log.records)
         answers = log.evaluated(batch, range(first, first + len(batch)), "search")

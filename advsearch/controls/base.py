@@ -10,11 +10,12 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from torch import Tensor
 
 from advsearch.controls.values import Moved, is_number, is_whole
+from advsearch.copies import hand_copies
 from advsearch.described import Value as Value
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.description import OBJECT, SceneDescription
@@ -94,6 +95,11 @@ class BoundControl(ABC):
     refines: frozenset[str] = frozenset()
     on_top: bool = False
 
+    def __init_subclass__(cls, **more: Any) -> None:
+        super().__init_subclass__(**more)
+        asked = ("inputs", "picture", "describe", "artifacts", "printed", "numbers", "files")
+        hand_copies(cls, **dict.fromkeys(asked, slice(None)))
+
     @property
     def budget(self) -> Budget:
         """The budget of the whole slice: that of its largest group."""
@@ -157,6 +163,10 @@ class Control(ABC):
     choices: ClassVar[tuple[Choice, ...]]
     of_a_mesh: ClassVar[bool] = False
     name: str
+
+    def __init_subclass__(cls, **more: Any) -> None:
+        super().__init_subclass__(**more)
+        hand_copies(cls, prepare=slice(None), bind=slice(None))
 
     @classmethod
     def declared(cls, settings: Iterable[str]) -> tuple[Parameter, ...]:

@@ -232,7 +232,7 @@ class Preconditioner:
 
 
 class _Solve(torch.autograd.Function):
-    """Solution of a symmetric sparse system; its derivative is the same solution."""
+    """Solution of a symmetric sparse system; its derivative is the same solution, any number of times."""
 
     @staticmethod
     def forward(ctx: Any, right: Tensor, factor: Any) -> Tensor:
@@ -240,10 +240,8 @@ class _Solve(torch.autograd.Function):
         return torch.from_numpy(factor.solve(right.detach().cpu().numpy())).to(right.device)
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
     def backward(ctx: Any, cotangent: Tensor) -> tuple[Tensor, None]:
-        right = np.ascontiguousarray(cotangent.cpu().numpy())
-        return torch.from_numpy(ctx.factor.solve(right)).to(cotangent.device), None
+        return _Solve.apply(cotangent.contiguous(), ctx.factor), None  # type: ignore[no-untyped-call]
 
 
 # ---- how far ---------------------------------------------------------------------------------------------------------

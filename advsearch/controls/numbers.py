@@ -16,7 +16,7 @@ from __future__ import annotations
 from abc import ABC
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -40,6 +40,7 @@ from advsearch.controls.values import (
     to_unit,
     to_value,
 )
+from advsearch.copies import copied, hand_copies, is_ours
 from advsearch.errors import UnknownNameError
 from advsearch.scene.description import ENVIRONMENT, SceneDescription
 
@@ -67,6 +68,11 @@ class NumberControl(Control, ABC):
     amount: ClassVar[str | None] = None
     """The parameter whose value in the scene as it was described means that the rest of the control does not show: the
     power of a lamp, say. None where the scene has all parameters of itself."""
+
+    def __init_subclass__(cls, **more: Any) -> None:
+        super().__init_subclass__(**more)
+        asked = ("scene_inputs", "on_picture", "measured", "kept_pictures", "kept_files")
+        hand_copies(cls, **dict.fromkeys(asked, slice(1, None)))
 
     def __init__(self, name: str | None = None, **settings: object) -> None:
         self.name = name or self.kind
@@ -167,6 +173,7 @@ class NumberControl(Control, ABC):
     # ---- what it makes of it ----------------------------------------------------------------------------------------
 
     def bind(self, scene: SceneDescription) -> BoundNumbers:
+        scene = scene if is_ours(type(self)) else copied(scene)
         slots: list[Slot] = []
         begin = 0
         for parameter in self.own:

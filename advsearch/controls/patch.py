@@ -244,7 +244,7 @@ class BoundPatch(BoundControl):
     def pixels(self, u: Tensor) -> Tensor:
         """Return the patch (n, n, 3), display-referred sRGB in [0, 1]."""
         if not self._searched:
-            return self._pixels.to(u.device)
+            return self._pixels.to(u.device, copy=True)
         share = u[: self._searched].reshape(self._pixels.shape)
         return self._spec.low + (self._spec.high - self._spec.low) * share
 
@@ -252,7 +252,7 @@ class BoundPatch(BoundControl):
         """Return place, size and rotation, in their units."""
         if isinstance(self._numbers, BoundNumbers):
             return self._numbers.values(u[self._searched :])
-        return {name: number.to(u.device) for name, number in self._numbers.items()}
+        return {name: number.to(u.device, copy=True) for name, number in self._numbers.items()}
 
     def inputs(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Tensor]:
         return {BASE_COLOR: self._sticker.paint(so_far.get(BASE_COLOR), self.pixels(u), self.numbers(u))}

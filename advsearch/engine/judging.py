@@ -18,6 +18,7 @@ from torch import Tensor
 from advsearch.attacks.objectives import labels_of
 from advsearch.config import SceneConfig
 from advsearch.controls import Space
+from advsearch.copies import copied
 from advsearch.described import Value
 from advsearch.engine.loading import Scene
 from advsearch.engine.rendering import pictures_of, render, sight_of
@@ -127,14 +128,14 @@ def judgements(
 
 def measured(judgement: Judgement, metrics: Metrics, image: Tensor, output: Output, truth: Truth) -> Judgement:
     """Return the judgement of a picture (H, W, 3), sRGB in [0, 1], with what metrics say of it. A metric gets the truth
-    as an objective does, of one picture."""
+    as an objective does, of one picture; all that it gets are copies."""
     if not metrics:
         return judgement
     found: dict[str, float | None] = {}
     seen, right = _of_one(output, truth)
     with torch.no_grad():
         for name, metric in metrics.items():
-            said = metric(image.detach().clone(), seen, right)
+            said = metric(*copied((image.detach(), seen, right)))
             if isinstance(said, Mapping):
                 found |= {f"{name}.{key}": _number(f"{name}.{key}", one) for key, one in said.items()}
             else:

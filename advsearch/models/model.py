@@ -86,7 +86,7 @@ class Preprocessing:
         if (x.shape[2], x.shape[3]) != self.input_size:
             x = F.interpolate(x, size=self.input_size, mode="bilinear", align_corners=False, antialias=True)
         if self.processor:
-            x = self.processor(x)
+            x = self.processor(x.clone())  # which may write into it
         else:
             gain, offset = self._affine
             x = x.flip(1) if self.channels == "BGR" else x
@@ -169,11 +169,11 @@ class Model:
             ModelError: the network's answer is not (N, classes), or `read` finds no output in it.
         """
         images = checked_images(images)
-        parts = [self.ask(self.prepared(part))[: len(part)] for part in images.split(self.batch_limits[1])]
-        output = parts[0] if len(parts) == 1 else joined(parts)
-        if isinstance(output, Tensor):
-            return output.to(images.device)
-        return each_tensor(output, lambda one: one.to(images.device))
+        parts = [
+            each_tensor(self.ask(self.prepared(part))[: len(part)], lambda one: _kept(one, images.device))
+            for part in images.split(self.batch_limits[1])
+        ]
+        return parts[0] if len(parts) == 1 else joined(parts)
 
     def label_set(self, text: str | int | Sequence[str | int]) -> LabelSet:
         """Return the classes that `text` names, e.g. ``"coffee mug,cup"`` or ``"#504"``; see `find_label_set`."""
@@ -183,10 +183,13 @@ class Model:
         """Return what the network is given for images (N, H, W, 3), no more than it takes at once.
 
         They are preprocessed, and of the network's type and device. Where they are too few, the last one is repeated.
+        They are its own: it may write into them.
         """
         missing = self.batch_limits[0] - len(images)
         full = torch.cat([images, images[-1:].expand(missing, -1, -1, -1)]) if missing > 0 else images
-        return self.preprocessing(full.to(device=self.device, dtype=torch.float32)).to(self.dtype)
+        given = self.preprocessing(full.to(device=self.device, dtype=torch.float32)).to(self.dtype)
+        shared = given.untyped_storage().data_ptr() == images.untyped_storage().data_ptr()
+        return given.clone() if shared else given
 
     def ask(self, x: Tensor, *, raw: bool = False) -> Any:
         """Return the output for a batch as `prepared` returns it, or, if `raw`, what the network itself gives."""
@@ -199,6 +202,12 @@ class Model:
             return read_by(self.read, answer, len(x), self.name)
         logits = logits_of(answer, len(x), len(self.labels), self.name)
         return logits.clamp_min(SMALLEST_PROBABILITY).log() if self.probabilities else logits
+
+
+def _kept(output: Tensor, device: torch.device) -> Tensor:
+    """An answer on a device; a copy, for a network may answer into the same memory again."""
+    moved = output.to(device)
+    return moved.clone() if moved is output and not output.requires_grad else moved
 
 
 class Detaching(TorchFunctionMode):

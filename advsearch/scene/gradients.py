@@ -8,10 +8,10 @@ says which has the least variance x time. Any of them can be forced by name.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
-from typing import TypedDict
+from functools import cached_property, wraps
+from typing import Any, TypedDict
 
 import torch
 from torch import Tensor
@@ -299,3 +299,42 @@ def _first(group: Group, steps: Tensor, forced: Mapping[str, str], across: float
     only = len(group.valid) == 1
     reason = "the only valid estimator" if only else f"preferred among {', '.join(group.valid)}; not measured"
     return replace(group, estimator=group.valid[0], step=step, reason=reason)
+
+
+# ---- no second derivatives -------------------------------------------------------------------------------------------
+
+Backward = Callable[[Any, Tensor], tuple[Tensor | None, ...]]
+
+
+def first_order(backward: Backward) -> Backward:
+    """Have what an autograd function's backward pass returns refuse to be differentiated again.
+
+    Torch's own `once_differentiable` refuses only where the engine runs its node: `torch.autograd.grad` and
+    `functional.hessian` leave that out, and a part of the derivative with it.
+    """
+
+    @wraps(backward)
+    def once(ctx: Any, cotangent: Tensor) -> tuple[Tensor | None, ...]:
+        with torch.no_grad():
+            found = backward(ctx, cotangent)
+        if not torch.is_grad_enabled():
+            return found
+        of = (cotangent, *ctx.saved_tensors)
+        return tuple(one if one is None or one is cotangent else _Once.apply(one, *of) for one in found)  # type: ignore[no-untyped-call]
+
+    return once
+
+
+class _Once(torch.autograd.Function):
+    """A derivative, as something that depends on what it is taken at and cannot be differentiated."""
+
+    @staticmethod
+    def forward(ctx: Any, derivative: Tensor, *of: Tensor) -> Tensor:
+        return derivative.view_as(derivative)
+
+    @staticmethod
+    def backward(ctx: Any, cotangent: Tensor) -> tuple[Tensor | None, ...]:
+        raise NotImplementedError(
+            "render: it has first derivatives only, since light is differentiated by an adjoint or by differences; "
+            "leave out what needs a second one (a Hessian, a gradient penalty), or take differences of gradients"
+        )

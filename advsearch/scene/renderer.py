@@ -29,7 +29,7 @@ from advsearch.errors import InputError
 from advsearch.scene.assembly import ON_PICTURE, Motion, central, steps_for
 from advsearch.scene.description import OBJECT
 from advsearch.scene.formation import ImageFormation, levels_of
-from advsearch.scene.gradients import BY_ADJOINT, BY_DIFFERENCES, TURN_STEP, Group, first_plan
+from advsearch.scene.gradients import BY_ADJOINT, BY_DIFFERENCES, TURN_STEP, Group, first_order, first_plan
 from advsearch.scene.mitsuba_backend.denoise import denoise
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.surfaces import Surfaces
@@ -152,13 +152,16 @@ class Renderer:
         """Render a configuration as the model would see it, or several.
 
         Args:
-            u: (d,) in [0, 1], a tensor or an array; or (N, d), rendered one after the other with the same seed.
+            u: (d,) in [0, 1], a tensor or an array; or (N, d), rendered one after the other with the same seed. It is
+                rendered in float32, whatever its dtype.
             seed: number of the noise; the same seed gives the same bytes.
             spp: independent samples a pixel, 1 to 65,536.
 
         Returns:
             (H, W, 3) float32, display-referred sRGB in [0, 1], or (N, H, W, 3); differentiable with respect to u, in
-            `torch.inference_mode` too (not in `torch.no_grad`).
+            `torch.inference_mode` too (not in `torch.no_grad`), and once: a second derivative is an error. The
+            derivative has noise of its own and float32 steps, so that `torch.autograd.gradcheck` can't pass; `check`
+            compares it with differences that are wide enough.
 
         Raises:
             InputError: u has another shape, or values outside [0, 1], or spp is out of range; or u requires a
@@ -397,7 +400,7 @@ class _Radiance(torch.autograd.Function):
         return rendered
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
+    @first_order
     def backward(ctx: Any, cotangent: Tensor) -> tuple[Tensor | None, ...]:
         """Gradient of `sum(cotangent * radiance)` for the inputs whose coordinates use an adjoint.
 
@@ -439,9 +442,8 @@ class _Differences(torch.autograd.Function):
         return image.view_as(image)
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
+    @first_order
     def backward(ctx: Any, cotangent: Tensor) -> tuple[Tensor | None, ...]:
         (u,) = ctx.saved_tensors
-        with torch.no_grad():
-            found = ctx.renderer.differences(u, cotangent, ctx.seed, ctx.spp)
+        found = ctx.renderer.differences(u, cotangent, ctx.seed, ctx.spp)
         return None, None, None, found, cotangent

@@ -8,6 +8,7 @@ from typing import Any
 
 from torch import Tensor
 
+from advsearch.copies import copied
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.models import Model
 from advsearch.options import FROM_RUN, JOINED, check_options, check_takes, told
@@ -49,7 +50,7 @@ class OwnTask(Task):
 
     def margin(self, output: Any, truth: Facts) -> Tensor:
         """Return what the function says, (N,). Raises InputError where it returns something else."""
-        found, count = self.function(output, truth), len(output)
+        found, count = self.function(copied(output), truth), len(output)
         if isinstance(found, Tensor) and found.is_floating_point() and found.numel() == count:
             return found.reshape(count)
         got = f"{found.dtype} {tuple(found.shape)}" if isinstance(found, Tensor) else type(found).__name__

@@ -11,11 +11,13 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from types import MappingProxyType
 from typing import Any, ClassVar, TypeVar
 
 import torch
 from torch import Tensor
 
+from advsearch.copies import hand_copies
 from advsearch.described import NOT_A_NUMBER
 from advsearch.errors import InputError
 from advsearch.files import JsonValue
@@ -142,6 +144,7 @@ class Facts:
     own_label: str | None = None
     describe: Callable[[], Mapping[str, float]] = dict
     look: Callable[[], Sight] | None = None
+    gives_copies: ClassVar[bool] = True
 
     @cached_property
     def sight(self) -> Sight:
@@ -163,7 +166,7 @@ class Facts:
         Raises:
             InputError: as for `sight`.
         """
-        return self.sight.mask
+        return self.sight.mask.clone()
 
     @property
     def depth(self) -> Tensor:
@@ -174,7 +177,7 @@ class Facts:
         Raises:
             InputError: as for `sight`.
         """
-        return self.sight.depth
+        return self.sight.depth.clone()
 
     @property
     def z_depth(self) -> Tensor:
@@ -183,7 +186,7 @@ class Facts:
         Raises:
             InputError: as for `sight`.
         """
-        return self.sight.z_depth
+        return self.sight.z_depth.clone()
 
     @cached_property
     def box(self) -> tuple[int, int, int, int] | None:
@@ -200,7 +203,7 @@ class Facts:
     @cached_property
     def numbers(self) -> Mapping[str, float]:
         """The numbers of the configuration: of everything that varies, and of what the scene was given."""
-        return self.describe()
+        return MappingProxyType(dict(self.describe()))
 
     def number(self, name: str) -> float:
         """Return the number that a parameter has in this configuration.
@@ -244,6 +247,11 @@ class Task(ABC):
 
     minimise: bool = field(default=False, metadata=FROM_RUN)
     target: Truth = field(default=None, metadata=FROM_RUN)
+
+    def __init_subclass__(cls, **more: Any) -> None:
+        super().__init_subclass__(**more)
+        asked = ("margin", "score", "answers", "payloads", "marks", "judge", "said", "average", "seeing", "answerable")
+        hand_copies(cls, truth_names=slice(None), **dict.fromkeys(asked, slice(None)))
 
     def check_numbers(self, fits: Callable[[float], bool], expected: str, *names: str) -> None:
         """Check options that are numbers. Raises InputError where one is none, or does not fit; it says what was

@@ -292,3 +292,58 @@ def test_multijittered_samples_have_the_same_mean_and_less_noise() -> None:
 def test_unknown_samplers_are_refused() -> None:
     with pytest.raises(InputError, match="pixel_sampler: expected one of independent, multijitter, got 'halton'"):
         load_scene("mug").renderer("camera", resolution=SIZE, sampler="halton")
+
+
+SECOND = "render: it has first derivatives only"
+
+
+@pytest.fixture(scope="module")
+def numbers() -> Renderer:
+    """One number by the tone curve, one by an adjoint and one by differences."""
+    varied = {"camera": {"exposure": [-1, 1], "azimuth": [0, 90]}, "light": {"power": [0, 12]}}
+    return load_scene("mug").renderer(varied, resolution=8, denoise="none")
+
+
+@pytest.mark.parametrize("which", ["numbers", "raw"])
+@pytest.mark.parametrize("of", ["hessian", "penalty", "grad", "backward", "model"])
+def test_second_derivatives_are_refused_and_never_incomplete(
+    which: str, of: str, request: pytest.FixtureRequest
+) -> None:
+    render: Renderer = request.getfixturevalue(which)
+    u, weight = inside(render).requires_grad_(), torch.ones(3, requires_grad=True)
+
+    def value(at: Tensor) -> Tensor:
+        return (render(at, seed=0, spp=1) * weight).mean()
+
+    (slope,) = torch.autograd.grad(value(u), u, create_graph=True)
+    with pytest.raises(RuntimeError, match=SECOND):
+        if of == "hessian":
+            torch.autograd.functional.hvp(value, u.detach(), torch.ones_like(u))
+        elif of == "penalty":
+            torch.autograd.grad(slope.square().sum(), u)
+        elif of == "grad":
+            torch.autograd.grad(slope[0], [u])
+        elif of == "backward":
+            slope.square().sum().backward()
+        else:
+            torch.autograd.grad(slope.square().sum(), weight)
+
+
+def test_second_derivatives_of_the_tone_curve_alone_are_there() -> None:
+    render = load_scene("mug").renderer({"camera": {"exposure": [-1, 1]}}, resolution=8, denoise="none")
+    u = torch.tensor([0.4], requires_grad=True)
+    (slope,) = torch.autograd.grad(render(u, seed=0, spp=1).square().mean(), u, create_graph=True)
+    (second,) = torch.autograd.grad(slope, u)
+    ends = []
+    for at in (0.39, 0.41):
+        near = torch.tensor([at], requires_grad=True)
+        ends.append(float(torch.autograd.grad(render(near, seed=0, spp=1).square().mean(), near)[0]))
+    assert float(second) == pytest.approx((ends[1] - ends[0]) / 0.02, rel=0.05)
+
+
+def test_a_gradient_with_a_graph_is_the_one_without(numbers: Renderer) -> None:
+    found = []
+    for graph in (False, True):
+        u = inside(numbers).requires_grad_()
+        found.append(torch.autograd.grad(numbers(u, seed=2, spp=2).mean(), u, create_graph=graph)[0].detach())
+    assert torch.equal(*found)

@@ -83,7 +83,7 @@ class SurfaceView:
 
 
 class SparseProduct(torch.autograd.Function):
-    """A sparse matrix times columns, with its transpose as the derivative."""
+    """A sparse matrix times columns, with its transpose as the derivative, any number of times."""
 
     @staticmethod
     def forward(ctx: Any, matrix: scipy.sparse.csr_matrix, values: Tensor) -> Tensor:
@@ -91,9 +91,8 @@ class SparseProduct(torch.autograd.Function):
         return torch.from_numpy(matrix @ values.detach().numpy())
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
     def backward(ctx: Any, cotangent: Tensor) -> tuple[None, Tensor]:
-        return None, torch.from_numpy(ctx.matrix.T @ cotangent.numpy())
+        return None, SparseProduct.apply(ctx.matrix.T, cotangent)  # type: ignore[no-untyped-call]
 
 
 GATHERED = 256

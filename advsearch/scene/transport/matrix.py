@@ -220,16 +220,17 @@ class TextureTransport:
 
 
 class _Product(torch.autograd.Function):
-    """J times a change, with its transpose as the derivative."""
+    """J times a change, or its transpose, with the other as the derivative, any number of times."""
 
     @staticmethod
-    def forward(ctx: torch.autograd.function.FunctionCtx, transport: TextureTransport, change: Tensor) -> Tensor:
-        ctx.transport = transport  # type: ignore[attr-defined]
-        return transport.times(change)
+    def forward(ctx: Any, transport: TextureTransport, change: Tensor, transposed: bool = False) -> Tensor:
+        ctx.transport, ctx.transposed = transport, transposed
+        return transport.transposed_times(change) if transposed else transport.times(change)
 
     @staticmethod
-    def backward(ctx: torch.autograd.function.FunctionCtx, cotangent: Tensor) -> tuple[None, Tensor]:
-        return None, ctx.transport.transposed_times(cotangent.contiguous())  # type: ignore[attr-defined]
+    def backward(ctx: Any, cotangent: Tensor) -> tuple[None, Tensor, None]:
+        back = _Product.apply(ctx.transport, cotangent.contiguous(), not ctx.transposed)  # type: ignore[no-untyped-call]
+        return None, back, None
 
 
 def by_rows(matrix: scipy.sparse.csr_matrix) -> Tensor:
