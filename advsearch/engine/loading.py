@@ -164,7 +164,7 @@ def load_scene(
         up: the up axis of a mesh file, "y" or "z"; by default what its format or else its shape says.
         settings: parameters to fix, e.g. ``{"camera.azimuth": 130.0}``. The size of a picture belongs to none of them
             but to what makes it: `resolution` of `attack`, `sweep`, `render` and `Scene.renderer`.
-        camera: a camera file (OpenCV, Kalibr, ROS, COLMAP), "fisheye" or "equirectangular", whose lens the camera
+        camera: a camera file (docs/cameras.md), "fisheye" or "equirectangular", whose lens the camera
             around the object then has; the name of a camera of a scene file; "orbit" or None for a pinhole.
         texture: of the object in place of its own: a picture file, or (h, w, 3) sRGB in [0, 1] or of 8 bits, row 0 on
             top; `result.artifacts["texture"]`, say.

@@ -1,7 +1,7 @@
-"""Camera files: OpenCV's YAML and XML, Kalibr's camchain, `camera_info` of ROS and COLMAP's cameras.txt.
+"""Camera files of OpenCV, Kalibr (EuRoC), ROS (`camera_info`), camodocal (VINS), COLMAP and nerfstudio.
 
-The centre of the first pixel is (0, 0) in the first three and (0.5, 0.5) in COLMAP; what comes out is measured from the
-picture's corner.
+The centre of the first pixel is (0.5, 0.5) in the last two and (0, 0) in the others; what comes out is measured from
+the picture's corner. An entry that no reader asks for is named in a note, or refused where it makes another picture.
 """
 
 from __future__ import annotations
@@ -15,17 +15,16 @@ from typing import Any
 from xml.etree import ElementTree
 
 from advsearch.errors import FileFormatError
-from advsearch.files import read_text
+from advsearch.files import parse_json, read_text
+from advsearch.scene.camera_entries import Entries, made, nothing, number, plain, with_told
 from advsearch.scene.camera_model import BROWN_CONRADY, COEFFICIENTS, EQUIRECTANGULAR, FISHEYE, CameraModel
+from advsearch.scene.importing.files import shown
 from advsearch.yaml_text import LARGEST, parse_yaml
 
-MOST_PIXELS = 1 << 16
-"""Largest side of a picture."""
+LARGEST_JSON = 1 << 25
+"""Bytes of a JSON file, which may hold the pose of every picture."""
 MOST_BINNED = 64
 """Pixels along a side that a sensor makes into one, at most."""
-LARGEST_COEFFICIENT, LARGEST_FOCAL = 1e4, 1e3
-"""Coefficients are at most so large, and focal lengths so many sides of the picture."""
-
 IN_OPENCV = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tauX", "tauY")
 """OpenCV's order, which ROS has too."""
 LENGTHS = (0, 4, 5, 8, 12, 14)
@@ -51,6 +50,8 @@ OF_DISTORTION = {
     "rational_polynomial": BROWN_CONRADY,
     "thin_prism": BROWN_CONRADY,
     "radtan": BROWN_CONRADY,
+    "radial_tangential": BROWN_CONRADY,
+    "brown_conrady": BROWN_CONRADY,
     "none": BROWN_CONRADY,
     "": BROWN_CONRADY,
     "equidistant": FISHEYE,
@@ -58,12 +59,37 @@ OF_DISTORTION = {
     "kannala_brandt": FISHEYE,
     EQUIRECTANGULAR: EQUIRECTANGULAR,
 }
-"""The distortion models of ROS and Kalibr that are one of ours."""
+"""The distortion models of ROS, Kalibr and EuRoC that are one of ours."""
 
 MATRIX = ("cameramatrix", "k", "intrinsicmatrix", "mtx", "cameramatrix1")
-DISTORTION = ("distortioncoefficients", "distcoeffs", "distortioncoeffs", "distcoeff", "distortion", "d", "dist")
+DISTORTION = (
+    *("distortioncoefficients", "distcoeffs", "distortioncoeffs", "distcoeff", "distortion", "d", "dist"),
+    *("distortioncoefficients1", "distcoeffs1"),
+)
 WIDTH, HEIGHT = ("imagewidth", "width", "w"), ("imageheight", "height", "h")
 SIZE = ("imagesize", "resolution")
+GROUPS = ("projection_parameters", "distortion_parameters", "mirror_parameters")
+KANNALA = {"mu": "fx", "mv": "fy", "u0": "cx", "v0": "cy", "k2": "k1", "k3": "k2", "k4": "k3", "k5": "k4"}
+"""What camodocal calls the numbers of a fisheye, and OpenCV."""
+OF_A_FRAME = frozenset(("camera_model", "fl_x", "fl_y", "cx", "cy", "w", "h", *IN_OPENCV))
+"""What nerfstudio says of a camera, of all frames or of one."""
+OF_A_SCENE = frozenset(
+    "frames aabb_scale scale offset applied_transform applied_scale ply_file_path orientation_override "
+    "auto_scale_poses_override train_filenames val_filenames test_filenames camera_angle_x camera_angle_y "
+    "file_path transform_matrix sharpness colmap_im_id mask_path depth_file_path semantic_path time rotation".split()
+)
+"""Entries of a transforms.json, and of its frames, that say nothing of the lens; angles count where lengths lack."""
+CONVERTED = {
+    ".bin": "COLMAP's binary cameras: write them as text, colmap model_converter --input_path FOLDER --output_path "
+    "FOLDER --output_type TXT, and give cameras.txt",
+    ".npz": "NumPy's arrays: write them as JSON, with image_width, image_height, camera_matrix and "
+    "distortion_coefficients (numpy.ndarray.tolist)",
+}
+CONVERTED |= {
+    ".npy": CONVERTED[".npz"],
+    ".pkl": CONVERTED[".npz"].replace("NumPy's arrays", "a pickle, which may run code"),
+}
+"""What other files of cameras are, and what to do with them."""
 
 
 def read_camera(spec: str) -> CameraModel:
@@ -74,28 +100,46 @@ def read_camera(spec: str) -> CameraModel:
             ``cameras.txt#3``.
 
     Raises:
-        FileFormatError: the file is missing, is none of these kinds, has a model that is not one of ours, or numbers
-            that no camera has.
+        FileFormatError: the file is missing, is none of these kinds, has a model that is not one of ours, numbers that
+            no camera has, or an entry that makes another picture and is not read.
     """
     path, _, which = spec.partition("#")
+    ending = Path(path).suffix.lower()
+    if ending in CONVERTED and Path(path).is_file():
+        raise FileFormatError(f"{path}: expected a camera as text, got {CONVERTED[ending]}")
     try:
-        text = read_text(Path(path), "a camera file", LARGEST)
+        text = read_text(Path(path), "a camera file", LARGEST_JSON if ending == ".json" else LARGEST)
     except OSError as error:
         raise FileFormatError(f"{path}: expected a camera file, got {error.strerror}; check the path") from None
     lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
     if lines and re.fullmatch(r"\d+\s+[A-Za-z_]\w*\s.*", lines[0].strip()):
         return _of_colmap(spec, path, which, lines)
-    data = _xml(path, text) if text.lstrip().startswith("<") else _yaml(path, text)
+    data = _data(path, text)
+    if "frames" in data or "fl_x" in data or "camera_angle_x" in data:
+        return _of_nerfstudio(spec, which, data)
     cameras = {name: one for name, one in data.items() if isinstance(one, dict) and "intrinsics" in one}
     if cameras:
-        return _of_kalibr(spec, _chosen(path, which, cameras))
+        rest = Entries(path, {name: one for name, one in data.items() if name not in cameras})
+        return _of_kalibr(spec, Entries(path, _chosen(path, which, cameras)), rest.told())
     if which:
         raise FileFormatError(
             f"{path}: expected several cameras, as {which!r} is asked for, got one; leave #{which} out"
         )
     if "intrinsics" in data and "camera_model" in data:
-        return _of_kalibr(spec, data)
-    return _of_opencv(spec, {re.sub(r"[_\s]", "", name).lower(): one for name, one in data.items()})
+        return _of_kalibr(spec, Entries(path, data))
+    return _of_opencv(spec, Entries(path, _of_camodocal(data)))
+
+
+def _data(path: str, text: str) -> dict[str, Any]:
+    """The entries of a text in XML, JSON or YAML."""
+    if text.lstrip().startswith("<"):
+        return _xml(path, text)
+    if not path.lower().endswith(".json"):
+        return _yaml(path, text)
+    try:
+        return _checked(path, parse_json(text))
+    except ValueError as error:
+        raise FileFormatError(f"{path}: expected JSON, got {error}; correct the file") from None
 
 
 def _yaml(path: str, text: str) -> dict[str, Any]:
@@ -103,15 +147,19 @@ def _yaml(path: str, text: str) -> dict[str, Any]:
     text = re.sub(r"!!opencv-(nd-)?matrix", "", re.sub(r"\A%YAML[^\n]*\n", "", text))
     text = re.sub(r"\A\s*---[^\n]*\n", "", text).split("\n---")[0]
     try:
-        data = parse_yaml(text)
+        return _checked(path, parse_yaml(text))
     except ValueError as error:
         raise FileFormatError(
             f"{path}: expected YAML, or COLMAP's cameras.txt, got {error}; correct the file"
         ) from None
+
+
+def _checked(path: str, data: object) -> dict[str, Any]:
     if not isinstance(data, dict) or not all(isinstance(name, str) for name in data):
         got = "an empty file" if data is None else f"a {type(data).__name__}"
         raise FileFormatError(
-            f"{path}: expected a camera of OpenCV, Kalibr, ROS or COLMAP, got {got}; docs/cameras.md shows one of each"
+            f"{path}: expected a camera of OpenCV, Kalibr, ROS, COLMAP or nerfstudio, got {got}; docs/cameras.md shows "
+            "one of each"
         )
     return data
 
@@ -129,21 +177,29 @@ def _xml(path: str, text: str) -> dict[str, Any]:
             f"{path}: expected a camera of OpenCV in <opencv_storage>, got <{root.tag[:40]}>; docs/cameras.md has the "
             "formats that are read"
         )
-    matrices = {one.tag: one.findtext("data") for one in root}
-    return {one.tag: (one.text or "").strip() if (data := matrices[one.tag]) is None else data.split() for one in root}
+    return {one.tag: _of_element(one) for one in root}
+
+
+def _of_element(element: ElementTree.Element) -> object:
+    """The numbers of a matrix, the entries of another element with some inside, or text."""
+    if (data := element.findtext("data")) is not None:
+        return data.split()
+    if len(element):
+        return {one.tag: (one.text or "").strip() for one in element}
+    return (element.text or "").strip()
 
 
 def _chosen(path: str, which: str, cameras: Mapping[str, Any]) -> Any:
     """The camera that is asked for, or the only one."""
     names = list(map(str, cameras))
-    shown = ", ".join(names[:8]) + (", ..." if len(names) > 8 else "")
+    listed = ", ".join(names[:8]) + (", ..." if len(names) > 8 else "")
     if which and which not in names:
         raise FileFormatError(
-            f"{path}: expected one of its cameras {shown}, got {which[:40]!r}; write {path}#{names[0]}"
+            f"{path}: expected one of its cameras {listed}, got {which[:40]!r}; write {path}#{names[0]}"
         )
     if not which and len(names) > 1:
         raise FileFormatError(
-            f"{path}: has {len(names)} cameras, {shown}: say which one takes the picture, as in {path}#{names[0]}"
+            f"{path}: has {len(names)} cameras, {listed}: say which one takes the picture, as in {path}#{names[0]}"
         )
     return cameras[which or names[0]]
 
@@ -163,42 +219,72 @@ def _of_colmap(spec: str, path: str, which: str, lines: Sequence[str]) -> Camera
     wanted = ["width", "height", *names.split()]
     if len(rest) != len(wanted):
         raise FileFormatError(f"{path}: {name}: expected {' '.join(wanted)}, got {len(rest)} numbers; correct the line")
-    found = {one: _number(path, one, value) for one, value in zip(wanted, rest, strict=True)}
+    found = {one: number(path, one, value) for one, value in zip(wanted, rest, strict=True)}
     size = (found.pop("height"), found.pop("width"))
     if "f" in found:
         found["fx"] = found["fy"] = found.pop("f")
-    return _made(spec, kind, size, found)
+    return made(spec, kind, size, found)
 
 
-def _of_kalibr(spec: str, camera: Mapping[str, Any]) -> CameraModel:
-    path = spec.partition("#")[0]
-    model = str(camera.get("camera_model", "pinhole"))
+def _of_nerfstudio(spec: str, which: str, data: Mapping[str, Any]) -> CameraModel:
+    """A transforms.json of nerfstudio or Instant NGP; of several cameras in its frames the one with that number."""
+    path, frames = spec.partition("#")[0], data.get("frames") or []
+    frames = [one for one in frames if isinstance(one, dict)] if isinstance(frames, list) else []
+    own = [{key: one[key] for key in one if key in OF_A_FRAME} for one in frames] or [{}]
+    if which or any(one != own[0] for one in own):
+        own = [_chosen(path, which, {str(count): one for count, one in enumerate(own)})]
+    others = {key: one for frame in frames for key, one in frame.items() if key not in OF_A_FRAME | OF_A_SCENE}
+    entries = Entries(path, {key: one for key, one in data.items() if key not in OF_A_SCENE} | own[0])
+    width, height = (entries.number((side,), side) for side in ("w", "h"))
+    name = str(entries.get("cameramodel") or "PINHOLE").upper()
+    if name not in (*COLMAP, "PERSPECTIVE"):
+        raise FileFormatError(
+            f"{path}: expected one of the camera models {', '.join(COLMAP)}, got {shown(name)}, which is another "
+            "projection; fit one of these to it"
+        )
+    kind = COLMAP[name][0] if name in COLMAP else BROWN_CONRADY
+    kind = FISHEYE if entries.get("isfisheye") else kind
+    angles = [data.get(f"camera_angle_{axis}") for axis in "xy"]
+    lengths = [
+        0.0 if angle is None else side / 2.0 / max(math.tan(number(path, "camera_angle", angle) / 2.0), 1e-9)
+        for angle, side in zip(angles, (width, height), strict=True)
+    ]
+    fx = entries.number(("flx",), "fl_x", lengths[0] or None)
+    found = {"fx": fx, "fy": entries.number(("fly",), "fl_y", lengths[1] or fx)}
+    found |= {axis: entries.number((axis,), axis, side / 2.0) for axis, side in (("cx", width), ("cy", height))}
+    found |= _coefficients(entries, COEFFICIENTS[:4] if kind == FISHEYE else ("k1", "k2", "k3", "p1", "p2"))
+    model = made(spec, kind, (height, width), found)
+    return with_told(model, [*entries.told(), *Entries(path, others).told("frames.")])
+
+
+def _of_kalibr(spec: str, entries: Entries, beside: Sequence[str] = ()) -> CameraModel:
+    """Kalibr's and EuRoC's; `beside` are other entries of the file."""
+    path = entries.path
+    model = str(entries.get("cameramodel") or "pinhole")
     if model != "pinhole":
         raise FileFormatError(
             f"{path}: expected the camera_model pinhole of Kalibr, got {model[:40]}, which is another projection; "
             "calibrate as pinhole-equi or pinhole-radtan"
         )
-    kind = _kind(path, camera.get("distortion_model", "none"))
-    focal = _numbers(path, "intrinsics", camera["intrinsics"], (4,))
-    coefficients = _numbers(path, "distortion_coeffs", camera.get("distortion_coeffs", []), (0, 4))
-    width, height = _numbers(path, "resolution", _there(path, camera, ("resolution",)), (2,))
+    kind = _kind(path, entries.get("distortionmodel"))
+    focal = entries.numbers("intrinsics", entries.get("intrinsics"), (4,))
     names = ("k1", "k2", "k3", "k4") if kind == FISHEYE else ("k1", "k2", "p1", "p2")
-    found = dict(zip(("fx", "fy", "cx", "cy"), focal, strict=True)) | dict(zip(names, coefficients, strict=False))
-    return _made(spec, kind, (height, width), _from_corner(found))
+    width, height = entries.numbers("resolution", entries.there(("resolution",), "resolution"), (2,))
+    found = dict(zip(("fx", "fy", "cx", "cy"), focal, strict=True)) | _distortion(entries, names, (0, 4))
+    return with_told(made(spec, kind, (height, width), _from_corner(found)), [*beside, *entries.told()])
 
 
-def _of_opencv(spec: str, data: Mapping[str, Any]) -> CameraModel:
-    """OpenCV's files and ROS; their keys are in small letters and without underscores here."""
-    path = spec.partition("#")[0]
-    kind = _kind(path, data.get("distortionmodel", data.get("cameramodel", "")))
-    if data.get("fisheyemodel") not in (None, 0, False, "0"):
-        kind = FISHEYE
+def _of_opencv(spec: str, entries: Entries) -> CameraModel:
+    """OpenCV's files and ROS."""
+    path = entries.path
+    keys = ("distortionmodel", "cameramodel", "modeltype")
+    kinds = {_kind(path, one) for key in keys if (one := entries.get(key)) is not None}
+    kind = FISHEYE if not nothing(entries.get("fisheyemodel")) else next(iter(kinds), BROWN_CONRADY)
+    if len(kinds) > 1:
+        raise FileFormatError(f"{path}: expected one model, got a camera_model beside another distortion_model")
     if kind == EQUIRECTANGULAR:
-        return _made(spec, kind, _size(path, data), {})
-    roi = data.get("roi")
-    if isinstance(roi, Mapping) and any(roi.get(side) for side in ("x_offset", "y_offset", "width", "height")):
-        raise FileFormatError(f"{path}: expected a camera_info of whole pictures, got one of a part (roi); set it to 0")
-    matrix = _numbers(path, "camera_matrix", _there(path, data, MATRIX, "camera_matrix"), (9,))
+        return with_told(made(spec, kind, _size(entries), {}), entries.told())
+    matrix = _matrix(entries)
     if not any(matrix):
         raise FileFormatError(
             f"{path}: expected a calibrated camera, got a camera_matrix (K) of zeros, as ROS says of one that is not "
@@ -206,18 +292,28 @@ def _of_opencv(spec: str, data: Mapping[str, Any]) -> CameraModel:
         )
     if matrix[3] or matrix[6] or matrix[7] or matrix[8] != 1.0:
         raise FileFormatError(f"{path}: camera_matrix: expected fx, skew, cx, 0, fy, cy, 0, 0, 1, got other numbers")
-    given: object = next((data[name] for name in DISTORTION if data.get(name) is not None), [])
-    coefficients = _numbers(path, "distortion_coefficients", given, (0, 4) if kind == FISHEYE else LENGTHS)
-    names = COEFFICIENTS[:4] if kind == FISHEYE else IN_OPENCV
-    found = dict(zip(names, coefficients, strict=False))
+    size, fisheye = _size(entries), kind == FISHEYE
+    unread = _check_roi(entries, size)
+    found = _distortion(entries, COEFFICIENTS[:4] if fisheye else IN_OPENCV, (0, 4) if fisheye else LENGTHS)
     if found.pop("tauX", 0.0) or found.pop("tauY", 0.0):
         raise FileFormatError(
             f"{path}: expected no tilt of the sensor (tauX, tauY), got one; calibrate without CALIB_TILTED_MODEL"
         )
     found |= {"fx": matrix[0], "skew": matrix[1], "cx": matrix[2], "fy": matrix[4], "cy": matrix[5]}
-    (height, width), (down, across) = _size(path, data), _binning(path, data)
-    model = _made(spec, kind, (height - height % down, width - width % across), _from_corner(found))
-    return replace(model, size=(int(height // down), int(width // across)))
+    (height, width), (down, across) = size, _binning(entries)
+    model = made(spec, kind, (height - height % down, width - width % across), _from_corner(found))
+    model = replace(model, size=(int(height // down), int(width // across)))
+    rectified = _rectified(entries, matrix)
+    return with_told(model, unread + entries.told(), rectified)
+
+
+def _of_camodocal(data: Mapping[str, Any]) -> dict[str, Any]:
+    """Entries without the groups that camodocal (VINS) has, and with OpenCV's names for its fisheye's numbers."""
+    groups = [one for name in GROUPS if isinstance(one := data.get(name), dict)]
+    found = {name: one for name, one in data.items() if not (name in GROUPS and isinstance(one, dict))}
+    for group in groups:
+        found |= {KANNALA.get(key, key) if "mu" in group else key: one for key, one in group.items()}
+    return found
 
 
 def _from_corner(found: dict[str, float]) -> dict[str, float]:
@@ -228,16 +324,61 @@ def _from_corner(found: dict[str, float]) -> dict[str, float]:
 # ---- what they are made of ------------------------------------------------------------------------------------------
 
 
-def _there(path: str, data: Mapping[str, Any], names: Sequence[str], shown: str = "") -> Any:
-    """The first of these keys that is there."""
-    for name in names:
-        if data.get(name) is not None:
-            return data[name]
-    raise FileFormatError(f"{path}: expected {shown or names[0]}, got {', '.join(list(data)[:8]) or 'nothing'}; add it")
+def _distortion(entries: Entries, names: Sequence[str], counts: Sequence[int]) -> dict[str, float]:
+    """The coefficients of a list, or where there is none, those that have entries of their own."""
+    given = entries.get(*DISTORTION)
+    if nothing(given) and not isinstance(given, Mapping):
+        return _coefficients(entries, names)
+    return dict(zip(names, entries.numbers("distortion_coefficients", given, counts), strict=False))
+
+
+def _matrix(entries: Entries) -> list[float]:
+    """The camera matrix, row by row, also of its numbers one by one."""
+    given = entries.get(*MATRIX)
+    if given is None and entries.get("fx") is not None:
+        fx, fy, cx, cy = (entries.number((one,), one) for one in ("fx", "fy", "cx", "cy"))
+        return [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
+    return entries.numbers("camera_matrix", entries.there(MATRIX, "camera_matrix"), (9,))
+
+
+def _coefficients(entries: Entries, names: Sequence[str]) -> dict[str, float]:
+    return {name: entries.number((plain(name),), name, 0.0) for name in names}
+
+
+def _rectified(entries: Entries, matrix: Sequence[float]) -> list[str]:
+    """What there is about rectified pictures, which the camera's own ones are not; none where that changes nothing."""
+    x, skew, cx, y, cy = (matrix[place] for place in (0, 1, 2, 4, 5))
+    same = ([1.0, 0, 0, 0, 1, 0, 0, 0, 1], [x, skew, cx, 0, 0, y, cy, 0, 0, 0, 1, 0])
+    found = []
+    words = ("rectification_matrix", "projection_matrix")
+    for names, shown_as, expected in zip(
+        (("rectificationmatrix", "r"), ("projectionmatrix", "p")), words, same, strict=True
+    ):
+        given = entries.get(*names)
+        if nothing(given):
+            continue
+        told = entries.numbers(shown_as, given, (len(expected),))
+        if any(abs(one - other) > 1e-6 * max(1.0, abs(other)) for one, other in zip(told, expected, strict=True)):
+            found.append(shown_as)
+    return found
+
+
+def _check_roi(entries: Entries, size: tuple[float, float]) -> list[str]:
+    """Refuse a part of the picture (0, 0 and its own size are the whole); return what it says that is not read."""
+    roi = entries.part("roi")
+    x, y, height, width = (roi.number((plain(one),), one, 0.0) for one in ("x_offset", "y_offset", "height", "width"))
+    roi.get("dorectify")
+    if (x, y) != (0.0, 0.0) or (height, width) not in ((0.0, 0.0), size):
+        raise FileFormatError(
+            f"{entries.path}: expected a camera_info of whole pictures, got one of a part (roi); set it to 0"
+        )
+    return roi.told("roi.")
 
 
 def _kind(path: str, named: object) -> str:
-    name = str(named or "").strip().lower()
+    name = re.sub(r"[-\s]", "_", str(named or "").strip().lower())
+    if name == "pinhole":
+        return BROWN_CONRADY
     if name not in OF_DISTORTION:
         raise FileFormatError(
             f"{path}: expected one of the distortion models {', '.join(filter(None, OF_DISTORTION))}, got {name[:40]!r}"
@@ -245,90 +386,19 @@ def _kind(path: str, named: object) -> str:
     return OF_DISTORTION[name]
 
 
-def _size(path: str, data: Mapping[str, Any]) -> tuple[float, float]:
+def _size(entries: Entries) -> tuple[float, float]:
     """Height and width of the pictures."""
-    for name in SIZE:
-        if data.get(name) is not None:
-            width, height = _numbers(path, name, data[name], (2,))
-            return height, width
-    width, height = (
-        _number(path, shown, _there(path, data, names, shown))
-        for names, shown in ((WIDTH, "image_width"), (HEIGHT, "image_height"))
-    )
+    if (given := entries.get(*SIZE)) is not None:
+        width, height = entries.numbers("image_size", given, (2,))
+        return height, width
+    width, height = (entries.number(names, one) for names, one in ((WIDTH, "image_width"), (HEIGHT, "image_height")))
     return height, width
 
 
-def _binning(path: str, data: Mapping[str, Any]) -> tuple[float, float]:
+def _binning(entries: Entries) -> tuple[float, float]:
     """Pixels, down and across, that ROS says are made into one; its calibration is for those before."""
-    found = {name: _number(path, name, data.get(name.replace("_", "")) or 1) for name in ("binning_y", "binning_x")}
-    for name, number in found.items():
-        if number != int(number) or not 1 <= number <= MOST_BINNED:
-            raise FileFormatError(f"{path}: {name}: expected a whole number up to {MOST_BINNED}, got {number:g}")
+    found = {name: entries.number((plain(name),), name, 1.0) or 1.0 for name in ("binning_y", "binning_x")}
+    for name, one in found.items():
+        if one != int(one) or not 1 <= one <= MOST_BINNED:
+            raise FileFormatError(f"{entries.path}: {name}: expected a whole number up to {MOST_BINNED}, got {one:g}")
     return found["binning_y"], found["binning_x"]
-
-
-def _numbers(path: str, name: str, given: object, counts: Sequence[int]) -> list[float]:
-    """A list of numbers, flat, in rows, or in the `data` of a matrix."""
-    if isinstance(given, Mapping):
-        given = given.get("data")
-    flat: list[object] = []
-    for one in given if isinstance(given, list) else [given]:
-        flat += one if isinstance(one, list) else [one]
-    if len(flat) not in counts:
-        wanted = " or ".join(map(str, counts))
-        raise FileFormatError(f"{path}: {name}: expected a list of {wanted} numbers, got {len(flat)}; correct it")
-    return [_number(path, name, one) for one in flat]
-
-
-def _number(path: str, name: str, given: object) -> float:
-    try:
-        number = float(given) if isinstance(given, (int, float, str)) and not isinstance(given, bool) else math.nan
-    except (ValueError, OverflowError):
-        number = math.nan
-    if not math.isfinite(number):
-        raise FileFormatError(f"{path}: {name}: expected a finite number, got {str(given)[:40]!r}; correct it")
-    return number
-
-
-def _made(spec: str, kind: str, size: tuple[float, float], found: Mapping[str, float]) -> CameraModel:
-    """The model of numbers in pixels, from the corner of the picture.
-
-    Raises:
-        FileFormatError: numbers that no camera has.
-    """
-    path = spec.partition("#")[0]
-    height, width = size
-    if not all(side == int(side) and 1 <= side <= MOST_PIXELS for side in size):
-        raise FileFormatError(
-            f"{path}: expected a width and a height from 1 to {MOST_PIXELS} pixels, got {width:g} x {height:g}"
-        )
-    if kind == EQUIRECTANGULAR:
-        found = {"fx": width, "fy": height, "cx": width / 2.0, "cy": height / 2.0}
-    for name, side in (("fx", width), ("fy", height)):
-        if not side / LARGEST_FOCAL <= found[name] <= side * LARGEST_FOCAL:
-            raise FileFormatError(
-                f"{path}: {name}: expected a focal length from {side / LARGEST_FOCAL:g} to {side * LARGEST_FOCAL:g} "
-                f"pixels for a side of {side:g}, got {found[name]:g}"
-            )
-    for name, side in (("cx", width), ("cy", height)):
-        if not 0.0 < found[name] < side:
-            raise FileFormatError(
-                f"{path}: {name}: expected a principal point inside the picture, up to {side:g}, got {found[name]:g}"
-            )
-    if abs(found.get("skew", 0.0)) > found["fx"]:
-        raise FileFormatError(f"{path}: skew: expected less than fx, {found['fx']:g}, got {found['skew']:g}")
-    for name in COEFFICIENTS:
-        if abs(found.get(name, 0.0)) > LARGEST_COEFFICIENT:
-            raise FileFormatError(
-                f"{path}: {name}: expected a coefficient from -{LARGEST_COEFFICIENT:g} to {LARGEST_COEFFICIENT:g}, got "
-                f"{found[name]:g}; is it in the order of OpenCV?"
-            )
-    linear = (
-        found["fx"] / width,
-        found["fy"] / height,
-        found["cx"] / width,
-        found["cy"] / height,
-        found.get("skew", 0.0) / width,
-    )
-    numbers = (*linear, *(found.get(name, 0.0) for name in COEFFICIENTS))
-    return CameraModel(kind, numbers, spec, (int(height), int(width)))

@@ -60,6 +60,7 @@ class CameraModel:
         name: how it was asked for: a file, or a bundled one; empty where `camera.fov` says its focal length.
         size: (height, width) in pixels that it was calibrated for; None for any.
         reach: largest angle to the axis that it sees, degrees.
+        told: sentences about how its file was read.
     """
 
     kind: str
@@ -67,6 +68,7 @@ class CameraModel:
     name: str = ""
     size: tuple[int, int] | None = None
     reach: float = 180.0
+    told: tuple[str, ...] = ()
 
     @property
     def values(self) -> dict[str, float]:
@@ -317,14 +319,16 @@ class CameraModel:
     def notes(self) -> tuple[str, ...]:
         """What a user should know of it, in sentences."""
         if self.black == 0.0:
-            return ()
+            return self.told
         name = self.name or "the lens"
         if self.fold < math.radians(self.reach):
             return (
+                *self.told,
                 f"{name}: the lens folds at {math.degrees(self.fold):.1f} degrees from its axis, and "
                 f"{100.0 * self.black:.2g} % of the picture, which only directions beyond that would fill, is black.",
             )
-        return (f"{name}: {100.0 * self.black:.2g} % of the picture lies outside the lens's circle and is black.",)
+        circle = f"{name}: {100.0 * self.black:.2g} % of the picture lies outside the lens's circle and is black."
+        return (*self.told, circle)
 
     def scaling(self, resolution: tuple[int, int]) -> tuple[str, ...]:
         """Return what is to be said of a picture of another size (height, width) than the model is for."""

@@ -233,7 +233,7 @@ class SceneDescription:
     def number(self, name: str) -> float:
         """Return a setting that always has a value; of the field of view, that of the camera in use."""
         if name == "camera.fov" and self.camera != ORBIT_CAMERA:
-            return self.cameras[self.camera].fov
+            return self.cameras[self.camera].larger_fov(self.aspect)
         value = self.values[name]
         if value is None:
             raise KeyError(name)

@@ -206,11 +206,19 @@ class PlacedCamera:
 
     Attributes:
         to_world: (4, 4) its pose: it looks along its own +z with +y up and +x to the left.
-        fov: field of view along the larger side of the picture, degrees.
+        fov: field of view along the larger side of the picture, or if `upright` along its height, degrees.
+        upright: whether it is the height that it is along, whatever the picture's shape.
     """
 
     to_world: Doubles
     fov: float
+    upright: bool = False
+
+    def larger_fov(self, aspect: float) -> float:
+        """Return the field of view, degrees, along the larger side of a picture of width / height `aspect`."""
+        if not self.upright or aspect <= 1.0:
+            return self.fov
+        return math.degrees(2.0 * math.atan(math.tan(math.radians(self.fov) / 2.0) * aspect))
 
 
 @dataclass(frozen=True, eq=False)

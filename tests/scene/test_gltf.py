@@ -27,7 +27,7 @@ from advsearch.scene.importing.texture import filtered, sampled
 
 REPEAT, MIRRORED, CLAMPED, NEAREST, LINEAR = 10497, 33648, 33071, 9728, 9729
 TYPES = {"i1": 5120, "u1": 5121, "i2": 5122, "u2": 5123, "u4": 5125, "f4": 5126}
-WIDTHS = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
+WIDTHS = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
 SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.0]])
 MAP = np.array([[0, 1], [1, 1], [1, 0], [0, 0.0]])  # v = 0 is the top of the picture
 FACES = np.array([0, 1, 2, 0, 2, 3])

@@ -1,8 +1,4 @@
-"""glTF files: the header, read strictly and held to limits, and the numbers in their buffers.
-
-And what a file has and a scene of ours has not, in sentences: nothing is dropped in silence. Each of them begins with
-the name of the file, which the caller puts before it.
-"""
+"""glTF files: the header, read strictly and held to limits, and the numbers in their buffers."""
 
 from __future__ import annotations
 
@@ -10,7 +6,7 @@ import base64
 import binascii
 import json
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote_to_bytes
@@ -24,7 +20,6 @@ from advsearch.errors import FileFormatError
 from advsearch.files import JsonValue
 from advsearch.scene.assets import Doubles, Ints
 from advsearch.scene.importing.files import (
-    Inventory,
     References,
     check_faces,
     damaged,
@@ -33,7 +28,7 @@ from advsearch.scene.importing.files import (
     shown,
     text_of,
 )
-from advsearch.scene.importing.gltf_entries import CUT_OUTS, Asset, Header, Primitive, TextureUse
+from advsearch.scene.importing.gltf_entries import Asset, Header, Primitive, TextureUse
 
 MOST_VALUES = 1_000_000
 """Lists, objects and values in a header; each takes hundreds of bytes of memory, and may take two of the file."""
@@ -46,13 +41,14 @@ def read_header(path: Path, data: bytes) -> Header:
         FileFormatError: the file is not glTF, is shorter than it says, has other types in its header than glTF has,
             refers to what is not there, is over a limit, or needs what is not supported.
     """
-    text = text_of(_json_chunk(path, data) if path.suffix.lower() != ".gltf" else data)
+    chunk = data if path.suffix.lower() == ".gltf" else _json_chunk(path, data).rstrip(b"\0")  # some pad with zeros
+    text = text_of(chunk)
     if text.count(",") + text.count("[") + text.count("{") > files.scaled(MOST_VALUES):
         raise files.too_large(path, f"a glTF header of at most {files.scaled(MOST_VALUES):,} values", "more")
     try:
         content = files.parse_json(text)
     except ValueError as error:
-        kind, reason = looks_like(data), str(error)
+        kind, reason = looks_like(chunk), str(error)
         if "another kind" in kind:
             kind = reason if reason.startswith(("a whole", "lists or")) else "something else"
         raise damaged(path, "glTF with a JSON header", kind) from None
@@ -149,8 +145,7 @@ def check_header(path: Path, header: Header) -> None:
     """
     needed = sorted(name for name in header.extensionsRequired if name not in READ and not name.startswith(_LOOKS))
     if needed:
-        names = shown(", ".join(needed), quoted=False)
-        raise FileFormatError(f"{path}: needs {names}, which is not supported; export it without that option")
+        raise _needs(path, needed)
     for kind, index, entries in _references(header):
         if index is not None and index >= len(entries):
             raise damaged(path, f"glTF with {index + 1} {kind}, as it refers to", f"{len(entries)}")
@@ -164,10 +159,25 @@ def check_header(path: Path, header: Header) -> None:
     _check_tree(path, header)
 
 
+def _needs(path: Path, names: Iterable[str]) -> FileFormatError:
+    named = shown(", ".join(names), quoted=False)
+    return FileFormatError(f"{path}: needs {named}, which is not supported; export it without that option")
+
+
+def _unread_extensions(entry: BaseModel) -> list[str]:
+    """Return the extensions of an entry that are not understood."""
+    held = (entry.model_extra or {}).get("extensions")
+    return sorted(name for name in held if name not in READ) if isinstance(held, dict) else []
+
+
 def _references(header: Header) -> Iterator[tuple[str, int | None, Sequence[object]]]:
     """Yield every number by which the header refers to another entry: the kind, the number and what there is."""
     for view in header.bufferViews:
         yield "buffers", view.buffer, header.buffers
+    for skin in header.skins:
+        yield "accessors", skin.inverseBindMatrices, header.accessors
+        for joint in skin.joints:
+            yield "nodes", joint, header.nodes
     sparse = [part for one in header.accessors if one.sparse for part in (one.sparse.indices, one.sparse.values)]
     for held in (*header.accessors, *sparse, *header.images):
         yield "bufferViews", held.bufferView, header.bufferViews
@@ -184,6 +194,7 @@ def _references(header: Header) -> Iterator[tuple[str, int | None, Sequence[obje
         yield "materials", primitive.material, header.materials
     for node in header.nodes:
         yield "meshes", node.mesh, header.meshes
+        yield "skins", node.skin, header.skins
         yield "cameras", node.camera, header.cameras
         yield "lights", node.lamp, header.lights
     for child in (child for one in header.nodes for child in one.children):
@@ -204,6 +215,12 @@ def _check_primitive(path: Path, header: Header, primitive: Primitive) -> None:
         if name in held and "POSITION" in held and held[name].count != held["POSITION"].count:
             expected = f"as many values of {name} as of POSITION, {held['POSITION'].count:,}"
             raise damaged(path, expected, f"{held[name].count:,}")
+    for index in (*primitive.attributes.values(), primitive.indices):
+        bare = (
+            index is not None and header.accessors[index].bufferView is None and header.accessors[index].sparse is None
+        )
+        if bare and (unread := _unread_extensions(primitive)):  # which has the numbers, as Draco's
+            raise _needs(path, unread)
     if primitive.indices is not None and header.accessors[primitive.indices].type != "SCALAR":
         raise damaged(path, "indices of type SCALAR", header.accessors[primitive.indices].type)
     if primitive.indices is not None and header.accessors[primitive.indices].componentType not in (5121, 5123, 5125):
@@ -299,6 +316,9 @@ class Buffers:
             uri = self._header.buffers[number].uri
             try:
                 if uri is None and (number > 0 or self._chunk is None):
+                    views = [one for one in self._header.bufferViews if one.buffer == number]
+                    if unread := {name for one in views for name in _unread_extensions(one)}:  # as meshopt's
+                        raise _needs(self._path, sorted(unread))
                     raise damaged(self._path, f"a buffer {number} with content", "none")
                 self._read[number] = self.uri(uri) if uri is not None else self._chunk or b""
             except FileNotFoundError:
@@ -354,143 +374,3 @@ class Buffers:
         if not self._header.accessors[index].normalized or values.dtype.kind == "f":
             return numbers
         return np.asarray(numbers / np.iinfo(values.dtype).max).clip(-1.0)
-
-
-_OPAQUE = " lets light pass through surfaces with {name}; here they are opaque"
-
-EXTENSIONS = {
-    "EXT_mesh_gpu_instancing": " repeats meshes with {name}; each is there once",
-    "KHR_materials_diffuse_transmission": _OPAQUE,
-    "KHR_materials_pbrSpecularGlossiness": " has {name}, of which only diffuse colour and glossiness are read",
-    "KHR_materials_transmission": _OPAQUE,
-    "KHR_materials_unlit": " has surfaces that keep their colour in any light ({name}); here they are lit as others",
-    "KHR_materials_variants": " has variants of its materials ({name}); those that it shows by itself are taken",
-}
-"""What becomes of a file with an extension; of all that are not named here, nor understood, `UNKNOWN`."""
-
-UNKNOWN = " uses {name}, which is not understood and left out"
-
-FAR = 1000.0
-"""Distance of a directional light, in object sizes."""
-
-
-def left_out(header: Header) -> Iterator[str]:
-    """Yield what the file has that is not carried over, whether one node or all of it is the object."""
-    used = {*header.extensionsUsed, *header.extensionsRequired}
-    for name in sorted(used & set(EXTENSIONS) | used - set(READ)):
-        yield EXTENSIONS.get(name, UNKNOWN).format(name=shown(name, quoted=False))
-    drawn = in_the_scene(header)
-    absent = sum(node.mesh is not None for index, node in enumerate(header.nodes) if index not in drawn)
-    found = {
-        "occlusion map{s}: left out": sum(one.occlusionTexture is not None for one in header.materials),
-        "mesh{es} with morph targets, which are left out": sum(
-            any(primitive.targets for primitive in mesh.primitives) for mesh in header.meshes
-        ),
-        "normal map{s} with other texture coordinates than the base colour: left out": sum(
-            not one.reads(one.normalTexture) for one in header.materials
-        ),
-        "emission texture{s} with other coordinates than the base colour: left out, with the emission": sum(
-            any(one.emission) and not one.reads(one.emissiveTexture) for one in header.materials
-        ),
-        "material{s} with an alphaMode that glTF does not have: opaque": sum(
-            one.alphaMode not in ("OPAQUE", *CUT_OUTS) for one in header.materials
-        ),
-        "skin{s}: what is bound to bones stays as it was drawn": _length(header.skins),
-        "animation{s}: left out": _length(header.animations),
-        "further scene{s}: left out": max(0, len(header.scenes) - 1),
-        "node{s} with a mesh outside of its scene: left out": absent,
-    }
-    for what, count in found.items():
-        if count:
-            yield f": {counted(count, what)}"
-    yield from (f": {clause}" for clause in _unread(header))
-
-
-WORDS = {
-    "Header": "entry",
-    "MaterialEntry": "entry of a material",
-    "MetallicRoughness": "entry of a material",
-    "TextureUse": "entry of a material's texture",
-    "NormalUse": "entry of a material's texture",
-    "MeshEntry": "entry of a mesh",
-    "Primitive": "entry of a primitive",
-    "Node": "entry of a node",
-    "Sampler": "entry of a sampler",
-    "Texture": "entry of a texture",
-    "Image": "entry of an image",
-    "LightEntry": "entry of a light",
-}
-"""What is left out of entries whose contents are seen."""
-
-PLAIN = frozenset(("name", "weights", "skin", "extensions"))
-"""Keys without a field that make no difference, or are named with what they belong to."""
-
-
-def _unread(header: Header) -> Iterator[str]:
-    """Yield a clause for every key, extras of materials among them, and every attribute that is not read."""
-    found = Inventory()
-    level: list[object] = [header]
-    for entry in level:  # which grows
-        if isinstance(entry, list):
-            level.extend(one for one in entry if isinstance(one, BaseModel))
-        elif isinstance(entry, BaseModel):
-            kind = WORDS.get(type(entry).__name__)
-            for key in (entry.model_extra or {}) if kind else ():
-                found.has(str(kind), key)
-            level.extend(getattr(entry, name) for name in type(entry).model_fields)
-    for kind in set(WORDS.values()):
-        for key in PLAIN if "material" in kind or "texture" in kind else {*PLAIN, "extras"}:  # notes of applications
-            found.take(kind, key)
-    for mesh in header.meshes:
-        for primitive in mesh.primitives:
-            material = None if primitive.material is None else header.materials[primitive.material]
-            read = {"POSITION", "NORMAL", "COLOR_0", "TEXCOORD_0", material.attribute if material else ""}
-            for name in primitive.attributes:
-                if name not in read and not (header.skins and name.startswith(("JOINTS_", "WEIGHTS_"))):
-                    found.has("attribute", name)
-    return found.left()
-
-
-def beside(header: Header) -> str | None:
-    """Return what a file read as one object leaves out of its scene; None if nothing."""
-    lights = sum(node.lamp is not None for node in header.nodes)
-    cameras = sum(node.camera is not None for node in header.nodes)
-    found = [counted(count, what) for count, what in ((lights, "light{s}"), (cameras, "camera{s}")) if count]
-    if not found:
-        return None
-    verb = "is" if lights + cameras == 1 else "are"
-    what_to_do = "name one node as the object, FILE#NODE, to keep the rest around it"
-    return f": {' and '.join(found)} {verb} left out of the object; {what_to_do}"
-
-
-def lights_and_cameras(header: Header) -> Iterator[str]:
-    """Yield what becomes of lights and cameras that are not what they are in the file."""
-    distant = [light.type == "directional" for light in header.lights]
-    found = {
-        f"directional light{{s}}, here as lamps {FAR:g} object sizes away": sum(distant),
-        "light{s} with a range, which is left out: light reaches beyond it": sum(
-            light.range is not None for light in header.lights
-        ),
-        "camera{s} without perspective: left out": sum(one.perspective is None for one in header.cameras),
-    }
-    yield from (f": {counted(count, what)}" for what, count in found.items() if count)
-
-
-def counted(count: int, what: str) -> str:
-    return f"{count} {what.format(s='' if count == 1 else 's', es='' if count == 1 else 'es')}"
-
-
-def _length(entries: object) -> int:
-    return len(entries) if isinstance(entries, list) else 0
-
-
-def in_the_scene(header: Header) -> set[int]:
-    """The nodes of the scene that is read."""
-    if not header.scenes:
-        return set(range(len(header.nodes)))
-    found: set[int] = set()
-    level = list(header.scenes[header.scene or 0].nodes)
-    while level:
-        found.update(level)
-        level = [child for index in level for child in header.nodes[index].children]
-    return found

@@ -28,12 +28,13 @@ class _Entry(BaseModel):
 
 
 def _extension(*path: str, default: Any = None) -> Any:
-    """A field that an extension of the entry holds; those that are not understood are named by `gltf.left_out`."""
+    """A field that an extension of the entry holds; those that are not understood are named by `gltf_left_out`."""
     return Field(default=default, validation_alias=AliasPath("extensions", *path))
 
 
 class Asset(_Entry):
     version: str
+    generator: JsonValue = ""
 
 
 class Buffer(_Entry):
@@ -103,6 +104,7 @@ class Node(_Entry):
     children: List[Index] = []
     mesh: Index | None = None
     camera: Index | None = None
+    skin: Index | None = None
     lamp: Index | None = _extension("KHR_lights_punctual", "light")
     """Number of the light that the node carries."""
     matrix: Annotated[list[float], Field(min_length=16, max_length=16)] | None = None
@@ -110,6 +112,13 @@ class Node(_Entry):
     rotation: Annotated[list[float], Field(min_length=4, max_length=4)] | None = None
     scale: Annotated[list[float], Field(min_length=3, max_length=3)] | None = None
     name: str | None = None
+
+
+class Skin(_Entry):
+    """The nodes that move a mesh, and the accessor of the matrices from the mesh to each of them."""
+
+    joints: Annotated[list[Index], FailFast(), Field(min_length=1)]
+    inverseBindMatrices: Index | None = None
 
 
 class SceneEntry(_Entry):
@@ -308,7 +317,7 @@ class Header(_Entry):
     images: List[Image] = []
     samplers: List[Sampler] = []
     cameras: List[CameraEntry] = []
-    skins: Unread = None
+    skins: List[Skin] = []
     animations: Unread = None
     lights: List[LightEntry] = _extension("KHR_lights_punctual", "lights", default=[])
     """The lights that nodes may carry."""

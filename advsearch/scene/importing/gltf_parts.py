@@ -18,7 +18,7 @@ from advsearch.pictures import FORMATS
 from advsearch.scene.assets import Doubles, Floats, Ints
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.importing.files import References, check_faces, damaged, shown
-from advsearch.scene.importing.gltf import Buffers, binary_chunk, counted, left_out, read_header
+from advsearch.scene.importing.gltf import Buffers, binary_chunk, read_header
 from advsearch.scene.importing.gltf_entries import (
     CLAMPED,
     CUT_OUTS,
@@ -31,6 +31,8 @@ from advsearch.scene.importing.gltf_entries import (
     Sampler,
     TextureUse,
 )
+from advsearch.scene.importing.gltf_left_out import counted, left_out
+from advsearch.scene.importing.gltf_skins import Bound, bound, joint_matrices, posed
 from advsearch.scene.importing.parts import (
     ImportedPart,
     ImportedSurface,
@@ -262,8 +264,9 @@ def read_gltf(path: Path, data: bytes) -> tuple[list[ImportedPart], list[str]]:
     drawn = [(node, pose) for node, pose in poses(header) if header.nodes[node].mesh is not None]
     drawn.sort(key=lambda item: item[0])
     meshes = {mesh: header.meshes[mesh] for node, _ in drawn if (mesh := header.nodes[node].mesh) is not None}
+    skinned = {header.nodes[node].mesh for node, _ in drawn if header.nodes[node].skin is not None}
     pieces = {
-        (mesh, number): _piece(path, header, buffers, primitive)
+        (mesh, number): _piece(path, header, buffers, primitive, skinned=mesh in skinned)
         for mesh, entry in meshes.items()
         for number, primitive in enumerate(entry.primitives)
     }
@@ -291,8 +294,20 @@ def read_gltf(path: Path, data: bytes) -> tuple[list[ImportedPart], list[str]]:
             finished[key] = replace(
                 part, surface=surface, uvs=None if part.uvs is None else fit(part.uvs) * [1.0, -1.0] + [0.0, 1.0]
             )
+    everywhere = dict(poses(header.model_copy(update={"scenes": []})))
+    skins = {
+        number: joint_matrices(path, header.skins[number], buffers, everywhere)
+        for number in {header.nodes[node].skin for node, _ in drawn} - {None}
+        if number is not None
+    }
+
+    def in_place(key: tuple[int, int], node: int, pose: Doubles) -> ImportedPart:
+        skin, by = header.nodes[node].skin, found[key].bound
+        moved = skin is not None and by is not None
+        return posed(path, finished[key], by, skins[skin]) if moved else placed(finished[key], pose)
+
     parts = [
-        replace(placed(finished[mesh, number], pose), node=node)
+        replace(in_place((mesh, number), node, pose), node=node)
         for node, pose in drawn
         if (mesh := header.nodes[node].mesh) is not None
         for number in range(len(header.meshes[mesh].primitives))
@@ -310,14 +325,16 @@ class _Piece:
         part: its geometry.
         material: its number.
         see_through: it has vertex colours whose alpha would count.
+        bound: to which joints; None where it is to none.
     """
 
     part: ImportedPart
     material: int | None
     see_through: bool
+    bound: Bound | None
 
 
-def _piece(path: Path, header: Header, buffers: Buffers, primitive: Primitive) -> _Piece | None:
+def _piece(path: Path, header: Header, buffers: Buffers, primitive: Primitive, *, skinned: bool) -> _Piece | None:
     """Return a primitive; None for points, lines and what has no places."""
     held = primitive.attributes
     if primitive.mode < TRIANGLES or "POSITION" not in held:
@@ -342,7 +359,8 @@ def _piece(path: Path, header: Header, buffers: Buffers, primitive: Primitive) -
         see_through = material.alphaMode in CUT_OUTS and given.shape[1] == 4 and bool((given[:, 3] < 1.0).any())
     normals = buffers.numbers(held["NORMAL"], used) if "NORMAL" in held else None
     part = ImportedPart(vertices, faces, normals, uvs, colors, ImportedSurface(), flat=True)
-    return _Piece(part, primitive.material, see_through)
+    by = bound(path, header, buffers, primitive, used) if skinned else None
+    return _Piece(part, primitive.material, see_through, by)
 
 
 def _triangles(order: Ints, mode: int) -> Ints:

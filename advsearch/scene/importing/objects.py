@@ -25,7 +25,7 @@ from advsearch.files import MESHES
 from advsearch.pictures import without_pillows_limit
 from advsearch.scene.assets import Doubles, Floats, Material, Mesh, ObjectAsset, UpAxis, normalised
 from advsearch.scene.color import srgb_to_linear
-from advsearch.scene.importing import gltf
+from advsearch.scene.importing import gltf, gltf_left_out
 from advsearch.scene.importing.blender import read_mesh_bytes
 from advsearch.scene.importing.files import Inventory, check_faces, damaged, looks_like, safe_name, shown, text_of
 from advsearch.scene.importing.geometry import Soup, assemble, join, repaired
@@ -198,7 +198,7 @@ def import_object(path: str | PathLike[str], *, up: Literal["y", "z"] | None = N
     file = Path(path)
     data = read_mesh_bytes(file, "object", MESHES)
     parts, notes = read_parts(file, data)
-    rest = gltf.beside(gltf.read_header(file, data)) if file.suffix.lower() in GLTF else None
+    rest = gltf_left_out.beside(gltf.read_header(file, data)) if file.suffix.lower() in GLTF else None
     notes += [] if rest is None else [file.name + rest]
     return object_of(parts, notes, file, safe_name(file), up)
 

@@ -18,7 +18,7 @@ import numpy as np
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.files import MESHES
 from advsearch.scene.assets import Doubles, ObjectAsset
-from advsearch.scene.importing import gltf
+from advsearch.scene.importing import gltf, gltf_left_out
 from advsearch.scene.importing.blender import read_mesh_bytes
 from advsearch.scene.importing.files import safe_name, shown
 from advsearch.scene.importing.geometry import FLAT
@@ -35,9 +35,11 @@ BEHIND = np.diag([-1.0, 1.0, -1.0])
 MITSUBA_FILE = ".xml"
 """Ending of Mitsuba's scenes."""
 LUMENS = 683.0
-"""Lumens of a watt, as exporters of glTF count: the eye's at 555 nm."""
+"""Lumens of a watt: the eye's at 555 nm. Blender's exporter multiplies the power of lights by it, and no emission."""
 FURTHEST = 1e12
 """Distance of a light or camera in object sizes, and radiant intensity of a light."""
+SQUARE = 1e-3
+"""Cosine of the angle between two axes of a camera, at most."""
 WIDEST_VIEW = 170.0
 """Field of view of a camera along the larger side of its picture, degrees."""
 MOST_SURROUNDINGS = 200
@@ -111,9 +113,12 @@ def import_scene(path: Path, node: str) -> ImportedScene:
         matrix[:3, :3] *= place.size / frame.size
         matrix[:3, 3] = frame.inside(place.origin)
         surroundings.append(mesh_part(name, made, matrix, made.material))
-    for index in lamps:
-        light = header.lights[header.nodes[index].lamp or 0]
-        lamp = _lamp(names.free(light.name or header.label(index)), light, places[index], frame)
+    lit = [header.lights[header.nodes[index].lamp or 0] for index in lamps]
+    glows = any(part.surface.emission is not None for part in parts)
+    unit, told = _unit_of_light(header, bool(lit) and glows)
+    notes.extend([f"{path.name}: {told}"] if told else [])
+    for index, light in zip(lamps, lit, strict=True):
+        lamp = _lamp(names.free(light.name or header.label(index)), light, unit, places[index], frame)
         _check_lamp(path, lamp)
         surroundings.append(lamp)
     cameras = {
@@ -285,12 +290,28 @@ def _below(header: Header, index: int) -> set[int]:
     return found
 
 
-def _lamp(name: str, light: LightEntry, pose: Doubles, frame: FileFrame) -> PointLamp | SpotLamp:
+def _unit_of_light(header: Header, both: bool) -> tuple[float, str | None]:
+    """How many candela are one unit of radiance times the file's area, and what is said of it.
+
+    Alone, lamps are in watts, as exporters have them. Beside surfaces that emit light, of which one nit is one unit,
+    what a candela is decides how bright they are to each other.
+    """
+    if not both:
+        return LUMENS, None
+    if "blender" in str(header.asset.generator).lower():
+        return LUMENS, (
+            "it has lights beside surfaces that emit light, and is Blender's, which exports lights 683 times as bright "
+            "beside them as it shows them: they are as Blender shows them"
+        )
+    return 1.0, "it has lights beside surfaces that emit light: they are taken as candela and nit, as glTF defines them"
+
+
+def _lamp(name: str, light: LightEntry, unit: float, pose: Doubles, frame: FileFrame) -> PointLamp | SpotLamp:
     """A light at its place; light falls off with the square of the distance in object sizes as it does in the file."""
-    power = np.array(light.color) * light.intensity / LUMENS
+    power = np.array(light.color) * light.intensity / unit
     if light.type == "directional":
         way = UPRIGHT @ pose[:3, 2]  # it shines along its -z
-        place, power = gltf.FAR * way / max(float(np.linalg.norm(way)), 1e-12), power * gltf.FAR**2
+        place, power = gltf_left_out.FAR * way / max(float(np.linalg.norm(way)), 1e-12), power * gltf_left_out.FAR**2
     else:
         place, power = frame.inside(UPRIGHT @ pose[:3, 3]), power / frame.size**2
     x, y, z = map(float, place)
@@ -311,7 +332,7 @@ def _lamp(name: str, light: LightEntry, pose: Doubles, frame: FileFrame) -> Poin
 
 
 def _changed(path: Path, header: Header) -> list[str]:
-    return [path.name + what for what in gltf.lights_and_cameras(header)]
+    return [path.name + what for what in gltf_left_out.lights_and_cameras(header)]
 
 
 def _check_lamp(path: Path, lamp: PointLamp | SpotLamp) -> None:
@@ -330,11 +351,17 @@ def _check_camera(path: Path, name: str, camera: PlacedCamera) -> None:
             f"{path}: expected the camera {name} within {FURTHEST:g} object sizes, got more; correct its place, or "
             "remove it"
         )
-    lengths = np.linalg.norm(camera.to_world[:3, :3], axis=0)
-    if not np.allclose(lengths, 1.0):
+    axes = camera.to_world[:3, :3]
+    if not np.allclose(np.linalg.norm(axes, axis=0), 1.0):
         raise InputError(
             f"{path}: expected the camera {name} to look somewhere, got axes without length; correct the scale of its "
             "node, or remove it"
+        )
+    if not np.allclose(axes.T @ axes, np.eye(3), atol=SQUARE) or np.linalg.det(axes) < 0.0:
+        what = "mirrored" if np.linalg.det(axes) < 0.0 else "sheared"
+        raise InputError(
+            f"{path}: expected the camera {name} under nodes that turn, move and scale it, got {what} axes; apply the "
+            "scale of the nodes above it (in Blender Ctrl A), or remove it"
         )
     if not 0.0 < camera.fov <= WIDEST_VIEW:
         raise InputError(
@@ -349,5 +376,6 @@ def _camera(camera: CameraEntry, pose: Doubles, frame: FileFrame) -> PlacedCamer
     matrix = np.eye(4)
     matrix[:3, :3] = turn / np.maximum(np.linalg.norm(turn, axis=0), 1e-12)
     matrix[:3, 3] = frame.inside(UPRIGHT @ pose[:3, 3])
-    larger = max(camera.perspective.aspectRatio or 1.0, 1.0)
-    return PlacedCamera(matrix, math.degrees(2.0 * math.atan(math.tan(camera.perspective.yfov / 2.0) * larger)))
+    ratio = camera.perspective.aspectRatio  # without one, that of the picture holds (section 5.13)
+    half = math.tan(camera.perspective.yfov / 2.0) * max(ratio or 1.0, 1.0)
+    return PlacedCamera(matrix, math.degrees(2.0 * math.atan(half)), upright=ratio is None)

@@ -1,0 +1,264 @@
+"""Every key of every kind of camera file: it changes what is seen, is on the list of those that do not, or is told."""
+
+from __future__ import annotations
+
+import copy
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from advsearch.errors import FileFormatError
+from advsearch.scene.camera_entries import QUIET, plain
+from advsearch.scene.camera_files import read_camera
+from advsearch.scene.camera_model import CameraModel
+
+MATRIX = [400.0, 2.0, 319.5, 0.0, 410.0, 239.5, 0.0, 0.0, 1.0]
+SCALARS = {"k1": -0.3, "k2": 0.08, "p1": 0.001, "p2": -0.002}
+FOUR = list(SCALARS.values())
+FRAME = {"file_path": "a.png", "transform_matrix": [[1.0, 0.0, 0.0, 0.0]] * 4, "sharpness": 9.0}
+NERF = {"w": 640, "h": 480, "fl_x": 400.0, "fl_y": 410.0, "cx": 320.0, "cy": 240.0}
+
+KINDS: dict[str, dict[str, Any]] = {
+    "opencv": {
+        "calibration_time": "Fri 27 Nov",
+        "nframes": 20,
+        "image_width": 640,
+        "image_height": 480,
+        "board_width": 9,
+        "square_size": 0.025,
+        "flags": 0,
+        "camera_matrix": {"rows": 3, "cols": 3, "dt": "d", "data": MATRIX},
+        "distortion_coefficients": {"rows": 5, "cols": 1, "dt": "d", "data": [*FOUR, 0.01]},
+        "avg_reprojection_error": 0.2,
+        "extrinsic_parameters": {"rows": 1, "cols": 6, "dt": "d", "data": [0.0] * 6},
+    },
+    "fisheye": {
+        "fisheye_model": 1,
+        "image_size": [640, 480],
+        "K": [MATRIX[:3], MATRIX[3:6], MATRIX[6:]],
+        "D": [0.1, 0.02, 0.003, 0.0004],
+    },
+    "scalars": {"image_width": 640, "image_height": 480, "camera_matrix": MATRIX, **SCALARS},
+    "ros": {
+        "header": {"seq": 0, "frame_id": "cam"},
+        "height": 480,
+        "width": 640,
+        "distortion_model": "plumb_bob",
+        "d": [*FOUR, 0.0],
+        "k": [400.0, 0.0, 319.5, 0.0, 400.0, 239.5, 0.0, 0.0, 1.0],
+        "r": [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
+        "p": [400.0, 0.0, 319.5, 0.0, 0.0, 400.0, 239.5, 0.0, 0.0, 0.0, 1.0, 0.0],
+        "binning_x": 2,
+        "binning_y": 2,
+        "roi": {"x_offset": 0, "y_offset": 0, "height": 480, "width": 640, "do_rectify": False},
+    },
+    "kalibr": {
+        "cam0": {
+            "camera_model": "pinhole",
+            "cam_overlaps": [],
+            "T_cam_imu": [[1.0, 0.0, 0.0, 0.0]] * 4,
+            "distortion_model": "equidistant",
+            "distortion_coeffs": [0.1, 0.02, 0.003, 0.0004],
+            "intrinsics": [400.0, 410.0, 319.5, 239.5],
+            "resolution": [640, 480],
+            "rostopic": "/cam0",
+            "timeshift_cam_imu": 0.001,
+        }
+    },
+    "euroc": {
+        "sensor_type": "camera",
+        "comment": "left",
+        "T_BS": {"cols": 4, "rows": 4, "data": [1.0] * 16},
+        "rate_hz": 20,
+        "resolution": [640, 480],
+        "camera_model": "pinhole",
+        "intrinsics": [400.0, 410.0, 319.5, 239.5],
+        "distortion_model": "radial-tangential",
+        "distortion_coefficients": FOUR,
+    },
+    "vins": {
+        "model_type": "PINHOLE",
+        "camera_name": "camera",
+        "image_width": 640,
+        "image_height": 480,
+        "distortion_parameters": SCALARS,
+        "projection_parameters": {"fx": 400.0, "fy": 410.0, "cx": 319.5, "cy": 239.5},
+    },
+    "vins fisheye": {
+        "model_type": "KANNALA_BRANDT",
+        "camera_name": "camera",
+        "image_width": 640,
+        "image_height": 480,
+        "projection_parameters": {"k2": 0.1, "k3": 0.02, "k4": 3e-3, "k5": 4e-4}
+        | {"mu": 400.0, "mv": 410.0, "u0": 319.5, "v0": 239.5},
+    },
+    "nerfstudio": {"camera_model": "OPENCV", **NERF, **SCALARS, "k3": 0.01, "k4": 0.0, "frames": [FRAME, FRAME]},
+    "nerfstudio fisheye": {"camera_model": "OPENCV_FISHEYE", **NERF, "k1": 0.1, "k2": 0.02, "k3": 3e-3, "k4": 4e-4},
+    "nerfstudio frames": {"camera_model": "OPENCV", "frames": [FRAME | NERF | SCALARS] * 2, "applied_scale": 2.0},
+    "instant-ngp": {"camera_angle_x": 1.35, "w": 640, "h": 480, **SCALARS, "aabb_scale": 4, "scale": 0.3, "frames": []},
+}
+
+
+def read(tmp_path: Path, data: dict[str, Any], which: str = "") -> CameraModel:
+    (tmp_path / "camera.json").write_text(json.dumps(data))
+    return read_camera(f"{tmp_path / 'camera.json'}{which}")
+
+
+def numbers(data: object, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    """Paths of all numbers that are not 0."""
+    items = data.items() if isinstance(data, dict) else enumerate(data) if isinstance(data, list) else ()
+    for key, value in items:
+        yield from numbers(value, (*path, key))
+    if isinstance(data, (int, float)) and not isinstance(data, bool) and data:
+        yield path
+
+
+def harmless(path: tuple[Any, ...]) -> bool:
+    last = [one for one in path if isinstance(one, str) and one != "frames"]
+    places = (
+        "aabb_scale",
+        "scale",
+        "applied_scale",
+        "transform_matrix",
+        "sharpness",
+        "rows",
+        "cols",
+        "roi",
+        "fisheye_model",
+    )
+    return any(QUIET.fullmatch(plain(one)) or one in places for one in last)
+
+
+@pytest.mark.parametrize("kind", list(KINDS))
+def test_a_number_that_is_changed_is_seen_or_told(kind: str, tmp_path: Path) -> None:
+    """Also where it is one of a matrix; what is on the list of those without effect has none."""
+    whole = read(tmp_path, KINDS[kind])
+    assert whole.told == ()
+    for path in numbers(KINDS[kind]):
+        data = copy.deepcopy(KINDS[kind])
+        inner: Any = data
+        for key in path[:-1]:
+            inner = inner[key]
+        inner[path[-1]] = inner[path[-1]] * 3 if isinstance(inner[path[-1]], int) else inner[path[-1]] * 1.03
+        try:
+            found = read(tmp_path, data)
+        except FileFormatError:
+            assert not harmless(path) or "roi" in path, path
+            continue
+        changed = (found.numbers, found.size) != (whole.numbers, whole.size) or found.told != ()
+        assert changed != harmless(path), path
+
+
+def everywhere(kind: str, key: str, value: object) -> Iterator[dict[str, Any]]:
+    """The file with a key more, at its top and in each of its mappings that says something of the camera."""
+    yield KINDS[kind] | {key: value}
+    for name, inner in KINDS[kind].items():
+        if isinstance(inner, dict) and name not in ("header", "T_BS", "extrinsic_parameters"):
+            yield KINDS[kind] | {name: inner | {key: value}}
+        if name == "frames" and inner:
+            yield KINDS[kind] | {name: [one | {key: value} for one in inner]}
+
+
+@pytest.mark.parametrize("kind", list(KINDS))
+def test_an_unknown_key_is_told(kind: str, tmp_path: Path) -> None:
+    for data in everywhere(kind, "zoominess", 1.5):
+        told = read(tmp_path, data).told
+        assert len(told) == 1 and "zoominess" in told[0], data
+
+
+@pytest.mark.parametrize("key", ["xi", "skew", "distortion_parms", "lens_distortion", "k7", "binning", "crop", "tilt"])
+@pytest.mark.parametrize("kind", list(KINDS))
+def test_a_key_that_makes_another_picture_is_refused_by_name(kind: str, key: str, tmp_path: Path) -> None:
+    for data in everywhere(kind, key, 1.5):
+        inside_a_matrix = any(isinstance(one, dict) and "data" in one and key in one for one in data.values())
+        if inside_a_matrix:
+            assert key in read(tmp_path, data).told[0]
+            continue
+        with pytest.raises(FileFormatError, match=key):
+            read(tmp_path, data)
+    assert read(tmp_path, KINDS[kind] | {key: 0.0}).numbers == read(tmp_path, KINDS[kind]).numbers
+
+
+def test_all_kinds_with_one_lens_are_one_lens(tmp_path: Path) -> None:
+    """Those of the pinhole with radial and tangential coefficients, but for skew, k3 and the frames of nerfstudio."""
+    wanted = read(tmp_path, KINDS["vins"])
+    for kind in ("euroc", "nerfstudio frames"):
+        assert read(tmp_path, KINDS[kind]).numbers == pytest.approx(wanted.numbers), kind
+    fisheye = read(tmp_path, KINDS["kalibr"])
+    for kind in ("vins fisheye", "nerfstudio fisheye"):
+        found = read(tmp_path, KINDS[kind])
+        assert found.kind == fisheye.kind == "fisheye" and found.numbers == pytest.approx(fisheye.numbers), kind
+
+
+def test_rectification_is_told_where_it_is_some(tmp_path: Path) -> None:
+    turned = KINDS["ros"] | {"r": [0.8, 0.6, 0.0, -0.6, 0.8, 0.0, 0.0, 0.0, 1.0]}
+    (told,) = read(tmp_path, turned).told
+    assert "rectification_matrix" in told and "the camera's own ones" in told and "projection" not in told
+
+
+@pytest.mark.parametrize(
+    ("roi", "whole"),
+    [
+        ({"x_offset": 0, "y_offset": 0, "height": 480, "width": 640}, True),
+        ({"x_offset": 0, "y_offset": 0, "height": 0, "width": 0}, True),
+        ({"x_offset": 0, "y_offset": 0, "height": 480, "width": 320}, False),
+        ({"x_offset": 2, "y_offset": 0, "height": 480, "width": 640}, False),
+    ],
+)
+def test_a_roi_is_the_whole_picture_or_refused(roi: dict[str, int], whole: bool, tmp_path: Path) -> None:
+    if whole:
+        assert read(tmp_path, KINDS["ros"] | {"roi": roi}) == read(tmp_path, KINDS["ros"])
+        return
+    with pytest.raises(FileFormatError, match=r"one of a part \(roi\)"):
+        read(tmp_path, KINDS["ros"] | {"roi": roi})
+
+
+def test_frames_with_lenses_of_their_own_are_chosen_by_number(tmp_path: Path) -> None:
+    data = {"camera_model": "OPENCV", "frames": [FRAME | NERF, FRAME | NERF | {"k1": 0.1}]}
+    with pytest.raises(FileFormatError, match="has 2 cameras, 0, 1: say which"):
+        read(tmp_path, data)
+    assert read(tmp_path, data, "#1").values["k1"] == 0.1 and read(tmp_path, data, "#0").values["k1"] == 0.0
+
+
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        ({"camera_angle_x": 0.7, "frames": [FRAME]}, "expected w"),
+        (KINDS["nerfstudio"] | {"k4": 0.1}, "k4"),
+        (KINDS["nerfstudio"] | {"camera_model": "FISHEYE624"}, "got 'FISHEYE624'"),
+        (KINDS["scalars"] | {"distortion_coefficients": [0.1, 0.0, 0.0, 0.0]}, "k1"),
+        (KINDS["scalars"] | {"camera_model": "omni"}, "got 'omni'"),
+        (KINDS["scalars"] | {"camera_model": "fisheye", "distortion_model": "plumb_bob"}, "beside another"),
+        (KINDS["vins"] | {"model_type": "MEI"}, "got 'mei'"),
+        (KINDS["vins"] | {"mirror_parameters": {"xi": 1.6}}, "xi"),
+        (KINDS["fisheye"] | {"d": [0.0] * 4}, "has 'D' and 'd'"),
+    ],
+)
+def test_what_contradicts_itself_or_is_another_model_is_refused(data: Any, words: str, tmp_path: Path) -> None:
+    with pytest.raises(FileFormatError, match=words):
+        read(tmp_path, data)
+
+
+@pytest.mark.parametrize(
+    ("name", "words"), [("cameras.bin", "colmap model_converter"), ("c.npz", "write them as JSON"), ("c.npy", "JSON")]
+)
+def test_a_binary_camera_says_what_it_is_and_what_to_do(name: str, words: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_bytes(b"\x01\x00")
+    with pytest.raises(FileFormatError, match=words):
+        read_camera(str(tmp_path / name))
+
+
+def test_an_xml_has_its_keys_told_too(tmp_path: Path) -> None:
+    path = tmp_path / "camera.xml"
+    path.write_text(
+        "<opencv_storage><image_width>640</image_width><image_height>480</image_height>"
+        f"<camera_matrix type_id='opencv-matrix'><rows>3</rows><cols>3</cols><dt>d</dt><data>"
+        f"{' '.join(map(str, MATRIX))}</data></camera_matrix><zoominess>2</zoominess></opencv_storage>"
+    )
+    assert "zoominess" in read_camera(str(path)).told[0]
+    path.write_text(path.read_text().replace("zoominess", "xi"))
+    with pytest.raises(FileFormatError, match="xi"):
+        read_camera(str(path))
