@@ -1,6 +1,6 @@
-"""Ctrl-C, counted: what a handler raises inside a destructor, a callback or native code may come to nothing, and modules
-that are being imported make other errors of it. So all that renders, asks a model, waits for workers or tells how far it
-is looks (`INTERRUPTS.look`) whether there was one that nobody has answered."""
+"""Ctrl-C, counted: what a handler raises inside a destructor, a callback or native code may come to nothing, and
+modules that are being imported make other errors of it. So all that renders, asks a model, waits for workers or tells
+how far it is looks (`INTERRUPTS.look`) whether there was one that nobody has answered."""
 
 from __future__ import annotations
 
