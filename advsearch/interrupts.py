@@ -1,10 +1,21 @@
-"""Ctrl-C, counted: modules that are being imported and native code make other errors of an interrupt, or lose it."""
+"""Ctrl-C, counted: what a handler raises inside a destructor, a callback or native code may come to nothing, and
+modules that are being imported make other errors of it. So all that renders, asks a model, waits for workers or tells
+how far it is looks (`INTERRUPTS.look`) whether there was one that nobody has answered."""
 
 from __future__ import annotations
 
+import os
+import signal
+import socket
+import sys
+import threading
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from types import FrameType
+
+ONE = 0.5
+"""Seconds within which a second signal is the same Ctrl-C: programs pass on what the terminal has sent to all."""
 
 
 class Interrupts:
@@ -12,17 +23,26 @@ class Interrupts:
     nothing is left to interrupt."""
 
     def __init__(self) -> None:
-        self.count = 0
+        self.count = self.answered = 0
         self.ended = False
+        self._last = -ONE
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
+        before, self._last = self._last, time.monotonic()
+        if self._last - before < ONE:
+            return
         self.count += 1
         if not self.ended:
             raise KeyboardInterrupt
 
-    def check(self) -> None:
-        """Raise an interrupt that has come already."""
-        if self.count:
+    @property
+    def waiting(self) -> bool:
+        """Whether one has come that nobody has answered."""
+        return self.count > self.answered
+
+    def look(self) -> None:
+        """Raise an interrupt that has come already and was not answered; in the main thread, where it belongs."""
+        if self.waiting and threading.current_thread() is threading.main_thread():
             raise KeyboardInterrupt
 
 
@@ -32,12 +52,63 @@ INTERRUPTS = Interrupts()
 
 @contextmanager
 def interruptible() -> Iterator[None]:
-    """Raise what an interrupt that comes inside the block was made into as the interrupt that it is. Raises
-    KeyboardInterrupt where there was an error of any kind inside the block, and an interrupt before it."""
-    before = INTERRUPTS.count
+    """Raise an interrupt that comes inside the block, whatever was made of it, once: what follows the block answers it.
+    Raises KeyboardInterrupt where one waits at the end of the block, and in place of any error inside it."""
+    with _counted():
+        try:
+            yield
+            INTERRUPTS.look()
+        except KeyboardInterrupt:
+            INTERRUPTS.answered = INTERRUPTS.count
+            raise
+        except Exception as error:
+            if INTERRUPTS.waiting:
+                INTERRUPTS.answered = INTERRUPTS.count
+                raise KeyboardInterrupt from error
+            raise
+
+
+@contextmanager
+def _counted() -> Iterator[None]:
+    """Count interrupts inside the block where Python's own handler would raise them, as in a script or a notebook."""
+    handler = signal.getsignal(signal.SIGINT)
+    if handler is not signal.default_int_handler or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    INTERRUPTS.answered = INTERRUPTS.count
+    signal.signal(signal.SIGINT, INTERRUPTS)
     try:
         yield
-    except Exception as error:
-        if INTERRUPTS.count > before:
-            raise KeyboardInterrupt from error
-        raise
+    finally:
+        signal.signal(signal.SIGINT, handler)
+
+
+def end_at_the_second() -> None:
+    """Let a second Ctrl-C end this process at once, wherever it is: a thread hears of it, also while native code runs.
+
+    What is stored is kept, as with a kill. Call it in the main thread, once.
+    """
+    ours, theirs = socket.socketpair()
+    theirs.setblocking(False)
+    signal.set_wakeup_fd(theirs.fileno(), warn_on_full_buffer=False)
+    # `theirs` must live as long as the thread
+    threading.Thread(target=_hear, args=(ours, theirs), name="interrupts", daemon=True).start()
+
+
+def _hear(ours: socket.socket, theirs: socket.socket) -> None:
+    first: float | None = None
+    while True:
+        if signal.SIGINT not in ours.recv(64):
+            continue
+        now = time.monotonic()
+        if first is not None and now - first >= ONE and not INTERRUPTS.ended:
+            with suppress(OSError):
+                os.write(2, b"\x1b[?25h" * os.isatty(2) + b"advsearch: interrupted\n")  # bars hide the cursor
+            os._exit(128 + signal.SIGINT)
+        first = now if first is None else first
+
+
+def unless_interrupted(unraisable: sys.UnraisableHookArgs) -> None:
+    """Tell an exception that a destructor or a callback could not raise, but for an interrupt: that is counted."""
+    if not issubclass(unraisable.exc_type, KeyboardInterrupt):
+        sys.__unraisablehook__(unraisable)

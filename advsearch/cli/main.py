@@ -25,7 +25,7 @@ from typing import Any, NoReturn, cast
 from advsearch import __version__
 from advsearch.cli.output import end_output, open_descriptors, screens, shortened
 from advsearch.errors import AdvsearchError, InputError, UnknownNameError
-from advsearch.interrupts import INTERRUPTS
+from advsearch.interrupts import INTERRUPTS, end_at_the_second, unless_interrupted
 from advsearch.registry import allow_code, nothing_allowed
 from advsearch.rooms import there
 
@@ -108,10 +108,11 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _interruptible(given: list[str]) -> int:
     """As `_status`, with Ctrl-C for as long as there is something to interrupt, and never a traceback of it."""
-    sys.unraisablehook = _unless_interrupted
+    sys.unraisablehook = unless_interrupted
     os.environ.setdefault("PYTHONSAFEPATH", "1")  # of workers, which would look for modules here first
     try:
         signal.signal(signal.SIGINT, INTERRUPTS)
+        end_at_the_second()
         status = _status(given)
         INTERRUPTS.ended = True
         return status
@@ -120,18 +121,12 @@ def _interruptible(given: list[str]) -> int:
         return INTERRUPTED
 
 
-def _unless_interrupted(unraisable: sys.UnraisableHookArgs) -> None:
-    """Tell an exception that a destructor or a callback could not raise, but for an interrupt: that is counted."""
-    if not issubclass(unraisable.exc_type, KeyboardInterrupt):
-        sys.__unraisablehook__(unraisable)
-
-
 def _status(given: list[str]) -> int:
     """Run one command, print what went wrong, and return the exit status."""
     try:
         status = _run_and_tell(given)
-        if status != INTERRUPTED:
-            INTERRUPTS.check()  # whatever has swallowed one: it was asked to stop
+        if status != INTERRUPTED and INTERRUPTS.count:  # whatever has swallowed one: it was asked to stop
+            raise KeyboardInterrupt
         return status
     except BaseException as error:
         # Modules that are being imported, and native code, make other errors of an interrupt.

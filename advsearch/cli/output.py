@@ -274,18 +274,14 @@ def _descriptor_redirected(source: int, target: int) -> Iterator[None]:
         os.close(kept)
 
 
-LOADING_STAGES = 2
-"""The first stages of a command: modules are imported, then a scene and a model are loaded, which imports more."""
-
-
 @contextmanager
 def at_work(*, as_json: bool, quiet: bool) -> Iterator[Progress]:
     """Watch a command's work; where JSON is to be printed, keep everything else off standard output meanwhile."""
     with output_kept_clean() if as_json else nullcontext(), watch_progress(quiet=quiet) as watcher:
-        progress = LoadingProgress(watcher)
+        progress = LookingProgress(watcher)
         progress.stage("starting: loading PyTorch and Mitsuba")
         yield progress
-        progress.end()
+        INTERRUPTS.look()
 
 
 @contextmanager
@@ -303,31 +299,22 @@ def watch_progress(*, quiet: bool = False) -> Iterator[Progress]:
             yield told
 
 
-class LoadingProgress:
-    """A watcher that raises an interrupt which came while something was loaded, when that stage ends.
-
-    Modules that are being imported and native code make other errors of an interrupt, or none. After `LOADING_STAGES`
-    all that catches one is ours and answers it. Everything is told to `progress`.
-    """
+class LookingProgress:
+    """A watcher that raises an interrupt which was lost where it struck, when a step or a stage ends: modules that are
+    being imported, destructors and native code make other errors of one, or none. All is told to `progress`."""
 
     def __init__(self, progress: Progress) -> None:
         self._progress = progress
-        self._begun = 0
 
     def stage(self, name: str, total: int | None = None, *, hint: str = "", at_most: bool = False) -> None:
-        """See `Progress.stage`. Raises KeyboardInterrupt where one came while something was loaded."""
-        if self._begun <= LOADING_STAGES:
-            INTERRUPTS.check()
-        self._begun += 1
+        """See `Progress.stage`. Raises KeyboardInterrupt where one came that nobody has answered."""
+        INTERRUPTS.look()
         self._progress.stage(name, total, hint=hint, at_most=at_most)
 
     def advance(self, n: int = 1, **info: float | str) -> None:
+        """See `Progress.advance`; raises as `stage` does."""
         self._progress.advance(n, **info)
+        INTERRUPTS.look()
 
     def message(self, text: str) -> None:
         self._progress.message(text)
-
-    def end(self) -> None:
-        """End the work. Raises KeyboardInterrupt where nothing but imports was there, and one came meanwhile."""
-        if self._begun < LOADING_STAGES:
-            INTERRUPTS.check()

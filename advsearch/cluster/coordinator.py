@@ -15,6 +15,7 @@ from typing import Any
 from advsearch.cluster import Disconnected, Done, Dropped, Ended, Event, Joined, Left, Pool, Work, Workforce
 from advsearch.cluster.worker import Carried, Failure, Files, MachineInfo, Ready, carry_out_batch, machine_name, prepare
 from advsearch.errors import ClusterError
+from advsearch.interrupts import INTERRUPTS
 
 DEPTH = 2
 """Batches that a worker has at once: the one it is at, and the next (`Work.ahead`), so that it never waits."""
@@ -100,6 +101,7 @@ class Coordinator:
             self._alone_since = self._clock()
         try:
             while True:
+                INTERRUPTS.look()
                 if call != self._call:
                     raise RuntimeError("these results were given up when others were asked for")
                 self._give_out(source)

@@ -13,6 +13,7 @@ import importlib.util
 import json
 import logging
 import queue
+import signal
 import sys
 import threading
 import time
@@ -20,6 +21,7 @@ from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +57,10 @@ CONFIG = {
     "distributed.worker.profile.enabled": False,
     "distributed.admin.system-monitor.gil.enabled": False,
 }
+
+
+NO_WORKER = ("NoValidWorkerError", "NoWorkerError")
+"""Errors by which a scheduler ends a call whose worker has not been there for long."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +111,7 @@ class DaskPool:
         self._cluster: Any = None
         self._watch: asyncio.Task[None] | None = None
         self._loop = asyncio.new_event_loop()
-        self._thread = threading.Thread(target=self._loop.run_forever, name="cluster", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="cluster", daemon=True)
         self._thread.start()
         try:
             self._done(self._open(CONNECT))
@@ -161,6 +167,12 @@ class DaskPool:
 
     # ---- in the loop ------------------------------------------------------------------------------------------------
 
+    def _run(self) -> None:
+        """Run the loop; processes that it starts inherit that Ctrl-C, which a terminal sends to all, is ours alone."""
+        resource_tracker.ensure_running()  # else it begins later, and lets the signal through again
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        self._loop.run_forever()
+
     def _begin(self, work: Any) -> Future[None]:
         return asyncio.run_coroutine_threadsafe(work, self._loop)
 
@@ -191,6 +203,9 @@ class DaskPool:
                     timeout=max(1.0, min(CONNECT, deadline - time.monotonic())),
                     set_as_default=False,
                 )
+                self._known = set()
+                self._client.subscribe_topic("all", self._told)
+                await self._look_around()
                 break
             except (OSError, TimeoutError, asyncio.TimeoutError, RuntimeError, ValueError) as error:
                 if time.monotonic() >= deadline:
@@ -198,12 +213,13 @@ class DaskPool:
                         f"{self.where}: there is no scheduler that answers ({error or type(error).__name__}); start "
                         "one with dask scheduler, check address and certificates, and go on with advsearch resume"
                     ) from error
+                client, self._client = self._client, None
+                await _close(client)
+                for worker in self._known:  # that it was told of already
+                    self._events.put(Left(worker, told=True))
                 await asyncio.sleep(LOOK)
         drawn = importlib.util.find_spec("bokeh") is not None  # what Dask draws its pages with
         self.link = str(self._client.dashboard_link or "") if drawn else ""
-        self._known = set()
-        self._client.subscribe_topic("all", self._told)
-        await self._look_around()
         self._watch = self._loop.create_task(self._watching(self._client))
 
     async def _leave(self) -> None:
@@ -216,37 +232,48 @@ class DaskPool:
         client, cluster, self._client, self._cluster = self._client, self._cluster, None, None
         if client is not None and client.status == "running":
             client.unsubscribe_topic("all")  # or the scheduler tells it of its own leaving
-        for one in (client, cluster):
-            if one is not None:
-                try:
-                    await asyncio.wait_for(one.close(), RESTART)
-                except Exception:  # its other end is not there any more
-                    logging.getLogger(__name__).debug("closing %r failed", one, exc_info=True)
+        await _close(client)
+        await _close(cluster)
 
     async def _call(self, ticket: int, worker: str, function: Callable[..., Any], args: tuple[Any, ...]) -> None:
+        """Have a worker call a function, again where its answer was lost on the way, and tell what came of it."""
+        client, event = self._client, None
+        while event is None and client.status == "running":  # else all workers are gone, which `_watching` says
+            future = client.submit(
+                function, *args, workers=[worker], allow_other_workers=False, pure=False, retries=0, priority=-ticket
+            )
+            try:
+                event = await self._outcome(ticket, future)
+            finally:
+                if client.status == "running":
+                    future.release()
+            if event is None:
+                await asyncio.sleep(LOOK)
+        self._calls.pop(ticket, None)
+        if event is not None:
+            self._events.put(event)
+
+    async def _outcome(self, ticket: int, future: Any) -> Event | None:
+        """Return what came of a call, or None where that was lost on the way.
+
+        No type of an error tells the work from the way to it, but Dask's state does: a call that ended with an error
+        has the state "error", by word of the scheduler. Whatever else is raised comes from fetching the answer, or from
+        a future that was let go when a connection was lost.
+        """
         # comes with the extra `dask`
         from distributed import KilledWorker
 
-        client = self._client
-        future = client.submit(
-            function, *args, workers=[worker], allow_other_workers=False, pure=False, retries=0, priority=-ticket
-        )
         try:
-            event: Event = Ended(ticket, await future)
+            return Ended(ticket, await future)
         except asyncio.CancelledError:
-            if client.status == "running":  # else all workers are gone, which `_watching` says
-                future.release()
-            return
+            if ticket not in self._calls:  # `forget` or `_leave`
+                raise
+            return None
         except KilledWorker as error:
-            event = Dropped(ticket, str(error))
+            return Dropped(ticket, str(error))
         except Exception as error:
-            if client.status != "running":
-                return
-            event = Ended(ticket, _failure(error))
-        finally:
-            self._calls.pop(ticket, None)
-        future.release()
-        self._events.put(event)
+            its_own = future.status == "error" and type(error).__name__ not in NO_WORKER
+            return Ended(ticket, _failure(error)) if its_own else None
 
     async def _restart(self, worker: str) -> None:
         client = self._client
@@ -298,6 +325,16 @@ class DaskPool:
                 await asyncio.wait_for(self._look_around(), RESYNC)
 
 
+async def _close(one: Any) -> None:
+    """Close a client or a cluster, where there is one, whether or not its other end is there."""
+    if one is None:
+        return
+    try:
+        await asyncio.wait_for(one.close(), RESTART)
+    except Exception:
+        logging.getLogger(__name__).debug("closing %r failed", one, exc_info=True)
+
+
 async def scheduler_gone(client: Any) -> None:
     """Wait until a client of Dask has lost its scheduler, also where it has found it again between two looks.
 
@@ -313,6 +350,8 @@ def _failure(error: Exception) -> Failure:
     text = f"{type(error).__name__}: {error}"
     if isinstance(error, (ImportError, AttributeError)):
         return Failure(f"it cannot begin ({text}); install the same advsearch there", unfit=True)
+    if isinstance(error, (OSError, MemoryError)):
+        return Failure(f"it cannot begin ({text})", unfit=True)
     return Failure(text, trace=text)
 
 

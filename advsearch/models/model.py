@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
 from advsearch.errors import InputError, ModelError
+from advsearch.interrupts import INTERRUPTS
 from advsearch.models.labels import LabelSet, find_label_set
 
 CPU = torch.device("cpu")
@@ -193,6 +194,7 @@ class Model:
 
     def ask(self, x: Tensor, *, raw: bool = False) -> Any:
         """Return the output for a batch as `prepared` returns it, or, if `raw`, what the network itself gives."""
+        INTERRUPTS.look()
         mode = Detaching(ignored=True) if self.attached and torch.is_grad_enabled() else nullcontext()
         with mode, torch.set_grad_enabled(torch.is_grad_enabled()):  # a network may switch gradients off as it runs
             answer = self.module(x)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import os
+import queue
 import signal
 import socket
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
@@ -20,13 +21,16 @@ import pytest
 from conftest import ROOT
 from covering import only
 
-from advsearch.cluster import Executor, Work
-from advsearch.cluster.dask_pool import CLASSES, executor_of, place_of, scheduler_gone
+from advsearch.cluster import Dropped, Ended, Event, Executor, Work
+from advsearch.cluster.dask_pool import CLASSES, DaskPool, executor_of, place_of, scheduler_gone
 from advsearch.errors import ClusterError, FileFormatError, InputError
 
 psutil: Any = import_module("psutil")  # which Dask brings along
 dask: Any = import_module("dask")
-import_module("distributed")  # first: what it adds to the configuration would go again with what a test sets there
+distributed: Any = import_module(
+    "distributed"
+)  # first: what it adds to the configuration would go again with what a test sets there
+scheduling: Any = import_module("distributed.scheduler")
 SCRIPTS = Path(sys.executable).parent
 
 
@@ -41,9 +45,18 @@ def check(executor: Executor | None, count: int, added: int = 0) -> None:
     assert found == {number: number * number + added for number in range(count)}
 
 
-def test_processes_of_this_machine_are_killed_and_nothing_is_lost() -> None:
-    """Nothing listens beyond loopback; a number of which a worker dies each time is said."""
+def test_processes_of_this_machine_are_killed_and_nothing_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing listens beyond loopback; a number of which a worker dies each time is said. The scheduler goes once as
+    it is found, too."""
     told: list[str] = []
+    look, failing = DaskPool._look_around, [distributed.comm.CommClosedError("in identity: Stream is closed")]
+
+    async def fails_once(self: DaskPool) -> None:
+        if failing:
+            raise failing.pop()
+        await look(self)
+
+    monkeypatch.setattr(DaskPool, "_look_around", fails_once)
     work = Work("cluster_work:squares", {"seconds": 0.01, "deadly": [301]})
     with executor_of(work, workers=2, cluster=None, tell=told.append) as executor:
         assert executor is not None
@@ -61,6 +74,9 @@ def test_processes_of_this_machine_are_killed_and_nothing_is_lost() -> None:
             if count == 20:
                 workers = [one for one in mine if "spawn_main" in " ".join(one.cmdline())]
                 assert len(workers) >= 2, "they are spawned, never forked"
+                for one in workers:  # Ctrl-C, which a terminal sends to all, is for the main process
+                    blocked = Path(f"/proc/{one.pid}/status").read_text().partition("SigBlk:")[2].split()[0]
+                    assert int(blocked, 16) >> (signal.SIGINT - 1) & 1
                 workers[0].kill()
         assert len(seen) == 400 and list(lost) == [301]
         facts = executor.facts
@@ -108,8 +124,8 @@ def free_port() -> str:
         return str(one.getsockname()[1])
 
 
-def test_a_scheduler_and_workers_of_their_own(tmp_path: Path) -> None:
-    """Files come along; the scheduler is killed and comes back under its address."""
+def test_a_scheduler_and_workers_of_their_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Files come along; the scheduler is killed while a result is fetched from it, and comes back under its address."""
     port = free_port()
     scheduler = ("scheduler", "--host", "127.0.0.1", "--port", port, "--no-dashboard")
     worker = (
@@ -125,18 +141,26 @@ def test_a_scheduler_and_workers_of_their_own(tmp_path: Path) -> None:
     added = tmp_path / "added.txt"
     added.write_text("7")
     work = Work("cluster_work:squares", {"seconds": 0.01, "file": str(added)}, ("file",))
-    with started(*worker), started(*scheduler) as first:
+    with ExitStack() as later, started(*worker), started(*scheduler) as first:
         with executor_of(work, workers=None, cluster=f"tcp://127.0.0.1:{port}", tell=told.append) as executor:
             check(executor, 40, added=7)
             assert executor is not None
             results = executor.results(pieces(200))
             seen = [number for _ in range(10) for number in next(results).items]
-            os.killpg(first.pid, signal.SIGKILL)
-            first.wait()
-            with started(*scheduler), started(*worker):
-                seen += [number for done in results for number in done.items]
-                assert sorted(seen) == list(range(200))
-                assert any("the scheduler has gone" in text for text in told)
+            fetch = distributed.Client._gather_remote
+
+            async def killed(*args: Any) -> Any:
+                monkeypatch.setattr(distributed.Client, "_gather_remote", fetch)
+                os.killpg(first.pid, signal.SIGKILL)
+                first.wait()
+                for words in (scheduler, worker):
+                    later.enter_context(started(*words))
+                return await fetch(*args)
+
+            monkeypatch.setattr(distributed.Client, "_gather_remote", killed)
+            seen += [number for done in results for number in done.items]
+            assert sorted(seen) == list(range(200))
+            assert any("the scheduler has gone" in text for text in told)
 
 
 def test_a_scheduler_that_went_and_came_back_between_two_looks_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -152,6 +176,69 @@ def test_a_scheduler_that_went_and_came_back_between_two_looks_is_noticed(monkey
         await asyncio.wait_for(gone, 1.0)
 
     asyncio.run(look())
+
+
+class Answer:
+    """A future of Dask that ends so."""
+
+    def __init__(self, status: str, comes: Any) -> None:
+        self.status, self.comes, self.released = status, comes, False
+
+    def __await__(self) -> Iterator[Any]:
+        if isinstance(self.comes, BaseException):
+            raise self.comes
+        return self.comes
+        yield  # as a coroutine does
+
+    def release(self) -> None:
+        self.released = True
+
+
+def called(monkeypatch: pytest.MonkeyPatch, *answers: Answer) -> list[Event]:
+    """What is told of a call whose answers come so, one for each time that it is asked."""
+    monkeypatch.setattr("advsearch.cluster.dask_pool.LOOK", 0.0)
+    left, pool = iter(answers), object.__new__(DaskPool)
+    client = SimpleNamespace(status="running", submit=lambda *args, **named: next(left))
+    vars(pool).update(_client=client, _calls={5: None}, _events=queue.SimpleQueue())
+    asyncio.run(pool._call(5, "tcp://here", len, ("abc",)))
+    assert all(one.released for one in answers) and not list(left) and not pool._calls
+    return pool.events(0.0)
+
+
+ON_THE_WAY = [
+    ("finished", distributed.comm.CommClosedError("in ConnectionPool.gather: Stream is closed")),
+    ("finished", OSError("no route to host")),
+    ("finished", TimeoutError("in 120 s")),
+    ("finished", RuntimeError("of a thread that is not there any more")),
+    ("lost", AssertionError("not there")),
+    ("cancelled", distributed.client.FutureCancelledError(key="a", reason="scheduler-connection-lost")),
+    ("cancelled", asyncio.CancelledError("by somebody else")),
+    ("error", scheduling.NoValidWorkerError("a", set(), {"tcp://here"}, {}, 60.0)),
+    ("error", scheduling.NoWorkerError("a", 60.0)),
+]
+
+
+@pytest.mark.parametrize(("status", "error"), ON_THE_WAY, ids=[type(error).__name__ for _, error in ON_THE_WAY])
+def test_what_is_lost_on_the_way_is_asked_again(
+    monkeypatch: pytest.MonkeyPatch, status: str, error: BaseException
+) -> None:
+    told = called(monkeypatch, Answer(status, error), Answer(status, error), Answer("finished", "value"))
+    assert told == [Ended(5, "value")]
+
+
+def test_what_a_worker_cannot_begin_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By the state of the call, not by the error's type, which may be the same."""
+    for error, unfit in (
+        (distributed.comm.CommClosedError("its own"), True),
+        (OSError("the disk is gone"), True),
+        (ImportError("no advsearch"), True),
+        (ValueError("a bug"), False),
+    ):
+        (told,) = called(monkeypatch, Answer("error", error))
+        assert isinstance(told, Ended) and told.value.unfit is unfit and str(error) in told.value.text
+    killed = distributed.KilledWorker("a", SimpleNamespace(address="tcp://here"), 0)
+    (told,) = called(monkeypatch, Answer("error", killed))
+    assert isinstance(told, Dropped)
 
 
 def test_a_scheduler_that_is_not_there_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from advsearch.errors import InputError
+from advsearch.interrupts import INTERRUPTS
 from advsearch.scene.assembly import Assembly
 from advsearch.scene.description import OBJECT, SceneDescription
 from advsearch.scene.formation import EVERYTHING, SAMPLER, next_count
@@ -192,6 +193,7 @@ class MitsubaScene:
             For each of `seeds` (H, W, 3) float32; of a scene with a backdrop (H, W, 4) with the coverage of its
             surfaces; of "guides" (H, W, 6), the first hit's albedo in [0, 1] and its shading normal.
         """
+        INTERRUPTS.look()
         with one_at_a_time:
 
             def render(scene: Any, sensor: Any, integrator: Any, seed: Any) -> Any:

@@ -1,0 +1,175 @@
+"""Ctrl-C is answered wherever it strikes, once."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import weakref
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+import torch
+from conftest import ROOT
+from simulated_cluster import Simulated, coordinator
+from small_models import easy
+
+from advsearch.cli.output import LookingProgress
+from advsearch.interrupts import INTERRUPTS, ONE, Interrupts, interruptible, unless_interrupted
+from advsearch.progress import NullProgress
+from advsearch.scene.mitsuba_backend.scene import MitsubaScene
+
+
+def strike() -> None:
+    """Press Ctrl-C, and let the handler run here."""
+    signal.raise_signal(signal.SIGINT)
+    sum(range(1000))
+
+
+class Struck:
+    def __del__(self) -> None:
+        strike()
+
+
+def in_a_destructor() -> None:
+    Struck()
+
+
+def in_a_callback() -> None:
+    gone = type("Gone", (), {})()
+    reference = weakref.ref(gone, lambda _: strike())
+    del gone
+    assert reference() is None
+
+
+def in_a_library() -> None:
+    try:
+        strike()
+    except:  # noqa: E722 (as theirs)
+        pass
+
+
+@pytest.fixture(autouse=True)
+def alone(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Handler, hook and counts are as before afterwards."""
+    monkeypatch.setattr(sys, "unraisablehook", unless_interrupted)
+    for name in ("count", "answered", "ended", "_last"):
+        monkeypatch.setattr(INTERRUPTS, name, vars(Interrupts())[name])
+    yield
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+LOST = [in_a_destructor, in_a_callback, in_a_library]
+
+
+@pytest.mark.parametrize("lost", LOST)
+def test_one_that_is_lost_is_raised_at_the_next_look_and_answered_once(lost: Callable[[], None]) -> None:
+    steps = 0
+    with pytest.raises(KeyboardInterrupt):
+        with interruptible():
+            for steps in range(10):
+                INTERRUPTS.look()
+                if steps == 4:
+                    lost()
+    assert steps == 5
+    INTERRUPTS.look()  # answered
+    with pytest.raises(KeyboardInterrupt):
+        with interruptible():
+            INTERRUPTS._last = -1.0  # another Ctrl-C, later
+            lost()
+    with interruptible():
+        INTERRUPTS.look()
+
+
+def test_what_was_made_of_one_is_the_interrupt_that_it_is() -> None:
+    with pytest.raises(KeyboardInterrupt), interruptible():
+        in_a_library()
+        raise RuntimeError("what native code says")
+    with pytest.raises(ValueError, match="of its own"), interruptible():
+        raise ValueError("of its own")
+
+
+def test_nested_blocks_answer_it_together() -> None:
+    reached = []
+    with interruptible():
+        try:
+            with interruptible():
+                in_a_destructor()
+                INTERRUPTS.look()
+        except KeyboardInterrupt:
+            reached.append("inner")
+        INTERRUPTS.look()
+        reached.append("what follows")
+    assert reached == ["inner", "what follows"]
+
+
+def scene_pictures() -> Any:
+    return MitsubaScene.pictures(object.__new__(MitsubaScene), {}, {}, 1)
+
+
+def model_answers() -> Any:
+    model = easy()
+    return model.ask(model.prepared(torch.zeros(1, 8, 8, 3)))
+
+
+def workers_results() -> Any:
+    return list(coordinator(Simulated()).results([range(2)]))
+
+
+def progress_advances() -> None:
+    LookingProgress(NullProgress()).advance()
+
+
+def progress_stages() -> None:
+    LookingProgress(NullProgress()).stage("next")
+
+
+@pytest.mark.parametrize("look", [scene_pictures, model_answers, workers_results, progress_advances, progress_stages])
+def test_whatever_takes_time_looks(look: Callable[[], Any]) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        with interruptible():
+            in_a_destructor()
+            with pytest.raises(KeyboardInterrupt):
+                look()
+
+
+SECOND = """
+import hashlib, signal, sys
+from advsearch.cli import main
+def given(argv):
+    print("begun", flush=True)
+    hashlib.pbkdf2_hmac("sha256", b"", b"", 2**31 - 1)  # native code that knows no signals
+main._run_and_tell, sys.argv = given, ["advsearch"]
+sys.exit(main.main())
+"""
+
+
+def test_a_second_one_ends_native_code_at_once_and_one_that_is_passed_on_does_not() -> None:
+    words, environment = [sys.executable, "-c", SECOND], {**os.environ, "PYTHONPATH": str(ROOT)}
+    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment) as process:
+        try:
+            assert process.stdout is not None and process.stdout.readline() == "begun\n"
+            process.send_signal(signal.SIGINT)
+            process.send_signal(signal.SIGINT)
+            with pytest.raises(subprocess.TimeoutExpired):
+                process.wait(1.0)
+            process.send_signal(signal.SIGINT)
+            assert process.wait(60) == 130
+            assert process.stderr is not None and process.stderr.read() == "advsearch: interrupted\n"
+        finally:
+            process.kill()
+
+
+def test_one_that_is_passed_on_counts_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    times = iter([5.0, 5.0 + ONE / 2, 6.0 + ONE])
+    monkeypatch.setattr("advsearch.interrupts.time.monotonic", lambda: next(times))
+    handler = Interrupts()
+    with pytest.raises(KeyboardInterrupt):
+        handler(2, None)
+    handler(2, None)
+    assert handler.count == 1
+    with pytest.raises(KeyboardInterrupt):
+        handler(2, None)
+    assert handler.count == 2
