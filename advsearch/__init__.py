@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from advsearch.api.render import load_model as load_model
     from advsearch.api.render import load_run as load_run
     from advsearch.api.render import render as render
+    from advsearch.attacks import Policy as Policy
+    from advsearch.controls.base import Control as Control
     from advsearch.engine.attack_result import AttackResult as AttackResult
     from advsearch.engine.loading import Scene as Scene
     from advsearch.engine.loading import load_scene as load_scene
@@ -39,15 +41,19 @@ if TYPE_CHECKING:
     from advsearch.questions.stability.carry_out import stability as stability
     from advsearch.questions.sweep.carry_out import sweep as sweep
     from advsearch.registry import allow_code as allow_code
+    from advsearch.tasks import Task as Task
 
 __version__ = "0.1.0"
 
 _HOMES = {
     "AttackResult": "advsearch.engine.attack_result",
+    "Control": "advsearch.controls.base",
     "Model": "advsearch.models",
+    "Policy": "advsearch.attacks",
     "Rendering": "advsearch.api.render",
     "Scene": "advsearch.engine.loading",
     "SweepResult": "advsearch.engine.sweeps.summary",
+    "Task": "advsearch.tasks",
     "allow_code": "advsearch.registry",
     "attack": "advsearch.questions.attack.carry_out",
     "check": "advsearch.questions.check.carry_out",

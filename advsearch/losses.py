@@ -20,8 +20,9 @@ from advsearch.engine import objective
 from advsearch.errors import InputError
 
 __all__ = [
-    "carlini_wagner", "cross_entropy", "dlr", "log_odds", "margin", "non_printability", "targeted_carlini_wagner",
-    "targeted_cross_entropy", "targeted_dlr", "targeted_log_odds", "targeted_margin", "total_variation",
+    "carlini_wagner", "cross_entropy", "dlr", "log_odds", "margin", "non_printability", "nps",
+    "targeted_carlini_wagner", "targeted_cross_entropy", "targeted_dlr", "targeted_log_odds", "targeted_margin",
+    "total_variation",
 ]  # fmt: skip
 
 Labels = Tensor | Sequence[int]
@@ -110,6 +111,10 @@ def non_printability(colors: Tensor, palette: Tensor | None = None) -> Tensor:
         palette: (P, 3) sRGB in [0, 1], the colours that can be printed; None for the 125 of `printable`.
     """
     return torch.stack([objective.off_print(one, palette) for one in _pictures(colors)])
+
+
+nps = non_printability
+"""Its usual short name."""
 
 
 # ---- as objectives --------------------------------------------------------------------------------------------------

@@ -94,6 +94,21 @@ class AttackResult:
         """Whether a verified configuration was found."""
         return self.summary.ending == Ending.FOUND.value
 
+    @property
+    def success(self) -> bool:
+        """The same as `found`."""
+        return self.found
+
+    @property
+    def images(self) -> dict[str, Tensor]:
+        """The two pictures by name, `clean` and `adversarial`: (H, W, 3) display-referred sRGB in [0, 1]."""
+        return {"clean": self.clean, "adversarial": self.adversarial}
+
+    @property
+    def history(self) -> list[float]:
+        """The objective of each evaluation of the search, in order; `rows("search")` has all that is known of them."""
+        return [row.objective for row in self.rows("search") if row.phase != "ranking"]
+
     @names_code
     @in_turn()
     def render(
@@ -177,8 +192,7 @@ class AttackResult:
             axes: to draw on; None makes new ones.
         """
         axes = new_axes() if axes is None else axes
-        searched = [row.objective for row in self.rows("search") if row.phase != "ranking"]
-        search_axes({self.summary.policy: searched}, self.summary.objective, axes)
+        search_axes({self.summary.policy: self.history}, self.summary.objective, axes)
         return axes
 
     def __repr__(self) -> str:

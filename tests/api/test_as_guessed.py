@@ -453,6 +453,15 @@ def test_a_table_says_which_rows_are_steps(attacked: AttackResult) -> None:
     assert frame["phase"] == ["search"] * 4 + ["ranking"] * 8
     axes = attacked.plot()
     assert len(axes.lines[0].get_xdata()) == 4
+    assert attacked.history == pytest.approx([record.objective for record in search.history])
+
+
+def test_names_that_people_guess_are_there(attacked: AttackResult) -> None:
+    assert attacked.success is attacked.found
+    assert attacked.images["clean"] is attacked.clean and attacked.images["adversarial"] is attacked.adversarial
+    assert advsearch.losses.nps is advsearch.losses.non_printability
+    for base in (advsearch.Control, advsearch.Policy, advsearch.Task):
+        assert inspect.isabstract(base), base
 
 
 @pytest.mark.usefixtures("pandas")
