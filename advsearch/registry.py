@@ -5,7 +5,7 @@ A package adds to a registry through an entry point of the registry's group, as 
 
 from __future__ import annotations
 
-import importlib.util
+import importlib
 import inspect
 import os
 import re
@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from functools import cached_property, wraps
 from importlib import import_module
+from importlib.machinery import PathFinder
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, Generic, TypeVar
@@ -188,12 +189,8 @@ def check_import(name: str) -> None:
     """
     if name in _ALLOWED:
         return
-    package = name.partition(":")[0].partition(".")[0]
-    with current_directory_importable():
-        try:
-            found = importlib.util.find_spec(package)
-        except (ImportError, ValueError):
-            found = None
+    importlib.invalidate_caches()
+    found = PathFinder.find_spec(name.partition(":")[0].partition(".")[0], [*sys.path, os.getcwd()])
     where = f" from {found.origin}" if found is not None and found.origin else ""
     raise InputError(
         f"a file names {name}, Python code{where} that would be imported and run; read it, and if you trust it, allow "

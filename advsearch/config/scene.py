@@ -378,7 +378,7 @@ class RenderConfig(SceneConfig):
     )
     out: str = setting(
         ..., "picture", "the file to write: a .png holds what the model sees, an .exr linear radiance times the gain",
-        "the path of a .png or .exr file", power=power.file,
+        "the path of a .png or .exr file",
     )
     # fmt: on
 

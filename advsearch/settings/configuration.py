@@ -386,7 +386,7 @@ class Config(BaseModel):
         return copy
 
     def to_yaml(self) -> str:
-        """Return the YAML form; `from_yaml` of it gives an equal configuration."""
+        """Return the YAML form; `from_yaml` of it gives an equal configuration, where no `powers` are in it."""
         data = {"schema": written.SCHEMA, "command": self.command, **self.plain()}
         note = f"# But it can't be: {self._in_words()}\n" if self._only_here else ""
         return written.HEADER + note + str(yaml.safe_dump(data, sort_keys=False))
