@@ -145,11 +145,12 @@ def read_text(path: Path, expected: str, limit: int) -> str:
         raise FileFormatError(f"{path}: expected {expected} in UTF-8, got bytes that are not text") from None
 
 
-def parse_json(text: str | bytes) -> Any:
+def parse_json(text: str | bytes, *, finite: bool = False) -> Any:
     """Return the value of a JSON text. Raises ValueError where it is not JSON, is nested deeper than `DEPTH`, or has a
-    number of thousands of digits; the message is short."""
+    number of thousands of digits; with `finite` also where one is NaN or infinite. The message is short."""
+    number = _finite if finite else None
     try:
-        value = json.loads(text, parse_int=_whole_number)
+        value = json.loads(text, parse_int=_whole_number, parse_float=number, parse_constant=number)
     except RecursionError:
         raise ValueError(f"lists or objects nested deeper than {DEPTH}") from None
     level = [value]
@@ -165,6 +166,12 @@ def _whole_number(text: str) -> int:
     if len(text) > DIGITS:
         raise ValueError(f"a whole number of {len(text)} digits")
     return int(text)
+
+
+def _finite(text: str) -> float:
+    if not math.isfinite(number := float(text)):
+        raise ValueError(f"the number {text[:40]}")
+    return number
 
 
 def _check(path: Path, status: os.stat_result, expected: str, limit: int) -> None:

@@ -154,6 +154,9 @@ def _runs(args: argparse.Namespace) -> int:
         for one in runs
     ]
     print(output.aligned([heads, *rows]))
+    for one in runs:
+        if one.fault:
+            print(f"advsearch: {one.name}: {one.fault}", file=sys.stderr)
     return 0
 
 

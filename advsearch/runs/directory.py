@@ -366,8 +366,11 @@ def typed_name(path: str | Path) -> str:
     return path.name if path.parent == HOME else str(path)
 
 
-def find_run(run: str | Path) -> Path:
+def find_run(run: str | Path, *, checked: bool = True) -> Path:
     """Return the directory of an existing run, called by name or by path (of the directory, or of its run.yaml).
+
+    Args:
+        checked: whether links in it are refused, as they must be before anything in it is read.
 
     Raises:
         UnknownNameError: there is no such run.
@@ -376,7 +379,8 @@ def find_run(run: str | Path) -> Path:
     for path in (Path(run).expanduser(), run_path(run)):
         folder = path.parent if path.name in CONTENTS and os.path.isfile(path) else path
         if is_run(folder):
-            check_links(folder)
+            if checked:
+                check_links(folder)
             return folder
     known = (path.name for path in HOME.glob("*") if is_run(path))
     raise UnknownNameError("run", str(run), known, "Give a name in runs/ or the path of a run's folder.")

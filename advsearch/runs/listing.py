@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from contextlib import suppress
-from dataclasses import dataclass
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from advsearch.errors import AdvsearchError
 from advsearch.runs import files, store, summary
-from advsearch.runs.directory import CONFIG, is_run
+from advsearch.runs.directory import CONFIG, check_links, is_run
 from advsearch.runs.results.base import Result
 from advsearch.settings import read_yaml
+
+FAULT = "it cannot be read, which is a fault of advsearch"
 
 
 @dataclass(frozen=True)
 class Listed:
     """One run in its folder: the command that made it, what the model should recognise, what could change, rows by
     kind; ``"running"`` where a process works on it, ``"stopped"`` where it can be resumed, else its ending; the answer
-    in a few words; whether it has begun, so that it can be resumed; and when, seconds since 1970 (UTC), if known."""
+    in a few words; whether it has begun, so that it can be resumed; when, seconds since 1970 (UTC), if known; and what is
+    wrong with it, empty where nothing is."""
 
     name: str
     path: str
@@ -31,6 +35,7 @@ class Listed:
     kinds: Mapping[str, int]
     begun: bool
     when: float | None
+    fault: str = ""
 
 
 def listed_runs(folder: Path) -> list[Listed]:
@@ -53,18 +58,53 @@ def can_resume(path: Path) -> bool:
         return results.goes_on
 
 
+_LISTED: dict[tuple[str, bool], tuple[object, Listed]] = {}
+
+
 def listed_run(path: Path, *, counts: bool = True) -> Listed:
-    """Return the run in a folder; what cannot be read is shown as far as it can. To count rows takes a second for a
-    million."""
+    """Return the run in a folder; what cannot be read is shown as far as it can, and `fault` says why. To count rows
+    takes a second for a million. A run is read again where its files have changed, or a process works on it."""
+    running = files.is_held(path)
+    key, state = (os.path.abspath(path), counts), (str(path), running, *map(_state, _read_of(path)))
+    if key not in _LISTED or _LISTED[key][0] != state or (running and counts):
+        _LISTED[key] = state, _listed(path, counts=counts, running=running)
+    return _LISTED[key][1]
+
+
+def _read_of(path: Path) -> Iterator[Path]:
+    """What a line of the list depends on."""
+    return (path / name for name in ("", CONFIG, summary.NAME, store.NAME, f"{store.NAME}-wal"))
+
+
+def _state(path: Path) -> object:
+    with suppress(OSError):
+        found = os.lstat(path)
+        return found.st_ino, found.st_size, found.st_mtime_ns
+    return None
+
+
+def _listed(path: Path, *, counts: bool, running: bool) -> Listed:
+    faults: list[str] = []
+    try:
+        check_links(path)
+        found = _as_far_as_read(path, counts, running, faults)
+    except Exception as error:  # whatever is wrong with one run, the others are listed
+        faults.append(str(error) if isinstance(error, AdvsearchError) else f"{FAULT}: {type(error).__name__}")
+        found = Listed(path.name, str(path), "?", "?", (), 0, "damaged", "", {}, False, None)
+    return replace(found, fault=faults[0] if faults else "")
+
+
+def _as_far_as_read(path: Path, counts: bool, running: bool, faults: list[str]) -> Listed:
+    """What a run is, as far as it can be read; `faults` gets what cannot."""
     config: dict[str, object] = {}
     result: Result | None = None
     kinds: dict[str, int] = {}
-    with suppress(AdvsearchError):
+    with _told(faults, path / CONFIG):
         config = read_yaml(path / CONFIG)
-    with suppress(AdvsearchError):
+    with _told(faults, path / summary.NAME):
         result = summary.read_result(path)
     if counts:
-        with suppress(AdvsearchError), store.Store(path / store.NAME, read_only=True) as results:
+        with _told(faults, path / store.NAME), store.Store(path / store.NAME, read_only=True) as results:
             kinds = results.counts()
     object_name = getattr(result, "object", None) or ",".join(getattr(result, "objects", ()))
     controls = getattr(result, "controls", ()) or config.get("controls") or ()
@@ -76,12 +116,22 @@ def listed_run(path: Path, *, counts: bool = True) -> Listed:
         object=str(config.get("object") or object_name or ("" if config else "?")),
         controls=tuple(map(str, controls)) if isinstance(controls, (list, tuple, dict)) else ("?",),
         rows=sum(kinds.values()),
-        state="running" if files.is_held(path) else ending,
+        state="running" if running else ending,
         answer=result.brief if result else "",
         kinds=kinds,
         begun=bool(config),
         when=_when(path),
     )
+
+
+@contextmanager
+def _told(faults: list[str], file: Path) -> Iterator[None]:
+    """Note what is wrong with a file, but not that it is missing."""
+    try:
+        yield
+    except AdvsearchError as error:
+        if os.path.lexists(file):
+            faults.append(str(error))
 
 
 def _when(path: Path) -> float | None:

@@ -245,7 +245,7 @@ class Store:
         """Return the JSON value that was noted under `key`, or None."""
         text = self.note(key)
         try:
-            return None if text is None else parse_json(text)
+            return None if text is None else parse_json(text, finite=True)
         except ValueError as error:
             raise FileFormatError(f"{self.path}: expected JSON in the note {key!r}, got {error}; {DAMAGED}") from None
 
@@ -305,9 +305,19 @@ def _column_types() -> dict[str, tuple[type, ...]]:
 _TYPES = _column_types()
 
 
+_INFINITE = (math.inf, -math.inf)
+
+LARGEST_NUMBER = 1e300
+"""Larger numbers are none in rows: what is reckoned from them would overflow."""
+
+MOST_STEPS = (1 << 32) - 1
+
+
 def _decode(values: tuple[Any, ...], path: Path) -> Row:
     given = dict(zip(_FIELDS, values, strict=True))
-    wrong = [name for name, value in given.items() if not isinstance(value, _TYPES[name])]
+    wrong = [name for name, value in given.items() if not isinstance(value, _TYPES[name]) or value in _INFINITE]
+    if not wrong and not 0 <= given["step"] <= MOST_STEPS:
+        wrong = ["step"]
     if not wrong:
         given["values"] = _values(given["values"])
         wrong = ["values_json"] if given["values"] is None else []
@@ -316,7 +326,7 @@ def _decode(values: tuple[Any, ...], path: Path) -> Row:
         wrong = ["metrics_json"] if given["metrics"] is None else []
     if not wrong and given["payload"] is not None:
         try:
-            given["payload"] = parse_json(given["payload"])
+            given["payload"] = parse_json(given["payload"], finite=True)
         except ValueError:
             wrong = ["payload_json"]
     if wrong:
@@ -355,11 +365,29 @@ def _values(text: str) -> dict[str, Value] | None:
         values = json.loads(text)
     except (ValueError, RecursionError):
         return None
-    return values if isinstance(values, dict) else None
+    return values if isinstance(values, dict) and all(map(_is_value, values.values())) else None
+
+
+def _is_value(told: object) -> bool:
+    """Whether it is a `Value`: a number, a name or several of them, and a unit."""
+    if not isinstance(told, dict) or not isinstance(told.get("unit"), str) or "value" not in told:
+        return False
+    value = told["value"]
+    return _is_plain(value) or (isinstance(value, list) and all(map(_is_plain, value)))
+
+
+def _is_plain(value: object) -> bool:
+    return value is None or isinstance(value, str) or _is_number(value)
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, (int, float)) and -LARGEST_NUMBER <= value <= LARGEST_NUMBER
 
 
 def _metrics(text: str) -> dict[str, float | None] | None:
     """Return the metrics of a row, None where they are not numbers by name."""
-    found: Any = _values(text)
-    numbers = found is not None and all(one is None or type(one) in (int, float) for one in found.values())
-    return dict(found) if numbers else None
+    try:
+        found = json.loads(text)
+    except (ValueError, RecursionError):
+        return None
+    return found if isinstance(found, dict) and all(one is None or _is_number(one) for one in found.values()) else None

@@ -47,7 +47,7 @@ def read_result(folder: Path) -> Result:
     writes."""
     path = folder / NAME
     try:
-        values = parse_json(read_text(path, "the summary of a run", LARGEST))
+        values = parse_json(read_text(path, "the summary of a run", LARGEST), finite=True)
     except FileNotFoundError:
         raise _other(path, "no such file; did the run end?") from None
     except (OSError, ValueError) as error:

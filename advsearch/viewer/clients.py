@@ -200,23 +200,26 @@ class Clients:
                 with suppress(OSError):  # not the method of an SSL socket, which would forget that it is one
                     socket.socket.shutdown(one.connection, socket.SHUT_RDWR)
 
-    def _work(self) -> None:
+    def serve_one(self, connection: socket.socket, address: Any) -> None:
+        """Answer one client, in this thread; whatever it does, nothing is raised."""
         own = threading.get_ident()
+        try:
+            connection.setblocking(True)
+            if self._context is not None:
+                connection = self._context.wrap_socket(connection, server_side=True, do_handshake_on_connect=False)
+            self._served[own] = _Served(connection)
+            self.wait_for(PATIENCE)
+            if isinstance(connection, ssl.SSLSocket):
+                connection.do_handshake()
+            self._answer(connection, address)
+        except Exception:
+            return
+        finally:
+            self._served.pop(own, None)
+            with suppress(OSError):
+                socket.socket.shutdown(connection, socket.SHUT_WR)
+            connection.close()
+
+    def _work(self) -> None:
         while (job := self._ready.get()) is not None:
-            connection, address = job
-            try:
-                connection.setblocking(True)
-                if self._context is not None:
-                    connection = self._context.wrap_socket(connection, server_side=True, do_handshake_on_connect=False)
-                self._served[own] = _Served(connection)
-                self.wait_for(PATIENCE)
-                if isinstance(connection, ssl.SSLSocket):
-                    connection.do_handshake()
-                self._answer(connection, address)
-            except Exception:
-                continue  # whatever one client does, the others are answered
-            finally:
-                self._served.pop(own, None)
-                with suppress(OSError):
-                    socket.socket.shutdown(connection, socket.SHUT_WR)
-                connection.close()
+            self.serve_one(*job)

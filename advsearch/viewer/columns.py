@@ -18,7 +18,9 @@ import numpy as np
 import numpy.typing as npt
 
 from advsearch.described import NOT_A_NUMBER, Value
+from advsearch.errors import FileFormatError
 from advsearch.files import JsonObject
+from advsearch.runs.files import DAMAGED
 from advsearch.runs.store import NAME, Row, Store
 
 KIND = "sweep"
@@ -148,7 +150,7 @@ def read_columns(run: Path, after: int = 0, most: int | None = None) -> Columns:
     """Return the rows of the sweep in `run` that were written after the row with this id, `most` of them at most.
     Raises FileFormatError where the results cannot be read."""
     with Store(run / NAME, read_only=True) as store:
-        found, edges = columns_of(islice(store.rows(KIND, after=after), most)), store.noted(EDGES)
+        found, edges = columns_of(islice(store.rows(KIND, after=after), most), run), store.noted(EDGES)
     known = edges if isinstance(edges, dict) else {}
     cut = (replace(one, edges=_edges(known.get(one.name))) for one in found.parameters)
     return replace(found, parameters=tuple(cut))
@@ -161,8 +163,8 @@ def _edges(noted: object) -> tuple[float, ...] | None:
     return tuple(map(float, noted))
 
 
-def columns_of(rows: Iterable[Row]) -> Columns:
-    """Return rows as columns."""
+def columns_of(rows: Iterable[Row], run: Path) -> Columns:
+    """Return rows of the run in a folder as columns. Raises FileFormatError where the boxes of one are none."""
     steps, margins, shares, right = array("L"), array("f"), array("H"), array("B")
     answers, parameters, last, boxes = _Levels(), _Parameters(), 0, array("H")
     for number, row in enumerate(rows):
@@ -176,7 +178,7 @@ def columns_of(rows: Iterable[Row]) -> Columns:
         last = row.id or number + 1
         if isinstance(row.payload, dict) and "box" in row.payload:
             boxes.extend([NO_BOX] * (8 * number - len(boxes)))
-            boxes.extend(_boxes(row.payload, row.label or ""))
+            boxes.extend(_boxes(row, run))
     boxes.extend([NO_BOX] * (8 * len(steps) - len(boxes) if boxes else 0))
     return Columns(
         step=np.array(steps, np.uint32),
@@ -191,11 +193,21 @@ def columns_of(rows: Iterable[Row]) -> Columns:
     )
 
 
-def _boxes(payload: Mapping[str, Any], label: str) -> list[int]:
+def _boxes(row: Row, run: Path) -> list[int]:
     """The true box of a detector's answer, and the best one with the label that the answer is, or misses."""
-    said = next((one["box"] for one in payload.get("found", ()) if one["label"] == label.removeprefix("no ")), None)
-    corners = (*(payload["box"] or [None] * 4), *(said or [None] * 4))
-    return [NO_BOX if x is None else round(min(max(BOX_STEPS * x, 0), NO_BOX - 1)) for x in corners]
+    payload: Any = row.payload
+    sought = (row.label or "").removeprefix("no ")
+    try:
+        said = next((one["box"] for one in payload.get("found", ()) if one["label"] == sought), None)
+        corners = [one for box in (payload["box"], said) for one in (box or [None] * 4)]
+        found = [NO_BOX if x is None else round(min(max(BOX_STEPS * x, 0), NO_BOX - 1)) for x in corners]
+    except (LookupError, TypeError, ValueError, OverflowError):
+        found = []
+    if len(found) != 8:
+        raise FileFormatError(
+            f"{run / NAME}: row {row.id}: expected boxes of a detector, got something else; {DAMAGED}"
+        )
+    return found
 
 
 class _Levels:

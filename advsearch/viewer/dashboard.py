@@ -41,7 +41,9 @@ def list_page(runs: Mapping[str, Path]) -> str:
 def _line(name: str, one: Listed, *, comparable: bool) -> Html:
     place, sweep = f"runs/{in_address(name)}/", one.command == "sweep"
     box = element("input", type="checkbox", name="run", value=name, aria_label=f"compare {name}") if sweep else None
-    picture = element("img", src=f"{place}cover", alt="", loading="lazy", width="72", height="72")
+    picture = (
+        element("img", src=f"{place}cover", alt="", loading="lazy", width="72", height="72") if not one.fault else None
+    )
     about = ", ".join(filter(None, (one.command, wording.short_names(one.object), " and ".join(one.controls))))
     photos = element("a", "photographs", href=f"{place}align/", aria_label=f"photographs of {name}")
     beside = join_html(" ", photos) if one.command in ("attack", "sweep") else None
@@ -51,9 +53,13 @@ def _line(name: str, one: Listed, *, comparable: bool) -> Html:
         element("td", box) if comparable else None,
         element("td", element("a", picture, href=place, tabindex="-1", aria_hidden="true")),
         element("th", element("a", name, href=place), element("div", about, beside, class_="soft"), scope="row"),
-        element("td", join_html(one.state, f": {one.answer}" if one.answer else None)),
+        element("td", join_html(one.state, f": {one.answer}" if one.answer else None), _fault(one)),
         element("td", begun, class_="number"),
     )
+
+
+def _fault(one: Listed) -> Html | None:
+    return element("div", one.fault, class_="remarks") if one.fault else None
 
 
 MOST_ROWS = 2000

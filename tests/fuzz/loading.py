@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import shutil
 import warnings
 from collections.abc import Callable, Iterable
+from functools import partial
 from pathlib import Path
 
 
@@ -94,6 +96,108 @@ def load_run(path: Path) -> None:
     show_run(str(path.parent), as_json=False)
 
 
+QUESTIONS = (
+    ("show", "{run}"),
+    ("show", "{run}", "--json"),
+    ("report", "{run}", "--evidence", "--out", "made/report"),
+    ("view", "{run}", "--bundle", "made/site"),
+)
+EXPORTS = (
+    ("export", "{run}", "--out", "made/rows.csv"),
+    ("export", "{run}", "--out", "made/rows.json"),
+    ("export", "{run}", "--format", "fiftyone", "--out", "made/fiftyone"),
+)
+OF_SWEEPS = (
+    ("export", "{run}", "--format", "3db", "--out", "made/3db"),
+    ("compare", "{run}", "../honest/sweep", "--run", "made/compare", "--pictures", "2"),
+    ("explain", "{run}", "--confirm", "0", "--pairs", "0", "--clusters", "0", "--run", "made/explain"),
+)
+ASKED = {
+    "study": QUESTIONS,
+    "attack": (*QUESTIONS, *EXPORTS),
+    "detection": (*QUESTIONS, *EXPORTS),
+    "sweep": (*QUESTIONS, *EXPORTS, *OF_SWEEPS),
+}
+"""What is asked of a whole run, by its kind in `fuzz.run_folders`."""
+
+PAGES = (
+    *("", "cover", "rows", "rows?after=5", "progress", "align/", "pictures/0000/3.jpg", "parts/a/report.html"),
+    *("align/renderings/3", "align/renderings/clean", "align/renderings/adversarial"),
+)
+"""Of the dashboard, about a run."""
+
+
+def load_whole_run(kind: str, path: Path) -> None:
+    """Ask all that is asked of a run that somebody else made: the list, the commands that read it, the dashboard.
+
+    Raises the first of the errors that are told, and an ArithmeticError for what is no error of the run.
+    """
+    from advsearch.errors import InputError
+    from advsearch.runs import listing
+
+    run = path.parent
+    fault = listing.listed_run(run).fault
+    said = [fault] if fault else []
+    Path("made").mkdir(exist_ok=True)
+    try:
+        for question in ASKED[kind]:
+            said += _refusal([word.format(run=run) for word in question])
+    finally:
+        shutil.rmtree("made")
+    said += _page_faults(run, compares=kind in ("sweep", "detection"))
+    unexpected = [one for one in said if "a fault of advsearch" in one]
+    if unexpected:
+        raise ArithmeticError(unexpected[0])
+    if said:
+        raise InputError(said[0])
+
+
+def _refusal(words: list[str]) -> list[str]:
+    """What a command says that refuses what it is given."""
+    import contextlib
+    import io
+
+    from advsearch.cli.main import main
+
+    out, errors = io.TextIOWrapper(io.BytesIO(), "utf-8"), io.TextIOWrapper(io.BytesIO(), "utf-8")
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(errors):
+        status = main(words)
+        errors.flush()
+    text = errors.buffer.getvalue().decode()  # type: ignore[attr-defined]
+    if status not in (0, 2):
+        raise ArithmeticError(f"{words[0]} ended with {status}: {text[-200:]}")
+    return [text.splitlines()[-1].removeprefix("advsearch: error: ")] if status else []
+
+
+def _page_faults(run: Path, *, compares: bool) -> list[str]:
+    """What the dashboard says of pages that it cannot make."""
+    import socket
+    from threading import Thread
+    from urllib.parse import quote
+
+    from advsearch.viewer.server import Dashboard
+
+    said, server = [], Dashboard((run,))
+    name = quote(os.fsencode(run.name), safe="")
+    pages = ["/", *(f"/runs/{name}/{page}" for page in PAGES), *([f"/compare/?run={name}"] if compares else [])]
+    for page in pages:
+        own, other = socket.socketpair()
+        answered: list[bytes] = []
+        reader = Thread(target=lambda own=own, answered=answered: answered.append(own.makefile("rb").read()))
+        reader.start()
+        own.sendall(f"GET {page} HTTP/1.0\r\nHost: 127.0.0.1:{server.server_port}\r\n\r\n".encode())
+        server.clients.serve_one(other, ("127.0.0.1", 0))
+        reader.join()
+        own.close()
+        head, _, body = answered[0].partition(b"\r\n\r\n")
+        if b"Content-Security-Policy: " not in head:
+            raise ArithmeticError(f"{page}: has no policy: {head[:100]!r}")
+        if head.split(b" ")[1] not in (b"200", b"404"):
+            said.append(body.decode().strip())
+    server.server_close()
+    return said
+
+
 def load_answer(path: Path) -> None:
     """Read the answer of a run."""
     from advsearch.runs.summary import read_answer
@@ -164,6 +268,7 @@ LOADERS: dict[str, Callable[[Path], object]] = {
     "labels": load_labels,
     "settings": load_settings,
     "run": load_run,
+    **{f"whole {kind}": partial(load_whole_run, kind) for kind in ASKED},
     "answer": load_answer,
     "blend": load_blend,
     "3db": load_threedb,
@@ -185,6 +290,9 @@ def warm_up(loaders: Iterable[str]) -> None:
         import advsearch.scene.mitsuba_backend.scene_files
 
         Image.init()
+    for kind in ASKED:
+        if f"whole {kind}" in loaders:
+            load_whole_run(kind, Path("../outside") / kind / "run.yaml")
     if {"model", "labels"} & set(loaders):
         import torch.export.pt2_archive  # makes a folder for compiled code
         import torch.jit  # noqa: F401

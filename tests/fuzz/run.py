@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from fuzz import run_folders
 from fuzz.case import Case
 from fuzz.pictures import plain_png
 
@@ -66,6 +67,7 @@ def run(cases: Sequence[tuple[int, Case]], folder: Path) -> Iterator[Outcome]:
     """
     outside, runs = folder / "outside", folder / "runs"
     _plant(outside)
+    run_folders.plant(folder / "honest")
     runs.mkdir(parents=True, exist_ok=True)
     untouched = _digest(outside)
     worker = _Worker(folder, cases)
@@ -91,6 +93,7 @@ def _plant(outside: Path) -> None:
     (outside / "secret.bin").write_bytes(bytes(1 << 12))
     (outside / "secret.png").write_bytes(plain_png(8, 8))
     (outside / "secret.txt").write_text("mug\nbowl\n")
+    run_folders.plant(outside)
 
 
 def _digest(folder: Path) -> dict[str, tuple[int, str]]:
@@ -164,7 +167,7 @@ class _Worker:
             cwd=self._folder / "runs",
             env=environment,
         )
-        if self._line(self._process, time.monotonic() + 300) is None:
+        if not self._line(self._process, time.monotonic() + 300):
             raise RuntimeError("the process that loads the cases did not start")
         return self._process
 

@@ -42,8 +42,8 @@ class Watch:
             self.seen.append(f"{event} {arguments[0]!r}")
         elif event in _CHANGES or (event == "open" and self._writes(arguments)):
             self._note("writes", arguments[0], allowed=self.runs)
-        elif event == "open" and isinstance(arguments[0], (str, bytes)):
-            path = os.path.realpath(os.fsdecode(arguments[0]))
+        elif event in ("open", "sqlite3.connect") and isinstance(arguments[0], (str, bytes)):
+            path = os.path.realpath(os.fsdecode(arguments[0]).removeprefix("file://").partition("?")[0])
             if path.startswith(self.outside):
                 self.seen.append(f"reads {path}")
 

@@ -48,7 +48,7 @@ def test_a_page_embeds_the_pictures_of_the_worst_margins(tmp_path: Path) -> None
 
 
 def test_what_is_packed_is_what_the_rows_are() -> None:
-    head, columns = unpacked(columns_of([row(k, yaw=10.0 * k, environment="ab"[k % 2]) for k in range(5)]))
+    head, columns = unpacked(columns_of([row(k, yaw=10.0 * k, environment="ab"[k % 2]) for k in range(5)], Path()))
     assert head["count"] == 5
     assert list(columns["step"]) == [0, 1, 2, 3, 4]
     assert list(columns["right"]) == [1, 0, 1, 0, 1]
@@ -62,14 +62,14 @@ def test_what_is_packed_is_what_the_rows_are() -> None:
 
 
 def test_columns_begin_at_multiples_of_their_size() -> None:
-    head, _ = unpacked(columns_of([row(k, name="x" * k, yaw=1.0) for k in range(3)]))
+    head, _ = unpacked(columns_of([row(k, name="x" * k, yaw=1.0) for k in range(3)], Path()))
     for one in head["columns"]:
         assert one["at"] % np.dtype(one["type"]).itemsize == 0
 
 
 def test_what_a_row_lacks_is_said() -> None:
     bare = Row("sweep", 7, values={})
-    head, columns = unpacked(columns_of([row(0, yaw=1.0, name="n"), bare, row(2, yaw=3.0, late=5.0)]))
+    head, columns = unpacked(columns_of([row(0, yaw=1.0, name="n"), bare, row(2, yaw=3.0, late=5.0)], Path()))
     assert columns["right"][1] == UNKNOWN
     assert columns["probability"][1] == NO_PROBABILITY
     assert math.isnan(columns["margin"][1])
@@ -79,7 +79,7 @@ def test_what_a_row_lacks_is_said() -> None:
 
 
 def test_numbers_among_names_become_names() -> None:
-    head, columns = unpacked(columns_of([row(0, mixed=1.5), row(1, mixed="inside")]))
+    head, columns = unpacked(columns_of([row(0, mixed=1.5), row(1, mixed="inside")], Path()))
     assert [head["parameters"][0]["levels"][k] for k in columns["parameter 0"]] == ["1.5", "inside"]
 
 
