@@ -210,9 +210,7 @@ def ruled(scene: str, searches: int) -> None:
                 shares[kind].append(Deviation.of([one[kind] for one in seen]).share)
                 views_seen += found.pictures // 3 if kind == 0 else 0
             margins += [one[0].margin for one in seen]
-        print(
-            f"{scene}{name}: accepted of {searches} searches, and levels off on the object as a share of a rendered one"
-        )
+        print(f"{scene}{name}: accepted of {searches} searches, and levels off as a share of the limit")
         for planted, count, share in zip(PLANTED, accepted, shares, strict=True):
             print(f"  {planted:24s} {count:3d}   {statistics.fmean(share):.2f}", flush=True)
         told = f"{statistics.fmean(margins):+.2f}, with a deviation of {statistics.stdev(margins):.2f} over views"

@@ -30,7 +30,8 @@ def coarse() -> Iterator[None]:
         patched.setattr(texels, "GROUND", 32)
         for module, name, value in (
             (arrangement, "SIDE", 48), (arrangement, "GATHERED", 64), (acceptance, "CHECK_SPP", 4),
-            (acceptance, "BOUND", 50.0), (acceptance, "MARGIN", 50.0), (carry_out, "MOST_PROBED", 20), (carry_out, "pays_from", lambda *_: 1),
+            (acceptance, "BOUND", 50.0), (acceptance, "MARGIN", 50.0), (carry_out, "MOST_PROBED", 20),
+            (carry_out, "pays_from", lambda *_: 1),
         ):  # fmt: skip
             patched.setattr(module, name, value)
         yield
