@@ -20,8 +20,8 @@ With `--sweep`, of a sweep over azimuth, elevation and distance that is predicte
 seeds: rows a second, light and comparisons included, and how often that is of the rendered ones (asked for: 5); the
 accuracy; and in how many rows the verdict is not that of the rendered ones, and how many differ between these.
 
-With `--rule`, how often the comparison before a search accepts predictions: as they are, and with mistakes planted in
-them. Each of `--views` searches compares two pictures. Beside it: how far the pictures are off, by more samples.
+With `--rule`, how often the comparison before a search accepts predictions (`engine.acceptance`): by simulation; and as
+they are, and with mistakes planted in them, for `--views` searches, near and from afar, where the object is small.
 
 With `--viewpoints`, the search of the recipe of that name up to its verified answer, predicted, and rendered where the
 object moves in place of the shift of the picture; with `--region`, a region over azimuth and elevation with its map,
@@ -33,13 +33,17 @@ from __future__ import annotations
 
 import argparse
 import itertools
+import math
 import statistics
 import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -49,11 +53,10 @@ from advsearch import threads
 threads.configure()
 
 from advsearch.config import AttackConfig, SweepConfig  # noqa: E402
+from advsearch.engine.acceptance import VIEWS, Deviation, View, compared, view_of  # noqa: E402
 from advsearch.engine.loading import load_scene  # noqa: E402
-from advsearch.engine.surface_light import CHECK_SPP, COMPARED, levels_off, over_all  # noqa: E402
 from advsearch.engine.sweeps.loop import Sweep  # noqa: E402
 from advsearch.engine.sweeps.summary import SweepResult  # noqa: E402
-from advsearch.engine.transport import BOUND, Deviation  # noqa: E402
 from advsearch.models import Model, load_model  # noqa: E402
 from advsearch.progress import NullProgress  # noqa: E402
 from advsearch.questions.attack.carry_out import attack_once  # noqa: E402
@@ -91,6 +94,7 @@ def main() -> None:
                 grown(thing, environment or "studio")
         return
     if args.rule:
+        simulated()
         for scene in args.scenes:
             with torch.no_grad():
                 ruled(scene, args.views)
@@ -179,33 +183,88 @@ def swept(scene: str, rows: int, label: str | None) -> None:
     print(f"  {error}{told.reason or 'all predicted'}", flush=True)
 
 
+PLANTED = (
+    "as predicted",
+    "object 10 % too bright",
+    "object 25 % too bright",
+    "one pixel aside",
+    "half a logit too good",
+)
+
+
 def ruled(scene: str, searches: int) -> None:
     """Print how often the comparison accepts predictions, and wrong ones."""
     thing, _, environment = scene.partition("@")
-    renderer = load_scene(thing, environment or None).renderer(["camera", "environment"], resolution=128)
-    light = SurfaceRenderer(renderer, renderer.start, seed=0)
-    names = ("as predicted", "object 10 % too bright", "object 25 % too bright", "one pixel aside", "two pixels aside")
-    accepted, off = [0] * len(names), [list[float]() for _ in names]
-    wholes = views(renderer, COMPARED * searches)
-    for search in range(searches):
-        found: list[list[Deviation]] = [[] for _ in names]
-        for number, whole in enumerate(wholes[COMPARED * search :][:COMPARED], start=COMPARED * search):
-            inputs = renderer.scene.assembly(renderer.space.inputs(whole))
-            color, lit = light.color(inputs), light.light(inputs)
-            brighter = [replace(lit, on_object=lit.on_object * factor) for factor in (1.0, 1.1, 1.25)]
-            pictures = [light.shown(light.looks([inputs], one), [inputs], color, [whole])[0] for one in brighter]
-            pictures += [pictures[0].roll(shift, dims=1) for shift in (1, 2)]
-            shown = [*pictures, renderer(whole, seed=number, spp=SPP)]
-            *levels, rendered = levels_off(renderer, shown, whole, search, CHECK_SPP)
-            for kind, one in enumerate(levels):
-                found[kind].append(Deviation(one, 0.0, max(BOUND, rendered), pictures=3))
-            for kind, one in enumerate(levels_off(renderer, pictures, whole, number, 16 * CHECK_SPP)):
-                off[kind].append(one)
-        for kind, both in enumerate(map(over_all, found)):
-            accepted[kind] += both.levels <= both.most
-    print(f"{scene}: accepted in {searches} searches, and levels off")
-    for name, count, levels in zip(names, accepted, off, strict=True):
-        print(f"  {name:24s} {count:3d}   {statistics.fmean(one**2 for one in levels) ** 0.5:.2f}", flush=True)
+    loaded = load_scene(thing, environment or None)
+    model, label = load_model("reference"), loaded.description.object.label
+    for name, camera in (("", {}), (", small", {"distance": [4.0, 5.0]})):
+        renderer = loaded.renderer({"camera": camera, "environment": {}}, resolution=128)
+        light = SurfaceRenderer(renderer, renderer.start, seed=0)
+        accepted, shares, margins, views_seen = [0] * len(PLANTED), [list[float]() for _ in PLANTED], list[float](), 0
+        wholes = views(renderer, VIEWS * searches)
+        for search in range(searches):
+            seen = [compare(renderer, light, wholes[VIEWS * search + n], search, model, label) for n in range(VIEWS)]
+            for kind in range(len(PLANTED)):
+                found = compared(lambda number, kind=kind: seen[number][kind])  # type: ignore[misc]
+                accepted[kind] += found.good
+                shares[kind].append(Deviation.of([one[kind] for one in seen]).share)
+                views_seen += found.pictures // 3 if kind == 0 else 0
+            margins += [one[0].margin for one in seen]
+        print(f"{scene}{name}: accepted of {searches} searches, and levels off as a share of the limit")
+        for planted, count, share in zip(PLANTED, accepted, shares, strict=True):
+            print(f"  {planted:24s} {count:3d}   {statistics.fmean(share):.2f}", flush=True)
+        told = f"{statistics.fmean(margins):+.2f}, with a deviation of {statistics.stdev(margins):.2f} over views"
+        print(f"  views compared: {views_seen / searches:.1f}; margin off by {told}", flush=True)
+
+
+def compare(
+    renderer: Renderer, light: SurfaceRenderer, whole: Tensor, search: int, model: Model, label: str | None
+) -> list[View]:
+    """One view, predicted and with each mistake planted; all beside the same traced pictures."""
+    inputs = renderer.scene.assembly(renderer.space.inputs(whole))
+    color, lit = light.color(inputs), light.light(inputs)
+    brighter = [replace(lit, on_object=lit.on_object * factor) for factor in (1.0, 1.1, 1.25)]
+    pictures = [light.shown(light.looks([inputs], one), [inputs], color, [whole])[0] for one in brighter]
+    pictures += [pictures[0].roll(1, dims=1), pictures[0]]
+    once: Any = Once(renderer)
+    found = [view_of(once, one, whole, search, SPP, lambda at, _: -margin(model, at, label)) for one in pictures]
+    return [*found[:-1], replace(found[-1], margin=found[-1].margin + 0.5)]
+
+
+class Once:
+    """A renderer that traces a configuration once."""
+
+    def __init__(self, renderer: Renderer) -> None:
+        self.mask = lru_cache(renderer.mask)
+        self.halves = lru_cache(renderer.halves)
+        self.__call = lru_cache(renderer.__call__)
+
+    def __call__(self, u: Tensor, seed: int, spp: int) -> Tensor:
+        return self.__call(u, seed, spp)
+
+
+def simulated(searches: int = 4000) -> None:
+    """Print how often the rule accepts, over views whose squared errors are log-normal, by simulation."""
+    generator = np.random.default_rng(0)
+
+    def accepts(share: float, bias: float, spread: float, deviation: float) -> str:
+        sigma = math.sqrt(math.log(1.0 + spread**2))
+        normal = generator.normal(size=(2, searches, VIEWS))
+        squares, moved = share**2 * np.exp(sigma * normal[0] - sigma**2 / 2.0), bias + deviation * normal[1]
+        good = sum(
+            compared(lambda n, one=one: View(16.0 * float(squares[one, n]), 16.0, float(moved[one, n]), 3)).good  # type: ignore[misc]
+            for one in range(searches)
+        )
+        return f"{100.0 * good / searches:5.1f}"
+
+    levels = (0.5, 0.7, 0.8, 0.9, 1.0, 1.1, 1.25, 1.5)
+    print("accepted, %, where predictions are off by a share of the limit in levels of", *levels)
+    for spread in (0.5, 0.8, 1.2):
+        print(f"  squares spread by {spread}:", *(accepts(share, 0.0, spread, 0.2) for share in levels), flush=True)
+    biases = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.75, 1.0)
+    print("accepted, %, of half the limit in levels, where the margin is off by", *biases)
+    for deviation in (0.2, 0.3, 0.45):
+        print(f"  deviation {deviation}:", *(accepts(0.5, bias, 0.8, deviation) for bias in biases), flush=True)
 
 
 def searched(thing: str, environment: str, size: int) -> None:

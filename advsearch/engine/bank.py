@@ -19,8 +19,9 @@ from advsearch.attacks import Evaluate, Evaluation
 from advsearch.attacks.domain import Domain, centre_of_option
 from advsearch.attacks.draws import Draws
 from advsearch.attacks.evaluation import Query, WhichGradient
+from advsearch.engine.acceptance import Deviation, View, compared
 from advsearch.engine.problem import Problem
-from advsearch.engine.transport import Conditions, Deviation, Predictor, Tick, deviation_of
+from advsearch.engine.transport import Conditions, Predictor, Tick
 from advsearch.files import scaled
 from advsearch.scene.formation import to_8_bit
 from advsearch.scene.transport.matrix import MOST_BYTES, LinearRenderer
@@ -218,7 +219,8 @@ class Bank(Predictor):
         return Condition(number, asked.u[u.numel() :], made, alone)
 
     def _compare(self, u: Tensor, index: int) -> None:
-        """Look at unseen conditions, and let the bank grow while they are clearly better for the model."""
+        """Look at unseen conditions and at the bank's own, and let the bank grow while the first are clearly better for
+        the model, or predictions of the second are too far off."""
         problem, begun = self.problem, time.perf_counter()
         noise = seeds.stream(problem.seed, "bank check", index)
         draws = [seeds.stream(noise, "draw", number) for number in range(UNSEEN)]
@@ -231,9 +233,13 @@ class Bank(Predictor):
         seen = [one.objective for one, _ in found]
         self.gaps.append(statistics.fmean(seen) - statistics.fmean(unseen))
         error = math.sqrt(sum(statistics.pvariance(some) / len(some) for some in (seen, unseen)))
-        at = torch.cat([self._place(chosen[0].number), chosen[0].numbers])
-        self.deviations.append(deviation_of(problem, chosen[0].renderer, at, wholes[0], noise))
-        if self.gaps[-1] > SURE * error:
+
+        def view(number: int) -> View:
+            which = number % len(chosen)
+            return problem.view(chosen[which].renderer, wholes[which], seeds.stream(noise, "view", number), SPP)
+
+        self.deviations.append(compared(view))
+        if self.gaps[-1] > SURE * error or not self.deviations[-1].good:
             self._places[index] = u.detach().clone()
             self.grown.append(index)
         self.seconds += time.perf_counter() - begun

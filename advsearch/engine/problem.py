@@ -18,6 +18,7 @@ from advsearch.attacks.evaluation import Query, WhichGradient
 from advsearch.attacks.verification import EASIER, OVER_CONDITIONS, WORST_CASE, Rule
 from advsearch.controls import Space
 from advsearch.described import Value
+from advsearch.engine.acceptance import View, view_of
 from advsearch.engine.judging import Described, KnownTruths, Looked, Metrics, judgements, mean_metrics
 from advsearch.engine.objective import Asked, domain_of
 from advsearch.models import Model
@@ -165,6 +166,17 @@ class Problem:
             objective = float(self.objective(output, picture[None], truth, self.asked(whole))[0])
             (said,) = judgements(self.task, output, picture[None], [truth], self.metrics)
             return replace(said, objective=objective)
+
+    def view(
+        self, predict: Callable[[Tensor], Tensor], whole: Tensor, seed: int, spp: int, *, climbed: bool = True
+    ) -> View:
+        """Compare a picture (H, W, 3) that is predicted of the whole space at `whole` with traced ones; `spp` are the
+        samples a pixel of a rendered one. `climbed` is whether the search moved it away from its start."""
+        with torch.no_grad():
+            predicted = predict(whole)
+            start = torch.cat([self.domain.start, whole[self.domain.dim :]])
+            before = predict(start) if climbed and not torch.equal(start, whole) else None
+        return view_of(self.renderer, predicted, whole, seed, spp, lambda *at: self.judge(*at).margin, before)
 
     def marks(self, picture: Tensor, whole: Tensor) -> list[Mark]:
         """Return what shows the model's answer to a picture (H, W, 3) of the whole space at `whole`."""

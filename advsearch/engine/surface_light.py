@@ -4,8 +4,6 @@ the second time in a row pictures are traced from there on, or predicted by matr
 
 from __future__ import annotations
 
-import math
-import statistics
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -19,12 +17,12 @@ from advsearch import seeds
 from advsearch.attacks import Evaluate, Evaluation, Policy
 from advsearch.attacks.evaluation import Query
 from advsearch.controls import Space
+from advsearch.engine.acceptance import VIEWS, Deviation, View, compared
 from advsearch.engine.bank import stratified
 from advsearch.engine.problem import Problem
-from advsearch.engine.transport import BOUND, Conditions, Deviation, Predictor, Tick
+from advsearch.engine.transport import Conditions, Predictor, Tick
 from advsearch.scene.formation import to_8_bit
 from advsearch.scene.mitsuba_backend.surface import RAYS
-from advsearch.scene.renderer import Renderer
 from advsearch.scene.surface import renderer as surface_renderer
 from advsearch.scene.surface.arrangement import CAMERAS, COLOR, MAP
 from advsearch.scene.surface.renderer import Look, Sketch, SurfaceRenderer
@@ -36,10 +34,6 @@ NO_CAMERA = "no camera moves"
 LIGHTS = 64
 """Environments in the bank, where they vary."""
 EVERY = 100
-COMPARED = 2
-"""Pictures of a comparison."""
-CHECK_SPP = 16
-"""Samples a pixel of each of the two traced pictures beside one."""
 TOGETHER = 8
 """Pictures that the model is asked about at once."""
 AGAIN = 4
@@ -189,9 +183,7 @@ class SurfaceLight(Predictor):
     def too_far_off(self) -> str | None:
         """Why it predicts nothing, from the comparison before the search, in words."""
         first = self.deviations[0] if self.deviations else None
-        if first is None or first.levels <= first.most:
-            return None
-        return f"light on surfaces is {first.levels:.1f} levels of 255 off, where {first.most:.1f} would do"
+        return None if first is None or first.good else f"light on surfaces is {first.reason}"
 
     def passed(self, query: Query) -> None:
         self._come_to(query)
@@ -297,11 +289,10 @@ class SurfaceLight(Predictor):
         if due and self.ended is None:
             before = self.deviations[-1]
             found = self._compare(query.u, query.number)
-            good = found.levels <= found.most
-            self._next = query.number + (query.number if good and not self._colored else EVERY)
-            if good:
+            self._next = query.number + (query.number if found.good and not self._colored else EVERY)
+            if found.good:
                 return
-            if before.levels > before.most:
+            if not before.good:
                 self.ended = query.number
             if self.ended is not None or not self._colored:
                 return
@@ -310,49 +301,21 @@ class SurfaceLight(Predictor):
             self.renewals.append(query.number)
             self.seconds += time.perf_counter() - begun
 
-    def _deviation(self, whole: Tensor, seed: int) -> Deviation:
-        """Compare a predicted picture and a rendered one with traced ones."""
-        problem, renderer = self.problem, self.problem.renderer
-        with torch.no_grad():
-            predicted, rendered = self.renderer(whole), renderer(whole, seeds.stream(seed, "rendered"), problem.spp)
-        off, good = levels_off(renderer, (predicted, rendered), whole, seed, CHECK_SPP)
-        values = [problem.judge(one, whole).objective or 0.0 for one in (predicted, rendered)]
-        return Deviation(off, values[0] - values[1], max(BOUND, good), pictures=3)
-
     def _compare(self, u: Tensor, index: int) -> Deviation:
         """Compare predicted pictures with traced ones, and keep what was found. The first is that of u; in the others,
         searched cameras and environments are anywhere."""
         begun, problem = time.perf_counter(), self.problem
         query = Query(u, 0, kind="surface check", number=index)
         seed = seeds.stream(problem.seed, query.kind, index)
-        elsewhere = problem.domain.sample(torch.Generator().manual_seed(seed), COMPARED)
+        elsewhere = problem.domain.sample(torch.Generator().manual_seed(seed), VIEWS)
         places = torch.where(self._moving, elsewhere, u)
         places[0] = u
-        wholes = [torch.cat(both) for both in zip(places, self._drawn(query, COMPARED), strict=True)]
-        self.deviations.append(over_all([self._deviation(whole, seed) for whole in wholes]))
+        wholes = [torch.cat(both) for both in zip(places, self._drawn(query, VIEWS), strict=True)]
+
+        def view(number: int) -> View:
+            seen = seeds.stream(seed, "view", number)
+            return problem.view(self.renderer, wholes[number], seen, problem.spp, climbed=self._colored)
+
+        self.deviations.append(compared(view))
         self.seconds += time.perf_counter() - begun
         return self.deviations[-1]
-
-
-def levels_off(renderer: Renderer, pictures: Sequence[Tensor], u: Tensor, seed: int, spp: int) -> list[float]:
-    """Return how far pictures (H, W, 3) of a configuration are off, levels of 255.
-
-    They are compared with two that are traced without the denoiser, which leaves its own marks in all that it is given.
-    The mean product of the differences to both is the squared error without their noise, which a square would count.
-    """
-    undenoised = renderer.like(denoiser="none")
-    with torch.no_grad():
-        one, other = (undenoised(u, seeds.stream(seed, "traced", half), spp) for half in range(2))
-    squares = [float(((picture - one) * (picture - other)).mean()) for picture in pictures]
-    return [255.0 * math.sqrt(max(0.0, square)) for square in squares]
-
-
-def over_all(found: Sequence[Deviation]) -> Deviation:
-    """Return what several comparisons say together: of all pictures the root mean square difference, and the mean of
-    what it may be."""
-    return Deviation(
-        levels=statistics.fmean(one.levels**2 for one in found) ** 0.5,
-        logits=statistics.fmean(one.logits for one in found),
-        most=statistics.fmean(one.most for one in found),
-        pictures=sum(one.pictures for one in found),
-    )

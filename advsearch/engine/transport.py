@@ -1,6 +1,6 @@
 """Searches over base colours and light by light transport, and how far its pictures are from traced ones. Every `EVERY`
-evaluations the change since the matrix was made is traced: where it is predicted wrongly by more than `BOUND`, the
-matrix is made anew. The ranking and all trials trace paths."""
+evaluations predictions are compared with traced pictures: where they are too far off (`engine.acceptance`), the matrix
+is made anew. The ranking and all trials trace paths."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from torch import Tensor
 from advsearch import seeds
 from advsearch.attacks import Evaluate, Evaluation
 from advsearch.attacks.evaluation import Query
+from advsearch.engine.acceptance import Deviation, compared
 from advsearch.engine.problem import Problem
 from advsearch.scene.formation import to_8_bit
-from advsearch.scene.renderer import Renderer
 from advsearch.scene.transport.lights import (
     HAZE,
     NOISE,
@@ -38,17 +38,6 @@ WORTH = 16
 WORTH_A_LIGHT = 8
 """Evaluations for each light from which a search pays for its basis picture."""
 EVERY = 20
-BOUND = 2.0
-"""Levels of 255, root mean square over the picture. On the bundled mug a matrix made anew at 1.7 levels, half way
-through 40 evaluations, moved the verified margin by 0.1 of 28 logits, for as long as all of them take."""
-CHANGE_SPP = 16
-"""Samples a pixel of each traced picture of a comparison of changes. Four of them measure what is off by 0.63, 1.3 and
-1.5 levels as 0.53 to 0.64, 1.1 to 1.5 and 1.4 to 1.8 (bundled mug, 128 x 128; against 1,024 samples)."""
-SMALL_PART = 0.0625
-"""Part of an error of radiance that is taken through the tone curve, which is straight over so little: the noise of an
-error does not move its mean then."""
-CHECK_SPP = 64
-"""Samples a pixel of the traced picture of a comparison under light."""
 FEWEST_SCORES = 4
 """Trials whose spread says something."""
 SPREAD = 1.64
@@ -61,19 +50,6 @@ AVOIDABLE = {
 """Reasons to render that cost much, and what a user can do instead."""
 Tick = Callable[[int], None]
 Judged = float | Tensor
-
-
-@dataclass(frozen=True)
-class Deviation:
-    """How far the prediction of one configuration is from what paths show: the root mean square difference of the
-    change of the picture since the matrix was made (`change_off`), or where light moves of the picture itself, in
-    levels of 255; that of the objective; and the levels that are good enough: `BOUND`, or, where light moves, what a
-    rendered evaluation is off if that is more. So many pictures were traced to find it."""
-
-    levels: float
-    logits: float
-    most: float
-    pictures: int
 
 
 @dataclass(frozen=True)
@@ -301,9 +277,9 @@ class Transport(Predictor):
             return None
         place = self._present.setdefault(kind, self._begin)
         if number and number % EVERY == 0 and kind.startswith("search"):
-            found = self.deviation(place.renderer, place.u, query.u, number)
+            found = self.deviation(place.renderer, query.u, number)
             self.deviations.append(found)
-            if found.levels > found.most:
+            if not found.good:
                 self.renewals.setdefault(kind, []).append(number)
                 if not self._renewable:
                     return None
@@ -317,64 +293,11 @@ class Transport(Predictor):
         self.seconds += time.perf_counter() - begun
         return ExpansionPoint(u.detach().clone(), made)
 
-    def deviation(self, linear: PredictingRenderer, at: Tensor, u: Tensor, index: int) -> Deviation:
-        """Compare what a prediction says of the change since its matrix was made at `at` with what traced pictures
-        do."""
+    def deviation(self, linear: PredictingRenderer, u: Tensor, index: int) -> Deviation:
+        """Compare what a matrix predicts with traced pictures of several seeds."""
         begun = time.perf_counter()
-        problem, seed = self.problem, seeds.stream(self.problem.seed, "transport check", index)
-        if isinstance(linear, BasisRenderer):
-            found = deviation_under_light(problem.renderer, problem.loss, linear, u, seed, problem.spp)
-        else:
-            found = deviation_of(problem, linear, at, u, seed)
+        seed = seeds.stream(self.problem.seed, "transport check", index)
+        problem = self.problem
+        found = compared(lambda number: problem.view(linear, u, seeds.stream(seed, "view", number), problem.spp))
         self.seconds += time.perf_counter() - begun
         return found
-
-
-def deviation_of(problem: Problem, linear: PredictingRenderer, at: Tensor, u: Tensor, seed: int) -> Deviation:
-    """Compare what a prediction says of the change from one configuration of the whole space to another with what
-    traced pictures do."""
-    levels = change_off(problem.renderer, linear, at, u, seed)
-    with torch.no_grad():
-        logits = float(problem.loss(linear(u)) - problem.loss(problem.renderer(u, seed=seed, spp=CHANGE_SPP)))
-    return Deviation(levels, logits, BOUND, pictures=5)
-
-
-def change_off(renderer: Renderer, linear: PredictingRenderer, at: Tensor, u: Tensor, seed: int) -> float:
-    """How far the predicted change of the picture from one configuration of the whole space to another is off, in
-    levels of 255 (root mean square).
-
-    The change of radiance is traced with one seed for both pictures, so that most of the noise drops out, and without
-    the denoiser, which takes a fine pattern for noise. That is done twice, with other noise: the mean product of both
-    errors is the squared error, without the noise that is left.
-    """
-    undenoised = renderer.like(denoiser="none")
-
-    def picture(radiance: Tensor) -> Tensor:
-        return renderer.space.picture(u, renderer.formation.display(radiance))
-
-    with torch.no_grad():
-        before, after = linear.radiance(at), linear.radiance(u)
-        errors = []
-        for half in range(2):
-            noise = seeds.stream(seed, "half", half)
-            change = undenoised.radiance(u, noise, CHANGE_SPP) - undenoised.radiance(at, noise, CHANGE_SPP)
-            off = (after - before) - change
-            errors.append((picture(after) - picture(after - SMALL_PART * off)) / SMALL_PART)
-        return 255.0 * math.sqrt(max(0.0, float((errors[0] * errors[1]).mean())))
-
-
-def deviation_under_light(
-    renderer: Renderer, loss: Callable[[Tensor], Judged], predicted: PredictingRenderer, u: Tensor, seed: int, spp: int
-) -> Deviation:
-    """Compare a predicted picture with a traced one. It may be as far from that as a rendered one, at `spp` samples a
-    pixel: noise grows with the power of light, and that of two lights does not drop out of a change."""
-    with torch.no_grad():
-        found, traced = predicted(u), renderer(u, seed=seed, spp=CHECK_SPP)
-        rendered = renderer(u, seed=seeds.stream(seed, "rendered"), spp=spp)
-        logits = float(loss(found) - loss(traced))
-    return Deviation(levels_apart(found, traced), logits, max(BOUND, levels_apart(rendered, traced)), pictures=2)
-
-
-def levels_apart(one: Tensor, other: Tensor) -> float:
-    """Root mean square difference of two pictures in levels of 255."""
-    return 255.0 * math.sqrt(float(((one - other) ** 2).mean()))

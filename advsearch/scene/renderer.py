@@ -186,6 +186,23 @@ class Renderer:
         with torch.inference_mode(False) if torch.is_inference_mode_enabled() else nullcontext():
             return self._picture(through, seed, spp, shown=False)
 
+    def halves(self, u: Tensor, seed: int, spp: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Trace two pictures (H, W, 3) of a configuration with independent noise, which are not denoised; and return
+        beside them that of all their samples, which is. Arguments as for a call; without a graph, and not counted."""
+        with torch.no_grad():
+            inputs = self.scene.assembly(self.space.inputs(u))
+            hide = "backdrop.color" in inputs
+            traced = {name: value for name, value in inputs.items() if name not in ON_PICTURE}
+            noisy = self.like(denoiser="none")
+            numbers = [seeds.stream(seed, "traced", half) for half in range(2)]
+            one, other = (noisy._rendered(traced, number, spp, hide) for number in numbers)
+            both = (one + other) / 2.0
+            noise = seeds.stream(self.root_seed, "guides", numbers[0])
+            clean = denoise(both[..., :3].contiguous(), *self.scene.guides(traced, noise, spp))
+            both = torch.cat([clean, both[..., 3:]], dim=-1)
+            first, second, last = (self._shown(picture, inputs, u) for picture in (one, other, both))
+            return first, second, last
+
     def mask(self, u: Configuration) -> Tensor:
         """Return the pixels in which the object is the first thing that the camera sees, (H, W) bool.
 

@@ -14,11 +14,11 @@ import advsearch
 from advsearch.attacks import make_policy
 from advsearch.attacks.evaluation import Query
 from advsearch.config import AttackConfig
-from advsearch.engine import surface_light
+from advsearch.engine import acceptance, surface_light
+from advsearch.engine.acceptance import Deviation
 from advsearch.engine.attack_parts import parts_of, problem_of_parts
 from advsearch.engine.attack_result import AttackResult
 from advsearch.engine.surface_light import SurfaceLight
-from advsearch.engine.transport import Deviation
 from advsearch.questions.attack.carry_out import attack_once
 from advsearch.runs.store import NAME as STORE
 from advsearch.runs.store import Store
@@ -44,9 +44,10 @@ def coarse() -> Iterator[None]:
         patched.setattr(texels, "GROUND", 32)
         for name, value in {"SIDE": 48, "GATHERED": 64}.items():
             patched.setattr(arrangement, name, value)
-        kept: dict[str, float] = {"LIGHTS": 3, "EVERY": 6, "CHECK_SPP": 4, "BOUND": 50.0}
-        for name, number in kept.items():
-            patched.setattr(surface_light, name, number)
+        for name, count in {"LIGHTS": 3, "EVERY": 6}.items():
+            patched.setattr(surface_light, name, count)
+        for name, number in {"CHECK_SPP": 4, "BOUND": 50.0, "MARGIN": 50.0}.items():
+            patched.setattr(acceptance, name, number)
         yield
 
 
@@ -119,7 +120,7 @@ def test_a_search_for_a_viewpoint_is_predicted_and_its_ranking_is_traced(viewpoi
     told, renders = viewpoints[1].summary.transport, viewpoints[1].summary.renders
     assert told is not None and (told.way, told.reason, told.conditions) == ("surface light", None, None)
     assert (renders["products"], renders["baseline"]) == (80, 8)
-    assert renders["search"] == 8 + 4 * surface_light.COMPARED * 3
+    assert renders["search"] == 8 + 4 * acceptance.FIRST * 3
     with Store(viewpoints[0] / STORE, read_only=True) as store:
         spp = {(row.phase, row.spp, row.renders) for kind in ("search", "baseline") for row in store.rows(kind)}
     assert spp == {("search", None, 0), ("ranking", 8, 1)}

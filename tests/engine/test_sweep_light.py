@@ -10,10 +10,11 @@ from stand_ins import rows
 
 import advsearch
 from advsearch.attacks.draws import Product
-from advsearch.engine.sweeps import swept_scene
+from advsearch.engine import acceptance
+from advsearch.engine.acceptance import Deviation
+from advsearch.engine.sweeps import predicting, swept_scene
 from advsearch.engine.sweeps.predicting import Groups, combined
 from advsearch.engine.sweeps.swept_scene import SweptScene
-from advsearch.engine.transport import Deviation
 from advsearch.runs.results.attack import LinearTransport, PredictionError
 
 SMALL: dict[str, Any] = {"resolution": 48, "trials": 0}
@@ -22,8 +23,10 @@ GRID = {"camera.exposure": [-10, -1, 6], "light.power": "0:6:8"}
 
 @pytest.fixture(autouse=True)
 def _paying(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A few dozen pictures are enough here."""
-    monkeypatch.setattr(swept_scene, "PAYS", 0.3)
+    """A few dozen pictures are enough here, and the first two views of a comparison decide."""
+    monkeypatch.setattr(swept_scene, "PAYS", 0.2)
+    for name in ("BOUND", "MARGIN"):
+        monkeypatch.setattr(acceptance, name, 50.0)
 
 
 def test_pictures_fall_into_groups_that_differ_in_light_alone() -> None:
@@ -53,7 +56,7 @@ def test_verdicts_are_those_of_rendering_each() -> None:
     assert 0 < predicted.summary.correct < 24
     told, renders = predicted.summary.transport, predicted.summary.renders
     assert told is not None and told.used and told.error is not None and told.bytes
-    assert renders["products"] == 24 and renders["sweep"] == 2 + 2 * 3
+    assert renders["products"] == 24 and renders["sweep"] == 2 + 3 * 2
     assert all(one.seed is None and one.spp == 128 for one, _ in pairs)
     assert sum(one.renders or 0 for one, _ in pairs) == 8
     assert rendered.summary.transport == LinearTransport(used=False, reason="nothing is left out")
@@ -67,7 +70,7 @@ def test_each_pose_has_basis_pictures_of_its_own_and_a_sweep_that_was_stopped_en
     settings = {**settings, "batch": 8}
     whole = advsearch.sweep("mug", "reference", run=tmp_path / "whole", **settings).summary
     assert whole.transport is not None and whole.transport.used
-    assert whole.renders["products"] == 36 and whole.renders["sweep"] == 2 * (2 + 2 * 2)
+    assert whole.renders["products"] == 36 and whole.renders["sweep"] == 2 * (2 + 3 * 2)
     look, looked = SweptScene.answers, 0
 
     def stopped(self: SweptScene, *given: Any) -> Any:
@@ -86,18 +89,18 @@ def test_each_pose_has_basis_pictures_of_its_own_and_a_sweep_that_was_stopped_en
 
 
 def test_a_group_whose_prediction_is_off_is_rendered(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(swept_scene, "deviation_under_light", lambda *given: Deviation(9.0, 0.0, 2.0, pictures=2))
+    monkeypatch.setattr(predicting, "compared", lambda view: Deviation(9.0, 0.0, 2.0, pictures=6))
     found = advsearch.sweep("mug", "reference", GRID, **SMALL)
     told, renders = found.summary.transport, found.summary.renders
     assert told is not None and "1 of 1 groups were rendered" in str(told.reason)
-    assert "products" not in renders and renders["sweep"] == 24 + 2 + 2 * 3
+    assert "products" not in renders and renders["sweep"] == 24 + 2 + 6
     assert all(one.seed is not None for one in found.rows())
 
 
 def test_draws_of_light_share_one_basis() -> None:
     controls = {"environment": {"exposure": [-1, 1], "tint_red": [0, 2]}}
     found = advsearch.sweep("mug", "reference", controls=controls, samples=32, **SMALL).summary
-    assert found.renders == {"sweep": 1 + 2 * 3, "verification": 0, "products": 32}
+    assert found.renders == {"sweep": 1 + 3 * 2, "verification": 0, "products": 32}
 
 
 @pytest.mark.parametrize(

@@ -15,12 +15,13 @@ import advsearch
 from advsearch.attacks.draws import Product
 from advsearch.cluster import Done, Workforce
 from advsearch.config import SweepConfig
+from advsearch.engine import acceptance
+from advsearch.engine.acceptance import Deviation
 from advsearch.engine.journal import answering
 from advsearch.engine.sweeps import predicting
 from advsearch.engine.sweeps.loop import Sweep
 from advsearch.engine.sweeps.predicting import Groups
 from advsearch.engine.sweeps.swept_scene import Scenes, SweptScene
-from advsearch.engine.transport import Deviation
 from advsearch.progress import NullProgress
 from advsearch.questions.sweep.carry_out import job_of
 from advsearch.runs.directory import RunDirectory
@@ -39,9 +40,9 @@ def coarse(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[SurfaceRenderer]]:
     monkeypatch.setattr(texels, "GROUND", 24)
     for name, value in {"SIDE": 32, "GATHERED": 48}.items():
         monkeypatch.setattr(arrangement, name, value)
-    numbers: dict[str, float] = {"PAYS": 0.0, "CHECK_SPP": 2, "BOUND": 50.0}
-    for name, number in numbers.items():
-        monkeypatch.setattr(predicting, name, number)
+    monkeypatch.setattr(predicting, "PAYS", 0.0)
+    for name, number in {"CHECK_SPP": 2, "BOUND": 50.0, "MARGIN": 50.0}.items():
+        monkeypatch.setattr(acceptance, name, number)
     made, make = list[SurfaceRenderer](), SurfaceRenderer.__init__
 
     def counted(self: SurfaceRenderer, *given: Any) -> None:
@@ -147,7 +148,7 @@ def test_drives_are_predicted_whatever_is_drawn_for_each(coarse: list[SurfaceRen
 
 def test_a_group_whose_pictures_are_too_far_off_is_rendered(monkeypatch: pytest.MonkeyPatch) -> None:
     levels = iter([9.0, 1.0])
-    monkeypatch.setattr(predicting, "over_all", lambda found: Deviation(next(levels), 0.0, 2.0, pictures=6))
+    monkeypatch.setattr(predicting, "compared", lambda view: Deviation(next(levels), 0.0, 2.0, pictures=6))
     found = swept(grid=GRID)
     told = found.summary.transport
     assert told is not None and "1 of 2 groups were rendered" in str(told.reason)
@@ -177,7 +178,6 @@ def test_why_a_sweep_is_rendered(more: dict[str, Any], reason: str | None) -> No
 
 def test_few_pictures_do_not_pay(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(predicting, "PAYS", 2.0)
-    monkeypatch.setattr(predicting, "CHECK_SPP", 32)
     told = swept(grid=GRID, resolution=128).summary.transport
     assert told == LinearTransport(
         used=False, reason="light on surfaces pays where 79 pictures differ in the camera alone; here 8 do"

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from stand_ins import Impatient, rows
 
-from advsearch.engine import surface_light
+from advsearch.engine import acceptance
 from advsearch.questions.region import carry_out
 from advsearch.questions.region.answer import RegionResult
 from advsearch.questions.region.settings import RegionConfig
@@ -29,8 +29,9 @@ def coarse() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(texels, "GROUND", 32)
         for module, name, value in (
-            (arrangement, "SIDE", 48), (arrangement, "GATHERED", 64), (surface_light, "CHECK_SPP", 4),
-            (surface_light, "BOUND", 50.0), (carry_out, "MOST_PROBED", 20), (carry_out, "pays_from", lambda *_: 1),
+            (arrangement, "SIDE", 48), (arrangement, "GATHERED", 64), (acceptance, "CHECK_SPP", 4),
+            (acceptance, "BOUND", 50.0), (acceptance, "MARGIN", 50.0), (carry_out, "MOST_PROBED", 20),
+            (carry_out, "pays_from", lambda *_: 1),
         ):  # fmt: skip
             patched.setattr(module, name, value)
         yield
@@ -53,7 +54,7 @@ def test_viewpoints_are_predicted_and_fresh_samples_are_rendered(whole: tuple[Pa
     assert result.samples == 8 and checked % 8 == 0 and checked >= 8
     assert predicted and found.count(("map", True, 4)) == 9 and len(found) == predicted + checked + 9
     assert result.renders["products"] == predicted + 9
-    compared = 3 * surface_light.COMPARED
+    compared = 3 * acceptance.FIRST
     assert result.renders["verification"] == carry_out.AT_CENTRE + checked + compared
 
 

@@ -11,6 +11,7 @@ from stand_ins import Impatient, rows
 from torch import Tensor
 
 import advsearch
+from advsearch.engine import acceptance
 from advsearch.engine import transport as searching
 from advsearch.scene.mitsuba_backend.variant import mitsuba
 from advsearch.scene.renderer import Renderer
@@ -174,11 +175,13 @@ SEARCH: dict[str, Any] = {
 
 def test_a_search_over_light_renders_its_basis_and_its_comparisons(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(searching, "EVERY", 8)
+    for name in ("BOUND", "MARGIN"):
+        monkeypatch.setattr(acceptance, name, 50.0)
     found = advsearch.attack("mug", run=None, **SEARCH).summary
     told, renders = found.transport, found.renders
     assert told is not None and told.used and told.reason is None and told.entries == 0 and told.bytes
     assert told.error is not None and told.error.levels < 8.0
-    assert renders["products"] == 18 and renders["search"] == 2 + 2 * 2 + 8  # basis, comparisons, ranking
+    assert renders["products"] == 18 and renders["search"] == 2 + 2 * 2 * 3 + 8  # basis, comparisons, ranking
 
 
 @pytest.mark.slow
@@ -187,8 +190,8 @@ def test_a_prediction_that_is_off_ends_in_rendering_and_goes_on_so(
 ) -> None:
     """Also in a run that was stopped after that."""
     monkeypatch.setattr(searching, "EVERY", 6)
-    off = searching.Deviation(9.0, 0.0, 2.0, pictures=2)
-    monkeypatch.setattr(searching, "deviation_under_light", lambda *given: off)
+    off = searching.Deviation(9.0, 0.0, 2.0, pictures=6)
+    monkeypatch.setattr(searching, "compared", lambda view: off)
     settings = {**SEARCH, "deterministic": True}
     whole = advsearch.attack("mug", run=tmp_path / "whole", **settings).summary
     assert whole.transport is not None and "from evaluation 6" in str(whole.transport.reason)

@@ -7,7 +7,7 @@ from __future__ import annotations
 import math
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
@@ -16,10 +16,9 @@ from torch import Tensor
 
 from advsearch import seeds
 from advsearch.attacks.draws import Product
-from advsearch.engine.surface_light import levels_off, over_all
+from advsearch.engine.acceptance import CHECK_SPP, VIEWS, Deviation, MarginOf, View, compared, view_of
 from advsearch.engine.sweeps.axes import Axis
 from advsearch.engine.sweeps.points import Points
-from advsearch.engine.transport import BOUND, Deviation
 from advsearch.files import scaled
 from advsearch.runs.results.attack import LinearTransport, PredictionError
 from advsearch.scene.assembly import ON_PICTURE
@@ -31,9 +30,6 @@ from advsearch.scene.transport.matrix import MOST_BYTES
 
 PAYS = 2.0
 """Times the samples that a prediction takes, comparisons included, that a group has to take rendered, for it to pay."""
-
-MarginOf = Callable[[Tensor, Tensor], float]
-"""What a model says of a picture (H, W, 3) of a configuration, as a number of logits."""
 
 
 @dataclass(frozen=True)
@@ -120,15 +116,11 @@ class SweptPicture:
 class SweptPredictor(ABC):
     """Predicts pictures of one scene at one size; `before` it the other scenes have so many. Every picture is rendered
     for a `reason`, if there is one, which is empty where nothing moves that it follows, and in groups that are `left`
-    since a prediction was too far off. `score` says what a comparison does in logits."""
+    since predictions were too far off. `score` is the margin of a picture."""
 
     way: ClassVar[str]
     samples: ClassVar[int]
     """Samples a pixel of what predicts."""
-    checks: ClassVar[tuple[int, int]]
-    """Pictures of a scene that are compared, spread over its groups; and those of each group at least."""
-    for_a_check: ClassVar[int]
-    """Pictures that are traced to compare one."""
 
     renderer: Renderer
     points: Points
@@ -141,6 +133,7 @@ class SweptPredictor(ABC):
     deviations: list[Deviation] = field(default_factory=list)
     seconds: float = 0.0
     left: set[int] = field(default_factory=set)
+    _checked: dict[int, int] = field(default_factory=dict)
     _held: dict[int, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -164,11 +157,6 @@ class SweptPredictor(ABC):
     @abstractmethod
     def _predicted(self, made: Any, us: Sequence[Tensor]) -> Sequence[Tensor]:
         """Return the pictures (H, W, 3) of configurations of a group."""
-
-    @abstractmethod
-    def _compared(self, made: Any, shown: Sequence[tuple[Tensor, int]]) -> list[Deviation]:
-        """Compare predicted pictures with traced ones, of configurations with seeds; a group is predicted where all
-        that is found is good."""
 
     @property
     def _traced(self) -> int:
@@ -212,12 +200,7 @@ class SweptPredictor(ABC):
     def _spent(self, one: WantedPicture) -> int:
         """Pictures that were traced for a group, said of its first picture alone."""
         first = one.number == self._groups.member(one.number, 0)
-        return (self._traced + self._checks * self.for_a_check) * first
-
-    @property
-    def _checks(self) -> int:
-        whole, least = self.checks
-        return max(least, -(-whole // self._groups.count))
+        return (self._traced + self._checked[self._groups.group(one.number)]) * first
 
     def _fall(self, follows: frozenset[str]) -> Groups:
         """How pictures fall into groups that may differ in some groups of coordinates."""
@@ -239,15 +222,20 @@ class SweptPredictor(ABC):
         begun = time.perf_counter()
         seed = seeds.stream(self.seed, "light", self.before + group)
         made = self._made(self._configuration(number, 0), seed)
-        places = [seeds.stream(seed, "check", check) % self._groups.size for check in range(self._checks)]
-        shown = [(self._configuration(number, p), seeds.stream(seed, "traced", k)) for k, p in enumerate(places)]
-        found = self._compared(made, shown)
-        self.deviations += found
-        good = all(one.levels <= one.most for one in found)
-        if not good:
+
+        def view(check: int) -> View:
+            u = self._configuration(number, seeds.stream(seed, "check", check) % self._groups.size)
+            (predicted,) = self._predicted(made, [u])
+            return view_of(self.renderer, predicted, u, seeds.stream(seed, "traced", check), self.spp, self.score)
+
+        with torch.no_grad():
+            found = compared(view)
+        self.deviations.append(found)
+        self._checked[group] = found.pictures
+        if not found.good:
             self.left.add(group)
         self.seconds += time.perf_counter() - begun
-        return made if good else None
+        return made if found.good else None
 
     def _configuration(self, number: int, place: int) -> Tensor:
         member = self._groups.member(number, place)
@@ -292,9 +280,6 @@ def combined(found: Sequence[LinearTransport | None]) -> LinearTransport | None:
     )
 
 
-CHECK_SPP = 32
-"""Samples a pixel of each of the two traced pictures of a comparison. Of single views of the bundled mug that are off
-by 1.6 to 2.5 levels they say 1.9 to 2.5."""
 ARRANGED, LIT = 2_200_000, 80_000
 """Samples that take as long as finding what texels see, and the light of an environment: 0.8 and 0.03 s where a picture
 of 128 x 128 pixels with 8 samples a pixel takes 46 ms."""
@@ -306,11 +291,11 @@ LIT_BYTES = 4_000_000
 """Memory of the light of an environment beside its map, about."""
 
 
-def pays_from(renderer: Renderer, spp: int, checks: int, arrangements: float = 1.0) -> int:
+def pays_from(renderer: Renderer, spp: int, arrangements: float = 1.0) -> int:
     """Return how many pictures under one light have to be wanted for it to pay, where what texels see is found
     `arrangements` times for each light."""
     height, width = renderer.formation.resolution
-    samples = (ARRANGED * arrangements + LIT) / (height * width) + checks * (2 * CHECK_SPP + spp)
+    samples = (ARRANGED * arrangements + LIT) / (height * width) + VIEWS * (2 * CHECK_SPP + spp)
     return math.ceil(PAYS * samples / (spp - SHOWN))
 
 
@@ -328,8 +313,6 @@ class SweptSurfaceLight(SweptPredictor):
 
     way: ClassVar[str] = "surface light"
     samples: ClassVar[int] = RAYS
-    checks: ClassVar[tuple[int, int]] = (4, 2)
-    for_a_check: ClassVar[int] = 3
     _arranged: list[SurfaceRenderer] = field(default_factory=list)
 
     def _follows(self) -> frozenset[str]:
@@ -347,7 +330,7 @@ class SweptSurfaceLight(SweptPredictor):
         if not self.specialise:
             return "nothing is left out"
         groups, arranged = self._groups, self._arrangements
-        least = pays_from(self.renderer, self.spp, self._checks, arranged.count / groups.count)
+        least = pays_from(self.renderer, self.spp, arranged.count / groups.count)
         if groups.size < least:
             return f"light on surfaces pays where {least} pictures differ in the camera alone; here {groups.size} do"
         reason = why_not_kept(self.renderer)
@@ -388,13 +371,3 @@ class SweptSurfaceLight(SweptPredictor):
                 some = slice(begin, begin + of.at_once)
                 found += of.shown(of.looks(inputs[some], made.light), inputs[some], of.there, us[some])
         return found
-
-    def _compared(self, made: LitGroup, shown: Sequence[tuple[Tensor, int]]) -> list[Deviation]:
-        found = []
-        for u, seed in shown:
-            rendered = self.renderer(u, seed=seeds.stream(seed, "rendered"), spp=self.spp)
-            (predicted,) = self._predicted(made, [u])
-            levels, good = levels_off(self.renderer, (predicted, rendered), u, seed, CHECK_SPP)
-            logits = self.score(predicted, u) - self.score(rendered, u)
-            found.append(Deviation(levels, logits, max(BOUND, good), pictures=self.for_a_check))
-        return [over_all(found)]

@@ -18,6 +18,7 @@ from advsearch import seeds
 from advsearch.attacks import Evaluation, Query, Trials, choose_spp, run_trials
 from advsearch.attacks.trials import margins_of, most_samples
 from advsearch.described import Value
+from advsearch.engine.acceptance import CHECK_SPP, VIEWS
 from advsearch.engine.journal import Journal, Shared
 from advsearch.engine.judging import judgements
 from advsearch.engine.loading import framed, make_renderer
@@ -25,7 +26,6 @@ from advsearch.engine.record import Stages, rate_of
 from advsearch.engine.sweeps import Job
 from advsearch.engine.sweeps.points import Picks, Points
 from advsearch.engine.sweeps.predicting import PAYS, SweptPicture, SweptPredictor, SweptSurfaceLight, WantedPicture
-from advsearch.engine.transport import CHECK_SPP, Deviation, deviation_under_light
 from advsearch.engine.verifier import ladder_of
 from advsearch.files import scaled
 from advsearch.runs.directory import RunDirectory
@@ -47,8 +47,6 @@ class SweptLight(SweptPredictor):
 
     way: ClassVar[str] = "basis pictures"
     samples: ClassVar[int] = SPP
-    checks: ClassVar[tuple[int, int]] = (3, 1)
-    for_a_check: ClassVar[int] = 2
 
     def _follows(self) -> frozenset[str]:
         self._moving, self._lights = lighting(self.renderer), 0
@@ -63,7 +61,7 @@ class SweptLight(SweptPredictor):
             return NOISE
         groups, inputs = self._groups, self.renderer.scene.assembly(self.renderer.space.inputs(self.renderer.start))
         self._lights = len(Lights(self.renderer, self._moving, inputs).alone)
-        samples = self._lights * SPP + self._checks * (CHECK_SPP + self.spp)
+        samples = self._lights * SPP + VIEWS * (2 * CHECK_SPP + self.spp)
         least = math.ceil(PAYS * samples / self.spp)
         if groups.size < least:
             return f"basis pictures pay where {least} pictures or more differ in light alone; here {groups.size} do"
@@ -89,16 +87,6 @@ class SweptLight(SweptPredictor):
 
     def _predicted(self, made: BasisRenderer, us: Sequence[Tensor]) -> list[Tensor]:
         return [made(u) for u in us]
-
-    def _compared(self, made: BasisRenderer, shown: Sequence[tuple[Tensor, int]]) -> list[Deviation]:
-        found = []
-        for u, seed in shown:
-
-            def loss(picture: Tensor, u: Tensor = u) -> float:
-                return self.score(picture, u)
-
-            found.append(deviation_under_light(self.renderer, loss, made, u, seed, self.spp))
-        return found
 
 
 class SweptScene:

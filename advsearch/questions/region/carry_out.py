@@ -24,7 +24,7 @@ from advsearch.engine.naming import AnyModel
 from advsearch.engine.outcome import transport_of
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Stages
-from advsearch.engine.surface_light import COMPARED, LIGHTS, SurfaceLight
+from advsearch.engine.surface_light import LIGHTS, SurfaceLight
 from advsearch.engine.sweeps.predicting import pays_from
 from advsearch.engine.verifier import Verifier, ladder_of
 from advsearch.errors import InputError, UnknownNameError
@@ -184,7 +184,7 @@ def _light(verifier: Verifier, config: RegionConfig, varied: Varied, centre: Ten
     if not config.specialise or not moved & CAMERAS or not moved <= FREE:
         return None
     wanted = USUAL * len(varied.names) + config.map**2
-    least = pays_from(problem.renderer, findings.spp, COMPARED)
+    least = pays_from(problem.renderer, findings.spp)
     reason = surface_renderer.why_not_kept(problem.renderer)
     if reason is None and wanted < least:
         reason = f"light on surfaces pays from {least} pictures on"

@@ -9,9 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from advsearch.engine.acceptance import ACCEPTED, Deviation, levels_off, view_of
 from advsearch.engine.gradients import smooth_loss
-from advsearch.engine.surface_light import CHECK_SPP, levels_off
-from advsearch.engine.transport import BOUND
 from advsearch.questions.stability.light import BRIGHT, behind_glass, grey_map
 from advsearch.questions.stability.scene import REFERENCE_SPP, CaseGroup, Check, ControlSettings, Outcome, holds, small
 from advsearch.scene import library
@@ -299,9 +298,9 @@ def lit_mirror() -> Outcome:
     for given in ({"material.roughness": 0.0, "material.metallic": 1.0}, {}):
         renderer = small("mug", PAINTED, settings=given, denoise="oidn")
         with torch.no_grad():
-            pictures = lit(renderer)(renderer.start), renderer(renderer.start, 7, 8)
-        off, rendered = levels_off(renderer, pictures, renderer.start, 3, CHECK_SPP)
-        taken.append(off / max(BOUND, rendered))
+            picture = lit(renderer)(renderer.start)
+        view = view_of(renderer, picture, renderer.start, 3, 8, lambda *at: 0.0)
+        taken.append(Deviation.of([view]).share / ACCEPTED)
     checks = (
         Check("of a mirror, levels off as a share of what is accepted", taken[0], least=1.5),
         Check("of the mug as it is", taken[1], most=1.0),

@@ -223,10 +223,10 @@ class NotFinite(Fields):
 
 
 class PredictionError(Fields):
-    """How far a predicted picture was from a traced one, at the last comparison."""
+    """How far predicted pictures were from traced ones, at the last comparison."""
 
-    levels: JsonFloat = Field(description="of 255: of the change of the picture, root mean square")
-    logits: JsonFloat = Field(description="of the objective")
+    levels: JsonFloat = Field(description="of 255, over the object's pixels, root mean square")
+    logits: JsonFloat = Field(description="of the margin, the mean over the pictures that were compared")
 
 
 class BankOfConditions(Fields):

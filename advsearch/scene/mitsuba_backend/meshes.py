@@ -41,8 +41,7 @@ def principled(part: MeshPart, extra: Plugin | None = None) -> Plugin:
     """A two-sided principled BSDF with the base colour as a bilinear texture of linear reflectance.
 
     Args:
-        part: the mesh whose surface it is, with cut-outs and normal map. A clearcoat of 0 leaves the lobe out; a control
-            that raises it brings the lobe back.
+        part: the mesh whose surface it is, with cut-outs and normal map. A clearcoat of 0 leaves the lobe out.
         extra: further entries of the plugin's dictionary.
     """
     material = part.material

@@ -1,0 +1,123 @@
+"""The rule by which predicted pictures take the place of rendered ones, and how often it is wrong."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from advsearch.engine.acceptance import BOUND, VIEWS, View, compared, squares_off, view_of
+
+SEARCHES = 400
+
+
+def accepted(share: float, bias: float = 0.0, deviation: float = 0.2) -> float:
+    """How many of the searches are predicted whose predictions are off by a share of what is allowed, over views whose
+    squared errors are log-normal, and whose margins are off by a bias and a deviation."""
+    random, sigma = np.random.default_rng(0), math.sqrt(math.log(1.0 + 0.8**2))
+    good = 0
+    for normal in random.normal(size=(SEARCHES, 2, VIEWS)):
+        squares, margins = share**2 * np.exp(sigma * normal[0] - sigma**2 / 2.0), bias + deviation * normal[1]
+        good += compared(lambda n, s=squares, m=margins: View(9.0 * s[n], 9.0, m[n], 3)).good  # type: ignore[misc]
+    return good / SEARCHES
+
+
+@pytest.mark.parametrize(
+    ("share", "bias", "least", "most"),
+    [
+        (0.5, 0.0, 0.97, 1.0),
+        (0.7, 0.0, 0.85, 1.0),
+        (1.25, 0.0, 0.0, 0.06),
+        (1.5, 0.0, 0.0, 0.02),
+        (0.5, 0.5, 0.0, 0.05),
+        (0.5, -0.5, 0.0, 0.05),
+        (0.5, 1.0, 0.0, 0.01),
+    ],
+)
+def test_right_predictions_are_accepted_and_wrong_ones_seldom(
+    share: float, bias: float, least: float, most: float
+) -> None:
+    assert least <= accepted(share, bias) <= most
+
+
+def test_few_views_decide_where_they_are_clear() -> None:
+    for square, margin, pictures in ((1.0, 0.0, 6), (90.0, 0.0, 6), (8.0, 0.0, 18), (1.0, 0.5, 18)):
+        assert compared(lambda number, s=square, m=margin: View(s, 9.0, m, 3)).pictures == pictures  # type: ignore[misc]
+
+
+def test_what_the_search_moved_allows_as_small_a_part_of_it() -> None:
+    assert compared(lambda number: View(1.0, 9.0, 1.0, 3, moved=30.0)).good
+    assert not compared(lambda number: View(1.0, 9.0, 1.0, 3, moved=10.0)).good
+
+
+@pytest.mark.parametrize("broken", [{"margin": math.nan}, {"square": math.nan}, {"margin": math.inf}])
+def test_what_is_no_number_is_refused(broken: dict[str, float]) -> None:
+    given: dict[str, Any] = {"square": 1.0, "allowed": 9.0, "margin": 0.0, "pictures": 3, **broken}
+    assert not compared(lambda number: View(**given)).good
+
+
+class Tracer:
+    """A renderer of a grey picture with a small object in it: 36 of 4,096 pixels."""
+
+    def __init__(self, noise: float = 0.02) -> None:
+        self.picture, self.noise = torch.full((64, 64, 3), 0.5), noise
+        self.seen = torch.zeros(64, 64, dtype=torch.bool)
+        self.seen[30:36, 30:36] = True
+
+    def __call__(self, u: Tensor, seed: int, spp: int) -> Tensor:
+        return self.noisy(seed)
+
+    def noisy(self, seed: int) -> Tensor:
+        return self.picture + self.noise * torch.randn(64, 64, 3, generator=torch.Generator().manual_seed(seed % 2**31))
+
+    def halves(self, u: Tensor, seed: int, spp: int) -> tuple[Tensor, Tensor, Tensor]:
+        return self.noisy(seed + 1), self.noisy(seed + 2), self.picture
+
+    def mask(self, u: Tensor) -> Tensor:
+        return self.seen
+
+
+def of_model(picture: Tensor, u: Tensor) -> float:
+    return 0.0
+
+
+def seen(change: Callable[[Tracer, Tensor], Tensor], margin: Callable[[Tensor, Tensor], float] = of_model) -> Any:
+    """The comparison of a picture that is changed."""
+    tracer: Any = Tracer()
+    predicted = change(tracer, tracer.picture.clone())
+    return compared(lambda number: view_of(tracer, predicted, torch.zeros(1), 10 * number, 8, margin)), predicted
+
+
+def brighter(tracer: Tracer, picture: Tensor) -> Tensor:
+    picture[tracer.seen] *= 1.25
+    return picture
+
+
+def test_a_small_object_that_is_too_bright_is_refused() -> None:
+    """Over the whole picture it would be less than two levels off."""
+    found, predicted = seen(brighter)
+    whole = 255.0 * float((predicted - Tracer().picture).square().mean().sqrt())
+    assert whole < 3.0 and found.levels > 25.0 and not found.good
+    assert "levels of 255 off on the object" in found.reason
+    right, _ = seen(lambda tracer, picture: picture)
+    assert right.good and right.levels < BOUND
+
+
+def test_a_bias_of_the_margin_is_refused_where_the_picture_is_near_enough() -> None:
+    def model(picture: Tensor, u: Tensor) -> float:
+        return 100.0 * float(picture[..., 0].mean())
+
+    found, _ = seen(lambda tracer, picture: picture + 0.005, model)
+    assert found.levels < BOUND and found.logits == pytest.approx(0.5, abs=1e-3) and not found.good
+    assert found.reason == "+0.50 off in the margin, where 0.30 would do"
+
+
+def test_the_noise_of_traced_pictures_does_not_count() -> None:
+    tracer = Tracer(noise=0.05)
+    off = [squares_off(tracer.picture + 0.02, (tracer.noisy(2 * n), tracer.noisy(2 * n + 1))) for n in range(8)]
+    assert np.mean(off) == pytest.approx((255 * 0.02) ** 2, rel=0.1)
