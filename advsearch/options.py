@@ -39,7 +39,8 @@ def by_key(controls: Mapping[str, object]) -> dict[str, object]:
         kind, colon, key = str(name).partition(":")
         if kind != BY_KEY or not colon:
             _, dot, parameter = str(name).partition(".")
-            alone = dot and ":" not in name and not (given is None or isinstance(given, Mapping))
+            spec = isinstance(given, Mapping) and bool(given.keys() & {"distribution", "choices", "range"})
+            alone = dot and ":" not in name and not (given is None or (isinstance(given, Mapping) and not spec))
             found[name] = {parameter: given} if alone else given
         elif not key or given is None or given in ({}, ""):
             raise InputError(f"`controls` {name}: expected a range, as in {BY_KEY}:{key or 'KEY'}=[0.2, 0.8]")

@@ -25,6 +25,7 @@ SOURCES = {"advsearch": ROOT / "advsearch", "advsearch.bundled": ROOT / "scenes"
 RENDERER = {"mitsuba", "drjit", "mitsuba_oidn"}
 COMMON = {
     "copies",
+    "distributions",
     "described",
     "errors",
     "files",

@@ -226,7 +226,7 @@ def asks(config: type[Config], keywords: type[Any]) -> Callable[[Function], Func
                             "takes your own, and `sweep` a task of your own"
                         )
                 for key in {"controls", "over"} & plain.keys() - own.parameters.keys():
-                    if loading.instances_in(plain[key]):
+                    if loading.instances_in(plain[key]) or isinstance(plain[key], Mapping):
                         if loading.only_here(plain[key]):
                             check_not_spread(plain)
                         stack.enter_context(

@@ -273,10 +273,11 @@ class ContentsControl(NumberControl):
         bounds: dict[str, tuple[float, float]] = {}
         for name in INGREDIENTS:
             spec = self.specs.get(name)
-            if isinstance(spec, OneOf):
+            if spec is not None and not isinstance(spec, Fixed) and type(spec) is not Range:
+                got = "a list of values; a choice" if isinstance(spec, OneOf) else "a distribution; a draw"
                 raise InputError(
-                    f"{self.name}.{name}: expected a number or a range [low, high], got a list of values; a choice "
-                    "among proportions would not add up to 1"
+                    f"{self.name}.{name}: expected a number or a range [low, high], got {got} among proportions would "
+                    "not add up to 1"
                 )
             if isinstance(spec, Fixed):
                 bounds[name] = (float(spec.value), float(spec.value))

@@ -41,7 +41,8 @@ from advsearch.controls.values import (
     to_value,
 )
 from advsearch.copies import copied, hand_copies, is_ours
-from advsearch.errors import UnknownNameError
+from advsearch.distributions import as_setting
+from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.description import ENVIRONMENT, SceneDescription
 
 Values = Mapping[str, Tensor]
@@ -76,6 +77,7 @@ class NumberControl(Control, ABC):
 
     def __init__(self, name: str | None = None, **settings: object) -> None:
         self.name = name or self.kind
+        settings = {setting: as_setting(value) for setting, value in settings.items()}
         own = self.own = self.declared(settings)
         known = [one.name for one in own] + [one.name for one in self.choices]
         for setting in settings:
@@ -236,7 +238,7 @@ class Slot:
     def periodic(self) -> bool:
         """Whether the range is a whole turn."""
         spec, parameter = self.spec, self.parameter
-        return parameter.periodic and isinstance(spec, Range) and abs(spec.high - spec.low - 360.0) < 1e-9
+        return parameter.periodic and type(spec) is Range and abs(spec.high - spec.low - 360.0) < 1e-9
 
     def start_value(self) -> Number:
         """The default, or the nearest value that is allowed; of names, the first one that is allowed."""
@@ -283,6 +285,8 @@ class BoundNumbers(BoundControl):
         parameter, spec = slot.parameter, slot.spec
         options = len(spec.values) if isinstance(spec, OneOf) else 0
         estimators = () if options else self.control.estimators(self.scene, parameter)
+        if type(spec) not in (OneOf, Range) and self.control.budget(self.scene, parameter) != WHOLE_RANGE:
+            raise InputError(f"{self.name}.{parameter.name}: it has a ball and no distribution; give it a range")
         return Group(
             parameter.name,
             slot.width,
@@ -302,7 +306,8 @@ class BoundNumbers(BoundControl):
         for slot in self.slots:
             parameter, spec, place = slot.parameter, slot.spec, slice(slot.begin, slot.begin + slot.size)
             if isinstance(spec, Range):
-                value = to_value(spec, log=True, u=u[place]) if parameter.log else every[place]
+                mapped = parameter.log or type(spec) is not Range
+                value = to_value(spec, log=parameter.log, u=u[place]) if mapped else every[place]
                 found[parameter.name] = value if parameter.shape else value.reshape(())
                 continue
             one = spec.value if isinstance(spec, Fixed) else spec.values[option_index(len(spec.values), u[slot.begin])]

@@ -136,10 +136,9 @@ class PatchControl(Control):
         if self.picture is not None:
             raise InputError(f"{self.name}.pixels: expected none beside {self.name}.picture; leave one of them out")
         spec = read(f"{self.name}.pixels", self.parameters[0], self._pixels_given)
-        if isinstance(spec, OneOf):
-            raise InputError(
-                f"{self.name}.pixels: expected [low, high] or one number, got a list of {len(spec.values)}"
-            )
+        if not isinstance(spec, Fixed) and type(spec) is not Range:
+            got = f"a list of {len(spec.values)}" if isinstance(spec, OneOf) else "a distribution"
+            raise InputError(f"{self.name}.pixels: expected [low, high] or one number, got {got}")
         return spec
 
     def bind(self, scene: SceneDescription) -> BoundControl:

@@ -2,7 +2,8 @@
 
     pose: {yaw: [0, 360], pitch: 10, scale: {choices: [0.8, 1.0, 1.2]}}
 
-Two numbers in a list are a range; three or more, or names, are a choice. Where a control leaves out a value of the
+Two numbers in a list are a range; three or more, or names, are a choice. `{range: [low, high]}` and `{choices: [...]}`
+say which. Values that are drawn may have weights, or a distribution (`advsearch.controls.drawn`). Where a control leaves out a value of the
 clean scene that was asked for, the two contradict each other, and that is refused. Where it leaves out only a default,
 the clean scene has the nearest value that the control allows, and that is said: a `Moved`.
 """
@@ -13,12 +14,13 @@ import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import groupby
+from itertools import groupby, pairwise
 from typing import TypeGuard
 
 import torch
 from torch import Tensor
 
+from advsearch.distributions import CHOICES, DISTRIBUTION, WEIGHTS, as_setting
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.description import ENVIRONMENT, SceneDescription, check_one_environment
 from advsearch.scene.settings import SETTINGS, Parameter
@@ -58,7 +60,8 @@ Spec = Fixed | Range | OneOf
 
 
 def plain(given: object) -> object:
-    """Return numbers and arrays of numpy and torch, also in a list, as Python's."""
+    """Return numbers and arrays of numpy and torch, also in a list, as Python's, and distributions as settings."""
+    given = as_setting(given)
     if isinstance(given, (list, tuple)):
         return type(given)(map(plain, given))
     return given.tolist() if hasattr(given, "tolist") and hasattr(given, "dtype") else given
@@ -70,15 +73,28 @@ def read(where: str, parameter: Parameter, given: object) -> Spec:
     Args:
         where: how messages name it, e.g. "pose.yaw".
         parameter: says what is allowed.
-        given: a number or a name, [low, high], a list of values, or {"choices": [...]}.
+        given: a number or a name, [low, high], a list of values, {"range": [low, high]}, {"choices": [...]}, perhaps
+            with "weights", or a distribution.
 
     Raises:
         InputError: not such a form, or a value outside the parameter's range.
     """
+    if isinstance(given, Mapping) and DISTRIBUTION in given and not parameter.options:
+        from advsearch.controls.drawn import read_drawn  # which is made of what is here
+
+        return read_drawn(where, parameter, given)
+    if isinstance(given, Mapping) and set(given) == {"range"} and _is_list(given["range"]) and len(given["range"]) == 2:
+        given = given["range"]
     if isinstance(given, Mapping):
-        if set(given) != {"choices"} or not _is_list(given["choices"]) or not given["choices"]:
-            raise InputError(f"{where}: expected {{choices: [value, ...]}}, got {dict(given)!r}")
-        return _choices(where, [_value(where, parameter, one) for one in given["choices"]])
+        if not {CHOICES} <= set(given) <= {CHOICES, WEIGHTS} or not _is_list(given[CHOICES]) or not given[CHOICES]:
+            raise InputError(
+                f"{where}: expected {{range: [low, high]}}, {{choices: [value, ...]}}, {{choices: [value, ...], "
+                "weights: [number, ...]}}"
+                + ("" if parameter.options else " or {distribution: NAME, ...}")
+                + f", got {dict(given)!r}"
+            )
+        values = [_value(where, parameter, one) for one in given[CHOICES]]
+        return _weighted(where, _choices(where, values), given[WEIGHTS]) if WEIGHTS in given else _choices(where, values)
     if not _is_list(given):
         return Fixed(_value(where, parameter, given))
     values = [_value(where, parameter, one) for one in given]  # type: ignore[attr-defined]
@@ -90,7 +106,14 @@ def read(where: str, parameter: Parameter, given: object) -> Spec:
     if low == high:
         raise InputError(f"{where}: the range [{low:g}, {high:g}] has no size; write {low:g} to fix the value")
     if low > high:
-        raise InputError(f"{where}: the range [{low:g}, {high:g}] is reversed; write [{high:g}, {low:g}]")
+        mend = f"write [{high:g}, {low:g}]"
+        if parameter.periodic and low - high < TURN:
+            ends = (low - TURN, high) if low - TURN >= parameter.low else (low, high + TURN)
+            mend = (
+                f"write [{ends[0]:g}, {ends[1]:g}] for the {TURN - low + high:g} degrees from {low:g} through "
+                f"{0 if ends[0] <= 0 else TURN:g} to {high:g}, or [{high:g}, {low:g}] for the other {low - high:g}"
+            )
+        raise InputError(f"{where}: the range [{low:g}, {high:g}] is reversed; {mend}")
     if parameter.log and low <= 0.0:
         raise InputError(f"{where}: expected a range over 0 (it is searched on a logarithmic scale), got {low:g}")
     return Range(low, high)
@@ -102,6 +125,34 @@ def _choices(where: str, values: Sequence[Number]) -> OneOf:
     if twice:
         raise InputError(f"{where}: expected different choices, got {shown(twice[0])} twice; leave one of them out")
     return OneOf(tuple(values))
+
+
+MOST_SHARES = 1000
+"""Equal shares of probability that weights are rounded to, at most."""
+
+
+def _weighted(where: str, choice: OneOf, weights: object) -> OneOf:
+    """A choice that has each value as often as its weight says, so that equal shares of u draw it so."""
+    values = choice.values
+    numbers = [one for one in weights if is_number(one) and one >= 0.0] if _is_list(weights) else []  # type: ignore[attr-defined]
+    if len(numbers) != len(values) or not _is_list(weights) or len(weights) != len(values) or not sum(numbers):  # type: ignore[arg-type]
+        raise InputError(
+            f"{where}: expected a weight of at least 0 for each of {len(values)} values, and one over 0, got {weights!r}"
+        )
+    shares = [one / sum(numbers) for one in numbers]
+    exact = (n for n in range(1, MOST_SHARES) if all(abs(n * one - round(n * one)) < CLOSE * n for one in shares))
+    count = next(exact, MOST_SHARES)
+    ends = [0, *(round(count * sum(shares[: number + 1])) for number in range(len(shares)))]
+    counts = [high - low for low, high in pairwise(ends)]
+    lost = [value for value, number, one in zip(values, counts, shares, strict=True) if one and not number]
+    if lost:
+        raise InputError(f"{where}: {shown(lost[0])} has less than a {MOST_SHARES}th of the weight; leave it out")
+    return OneOf(tuple(value for value, number in zip(values, counts, strict=True) for _ in range(number)))
+
+
+def by_distribution(spec: Spec) -> bool:
+    """Return whether a spec says how likely each value is."""
+    return type(spec) not in (Fixed, Range) and (not isinstance(spec, OneOf) or len({*spec.values}) < len(spec.values))
 
 
 def _is_list(given: object) -> bool:
@@ -141,13 +192,15 @@ def in_words(spec: Spec) -> str:
     """Say what a parameter is set to: ``10``, ``from 5 to 30``, ``one of noon, kitchen``."""
     if isinstance(spec, Range):
         return f"from {spec.low:g} to {spec.high:g}"
-    values = (spec.value,) if isinstance(spec, Fixed) else spec.values
+    values = (spec.value,) if isinstance(spec, Fixed) else dict.fromkeys(spec.values)
     written = ", ".join(map(shown, values))
     return written if isinstance(spec, Fixed) else f"one of {written}"
 
 
 def to_value(spec: Range, log: bool, u: Tensor) -> Tensor:
     """Map coordinates in [0, 1] to values of a range; differentiable."""
+    if hasattr(spec, "at"):
+        return spec.at(u)  # type: ignore[no-any-return]
     if log:
         return torch.exp(torch.lerp(torch.full_like(u, math.log(spec.low)), torch.full_like(u, math.log(spec.high)), u))
     return spec.low + (spec.high - spec.low) * u
@@ -155,6 +208,8 @@ def to_value(spec: Range, log: bool, u: Tensor) -> Tensor:
 
 def to_unit(spec: Range, log: bool, value: float) -> float:
     """Map a value to its coordinate, clipped to [0, 1]."""
+    if hasattr(spec, "coordinate"):
+        return spec.coordinate(value)  # type: ignore[no-any-return]
     if log:
         value = max(value, 1e-30)
         share = (math.log(value) - math.log(spec.low)) / (math.log(spec.high) - math.log(spec.low))

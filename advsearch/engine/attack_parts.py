@@ -25,7 +25,7 @@ from advsearch.config.attack import OVER_NUMBERS, OVER_ONE, OVER_PREDICTED, OVER
 from advsearch.config.scene import one_only
 from advsearch.controls import make_space
 from advsearch.controls.base import Control
-from advsearch.controls.values import sentences
+from advsearch.controls.values import by_distribution, sentences
 from advsearch.engine.judging import Described, Looked, Metrics, check_truth, facts_of, load_metrics, shown
 from advsearch.engine.loading import SCENE, Controls, Scene, framed, lent, make_renderer
 from advsearch.engine.naming import AnyModel, check_run_settings, given_to, load_models, scene_of, several
@@ -106,7 +106,15 @@ def controls_given(
     budget."""
     check_run_settings(config)
     without_budget = config.model_copy(update={"epsilon": None})
-    return given_to(config, searched), given_to(without_budget, drawn)
+    found = given_to(config, searched)
+    for one in found:
+        likely = [name for name, spec in getattr(one, "specs", {}).items() if by_distribution(spec)]
+        if likely:
+            raise InputError(
+                f"`controls` {one.name}.{likely[0]}: expected values to search, which are all as good, got how likely "
+                "each is; give a range, or put it into `over`, under which it varies by chance"
+            )
+    return found, given_to(without_budget, drawn)
 
 
 def task_and_objective(

@@ -15,6 +15,7 @@ import numpy.typing as npt
 from torch import Tensor
 
 from advsearch.controls import CONTROLS, Control, Space, gathered, make_control, make_space, settings_by_name
+from advsearch.distributions import OwnQuantiles, as_setting
 from advsearch.errors import InputError
 from advsearch.models.guards import plainly
 from advsearch.options import told
@@ -294,7 +295,7 @@ def as_controls(controls: Controls) -> tuple[Control, ...]:
 def controls_by_name(controls: Controls) -> dict[str, Control | Mapping[str, object]]:
     """Return instances and settings by name, in the order in which they were given."""
     if isinstance(controls, Mapping):
-        asked = dict(controls)
+        asked = {name: _plain(one) for name, one in controls.items()}
         for name, one in asked.items():
             if isinstance(one, type) or (isinstance(one, Control) and one.name != name):
                 got = f"one that is called {one.name}" if isinstance(one, Control) else told(one)
@@ -307,6 +308,15 @@ def controls_by_name(controls: Controls) -> dict[str, Control | Mapping[str, obj
     ready = {name: one for name, one in asked.items() if isinstance(one, Control)}
     named = settings_by_name({**asked, **dict.fromkeys(ready)})
     return {name: ready.get(name, given) for name, given in named.items()}
+
+
+def _plain(given: object) -> object:
+    """What was given for one control, or one parameter of one, with distributions as settings have them."""
+    if isinstance(given, (Control, type)):
+        return given
+    if isinstance(given, Mapping) and not given.keys() & {"distribution", "choices", "range"}:
+        return {key: as_setting(one) for key, one in given.items()}
+    return as_setting(given)
 
 
 def _listed(controls: str | Control | Iterable[object]) -> dict[str, object]:
@@ -359,5 +369,13 @@ def lending(kind: str, things: Mapping[str, Any]) -> Iterator[None]:
 
 
 def only_here(controls: Controls) -> list[str]:
-    """Return the classes of controls that have no name by which a file or another process could ask for them."""
-    return [type(one).__name__ for one in instances_in(controls) if CONTROLS.get(one.kind) is not type(one)]
+    """Return the classes of controls that have no name by which a file or another process could ask for them, and the
+    parameters that functions from Python draw."""
+    classes = [type(one).__name__ for one in instances_in(controls) if CONTROLS.get(one.kind) is not type(one)]
+    drawn = [
+        f"{name if '.' in name else f'{name}.{parameter}'} (drawn by {value['name']})"
+        for name, given in settings_of(controls).items()
+        for parameter, value in given.items()
+        if isinstance(value, OwnQuantiles)
+    ]
+    return [*classes, *drawn]

@@ -269,7 +269,7 @@ def _conditions(problem: Problem) -> dict[str, VariedValue]:
         if numbers and not block.options:
             found[group.name] = VariedValue(unit=unit, low=min(numbers), high=max(numbers))
         elif told:
-            found[group.name] = VariedValue(unit=unit, names=[number_text(one) for one in told])
+            found[group.name] = VariedValue(unit=unit, names=[number_text(one) for one in dict.fromkeys(told)])
     return found
 
 

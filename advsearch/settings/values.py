@@ -13,6 +13,7 @@ from typing import Any
 
 from pydantic import ValidationInfo, field_validator
 
+from advsearch.distributions import OwnQuantiles
 from advsearch.errors import FileFormatError, InputError
 from advsearch.files import read_text
 from advsearch.yaml_text import LARGEST, parse_yaml
@@ -31,6 +32,8 @@ def is_shallow(value: Any, levels: int = DEEPEST) -> bool:
 
 def as_python(value: Any) -> Any:
     """Return numbers and arrays of numpy and torch in `value`, which `is_shallow`, as Python's."""
+    if isinstance(value, OwnQuantiles):
+        return value
     if isinstance(value, Mapping):
         return {as_python(name): as_python(inner) for name, inner in value.items()}
     if isinstance(value, (list, tuple)):

@@ -58,13 +58,15 @@ class Picks:
 @dataclass(frozen=True)
 class Drawn:
     """A drawn number, as the table shows it: its column of `Picks.shares`, and what equal parts of [0, 1] stand for:
-    pairs of ends, or values of a list; if `settled`, in every scene."""
+    pairs of ends, or values of a list; if `settled`, in every scene. Where values have weights, `shares` says which part
+    each of more equal shares stands for."""
 
     name: str
     unit: str
     column: int
     parts: tuple[Any, ...]
     settled: bool = True
+    shares: tuple[int, ...] = ()
 
     @property
     def varied(self) -> VariedValue:
@@ -120,7 +122,7 @@ class Points:
         self.drawn = self._lay_out()
         small, large = (chosen[-1][2].stop if chosen else 0 for chosen in (self._small, self._large))
         self._columns = [one.column for one in self.drawn]
-        self._sizes = np.array([len(one.parts) for one in self.drawn], dtype=np.int64)
+        self._sizes = np.array([len(one.shares or one.parts) for one in self.drawn], dtype=np.int64)
         self._draws = Draws(small, sampler, seed)
         self._noise = Draws(large, "random", seed, "large draws")
         shown = tuple((one.name, one.column, len(one.parts)) for one in self.drawn)
@@ -161,7 +163,9 @@ class Points:
         parameter, spec = _spec(control, name)
         full = f"{control.name}.{name}"
         if isinstance(spec, OneOf):
-            return [Drawn(full, _unit(parameter), first, spec.values)]
+            values = tuple(dict.fromkeys(spec.values))
+            shares = () if values == spec.values else tuple(map(values.index, spec.values))
+            return [Drawn(full, _unit(parameter), first, values, shares=shares)]
         found = []
         for number in range(block.size):
             low, high = (float(ends[part.start + number]) for ends in (self._lower, self._upper))
@@ -179,6 +183,9 @@ class Points:
         digits = [self.digits(number) for number in range(first, first + count)]
         shares = self._drawn(self._draws, before + first, count)
         parts = np.minimum((shares[:, self._columns] * self._sizes).astype(np.int64), self._sizes - 1)
+        for number, one in enumerate(self.drawn):
+            if one.shares:
+                parts[:, number] = np.take(one.shares, parts[:, number])
         return Picks(before + first, digits, shares, parts.tolist())
 
     def digits(self, number: int) -> tuple[int, ...]:
