@@ -107,6 +107,23 @@ def test_a_file_of_such_faces_only_has_none(tmp_path: Path) -> None:
         read(tmp_path, MAPPED + "f 1 2\nf 3\n")
 
 
+def test_a_ply_loses_them_too_and_keeps_colours_and_coordinates_of_the_others(tmp_path: Path) -> None:
+    path = tmp_path / "a.ply"
+    faces = "2 0 1 2 0 0 1 1 9 0 0\n4 0 1 2 3 8 0 0 1 0 1 1 0 1 0 255 0\n1 3 0 0 0 9\n"
+    path.write_text(
+        "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
+        "element face 3\nproperty list uchar int vertex_indices\nproperty list uchar float texcoord\n"
+        "property uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n"
+        "0 0 0\n1 0 0\n1 1 0\n0 1 0\n"
+        + faces.replace("2 0 1 2 0 0 1 1 9 0 0", "2 0 1 4 0 0 1 1 9 0 0").replace("1 3 0 0 0 9", "1 3 2 0 0 0 0 9")
+    )
+    (part,), notes = read_parts(path, path.read_bytes())
+    assert areas(part).sum() == pytest.approx(1.0) and part.colors is not None and part.uvs is not None
+    assert part.colors.reshape(-1, 3) == pytest.approx(np.tile([0.0, 1.0, 0.0], (6, 1)))
+    assert (part.uvs == part.vertices[:, :2]).all()
+    assert notes == ["a.ply: 2 faces of fewer than 3 corners left out"]
+
+
 # ---- means ----------------------------------------------------------------------------------------------------------
 
 

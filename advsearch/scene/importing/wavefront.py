@@ -33,7 +33,7 @@ from advsearch.scene.importing.files import (
 from advsearch.scene.importing.mtl import without_comment
 from advsearch.scene.importing.mtl_surfaces import MtlReader, Painted, libraries_of
 from advsearch.scene.importing.parts import NEUTRAL, ImportedPart, ImportedSurface, Looked, split_at_corners
-from advsearch.scene.importing.polygons import triangulated
+from advsearch.scene.importing.polygons import FEW, triangulated
 
 GROUPING = frozenset(("g", "o"))
 """Statements that only name parts; all parts are joined."""
@@ -62,8 +62,9 @@ def read_obj(path: Path, data: bytes) -> tuple[list[ImportedPart], list[str]]:
     tables = {kind: lines.table(kind) for kind in TABLES}
     if not len(tables["v"]):
         raise damaged(path, EXPECTED, looks_like(data))
-    corners, counts, rows, few = lines.faces({kind: len(table) for kind, table in tables.items()})
-    if not len(counts):
+    corners, counts, rows = lines.faces({kind: len(table) for kind, table in tables.items()})
+    few = int((counts < 3).sum())
+    if few == len(counts):
         raise FileFormatError(f"{path}: expected a mesh with faces, got points or lines only; export triangles")
     inventory, references = Inventory(), References(path)
 
@@ -77,7 +78,7 @@ def read_obj(path: Path, data: bytes) -> tuple[list[ImportedPart], list[str]]:
     for name in libraries_of(said.libraries, references):
         reader.read_library(name)
     if few:
-        reader.note(f"{path.name}: {few:,} {'face' if few == 1 else 'faces'} of fewer than 3 corners left out")
+        reader.note(f"{path.name}: {FEW.format(count=few, s='' if few == 1 else 's')}")
     points = tables["v"][:, :3]
     triangles, face, wrong = triangulated(points[corners[:, 0]], counts)
     if wrong:
@@ -299,17 +300,16 @@ class Lines:
         table[np.repeat(np.arange(len(rows)), counts)[kept], place[kept]] = values[kept]
         return table
 
-    def faces(self, counts: dict[str, int]) -> tuple[Ints, Ints, Ints, int]:
+    def faces(self, counts: dict[str, int]) -> tuple[Ints, Ints, Ints]:
         """Return the corners of all faces: (C, 3) rows of the tables of points, texture coordinates and normals, -1
-        where there is none; (P,) how many corners each face has; (P,) the rows that they are in; and how many faces of
-        fewer than 3 corners are left out.
+        where there is none; (P,) how many corners each face has; and (P,) the rows that they are in.
 
         Raises:
             FileFormatError: a face is damaged, is too large, or refers to what is not there; or they are too many.
         """
         rows, data = self._of("f")
         if not len(rows):
-            return np.zeros((0, 3), np.int64), rows, rows, 0
+            return np.zeros((0, 3), np.int64), rows, rows
         blank, slash = _BLANK[data], data == _SLASH
         number = ~(blank | slash)
         begins = np.flatnonzero(number[1:] & ~number[:-1]) + 1
@@ -325,20 +325,18 @@ class Lines:
             self._blame_faces(rows)
         at = np.flatnonzero(first)
         sizes = np.diff(np.searchsorted(begins[at], np.flatnonzero(data == _NEWLINE)), prepend=0)
-        few = sizes < 3
-        if few[-1] and self.unended and rows[-1] == len(self.starts) - 1:
+        if sizes[-1] < 3 and self.unended and rows[-1] == len(self.starts) - 1:
             self._blame_faces(rows[-1:])
         if sizes.max() > files.scaled(MOST_CORNERS):
             expected = f"at most {files.scaled(MOST_CORNERS):,} corners in the face on line {rows[sizes.argmax()] + 1}"
             raise files.too_large(self.path, expected, f"{sizes.max():,}")
-        check_faces(self.path, int((sizes[~few] - 2).sum()))
+        check_faces(self.path, int((sizes - 2).clip(0).sum()))
         corners = np.zeros((len(at), 3), dtype=np.int64)
         corners[np.cumsum(first) - 1, place] = values
-        corners, sizes, rows = corners[np.repeat(~few, sizes)], sizes[~few], rows[~few]
-        if not len(sizes):
-            return corners, sizes, rows, len(few)
         for column, kind in enumerate(TABLES):
             index = corners[:, column]
+            if not len(index):
+                continue
             if (index < 0).any():
                 before = np.repeat(np.cumsum(self.kind == KINDS.index(kind))[rows], sizes)
                 if (index < -before).any():
@@ -348,7 +346,7 @@ class Lines:
                 row = rows[np.searchsorted(np.cumsum(sizes), int(index.argmax()), side="right")]
                 got = f"{counts[kind]}, and a face on line {row + 1} that refers to number {index.max()}"
                 raise damaged(self.path, f"at least {index.max()} {kind!r} lines", f"{got} (is the file cut short?)")
-        return corners - 1, sizes, rows, int(few.sum())
+        return corners - 1, sizes, rows
 
     def zbrush_colors(self, count: int) -> Doubles | None:
         """Return the colours (N, 3) in [0, 255] that ZBrush writes into comments (``#MRGB``), or None."""
