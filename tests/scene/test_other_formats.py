@@ -66,6 +66,19 @@ def test_a_buffer_names_the_file_beside_it(tmp_path: Path) -> None:
         import_object(tmp_path / "scene.bin")
 
 
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("a.ply#lid", r"a\.ply: has no parts by name, got #lid"),
+        ("a.fbx#lid", "an FBX model"),
+        ("a.nonsense#lid", r"got '\.nonsense#lid'"),
+    ],
+)
+def test_a_part_of_a_file_without_parts_is_told_so(name: str, words: str, tmp_path: Path) -> None:
+    with pytest.raises(FileFormatError, match=words):
+        import_object(tmp_path / name)
+
+
 def test_a_ply_of_splats_is_not_called_points(tmp_path: Path) -> None:
     path = tmp_path / "point_cloud.ply"
     path.write_text(

@@ -69,7 +69,10 @@ def read_bytes(path: Path, what: str, suffixes: Sequence[str]) -> bytes:
         if path.is_dir():
             raise FileFormatError(f"{path}: expected a file with an {what}, got a directory; name a file inside it")
         if path.suffix.lower() not in suffixes:
-            known = None if what == "environment" else advice(path)
+            file, _, part = str(path).rpartition("#")
+            if part and Path(file).suffix.lower() in suffixes:
+                raise FileFormatError(f"{file}: has no parts by name, got #{shown(part, quoted=False)}; leave it out")
+            known = None if what == "environment" else advice(Path(file) if file else path)
             if known is not None:
                 raise FileFormatError(f"{path}: {known} (read are {files.either(suffixes)})")
             got = f"got {path.suffix!r}" if path.suffix else "got a name without ending"
