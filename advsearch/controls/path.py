@@ -10,7 +10,7 @@ from __future__ import annotations
 import csv
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,6 +22,7 @@ from advsearch.controls.base import Choice, Parameter, Value
 from advsearch.controls.numbers import NumberControl, Values
 from advsearch.errors import FileFormatError, InputError
 from advsearch.files import read_text
+from advsearch.scene.assets import Doubles
 from advsearch.scene.description import ORBIT_CAMERA, SceneDescription
 from advsearch.scene.geometry import affine, camera_to_world, middle, object_to_world
 from advsearch.scene.settings import GEOMETRIC, ORBIT, moving
@@ -37,6 +38,12 @@ CLEAN_AT = {APPROACH: 1.0, PASS: 0.5, TURN: 0.0}
 REACH, SECONDS = 4.0, 10.0
 SHORTEST, LONGEST = 1e-3, 3600.0
 """Seconds between waypoints at least, and of a path at most."""
+ROUNDED = 1e-3
+"""Share of the least time between waypoints that may be lost where times are written in decimals."""
+NEAREST = 1e-3
+"""Object sizes from the camera to what it looks at, at least: nearer, it looks nowhere."""
+LOOKS = 2048
+"""Times at which curved paths are looked at; a file's waypoints are in addition."""
 TIME, PLACE, LOOKING, HEADING = "time", ("x", "y", "z"), ("look_x", "look_y", "look_z"), "heading"
 SHIFT, TURNING = ("object_x", "object_y", "object_z"), "object_heading"
 """Columns of the object in a file that is about both."""
@@ -54,19 +61,21 @@ class Waypoints:
         places: (n, 3) object sizes from the middle of where the object stands; of an object that moves, its shift.
         targets: (n, 3) what the camera looks at, from the same middle; None for the middle itself.
         headings: (n,) degrees that the object is turned by; None for none.
+        notes: sentences about how it is read.
     """
 
     times: Tensor
     places: Tensor
     targets: Tensor | None
     headings: Tensor | None
+    notes: tuple[str, ...] = ()
 
     def at(self, time: Tensor, of: Tensor) -> Tensor:
-        """Return a column, or several, at a time, linear between waypoints; differentiable in the time."""
-        place = int(torch.searchsorted(self.times, time.detach().clamp(self.times[0], self.times[-1]), right=True))
-        place = min(max(place, 1), len(self.times) - 1)
+        """Return a column, or several, at times (...,), linear between waypoints; differentiable in the times."""
+        place = torch.searchsorted(self.times, time.detach(), right=True).clamp(1, len(self.times) - 1)
         begin, end = self.times[place - 1], self.times[place]
-        return torch.lerp(of[place - 1], of[place], ((time - begin) / (end - begin)).clamp(0.0, 1.0))
+        share = ((time - begin) / (end - begin)).clamp(0.0, 1.0)
+        return torch.lerp(of[place - 1], of[place], share[..., None] if of.ndim > 1 else share)
 
 
 class Start(NamedTuple):
@@ -140,7 +149,33 @@ class PathControl(NumberControl):
                 f"`controls` {self.name}: moves the camera, and the scene is seen by its camera {scene.camera!r}; give "
                 f"moves=object, or have it seen by {ORBIT_CAMERA!r}"
             )
-        return scene
+        if CAMERA in self._ways:
+            self._check_looks(scene)
+        wide = [note for way in self._ways.values() if isinstance(way, Waypoints) for note in way.notes]
+        return replace(scene, remarks=tuple(dict.fromkeys((*scene.remarks, *wide)))) if wide else scene
+
+    def _check_looks(self, scene: SceneDescription) -> None:
+        """Refuse a path on which the camera is at what it looks at, at a waypoint or between two.
+
+        Raises:
+            InputError: it is, somewhere.
+        """
+        files = [way.times for way in self._ways.values() if isinstance(way, Waypoints)]
+        time = torch.cat([torch.linspace(0.0, self.seconds, LOOKS), *files]).unique()
+        begin = self._start(scene, time)
+        place, target = self._camera(begin, time, self._object(begin, time)[0])
+        gap = (target - place).expand(len(time), 3).double()
+        step = gap[1:] - gap[:-1]
+        share = (-(gap[:-1] * step).sum(dim=1) / step.square().sum(dim=1).clamp_min(1e-300)).clamp(0.0, 1.0)
+        away = (gap[:-1] + share[:, None] * step).norm(dim=1)
+        if float(away.min()) < NEAREST:
+            at = int(away.argmin())
+            when = float(torch.lerp(time[at], time[at + 1], share[at].float()))
+            raise InputError(
+                f"`controls` {self.name}: {self.chosen['path']}: {when:.4g} s after its start the camera is where it "
+                "looks, so that it has no direction; lead it past that place, or say what it looks at (look_x, look_y, "
+                "look_z)"
+            )
 
     def default(self, scene: SceneDescription, parameter: Parameter) -> float | str:
         first, *last = self._ways.values()
@@ -195,12 +230,13 @@ class PathControl(NumberControl):
         ahead = ahead / ahead.norm().clamp_min(1e-6)
         share = self._share(time)
         if way == APPROACH:
-            return start - ahead * away * (reach - 1.0) * (1.0 - share), center + shift
+            return start - ahead * away * (reach - 1.0) * (1.0 - share)[..., None], center + shift
         if way == PASS:
-            return start + own[:3, 0] * away * reach * (1.0 - 2.0 * share), center + shift
+            return start + own[:3, 0] * away * reach * (1.0 - 2.0 * share)[..., None], center + shift
         angle = 2.0 * math.pi * share
         x, y, z = start - center
-        turned = torch.stack([angle.cos() * x - angle.sin() * y, angle.sin() * x + angle.cos() * y, z.expand(())])
+        cos, sin = angle.cos(), angle.sin()
+        turned = torch.stack([cos * x - sin * y, sin * x + cos * y, z.expand(angle.shape)], dim=-1)
         return center + turned, center + shift
 
     def _object(self, begin: Start, time: Tensor) -> tuple[Tensor, Tensor]:
@@ -219,7 +255,7 @@ class PathControl(NumberControl):
         ahead = torch.stack([along[0], along[1], still])
         ahead = ahead / ahead.norm().clamp_min(1e-6)
         far = away * (reach - 1.0) * (1.0 - share) if way == APPROACH else away * reach * (1.0 - 2.0 * share)
-        return ahead * far, still
+        return ahead * far[..., None], still
 
 
 def looking(place: Tensor, target: Tensor, roll: float) -> Tensor:
@@ -239,6 +275,25 @@ def turned(start: Start, shift: Tensor, heading: Tensor) -> Tensor:
     about = torch.stack([angle.cos(), -angle.sin(), zero, angle.sin(), angle.cos(), zero, zero, zero, one])
     about = about.reshape(3, 3)
     return affine(about, center - about @ center + shift) @ start.object
+
+
+def the_shorter_way(degrees: Doubles) -> tuple[Doubles, str | None]:
+    """Return headings (n,) so that one goes to the next the shorter way round, and what is said of it.
+
+    Only where all are within one turn, from 0 to 360 or from -180 to 180: others count on, as 0 to 360 does for a whole
+    turn.
+    """
+    low, high = float(degrees.min()), float(degrees.max())
+    places = np.nonzero(np.abs(np.diff(degrees)) > 180.0)[0]
+    if (
+        not len(places)
+        or high - low >= 360.0
+        or not ((0.0 <= low and high <= 360.0) or (-180.0 <= low and high <= 180.0))
+    ):
+        return degrees, None
+    first, last = (f"{one:g}" for one in degrees[places[0] : places[0] + 2])
+    note = f"it turns the shorter way from {first} to {last} degrees; for the longer one, add a waypoint between them"
+    return np.asarray(np.unwrap(degrees, period=360.0)), note
 
 
 def _is_path(name: str) -> bool:
@@ -272,7 +327,7 @@ def read_waypoints(path: Path, mover: str, *, alone: bool = True) -> dict[str, W
     except ValueError as error:
         raise FileFormatError(f"{path}: expected {len(header)} numbers in each row, got something else") from error
     times = table[:, header.index(TIME)] - table[0, header.index(TIME)]
-    if not (np.isfinite(times).all() and (np.diff(times) > SHORTEST).all() and times[-1] <= LONGEST):
+    if not (np.isfinite(times).all() and (np.diff(times) >= SHORTEST * (1.0 - ROUNDED)).all() and times[-1] <= LONGEST):
         raise FileFormatError(
             f"{path}: expected times that ascend, by {SHORTEST:g} s at least and {LONGEST:g} s in all, got others"
         )
@@ -286,9 +341,12 @@ def read_waypoints(path: Path, mover: str, *, alone: bool = True) -> dict[str, W
         return torch.from_numpy(np.stack([column[one] for one in names], axis=1).astype(np.float32))
 
     def way(places: Tensor, targets: Tensor | None, heading: str) -> Waypoints:
-        headings = several(heading)
         seconds = torch.from_numpy(times.astype(np.float32))
-        return Waypoints(seconds, places, targets, None if headings is None else headings[:, 0])
+        if heading not in column:
+            return Waypoints(seconds, places, targets, None)
+        around, note = the_shorter_way(column[heading])
+        told = (f"{path}: {heading}: {note}",) if note else ()
+        return Waypoints(seconds, places, targets, torch.from_numpy(around.astype(np.float32)), told)
 
     places, shift = several(*PLACE), several(*SHIFT)
     assert places is not None

@@ -15,7 +15,7 @@ from typing import Any
 from xml.etree import ElementTree
 
 from advsearch.errors import FileFormatError
-from advsearch.files import parse_json, read_text
+from advsearch.files import MESHES, parse_json, read_text
 from advsearch.scene.camera_entries import Entries, made, nothing, number, plain, with_told
 from advsearch.scene.camera_model import BROWN_CONRADY, COEFFICIENTS, EQUIRECTANGULAR, FISHEYE, CameraModel
 from advsearch.scene.importing.files import shown
@@ -107,6 +107,8 @@ def read_camera(spec: str) -> CameraModel:
     ending = Path(path).suffix.lower()
     if ending in CONVERTED and Path(path).is_file():
         raise FileFormatError(f"{path}: expected a camera as text, got {CONVERTED[ending]}")
+    if ending in MESHES:
+        raise FileFormatError(f"{path}: expected a camera file, got a mesh; it is an object's, not a camera's")
     try:
         text = read_text(Path(path), "a camera file", LARGEST_JSON if ending == ".json" else LARGEST)
     except OSError as error:

@@ -190,6 +190,103 @@ def test_a_camera_over_the_object_has_a_pose(tmp_path: Path) -> None:
     assert bool(torch.isfinite(placed(bound(describe("mug"), path=str(file)), 0.5)).all())
 
 
+@pytest.mark.parametrize(
+    ("text", "when"),
+    [
+        ("time,x,y,z\n0,4,0,1.2\n1,0,0,0\n2,-4,0,1.2\n", "1 s"),  # at a waypoint
+        ("time,x,y,z\n0,4,0,2\n1,-4,0,-2\n", "0.5 s"),  # between two
+        ("time,x,y,z,look_x,look_y,look_z\n0,4,0,1,0,0,1\n4,4,0,1,8,0,1\n", "2 s"),  # what it looks at comes by
+        ("time,x,y,z,object_x,object_y,object_z\n0,4,0,0,0,0,0\n4,4,0,0,8,0,0\n", "2 s"),
+        ("time,x,y,z\n0,4,0,1.2\n1,0,0,0.1\n2,-4,0,1.2\n", None),
+        ("time,x,y,z,look_x,look_y,look_z\n0,4,0,1,9,0,1\n1,0,0,0,9,0,1\n", None),
+    ],
+)
+def test_a_path_through_what_the_camera_looks_at_is_refused(
+    scene: SceneDescription, text: str, when: str | None, tmp_path: Path
+) -> None:
+    file = tmp_path / "way.csv"
+    file.write_text(text)
+    if when is None:
+        control = bound(scene, path=str(file))
+        for share in torch.linspace(0.0, 1.0, 5).tolist():
+            turn = placed(control, share)[:3, :3]
+            torch.testing.assert_close(turn @ turn.T, torch.eye(3), atol=1e-5, rtol=0)
+        return
+    with pytest.raises(InputError, match=rf"way\.csv: {when} after its start the camera is where it looks"):
+        bound(scene, path=str(file))
+
+
+def test_a_path_through_what_it_looks_at_is_refused_where_no_file_is(tmp_path: Path) -> None:
+    level = describe("mug", given={"camera.elevation": 0.0})
+    file = tmp_path / "car.csv"
+    file.write_text("time,x,y,z\n0,-9,0,0\n1,9,0,0\n")  # past the middle; the camera is at +x, and looks at the object
+    east = describe("mug", given={"camera.elevation": 0.0, "camera.azimuth": 0.0})
+    with pytest.raises(InputError, match="the camera is where it looks"):
+        bound(east, path=f"approach+{file}")
+    for path in (*PATHS, "approach+orbit", "pass+pass"):
+        bound(level, path=path)
+
+
+def test_as_many_times_at_once_are_those_one_by_one(scene: SceneDescription, tmp_path: Path) -> None:
+    """By which a whole path is looked at."""
+    file = tmp_path / "way.csv"
+    file.write_text(WAY)
+    for path in (*PATHS, f"{file}+orbit", f"approach+{file}", "pass+pass"):
+        control = PathControl(path=path)
+        time = torch.linspace(0.0, control.seconds, 7)
+        start = control._start(scene, time)
+
+        def both(at: Tensor, control: PathControl = control, start: Any = start) -> Tensor:
+            place, target = control._camera(start, at, control._object(start, at)[0])
+            return (target - place).expand(*at.shape, 3)
+
+        torch.testing.assert_close(both(time), torch.stack([both(one) for one in time]))
+
+
+@pytest.mark.parametrize(
+    ("headings", "middles", "told"),
+    [
+        ([350, 10], [0.0], True),
+        ([10, 350], [0.0], True),
+        ([-170, 170], [180.0], True),
+        ([0, 360], [180.0], False),
+        ([0, 180], [90.0], False),
+        ([350, 370], [0.0], False),
+        ([350, 10, 40], [0.0, 25.0], True),
+        ([-180, 180], [0.0], False),
+        ([700, 20], [0.0], False),
+    ],
+)
+def test_headings_go_the_shorter_way_round(
+    scene: SceneDescription, headings: list[int], middles: list[float], told: bool, tmp_path: Path
+) -> None:
+    file = tmp_path / "car.csv"
+    file.write_text("time,x,y,z,heading\n" + "".join(f"{at},0,0,0,{one}\n" for at, one in enumerate(headings)))
+    control = bound(scene, path=str(file), moves="object")
+    for place, middle_of in enumerate(middles):
+        angle = float(torch.rad2deg(torch.atan2(*_turned(scene, control, (place + 0.5) / (len(headings) - 1)))))
+        assert (angle - middle_of + 180.0) % 360.0 - 180.0 == pytest.approx(0.0, abs=1e-2)
+    notes = PathControl(path=str(file), moves="object").prepare(scene).notes
+    assert any("the shorter way" in note for note in notes) == told
+
+
+def _turned(scene: SceneDescription, control: BoundControl, share: float) -> tuple[Tensor, Tensor]:
+    """Sine and cosine of how far the object is turned."""
+    turn = placed(control, share)[:3, :3] @ torch.linalg.inv(torch.from_numpy(object_to_world(scene)).float()[:3, :3])
+    return turn[1, 0], turn[0, 0]
+
+
+@pytest.mark.parametrize("start", [0.0, 1764201600.0])
+def test_waypoints_of_a_thousand_a_second_are_read(start: float, tmp_path: Path) -> None:
+    """Though a thousandth is no sum of powers of two."""
+    file = tmp_path / "fast.csv"
+    file.write_text("time,x,y,z\n" + "".join(f"{start + one / 1000:.3f},{4 - one / 500},0,1\n" for one in range(400)))
+    assert PathControl(path=str(file)).seconds == pytest.approx(0.399)
+    file.write_text("time,x,y,z\n0,1,1,1\n0.0009,1,1,1\n")
+    with pytest.raises(FileFormatError, match=r"by 0\.001 s at least"):
+        PathControl(path=str(file))
+
+
 def test_a_file_that_changes_is_read_again(scene: SceneDescription, tmp_path: Path) -> None:
     file = tmp_path / "way.csv"
     file.write_text(WAY)

@@ -194,6 +194,35 @@ def test_what_mitsuba_refuses_is_told_in_its_words(box: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    "surface",
+    [
+        '<bsdf type="roughplastic"><float name="eta" value="1.5"/></bsdf>',
+        '<bsdf type="roughplastic"><string name="alpha" value="lots"/></bsdf>',
+        '<bsdf type="diffuse"><boolean name="reflectance" value="true"/></bsdf>',
+        '<bsdf type="twosided"/>',
+        '<bsdf type="blendbsdf"><float name="weight" value="0.4"/><bsdf type="diffuse"/></bsdf>',
+        '<bsdf type="conductor"><string name="material" value="Xx"/></bsdf>',
+        '<bsdf type="diffuse"><texture type="checkerboard" name="reflectance"><float name="oops" value="1"/></texture>'
+        "</bsdf>",
+        '<bsdf type="diffuse"><texture type="mesh_attribute" name="reflectance"/></bsdf>',
+    ],
+)
+def test_what_mitsuba_refuses_of_the_objects_own_surface_is_told_too(surface: str, tmp_path: Path) -> None:
+    path = tmp_path / "one.xml"
+    path.write_text(f'<scene version="3.0.0"><shape type="cube" id="thing">{surface}</shape></scene>')
+    with pytest.raises(InputError, match=r"one\.xml#thing: Mitsuba refuses the scene: [^\n]*; change it there"):
+        advsearch.load_scene(f"{path}#thing").renderer("pose", resolution=16)
+
+
+def test_an_entry_that_the_object_does_not_have_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "one.xml"
+    path.write_text(
+        '<scene version="3.0.0"><shape type="cube" id="thing"><float name="roundness" value="1"/></shape></scene>'
+    )
+    assert "'roundness' is left out: a cube has none" in " ".join(import_plugins(path, "thing").object.warnings)
+
+
+@pytest.mark.parametrize(
     ("changed", "is_haze"),
     [
         ({}, True),

@@ -230,7 +230,7 @@ def test_other_elements_and_points_alone(tmp_path: Path) -> None:
         (b"1.0 1.0", b"1.0 one", "expected 4 rows of 'vertex', as the PLY header says, got 'one' among their numbers"),
         (b"4 0 1 2 3", b"4 0 1 2 4", "got a face that refers to a vertex that is not there"),
         (b"4 0 1 2 3", b"4 0 1 2 0.5e99", "got a face that refers to a vertex that is not there"),
-        (b"4 0 1 2 3", b"2 0 1 2 3", "expected faces with 3 or more corners, got one with 2"),
+        (b"4 0 1 2 3", b"2 0 1 2 3", "expected a mesh with faces, got points or lines only"),
         (b"4 0 1 2 3", b"-1 0 1 2 3", "expected lists in the PLY element 'face', got one of -1 values"),
     ],
 )

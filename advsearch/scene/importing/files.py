@@ -20,6 +20,7 @@ import numpy.typing as npt
 
 from advsearch import files
 from advsearch.errors import FileFormatError
+from advsearch.scene.importing.other_formats import advice
 
 LARGEST_FILE = 1 << 29
 """Bytes that a mesh, a texture or an environment may have, before `advsearch.files.scaled`."""
@@ -36,6 +37,12 @@ _KINDS = (
     (b"ply\n", "a PLY mesh (.ply)"),
     (b"ply\r", "a PLY mesh (.ply)"),
     (b"Kaydara FBX", "an FBX model"),
+    (b"PXR-USDC", "a USD scene"),
+    (b"#usda", "a USD scene"),
+    (b"# Blender", "a Wavefront OBJ file (.obj)"),
+    (b"<?xml", "XML"),
+    (b"\x93NUMPY", "NumPy's arrays"),
+    (b"ISO-10303-21", "a CAD model (STEP)"),
     (b"BLENDER", "a Blender scene"),
     (b"PK\x03\x04", "a ZIP archive"),
     (b"\x1f\x8b", "a gzip archive"),
@@ -62,6 +69,12 @@ def read_bytes(path: Path, what: str, suffixes: Sequence[str]) -> bytes:
         if path.is_dir():
             raise FileFormatError(f"{path}: expected a file with an {what}, got a directory; name a file inside it")
         if path.suffix.lower() not in suffixes:
+            file, _, part = str(path).rpartition("#")
+            if part and Path(file).suffix.lower() in suffixes:
+                raise FileFormatError(f"{file}: has no parts by name, got #{shown(part, quoted=False)}; leave it out")
+            known = None if what == "environment" else advice(Path(file) if file else path)
+            if known is not None:
+                raise FileFormatError(f"{path}: {known} (read are {files.either(suffixes)})")
             got = f"got {path.suffix!r}" if path.suffix else "got a name without ending"
             raise FileFormatError(
                 f"{path}: expected an {what} file ending in {files.either(suffixes)}, {got}; convert it to one of these"

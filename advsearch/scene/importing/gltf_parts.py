@@ -43,6 +43,7 @@ from advsearch.scene.importing.parts import (
     with_opacity,
 )
 from advsearch.scene.importing.pictures import Kind, Pictures
+from advsearch.scene.importing.texture import mean_over
 
 Fit = Callable[[Doubles], Doubles]
 """Takes texture coordinates (V, 2) of the format to those of the pictures that were made."""
@@ -78,13 +79,14 @@ class GltfSurfaces:
     def __post_init__(self) -> None:
         self._pictures = Pictures(len(self.header.materials), self.references.get, self.references.refused)
 
-    def surface(self, number: int | None, uvs: Sequence[Doubles]) -> tuple[ImportedSurface, Fit]:
+    def surface(self, number: int | None, parts: Sequence[ImportedPart]) -> tuple[ImportedSurface, Fit]:
         """Return the surface of a material, and how texture coordinates fit its pictures.
 
         Args:
             number: of the material; None for the format's default.
-            uvs: all texture coordinates (V, 2) by which it is looked up.
+            parts: all that have it, with the format's texture coordinates.
         """
+        uvs = [part.uvs for part in parts if part.uvs is not None]
         material = MaterialEntry() if number is None else self.header.materials[number]
         given = material.surface
         scaled = np.array([1.0] * 4 if given.baseColorFactor is None else given.baseColorFactor, np.float32).clip(0, 1)
@@ -112,7 +114,8 @@ class GltfSurfaces:
         )
         if packed is not None:
             self._note(": textures of roughness and metallic are replaced by their means")
-            roughness, metallic = roughness * float(packed[:, :, 1].mean()), metallic * float(packed[:, :, 2].mean())
+            _, green, blue = self._mean(packed, material, given.metallicRoughnessTexture, parts).tolist()
+            roughness, metallic = roughness * green, metallic * blue
         normals = None
         if material.normalTexture is not None and material.reads(material.normalTexture):
             words = ": the normal map {name} {why}; it is left out"
@@ -121,6 +124,19 @@ class GltfSurfaces:
         name = "" if number is None else material.name or f"material {number}"
         found = ImportedSurface(kept, texture, unit(roughness), unit(metallic), normals, self._emission(material), name)
         return self._fitted(found, material, uvs)
+
+    def _mean(
+        self, packed: Floats, material: MaterialEntry, use: TextureUse | None, parts: Sequence[ImportedPart]
+    ) -> Floats:
+        """The mean (3,) of a picture over the faces that show it; over all of it where it has other coordinates than
+        those that are read."""
+        parts = [part for part in parts if part.uvs is not None]
+        if use is None or not parts or not use.looked_up_as(material.layout or TextureUse(index=0)):
+            return np.asarray(packed.mean(axis=(0, 1), dtype=np.float64), np.float32)
+        corners = [part.uvs[part.faces] * [1.0, -1.0] + [0.0, 1.0] for part in parts if part.uvs is not None]
+        triangles = np.concatenate([part.vertices[part.faces] for part in parts])
+        sides = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+        return mean_over(packed, np.concatenate(corners), np.linalg.norm(sides, axis=1))
 
     def _emission(self, material: MaterialEntry) -> Floats | None:
         """The radiance of a material (section 3.9.3, and KHR_materials_emissive_strength), in the unit of
@@ -289,7 +305,7 @@ def read_gltf(path: Path, data: bytes) -> tuple[list[ImportedPart], list[str]]:
         groups.setdefault(piece.material, {})[key] = piece.part
     finished = {}
     for material, group in groups.items():
-        surface, fit = surfaces.surface(material, [part.uvs for part in group.values() if part.uvs is not None])
+        surface, fit = surfaces.surface(material, list(group.values()))
         for key, part in group.items():
             finished[key] = replace(
                 part, surface=surface, uvs=None if part.uvs is None else fit(part.uvs) * [1.0, -1.0] + [0.0, 1.0]

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from PIL import Image
 
-from advsearch.scene.assets import Floats
+from advsearch.scene.assets import Doubles, Floats
+from advsearch.scene.importing import udim
 from advsearch.scene.importing.files import Inventory, References, plain_name, shown, text_of
 from advsearch.scene.importing.mtl import (
     MapUse,
@@ -31,6 +32,7 @@ from advsearch.scene.importing.parts import (
     with_opacity,
 )
 from advsearch.scene.importing.pictures import Kind, Pictures
+from advsearch.scene.importing.texture import mean_over
 
 STATEMENT = "material statement"
 READ = frozenset("kd ke d tr pr pm map_kd map_ke map_d map_pr map_pm norm map_kn map_bump bump illum".split())
@@ -71,6 +73,8 @@ class MtlReader:
         source: the mesh file's name, for warnings.
         references: finds files.
         inventory: of the mesh file.
+        shown_on: returns texture coordinates (F, 3, 2) and areas (F,) of the faces with a material, by its name and a
+            UDIM square.
         libraries: how many material files were read.
         notes: the warnings so far.
     """
@@ -78,10 +82,12 @@ class MtlReader:
     source: str
     references: References
     inventory: Inventory
+    shown_on: Callable[[str, int], tuple[Doubles, Doubles]]
     libraries: int = 0
     notes: list[str] = field(default_factory=list)
     _materials: dict[str, MtlMaterial] = field(default_factory=dict)
-    _painted: dict[int, Painted] = field(default_factory=dict)
+    _painted: dict[tuple[int, int], Painted] = field(default_factory=dict)
+    _uses: dict[tuple[int, str], MapUse | None] = field(default_factory=dict)
     _pictures: Pictures | None = None
     _read: dict[tuple[str, Kind], Floats | str] = field(default_factory=dict)
 
@@ -107,24 +113,45 @@ class MtlReader:
         for material in materials:  # a comment, or part of the name: both are tried
             self._materials.setdefault(without_comment(material.name), material)
 
-    def painted(self, name: str) -> Painted | None:
-        """Return a material by its name, or None; the name may have a comment after it."""
+    def painted(self, name: str, square: int = 0) -> Painted | None:
+        """Return a material by its name, or None; the name may have a comment after it. Of pictures of one UDIM square
+        each, it takes those of that one, or as the file names them."""
         material = self._materials.get(name) or self._materials.get(without_comment(name))
         if material is None:
             return None
-        if id(material) not in self._painted:
-            self._painted[id(material)] = self._look_of(material)
-        return self._painted[id(material)]
+        if (id(material), square) not in self._painted:
+            self._painted[id(material), square] = self._look_of(material, square, name)
+        return self._painted[id(material), square]
+
+    def squares_of(self, name: str, wanted: Sequence[int]) -> list[int]:
+        """Return for which of these UDIM squares, the first of them 1001, there are pictures of their own; none of a
+        material whose pictures have no square in their names, or repeat."""
+        material = self._materials.get(name) or self._materials.get(without_comment(name))
+        maps = [use for key in PLACED if material is not None and (use := self._use(material, key)) is not None]
+        numbered = next((use.name for use in maps if udim.number_in(use.name) is not None), None)
+        if numbered is None or not (others := [one for one in wanted if one and one != udim.number_in(numbered)]):
+            return []
+        beside = [one for one in others if isinstance(self.references.tried(udim.named(numbered, one)), bytes)]
+        if udim.number_in(numbered) == 0 or beside:
+            return [one for one in wanted if one]
+        self.note(
+            f"{self.source}: {shown(numbered)} is named like one of several pictures (UDIM), and there is none for the "
+            f"faces in {', '.join(map(str, others[:8]))}: it repeats there; put those pictures beside it"
+        )
+        return []
 
     def note(self, message: str) -> None:
         """Warn, once."""
         if message not in self.notes:
             self.notes.append(message)
 
-    def _look_of(self, material: MtlMaterial) -> Painted:
+    def _look_of(self, material: MtlMaterial, square: int, name: str) -> Painted:
         """Read all statements of a material."""
-        self._list(material)
+        if not any(known == id(material) for known, _ in self._painted):
+            self._list(material)
         uses = {key: use for key in (*PLACED, "map_pr", "map_pm") if (use := self._use(material, key)) is not None}
+        if square:
+            uses = {key: replace(use, name=udim.named(use.name, square)) for key, use in uses.items()}
         first = next((uses[key] for key in PLACED if key in uses), None)
         for key in [key for key in PLACED if key in uses]:
             if first is not None and (uses[key].scale, uses[key].offset) != (first.scale, first.offset):
@@ -144,8 +171,8 @@ class MtlReader:
         found = self._see_through(material, uses.get("map_d"), ImportedSurface(color, texture))
         found = replace(
             found,
-            roughness=self._share(material, "pr", uses.get("map_pr")),
-            metallic=self._share(material, "pm", uses.get("map_pm")),
+            roughness=self._share(material, "pr", uses.get("map_pr"), name, square),
+            metallic=self._share(material, "pm", uses.get("map_pm"), name, square),
             normal_map=self._bumps(material, uses),
             emission=self._glow(material, uses.get("map_ke")),
             name=material.name,
@@ -176,6 +203,11 @@ class MtlReader:
 
     def _use(self, material: MtlMaterial, key: str) -> MapUse | None:
         """Return what a statement says that names a picture, and put options that are not read into the inventory."""
+        if (id(material), key) not in self._uses:
+            self._uses[id(material), key] = self._new_use(material, key)
+        return self._uses[id(material), key]
+
+    def _new_use(self, material: MtlMaterial, key: str) -> MapUse | None:
         rest = material.statements.get(key, "")
         use = map_of(without_comment(rest))
         whole = map_of(rest)
@@ -258,13 +290,15 @@ class MtlReader:
             )
         return 1.0 - max(clear, 0.0)
 
-    def _share(self, material: MtlMaterial, key: str, use: MapUse | None) -> float | None:
-        """Return a roughness or metallic: the mean of its map, or else its number; None where there is neither."""
+    def _share(self, material: MtlMaterial, key: str, use: MapUse | None, name: str, square: int) -> float | None:
+        """Return a roughness or metallic: the mean of its map over the faces that show it, or else its number; None
+        where there is neither."""
         if use is not None:
             found = self._picture(use, "numbers")
             if isinstance(found, np.ndarray):
                 self.note(f"{self.source}: textures of roughness and metallic are replaced by their means")
-                return float(_channel(found, use).mean())
+                uvs, areas = self.shown_on(name, square)
+                return float(mean_over(_channel(found, use)[:, :, None], uvs * use.scale + use.offset, areas)[0])
             self.note(f"{self.source}: {material.spelled[f'map_{key}']} {shown(use.name)} {found}; it is left out")
         rest = material.numbers(key)
         value = share_of(rest, -1.0)

@@ -44,9 +44,12 @@ def normal_map(picture: Floats, scale: float = 1.0) -> Floats:
 
 
 def holds_normals(picture: Floats) -> bool:
-    """Tell whether a picture (H, W, 3) holds normals, and not heights, which are grey."""
-    off = np.abs(np.linalg.norm(picture * 2.0 - 1.0, axis=2) - 1.0)
-    blue = float((picture[..., 2] - picture[..., 0]).mean(dtype=np.float64))
+    """Tell whether a picture (H, W, 3) holds normals, and not heights, which are grey; black is what no face shows."""
+    used = picture[picture.any(axis=2)]
+    if not len(used):
+        return False
+    off = np.abs(np.linalg.norm(used * 2.0 - 1.0, axis=1) - 1.0)
+    blue = float((used[:, 2] - used[:, 0]).mean(dtype=np.float64))
     return blue > BLUE and bool((off < LENGTH).mean() > MOSTLY)
 
 

@@ -26,9 +26,10 @@ from advsearch.scene.importing.files import (
     shown,
     text_of,
 )
+from advsearch.scene.importing.other_formats import SPLATS
 from advsearch.scene.importing.parts import NEUTRAL, ImportedPart, ImportedSurface, Looked, split_at_corners
 from advsearch.scene.importing.pictures import Pictures
-from advsearch.scene.importing.polygons import triangulated
+from advsearch.scene.importing.polygons import FEW, triangulated
 
 Numbers = npt.NDArray[np.generic]
 
@@ -353,16 +354,17 @@ class _Reader:
             corner.append(_of_strips(_whole(strips.values), strips.counts).reshape(-1))
             counts.append(np.full(len(corner[-1]) // 3, 3))
         all_corners, all_counts = np.concatenate(corner), np.concatenate(counts)
-        if not len(all_counts):
-            raise FileFormatError(
-                f"{self.path}: expected a mesh with faces, got points or lines only; export triangles"
-            )
-        if all_counts.min() < 3:
-            raise damaged(self.path, "faces with 3 or more corners", f"one with {all_counts.min()}")
+        few = int((all_counts < 3).sum())
+        if few == len(all_counts):
+            splats = "f_dc_0" in self.elements["vertex"].scalars  # of 3D Gaussian splatting
+            what = f"Gaussian splats, a model that {SPLATS}" if splats else "points or lines only; export triangles"
+            raise FileFormatError(f"{self.path}: expected a mesh with faces, got {what}")
+        if few:
+            self.note(FEW.format(count=few, s="" if few == 1 else "s"))
         if all_counts.max() > files.scaled(MOST_CORNERS):
             most = f"faces with at most {files.scaled(MOST_CORNERS):,} corners"
             raise files.too_large(self.path, most, f"{all_counts.max():,}")
-        check_faces(self.path, int(all_counts.sum()) - 2 * len(all_counts))
+        check_faces(self.path, int((all_counts - 2).clip(0).sum()))
         if all_corners.min() < 0 or all_corners.max() >= points:
             raise damaged(self.path, "faces of its own vertices", "a face that refers to a vertex that is not there")
         return all_corners, all_counts
@@ -426,7 +428,9 @@ class _Reader:
             number[: faces.count] = _whole(faces.scalars["texnumber"])
         elif vertices is not None and "texnumber" in vertices.scalars:
             self.inventory.take("vertex property", "texnumber")
-            number = _whole(vertices.scalars["texnumber"])[corner[np.cumsum(counts) - counts]]
+            number = _whole(vertices.scalars["texnumber"])[
+                corner[np.minimum(np.cumsum(counts) - counts, len(corner) - 1)]
+            ]
         else:
             if len(names) > 1:
                 self.note(

@@ -9,6 +9,7 @@ from advsearch.scene.assets import Bools, Doubles, Ints
 MOST_WORK = 50_000_000
 """Points that are compared with ears, in all; then the polygons that are left are cut up as fans."""
 
+FEW = "{count:,} face{s} of fewer than 3 corners left out"
 _FLAT = 1e-9  # twice the area of a triangle, as a share of that of its polygon, up to which it has none
 
 
@@ -20,7 +21,7 @@ def triangulated(points: Doubles, counts: Ints) -> tuple[Ints, Ints, int]:
 
     Args:
         points: (C, 3) positions of the corners of all polygons, one polygon after the other; may hold NaN.
-        counts: (P,) number of corners of each, at least 3.
+        counts: (P,) number of corners of each; those of fewer than 3 become no triangle.
 
     Returns:
         (T, 3) corners of the triangles, as indices into `points`, in the order of the polygons; (T,) the polygon of
@@ -30,6 +31,8 @@ def triangulated(points: Doubles, counts: Ints) -> tuple[Ints, Ints, int]:
     kinds, group = np.unique(counts, return_inverse=True)
     triangles, owners, wrong, left = [], [], 0, MOST_WORK
     for number, count in enumerate(kinds):
+        if count < 3:
+            continue
         polygons = np.flatnonzero(group == number)
         corners = starts[polygons, None] + np.arange(count)
         cut = np.stack(
@@ -48,6 +51,8 @@ def triangulated(points: Doubles, counts: Ints) -> tuple[Ints, Ints, int]:
                 )
         triangles.append(cut.reshape(-1, 3))
         owners.append(np.repeat(polygons, count - 2))
+    if not owners:
+        return np.zeros((0, 3), np.int64), np.zeros(0, np.int64), wrong
     owner = np.concatenate(owners)
     order = np.argsort(owner, kind="stable")
     return np.concatenate(triangles)[order], owner[order], wrong

@@ -34,6 +34,7 @@ _WINDOW = 1.5  # how many textures wide and high UVs may be and still keep their
 _BORDER = 2.0  # texels outside a chart up to which it emits light: filtering needs them
 _SHARED = 0.005  # share of the texels which may lie on several faces where each should have its own
 _FINER = 1.5  # how many times more texels a picture may have than a baked texture before that is said
+_LOOKS, _FINEST = 1 << 18, 256  # places at which a mean is taken, and steps along the side of a face at most
 _FILLED = 0.5  # share of an atlas that its charts fill, about
 
 
@@ -132,7 +133,8 @@ def _why(soup: Soup, used: Sequence[ImportedSurface], uniform: bool) -> str:
     """Return the sentence that says why the object was unwrapped anew."""
     if not uniform:
         count = len({surface.name or id(surface) for surface in used})
-        return f"the colours of its {count} materials were baked into one texture"
+        what = f"the colours of its {count} materials" if count > 1 else "the pictures of its material"
+        return f"{what} were baked into one texture"
     if not _one_factor(soup) or soup.colors.min() < 1.0:
         return "its vertex or face colours were baked into a texture"
     if not np.isfinite(soup.uvs).all():
@@ -241,7 +243,7 @@ def baked(uvs: Doubles, soup: Soup, surfaces: Sequence[ImportedSurface]) -> Surf
         if not len(here):  # no texel at all
             continue
         surface, at = surfaces[int(part[here[0]])], np.einsum("tk,tkc->tc", weights[here], soup.uvs[face[here]])
-        color = _looked_up(surface, at)
+        color = _looked_up(surface, at, soup, surfaces)
         image[rows[here], columns[here], : color.shape[1]] = _tinted(color, factor[here])
         if normals is not None and surface.normal_map is not None and np.isfinite(at).all():
             bumps = sampled(surface.normal_map, at)
@@ -256,12 +258,17 @@ def baked(uvs: Doubles, soup: Soup, surfaces: Sequence[ImportedSurface]) -> Surf
     return SurfaceMaps(image[whole], None if normals is None else normals[whole], emission)
 
 
-def _looked_up(surface: ImportedSurface, at: Doubles) -> Floats:
-    """Return the base colour (T, 3 or 4) of a surface at UVs (T, 2)."""
+def _looked_up(surface: ImportedSurface, at: Doubles, soup: Soup, surfaces: Sequence[ImportedSurface]) -> Floats:
+    """Return the base colour (T, 3 or 4) of a surface at UVs (T, 2); where it has none, the mean over all faces that
+    show its texture."""
     if surface.texture is not None and np.isfinite(at).all():
         return filtered(surface.texture, at)
-    color = _plain(surface)[None] if surface.texture is None else _mean(surface.texture)
-    return np.broadcast_to(color, (len(at), color.shape[1]))
+    color = _plain(surface)
+    if surface.texture is not None:
+        mine = np.array([one.texture is surface.texture for one in surfaces])[soup.part]
+        areas = np.linalg.norm(soup.face_vectors(), axis=1)[mine]
+        color = _in_display(mean_over(_in_linear(surface.texture), soup.uvs[mine], areas))
+    return np.broadcast_to(color[None], (len(at), len(color)))
 
 
 def _texels(soup: Soup, surfaces: Sequence[ImportedSurface]) -> float:
@@ -272,10 +279,37 @@ def _texels(soup: Soup, surfaces: Sequence[ImportedSurface]) -> float:
     return texels
 
 
-def _mean(texture: Floats) -> Floats:
-    """Return the mean colour (1, 3 or 4) of a texture, taken in linear light."""
-    mean = _in_display(_in_linear(texture).mean(axis=(0, 1), dtype=np.float64).astype(np.float32))
-    return mean[None]
+def mean_over(texture: Floats, uvs: Doubles, areas: Doubles) -> Floats:
+    """Return the mean (C,) of a texture (H, W, C) over faces; what none of them shows does not count.
+
+    Args:
+        texture: its values, row 0 on top.
+        uvs: (F, 3, 2) of the faces, v = 0 at the bottom; NaN where one has none.
+        areas: (F,) of the faces.
+
+    Returns:
+        float32; the mean of all texels where no face has texture coordinates and an area.
+    """
+    known = np.isfinite(uvs).all(axis=(1, 2)) & (areas > 0.0)
+    if not known.any():
+        return np.asarray(texture.mean(axis=(0, 1), dtype=np.float64), np.float32)
+    uvs, areas = uvs[known], areas[known]
+    steps = int(np.clip(np.sqrt(_LOOKS / len(areas)), 1, _FINEST))
+    i, j = (one.reshape(-1) for one in np.meshgrid(np.arange(steps), np.arange(steps)))
+    up, down = i + j < steps, i + j < steps - 1  # the two kinds of small triangles, by their middles
+    b, c = (np.concatenate([one[up] + 1.0 / 3.0, one[down] + 2.0 / 3.0]) / steps for one in (i, j))
+    weights = np.stack([1.0 - b - c, b, c], axis=1)
+    total = np.zeros(texture.shape[2])
+    for some in np.array_split(np.arange(len(areas)), -(-len(areas) * len(b) // _LOOKS)):
+        places = np.einsum("pk,fkc->fpc", weights, uvs[some]).reshape(-1, 2)
+        rows, columns = np.stack([(1.0 - places[:, 1]) % 1.0, places[:, 0] % 1.0]) * [
+            [texture.shape[0]],
+            [texture.shape[1]],
+        ]
+        texels = texture[rows.astype(int) % texture.shape[0], columns.astype(int) % texture.shape[1]]
+        found = texels.reshape(len(some), len(b), -1).mean(axis=1, dtype=np.float64)
+        total += areas[some] @ found
+    return np.asarray(total / areas.sum(), np.float32)
 
 
 def filtered(colors: Floats, uvs: Doubles) -> Floats:

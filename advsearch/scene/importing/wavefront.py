@@ -17,6 +17,7 @@ from advsearch import files
 from advsearch.errors import FileFormatError
 from advsearch.scene.assets import Doubles, Ints
 from advsearch.scene.color import srgb_to_linear
+from advsearch.scene.importing import udim
 from advsearch.scene.importing.files import (
     MOST_CORNERS,
     Inventory,
@@ -32,7 +33,7 @@ from advsearch.scene.importing.files import (
 from advsearch.scene.importing.mtl import without_comment
 from advsearch.scene.importing.mtl_surfaces import MtlReader, Painted, libraries_of
 from advsearch.scene.importing.parts import NEUTRAL, ImportedPart, ImportedSurface, Looked, split_at_corners
-from advsearch.scene.importing.polygons import triangulated
+from advsearch.scene.importing.polygons import FEW, triangulated
 
 GROUPING = frozenset(("g", "o"))
 """Statements that only name parts; all parts are joined."""
@@ -62,13 +63,22 @@ def read_obj(path: Path, data: bytes) -> tuple[list[ImportedPart], list[str]]:
     if not len(tables["v"]):
         raise damaged(path, EXPECTED, looks_like(data))
     corners, counts, rows = lines.faces({kind: len(table) for kind, table in tables.items()})
-    if not len(counts):
+    few = int((counts < 3).sum())
+    if few == len(counts):
         raise FileFormatError(f"{path}: expected a mesh with faces, got points or lines only; export triangles")
     inventory, references = Inventory(), References(path)
-    reader = MtlReader(path.name, references, inventory)
+
+    def shown_on(name: str, number: int) -> tuple[Doubles, Doubles]:
+        mine = np.flatnonzero((material == names.index(name)) & (square == number) & (mapped >= 0).all(axis=1))
+        a, b, c = (points[position[mine, corner]] for corner in range(3))
+        return tables["vt"][mapped[mine]], np.linalg.norm(np.cross(b - a, c - a), axis=1)
+
+    reader = MtlReader(path.name, references, inventory, shown_on)
     said = _statements(lines, inventory)
     for name in libraries_of(said.libraries, references):
         reader.read_library(name)
+    if few:
+        reader.note(f"{path.name}: {FEW.format(count=few, s='' if few == 1 else 's')}")
     points = tables["v"][:, :3]
     triangles, face, wrong = triangulated(points[corners[:, 0]], counts)
     if wrong:
@@ -81,11 +91,13 @@ def read_obj(path: Path, data: bytes) -> tuple[list[ImportedPart], list[str]]:
         reader.note(f"{path.name}: smoothing groups are left out: its normals are made, with creases at sharp edges")
     colors = _colors(lines, tables["v"], inventory)
     parts = []
-    kinds = np.stack([material, (mapped >= 0).all(axis=1), off], axis=1)
+    square = _squares(reader, names, material, tables["vt"], mapped)
+    kinds = np.stack([material, (mapped >= 0).all(axis=1), off, square], axis=1)
     _, kind = np.unique(kinds, axis=0, return_inverse=True)
     for chosen in np.split(np.argsort(kind, kind="stable"), np.cumsum(np.bincount(kind.reshape(-1)))[:-1]):
         first = kinds[chosen[0]]
-        painted = reader.painted(names[first[0]]) if first[0] >= 0 and names[first[0]] else Painted(ImportedSurface())
+        named = first[0] >= 0 and names[first[0]]
+        painted = reader.painted(names[first[0]], int(first[3])) if named else Painted(ImportedSurface())
         tint = None if colors is None else colors[position[chosen]]
         if painted is None:
             painted = Painted(ImportedSurface(name=without_comment(names[first[0]])))
@@ -94,7 +106,7 @@ def read_obj(path: Path, data: bytes) -> tuple[list[ImportedPart], list[str]]:
         surface, tint = _tinted(reader, painted.surface, tint)
         uvs = Looked(tables["vt"], mapped).at(chosen)
         if uvs is not None:
-            uvs = replace(uvs, values=uvs.values * painted.scale + painted.offset)
+            uvs = replace(uvs, values=(uvs.values - udim.corner_of(int(first[3]))) * painted.scale + painted.offset)
             used = uvs.values[uvs.index[(uvs.index >= 0).all(axis=1)]]
             if painted.clamped and len(used) and not (used.min() >= -BEYOND and used.max() <= 1.0 + BEYOND):
                 reader.note(
@@ -105,6 +117,17 @@ def read_obj(path: Path, data: bytes) -> tuple[list[ImportedPart], list[str]]:
             split_at_corners(at, Looked(tables["vn"], normal).at(chosen), uvs, tint, surface, flat=bool(first[2]))
         )
     return parts, [*reader.notes, *(f"{path.name}: {clause}" for clause in inventory.left())]
+
+
+def _squares(reader: MtlReader, names: list[str], material: Ints, table: Doubles, mapped: Ints) -> Ints:
+    """Return for each face (F,) the UDIM square whose pictures it has; 0 where its material has one picture for all."""
+    found, inside = np.zeros(len(mapped), np.int64), (mapped >= 0).all(axis=1)
+    for number in np.unique(material[inside & (material >= 0)]):
+        mine = np.flatnonzero(inside & (material == number))
+        squares = udim.squares(table[mapped[mine]])
+        several = reader.squares_of(names[number], np.unique(squares).tolist())
+        found[mine] = np.where(np.isin(squares, several), squares, 0)
+    return found
 
 
 # --- what the statements beside numbers say ----------------------------------------
@@ -230,6 +253,7 @@ class Lines:
         if b"\nfo" in text:  # the old word for a face
             text = re.sub(rb"\nfo(?=[ \t])", b"\nf", text)
         self.path, self.text = path, text
+        self.unended = not data.endswith((b"\n", b"\r"))  # as files are that were cut short
         self.bytes = np.frombuffer(text, dtype=np.uint8)
         self.ends = np.flatnonzero(self.bytes == _NEWLINE)
         self.starts = np.concatenate([[0], self.ends[:-1] + 1])
@@ -301,16 +325,18 @@ class Lines:
             self._blame_faces(rows)
         at = np.flatnonzero(first)
         sizes = np.diff(np.searchsorted(begins[at], np.flatnonzero(data == _NEWLINE)), prepend=0)
-        if sizes.min() < 3:
-            self._blame_faces(rows)
+        if sizes[-1] < 3 and self.unended and rows[-1] == len(self.starts) - 1:
+            self._blame_faces(rows[-1:])
         if sizes.max() > files.scaled(MOST_CORNERS):
             expected = f"at most {files.scaled(MOST_CORNERS):,} corners in the face on line {rows[sizes.argmax()] + 1}"
             raise files.too_large(self.path, expected, f"{sizes.max():,}")
-        check_faces(self.path, int(sizes.sum()) - 2 * len(sizes))
+        check_faces(self.path, int((sizes - 2).clip(0).sum()))
         corners = np.zeros((len(at), 3), dtype=np.int64)
         corners[np.cumsum(first) - 1, place] = values
         for column, kind in enumerate(TABLES):
             index = corners[:, column]
+            if not len(index):
+                continue
             if (index < 0).any():
                 before = np.repeat(np.cumsum(self.kind == KINDS.index(kind))[rows], sizes)
                 if (index < -before).any():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import singledispatch
 from operator import attrgetter
@@ -342,19 +342,22 @@ def scene_dict(description: SceneDescription, resolution: tuple[int, int], filte
     return scene
 
 
-def loaded(plugins: Plugin, description: SceneDescription) -> Any:
-    """Return Mitsuba's scene of a dictionary.
+@contextlib.contextmanager
+def refusing(description: SceneDescription) -> Iterator[None]:
+    """What Mitsuba says of plugins that are the user's, the object's surface among them, while they are loaded inside.
 
     Raises:
-        InputError: Mitsuba refuses plugins of the user's.
+        InputError: Mitsuba refuses them.
     """
+    own = description.object.surface is not None and not description.object.finishes
     try:
         with fewer_warnings():
-            return mi.load_dict(plugins, optimize=False)
-    except RuntimeError as error:
-        if not any(isinstance(part, PluginPart) for part in description.parts):
+            yield
+    except (RuntimeError, TypeError, ValueError) as error:
+        if not own and not any(isinstance(part, PluginPart) for part in description.parts):
             raise
-        raise InputError(f"{description.object_name}: Mitsuba refuses the scene: {error}; change it there") from error
+        said = " ".join(str(error).split())
+        raise InputError(f"{description.object_name}: Mitsuba refuses the scene: {said}; change it there") from error
 
 
 def _camera(description: SceneDescription, resolution: tuple[int, int], filter: str, sampler: str) -> Plugin:

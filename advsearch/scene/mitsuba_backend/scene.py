@@ -29,9 +29,9 @@ from advsearch.scene.mitsuba_backend.parts import (
     camera_inputs,
     key_of,
     leave_dark_lamps_out,
-    loaded,
     mesh_translation,
     plain_number,
+    refusing,
     scene_dict,
     translation,
 )
@@ -114,15 +114,18 @@ class MitsubaScene:
                 self._guides = {"type": "advsearch_guides"}
             self.volumetric = any(part.volumetric for part in description.parts)
             plugins = scene_dict(description, resolution, filter, sampler)
-            translated = [mesh_translation(description.meshes[OBJECT], None if "lobes" in leave_out else IDLE_LOBES)]
-            translated += [translation(description.meshes.get(part.name, part)) for part in description.parts]
             self._path: Plugin = {"type": integrator}
-            for one in translated:
-                plugins |= one.plugins
-                self._path |= one.integrator
-            if "emitters" in leave_out:
-                leave_dark_lamps_out(plugins, description.parts)
-            self._scene = loaded(plugins, description)
+            with refusing(description):
+                translated = [
+                    mesh_translation(description.meshes[OBJECT], None if "lobes" in leave_out else IDLE_LOBES)
+                ]
+                translated += [translation(description.meshes.get(part.name, part)) for part in description.parts]
+                for one in translated:
+                    plugins |= one.plugins
+                    self._path |= one.integrator
+                if "emitters" in leave_out:
+                    leave_dark_lamps_out(plugins, description.parts)
+                self._scene = mi.load_dict(plugins, optimize=False)
             self._sensor = self._scene.sensors()[0]
             self.parameters = mi.traverse(self._scene)
             for name, weight in sampling_weights(description.meshes.values()).items():

@@ -22,7 +22,7 @@ from advsearch.scene.importing.scenes import TAKEN, ImportedScene, clean
 from advsearch.scene.importing.texture import textured
 from advsearch.scene.mitsuba_backend.meshes import plain
 from advsearch.scene.mitsuba_backend.shape_surfaces import ShapeSurface, constant, surface_of
-from advsearch.scene.mitsuba_backend.shapes import MESHES, ShapeMesh, haze_in, mesh_of
+from advsearch.scene.mitsuba_backend.shapes import MESHES, OF_A_SHAPE, ShapeMesh, haze_in, mesh_of
 from advsearch.scene.mitsuba_backend.variant import Plugin
 from advsearch.scene.mitsuba_backend.xml_files import read_scene, trusted
 from advsearch.scene.parts import MediumPart, PlacedCamera, PluginPart, ScenePart, plugins_in
@@ -281,7 +281,9 @@ def _left_out(tree: Mapping[str, object], shape: Mapping[str, object], *, hazy: 
             yield f"the sensor {name} sees nothing of its medium up to the first surface"
         if kind in SENSORS and any("principal_point" in key for key in one):
             yield f"the sensor {name} looks along its middle: its principal point is left out"
-    for inner in shape.values():
+    for key, inner in shape.items():
+        if not isinstance(inner, Mapping) and key not in OF_A_SHAPE:
+            yield f"the object's {shown(key)} is left out: a {shape['type']} has none"
         if isinstance(inner, Mapping) and inner["type"] in LIGHTS and not lit:
             yield "the object's own light is left out"
         if isinstance(inner, Mapping) and inner["type"] in MEDIA:

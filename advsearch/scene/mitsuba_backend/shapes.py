@@ -28,6 +28,8 @@ OF_A_MESH = frozenset(
     ("type", "filename", "to_world", "face_normals", "flip_tex_coords", "flip_normals", "shape_index")
 )
 """Entries of a mesh that are no surface, light or medium."""
+OF_A_SHAPE = OF_A_MESH | {"id", "radius", "center", "p0", "p1", "sampling_weight", "silhouette_sampling_weight"}
+"""The same of any shape."""
 
 
 @dataclass(frozen=True, eq=False)

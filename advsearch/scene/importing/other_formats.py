@@ -1,0 +1,73 @@
+"""Files of objects that are not read: what they are, and the program and command that make one of them that is."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from pathlib import Path
+
+BLENDER_READS = {
+    "an FBX model": ("bpy.ops.import_scene.fbx", (".fbx",)),
+    "a USD scene": ("bpy.ops.wm.usd_import", (".usd", ".usda", ".usdc", ".usdz")),
+    "an Alembic scene": ("bpy.ops.wm.alembic_import", (".abc",)),
+}
+ASSIMP_READS = {
+    "a COLLADA model": (".dae", ".zae"),
+    "a 3MF model": (".3mf",),
+    "a 3D Studio model": (".3ds",),
+    "an OFF mesh": (".off",),
+    "an X3D or VRML scene": (".x3d", ".wrl"),
+    "a LightWave model": (".lwo",),
+}
+SPLATS = (
+    "has no surface; train one that yields a mesh (2D Gaussian Splatting's render.py writes fuse_post.ply), name that"
+)
+POINTS = (
+    "has no surface; make one (in Python open3d.geometry.TriangleMesh.create_from_point_cloud_poisson), name its .ply"
+)
+UNPACK = "unpack it, and name the mesh in it"
+ELSEWHERE = "open it in that program and export glTF (.glb)"
+SAID = {
+    "a model of Gaussian splats": (SPLATS, (".splat", ".ksplat", ".spz")),
+    "a cloud of points": (POINTS, (".las", ".laz", ".pcd", ".e57", ".xyz", ".pts")),
+    "an archive": (UNPACK, (".zip", ".gz", ".7z", ".rar", ".tar", ".tgz", ".gltfz")),
+    "a file of Maya's": (ELSEWHERE, (".ma", ".mb")),
+    "a file of 3ds Max's": (ELSEWHERE, (".max",)),
+    "a file of Cinema 4D's": (ELSEWHERE, (".c4d",)),
+    "a file of SketchUp's": (ELSEWHERE, (".skp",)),
+    "binary glTF of an avatar": ("rename it to end in .glb", (".vrm",)),
+    "NumPy's arrays": ("write the mesh, as in trimesh.Trimesh(vertices, faces).export('mesh.ply')", (".npz", ".npy")),
+    "a picture": (
+        "an object is a mesh; --environment takes .hdr and .exr",
+        (".png", ".jpg", ".jpeg", ".webp", ".hdr", ".exr"),
+    ),
+}
+
+
+def advice(path: Path) -> str | None:
+    """Return what a file is by its ending, and what to do with it; None where that is not known.
+
+    The rest of a sentence: ``"an FBX model: make glTF of it, with Blender: blender -b ..."``.
+    """
+    ending, name = path.suffix.lower(), path.name
+    for what, (operator, endings) in BLENDER_READS.items():
+        if ending in endings:
+            steps = f"bpy.ops.wm.read_factory_settings(use_empty=True); {operator}(filepath={json.dumps(name)})"
+            script = f"import bpy; {steps}; bpy.ops.export_scene.gltf(filepath={json.dumps(f'{path.stem}.glb')})"
+            return f"{what}: make glTF of it, with Blender: blender -b --python-expr {shlex.quote(script)}"
+    for what, endings in ASSIMP_READS.items():
+        if ending in endings:
+            names = " ".join(map(shlex.quote, (name, f"{path.stem}.obj")))
+            return f"{what}: make an .obj of it, with assimp (Open Asset Import Library): assimp export {names}"
+    if ending in (".step", ".stp", ".iges", ".igs", ".brep"):
+        names = f"{shlex.quote(name)} -2 -o {shlex.quote(f'{path.stem}.stl')}"
+        return f"a CAD model without triangles: mesh it, with Gmsh: gmsh {names}"
+    if ending == ".ifc":
+        return f"a building (IFC): make glTF of it: IfcConvert {shlex.quote(name)} {shlex.quote(f'{path.stem}.glb')}"
+    if ending == ".b3dm":
+        names = f"-i {shlex.quote(name)} -o {shlex.quote(f'{path.stem}.glb')}"
+        return f"a tile of 3D Tiles: take its glTF out: npx 3d-tiles-tools b3dmToGlb {names}"
+    if ending == ".bin":
+        beside = sorted(one.name for one in path.parent.glob("*.gltf"))[:1] if path.parent.is_dir() else []
+        return f"a buffer, as a .gltf file has beside it: name that file{f', {beside[0]}' if beside else ''}"
+    return next((f"{what}: {said}" for what, (said, endings) in SAID.items() if ending in endings), None)
