@@ -42,9 +42,7 @@ def per_unit(values: npt.ArrayLike, units: Units) -> Numbers:
     return sums
 
 
-def share_interval(
-    counted: npt.ArrayLike, of: npt.ArrayLike, confidence: float = CONFIDENCE
-) -> tuple[float, float]:
+def share_interval(counted: npt.ArrayLike, of: npt.ArrayLike, confidence: float = CONFIDENCE) -> tuple[float, float]:
     """Return the interval of a share of answers, from the counts of independent units; it holds at any number of them.
 
     Args:
@@ -79,7 +77,7 @@ def mean_interval(values: npt.ArrayLike, low: float, high: float) -> tuple[float
 
 
 def most_shown(units: int) -> float:
-    """Return the lower end of a share's 95 % interval where so many units are right throughout: no more can be shown."""
+    """Return the lower end of a share's 95 % interval where so many units are right throughout: the most to show."""
     return _by_bets(np.ones(units), np.ones(units), CONFIDENCE)[0]
 
 

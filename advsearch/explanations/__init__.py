@@ -167,8 +167,9 @@ RowValues = Mapping[str, tuple[float | str, str]]
 """Value and unit of everything that a row shows, by name."""
 
 
-def observed(rows: Sequence[tuple[RowValues, bool]], units: Sequence[str]) -> Observations:
-    """Return rows as a table of what varies among them, with the unit of each; what only some have is left out."""
+def observed(rows: Sequence[tuple[RowValues, bool]], units: Sequence[str] | None = None) -> Observations:
+    """Return rows as a table of what varies among them, with the unit of each, its own where that is not said; what
+    only some have is left out."""
     if not rows:
         raise InputError("runs: expected sweeps with rows, got none")
     shared = [name for name in rows[0][0] if all(name in shown for shown, _ in rows)]
@@ -188,7 +189,8 @@ def observed(rows: Sequence[tuple[RowValues, bool]], units: Sequence[str]) -> Ob
         raise InputError("runs: expected rows in which something varies, got none that all of them have")
     values = np.array(columns, dtype=np.float64).T
     right = np.array([right for _, right in rows], dtype=bool)
-    return Observations(tuple(factors), values, right, np.unique(np.array(units), return_inverse=True)[1].reshape(-1))
+    places = np.arange(len(rows)) if units is None else np.unique(np.array(units), return_inverse=True)[1].reshape(-1)
+    return Observations(tuple(factors), values, right, places)
 
 
 def encoded(found: Observations) -> tuple[Numbers, list[tuple[int, int | None]]]:

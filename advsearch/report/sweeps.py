@@ -87,7 +87,8 @@ def wrong_text(counted: CountedAnswers) -> str:
 def difference_text(part: SurfacePart) -> str:
     """Return ``+83 % (+66 % to +91 %)``."""
     low, high = part.interval
-    return f"{part.difference:+.0%} ({low:+.0%} to {high:+.0%})".replace("%", " %")
+    interval = f" ({low:+.0%} to {high:+.0%})" if low == low else ""  # none where pictures share draws
+    return f"{part.difference:+.0%}{interval}".replace("%", " %")
 
 
 DISTANCE = "camera.distance"
@@ -123,6 +124,7 @@ def distance_of(summary: SweepSummary) -> SeenFrom | None:
     """Return how far away one model sees one object; None where the sweep does not tell."""
     rows = [row for row in summary.axes if row.axis == DISTANCE and row.configurations]
     several = "," in summary.object or "," in summary.model or summary.beside is not None
+    several = several or summary.drives is not None  # frames of a drive are not independent
     known = summary.task.partition("=")[0] == "detection" and len(rows) > 1 and not several
     return seen_from(rows) if known else None
 

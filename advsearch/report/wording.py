@@ -15,6 +15,9 @@ if TYPE_CHECKING:
 
 NO_INTERVAL = "no interval"
 
+PATH = "path"
+"""The control whose conditions are moments."""
+
 NORMS = {"linf": "the largest change of any value", "l2": "the root of the sum of all squared changes"}
 """What these words mean, said where they are first used."""
 
@@ -38,7 +41,7 @@ def attack_verdict(summary: AttackSummary) -> str:
         return f"Interrupted after {count(summary.steps, 'step')}. The answer so far is not verified: the model {says}."
     if verified is None:
         return f"{ending[:1].upper()}{ending[1:]} after {count(summary.steps, 'step')}; nothing is verified."
-    rate = rate_text(verified) + (f", each with another {' and '.join(summary.over)}" if summary.over else "")
+    rate = rate_text(verified) + another_text(summary.over)
     claim = _claim(summary, thing)
     if ending == "found":
         return f"{_how_it_errs(summary, verified, thing)} in {rate}."
@@ -48,6 +51,14 @@ def attack_verdict(summary: AttackSummary) -> str:
         return f"The search claims an answer that is not confirmed: {claim} in {rate}."
     why = _REASONS.get(ending, f"The search ended: {ending}.")
     return f"No {budget_text(summary)} was found that {_wanted(summary, thing)}: {claim} in {rate}. {why}"
+
+
+def another_text(over: Sequence[str]) -> str:
+    """Return what is another one in each trial: ``, each with another camera``; of a path it is the moment."""
+    others = [name for name in over if name != PATH]
+    said = [f"with another {' and '.join(others)}"] if others else []
+    said += ["at another moment of the path"] if PATH in over else []
+    return f", each {' and '.join(said)}" if said else ""
 
 
 def remarks(summary: AttackSummary) -> list[str]:

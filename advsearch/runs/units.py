@@ -73,10 +73,10 @@ def units_of(store: Store, summary: SweepSummary | None = None) -> Units | None:
     """Return what a run notes of its units; of an older one, what its summary says; None where neither does."""
     noted = store.noted(NOTE)
     if noted is not None:
-        try:
-            return Units(**{**noted, "sizes": tuple(noted["sizes"])})
-        except (TypeError, KeyError):
-            raise FileFormatError(f"{store.path}: expected what units of sampling are, got {str(noted)[:80]}") from None
+        found = _read(noted)
+        if found is None:
+            raise FileFormatError(f"{store.path}: expected what units of sampling are, got {str(noted)[:80]}")
+        return found
     if summary is None:
         return None
     times = [name.endswith(".time") and not name.startswith("mitsuba") for name in summary.grid]
@@ -87,6 +87,18 @@ def units_of(store: Store, summary: SweepSummary | None = None) -> Units | None:
         models=summary_models(summary),
         again=0 if summary.beside is None else summary.planned // 2 // summary_models(summary),
     )
+
+
+def _read(noted: Any) -> Units | None:
+    """What a note says; None where it is something else."""
+    if not isinstance(noted, dict) or not isinstance(noted.get("sizes"), list):
+        return None
+    sizes, frames = noted["sizes"], noted.get("frames")
+    counts = [*sizes, noted.get("samples"), noted.get("models")]
+    known = all(type(one) is int and one >= 1 for one in counts) and type(noted.get("again")) is int
+    if not known or noted["again"] < 0 or not (frames is None or (type(frames) is int and 0 <= frames < len(sizes))):
+        return None
+    return Units(tuple(sizes), frames, noted["samples"], noted["models"], noted["again"])
 
 
 def summary_models(summary: SweepSummary) -> int:

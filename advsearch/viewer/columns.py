@@ -21,7 +21,11 @@ from advsearch.described import NOT_A_NUMBER, Value
 from advsearch.errors import FileFormatError
 from advsearch.files import JsonObject
 from advsearch.runs.files import DAMAGED
+from advsearch.runs.results.sweep import SweepSummary
 from advsearch.runs.store import NAME, Row, Store
+from advsearch.runs.summary import NAME as SUMMARY
+from advsearch.runs.summary import read_result
+from advsearch.runs.units import units_of
 
 KIND = "sweep"
 
@@ -69,6 +73,7 @@ class Columns:
 
     Attributes:
         step: (n,) uint32, the number of the configuration.
+        unit: (n,) uint32, of what it is a draw of: rows of one unit are not independent (`runs.units`).
         margin: (n,) float32, NaN where there was none.
         answer: (n,) uint16, the place of the answer in `answers`.
         probability: (n,) uint16, in ten thousandths; `NO_PROBABILITY` where there was none.
@@ -83,6 +88,7 @@ class Columns:
     """
 
     step: AnyArray
+    unit: AnyArray
     margin: AnyArray
     answer: AnyArray
     probability: AnyArray
@@ -140,6 +146,7 @@ class Columns:
             ("answer", self.answer),
             ("probability", self.probability),
             ("right", self.right),
+            ("unit", self.unit),
         ]
         own += [(f"parameter {number}", one.data) for number, one in enumerate(self.parameters)]
         own += [] if self.boxes is None else [("boxes", self.boxes)]
@@ -151,9 +158,18 @@ def read_columns(run: Path, after: int = 0, most: int | None = None) -> Columns:
     Raises FileFormatError where the results cannot be read."""
     with Store(run / NAME, read_only=True) as store:
         found, edges = columns_of(islice(store.rows(KIND, after=after), most), run), store.noted(EDGES)
+        units = units_of(store) or units_of(store, _summary_of(run))
+    if units is not None:
+        found = replace(found, unit=units.of(found.step.astype(np.int64)).astype(np.uint32))
     known = edges if isinstance(edges, dict) else {}
     cut = (replace(one, edges=_edges(known.get(one.name))) for one in found.parameters)
     return replace(found, parameters=tuple(cut))
+
+
+def _summary_of(run: Path) -> SweepSummary | None:
+    """The result of an older run, whose store says nothing of units; None while it has none."""
+    found = read_result(run) if (run / SUMMARY).is_file() else None
+    return found if isinstance(found, SweepSummary) else None
 
 
 def _edges(noted: object) -> tuple[float, ...] | None:
@@ -182,6 +198,7 @@ def columns_of(rows: Iterable[Row], run: Path) -> Columns:
     boxes.extend([NO_BOX] * (8 * len(steps) - len(boxes) if boxes else 0))
     return Columns(
         step=np.array(steps, np.uint32),
+        unit=np.array(steps, np.uint32),
         margin=np.array(margins, np.float32),
         answer=np.array(answers.places, np.uint16),
         probability=np.array(shares, np.uint16),

@@ -170,15 +170,30 @@ def test_resumed_and_shared_drives_are_those_of_one_who_did_it_alone(tmp_path: P
     assert kept[0] == kept[1]
 
 
-def test_an_interval_is_that_of_a_mean_and_needs_five_drives() -> None:
-    few = over_drives(np.array([0.0, 1.0, 1.0, 1.0]), worst=min)
-    assert (few.mean, few.interval, few.worst) == (0.75, None, 0.0)
-    values = np.random.default_rng(0).normal(size=400)
-    many = over_drives(values, worst=max)
+def test_an_interval_is_that_of_a_mean_between_its_ends_and_has_a_width() -> None:
+    assert over_drives(np.array([0.75]), worst=min).interval is None, "one drive says nothing of others"
+    values = np.random.default_rng(0).uniform(2.0, 5.0, 400)
+    many = over_drives(values, max, (0.0, 8.0))
     assert many.interval is not None and many.worst == values.max()
     normal = 1.96 * values.std() / 20.0
-    assert many.interval == pytest.approx((values.mean() - normal, values.mean() + normal), abs=0.2 * normal)
-    assert over_drives(np.full(9, 0.5), worst=min).interval == (0.5, 0.5)
+    low, high = many.interval
+    assert low < values.mean() - normal and values.mean() + normal < high and high - low < 4.0 * 2.0 * normal
+    same = over_drives(np.full(9, 0.5), worst=min).interval
+    assert same is not None and same[0] < 0.4 and same[1] > 0.6, "nine drives that are alike are nine drives"
+
+
+@pytest.mark.parametrize("drives", [3, 5, 10, 30])
+@pytest.mark.parametrize("kind", ["any share", "right all the way or seldom", "all or none"])
+def test_intervals_over_drives_cover_the_mean_of_few_drives(drives: int, kind: str) -> None:
+    rng = np.random.default_rng(drives)
+    q, part = rng.random((120, drives)), rng.random((120, drives))
+    values, truth = {
+        "any share": (rng.beta(2, 5, (120, drives)), 2 / 7),
+        "right all the way or seldom": (np.where(q < 0.9, 1.0, part / 2), 0.925),
+        "all or none": ((q < 0.95) * 1.0, 0.95),
+    }[kind]
+    got = [over_drives(one, worst=min).interval for one in values]
+    assert sum(one is not None and one[0] <= truth <= one[1] for one in got) >= 112  # under 95 % by chance: 1 in 40
 
 
 def test_the_longest_run() -> None:

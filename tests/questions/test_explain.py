@@ -144,7 +144,8 @@ def test_typical_failures_take_turns_between_rules_and_those_under_none() -> Non
     """Failures at 1, 2 and 3 are under the rule, of which 2 is in the middle; one at 9 is not."""
     values = np.array([[1.0], [2.0], [3.0], [9.0], [10.0]])
     found = Observations((Factor("yaw"),), values, np.array([False, False, False, False, True]))
-    rule = CountedRule((RuleCondition(0, high=5.0),), 0, 3, 1, 2)
+    under = found.values[:, 0] <= 5.0
+    rule = CountedRule((RuleCondition(0, high=5.0),), found.where(under), found.where(~under))
     order = explaining.typical_failures(found, [rule], 12)
     assert [index for index, _ in order[:2]] == [1, 3] and {index for index, _ in order[2:]} == {0, 2}
     assert order[0][1] == rule.conditions and order[1][1] == ()

@@ -92,10 +92,17 @@ def test_few_rows_tell_a_clear_rule_and_say_how_many_a_faint_one_takes() -> None
     needed = [one.next.times_needed() for one in found if not one.told and one.next]
     assert all(times is None or times > 1.0 for times in needed) and any(needed)
     exact = fisher_exact([[7, 18], [25, 10]], alternative="less").pvalue
-    assert CountedRule((), 7, 25, 25, 35).chance == pytest.approx(exact)
-    assert CountedRule((), 7, 25, 25, 35).holds and not CountedRule((), 10, 25, 20, 35).holds
-    assert CountedRule((), 10, 25, 20, 35).times_needed() == pytest.approx(3.5, abs=0.5)
-    assert CountedRule((), 20, 25, 20, 35).times_needed() is None, "it is right more often there"
+    assert ruled(7, 25, 25, 35).chance == pytest.approx(exact)
+    assert ruled(7, 25, 25, 35).holds and not ruled(10, 25, 20, 35).holds
+    assert ruled(10, 25, 20, 35).times_needed() == pytest.approx(3.5, abs=0.5)
+    assert ruled(20, 25, 20, 35).times_needed() is None, "it is right more often there"
+
+
+def ruled(right: int, of: int, others: int, rest: int) -> CountedRule:
+    """A rule on independent rows, by its counts under it and elsewhere."""
+    under, beside = (np.arange(n) < k for k, n in ((right, of), (others, rest)))
+    sides = ((under, np.arange(of)), (beside, of + np.arange(rest)))
+    return CountedRule((), *(Observations((), np.zeros((len(one), 0)), one, units) for one, units in sides))
 
 
 @pytest.mark.parametrize(
@@ -107,7 +114,7 @@ def test_the_rows_that_the_page_names_tell_a_rule(right: float, elsewhere: float
     def counted(rows: int) -> CountedRule:
         under = round(0.4 * rows / 2)
         others = rows // 2 - under
-        return CountedRule((), round(right * under), under, round(elsewhere * others), others)
+        return ruled(round(right * under), under, round(elsewhere * others), others)
 
     assert counted(rows).holds and not counted(round(0.6 * rows)).holds
 

@@ -141,4 +141,5 @@ def over_drives(
 ) -> OverDrives:
     """Return the mean of a number over drives, its 95 % interval, and that of the worst drive; `ends` are what it is
     between whatever a model says."""
-    return OverDrives(mean=float(values.mean()), interval=mean_interval(values, *ends), worst=worst(values.tolist()))
+    interval = mean_interval(values, *ends) if len(values) > 1 else None
+    return OverDrives(mean=float(values.mean()), interval=interval, worst=worst(values.tolist()))

@@ -1,7 +1,8 @@
 """Which parts of an object's surface, when seen, go with wrong answers (docs/sweeps.md, "The surface"): the interval of
 a difference is Newcombe's (1998, Statistics in Medicine 17, method 10) of Wilson's (1927); what is chance comes from
 sharing the wrong answers out anew, each time with the part that stands out most (Westfall and Young 1993, the
-single-step maximum) by the likelihood ratio."""
+single-step maximum) by the likelihood ratio. Where pictures share a draw (frames of a drive), draws are exchanged
+whole, and no interval is told."""
 
 from __future__ import annotations
 
@@ -49,9 +50,13 @@ LEVEL = 0.05
 
 class PartCounts:
     """Counts of n parts over so many pictures, of which some are `failures`: those that show each (`seen`), and of
-    these the failures (`wrong`), both (n,); `chance` (SHARINGS, n) is the same for failures that are shared out."""
+    these the failures (`wrong`), both (n,); `chance` (SHARINGS, n) is the same for failures that are shared out: each
+    by itself, or as `exchanged` says, bits of (SHARINGS, pictures) packed along the first axis."""
 
-    def __init__(self, parts: int, pictures: int, failures: int, seed: int) -> None:
+    def __init__(
+        self, parts: int, pictures: int, failures: int, seed: int, exchanged: npt.NDArray[np.uint8] | None = None
+    ) -> None:
+        self.exchanged = exchanged
         self.pictures, self.failures = pictures, failures
         self.seen, self.wrong = np.zeros((2, parts), np.int64)
         self.chance = np.zeros((SHARINGS, parts), np.uint32)
@@ -62,7 +67,10 @@ class PartCounts:
         """Count a picture, by the numbers of the parts that hold in it, each once."""
         self.seen[parts] += 1
         self.wrong[parts] += failed
-        drawn = self._random.random(SHARINGS) * self._left < self._to_go  # so each choice of pictures is equally likely
+        if self.exchanged is not None:
+            drawn = np.unpackbits(self.exchanged[:, self.pictures - self._left], count=SHARINGS).astype(bool)
+        else:  # so that each choice of pictures is equally likely
+            drawn = self._random.random(SHARINGS) * self._left < self._to_go
         self._left, self._to_go = self._left - 1, self._to_go - drawn
         self.chance[np.ix_(np.flatnonzero(drawn), parts)] += 1
 
@@ -86,8 +94,10 @@ class Association:
 
     @property
     def strength(self) -> Doubles:
-        """(n,) the end of the interval that is nearer to 0, without its sign; 0 where the interval contains 0."""
-        return np.nan_to_num(np.maximum(np.maximum(self.low, -self.high), 0.0), nan=0.0)
+        """(n,) the end of the interval that is nearer to 0, without its sign; 0 where the interval contains 0. Without
+        an interval, how large the difference is."""
+        nearer = np.where(np.isnan(self.low), np.abs(self.difference), np.maximum(self.low, -self.high))
+        return np.nan_to_num(np.maximum(nearer, 0.0), nan=0.0)
 
 
 def association(tally: PartCounts, some: slice, least: int) -> Association:
@@ -102,6 +112,8 @@ def association(tally: PartCounts, some: slice, least: int) -> Association:
         own = _likelihood_ratio(k, n, failures, pictures)
         shared = (one[some][compared].astype(np.int64) for one in tally.chance)
         most = np.sort([_likelihood_ratio(one, n, failures, pictures).max() for one in shared])
+        if tally.exchanged is not None:
+            low[compared] = high[compared] = np.nan
         p[compared] = (1 + len(most) - np.searchsorted(most, own - 1e-9)) / (1 + len(most))
     return Association(compared, difference, low, high, p)
 
@@ -228,7 +240,8 @@ def map_surface(
     wrong: npt.NDArray[np.int8] = np.full((len(job.places), per_scene, models), UNKNOWN, np.int8)
     for row in rows:
         wrong.flat[row.step] = not judgement_of(row).right
-    counts = _empty(job, wrong)
+    draws = np.asarray(opened(0).points[job.sizes[0]].units.draw(np.arange(wrong[..., 0].size)))
+    counts = _empty(job, wrong, draws.reshape(wrong.shape[:2]))
     for scene, answers in enumerate(wrong):
         view, mine = opened(scene), counts[job.places[scene].object]
         for some in batches(0, per_scene, AT_ONCE):
@@ -242,18 +255,34 @@ def map_surface(
     return _told(job, counts, run)
 
 
-def _empty(job: Job, wrong: npt.NDArray[np.int8]) -> dict[str, SurfaceCounts]:
-    """Counts of each object, by its name, that know how many answers (scenes, pictures, models) there will be."""
+def _empty(job: Job, wrong: npt.NDArray[np.int8], draws: Counts) -> dict[str, SurfaceCounts]:
+    """Counts of each object, by its name, that know how many answers (scenes, pictures, models) there will be, and of
+    which draw (scenes, pictures) each is."""
     counts, models = {}, len(job.models)
     for number, (name, asset) in enumerate(_assets(job).items()):
         parts, tallies = SurfaceParts(asset.mesh), []
-        mine = wrong[[place.object == name for place in job.places]]
+        here = [place.object == name for place in job.places]
+        mine = wrong[here]
         for model in range(models):
             seed = seeds.stream(job.config.seed, "surface", number * models + model)
             answers, failures = (int((mine[..., model] >= least).sum()) for least in (0, 1))
-            tallies.append(PartCounts(parts.count, answers, failures, seed))
+            exchanged = exchange(mine[..., model].ravel(), draws[here].ravel(), seed)
+            tallies.append(PartCounts(parts.count, answers, failures, seed, exchanged))
         counts[name] = SurfaceCounts(parts, tallies)
     return counts
+
+
+def exchange(wrong: npt.NDArray[np.int8], draws: Counts, seed: int) -> npt.NDArray[np.uint8] | None:
+    """Return the answers of whole draws dealt out to draws anew, as `PartCounts` takes them; None where each picture
+    has a draw of its own. Both (n,), answers that are not known are left out."""
+    known, (_, of) = wrong != UNKNOWN, np.unique(draws, return_counts=True)
+    if of.max(initial=1) == 1:
+        return None
+    order = np.argsort(draws, kind="stable").reshape(len(of), -1)  # each has as many pictures
+    generator, found = np.random.default_rng(seed), np.zeros((SHARINGS, len(wrong)), bool)
+    for one in found:
+        one[order] = (wrong == 1)[order[generator.permutation(len(order))]]
+    return np.packbits(found[:, known], axis=0)
 
 
 def _assets(job: Job) -> dict[str, ObjectAsset]:

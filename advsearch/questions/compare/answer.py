@@ -124,7 +124,9 @@ class CompareResult(InNotebook, RunResult):
 RESULT = CompareResult
 
 
-LIKELY = "p: how likely a split so uneven of the pairs that one side alone gets right is where both are right equally often "
+LIKELY = (
+    "p: how likely a split so uneven of the pairs that one side alone gets right is where both are right equally often "
+)
 NOTE = (
     f"{LIKELY}(exact McNemar test, two-sided). Intervals of differences are Newcombe's for pairs, of shares "
     "Clopper-Pearson's, each for its row by itself."

@@ -321,9 +321,7 @@ def _masks(column: Column) -> Iterator[tuple[AxisValue, Mask]]:
             yield from ((float(f"{value:.6g}"), column.data == value) for value in values)
 
 
-def _rules(
-    columns: Sequence[Column], alone: Mask, units: npt.NDArray[np.int64], seed: int
-) -> list[PairRule] | None:
+def _rules(columns: Sequence[Column], alone: Mask, units: npt.NDArray[np.int64], seed: int) -> list[PairRule] | None:
     """Where one side alone is right more often than elsewhere; None of too few pairs, or where nothing varies.
 
     These are the rules of `explain`, whose wrong answers are the pairs that one side alone gets right.

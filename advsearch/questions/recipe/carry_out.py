@@ -121,6 +121,12 @@ def recipe_from_config(
         seconds = time.perf_counter() - begun + (_seconds(run.path) if resumed is not None else 0.0)
         settings = made_of(described, config).settings
         controls = [name for one, _ in results if isinstance(one.config, SceneConfig) for name in one.config.controls]
+        notes += [
+            f"{part.name} sweeps frames of drives, which are not independent: the intervals of figures take them as if "
+            "they were, and are too narrow. What its own page, `explain` and `compare` say is over drives."
+            for part, one in results
+            if isinstance(one, SweepSummary) and one.drives
+        ]
         warnings = [*notes, *(text for _, one in results for text in getattr(one, "warnings", ()))]
         result = RecipeResult(
             run=str(run.path),

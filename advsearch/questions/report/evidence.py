@@ -30,8 +30,8 @@ RULES = (
     "Each claim is about the run's own model, object, environment, label and settings, and about nothing else.",
     "`found`: fresh renders confirm a configuration that a search found; how many others there are is not known.",
     "`not found`: a search of so many renders found none; another policy or more renders may find one.",
-    "`measured`: a share of what was counted; its interval has 95 % confidence (Clopper-Pearson) and holds for the "
-    "distribution that was drawn from.",
+    "`measured`: a share of what was counted; its interval has 95 % confidence (Clopper-Pearson's; where answers share "
+    "a draw, as frames of a drive do, one over draws, by bets) and holds for the distribution that was drawn from.",
     "`nothing claimed`: the run does not carry a claim, for the reason that it gives.",
     "Renderings are not photographs: a claim is about reality only as far as photographs were compared.",
 )

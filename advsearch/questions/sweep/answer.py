@@ -51,7 +51,7 @@ def _verdict(summary: SweepSummary) -> str:
     seen, correct = summary.configurations, summary.correct
     if not seen:
         return "Interrupted before the first configuration."
-    rate = f"{percent(summary.accuracy)}, 95 % interval {wording.interval_text(summary.interval)}"
+    rate = f"{percent(summary.accuracy)}, 95 % interval {wording.interval_text(summary.interval)}{over_drives(summary)}"
     if summary.ending == INTERRUPTED and seen < summary.planned:
         return f"Interrupted after {seen} of {summary.planned} configurations: right in {correct} ({rate})."
     if summary.beside and summary.beside.pairs:
@@ -141,14 +141,20 @@ def claims(result: SweepSummary) -> Iterator[Claim]:
         total=result.configurations,
         interval=result.interval,
     )
-    how = "configurations drawn by chance from the ranges that are named"
+    thing = "configurations"
+    if result.drives:
+        thing = f"frames of {result.drives[0].drives} drives"
+    how = f"{thing} drawn by chance from the ranges that are named"
     note = ""
     if result.sampler is None and not result.grid:
-        how = "configurations"
+        how = thing
         note = " How these were chosen is not known; the interval takes them as a sample."
     elif result.sampler is None:
-        how = "points of the grid"
+        how = "points of the grid" if not result.drives else f"{thing}, whose ways and moments are given"
         note = " Nothing is said of what lies between or beside these points; the interval takes them as a sample."
+    elif result.drives:  # the frames are the grid, and what a drive has besides is drawn
+        how = f"{thing}; what else differs between drives is drawn by the sampler {result.sampler}"
+        note = " The interval is over drives, as if these were independent." * (result.sampler != "random")
     elif result.sampler != "random" or result.grid:
         how = f"configurations drawn by the sampler {result.sampler}" + (" at each point of a grid" * bool(result.grid))
         note = " The interval is that of independent draws, which these are not."
@@ -165,6 +171,11 @@ def claims(result: SweepSummary) -> Iterator[Claim]:
     if worst is not None:
         text = f"In the worst of these configurations the model is wrong in {wording.rate_text(worst)}."
         yield claim("measured", f"{text} No search looked for a worse one.", extent_of("wrong", worst))
+
+
+def over_drives(summary: SweepSummary) -> str:
+    """Return that an interval is over drives, where it is."""
+    return ", over drives" if summary.drives else ""
 
 
 def _in_each(result: SweepSummary) -> str:

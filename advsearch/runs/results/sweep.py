@@ -97,7 +97,10 @@ class SurfacePart(Fields):
     seen: CountedAnswers = Field(description="pictures that see it")
     hidden: CountedAnswers = Field(description="the other ones")
     difference: float = Field(description="share of wrong answers where it is seen, less that where it is not")
-    interval: Interval = Field(description="of that difference, 95 %, for the part by itself")
+    interval: Interval = Field(
+        description="of that difference, 95 %, for the part by itself; null where pictures share a draw, as frames of "
+        "a drive do"
+    )
     p: float = Field(description="how likely it is that by chance any part stands out as far")
 
 
@@ -137,7 +140,7 @@ class PairedRates(Fields):
     answer_only: int = Field(description="pairs that are right with it alone")
     neither: int = Field(description="pairs that are right in none")
     difference: float = Field(description="accuracy with the answer less that without")
-    interval: Interval = Field(description="of that difference, 95 %, of pairs")
+    interval: Interval = Field(description="of that difference, 95 %, of pairs, over draws where some share one")
 
 
 class BesideAnswer(Fields):
@@ -151,7 +154,7 @@ class OverDrives(Fields):
     """A number of each drive."""
 
     mean: float = Field(description="over drives")
-    interval: Interval | None = Field(description="of the mean, over drives; null of fewer than 5")
+    interval: Interval | None = Field(description="of the mean, 95 %, over drives; null of one")
     worst: float = Field(description="of the worst drive")
 
 

@@ -114,6 +114,32 @@
     return intervals.get(key);
   }
 
+  const STAKES = [1, 0.9, 0.75, 0.5, 0.25, 0.125, 0.0625, 0.03125], SURE = Math.log(40);
+  const overUnits = new Map();
+  // The interval over units (drives) that have several rows each, by bets (attacks/units.py), from what units come to:
+  // [right, rows, how many units].
+  function intervalOver(units) {
+    const key = units.map((one) => one.join(" ")).sort().join();
+    if (!overUnits.has(key)) {
+      const most = Math.max(...units.map(([, of]) => of));
+      const won = (mean, wrong) => {
+        const totals = STAKES.map((stake) => units.reduce((sum, [right, of, times]) => sum + times * Math.log(Math.max(0, 1 - (stake * of) / most + (stake * (wrong ? of - right : right)) / (most * mean))), 0));
+        const top = Math.max(...totals);
+        return top === -Infinity ? top : top + Math.log(totals.reduce((sum, one) => sum + Math.exp(one - top), 0) / STAKES.length);
+      };
+      const solve = (beyond) => {
+        let low = 0, high = 1;
+        for (let k = 0; k < 40; k++) {
+          const middle = (low + high) / 2;
+          if (beyond(middle)) high = middle; else low = middle;
+        }
+        return (low + high) / 2;
+      };
+      overUnits.set(key, [solve((mean) => won(mean, false) < SURE), solve((mean) => won(1 - mean, true) >= SURE)]);
+    }
+    return overUnits.get(key);
+  }
+
   function colour(share) {
     const place = Math.min(Math.max(share, 0), 1) * (MAP.length - 1);
     const first = Math.min(Math.floor(place), MAP.length - 2);
@@ -139,7 +165,7 @@
       this.parameters = [];
       this.answers = [];
       this.sources = [];
-      this.columns = { step: new Uint32Array(0), margin: new Float32Array(0), answer: new Uint16Array(0), probability: new Uint16Array(0), right: new Uint8Array(0), source: new Uint16Array(0), boxes: null };
+      this.columns = { step: new Uint32Array(0), unit: new Uint32Array(0), margin: new Float32Array(0), answer: new Uint16Array(0), probability: new Uint16Array(0), right: new Uint8Array(0), source: new Uint16Array(0), boxes: null };
     }
 
     add({ head, arrays }, source) {
@@ -150,9 +176,9 @@
         if (array) larger.set(array);
         return larger;
       };
-      for (const name of ["step", "margin", "probability", "right"]) {
+      for (const name of ["step", "unit", "margin", "probability", "right"]) {
         this.columns[name] = grown(this.columns[name], this.columns[name].constructor);
-        this.columns[name].set(arrays[name], before);
+        this.columns[name].set(arrays[name] || arrays.step, before); // older files have no unit
       }
       this.columns.source = grown(this.columns.source, Uint16Array);
       this.columns.source.fill(source, before);
@@ -179,11 +205,22 @@
         else mine.data.set(from, before);
       });
       this.count = count;
+      this.order = null;
       for (const one of this.parameters) {
         if (one.data.length === count) continue;
         const missing = one.levels ? this.places(one.levels, ["none"])[0] : NaN;
         one.data = grown(one.data, one.data.constructor, missing);
       }
+    }
+
+    // The rows, those of one unit of sampling beside each other; empty where each is a unit of its own.
+    byUnit() {
+      if (this.order) return this.order;
+      const { unit, source } = this.columns, order = Uint32Array.from({ length: this.count }, (_, k) => k);
+      order.sort((a, b) => source[a] - source[b] || unit[a] - unit[b]);
+      this.shared = order.some((k, place) => place > 0 && unit[k] === unit[order[place - 1]] && source[k] === source[order[place - 1]]);
+      this.order = this.shared ? order : new Uint32Array(0);
+      return this.order;
     }
 
     places(known, names) {
@@ -253,7 +290,7 @@
       this.state = { across: null, up: null, by: null, measure: "accuracy", fixed: {}, cell: null, show: "all", order: "worst" };
       this.parts = { peek: make("div", { class: "peek", hidden: true, "aria-hidden": "true" }), controls: make("div", { class: "parameters" }), options: make("div", { class: "options" }), maps: make("div", { class: "maps" }), legend: make("div", { class: "legend" }), status: make("p", { class: "status", role: "status", "aria-live": "polite" }), alongs: make("div", { class: "alongs" }), gallery: make("div", { class: "gallery" }), bar: make("div", { class: "options" }) };
       const heading = (text) => make("h2", {}, text);
-      place.append(heading("Accuracy over two parameters"), this.parts.options, this.parts.controls, this.parts.maps, this.parts.legend, this.parts.status, heading("Pictures"), this.parts.bar, this.parts.gallery, heading("Along each parameter"), make("p", { class: "soft" }, "Accuracy with its 95 % interval (Clopper and Pearson), over what is chosen above."), this.parts.alongs, this.parts.peek);
+      place.append(heading("Accuracy over two parameters"), this.parts.options, this.parts.controls, this.parts.maps, this.parts.legend, this.parts.status, heading("Pictures"), this.parts.bar, this.parts.gallery, heading("Along each parameter"), make("p", { class: "soft" }, "Accuracy with its 95 % interval, over what is chosen above: Clopper and Pearson's, and where rows share a draw (frames of a drive, models that are shown one picture) one over draws, by bets."), this.parts.alongs, this.parts.peek);
       window.addEventListener("hashchange", () => this.arrive());
     }
 
@@ -363,7 +400,39 @@
           margins[place] += 1;
         }
       }
-      return { all, right, judged, margin, margins };
+      return { all, right, judged, margin, margins, units: this.unitsOf(levels, sizes) };
+    }
+
+    // What the units of each place come to: "right of rows", and how many units do; null where each row is a unit.
+    unitsOf(levels, sizes) {
+      const order = this.table.byUnit(), { right: verdict, unit, source } = this.table.columns, kept = this.kept;
+      if (!order.length) return null;
+      const found = new Map();
+      let mine = new Map();
+      order.forEach((k, at) => {
+        if ((!kept || kept[k]) && verdict[k] !== UNKNOWN) {
+          let place = 0;
+          for (let a = 0; a < levels.length; a++) place = place * sizes[a] + levels[a][k];
+          const [right, of] = mine.get(place) || [0, 0];
+          mine.set(place, [right + verdict[k], of + 1]);
+        }
+        const next = order[at + 1];
+        if (next !== undefined && unit[next] === unit[k] && source[next] === source[k]) return;
+        for (const [place, [right, of]] of mine) {
+          if (!found.has(place)) found.set(place, new Map());
+          const key = `${right} ${of}`;
+          found.get(place).set(key, (found.get(place).get(key) || 0) + 1);
+        }
+        mine = new Map();
+      });
+      return found;
+    }
+
+    interval(counts, place) {
+      const units = counts.units && counts.units.get(place);
+      const told = units && [...units].map(([key, times]) => [...key.split(" ").map(Number), times]);
+      if (told && told.some(([, of]) => of > 1)) return intervalOver(told);
+      return interval(counts.right[place], counts.judged[place]);
     }
 
     // ---- what is chosen ----------------------------------------------------------------------------------------------
@@ -469,7 +538,7 @@
       const where = [[by, part], [up, row], [across, column]].filter(([axis]) => axis.name).map(([axis, level]) => `${axis.name} ${axis.labels[level]}`).join(", ");
       if (!counts.all[place]) return `${where}: no configuration`;
       const judged = counts.judged[place];
-      const [low, high] = judged ? interval(counts.right[place], judged) : [null, null];
+      const [low, high] = judged ? this.interval(counts, place) : [null, null];
       const margin = counts.margins[place] ? `, mean margin ${short(counts.margin[place] / counts.margins[place])}` : "";
       return `${where}: right in ${counts.right[place]} of ${judged} (${percent(judged ? counts.right[place] / judged : null)}, ${percent(low)} to ${percent(high)})${margin}`;
     }
@@ -563,7 +632,7 @@
       parts.forEach((part, series) => axis.labels.forEach((text, level) => {
         const place = series * n + level, judged = counts.judged[place];
         if (!judged) return;
-        const share = counts.right[place] / judged, [low, top] = interval(counts.right[place], judged);
+        const share = counts.right[place] / judged, [low, top] = this.interval(counts, place);
         const words = `${part ? `${part}, ` : ""}${text}: ${percent(share)}, ${percent(low)} to ${percent(top)}, of ${judged}`;
         const dot = shape(series, x(level, series), y(share));
         marks.push(drawn("g", { class: `series s${series % 6}` }, drawn("title", {}, words), drawn("line", { x1: x(level, series), x2: x(level, series), y1: y(low), y2: y(top) }), dot));

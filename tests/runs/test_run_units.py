@@ -1,0 +1,48 @@
+"""Which rows of a sweep share a draw."""
+
+from __future__ import annotations
+
+import json
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from advsearch.errors import FileFormatError
+from advsearch.runs.store import NAME as STORE
+from advsearch.runs.store import Store
+from advsearch.runs.units import NOTE, Units, units_of
+
+
+@pytest.mark.parametrize("frames", [0, 1, 2])
+@pytest.mark.parametrize(("models", "again"), [(1, 0), (2, 0), (2, 1)])
+def test_rows_of_a_unit_differ_in_frame_model_and_answer_alone(frames: int, models: int, again: int) -> None:
+    sizes, samples, scenes = (3, 2, 4), 2, 2
+    whole = Units(sizes, frames, samples, models, again * scenes * 24 * samples)
+    found: dict[int, set[tuple[int, ...]]] = {}
+    digits = product(range(1 + again), range(scenes), *map(range, sizes), range(samples), range(models))
+    for step, (_, scene, *places, sample, _) in enumerate(digits):
+        places[frames] = 0
+        found.setdefault(whole.of(step), set()).add((scene, *places, sample))
+    assert all(len(one) == 1 for one in found.values()), "a unit has one place beside its frames"
+    assert len(found) == scenes * 24 // sizes[frames] * samples == len({min(one) for one in found.values()})
+    steps = np.arange(scenes * 24 * samples * models * (1 + again))
+    assert (whole.of(steps) == [whole.of(int(one)) for one in steps]).all()
+    assert (np.unique(whole.of(steps), return_counts=True)[1] == whole.size).all() and whole.name == "drive"
+
+
+def test_without_frames_a_unit_is_a_picture() -> None:
+    assert Units((3, 2), None, 5).of(np.arange(30)).tolist() == list(range(30)) and Units((1,), 0).name == "picture"
+    assert Units((3,), None, 1, models=2).of(np.arange(6)).tolist() == [0, 0, 1, 1, 2, 2]
+
+
+def test_a_run_notes_its_units_and_what_is_none_is_refused(tmp_path: Path) -> None:
+    with Store(tmp_path / STORE) as store:
+        assert units_of(store) is None
+        store.set_note(NOTE, json.dumps(Units((3, 5), 1, 2, 2, 60).noted))
+        assert units_of(store) == Units((3, 5), 1, 2, 2, 60)
+        for text in ("[]", '{"sizes": 3}', '{"sizes": [3], "models": 0}', '{"sizes": ["a"]}'):
+            store.set_note(NOTE, text)
+            with pytest.raises(FileFormatError, match="what units of sampling are"):
+                units_of(store)
