@@ -237,6 +237,12 @@ def _looks() -> tuple[int, int, int]:
     return WORST_CASE.needed(first), WORST_CASE.needed(last), last
 
 
+def _exceptions(samples: int) -> float:
+    """The share of a box that may have another verdict, where all samples agree."""
+    nothing = torch.zeros(1)
+    return 1.0 - mapping.GrownBox(nothing, nothing, nothing, samples, samples, samples).interval[0]
+
+
 MADE_BY_HAND = [
     ("design.md", f"**First look**: {stages.FIRST_LOOK} renders of the clean scene"),
     ("design.md", f"That makes `steps` + {planned_renders(0)} renders"),
@@ -262,7 +268,7 @@ MADE_BY_HAND = [
     ("questions.md", {4: "with other seeds, up to four times"}[mapping.ATTEMPTS]),
     ("questions.md", f"First {mapping.AT_CENTRE} trials of the centre"),
     ("questions.md", f"Then {RegionConfig.model_fields['samples'].default} fresh samples"),
-    ("questions.md", f"at most {100 * (1 - clopper_pearson(200, 200)[0]):.1f} % of the box has another verdict"),
+    ("questions.md", f"at most {100 * _exceptions(200):.1f} % of the box has another verdict"),
     ("runs.md", {1.0: "may lose the rows of the last second"}[store.SYNC_INTERVAL]),
     ("runs.md", f"more than {100 * store.SYNC_SHARE:.0f} % of the time"),
     ("scenes.md", f"reaches to {100 * FRAME_FILL:.0f} % of the way"),
