@@ -45,7 +45,7 @@ RATE, OVER_RATE = 0.75, 0.85
 """Rates that are too low to be found, for one scene and over conditions."""
 MOST_FOUND, MOST_FOUND_OVER = 0.025, 0.035
 """How often they may be found, with a random search beside the search."""
-MOST_OFF = {0.1: 0.01, 0.05: 0.25}
+MOST_OFF = {0.1: 0.01, 0.05: 0.2}
 """How often a sample count that is said to be enough may leave the rate so far off."""
 CLEAN, OWN, BASELINE, FAILURE = 0.0, 1.0, 0.5, 0.25
 DOMAIN = Domain(torch.zeros(1), (Block(1, "linf", 1.0),))

@@ -166,7 +166,7 @@ class _SuiteRun:
             found = self.trial.claim(asked, self.suite.claims[one.name], one.config)
         else:
             assert isinstance(one.config, AttackConfig)
-            found = self.trial.counterexample(asked, one.one, one.config)
+            found = self.trial.counterexample(asked, one.one, one.config, added=self.config.add is not None)
         found = found.model_copy(update={"seconds": time.perf_counter() - begun})
         if TIME_OVER not in found.reason and found.reason != STOPPED:
             results.put(key, found.to_dict())

@@ -178,8 +178,10 @@ class Trial:
             }
         )
 
-    def counterexample(self, asked: ClaimAnswer, one: Counterexample, config: AttackConfig) -> ClaimAnswer:
-        """Try a counterexample: the model should be right on it."""
+    def counterexample(
+        self, asked: ClaimAnswer, one: Counterexample, config: AttackConfig, *, added: bool = False
+    ) -> ClaimAnswer:
+        """Try a counterexample: the model should be right on it. Trials by which it is `added` are no trials of it."""
         asked = asked.model_copy(update={"statement": f"{config.model} is right where it said {one.said}"})
         parts = parts_of(config)
         if not same_scene(one, parts.scene):
@@ -189,7 +191,7 @@ class Trial:
         u = problem.domain.project(one.configuration(problem.domain.start))
         count, right, label, picture = TRIALS[is_over(config)], 0, "", None
         self.progress.stage(one.name, count, at_most=True)
-        kind = f"counterexample {one.name}"
+        kind = f"{'added ' if added else ''}counterexample {one.name}"
         queries = (
             Query(u, seeds.stream(problem.seed, kind, number), kind, number, spp=one.spp) for number in range(count)
         )
