@@ -3,10 +3,11 @@
     python benchmarks/verdicts.py [--runs 400] [--epsilons .01 .02 .03 .04] [--object FILE] [--environment FILE] ...
 
 *Before* is how verdicts were taken at first: samples until the margin moves by less than half of itself, and then 20
-trials of which 19 have to succeed. *Now* samples stop where more of them leave the margin on its side, and trials
-stop with the verdict. Five tables:
+trials of which 19 have to succeed. *Now* samples stop where more of them leave the margin on its side, and fresh trials
+stop with the verdict. Five tables (`verdict_flow.py` has whole checks, with a random search and different failures):
 
-- trials: how often a rate is found, exactly, and how many trials it takes; how often intervals cover the rate;
+- trials: how often a rate is found, exactly, and how many trials it takes; how often intervals cover the rate; both by
+  the code that runs, in every way in which its trials may come out;
 - trials over many conditions: the same, where 200 were tried before;
 - sample counts: how often a margin passes for settled on the wrong side, where noise lifts it over zero;
 - close calls, drawn: how often what is `found` before and now, and the samples that both take;
@@ -14,7 +15,7 @@ stop with the verdict. Five tables:
 
 Exits with 1 where an interval covers too seldom, a rate of 75 % is found more often than before, one of 85 % over
 conditions in more than 3.3 %, a margin passes on the
-wrong side in more than 5 % of all cases, or noise aside (two standard errors) more is found at a limit that is none.
+wrong side in more than 5 % of all cases or, noise aside (two standard errors) more is found at a limit that is none.
 """
 
 from __future__ import annotations
@@ -23,8 +24,9 @@ import argparse
 import math
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from functools import partial
+from functools import cache, partial
 from itertools import product
 
 import numpy as np
@@ -48,7 +50,7 @@ from advsearch.attacks import (
     verify,
 )
 from advsearch.attacks.evaluation import Evaluate
-from advsearch.attacks.trials import LADDER, MarginsOf, Trials, clopper_pearson, margins_of
+from advsearch.attacks.trials import LADDER, MarginsOf, Trials, margins_of
 from advsearch.attacks.verification import (
     OVER_CONDITIONS,
     OVER_CONFIDENCE,
@@ -76,31 +78,51 @@ CALLS = (-0.5, -0.1, 0.0, 0.1, 0.25, 0.5, 1.0, 3.0)
 # ---- the rule, exactly
 
 
-def outcomes(rate: float) -> dict[tuple[int, int], float]:
-    """Return how often trials that nobody counted end with (successes, trials), for a rate of successes."""
-    last, allowed = TRIAL_LOOKS[-1], WORST_CASE.allowed(TRIAL_LOOKS[-1])
-    failing, ended = {0: 1.0}, dict[tuple[int, int], float]()
-    for n in range(1, last + 1):
-        went = {
-            failures: failing.get(failures, 0.0) * rate + failing.get(failures - 1, 0.0) * (1.0 - rate)
-            for failures in range(max(failing) + 2)
-        }
-        failing = {}
-        for failures, chance in went.items():
-            found = n in TRIAL_LOOKS and failures <= WORST_CASE.allowed(n)
-            lost = failures > allowed and n >= WORST_CASE.fewest
-            if found or lost or n == last:
-                ended[n - failures, n] = ended.get((n - failures, n), 0.0) + chance
-            else:
-                failing[failures] = chance
-        if not failing:
-            break
-    return ended
+class Unknown(Exception):
+    """A trial is asked for that the script doesn't have."""
+
+
+def ended(script: str) -> Verification:
+    """Return what the check itself says where trials succeed (1) or fail (0) one after the other; `Unknown` where it
+    asks for more."""
+    told = iter(script)
+
+    def evaluate(queries: Sequence[Query]) -> Iterator[Evaluation]:
+        for query in queries:
+            answer = "0" if float(query.u[0]) == 0.0 else next(told, None)
+            if answer is None:
+                raise Unknown
+            margin = 1.0 if answer == "1" else -1.0
+            yield Evaluation.of(Judgement(margin, margin, margin <= 0.0, Answer("")))
+
+    domain = Domain(torch.zeros(1), (Block(1, "linf", 1.0),))
+    return verify(evaluate, domain, torch.ones(1), claim=Ending.NOT_VERIFIED, spp=1, seed=0, trials=TRIAL_LOOKS)
+
+
+@cache
+def paths() -> dict[tuple[int, int, bool], int]:
+    """Return in how many ways trials that nobody counted end with (successes, trials, found), by the code that runs."""
+    ways, scripts = Counter[tuple[int, int, bool]](), [""]
+    while scripts:
+        script = scripts.pop()
+        try:
+            said = ended(script)
+        except Unknown:
+            scripts += [script + "0", script + "1"]
+            continue
+        rate = said.adversarial
+        ways[rate.successes, rate.trials, said.ending is Ending.FOUND] += 1
+    return dict(ways)
+
+
+def outcomes(rate: float) -> dict[tuple[int, int, bool], float]:
+    """Return how often trials end with (successes, trials, found), for a rate of successes."""
+    return {(k, n, found): ways * rate**k * (1.0 - rate) ** (n - k) for (k, n, found), ways in paths().items()}
 
 
 def found(rate: float) -> float:
     """Return how often a rate is found."""
-    return sum(chance for (k, n), chance in outcomes(rate).items() if k >= WORST_CASE.needed(n))
+    return sum(chance for (_, _, found), chance in outcomes(rate).items() if found)
 
 
 def found_before(rate: float) -> float:
@@ -110,7 +132,7 @@ def found_before(rate: float) -> float:
 
 def coverage(rate: float) -> float:
     """Return how often the interval that is printed covers the rate."""
-    intervals = {(k, n): clopper_pearson(k, n) for k, n in outcomes(rate)}
+    intervals = {at: Trials(at[0], at[1], 1).interval for at in paths()}
     return sum(chance for at, chance in outcomes(rate).items() if intervals[at][0] <= rate <= intervals[at][1])
 
 
@@ -118,7 +140,7 @@ def rule_table() -> int:
     """Print how the rule does; return how many things are wrong with it."""
     print("| rate | found before, % | now, % | trials before | now |\n| --- | --- | --- | --- | --- |")
     for rate in RATES:
-        trials = sum(chance * n for (_, n), chance in outcomes(rate).items())
+        trials = sum(chance * n for (_, n, _), chance in outcomes(rate).items())
         print(f"| {rate:.2f} | {100 * found_before(rate):.2f} | {100 * found(rate):.2f} | 20 | {trials:.1f} |")
     least = min(coverage(rate) for rate in np.linspace(0.005, 0.995, 199))
     print(f"intervals cover the rate in {100 * least:.1f} % of all cases at least\n")
@@ -353,7 +375,7 @@ def main() -> int:
     parser.add_argument("--label")
     args = parser.parse_args()
     threads.configure(None)
-    wrong = rule_table() + over_table() + sample_table(args.runs) + drawn_table(args.runs)
+    wrong = rule_table() + over_table() + sample_table(10 * args.runs) + drawn_table(args.runs)
     given = {name: getattr(args, name) for name in ("object", "environment", "model", "labels", "label")}
     given = {name: value for name, value in given.items() if value is not None}
     size = (args.resolution, args.resolution)

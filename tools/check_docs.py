@@ -20,8 +20,9 @@ from pathlib import Path
 from types import ModuleType
 
 import reference_scenes
+import torch
 
-from advsearch.attacks import POLICIES, candidates, clopper_pearson, planned_renders, trials, verification
+from advsearch.attacks import POLICIES, candidates, clopper_pearson, planned_renders, rate_samples, trials, verification
 from advsearch.attacks.objectives import OBJECTIVE_KINDS
 from advsearch.attacks.policies import pgd
 from advsearch.attacks.verification import WORST_CASE
@@ -38,6 +39,7 @@ from advsearch.questions.attack.answer import CurveResult, MatrixResult
 from advsearch.questions.gap.answer import GapResult
 from advsearch.questions.region import carry_out as mapping
 from advsearch.questions.region.settings import RegionConfig
+from advsearch.questions.test import counterexamples as tested
 from advsearch.runs import directory, export, store
 from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.results.base import RenderResult, Result
@@ -237,6 +239,17 @@ def _looks() -> tuple[int, int, int]:
     return WORST_CASE.needed(first), WORST_CASE.needed(last), last
 
 
+def _exceptions(samples: int) -> float:
+    """The share of a box that may have another verdict, where all samples agree."""
+    nothing = torch.zeros(1)
+    return 1.0 - mapping.GrownBox(nothing, nothing, nothing, samples, samples, samples).interval[0]
+
+
+def _draws(mean: float, value: float = 1.0) -> int:
+    """Pictures that decide a claim where all answers are alike."""
+    return trials.draws_needed(mean, confidence=trials.CONFIDENCE, value=value)
+
+
 MADE_BY_HAND = [
     ("design.md", f"**First look**: {stages.FIRST_LOOK} renders of the clean scene"),
     ("design.md", f"That makes `steps` + {planned_renders(0)} renders"),
@@ -262,7 +275,13 @@ MADE_BY_HAND = [
     ("questions.md", {4: "with other seeds, up to four times"}[mapping.ATTEMPTS]),
     ("questions.md", f"First {mapping.AT_CENTRE} trials of the centre"),
     ("questions.md", f"Then {RegionConfig.model_fields['samples'].default} fresh samples"),
-    ("questions.md", f"at most {100 * (1 - clopper_pearson(200, 200)[0]):.1f} % of the box has another verdict"),
+    ("questions.md", f"at most {100 * _exceptions(200):.1f} % of the box has another verdict"),
+    ("testing.md", "takes {} of them, *at least 0.99* {}, and".format(*map(_draws, (0.95, 0.99)))),
+    ("testing.md", f"*no worse by 5 points* {_draws(0.475, 0.5)} where both models answer alike"),
+    ("testing.md", "in all {} trials ({} for an answer".format(*(tested.TRIALS[over] for over in (False, True)))),
+    ("testing.md", f"6 of 6 show a share of at least {100 * clopper_pearson(6, 6)[0]:.0f} %"),
+    ("design.md", f"are rendered under {rate_samples.CONDITIONS} conditions at 4, 16 and 64 samples"),
+    ("design.md", f"carry at most {100 * rate_samples.MOVED:.0f} % of the conditions over zero"),
     ("runs.md", {1.0: "may lose the rows of the last second"}[store.SYNC_INTERVAL]),
     ("runs.md", f"more than {100 * store.SYNC_SHARE:.0f} % of the time"),
     ("scenes.md", f"reaches to {100 * FRAME_FILL:.0f} % of the way"),

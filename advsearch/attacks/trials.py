@@ -7,6 +7,7 @@ with the sample count, and a verification in the middle of that drift credits th
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -158,9 +159,12 @@ class ConfidenceSequence:
 
     Attributes:
         confidence: of the interval, at all times together; over 0 and under 1.
+        sides: 2 of the whole interval; 1 of each end by itself, for a claim "at least so much": if it is true only
+            `is_under` can be wrong, and else only `is_over`, so that each may be as often as the other says.
     """
 
     confidence: float = CONFIDENCE
+    sides: int = 2
     _counts: Counter[float] = field(default_factory=Counter)
 
     def __post_init__(self) -> None:
@@ -194,7 +198,20 @@ class ConfidenceSequence:
         return edge_of(lambda mean: not self.is_over(mean)), edge_of(self.is_under)
 
     def _won(self, mean: float, counts: Mapping[float, int]) -> bool:
-        return bool(capital(mean, counts) >= np.log(2.0 / (1.0 - self.confidence)))
+        return bool(capital(mean, counts) >= np.log(self.sides / (1.0 - self.confidence)))
+
+
+def draws_needed(mean: float, *, confidence: float, value: float = 1.0) -> int:
+    """Return how many draws, all of one value over a mean in (0, 1), show that the true one is over it, by one side of
+    a `ConfidenceSequence`: no others show it sooner where the value is 1."""
+
+    def shown(count: int) -> bool:
+        return capital(mean, {value: count}) >= math.log(1.0 / (1.0 - confidence))
+
+    high = 1
+    while not shown(high):
+        high *= 2
+    return bisect_left(range(1, high + 1), True, key=shown) + 1
 
 
 def capital(mean: float, counts: Mapping[float, int]) -> float:

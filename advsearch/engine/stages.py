@@ -228,7 +228,7 @@ class Attack:
         answer = problem.domain.project(found.best_u)
         if not self.config.smallest or findings.sample_count is None:
             searched = [one for one in (found, baseline, unprinted) if one is not None]
-            pictures = sum(one.renders * problem.draws + one.gradients for one in searched)
+            pictures = sum((one.renders + one.gradients) * problem.draws for one in searched)
             candidates = {"adversarial": answer, "clean": problem.domain.start}
             self._verifier.choose_spp(candidates, searched=pictures * problem.spp)
         groups = 1 + (baseline is not None) + (unprinted is not None) + (not self._verifier.clean_tried)
@@ -249,11 +249,11 @@ class Attack:
             check_failures(self._verifier, found)
 
     def _take_the_worse(self, found: SearchResult, baseline: SearchResult) -> None:
-        """Let the random search's answer be the run's if it is the worse one for the model, and remember that. It is
-        chosen by its trials, so these are no evidence: it has to be the worse one in fresh ones, too."""
+        """Let the random search's answer be the run's if it is found and the worse one for the model, and remember
+        that. It is chosen by its trials, so these are no evidence: it has to be the worse one in fresh ones, too."""
         findings = self.findings
         own, other = findings.verification, findings.baseline_verification
-        if own is None or other is None or _rank(other) <= _rank(own):
+        if own is None or other is None or other.ending is not Ending.FOUND or _rank(other) <= _rank(own):
             return
         title = "checking the random search's answer again"
         self._verifier.begin(title, 2 * self._verifier.count, at_most=True)

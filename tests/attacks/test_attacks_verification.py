@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from scipy import stats
+from scipy.stats import binom
 
 from advsearch.attacks import (
     Block,
@@ -332,6 +333,24 @@ def test_the_fewest_samples_of_a_region_follow_from_the_confidence_of_its_interv
     for samples in (FEWEST_SAMPLES - 1, FEWEST_SAMPLES):
         region = GrownBox(low, low, high, samples, samples, samples)
         assert (region.interval[0] >= LEAST_RATE) == (samples == FEWEST_SAMPLES)
+
+
+def test_the_interval_of_a_region_covers_although_it_is_sampled_until_nothing_differs() -> None:
+    """Exactly, where a part of the box has another verdict wherever it is cut; without its correction it would not."""
+    box, samples, attempts = torch.zeros(1), 50, 4
+    shares = np.arange(samples + 1)
+    ours = np.array([GrownBox(box, box, box, int(k), samples, samples).interval for k in shares])
+    plain = np.array([clopper_pearson(int(k), samples) for k in shares])
+    covered = []
+    for ends in (ours, plain):
+        covers = []
+        for rate in np.linspace(0.005, 0.995, 199):
+            chances, inside = binom.pmf(shares, samples, rate), (ends[:, 0] <= rate) & (rate <= ends[:, 1])
+            again = (1.0 - chances[-1]) ** np.arange(attempts)
+            early = chances[-1] * inside[-1] * again[:-1].sum()
+            covers.append(early + again[-1] * (chances * inside).sum())
+        covered.append(min(covers))
+    assert covered[0] >= 0.95 > 0.93 > covered[1]
 
 
 @pytest.mark.parametrize(

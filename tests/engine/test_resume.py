@@ -263,10 +263,18 @@ class Sleeper(Policy[Domain]):
         return state
 
 
+class Weaker(StandInProblem):
+    """Wrong so near the start that a random search finds it."""
+
+    def _logits(self, u: torch.Tensor, seed: int) -> torch.Tensor:
+        return super()._logits(u, seed) + torch.tensor([-0.11, 0.11])
+
+
 @pytest.mark.parametrize(("policy", "beaten"), [(Sleeper(), True), (make_policy("pgd"), False)])
 def test_the_random_searchs_answer_is_taken_where_it_is_the_worse_one(policy: Policy[Any], beaten: bool) -> None:
-    problem: Any = StandInProblem()
-    attack = attack_on(problem, configuration(), policy, Stages(NullProgress()))
+    problem: Any = Weaker()
+    config = configuration().model_copy(update={"steps": 200})
+    attack = attack_on(problem, config, policy, Stages(NullProgress()))
     findings = attack.carry_out()
     assert findings.search is not None and findings.baseline is not None and findings.verification is not None
     assert (findings.beaten is not None) == beaten

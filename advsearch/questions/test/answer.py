@@ -44,7 +44,11 @@ class ClaimAnswer(Fields):
     rate: JsonFloat | None = Field(
         None, description="share of right answers, or the difference of two models; absent of a search"
     )
-    interval: Interval | None = Field(None, description="that holds at all times together, at the suite's confidence")
+    interval: Interval | None = Field(
+        None,
+        description="of it: each end holds at all times together, at the suite's confidence; of a counterexample that "
+        "of Clopper and Pearson, 95 %",
+    )
     spp: int | None = Field(None, description="samples a pixel of the pictures; absent of a search")
     picture: str | None = Field(None, description="a picture that the model gets wrong, in the run's folder")
     part: str | None = Field(None, description="the run in `parts` that has the search; absent without one")
@@ -99,8 +103,8 @@ RESULT = SuiteResult
 TABLE_HEADS = ("claim", "answer", "pictures", "why")
 
 NOTE = (
-    "Held and failed are shown at the stated confidence, by an interval that holds however often it is looked at. A "
-    "search that finds nothing is no proof."
+    "Held and failed are shown at the stated confidence, by one end of an interval, each of which holds however often "
+    "it is looked at. A search that finds nothing is no proof."
 )
 
 TIME_OVER = "the time of the suite was over"
@@ -169,7 +173,10 @@ def search_answer(summary: AttackSummary, config: AttackConfig) -> tuple[str, st
     if summary.ending == "found" and verified is not None:
         label = next(iter(verified.labels), "")
         called = f", most often {with_article(label)}" if label else ""
-        return FAILED, f"a verified counterexample: wrong in {verified.successes} of {verified.trials} trials{called}"
+        wrong = (
+            f"wrong in {verified.successes} of {verified.trials} trials (interval {interval_text(verified.interval)})"
+        )
+        return FAILED, f"a verified counterexample: {wrong}{called}"
     if summary.goes_on:
         return UNDECIDED, STOPPED
     if verified is not None and verified.successes:
@@ -181,11 +188,15 @@ def search_answer(summary: AttackSummary, config: AttackConfig) -> tuple[str, st
     return HELD, f"not broken by {count(summary.steps, 'step')} of {summary.policy}{beside}; this is no proof"
 
 
-def tried_reason(right: int, wrong: int, label: str) -> tuple[str, str]:
-    """Return what trials of a counterexample say, and why."""
+def tried_reason(right: int, wrong: int, label: str, interval: tuple[float, float] | None) -> tuple[str, str]:
+    """Return what trials of a counterexample say, and why; the interval is of the share of right answers."""
+    if interval is None:
+        return UNDECIDED, TIME_OVER
     if not wrong:
-        return HELD, f"right in {right} of {right} trials"
-    said = f"wrong in {wrong} of {right + wrong} trials, {with_article(label)}"
+        return HELD, f"right in {right} of {right} trials (interval {interval_text(interval)})"
+    low, high = interval
+    said = f"wrong in {wrong} of {right + wrong} trials (interval {interval_text((1.0 - high, 1.0 - low))})"
+    said = f"{said}, {with_article(label)}"
     return (UNDECIDED, f"{said}: it depends on the noise") if right else (FAILED, said)
 
 
@@ -232,7 +243,7 @@ def claims(result: SuiteResult) -> Iterator[Claim]:
             yield Claim(kind="nothing claimed", statement=said, extent=None)
         else:
             sure = percent(result.confidence)
-            more = f" The interval is a confidence sequence at {sure}, in place of Clopper-Pearson's."
+            more = f" Each end of the interval is a confidence sequence at {sure}, in place of Clopper-Pearson's."
             yield Claim(kind="measured", statement=said + more, extent=None)
 
 

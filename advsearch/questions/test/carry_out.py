@@ -27,7 +27,7 @@ from advsearch.questions.test.answer import (
     statement,
     verdict,
 )
-from advsearch.questions.test.claims import Trial
+from advsearch.questions.test.claims import Trial, check_pictures
 from advsearch.questions.test.counterexamples import (
     Counterexample,
     add,
@@ -88,7 +88,7 @@ def test_from_config(
         planned = _planned(described, config, added)
         for one in planned if described is not suite else ():
             one.config.check_powers(f"claims.{one.name}.settings")
-        _check(planned, described)
+        remarks = _check(planned, described)
     except InputError as error:
         if added is not None:
             remove(added)
@@ -107,7 +107,10 @@ def test_from_config(
             config.workers,
             config.cluster,
             progress,
+            remarks,
         )
+        for remark in remarks:
+            progress.message(remark)
         suite_run = _SuiteRun(config, described, planned, trial, read_expected(config.suite))
         ending = suite_run.carry_out()
         if added is not None and suite_run.answers[0].answer != FAILED:
@@ -165,7 +168,7 @@ class _SuiteRun:
             found = self.trial.claim(asked, self.suite.claims[one.name], one.config)
         else:
             assert isinstance(one.config, AttackConfig)
-            found = self.trial.counterexample(asked, one.one, one.config)
+            found = self.trial.counterexample(asked, one.one, one.config, added=self.config.add is not None)
         found = found.model_copy(update={"seconds": time.perf_counter() - begun})
         if TIME_OVER not in found.reason and found.reason != STOPPED:
             results.put(key, found.to_dict())
@@ -248,14 +251,16 @@ def _planned(suite: Suite, config: SuiteConfig, added: Counterexample | None) ->
     return [one for one in planned if one.name in chosen or (one.one is not None and COUNTEREXAMPLES in chosen)]
 
 
-def _check(planned: Sequence[PlannedClaim], suite: Suite) -> None:
-    """Load everything that claims name, and refuse what could not be judged; a wrong name would end minutes of
-    rendering."""
+def _check(planned: Sequence[PlannedClaim], suite: Suite) -> list[str]:
+    """Load everything that claims name, and refuse what could not be judged or decided; a wrong name would end minutes
+    of rendering. Return what has to be said before."""
     known: list[AttackConfig] = []
+    claims = {one.name: suite.claims[one.name] for one in planned if one.one is None}
+    remarks = [check_pictures(name, claim, suite.confidence) for name, claim in claims.items()]
     for one in planned:
         if one.one is not None:
             continue  # what is beside the suite is loaded when it is tried, at once
-        claim = suite.claims[one.name]
+        claim = claims[one.name]
         if isinstance(claim, NotBrokenClaim):
             _check_search(one.name, one.config)
         whole = one.config if isinstance(one.config, AttackConfig) else AttackConfig.of(one.config)
@@ -269,6 +274,7 @@ def _check(planned: Sequence[PlannedClaim], suite: Suite) -> None:
                 except InputError as error:
                     raise InputError(f"claims.{one.name}: {error}") from None
                 known.append(config)
+    return [remark for remark in remarks if remark]
 
 
 def _check_search(name: str, config: SceneConfig) -> None:

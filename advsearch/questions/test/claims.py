@@ -15,12 +15,13 @@ from advsearch import seeds
 from advsearch.api.studies import carry_out_part
 from advsearch.attacks import Evaluation
 from advsearch.attacks.evaluation import Query
-from advsearch.attacks.trials import ConfidenceSequence
+from advsearch.attacks.trials import ConfidenceSequence, clopper_pearson, draws_needed
 from advsearch.config import AttackConfig, SceneConfig
 from advsearch.engine.attack_parts import executor_for, parts_of, problem_of
 from advsearch.engine.journal import Journal, Shared, answering
 from advsearch.engine.problem import Problem
 from advsearch.engine.verifier import ladder_of
+from advsearch.errors import InputError
 from advsearch.files import JsonObject
 from advsearch.progress import Progress
 from advsearch.questions.test.answer import (
@@ -83,7 +84,7 @@ class Trial:
 
     def _right(self, asked: ClaimAnswer, claim: RightClaim, config: SceneConfig) -> ClaimAnswer:
         problem, shared = self._problem(config), self._shared(config)
-        sequence, right = ConfidenceSequence(self.confidence), 0
+        sequence, right = ConfidenceSequence(self.confidence, sides=1), 0
         wrong: list[tuple[float, Query, str]] = []
         self.progress.stage(asked.name, claim.pictures, hint="fewer pictures in the suite shorten it", at_most=True)
         with executor_for(shared, "advsearch.questions.attack.carry_out:attack_answers", self.progress) as executor:
@@ -97,7 +98,7 @@ class Trial:
                 if not said.right:
                     score = said.score if math.isfinite(said.score) else -math.inf
                     wrong = sorted([*wrong, (score, query, said.answer.label)], key=lambda one: -one[0])[:1]
-                answer = decided(sequence, claim.at_least)
+                answer = decided(sequence, least_mean(claim))
                 if answer != UNDECIDED:
                     break
         worst, picture = "", None
@@ -111,7 +112,7 @@ class Trial:
     def _no_worse(self, asked: ClaimAnswer, claim: NoWorseClaim, config: SceneConfig) -> ClaimAnswer:
         problem, other = self._problem(config), self._problem(config.model_copy(update={"model": claim.than}))
         same = other.renderer.formation == problem.renderer.formation
-        sequence, ours, theirs, answer = ConfidenceSequence(self.confidence), 0, 0, UNDECIDED
+        sequence, ours, theirs, answer = ConfidenceSequence(self.confidence, sides=1), 0, 0, UNDECIDED
         kind, first = f"claim {asked.name}", None
         self.progress.stage(asked.name, claim.pictures, hint="fewer pictures in the suite shorten it", at_most=True)
         shared = self._shared(config).model_copy(update={"model": f"{config.model},{claim.than}"})
@@ -144,7 +145,7 @@ class Trial:
                         first = query
                     sequence.add((own.said.right - its.said.right + 1) / 2)
                     self.progress.advance(1, **journal.traced.told)
-                    answer = decided(sequence, 0.5 - claim.points / 200.0)
+                    answer = decided(sequence, least_mean(claim))
                     if answer != UNDECIDED:
                         break
                 if self.late():
@@ -177,8 +178,10 @@ class Trial:
             }
         )
 
-    def counterexample(self, asked: ClaimAnswer, one: Counterexample, config: AttackConfig) -> ClaimAnswer:
-        """Try a counterexample: the model should be right on it."""
+    def counterexample(
+        self, asked: ClaimAnswer, one: Counterexample, config: AttackConfig, *, added: bool = False
+    ) -> ClaimAnswer:
+        """Try a counterexample: the model should be right on it. Trials by which it is `added` are no trials of it."""
         asked = asked.model_copy(update={"statement": f"{config.model} is right where it said {one.said}"})
         parts = parts_of(config)
         if not same_scene(one, parts.scene):
@@ -188,7 +191,7 @@ class Trial:
         u = problem.domain.project(one.configuration(problem.domain.start))
         count, right, label, picture = TRIALS[is_over(config)], 0, "", None
         self.progress.stage(one.name, count, at_most=True)
-        kind = f"counterexample {one.name}"
+        kind = f"{'added ' if added else ''}counterexample {one.name}"
         queries = (
             Query(u, seeds.stream(problem.seed, kind, number), kind, number, spp=one.spp) for number in range(count)
         )
@@ -199,10 +202,12 @@ class Trial:
                 label, picture = evaluation.said.answer.label, self._picture(one.name, problem, query)
             if 0 < right < tried:
                 break  # it depends on the noise, whatever comes
-        answer, reason = tried_reason(right, tried - right, label)
+        interval = clopper_pearson(right, tried) if tried else None
+        answer, reason = tried_reason(right, tried - right, label, interval)
         if tried < count and not 0 < right < tried:
             answer, reason = UNDECIDED, TIME_OVER
         said = {"answer": answer, "reason": reason, "pictures": tried, "spp": one.spp, "picture": picture}
+        said |= {"rate": right / tried if tried else None, "interval": interval}
         return asked.model_copy(update=said)
 
     def _problem(self, config: SceneConfig) -> Problem:
@@ -293,6 +298,35 @@ def drawn(problem: Problem, kind: str, count: int, spp: int) -> Iterator[Query]:
         seed = seeds.stream(problem.seed, kind, number)
         values = problem.describe(u, seed) if problem.domain.dim <= MOST_KEPT else {}
         yield Query(u, seed, kind, number, spp=spp, values=values, sought=False)
+
+
+def least_mean(claim: RightClaim | NoWorseClaim) -> float:
+    """Return what the mean of the draws is claimed to be over: 1 for right and 0 for wrong; or 0, 1/2 and 1, of two
+    models."""
+    return claim.at_least if isinstance(claim, RightClaim) else 0.5 - claim.points / 200.0
+
+
+def check_pictures(name: str, claim: AnyClaim, confidence: float) -> str:
+    """Return what has to be said of a claim's number of pictures before any is made; nothing where it is enough.
+
+    Raises:
+        InputError: no answers to so many pictures could decide it, or only one way.
+    """
+    if not isinstance(claim, RightClaim | NoWorseClaim):
+        return ""
+    least = least_mean(claim)
+    needed = max(draws_needed(one, confidence=confidence) for one in (least, 1.0 - least))
+    if claim.pictures < needed:
+        raise InputError(
+            f"claims.{name}.pictures: expected at least {needed}, as fewer cannot both hold and fail this claim at a "
+            f"confidence of {number_text(confidence)} whatever the model answers, got {claim.pictures}"
+        )
+    alike = draws_needed(least, confidence=confidence, value=0.5) if isinstance(claim, NoWorseClaim) else 0
+    if claim.pictures >= alike:
+        return ""
+    return (
+        f"{name}: two models that answer alike are shown to be so by {alike} pictures, and it takes {claim.pictures}."
+    )
 
 
 def decided(sequence: ConfidenceSequence, least: float) -> str:

@@ -37,7 +37,7 @@ from advsearch.questions.test.answer import ClaimAnswer, SuiteResult
 from advsearch.questions.test.carry_out import test_from_config as carry_out
 from advsearch.questions.test.counterexamples import _Block as Block
 from advsearch.questions.test.counterexamples import counterexamples, folder_of
-from advsearch.questions.test.settings import SuiteConfig
+from advsearch.questions.test.settings import NoWorseClaim, SuiteConfig
 from advsearch.runs.store import Store
 from advsearch.runs.summary import read_result
 from advsearch.testing import assert_no_worse, assert_not_broken, assert_right, assert_suite
@@ -71,7 +71,7 @@ def written(folder: Path, claims: dict[str, Any], **more: Any) -> str:
 CLAIMS = {
     "in-front": claim("right", at_least=0.5, pictures=20),
     "behind": claim("right", BACK, at_least=0.5, pictures=20),
-    "too-few": claim("right", at_least=0.99, pictures=2),
+    "too-few": claim("no_worse", than=EASY, points=20, pictures=9),
     "no-worse": claim("no_worse", than=HARD, points=40, pictures=20),
 }
 
@@ -108,7 +108,7 @@ def test_every_claim_is_held_failed_or_undecided_and_stops_when_it_is(tested: tu
     assert "camera.azimuth 2" in found["behind"].reason, "where it is most wrong, in words"
     with Store(folder / "run" / "results.sqlite", read_only=True) as store:
         counts = store.counts()
-    assert counts["claim in-front"] == found["in-front"].pictures and counts["claim too-few"] == 2
+    assert counts["claim in-front"] == found["in-front"].pictures and counts["claim too-few"] == 9
     assert counts["claim no-worse"] == counts["claim no-worse beside"] == found["no-worse"].pictures
     assert read_result(folder / "run") == result
     page = (folder / "run" / "report.html").read_text("utf-8")
@@ -132,6 +132,29 @@ def test_the_command_repeats_a_claim_alone(tested: tuple[SuiteResult, Path], tmp
     assert other.claims[0].reason != first.reason and other.seed == 1
 
 
+@pytest.mark.parametrize(
+    ("asked", "needed"),
+    [
+        (claim("right", at_least=0.99), 426),
+        (claim("right", at_least=0.9, pictures=5), 41),
+        (claim("right", at_least=0.01, pictures=5), 426),
+        (claim("no_worse", than=HARD, points=5, pictures=6), 7),
+    ],
+)
+def test_a_claim_that_its_pictures_cannot_decide_is_refused_before_any_is_made(
+    asked: dict[str, Any], needed: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Problem, "picture", lambda *given, **more: pytest.fail("rendered"))
+    with pytest.raises(AdvsearchError, match=rf"claims\.it\.pictures: expected at least {needed}, .* got "):
+        carry_out(SuiteConfig(suite=written(tmp_path, {"it": asked}), run=str(tmp_path / "run")))
+
+
+def test_pictures_that_two_equal_models_would_need_are_told() -> None:
+    few = NoWorseClaim(claim="no_worse", than=EASY, points=5, pictures=83)
+    assert "shown to be so by 84 pictures, and it takes 83" in claims.check_pictures("it", few, 0.95)
+    assert not claims.check_pictures("it", few.model_copy(update={"pictures": 84}), 0.95)
+
+
 def test_a_search_fails_a_claim_by_a_verified_counterexample_and_never_calls_it_safe(tmp_path: Path) -> None:
     claims = {
         "little": {"claim": "not_broken", "settings": {**QUICK, "controls": {"camera": {"azimuth": [-20, 20]}}}},
@@ -141,7 +164,7 @@ def test_a_search_fails_a_claim_by_a_verified_counterexample_and_never_calls_it_
     little, much = result.claims
     assert (little.answer, much.answer) == ("held", "failed")
     assert little.reason.startswith("not broken by 8 steps of random") and "no proof" in little.reason
-    assert "wrong in 6 of 6 trials, most often a vase" in much.reason
+    assert "wrong in 6 of 6 trials (interval 54-100 %), most often a vase" in much.reason
     assert much.picture == "parts/much/images/adversarial.png" and (tmp_path / "run" / much.picture).is_file()
 
 
@@ -181,7 +204,8 @@ def test_a_suite_that_was_stopped_goes_on_where_it_was_whoever_shares_its_pictur
     ended = carry_out(config, resumed=tmp_path / "run")
     assert {one.name: (one.answer, one.reason, one.interval) for one in ended.claims} == whole
     if workers is None:
-        assert done < sum(one.pictures for one in ended.claims), "what was there was read back"
+        judged = sum(one.pictures * (1 + (one.kind == "no_worse")) for one in ended.claims)
+        assert done < judged, "what was there was read back"
 
 
 class Planted(small_models.Blue):
@@ -230,7 +254,10 @@ def test_a_counterexample_is_kept_small_tried_first_and_fails_fast(attacked: Pat
         ("found", "failed", 6),
         ("too-few", "undecided", 0),
     ]
-    assert tried.claims[0].reason == "wrong in 6 of 6 trials, a vase" and "counterexample failed" in tried.warnings[-1]
+    assert (
+        tried.claims[0].reason == "wrong in 6 of 6 trials (interval 54-100 %), a vase"
+        and "counterexample failed" in tried.warnings[-1]
+    )
     every = carry_out(SuiteConfig(suite=suite, all=True, update=True, run=str(tmp_path / "every")))
     assert every.changes == ["found: held -> failed", "too-few: held -> undecided"] and every.status == 0
     known = carry_out(SuiteConfig(suite=suite, run=str(tmp_path / "known")))
@@ -244,7 +271,7 @@ def test_an_answer_that_does_not_hold_for_the_suite_s_model_is_not_kept(attacked
     advsearch.allow_code("test_suites:always")
     always = {"object": "mug", "model": "test_suites:always", **SMALL}
     Path(suite).write_text(yaml.safe_dump({"settings": always, "claims": {"too-few": CLAIMS["too-few"]}}))
-    with pytest.raises(AdvsearchError, match="is not kept: right in 6 of 6 trials"):
+    with pytest.raises(AdvsearchError, match=r"is not kept: right in 6 of 6 trials \(interval 54-100 %\)"):
         carry_out(SuiteConfig(suite=suite, add=attacked, run=str(tmp_path / "run")))
     assert counterexamples(suite) == [] and not list(folder_of(suite).glob("*.jpg"))
 
@@ -516,8 +543,8 @@ def test_assertions_pass_and_fail_with_the_picture_and_what_repeats_them(
     (picture,) = (line.partition(": ")[2] for line in text.splitlines() if line.startswith("  picture"))
     assert Path(picture).is_file() and text.startswith("right: failed: right in 0 of")
     assert "again: pytest" in text and "::test_assertions_pass_and_fail" in text
-    with pytest.raises(AssertionError, match=r"undecided: .*not decided after 2 pictures"):
-        assert_no_worse("mug", easy, always(), pictures=2, controls=FRONT, **small)
+    with pytest.raises(AssertionError, match=r"undecided: .*not decided after 13 pictures"):
+        assert_no_worse("mug", easy, always(), points=20.0, pictures=13, controls=FRONT, **small)
 
 
 def test_a_search_and_a_suite_can_be_asserted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
