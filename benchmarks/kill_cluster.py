@@ -179,7 +179,9 @@ def killed(first: Sequence[str], run: Path, cluster: Cluster, kills: Kills) -> b
             if child is not None and child.returncode == 0:
                 return True
             known = (run / "run.yaml").is_file()
-            child = begin(["resume", str(run)] if known else [*first, "--cluster", cluster.address])
+            child = begin(
+                ["resume", str(run), f"cluster={cluster.address}"] if known else [*first, "--cluster", cluster.address]
+            )
         time.sleep(0.2)
         victim = kills.due() if kills.total - before < OF_A_RUN else None
         if victim is not None:

@@ -62,7 +62,7 @@ def setting(
         power: says what a value does beyond the run, which only a person may ask for (`settings.power`).
         constraints: as of `pydantic.Field`.
     """
-    notes: JsonObject = {"group": group, "expects": expects, "unit": unit, "otherwise": otherwise, "flag": flag}
+    notes: dict[str, Any] = {"group": group, "expects": expects, "unit": unit, "otherwise": otherwise, "flag": flag}
     notes |= {"metavar": metavar, "form": form, "switched": switched, "power": power}
     declared: Any = {"default": default, "description": description, **notes, **constraints}
     alias = constraints.pop("alias", None)
