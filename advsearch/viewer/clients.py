@@ -177,9 +177,8 @@ class Clients:
                     selector.unregister(key.fileobj)
                     self._ready.put((key.fileobj, silent.pop(key.fileobj)[0]))
             now = time.monotonic()
-            for connection in [
-                one for one, (_, since) in silent.items() if now - since > (PATIENCE if room else GRACE)
-            ]:
+            most = PATIENCE if room else min(PATIENCE, GRACE)
+            for connection in [one for one, (_, since) in silent.items() if now - since > most]:
                 del silent[connection]
                 selector.unregister(connection)
                 connection.close()
