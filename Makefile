@@ -46,7 +46,7 @@ test-slow: $(STAMP) ## run the tests that take minutes; ARGS="--one-in 10" runs 
 test-zoo: $(STAMP) ## run the tests of torchvision's, timm's and transformers' networks with these, in build/zoo
 	@bash tools/test_zoo.sh $(BIN)/python build/zoo $(ARGS)
 
-fuzz: $(STAMP) ## load 400 hostile files, each in bounds of time and memory; ARGS="--seed 1" makes others
+fuzz: $(STAMP) ## load 400 hostile files and run folders, each in bounds of time and memory; ARGS="--seed 1" makes others
 	@PYTHONPATH=tests $(BIN)/python -m fuzz $(ARGS)
 
 check: lint typecheck test docs ## everything that has to pass before a commit

@@ -5,6 +5,8 @@ reading them from the store when the sweep ends, and in Chromium (through Playwr
 to): the first paint of the page from `advsearch dashboard`, the map, and each interaction until the page is painted
 again. Seconds; medians of five for interactions.
 
+With `--list` it is the list of so many runs: processor time of a first request, of a second, and their ratio.
+
 With `--attack` it is the page of a real attack of 40 steps on a texture at 224 pixels: how large it is,
 how long it takes to be made, and until the object that can be turned is drawn.
 """
@@ -183,22 +185,42 @@ def of_sweep(folder: Path, rows: int, pictures: Literal["all", "none"]) -> dict[
     return found
 
 
+def of_list(folder: Path, count: int) -> dict[str, float]:
+    """Make the runs, and ask for their list twice."""
+    home = folder / "runs"
+    make(home / "0", 8, "none")
+    for number in range(1, count):
+        shutil.copytree(home / "0", home / str(number))
+    os.chdir(folder)
+    server, seconds = Dashboard(()), []
+    for _ in range(2):
+        begun = time.process_time()
+        server.list_page()
+        seconds.append(time.process_time() - begun)
+    server.server_close()
+    return {"first list [s]": seconds[0], "second list [s]": seconds[1], "ratio": seconds[0] / seconds[1]}
+
+
 def main() -> int:
     """Make the run, open it, and print what was measured."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rows", type=int, default=1_000_000, help="rows of the sweep")
     parser.add_argument("--keep-pictures", choices=["all", "none"], default="none", help="of the sweep")
     parser.add_argument("--attack", action="store_true", help="the page of an attack in place of a sweep's")
+    parser.add_argument("--list", type=int, metavar="COUNT", help="the list of so many runs in place of a page")
     parser.add_argument("--json", action="store_true", help="print JSON")
     args = parser.parse_args()
-    if CHROMIUM is None:
+    if CHROMIUM is None and not args.list:
         print("there is no Chromium here: apt-get install chromium", file=sys.stderr)
         return 2
     with tempfile.TemporaryDirectory() as folder:
         run = Path(folder) / "run"
-        found = of_attack(run) if args.attack else of_sweep(run, args.rows, args.keep_pictures)
+        if args.list:
+            found = of_list(Path(folder), args.list)
+        else:
+            found = of_attack(run) if args.attack else of_sweep(run, args.rows, args.keep_pictures)
     if args.json:
-        print(json.dumps(found if args.attack else {"rows": args.rows, **found}, indent=2))
+        print(json.dumps(found if args.attack or args.list else {"rows": args.rows, **found}, indent=2))
         return 0
     for name, value in found.items():
         print(f"{name:32} {value:8.3f}")

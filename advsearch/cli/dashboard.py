@@ -25,11 +25,19 @@ if TYPE_CHECKING:
 
 PORT = 8265
 
+SEEN = (
+    "Whoever has this address sees the runs and can send photographs. Each is judged on this machine, by the model "
+    "that the run's settings name, and kept in the run's folder, as a picture and as rows; nothing else is written."
+)
+
 
 def _dashboard_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("runs", nargs="*", metavar="RUN", help="names or folders of runs (default: all in runs/)")
     parser.add_argument(
-        "--host", default="127.0.0.1", help="address to listen at (default: %(default)s); others need the printed token"
+        "--host",
+        default="127.0.0.1",
+        help="address to listen at (default: %(default)s); at others, whoever has the printed "
+        "token sees the runs and can add photographs, which the run's model judges here",
     )
     parser.add_argument("--port", type=int, default=PORT, help="port; 0 takes a free one (default: %(default)s)")
     parser.add_argument(
@@ -57,7 +65,7 @@ def _dashboard(args: argparse.Namespace) -> int:
             file=sys.stderr,
         )
     if server.token:
-        print("Whoever has this address sees the runs and can add photographs to them.", file=sys.stderr)
+        print(SEEN, file=sys.stderr)
         print(qr_text(server.address) or f"For a code to point a phone at: {NO_QR}", file=sys.stderr)
     print("Ctrl-C ends it.", file=sys.stderr)
     try:

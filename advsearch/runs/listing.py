@@ -21,8 +21,8 @@ FAULT = "it cannot be read, which is a fault of advsearch"
 class Listed:
     """One run in its folder: the command that made it, what the model should recognise, what could change, rows by
     kind; ``"running"`` where a process works on it, ``"stopped"`` where it can be resumed, else its ending; the answer
-    in a few words; whether it has begun, so that it can be resumed; when, seconds since 1970 (UTC), if known; and what is
-    wrong with it, empty where nothing is."""
+    in a few words; whether it has begun, so that it can be resumed; when, seconds since 1970 (UTC), if known; and what
+    is wrong with it, empty where nothing is."""
 
     name: str
     path: str
@@ -73,13 +73,15 @@ def listed_run(path: Path, *, counts: bool = True) -> Listed:
 
 def _read_of(path: Path) -> Iterator[Path]:
     """What a line of the list depends on."""
-    return (path / name for name in ("", CONFIG, summary.NAME, store.NAME, f"{store.NAME}-wal"))
+    return (path / name for name in (CONFIG, summary.NAME, store.NAME, f"{store.NAME}-wal"))
 
 
 def _state(path: Path) -> object:
     with suppress(OSError):
         found = os.lstat(path)
-        return found.st_ino, found.st_size, found.st_mtime_ns
+        return (
+            (found.st_ino, found.st_size, found.st_mtime_ns) if found.st_size else None
+        )  # who reads leaves such a log
     return None
 
 

@@ -168,18 +168,18 @@ class Clients:
                 selector.unregister(self._listening)
             listens = room
             for key, _ in selector.select(TICK):
-                if key.fileobj is self._listening:
+                connection: Any = key.fileobj
+                if connection is self._listening:
                     with suppress(OSError):
                         connection, address = self._listening.accept()
                         silent[connection] = address, time.monotonic()
                         selector.register(connection, selectors.EVENT_READ)
                 else:
-                    selector.unregister(key.fileobj)
-                    self._ready.put((key.fileobj, silent.pop(key.fileobj)[0]))
+                    selector.unregister(connection)
+                    self._ready.put((connection, silent.pop(connection)[0]))
             now = time.monotonic()
-            for connection in [
-                one for one, (_, since) in silent.items() if now - since > (PATIENCE if room else GRACE)
-            ]:
+            most = PATIENCE if room else min(PATIENCE, GRACE)
+            for connection in [one for one, (_, since) in silent.items() if now - since > most]:
                 del silent[connection]
                 selector.unregister(connection)
                 connection.close()

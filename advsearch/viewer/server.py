@@ -436,4 +436,5 @@ def _with_way(page: bytes, home: str, above: tuple[str, str] | None, said: str |
     links = [("All runs", home), *([(above[1], above[0])] if above else [])]
     way = element("nav", *(element("a", text, href=address) for text, address in links), aria_label="back")
     way = join_html(way, element("p", said, class_="remarks") if said else None)
-    return page.replace(b"<body>", b"<body>" + way.encode("utf-8", "replace"), 1)
+    at = page.find(b"<body>") + len(b"<body>") if b"<body>" in page else 0
+    return page[:at] + way.encode("utf-8", "replace") + page[at:]

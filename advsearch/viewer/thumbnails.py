@@ -20,7 +20,7 @@ import numpy as np
 from PIL import Image
 
 from advsearch.described import Value
-from advsearch.errors import InputError
+from advsearch.errors import FileFormatError, InputError
 from advsearch.files import read_bytes
 from advsearch.runs.directory import AOV_FOLDER, CONFIG, IMAGES, SMALL_PICTURES
 from advsearch.runs.fiftyone import Pictured
@@ -130,8 +130,12 @@ class Kept:
         except OSError:
             return None
         stream = io.BytesIO()
-        with Image.open(io.BytesIO(data)) as image:
-            image.save(stream, "PNG")
+        try:
+            with Image.open(io.BytesIO(data)) as image:
+                image.save(stream, "PNG")
+        except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):
+            file = path_of(self.run, step // self.models)
+            raise FileFormatError(f"{file}: expected a small picture of the run, got something else") from None
         return stream.getvalue()
 
     def embedded(self, columns: Columns, most: int) -> Iterator[tuple[str, str]]:

@@ -166,7 +166,9 @@ def _refusal(words: list[str]) -> list[str]:
     text = errors.buffer.getvalue().decode()  # type: ignore[attr-defined]
     if status not in (0, 2):
         raise ArithmeticError(f"{words[0]} ended with {status}: {text[-200:]}")
-    return [text.splitlines()[-1].removeprefix("advsearch: error: ")] if status else []
+    if not status or "this run kept none" in text:
+        return []
+    return [text.splitlines()[-1].removeprefix("advsearch: error: ")]
 
 
 def _page_faults(run: Path, *, compares: bool) -> list[str]:

@@ -137,7 +137,7 @@ def _changed(random: Random, db: sqlite3.Connection) -> str:
         db.execute("UPDATE meta SET value = ? WHERE key = ?", (value, key))
         return f"note {key}"
     if column.endswith("_json") and random.random() < 0.7:
-        told = db.execute(f"SELECT {column} FROM evaluations WHERE {column} IS NOT NULL LIMIT 1").fetchone()
+        told = db.execute(f"SELECT {column} FROM evaluations WHERE json_valid({column}) LIMIT 1").fetchone()
         value = as_json(confused(random, json.loads(told[0]) if told else {"a": 1.0})).decode()
         db.execute(f"UPDATE OR IGNORE evaluations SET {column} = ?{every}", (value,))
         return f"{column} confused"

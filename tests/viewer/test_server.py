@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import io
+import os
 import re
+import shutil
 import socket
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from http.client import HTTPConnection, HTTPResponse, HTTPSConnection
 from pathlib import Path
@@ -17,10 +19,14 @@ from ssl import _create_unverified_context
 import numpy as np
 import pytest
 from PIL import Image
+from samples import make_run, written_page
 from stored_sweeps import make_sweep, serving
 
 from advsearch.errors import InputError
+from advsearch.questions.photographs.answer import PhotoAgreement
 from advsearch.runs.directory import RunDirectory
+from advsearch.viewer import clients
+from advsearch.viewer.document import document
 from advsearch.viewer.server import Dashboard
 from advsearch.viewer.thumbnails import Kept
 
@@ -224,6 +230,167 @@ def test_those_who_say_nothing_do_not_fill_the_server(server: Dashboard, monkeyp
         for _ in range(1000):
             stack.enter_context(socket.create_connection(("127.0.0.1", server.server_port), 60))
         assert ask(server, "/")[0].status == 200
+
+
+@contextmanager
+def slow_clients(server: Dashboard, count: int, begun: bytes) -> Iterator[list[socket.socket]]:
+    """Clients that have begun to ask, and go on with a letter now and then."""
+    with ExitStack() as stack:
+        talks = [
+            stack.enter_context(socket.create_connection(("127.0.0.1", server.server_port), 60)) for _ in range(count)
+        ]
+        for talk in talks:
+            talk.sendall(begun)
+        done = threading.Event()
+
+        def dribble() -> None:
+            while not done.wait(0.05):
+                for talk in talks:
+                    with suppress(OSError):
+                        talk.sendall(b"a")
+
+        thread = threading.Thread(target=dribble)
+        thread.start()
+        try:
+            yield talks
+        finally:
+            done.set()
+            thread.join()
+
+
+@pytest.mark.parametrize(
+    "begun", [b"", b"G", b"GET / HTTP/1.0\r\nA: ", b"POST /runs/first/align/renderings/3 HTTP/1.0\r\n"]
+)
+def test_slow_clients_keep_nobody_out(server: Dashboard, begun: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
+    """More of them than workers: each has a little while where others wait, in all and not for each letter."""
+    monkeypatch.setattr("advsearch.viewer.clients.PATIENCE", 1e6)
+    monkeypatch.setattr("advsearch.viewer.clients.GRACE", 0.2)
+    with slow_clients(server, 3 * clients.WORKERS, begun):
+        for _ in range(3):
+            assert ask(server, "/")[0].status == 200
+
+
+def test_a_request_has_its_time_in_all(server: Dashboard, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("advsearch.viewer.clients.PATIENCE", 0.2)
+    with slow_clients(server, 2, b"GET / HTTP/1.0\r\nA: ") as talks:
+        for talk in talks:
+            with suppress(ConnectionResetError):
+                assert talk.recv(1000) == b""  # ended by the server, although no letter was late
+
+
+def test_who_takes_no_answer_keeps_nobody_out(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("advsearch.viewer.clients.GRACE", 0.2)
+    monkeypatch.setattr("advsearch.viewer.server.list_page", lambda _: "x" * (64 << 20))
+    with serving(run) as server, ExitStack() as stack:
+        for _ in range(clients.WORKERS):
+            talk = stack.enter_context(socket.create_connection(("127.0.0.1", server.server_port), 60))
+            talk.sendall(f"GET / HTTP/1.0\r\nHost: 127.0.0.1:{server.server_port}\r\n\r\n".encode())
+        assert ask(server, "/runs/first/cover")[0].status == 200
+
+
+# ---- what lies in a run is somebody else's ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("path", "kind", "own"),
+    [
+        ("/", "text/html; charset=utf-8", True),
+        ("/compare/?run=first", "text/html; charset=utf-8", True),
+        ("/runs/first/", "text/html; charset=utf-8", True),
+        ("/runs/first/align/", "text/html; charset=utf-8", True),
+        ("/runs/attack/", "text/html; charset=utf-8", False),
+        ("/runs/attack/cover", "image/jpeg", False),
+        ("/runs/attack/progress", "application/json", False),
+        ("/runs/attack/align/renderings/clean", "image/png", False),
+        ("/runs/first/rows", "application/octet-stream", False),
+        ("/runs/first/pictures/0000/3.jpg", "image/jpeg", False),
+        ("/runs/first/align/renderings/3", "image/jpeg", False),
+        ("/runs/none/", "text/plain; charset=utf-8", False),
+    ],
+)
+def test_every_answer_has_a_kind_and_a_policy(run: Path, attack_run: Path, path: str, kind: str, own: bool) -> None:
+    """A page of the server's own may ask it for more; all else has an origin of its own. Neither runs foreign code."""
+    with serving(run, attack_run, photographs=NoPhotographs()) as server:
+        answer, _ = ask(server, path)
+    assert answer.headers["Content-Type"] == kind
+    assert answer.headers["X-Content-Type-Options"] == "nosniff"
+    rules = dict(one.strip().partition(" ")[::2] for one in answer.headers["Content-Security-Policy"].split(";"))
+    assert rules["default-src"] == "'none'" and rules["frame-ancestors"] == "'none'" and rules["base-uri"] == "'none'"
+    assert "sandbox" not in rules if own else "allow-same-origin" not in rules["sandbox"]
+    assert rules.get("connect-src") == ("'self'" if own else None)
+    assert rules["img-src"] == ("data: 'self'" if own else "data:")
+    assert rules["form-action"] == ("'self'" if own else "'none'")
+    assert all(one.startswith("'sha256-") for one in rules["script-src"].split())
+
+
+class NoPhotographs:
+    """Takes none."""
+
+    def add(self, run: Path, rendering: str, data: bytes) -> PhotoAgreement:
+        raise InputError("none")
+
+    def agreement(self, run: Path) -> PhotoAgreement:
+        return PhotoAgreement.of(
+            dict.fromkeys(("photos", "right_right", "right_wrong", "wrong_right", "wrong_wrong"), 0)
+            | {"agreement": None, "interval": None, "renderings": []}
+        )
+
+
+@pytest.fixture(scope="module")
+def attack_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    run = make_run(tmp_path_factory.mktemp("runs") / "attack")
+    written_page(run)
+    return run
+
+
+def test_a_page_whose_scripts_are_others_says_so(attack_run: Path, tmp_path: Path) -> None:
+    shutil.copytree(attack_run, tmp_path / "other")
+    page = (attack_run / "report.html").read_text()
+    (tmp_path / "other" / "report.html").write_text(page.replace("</body>", "<SCRIPT>alert(1)</SCRIPT></body>"))
+    with serving(attack_run, tmp_path / "other") as server:
+        said = b"Its scripts are of another advsearch and do not run here; advsearch view other"
+        assert said in ask(server, "/runs/other/")[1]
+        assert said[:20] not in ask(server, "/runs/attack/")[1]
+
+
+def test_scripts_of_a_page_are_those_that_are_named() -> None:
+    with pytest.raises(ValueError, match="expected one of SCRIPTS"):
+        document("a page", scripts=["make.js"])
+
+
+def test_a_photograph_of_one_run_needs_its_own_key(run: Path) -> None:
+    with serving(run) as server:
+        assert server.key("first") != server.key("second")
+        assert server.key("first").encode() not in ask(server, "/")[1] + ask(server, "/runs/first/")[1]
+
+
+def test_a_bad_run_does_not_take_the_list_along(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in (b"good", b"b\xffd", b"linked", b"broken", b"deep"):
+        make_sweep(tmp_path / "runs" / "made").rename(tmp_path / "runs" / os.fsdecode(name))
+    (tmp_path / "runs/linked/columns.bin").unlink()
+    (tmp_path / "runs/linked/columns.bin").symlink_to("/etc/passwd")
+    (tmp_path / "runs/broken/summary.json").write_text("NaN")
+    (tmp_path / "runs/deep/summary.json").write_text("[" * 100_000)
+    with serving() as server:
+        page = ask(server, "/")[1].decode()
+        assert page.count("<tr") == 6 and "b?d" in page
+        assert page.count("runs/linked/columns.bin: expected a file or a folder of this run, got a link") == 1
+        assert page.count("summary.json: expected the summary of a run") == 2
+        assert ask(server, "/runs/b%FFd/")[0].status == ask(server, "/runs/b%FFd/rows")[0].status == 200
+        assert ask(server, "/runs/b%FFd/align/")[0].status == 404  # no photographs here, and no fault
+        for path in ("", "rows", "cover", "pictures/0000/3.jpg", "progress"):
+            answer, said = ask(server, f"/runs/linked/{path}")
+            assert answer.status == 500 and b"got a link" in said and b"root:" not in said
+
+
+def test_an_error_of_our_own_is_an_answer(server: Dashboard, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("advsearch.viewer.server.cover", lambda _: 1 / 0)
+    answer, said = ask(server, "/runs/first/cover")
+    assert (answer.status, said) == (
+        500,
+        b"this page could not be made, which is a fault of advsearch: ZeroDivisionError\n",
+    )
 
 
 def test_a_client_that_goes_away_does_no_harm(server: Dashboard) -> None:
