@@ -19,6 +19,7 @@ from advsearch.files import MESHES, parse_json, read_text
 from advsearch.scene.camera_entries import Entries, made, nothing, number, plain, with_told
 from advsearch.scene.camera_model import BROWN_CONRADY, COEFFICIENTS, EQUIRECTANGULAR, FISHEYE, CameraModel
 from advsearch.scene.importing.files import shown
+from advsearch.scene.importing.other_formats import CAMERAS
 from advsearch.yaml_text import LARGEST, parse_yaml
 
 LARGEST_JSON = 1 << 25
@@ -81,17 +82,6 @@ OF_A_SCENE = frozenset(
     "file_path transform_matrix sharpness colmap_im_id mask_path depth_file_path semantic_path time rotation".split()
 )
 """Entries of a transforms.json, and of its frames, that say nothing of the lens; angles count where lengths lack."""
-CONVERTED = {
-    ".bin": "COLMAP's binary cameras: write them as text, colmap model_converter --input_path FOLDER --output_path "
-    "FOLDER --output_type TXT, and give cameras.txt",
-    ".npz": "NumPy's arrays: write them as JSON, with image_width, image_height, camera_matrix and "
-    "distortion_coefficients (numpy.ndarray.tolist)",
-}
-CONVERTED |= {
-    ".npy": CONVERTED[".npz"],
-    ".pkl": CONVERTED[".npz"].replace("NumPy's arrays", "a pickle, which may run code"),
-}
-"""What other files of cameras are, and what to do with them."""
 
 
 def read_camera(spec: str) -> CameraModel:
@@ -107,8 +97,8 @@ def read_camera(spec: str) -> CameraModel:
     """
     path, _, which = spec.partition("#")
     ending = Path(path).suffix.lower()
-    if ending in CONVERTED and Path(path).is_file():
-        raise FileFormatError(f"{path}: expected a camera as text, got {CONVERTED[ending]}")
+    if ending in CAMERAS and Path(path).is_file():
+        raise FileFormatError(f"{path}: expected a camera as text, got {CAMERAS[ending]}")
     if ending in MESHES:
         raise FileFormatError(f"{path}: expected a camera file, got a mesh; it is an object's, not a camera's")
     try:
