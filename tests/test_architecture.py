@@ -344,7 +344,12 @@ def test_an_attack_on_what_is_bundled_needs_little() -> None:
 # -- what is shipped -------------------------------------------------------------------------------------------------
 
 
-NOT_MESSAGES = ("advsearch.settings", "advsearch.viewer.document", "advsearch.scene.importing.blender")
+NOT_MESSAGES = (
+    "advsearch.settings",
+    "advsearch.viewer.document",
+    "advsearch.scene.importing.blender",
+    "advsearch.scene.importing.other_formats",
+)
 """Modules that read or write flags themselves, also those of another program, and a style sheet."""
 
 

@@ -22,6 +22,7 @@ LARGEST_COEFFICIENT, LARGEST_FOCAL = 1e4, 1e3
 
 BENDS = re.compile(
     r"xi|mu|mv|[dkps]\d?|t(au)?[xy]|alpha|beta|gamma\d*|omega|.*dist(?!ance).*|.*skew.*|.*shear.*|.*mirror.*|.*tilt.*|"
+    r".*coeff.*|.*flip.*|.*rotate.*|image(rotation|scale)|scale(factor)?|resize.*|(is|image)?rectified|"
     r".*roi.*|.*crop.*|.*binning.*|.*decimat.*|.*fisheye.*|.*lens.*model|.*poly.*|.*affine.*|.*projectionparam.*"
 )
 """Entries, by their plain names, that make another picture: in none of the models that are read, they are refused."""
@@ -126,7 +127,8 @@ class Entries:
             value = self._given[name]
             if name in self._used or QUIET.fullmatch(name):
                 continue
-            if BENDS.fullmatch(name) and not OF_RECTIFIED.fullmatch(name):
+            of_another = name.endswith("2") and f"{name[:-1]}1" in self._spelled  # of a stereo pair
+            if BENDS.fullmatch(name) and not OF_RECTIFIED.fullmatch(name) and not of_another:
                 if not nothing(value):
                     raise FileFormatError(
                         f"{self.path}: expected no {shown(within + spelled)}, got {shown(str(value))}: it makes another"

@@ -19,6 +19,7 @@ from advsearch.files import MESHES, parse_json, read_text
 from advsearch.scene.camera_entries import Entries, made, nothing, number, plain, with_told
 from advsearch.scene.camera_model import BROWN_CONRADY, COEFFICIENTS, EQUIRECTANGULAR, FISHEYE, CameraModel
 from advsearch.scene.importing.files import shown
+from advsearch.scene.importing.other_formats import CAMERAS
 from advsearch.yaml_text import LARGEST, parse_yaml
 
 LARGEST_JSON = 1 << 25
@@ -61,16 +62,18 @@ OF_DISTORTION = {
 }
 """The distortion models of ROS, Kalibr and EuRoC that are one of ours."""
 
-MATRIX = ("cameramatrix", "k", "intrinsicmatrix", "mtx", "cameramatrix1")
+MATRIX = ("cameramatrix", "k", "intrinsicmatrix", "mtx", "cameramatrix1", "m1")
 DISTORTION = (
     *("distortioncoefficients", "distcoeffs", "distortioncoeffs", "distcoeff", "distortion", "d", "dist"),
-    *("distortioncoefficients1", "distcoeffs1"),
+    *("coeffs", "coefficients", "distortioncoefficients1", "distcoeffs1", "d1"),
 )
 WIDTH, HEIGHT = ("imagewidth", "width", "w"), ("imageheight", "height", "h")
 SIZE = ("imagesize", "resolution")
 GROUPS = ("projection_parameters", "distortion_parameters", "mirror_parameters")
 KANNALA = {"mu": "fx", "mv": "fy", "u0": "cx", "v0": "cy", "k2": "k1", "k3": "k2", "k4": "k3", "k5": "k4"}
 """What camodocal calls the numbers of a fisheye, and OpenCV."""
+ALIKE = 0.01
+"""By what share a focal length may differ from what an angle says."""
 OF_A_FRAME = frozenset(("camera_model", "fl_x", "fl_y", "cx", "cy", "w", "h", *IN_OPENCV))
 """What nerfstudio says of a camera, of all frames or of one."""
 OF_A_SCENE = frozenset(
@@ -79,17 +82,6 @@ OF_A_SCENE = frozenset(
     "file_path transform_matrix sharpness colmap_im_id mask_path depth_file_path semantic_path time rotation".split()
 )
 """Entries of a transforms.json, and of its frames, that say nothing of the lens; angles count where lengths lack."""
-CONVERTED = {
-    ".bin": "COLMAP's binary cameras: write them as text, colmap model_converter --input_path FOLDER --output_path "
-    "FOLDER --output_type TXT, and give cameras.txt",
-    ".npz": "NumPy's arrays: write them as JSON, with image_width, image_height, camera_matrix and "
-    "distortion_coefficients (numpy.ndarray.tolist)",
-}
-CONVERTED |= {
-    ".npy": CONVERTED[".npz"],
-    ".pkl": CONVERTED[".npz"].replace("NumPy's arrays", "a pickle, which may run code"),
-}
-"""What other files of cameras are, and what to do with them."""
 
 
 def read_camera(spec: str) -> CameraModel:
@@ -105,8 +97,8 @@ def read_camera(spec: str) -> CameraModel:
     """
     path, _, which = spec.partition("#")
     ending = Path(path).suffix.lower()
-    if ending in CONVERTED and Path(path).is_file():
-        raise FileFormatError(f"{path}: expected a camera as text, got {CONVERTED[ending]}")
+    if ending in CAMERAS and Path(path).is_file():
+        raise FileFormatError(f"{path}: expected a camera as text, got {CAMERAS[ending]}")
     if ending in MESHES:
         raise FileFormatError(f"{path}: expected a camera file, got a mesh; it is an object's, not a camera's")
     try:
@@ -211,6 +203,10 @@ def _chosen(path: str, which: str, cameras: Mapping[str, Any]) -> Any:
 
 def _of_colmap(spec: str, path: str, which: str, lines: Sequence[str]) -> CameraModel:
     rows = {words[0]: words for line in lines if (words := line.split())}
+    if len(rows) < len(lines):
+        raise FileFormatError(
+            f"{path}: expected each camera once, got one with the same number twice; correct the file"
+        )
     _, name, *rest = _chosen(path, which, rows)
     if name not in COLMAP:
         raise FileFormatError(
@@ -252,6 +248,10 @@ def _of_nerfstudio(spec: str, which: str, data: Mapping[str, Any]) -> CameraMode
         for angle, side in zip(angles, (width, height), strict=True)
     ]
     fx = entries.number(("flx",), "fl_x", lengths[0] or None)
+    if lengths[0] and abs(fx - lengths[0]) > ALIKE * fx:
+        raise FileFormatError(
+            f"{path}: fl_x: expected {lengths[0]:g}, as camera_angle_x says, got {fx:g}; leave one out"
+        )
     found = {"fx": fx, "fy": entries.number(("fly",), "fl_y", lengths[1] or fx)}
     found |= {axis: entries.number((axis,), axis, side / 2.0) for axis, side in (("cx", width), ("cy", height))}
     found |= _coefficients(entries, COEFFICIENTS[:4] if kind == FISHEYE else ("k1", "k2", "k3", "p1", "p2"))
@@ -272,7 +272,9 @@ def _of_kalibr(spec: str, entries: Entries, beside: Sequence[str] = ()) -> Camer
     focal = entries.numbers("intrinsics", entries.get("intrinsics"), (4,))
     names = ("k1", "k2", "k3", "k4") if kind == FISHEYE else ("k1", "k2", "p1", "p2")
     width, height = entries.numbers("resolution", entries.there(("resolution",), "resolution"), (2,))
-    found = dict(zip(("fx", "fy", "cx", "cy"), focal, strict=True)) | _distortion(entries, names, (0, 4))
+    found = _distortion(entries, names, (0, 4))
+    _check_none(path, entries.get("distortionmodel"), found)
+    found |= zip(("fx", "fy", "cx", "cy"), focal, strict=True)
     return with_told(made(spec, kind, (height, width), _from_corner(found)), [*beside, *entries.told()])
 
 
@@ -297,6 +299,7 @@ def _of_opencv(spec: str, entries: Entries) -> CameraModel:
     size, fisheye = _size(entries), kind == FISHEYE
     unread = _check_roi(entries, size)
     found = _distortion(entries, COEFFICIENTS[:4] if fisheye else IN_OPENCV, (0, 4) if fisheye else LENGTHS)
+    _check_none(path, entries.get("distortionmodel"), found)
     if found.pop("tauX", 0.0) or found.pop("tauY", 0.0):
         raise FileFormatError(
             f"{path}: expected no tilt of the sensor (tauX, tauY), got one; calibrate without CALIB_TILTED_MODEL"
@@ -332,6 +335,12 @@ def _distortion(entries: Entries, names: Sequence[str], counts: Sequence[int]) -
     if nothing(given) and not isinstance(given, Mapping):
         return _coefficients(entries, names)
     return dict(zip(names, entries.numbers("distortion_coefficients", given, counts), strict=False))
+
+
+def _check_none(path: str, model: object, coefficients: Mapping[str, float]) -> None:
+    """Refuse coefficients beside a model that says that there are none."""
+    if isinstance(model, str) and model.strip().lower() == "none" and any(coefficients.values()):
+        raise FileFormatError(f"{path}: expected no distortion, as its distortion_model is none, got coefficients")
 
 
 def _matrix(entries: Entries) -> list[float]:

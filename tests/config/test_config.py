@@ -38,7 +38,7 @@ WRONG: dict[str, tuple[Any, str]] = {
     "camera": (
         "",
         "expected a name that advsearch import lists, orbit, fisheye, equirectangular, or a camera file of OpenCV, "
-        "Kalibr, ROS or COLMAP, got ''",
+        "Kalibr, ROS, COLMAP or nerfstudio, got ''",
     ),
     "set_": ({"camera.azimuth": math.nan}, "got camera.azimuth=nan"),
     "exposure": (99, "expected a number from -10 to 10, got 99"),

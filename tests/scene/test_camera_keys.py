@@ -216,6 +216,13 @@ def test_a_roi_is_the_whole_picture_or_refused(roi: dict[str, int], whole: bool,
         read(tmp_path, KINDS["ros"] | {"roi": roi})
 
 
+def test_of_a_stereo_pair_the_first_camera_is_read_and_the_second_told(tmp_path: Path) -> None:
+    pair = {f"{key}{one}": value for one in (1, 2) for key, value in (("cameraMatrix", MATRIX), ("distCoeffs", FOUR))}
+    found = read(tmp_path, pair | {"image_width": 640, "image_height": 480})
+    assert found.numbers == read(tmp_path, KINDS["scalars"]).numbers
+    assert found.told == (f"{tmp_path / 'camera.json'}: not read: 'cameraMatrix2', 'distCoeffs2'.",)
+
+
 def test_frames_with_lenses_of_their_own_are_chosen_by_number(tmp_path: Path) -> None:
     data = {"camera_model": "OPENCV", "frames": [FRAME | NERF, FRAME | NERF | {"k1": 0.1}]}
     with pytest.raises(FileFormatError, match="has 2 cameras, 0, 1: say which"):
@@ -233,6 +240,9 @@ def test_frames_with_lenses_of_their_own_are_chosen_by_number(tmp_path: Path) ->
         (KINDS["scalars"] | {"camera_model": "omni"}, "got 'omni'"),
         (KINDS["scalars"] | {"camera_model": "fisheye", "distortion_model": "plumb_bob"}, "beside another"),
         (KINDS["vins"] | {"model_type": "MEI"}, "got 'mei'"),
+        (KINDS["opencv"] | {"distortion_model": "none"}, "its distortion_model is none"),
+        (KINDS["opencv"] | {"flip_horizontal": True}, "flip_horizontal"),
+        (KINDS["instant-ngp"] | {"fl_x": 100.0}, "as camera_angle_x says"),
         (KINDS["vins"] | {"mirror_parameters": {"xi": 1.6}}, "xi"),
         (KINDS["fisheye"] | {"d": [0.0] * 4}, "has 'D' and 'd'"),
     ],

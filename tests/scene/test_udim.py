@@ -107,6 +107,15 @@ def test_a_file_of_such_faces_only_has_none(tmp_path: Path) -> None:
         read(tmp_path, MAPPED + "f 1 2\nf 3\n")
 
 
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [("f 0 1", "indices that count from 1"), ("f a 1", "whole numbers in the face"), ("f 1 99", "99 'v' lines")],
+)
+def test_what_is_no_corner_in_them_is_refused_all_the_same(line: str, words: str, tmp_path: Path) -> None:
+    with pytest.raises(FileFormatError, match=words):
+        read(tmp_path, f"{MAPPED}{line}\nf 1 2 3\n")
+
+
 def test_a_ply_loses_them_too_and_keeps_colours_and_coordinates_of_the_others(tmp_path: Path) -> None:
     path = tmp_path / "a.ply"
     faces = "2 0 1 2 0 0 1 1 9 0 0\n4 0 1 2 3 8 0 0 1 0 1 1 0 1 0 255 0\n1 3 0 0 0 9\n"

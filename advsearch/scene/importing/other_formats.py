@@ -1,4 +1,4 @@
-"""Files of objects that are not read: what they are, and the program and command that make one of them that is."""
+"""Files of objects and cameras that are not read: what they are, and the program and command that convert them."""
 
 from __future__ import annotations
 
@@ -38,10 +38,22 @@ SAID = {
     "binary glTF of an avatar": ("rename it to end in .glb", (".vrm",)),
     "NumPy's arrays": ("write the mesh, as in trimesh.Trimesh(vertices, faces).export('mesh.ply')", (".npz", ".npy")),
     "a picture": (
-        "an object is a mesh; --environment takes .hdr and .exr",
+        "an object is a mesh; `environment` takes .hdr and .exr",
         (".png", ".jpg", ".jpeg", ".webp", ".hdr", ".exr"),
     ),
 }
+
+CAMERAS = {
+    ".bin": "COLMAP's binary cameras: write them as text, colmap model_converter --input_path FOLDER --output_path "
+    "FOLDER --output_type TXT, and give cameras.txt",
+    ".npz": "NumPy's arrays: write them as JSON, with image_width, image_height, camera_matrix and "
+    "distortion_coefficients (numpy.ndarray.tolist)",
+}
+CAMERAS |= {
+    ".npy": CAMERAS[".npz"],
+    ".pkl": CAMERAS[".npz"].replace("NumPy's arrays", "a pickle, which may run code"),
+}
+"""What files of cameras are that are not read, and what to do."""
 
 
 def advice(path: Path) -> str | None:

@@ -326,7 +326,9 @@ class Lines:
         at = np.flatnonzero(first)
         sizes = np.diff(np.searchsorted(begins[at], np.flatnonzero(data == _NEWLINE)), prepend=0)
         if sizes[-1] < 3 and self.unended and rows[-1] == len(self.starts) - 1:
-            self._blame_faces(rows[-1:])
+            ((number, words),) = self._words(rows[-1:])
+            got = f"{shown(' '.join(['f', *words]))} (is the file cut short?)"
+            raise damaged(self.path, f"3 or more corners on line {number}", got)
         if sizes.max() > files.scaled(MOST_CORNERS):
             expected = f"at most {files.scaled(MOST_CORNERS):,} corners in the face on line {rows[sizes.argmax()] + 1}"
             raise files.too_large(self.path, expected, f"{sizes.max():,}")
@@ -388,9 +390,6 @@ class Lines:
     def _blame_faces(self, rows: Ints, *, before: bool = False) -> None:
         counts = np.stack([np.cumsum(self.kind == KINDS.index(kind)) for kind in TABLES], axis=1)
         for number, words in self._words(rows):
-            if len(words) < 3:
-                got = f"{shown(' '.join(['f', *words]))} (is the file cut short?)"
-                raise damaged(self.path, f"3 or more corners on line {number}", got)
             for word in words:
                 if not _CORNER.fullmatch(word):
                     raise damaged(self.path, f"whole numbers in the face on line {number}", shown(word))
