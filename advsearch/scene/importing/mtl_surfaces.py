@@ -9,7 +9,7 @@ import numpy as np
 from PIL import Image
 
 from advsearch.scene.assets import Floats
-from advsearch.scene.importing.files import Inventory, References, plain_name, shown, text_of
+from advsearch.scene.importing.files import Inventory, Notes, References, plain_name, shown, text_of
 from advsearch.scene.importing.mtl import (
     MapUse,
     MtlMaterial,
@@ -79,7 +79,7 @@ class MtlReader:
     references: References
     inventory: Inventory
     libraries: int = 0
-    notes: list[str] = field(default_factory=list)
+    notes: Notes = field(default_factory=Notes)
     _materials: dict[str, MtlMaterial] = field(default_factory=dict)
     _painted: dict[int, Painted] = field(default_factory=dict)
     _pictures: Pictures | None = None
@@ -118,8 +118,7 @@ class MtlReader:
 
     def note(self, message: str) -> None:
         """Warn, once."""
-        if message not in self.notes:
-            self.notes.append(message)
+        self.notes.once(message)
 
     def _look_of(self, material: MtlMaterial) -> Painted:
         """Read all statements of a material."""
@@ -308,7 +307,7 @@ class MtlReader:
             self._pictures = Pictures(len(self._materials), self.references.get, self.references.refused)
         if (use.name, kind) not in self._read:
             self._read[use.name, kind] = self._pictures.of_file(use.name, kind)
-            for note in self._pictures.notes:
+            for note in self._pictures.notes.taken():
                 self.note(f"{self.source}: {note}")
         found, (base, gain) = self._read[use.name, kind], use.range
         if isinstance(found, str) or (base, gain) == (0.0, 1.0):
