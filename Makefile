@@ -82,8 +82,9 @@ study: $(STAMP) ## the slow studies: policies at equal renders, stated budgets, 
 reference: $(STAMP) ## render, train and evaluate the bundled classifier again (some 45 minutes)
 	@$(BIN)/python tools/reference_model.py all $(ARGS)
 
-wheel: $(STAMP) ## build the wheel into dist/
+wheel: $(STAMP) ## build the wheel into dist/, with a list of what it was built and tested with (SBOM)
 	@$(BIN)/pip wheel --quiet --no-deps --no-build-isolation --wheel-dir dist .
+	@$(BIN)/python tools/sbom.py dist
 	@ls -l dist/*.whl
 
 check-wheel: $(STAMP) ## build the wheel, install it in a new environment and use it from another folder

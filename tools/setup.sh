@@ -71,22 +71,31 @@ may_install() {
     [ "$(id -u)" = 0 ] || { command -v sudo >/dev/null && sudo -n true 2>/dev/null; }
 }
 
+install_command=(apt-get install -y -q --no-install-recommends libllvm19)
+
 install_llvm() {
     export DEBIAN_FRONTEND=noninteractive
-    as_root apt-get install -y -q --no-install-recommends libllvm19 >/dev/null 2>&1 && return
+    as_root "${install_command[@]}" >/dev/null 2>&1 && return
     say "reading the lists of packages"
     as_root apt-get update -q >/dev/null || true
-    as_root apt-get install -y -q --no-install-recommends libllvm19 >/dev/null || true
+    as_root "${install_command[@]}" >/dev/null || true
 }
 
 ensure_llvm() {
     llvm >/dev/null 2>&1 && return
+    if [ -n "${ADVSEARCH_NO_SUDO:-}" ] && [ -z "${DRJIT_LIBLLVM_PATH:-}" ] && command -v apt-get >/dev/null; then
+        stop "no libLLVM that Dr.Jit can use, and ADVSEARCH_NO_SUDO forbids to install it. As root type:" \
+            "  ${install_command[*]}" "and then make setup again."
+    fi
     if [ -z "${DRJIT_LIBLLVM_PATH:-}" ] && may_install; then
-        say "no libLLVM that Dr.Jit can use; installing libllvm19"
+        say "no libLLVM that Dr.Jit can use, so this installs a system package as root: ${install_command[*]}"
+        say "(ADVSEARCH_NO_SUDO=1 prints the command instead)"
         install_llvm
     fi
     llvm >/dev/null || exit 2
 }
+
+[ "${BASH_SOURCE[0]}" = "$0" ] || return 0 # a test reads the functions
 
 choose_python
 make_venv

@@ -312,7 +312,10 @@ def read_waypoints(path: Path, mover: str, *, alone: bool = True) -> dict[str, W
         text = read_text(path, "a table of waypoints", MOST_BYTES).removeprefix("\ufeff")
     except OSError as error:
         raise FileFormatError(f"{path}: expected a table of waypoints, got {error.strerror}") from error
-    header, *rows = [[one.strip() for one in row] for row in csv.reader(text.splitlines()) if any(row)] or [[]]
+    try:
+        header, *rows = [[one.strip() for one in row] for row in csv.reader(text.splitlines()) if any(row)] or [[]]
+    except csv.Error as error:
+        raise FileFormatError(f"{path}: expected a table of waypoints, got one with a {error}") from error
     columns, parts = (TIME, *PLACE), [0 < len({*group} & {*header}) < len(group) for group in (LOOKING, SHIFT)]
     missing, twice = set(columns) - set(header), len(set(header)) < len(header)
     if missing or twice or set(header) - {*columns, *further} or any(parts):

@@ -14,7 +14,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, final
 
-from advsearch.errors import AdvsearchError, FileFormatError, InputError, RunExistsError, UnknownNameError
+from advsearch.errors import AdvsearchError, FileFormatError, InputError, RunExistsError, StorageError, UnknownNameError
 from advsearch.files import JsonObject, open_regular
 from advsearch.runs import files, images, store, summary, tracking
 from advsearch.runs.files import PART, replacing, storage_errors, write_bytes, write_text
@@ -79,7 +79,8 @@ class RunDirectory:
     """The directory of one run, locked against other processes until `close`. Make one with `create`.
 
     Used in a `with` block it is closed at the end; when the block raises before there is any result, the directory of a
-    new run is removed again, so that bad input leaves nothing behind.
+    new run is removed again, so that bad input leaves nothing behind. Where it was removed or renamed meanwhile, the
+    next write or the end of the block is a StorageError.
     """
 
     def __init__(self, path: Path, held: files.RunLock) -> None:
@@ -95,6 +96,7 @@ class RunDirectory:
         the next free number, and lock it; RunExistsError if there is something already. With `overwrite`, only a
         directory that advsearch wrote is touched, and in it only what advsearch writes."""
         path = _numbered(default) if run is None else run_path(run)
+        files.check_there(path)  # or the folder of the study that it is a part of would be made
         check_free(path, overwrite=overwrite)
         with storage_errors(path):
             path.mkdir(parents=True, exist_ok=True)
@@ -151,6 +153,7 @@ class RunDirectory:
     def resume(cls, run: str | Path, config: Config | None = None) -> RunDirectory:
         """Open and lock the directory of a run, to go on with it by `config`, if anything goes on; an InputError says
         if another process works on it, or it would give other numbers than the run began with."""
+        files.check_there(run_path(run))
         path = find_run(run)
         check_links(path)
         held = files.RunLock(path)
@@ -270,10 +273,12 @@ class RunDirectory:
     def discard(self) -> None:
         """Remove what this run wrote, and the directory if that leaves it empty."""
         self._told()
-        self.store.close()
-        with suppress(OSError):
+        with suppress(OSError, StorageError):
+            files.check_there(self.path)  # else it is another's by now
+            self.store.close()
             _clear(self.path)
             _remove_if_bare(self.path)
+        self.store.close()
         self._lock.release()
 
     def __enter__(self) -> RunDirectory:
@@ -282,8 +287,14 @@ class RunDirectory:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        if error is None:
+            try:
+                files.check_there(self.path)
+            finally:
+                self.close()
+            return
         kept = not self._began or any((self.path / name).exists() for name in (summary.NAME, PARTS))
-        if error is not None and not kept and self.store.count() == 0:
+        if not kept and self.store.count() == 0:
             self.discard()
         else:
             self.close()

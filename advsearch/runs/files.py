@@ -9,7 +9,7 @@ import fcntl
 import os
 import sqlite3
 import stat
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
 from functools import cache
 from pathlib import Path
@@ -46,6 +46,7 @@ def storage_errors(path: Path) -> Iterator[None]:
     try:
         yield
     except (OSError, sqlite3.OperationalError) as error:
+        check_there(path)
         raise StorageError(f"cannot write {path}: {_advice(error)}") from error
 
 
@@ -64,6 +65,7 @@ def replacing(path: Path, *, durable: bool = False) -> Iterator[Path]:
     raises, or the process is killed, `path` is as it was before. Missing folders are made. A `durable` file survives a
     power cut; that takes some 10 ms."""
     part = path.with_name(f"{PART}{os.getpid()}-{path.name}")
+    check_there(path)  # or missing folders would be made
     try:
         with storage_errors(path):
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -105,6 +107,45 @@ def _advice(error: OSError | sqlite3.Error) -> str:
         if words in str(error):
             return advice
     return f"{error}; choose another place with `run`"
+
+
+_open: dict[Path, tuple[Path, tuple[int, int]]] = {}
+"""Of the folders of runs that are written to here, the results and which file these are."""
+
+
+def note_open(results: Path) -> Callable[[], None]:
+    """Note that the results of a run are open for writing, for `check_there`; return what notes that they are not."""
+    with storage_errors(results):
+        found = results.stat()
+    entry = _open[results.parent] = results, (found.st_dev, found.st_ino)
+
+    def closed() -> None:
+        if _open.get(results.parent) is entry:
+            del _open[results.parent]
+
+    return closed
+
+
+def check_there(path: Path) -> None:
+    """Check that a path does not lie in the folder of a run that is written to here and was removed or renamed since:
+    what is open is still written then, but to nowhere.
+
+    Raises:
+        StorageError: the folder, or the results in it, are gone or others.
+    """
+    for folder in (path, *path.parents):
+        if folder not in _open:
+            continue
+        results, known = _open[folder]
+        try:
+            found = results.stat()
+        except OSError:
+            found = None
+        if found is None or (found.st_dev, found.st_ino) != known:
+            raise StorageError(
+                f"{folder}: the folder of this run was removed or renamed while the run went on; start it again, or "
+                "go on with what was renamed by advsearch resume"
+            )
 
 
 NAME = ".lock"

@@ -23,9 +23,11 @@ from advsearch.files import JsonValue, parse_json
 from advsearch.runs.files import (
     DAMAGED,
     check_schema,
+    check_there,
     check_version,
     connect_to_read,
     connect_to_write,
+    note_open,
     readable,
     storage_errors,
 )
@@ -132,11 +134,13 @@ class Store:
             self._db = connect_to_read(path) if read_only else connect_to_write(path)
             check_version(self._db, path)
             check_schema(self._db, path)
+        self._closed = (lambda: None) if read_only else note_open(path)
 
     def append(self, rows: Sequence[Row], told: Told | None = None) -> None:
         """Add rows in one transaction; they survive a kill of the process when this returns, and where the disk is full
         none of them is kept. A row whose kind and step are there already changes nothing. What it `told` is that of the
         last one."""
+        check_there(self.path)
         began, stamp = time.monotonic(), time.time()
         force = began >= self._next_sync
         with storage_errors(self.path):
@@ -194,6 +198,7 @@ class Store:
 
     def forget(self) -> None:
         """Remove what searches were told: the run is done."""
+        check_there(self.path)
         with storage_errors(self.path):
             with self._db:
                 anything = self._db.execute("DELETE FROM told").rowcount
@@ -251,12 +256,14 @@ class Store:
 
     def set_note(self, key: str, value: str) -> None:
         """Keep a text under `key`, in place of what was there."""
+        check_there(self.path)
         with storage_errors(self.path), self._db:
             self._db.execute("INSERT OR REPLACE INTO meta VALUES (?, ?)", (key, value))
 
     def close(self) -> None:
         """Close the file; a second call does nothing."""
         self._db.close()
+        self._closed()
 
     def __enter__(self) -> Store:
         return self

@@ -9,6 +9,7 @@ import io
 import json
 import math
 import os
+import shutil
 import signal
 import sqlite3
 import subprocess
@@ -406,6 +407,48 @@ def test_a_run_that_fails_later_keeps_what_it_has(tmp_path: Path, keep: str) -> 
     assert (tmp_path / "run" / "results.sqlite").exists()
     with RunDirectory.create(tmp_path / "run", overwrite=True):
         pass
+
+
+GONE_ON: dict[str, Callable[[RunDirectory], object]] = {
+    "record": lambda run: run.record(Row("search", 1)),
+    "write_summary": lambda run: run.write_summary(attack()),
+    "finish": lambda run: run.finish(),
+    "set_note": lambda run: run.store.set_note("a", "b"),
+    "save_image": lambda run: run.save_image("clean", np.zeros((2, 2, 3))),
+    "write_bytes": lambda run: write_bytes(run.path / "images" / "figure.svg", b"<svg/>"),
+    "create": lambda run: RunDirectory.create(run.path / "parts" / "00"),
+    "resume": lambda run: RunDirectory.resume(run.path / "parts" / "00"),
+    "nothing": lambda run: None,
+}
+
+
+@pytest.mark.parametrize("what", GONE_ON)
+@pytest.mark.parametrize("how", ["removed", "renamed", "another"])
+def test_a_run_whose_folder_went_ends_with_a_sentence_and_leaves_nothing(tmp_path: Path, what: str, how: str) -> None:
+    """Nor does it touch a run that another process has put in its place."""
+    path, other = tmp_path / "run", tmp_path / "moved"
+    with pytest.raises(StorageError, match="removed or renamed while the run went on.*advsearch resume"):
+        with RunDirectory.create(path) as run:
+            run.record(Row("search", 0))
+            shutil.rmtree(path) if how == "removed" else path.rename(other)
+            if how == "another":
+                shutil.copytree(other, path)
+                (path / "summary.json").write_text("of the other")
+            GONE_ON[what](run)
+    kept = {"results.sqlite", ".lock", "summary.json"}
+    assert ({one.name for one in path.iterdir()} >= kept) if how == "another" else not path.exists()
+    if how != "removed":
+        with RunDirectory.resume(other) as found:
+            assert found.store.count() == 1
+
+
+def test_a_run_that_fails_as_its_folder_goes_tells_its_own_error(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="its own"), RunDirectory.create(tmp_path / "run"):
+        (tmp_path / "run").rename(tmp_path / "moved")
+        (tmp_path / "run").mkdir()
+        (tmp_path / "run" / "run.yaml").write_text("of another")
+        raise InputError("its own")
+    assert (tmp_path / "run" / "run.yaml").read_text() == "of another"
 
 
 def test_runs_are_found_by_name_and_path(home: Path) -> None:

@@ -202,6 +202,26 @@ class Inventory:
                 yield f"{kind} {shown(name)}{times} is left out"
 
 
+class Notes(list[str]):
+    """Warnings about a file, in their order."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._known: set[str] = set()
+
+    def once(self, message: str) -> None:
+        """Warn, once; quick, since a file may give cause for 100,000 warnings."""
+        if message not in self._known:
+            self._known.add(message)
+            self.append(message)
+
+    def taken(self) -> list[str]:
+        """Return those since the last time."""
+        found = list(self)
+        self.clear()
+        return found
+
+
 MISSING = "is missing"
 OUTSIDE = "is outside its folder and is not read"
 
@@ -224,6 +244,7 @@ class References:
         self.refused: dict[str, str] = {}
         self._folder = os.path.realpath(path.parent)
         self._contents: dict[str, bytes] = {}
+        self._size = 0
 
     def get(self, name: str) -> bytes:
         """Return the content of a named file; after the name as it stands, its usual distortions are tried.
@@ -266,7 +287,7 @@ class References:
         return self._contents[path]
 
     def _keep(self, path: str, data: bytes) -> None:
-        most, size = files.scaled(LARGEST_FILE), len(data) + sum(map(len, self._contents.values()))
+        most, size = files.scaled(LARGEST_FILE), len(data) + self._size
         if size > most:
             raise files.too_large(path, f"files of at most {most:,} bytes in all", f"{size:,}")
-        self._contents[path] = data
+        self._contents[path], self._size = data, size

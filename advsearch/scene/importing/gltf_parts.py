@@ -17,7 +17,7 @@ from advsearch.errors import FileFormatError
 from advsearch.pictures import FORMATS
 from advsearch.scene.assets import Doubles, Floats, Ints
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
-from advsearch.scene.importing.files import References, check_faces, damaged, shown
+from advsearch.scene.importing.files import Notes, References, check_faces, damaged, shown
 from advsearch.scene.importing.gltf import Buffers, binary_chunk, read_header
 from advsearch.scene.importing.gltf_entries import (
     CLAMPED,
@@ -73,7 +73,7 @@ class GltfSurfaces:
     header: Header
     buffers: Buffers
     references: References
-    notes: list[str] = field(default_factory=list)
+    notes: Notes = field(default_factory=Notes)
     _opened: dict[tuple[str | None, int | None], Image.Image | None] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -170,9 +170,8 @@ class GltfSurfaces:
             why = self._pictures.why(name, found)
             self._note(words.format(name=shown(name), why=why))
             return None
-        self.notes += [
-            f"{self.source}: {note}" for note in self._pictures.notes if f"{self.source}: {note}" not in self.notes
-        ]
+        for note in self._pictures.notes.taken():
+            self._note(f": {note}")
         if self._sampler(use).magFilter != NEAREST or min(found.shape[:2]) == max(found.shape[:2]) == 1:
             return found
         sharp = self._pictures.side // 2  # so many that filtering does not show
@@ -251,9 +250,8 @@ class GltfSurfaces:
         return replaced, lambda given: given * scale + shift
 
     def _note(self, words: str) -> None:
-        message = self.source + words
-        if words and message not in self.notes:
-            self.notes.append(message)
+        if words:
+            self.notes.once(self.source + words)
 
 
 def _differ_at_edges(pictures: Sequence[Floats], side: int) -> bool:

@@ -15,7 +15,7 @@ from advsearch.scene.assets import Doubles, Floats
 
 Pair = tuple[float, float]
 
-_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+_NUMBER = r"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?"
 _OPTIONS = {
     "blendu": "on|off",
     "blendv": "on|off",

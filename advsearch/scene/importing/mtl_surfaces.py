@@ -10,7 +10,7 @@ from PIL import Image
 
 from advsearch.scene.assets import Doubles, Floats
 from advsearch.scene.importing import udim
-from advsearch.scene.importing.files import Inventory, References, plain_name, shown, text_of
+from advsearch.scene.importing.files import Inventory, Notes, References, plain_name, shown, text_of
 from advsearch.scene.importing.mtl import (
     MapUse,
     MtlMaterial,
@@ -84,7 +84,7 @@ class MtlReader:
     inventory: Inventory
     shown_on: Callable[[str, int], tuple[Doubles, Doubles]]
     libraries: int = 0
-    notes: list[str] = field(default_factory=list)
+    notes: Notes = field(default_factory=Notes)
     _materials: dict[str, MtlMaterial] = field(default_factory=dict)
     _painted: dict[tuple[int, int], Painted] = field(default_factory=dict)
     _uses: dict[tuple[int, str], MapUse | None] = field(default_factory=dict)
@@ -142,8 +142,7 @@ class MtlReader:
 
     def note(self, message: str) -> None:
         """Warn, once."""
-        if message not in self.notes:
-            self.notes.append(message)
+        self.notes.once(message)
 
     def _look_of(self, material: MtlMaterial, square: int, name: str) -> Painted:
         """Read all statements of a material."""
@@ -342,7 +341,7 @@ class MtlReader:
             self._pictures = Pictures(len(self._materials), self.references.get, self.references.refused)
         if (use.name, kind) not in self._read:
             self._read[use.name, kind] = self._pictures.of_file(use.name, kind)
-            for note in self._pictures.notes:
+            for note in self._pictures.notes.taken():
                 self.note(f"{self.source}: {note}")
         found, (base, gain) = self._read[use.name, kind], use.range
         if isinstance(found, str) or (base, gain) == (0.0, 1.0):

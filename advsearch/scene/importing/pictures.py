@@ -18,7 +18,7 @@ from advsearch.errors import FileFormatError
 from advsearch.pictures import FORMATS, LARGEST_PIXELS, check_decodable, check_pixels, opened, steps_of
 from advsearch.scene.assets import Floats
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
-from advsearch.scene.importing.files import LARGEST_FILE, plain_name, shown
+from advsearch.scene.importing.files import LARGEST_FILE, Notes, plain_name, shown
 
 TEXTURE_LIMIT = 1024
 """Longest side of an imported texture, in texels; larger ones are averaged down."""
@@ -170,7 +170,7 @@ class Pictures:
     materials: int
     read: Callable[[str], bytes]
     refused: Mapping[str, str]
-    notes: list[str] = field(default_factory=list)
+    notes: Notes = field(default_factory=Notes)
     _known: dict[tuple[int, Kind], Floats | str] = field(default_factory=dict)
     _opened: list[Image.Image] = field(default_factory=list)
     _pixels: dict[bool, int] = field(default_factory=lambda: {False: 0, True: 0})
@@ -229,5 +229,5 @@ class Pictures:
         if (columns, rows) != (width, height):
             called = f"the texture {shown(name)}" if name else "a texture"
             note = f"{called} of {width:,} x {height:,} texels is averaged down to {columns:,} x {rows:,}"
-            self.notes += [] if note in self.notes else [note]
+            self.notes.once(note)
         return texture

@@ -17,6 +17,7 @@ from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.importing.files import (
     MOST_CORNERS,
     Inventory,
+    Notes,
     References,
     check_faces,
     damaged,
@@ -254,7 +255,7 @@ def read_ply(path: Path, data: bytes) -> tuple[list[ImportedPart], list[str]]:
         FileFormatError: it is damaged, refers to vertices that are not there, or has no faces.
     """
     elements, comments = read_elements(path, data)
-    reader = _Reader(path, elements, Inventory(), [])
+    reader = _Reader(path, elements, Inventory(), Notes())
     points = reader.columns("vertex", (("x", "y", "z"),))
     if points is None:
         raise damaged(path, "a PLY file with vertices that have x, y and z", "none")
@@ -300,7 +301,7 @@ class _Reader:
     path: Path
     elements: dict[str, Element]
     inventory: Inventory
-    notes: list[str]
+    notes: Notes
 
     def __post_init__(self) -> None:
         for element in self.elements.values():
@@ -313,8 +314,7 @@ class _Reader:
 
     def note(self, message: str) -> None:
         """Warn, once."""
-        if message not in self.notes:
-            self.notes.append(message)
+        self.notes.once(message)
 
     def said(self) -> list[str]:
         """Return the warnings, each as what follows the file's name."""

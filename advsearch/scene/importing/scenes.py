@@ -6,8 +6,8 @@ z = 0, and z is up.
 
 from __future__ import annotations
 
-import itertools
 import math
+import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -67,7 +67,7 @@ def split_node(spec: str) -> tuple[str, str | None]:
     found = re.fullmatch(
         rf"(.+({'|'.join(map(re.escape, (*GLTF, MITSUBA_FILE)))}))#(.*)", spec, re.IGNORECASE | re.DOTALL
     )
-    return (found[1], found[3]) if found and not Path(spec).exists() else (spec, None)
+    return (found[1], found[3]) if found and not os.path.exists(spec) else (spec, None)
 
 
 @np.errstate(all="ignore")  # what is out of range is refused
@@ -141,8 +141,7 @@ def node_names(path: Path) -> list[str]:
     """
     header = gltf.read_header(path, read_mesh_bytes(path, "scene", GLTF))
     drawn = {index for index, node in enumerate(header.nodes) if node.mesh is not None}
-    found = (header.label(index) for index in range(len(header.nodes)) if _below(header, index) & drawn)
-    return list(dict.fromkeys(found))
+    return list(dict.fromkeys(map(header.label, sorted(_above(header, drawn)))))
 
 
 def _mesh_names(header: Header, parts: Sequence[ImportedPart], names: _Names) -> dict[int, str]:
@@ -251,15 +250,16 @@ class _Names:
 
     def __init__(self) -> None:
         self._taken = set(TAKEN)
+        self._last: dict[str, int] = {}
 
     def free(self, wanted: str) -> str:
         """Return the name, or the first free one with a number behind it."""
-        base = clean(wanted)
-        name = next(
-            one
-            for number in itertools.count(1)
-            if (one := base if number == 1 else f"{base}-{number}") not in self._taken
-        )
+        base = name = clean(wanted)
+        number = self._last.get(base, 1)
+        while name in self._taken:
+            number += 1
+            name = f"{base}-{number}"
+        self._last[base] = number
         self._taken.add(name)
         return name
 
@@ -271,7 +271,7 @@ def clean(name: str) -> str:
 
 def _named(path: Path, header: Header, name: str, with_mesh: set[int]) -> int:
     """The number of the node of that name which has a mesh, or one below it."""
-    labels = {index: header.label(index) for index in range(len(header.nodes)) if _below(header, index) & with_mesh}
+    labels = {index: header.label(index) for index in sorted(_above(header, with_mesh))}
     found = [index for index, label in labels.items() if name in (label, f"node {index}")]
     if not found:
         raise UnknownNameError(f"node of {path.name}", name, list(dict.fromkeys(labels.values())))
@@ -283,10 +283,25 @@ def _named(path: Path, header: Header, name: str, with_mesh: set[int]) -> int:
 
 def _below(header: Header, index: int) -> set[int]:
     """A node and all that hangs on it."""
-    found, level = {index}, [index]
-    while level:
-        level = [child for one in level for child in header.nodes[one].children]
-        found.update(level)
+    return _reached({index}, [node.children for node in header.nodes])
+
+
+def _above(header: Header, nodes: set[int]) -> set[int]:
+    """Nodes, and all on which they hang."""
+    parents: list[list[int]] = [[] for _ in header.nodes]
+    for index, node in enumerate(header.nodes):
+        for child in node.children:
+            parents[child].append(index)
+    return _reached(nodes, parents)
+
+
+def _reached(begin: set[int], steps: Sequence[Sequence[int]]) -> set[int]:
+    """The nodes to which steps lead from others, and these."""
+    found, left = set(begin), list(begin)
+    while left:
+        new = [one for one in steps[left.pop()] if one not in found]
+        found.update(new)
+        left += new
     return found
 
 

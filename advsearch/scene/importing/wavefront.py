@@ -41,6 +41,8 @@ FREE_FORM = frozenset(
     "bmat bsp bzp cdc cdp con cstype curv curv2 deg end hole mg parm res scrv sp step surf trim vp".split()
 )
 """Statements of curves and curved surfaces."""
+MOST_NAMED = 10_000
+"""Material files, and materials, that a file may name, before `advsearch.files.scaled`."""
 BEYOND = 0.01
 """How far texture coordinates may lie outside of a texture before it matters how that goes on."""
 
@@ -75,7 +77,11 @@ def read_obj(path: Path, data: bytes) -> tuple[list[ImportedPart], list[str]]:
 
     reader = MtlReader(path.name, references, inventory, shown_on)
     said = _statements(lines, inventory)
-    for name in libraries_of(said.libraries, references):
+    libraries = list(dict.fromkeys(said.libraries))
+    _check_count(path, libraries, "lines that name material files (mtllib)")
+    libraries = libraries_of(libraries, references)
+    _check_count(path, libraries, "material files")
+    for name in libraries:
         reader.read_library(name)
     if few:
         reader.note(f"{path.name}: {FEW.format(count=few, s='' if few == 1 else 's')}")
@@ -85,6 +91,7 @@ def read_obj(path: Path, data: bytes) -> tuple[list[ImportedPart], list[str]]:
         reader.note(f"{path.name}: {wrong:,} faces cross themselves, or are too much work, and may be cut up wrongly")
     position, mapped, normal = (corners[triangles, place] for place in range(3))
     names, material = _in_effect(said.materials, rows[face])
+    _check_count(path, names, "materials")
     smoothness, smooth = _in_effect(said.smoothing, rows[face])
     off = np.array([*(word in ("off", "0", "") for word in smoothness), False])[smooth]
     if ((smooth >= 0) & ~off & (normal < 0).any(axis=1)).any():
@@ -128,6 +135,12 @@ def _squares(reader: MtlReader, names: list[str], material: Ints, table: Doubles
         several = reader.squares_of(names[number], np.unique(squares).tolist())
         found[mine] = np.where(np.isin(squares, several), squares, 0)
     return found
+
+
+def _check_count(path: Path, named: list[str], what: str) -> None:
+    """Refuse a file that names too many: each is looked for on the disk, or is a part of its own."""
+    if len(named) > files.scaled(MOST_NAMED):
+        raise files.too_large(path, f"at most {files.scaled(MOST_NAMED):,} {what}", f"{len(named):,}")
 
 
 # --- what the statements beside numbers say ----------------------------------------

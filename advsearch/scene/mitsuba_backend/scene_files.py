@@ -47,6 +47,14 @@ DIAGONAL = math.hypot(36.0, 24.0)
 """Of the film of which Mitsuba's `focal_length` speaks, millimetres."""
 
 
+NUMBERS: Mapping[str, tuple[tuple[int, ...], str]] = {
+    **dict.fromkeys(("radius", "fov", "width", "height"), ((), "a number")),
+    **dict.fromkeys(("center", "p0", "p1", "position", "direction"), ((3,), "three numbers")),
+    "to_world": ((4, 4), "a transform"),
+}
+"""Entries that are numbers in whatever plugin has them, their shape, and what they are in words."""
+
+
 def read_tree(scene: Path | Mapping[str, object]) -> tuple[Plugin, list[str]]:
     """Return a scene file's dictionary, or a caller's own, with arrays for transforms; and warnings about its pictures.
 
@@ -56,7 +64,9 @@ def read_tree(scene: Path | Mapping[str, object]) -> tuple[Plugin, list[str]]:
     """
     notes: list[str] = []
     if isinstance(scene, Path):
-        return trusted(scene, read_scene(scene), notes), notes
+        tree = trusted(scene, read_scene(scene), notes)
+        _check_numbers(tree, str(scene))
+        return tree, notes
     if scene.get("type") != "scene":
         raise InputError(f"scene: expected a dictionary of type 'scene', got {scene.get('type')!r}")
     notes += [
@@ -64,7 +74,30 @@ def read_tree(scene: Path | Mapping[str, object]) -> tuple[Plugin, list[str]]:
         for name, one in scene.items()
         if name != "type" and not isinstance(one, Mapping)
     ]
-    return plain(scene), notes
+    tree = plain(scene)
+    _check_numbers(tree, "scene")
+    return tree, notes
+
+
+def _check_numbers(plugin: Mapping[str, object], where: str) -> None:
+    """Check that numbers stand where they are read here; what else a plugin has is for Mitsuba to refuse.
+
+    Raises:
+        InputError: one is a text, a colour or the like.
+    """
+    for key, value in plugin.items():
+        if key in NUMBERS:
+            shape, expected = NUMBERS[key]
+            try:
+                right = np.asarray(value, np.float64).shape == shape
+            except (TypeError, ValueError):
+                right = False
+            if not right:
+                raise InputError(
+                    f"{where}: expected {expected} as {key} of its {plugin['type']}, got {shown(str(value))}"
+                )
+        elif isinstance(value, Mapping) and "type" in value:
+            _check_numbers(value, where if plugin["type"] != "scene" else f"{where}: {shown(key, quoted=False)}")
 
 
 @dataclass(frozen=True)
@@ -382,6 +415,8 @@ def _camera(sensor: Mapping[str, object], frame: _Frame) -> PlacedCamera:
     matrix[:3, :3] /= np.maximum(np.linalg.norm(matrix[:3, :3], axis=0), 1e-12)
     film = next((one for one in sensor.values() if isinstance(one, Mapping) and "film" in str(one["type"])), {})
     width, height = (float(np.asarray(film.get(side, other))) for side, other in (("width", 768), ("height", 576)))
+    if not min(width, height) >= 1.0:
+        raise InputError(f"camera: expected a film of at least 1 x 1 pixels, got {width:g} x {height:g}")
     axis, degrees = str(sensor.get("fov_axis", "x")), float(np.asarray(sensor.get("fov", 0.0)))
     if not degrees:
         length = float(millimetres(str(sensor.get("focal_length", "50mm"))))

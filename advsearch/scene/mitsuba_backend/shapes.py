@@ -62,7 +62,7 @@ def mesh_of(shape: Mapping[str, object], name: str) -> ShapeMesh:
     kind = str(shape["type"])
     if kind not in MESHES:
         raise InputError(f"object {name}: a {kind} cannot be moved; expected a shape of {', '.join(MESHES)}")
-    vertices, faces, normals, uvs, attributes = _solid(kind, shape) if kind in SOLIDS else _loaded(shape, name)
+    vertices, faces, normals, uvs, attributes = _solid(kind, shape, name) if kind in SOLIDS else _loaded(shape, name)
     if not np.isfinite(vertices).all():
         raise InputError(f"object {name}: expected finite vertices, got NaN or infinite ones; repair the mesh")
     if uvs is None or normals is None or shape.get("face_normals"):
@@ -127,7 +127,7 @@ def _unit(vectors: Doubles) -> Doubles:
     return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-30))
 
 
-def _solid(kind: str, shape: Mapping[str, object]) -> Buffers:
+def _solid(kind: str, shape: Mapping[str, object], name: str) -> Buffers:
     """The same of a shape of which Mitsuba has no triangles."""
     own = np.eye(4)
     round_ = np.linspace(0.0, 1.0, SECTIONS + 1)
@@ -152,6 +152,8 @@ def _solid(kind: str, shape: Mapping[str, object]) -> Buffers:
     normals = np.tile((0.0, 0.0, 1.0), (len(vertices), 1)) if normals is None else normals
     faces = faces[np.linalg.norm(_fronts(vertices, faces), axis=1) > 1e-9]
     matrix = np.asarray(shape.get("to_world", np.eye(4)), dtype=np.float64) @ own
+    if not abs(np.linalg.det(matrix[:3, :3])) > 0.0:
+        raise InputError(f"object {name}: expected a {kind} of some size, got one without extent; change its numbers")
     normals = _unit(normals @ np.linalg.inv(matrix[:3, :3]))
     return vertices @ matrix[:3, :3].T + matrix[:3, 3], faces, normals, uvs, {}
 

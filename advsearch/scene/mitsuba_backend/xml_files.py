@@ -91,6 +91,8 @@ class _Reader:
     named: dict[str, Plugin] = field(default_factory=dict)
     """Plugins with ids that stand within others, to which the rest of the file may refer."""
     referred: set[str] = field(default_factory=set)
+    last: dict[tuple[int, str], int] = field(default_factory=dict)
+    """The last number behind a name in a plugin, by the identity of its dictionary."""
 
     def parsed(self, data: bytes) -> _Element:
         """Return the tree of a file."""
@@ -148,7 +150,7 @@ class _Reader:
             raise self.wrong(one, f"<{one.tag}> is not read; write the scene without it")
         elif one.tag == "ref":
             self.referred.add(_plain(self.text(one, "id")))
-            into[_free(into, one.name or "ref")] = {"type": "ref", "id": _plain(self.text(one, "id"))}
+            into[self.free(into, one.name or "ref")] = {"type": "ref", "id": _plain(self.text(one, "id"))}
         elif one.tag in PLUGINS and "type" in one.given:
             wanted = one.name or one.given.get("id") or (one.given["type"] if into["type"] == "scene" else one.tag)
             inner = self.plugin(one, self.text(one, "type"))
@@ -156,9 +158,18 @@ class _Reader:
                 wanted = one.given["id"]
             elif "id" in one.given and one.tag in SHARED:
                 self.named.setdefault(_plain(self.text(one, "id")), inner)
-            into[_free(into, _plain(wanted))] = inner
+            into[self.free(into, _plain(wanted))] = inner
         else:
-            into[_free(into, self.text(one, "name"))] = self.value(one)
+            into[self.free(into, self.text(one, "name"))] = self.value(one)
+
+    def free(self, taken: Plugin, wanted: str) -> str:
+        """A name that is free: the one that is wanted, or with a number behind it."""
+        name, number = wanted, self.last.get((id(taken), wanted), 1)
+        while name in taken:
+            number += 1
+            name = f"{wanted}-{number}"
+        self.last[id(taken), wanted] = number
+        return name
 
     def include(self, name: str, into: Plugin) -> None:
         """Put what another file of the folder holds into a dictionary."""
@@ -315,15 +326,6 @@ class _Reader:
 def _plain(name: str) -> str:
     """A name as Mitsuba's loader takes it: without dots."""
     return name.replace(".", "_")
-
-
-def _free(taken: Mapping[str, object], wanted: str) -> str:
-    """A name that is free: the one that is wanted, or with a number behind it."""
-    name, number = wanted, 1
-    while name in taken:
-        number += 1
-        name = f"{wanted}-{number}"
-    return name
 
 
 def _unit(vector: Doubles) -> Doubles:
