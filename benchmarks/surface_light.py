@@ -205,9 +205,10 @@ def ruled(scene: str, searches: int) -> None:
         for search in range(searches):
             seen = [compare(renderer, light, wholes[VIEWS * search + n], search, model, label) for n in range(VIEWS)]
             for kind in range(len(PLANTED)):
-                found = compared(lambda number, kind=kind: seen[number][kind])  # type: ignore[misc]
+                column = [one[kind] for one in seen]
+                found = compared(column.__getitem__)
                 accepted[kind] += found.good
-                shares[kind].append(Deviation.of([one[kind] for one in seen]).share)
+                shares[kind].append(Deviation.of(column).share)
                 views_seen += found.pictures // 3 if kind == 0 else 0
             margins += [one[0].margin for one in seen]
         print(f"{scene}{name}: accepted of {searches} searches, and levels off as a share of the limit")

@@ -385,6 +385,7 @@ def _remarks(findings: Findings, problem: Problem, journal: Journal) -> list[str
                 f"{OVER_LADDER[-1]}, and {MOST_TIMES} times the samples of the searches; `verify_spp` asks for more."
             )
         remarks.append(told)
-    if not_finite := problem.renderer.non_finite:
+    searches = [one.non_finite_elements for one in (findings.search, findings.baseline) if one is not None]
+    if not_finite := max(problem.renderer.non_finite, sum(searches)):  # what predicts pictures has no such count
         remarks.append(f"{not_finite} values of pictures or gradients were not finite and were set to 0.")
     return [*remarks, *lost_remarks(journal.lost), *journal.machines.remarks]

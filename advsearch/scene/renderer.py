@@ -67,6 +67,10 @@ class InputSpace(Protocol):
         """Return the numbers of the configuration, in their units, by name; differentiable."""
 
 
+SMALL_PART = 0.0625
+"""Part of noise that is taken through the tone curve, which is straight over so little; see `Renderer.halves`."""
+
+
 class Renderer:
     """Renders the configurations of one space in one scene.
 
@@ -188,7 +192,11 @@ class Renderer:
 
     def halves(self, u: Tensor, seed: int, spp: int) -> tuple[Tensor, Tensor, Tensor]:
         """Trace two pictures (H, W, 3) of a configuration with independent noise, which are not denoised; and return
-        beside them that of all their samples, which is. Arguments as for a call; without a graph, and not counted."""
+        beside them that of all their samples, which is. Arguments as for a call; without a graph, and not counted.
+
+        The two are taken through a tone curve that is straight about the third, so that they are right on average, and
+        not darker where they are noisy; they may leave [0, 1].
+        """
         with torch.no_grad():
             inputs = self.scene.assembly(self.space.inputs(u))
             hide = "backdrop.color" in inputs
@@ -200,8 +208,11 @@ class Renderer:
             noise = seeds.stream(self.root_seed, "guides", numbers[0])
             clean = denoise(both[..., :3].contiguous(), *self.scene.guides(traced, noise, spp))
             both = torch.cat([clean, both[..., 3:]], dim=-1)
-            first, second, last = (self._shown(picture, inputs, u) for picture in (one, other, both))
-            return first, second, last
+            *noisy, clean = (self._shown(picture, inputs, u, shown=False) for picture in (one, other, both))
+            there = self.formation.display(clean)
+            moved = (self.formation.display(torch.lerp(clean, one, SMALL_PART)) for one in noisy)
+            first, second = (self.space.picture(u, there + (one - there) / SMALL_PART) for one in moved)
+            return first, second, self.space.picture(u, there)
 
     def mask(self, u: Configuration) -> Tensor:
         """Return the pixels in which the object is the first thing that the camera sees, (H, W) bool.

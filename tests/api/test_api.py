@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 import torch
+from covering import only
 from stand_ins import interrupted
 from torch import Tensor, nn
 
@@ -247,6 +248,30 @@ def test_nan_logits_during_the_search_end_it_and_are_counted(
     summary = advsearch.attack(scene, victim, baseline=False, **FAST).summary
     assert summary.ending == "non-finite objective"
     assert summary.non_finite.objectives == 3
+
+
+WAYS: dict[str, dict[str, Any]] = {
+    "rendered": {"specialise": False},
+    "matrix": {},
+    "bank": {"over": "environment", "draws": 2},
+    "surface light": {"over": "camera", "draws": 2},
+}
+
+
+@pytest.mark.parametrize("way", only(["matrix"], WAYS))
+def test_a_gradient_that_is_not_finite_is_told_whatever_makes_the_pictures(level: float, way: str) -> None:
+    class Slopeless(Brightness):
+        def forward(self, images: Tensor) -> Tensor:
+            logits = super().forward(images)
+            return logits + (logits - logits.detach()).abs().sqrt()  # adds 0, and NaN to the derivative
+
+    victim = advsearch.load_model(Slopeless(level + 0.03), labels=LABELS, input_size=SIZE)
+    told = advsearch.attack(
+        "mug", victim, label="mug", controls={"texture": {"resolution": 8}}, resolution=SIZE, steps=16, trials=6,
+        verify_spp=4, baseline=False, policy="pgd", **WAYS[way],
+    ).summary  # fmt: skip
+    assert (told.transport is not None and told.transport.used) == (way != "rendered")
+    assert any("not finite and were set to 0" in one for one in told.warnings), told.warnings
 
 
 def test_rows_keep_what_is_right_apart_from_what_the_attack_wants(

@@ -13,8 +13,13 @@ import advsearch
 from advsearch.controls.material import NUMBERS, MaterialControl
 from advsearch.controls.material_patterns import PATTERNS, SIDE, covering, tile
 from advsearch.errors import InputError, UnknownNameError
+from advsearch.scene.assets import Material
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import SceneDescription, describe
+from advsearch.scene.mitsuba_backend.meshes import loadable, principled
+from advsearch.scene.mitsuba_backend.parts import IDLE_LOBES, mesh_translation, translation
+from advsearch.scene.mitsuba_backend.variant import mi
+from advsearch.scene.parts import PluginNumber, PluginNumbers
 from advsearch.scene.raster import texel_positions
 from advsearch.scene.settings import CHANNELS
 
@@ -137,6 +142,36 @@ def test_bad_settings_are_explained() -> None:
         MaterialControl(which="wod")
     with pytest.raises(InputError, match=r"material\.roughness: expected a number from 0 to 1"):
         MaterialControl(roughness=[0, 1.5])
+
+
+def test_every_way_into_a_number_has_the_same_guard(scene: SceneDescription) -> None:
+    """At a specular of exactly 0 Mitsuba's metal is black, and at a metallic of exactly 1 an adjoint has the wrong
+    sign: searched, fixed, of a named material, and of a surface in Mitsuba's own words."""
+    part = replace(scene.meshes["object"], material=Material(metallic=1.0, specular=0.0, clearcoat=0.0))
+    fixed = principled(part)["bsdf"]
+    assert (fixed["metallic"], fixed["specular"]) == (0.999, 1e-3) and "clearcoat" not in fixed
+    searched = {one.name: one for one in mesh_translation(part).inputs}
+    by_key = PluginNumber("object.bsdf.brdf_0.specular", (0.5,), "mitsuba.specular")
+    searched |= {one.name: one for one in translation(PluginNumbers("mitsuba", (by_key,))).inputs}
+    for name, value, rendered in (
+        ("object.metallic", 1.0, 0.999),
+        ("object.specular", 0.0, 1e-3),
+        ("object.clearcoat", 0.0, 1e-4),
+        ("object.roughness", 0.0, 0.0),
+        ("mitsuba.specular", 0.0, 1e-3),
+    ):
+        assert float(searched[name].rendered(torch.tensor([value]))) == pytest.approx(rendered)
+    own = loadable({"type": "twosided", "bsdf": {"type": "principled", "specular": 0.0, "metallic": 1.0}})["bsdf"]
+    assert own["specular"] == 1e-3
+    assert loadable({"type": "principled", "eta": 1})["eta"] == 1.001
+    assert loadable({"type": "roughplastic", "specular": 0.0})["specular"] == 0.0
+
+
+def test_equal_numbers_of_a_surface_stay_two(scene: SceneDescription) -> None:
+    """Mitsuba makes them one where it may, so that both would change."""
+    made = mesh_translation(replace(scene.meshes["object"], material=Material()), IDLE_LOBES).plugins["object"]
+    keys = mi.traverse(made).keys()
+    assert [one for one in ("clearcoat", "sheen") if not any(key.endswith(f".{one}.value") for key in keys)] == []
 
 
 # ---- rendered -------------------------------------------------------------------------------------------------------

@@ -106,7 +106,7 @@ def test_draws_of_light_share_one_basis() -> None:
 @pytest.mark.parametrize(
     ("settings", "reason"),
     [
-        ({"grid": {"light.power": [1, 2]}}, "basis pictures pay where 18 pictures or more differ in light alone"),
+        ({"grid": {"light.power": [1, 2]}}, "basis pictures pay where 13 pictures or more differ in light alone"),
         ({"grid": {"light.power": "0:12:16"}, "denoise": "none"}, "noise is part of the picture without the denoiser"),
         ({"grid": {"pose.yaw": [0, 90]}}, None),
         (

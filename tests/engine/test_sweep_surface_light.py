@@ -180,5 +180,5 @@ def test_few_pictures_do_not_pay(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(predicting, "PAYS", 2.0)
     told = swept(grid=GRID, resolution=128).summary.transport
     assert told == LinearTransport(
-        used=False, reason="light on surfaces pays where 79 pictures differ in the camera alone; here 8 do"
+        used=False, reason="light on surfaces pays where 106 pictures differ in the camera alone; here 8 do"
     )
