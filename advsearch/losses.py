@@ -121,12 +121,19 @@ nps = non_printability
 
 
 def check_aim(objective: object, *, targeted: bool) -> None:
-    """Check that one of these losses leads where a search is to go; any other objective passes.
+    """Check that one of these losses, or of torch's, leads where a search is to go; any other objective passes.
 
     Raises:
         InputError: it needs a target that is not there, or would lead away from the one that is.
     """
     function = getattr(objective, "func", objective)  # of functools.partial
+    module = str(getattr(function, "__module__", None) or type(function).__module__)
+    if targeted and module.startswith(("torch.nn.functional", "torch.nn.modules", "torch._C")):
+        name = getattr(function, "__name__", type(function).__name__)
+        raise InputError(
+            f"objective: it is maximised, and torch's {name} falls towards the `target`; take "
+            "losses.targeted_cross_entropy, or negate it: lambda logits, labels: -loss(logits, labels)"
+        )
     for name in (one for one in __all__ if f"targeted_{one}" in __all__):
         if function is globals()[name] and targeted:
             raise InputError(f"objective: losses.{name} leads away from the `target`; take losses.targeted_{name}")

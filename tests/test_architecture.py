@@ -24,6 +24,7 @@ SOURCES = {"advsearch": ROOT / "advsearch", "advsearch.bundled": ROOT / "scenes"
 
 RENDERER = {"mitsuba", "drjit", "mitsuba_oidn"}
 COMMON = {
+    "calls",
     "copies",
     "distributions",
     "described",

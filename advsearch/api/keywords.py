@@ -19,6 +19,7 @@ from typing import Any, Literal, TypedDict, TypeVar
 import numpy as np
 from torch import nn
 
+from advsearch.calls import check_types, unexpected
 from advsearch.engine import loading
 from advsearch.engine.naming import check_not_of_scene, check_not_spread, exists_here, in_turn, model_name
 from advsearch.errors import InputError
@@ -167,6 +168,7 @@ class _Signature(inspect.Signature):
 
 
 ONLY_BY_NAME = inspect.Parameter.KEYWORD_ONLY
+RUN = {"run": inspect.Parameter("run", ONLY_BY_NAME, default=None, annotation="str | Path | None")}
 
 KEPT = "The run is kept, in `run` or under runs/."
 SAME = {
@@ -208,10 +210,13 @@ def asks(config: type[Config], keywords: type[Any]) -> Callable[[Function], Func
 
         @wraps(function)
         def asked(*args: Any, **given: Any) -> Any:
+            if error := unexpected(function.__name__, given, list(signature.parameters)):
+                raise error
             try:
                 bound = signature.bind(*args, **given)
             except TypeError as error:
                 raise TypeError(f"{function.__name__}() {error}") from None
+            check_types({**own.parameters, **RUN}, bound.arguments)
             allow_named({**bound.arguments, **given})
             kept = ("scene", "model", "beside", "progress", "metrics")
             plain = {key: one if key in kept or not is_shallow(one) else as_python(one) for key, one in given.items()}

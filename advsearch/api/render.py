@@ -17,6 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from advsearch import models
+from advsearch.calls import helped
 from advsearch.config import RenderConfig
 from advsearch.engine import rendering
 from advsearch.engine.attack_parts import parts_in
@@ -47,6 +48,7 @@ if TYPE_CHECKING:
     from advsearch.models.model import Read
 
 
+@helped
 def load_run(run: str | Path) -> AttackResult | SweepResult | Result:
     """Return the answer of a run from its folder, of the type that the function of its question returns.
 
@@ -111,6 +113,7 @@ class ModelKeywords(TypedDict, total=False):
     read: Read | None
 
 
+@helped
 def load_model(
     spec: str | Path | nn.Module | Model, *, task: AnyTask | None = None, **options: Unpack[ModelKeywords]
 ) -> Model:
@@ -122,7 +125,7 @@ load_model.__doc__ = models.load_model.__doc__
 load_model.__signature__ = inspect.signature(models.load_model)  # type: ignore[attr-defined]
 
 
-render = names_code(in_turn()(shows_progress(rendering.render)))
+render = names_code(helped(in_turn()(shows_progress(rendering.render))))
 
 
 def render_from_config(config: RenderConfig, *, progress: Progress | None = None) -> RenderResult:

@@ -16,6 +16,7 @@ labels)` as losses of torch are, and asks for more by the names of further ones.
 from __future__ import annotations
 
 import inspect
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, final
@@ -375,12 +376,30 @@ def get_objective(
         found = _plain(form) if _OWN.get(kind.name) is kind else checked(form)
         of_answers = isinstance(task, Similarity) or (isinstance(task, ClassTask) and bool(task.nothing))
 
+    looks = kind is None and targeted
+
     def sought(output: Any, images: Tensor, truth: Any, more: More = nothing_more, /) -> Tensor:
+        nonlocal looks
         wanted = task.target if targeted else truth
         value = found(task.answerable(output, wanted) if of_answers else output, images, wanted, more)
+        if looks and value.requires_grad and isinstance(output, Tensor) and output.ndim == 2 and output.requires_grad:
+            looks = False
+            _warn_of_direction(name_of(objective), value, output, wanted)  # type: ignore[arg-type]
         return -value if task.minimise else value
 
     return sought
+
+
+def _warn_of_direction(name: str, values: Tensor, output: Tensor, target: Any) -> None:
+    """Warn of a user's function that falls as the target's logit rises."""
+    (slope,) = torch.autograd.grad(values.sum(), output, retain_graph=True, allow_unused=True)
+    classes = [one for one in target if isinstance(one, int)] if isinstance(target, tuple) else []
+    if slope is not None and classes and bool((slope[:, classes].sum(dim=1) < 0.0).all()):
+        warnings.warn(
+            f"objective {name!r} falls as the target becomes more likely, and an objective is maximised: the search walks "
+            "away from the target. Negate it, or take a loss of advsearch.losses that begins with targeted_.",
+            stacklevel=2,
+        )
 
 
 def check_objective(

@@ -28,8 +28,8 @@ from advsearch.attacks.evaluation import (
     usable,
 )
 from advsearch.attacks.policies.choices import with_choices
-from advsearch.copies import copied
 from advsearch.attacks.verification import Ending
+from advsearch.copies import copied
 from advsearch.errors import InputError
 from advsearch.interrupts import interruptible
 from advsearch.seeds import stream

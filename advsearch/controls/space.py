@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -11,6 +12,7 @@ from torch import Tensor
 
 from advsearch.controls.base import NOTHING, BoundControl, Group, Value
 from advsearch.controls.values import Moved
+from advsearch.copies import is_ours
 from advsearch.errors import InputError
 from advsearch.scene.description import ENVIRONMENT, OWN_MAP, SceneDescription
 
@@ -99,6 +101,8 @@ class Space:
         for number in self._turns:
             control = self.controls[number]
             own = control.inputs(parts[number], merged)
+            if not (is_ours(type(control)) and is_ours(type(getattr(control, "control", control)))):
+                _check_inputs(control.name, own)
             for name in own:
                 if name in merged and name not in control.refines:
                     both = f"{set_by[name]} and {control.name}"
@@ -204,6 +208,45 @@ class _Held(BoundControl):
 
     def numbers(self, u: Tensor) -> Mapping[str, Tensor]:
         return self._control.numbers(self._at)
+
+
+COLOR = (None, None, 3)
+EXPECTED: Mapping[str, tuple[tuple[int | None, ...] | None, float, float]] = {
+    "base_color": (COLOR, 0.0, 1.0), "color": ((3,), 0.0, 1.0), "data": (COLOR, 0.0, math.inf),
+    "to_world": ((4, 4), -math.inf, math.inf), "offsets": ((None, 3), -math.inf, math.inf),
+    "exposure": ((), -math.inf, math.inf), "shift": ((2,), -math.inf, math.inf),
+    **dict.fromkeys(("roughness", "metallic", "specular", "clearcoat"), (None, 0.0, 1.0)),
+}  # fmt: skip
+"""Shape and range of the inputs that a control of another package may set, by the last part of their names; None for any
+number or any shape."""
+
+SLACK = 1e-4
+"""How far past its range rounding may put a colour."""
+
+
+def _check_inputs(control: str, inputs: object) -> None:
+    """Refuse what a control of another package sets, where that can't be."""
+    if not isinstance(inputs, Mapping):
+        raise InputError(f"`controls` {control}: expected scene inputs by name, got {type(inputs).__name__}")
+    for name, value in inputs.items():
+        if not (isinstance(value, Tensor) and value.is_floating_point()):
+            got = value.dtype if isinstance(value, Tensor) else type(value).__name__
+            raise InputError(f"`controls` {control}: {name}: expected a tensor of real numbers, got {got}")
+        shape, low, high = EXPECTED.get(name.rpartition(".")[2], (None, -math.inf, math.inf))
+        if shape is not None and not (
+            value.ndim == len(shape)
+            and all(want in (None, side) for want, side in zip(shape, value.shape, strict=True))
+        ):
+            wanted = ", ".join("N" if one is None else str(one) for one in shape) + ("," if len(shape) == 1 else "")
+            raise InputError(f"`controls` {control}: {name}: expected shape ({wanted}), got {tuple(value.shape)}")
+        least, most = (float(one) for one in value.detach().aminmax()) if value.numel() else (low, high)
+        if not (low - SLACK <= least and most <= high + SLACK):
+            wanted = f"values from {low:g} to {high:g}" if high < math.inf else "numbers"
+            hint = f"; keep it inside, as by .clamp({low:g}, {high:g})" if high < math.inf else ""
+            raise InputError(
+                f"`controls` {control}: {name}: expected {wanted} (linear, for a colour), got {least:.4g} to {most:.4g}"
+                f"{hint}"
+            )
 
 
 def file_name(name: str) -> str:

@@ -94,7 +94,9 @@ def read(where: str, parameter: Parameter, given: object) -> Spec:
                 + f", got {dict(given)!r}"
             )
         values = [_value(where, parameter, one) for one in given[CHOICES]]
-        return _weighted(where, _choices(where, values), given[WEIGHTS]) if WEIGHTS in given else _choices(where, values)
+        return (
+            _weighted(where, _choices(where, values), given[WEIGHTS]) if WEIGHTS in given else _choices(where, values)
+        )
     if not _is_list(given):
         return Fixed(_value(where, parameter, given))
     values = [_value(where, parameter, one) for one in given]  # type: ignore[attr-defined]

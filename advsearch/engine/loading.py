@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from torch import Tensor
 
+from advsearch.calls import helped
 from advsearch.controls import CONTROLS, Control, Space, gathered, make_control, make_space, settings_by_name
 from advsearch.distributions import OwnQuantiles, as_setting
 from advsearch.errors import InputError
@@ -144,6 +145,7 @@ class Scene:
         return Scene(on_its_ground(replace(own, values=values, given=own.given | set(given))), self.only_here)
 
 
+@helped
 @plainly()
 def load_scene(
     object: str | Path | ObjectAsset,

@@ -155,7 +155,9 @@ def test_a_task_from_a_function_and_the_facts_that_it_gets() -> None:
         return value
 
     mask = torch.ones(2, 2, dtype=torch.bool)
-    facts = Facts("mug", describe=lambda: {"pose.yaw": 1.0}, look=lambda: Sight(mask, torch.ones(2, 2), torch.ones(2, 2)))
+    facts = Facts(
+        "mug", describe=lambda: {"pose.yaw": 1.0}, look=lambda: Sight(mask, torch.ones(2, 2), torch.ones(2, 2))
+    )
     task, output = make_task(judge), LOGITS.clone()
     assert [one.margin for one in task.judge(output, facts)] == [-1.0, -3.5]
     assert torch.equal(output, LOGITS) and mask.all() and facts.depth.eq(1).all() and facts.z_depth.eq(1).all()
@@ -321,7 +323,10 @@ def partial_of(method: Any) -> Any:
 
 def test_what_is_copied() -> None:
     at = torch.ones(2, requires_grad=True)
-    value = {"a": [at * 2.0, np.zeros(2)], "b": (SimpleNamespace(c=torch.zeros(1)), Evaluation(1.0, torch.ones(1), True))}
+    value = {
+        "a": [at * 2.0, np.zeros(2)],
+        "b": (SimpleNamespace(c=torch.zeros(1)), Evaluation(1.0, torch.ones(1), True)),
+    }
     found = copied(value)
     destroy(found)
     assert [one.tolist() for one in value["a"]] == [[2.0, 2.0], [0.0, 0.0]]  # type: ignore[attr-defined]

@@ -113,7 +113,7 @@ def attack(
     loaded_already = not all(isinstance(one, (str, Path)) for one in (scene, *several(model)))
     if loaded_already or callable(objective) or only_here(controls) or only_here(over) or isinstance(task, OwnTask):
         check_not_spread(options)
-    if not isinstance(policy, (str, Mapping, Policy)):
+    if not isinstance(policy, (str, Mapping, Policy)) or not policy:
         raise InputError(
             f"policy: expected a name, a mapping with a `name` and options, or an instance, got {told(policy)}"
         )

@@ -16,6 +16,7 @@ from PIL import Image
 
 from advsearch import seeds
 from advsearch.attacks import clopper_pearson
+from advsearch.calls import helped
 from advsearch.config import AttackConfig, SweepConfig
 from advsearch.described import Value
 from advsearch.engine.attack_parts import judged_alone, problem_from_config
@@ -53,6 +54,7 @@ _ALIGNED = re.compile(r"rendering-([0-9]{1,12})(?:-.*)?")
 """The name of a file with a photograph that was aligned with a rendering."""
 
 
+@helped
 @in_turn()
 def photo_agreement(run: str | Path) -> PhotoAgreement:
     """Return how the photographs that were taken for a run agree with its renderings (docs/viewer.md).

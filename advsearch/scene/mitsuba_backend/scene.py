@@ -7,6 +7,7 @@ no configuration is ever applied on top of another.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
@@ -406,6 +407,8 @@ class MitsubaScene:
         for name, fresh in wanted.items():
             key, one = self.declared[name]
             own = self.parameters[key]
+            if fresh is not None and one.shape is not None and fresh.numel() != math.prod(one.shape):
+                raise InputError(f"{name}: expected shape {one.shape}, got {tuple(fresh.shape)}, from what sets it")
             if name not in self._base:
                 self._base[name] = type(own)(own.torch().clone() if name in self._buffers else own)
             given = type(own)(self._base[name]) if fresh is None else mi.TensorXf(fresh)

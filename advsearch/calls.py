@@ -1,0 +1,144 @@
+"""What calls from Python give: keywords of other libraries are told what they are called here, and wrong types are
+refused in a sentence."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from functools import wraps
+from pathlib import Path
+from typing import Any, TypeVar
+
+from advsearch.errors import InputError, resembling
+from advsearch.options import told
+
+SYNONYMS = {
+    "objective": "loss loss_fn loss_function criterion objective_fn objective_function",
+    "policy": "lr learning_rate step_size alpha optimizer optimiser method algorithm attack strategy momentum restarts",
+    "epsilon": "eps budget radius",
+    "steps": "iterations iters n_iter num_iter max_iter num_steps n_steps epochs max_evals n_trials",
+    "progress": "verbose verbosity tqdm show_progress disable_tqdm",
+    "batch": "batch_size",
+    "samples": "n_samples num_samples",
+    "resolution": "size image_size img_size width height shape",
+    "run": "out output output_dir folder path_out save save_dir logdir log_dir name",
+    "model": "net network classifier detector models",
+    "scene": "object mesh scenes",
+    "object": "scene mesh",
+    "environment": "background envmap hdri lighting",
+    "labels": "classes class_names",
+    "label": "truth y true_label ground_truth",
+    "target": "targeted y_target target_label target_class",
+    "over": "eot transforms transformations expectation conditions",
+    "workers": "n_jobs jobs num_workers processes",
+    "seed": "random_state random_seed rng",
+    "spp": "samples_per_pixel num_spp",
+    "threads": "num_threads n_threads",
+    "overwrite": "force exist_ok",
+    "controls": "params parameters space control search_space",
+    "metrics": "metric callbacks callback",
+    "seconds": "timeout time_limit time max_time",
+    "minimise": "minimize",
+    "settings": "set",
+    "set": "settings",
+    "denoise": "denoiser",
+    "input_size": "size image_size img_size resolution",
+}
+"""Keywords of Python's functions, and what else they are called elsewhere."""
+
+NOWHERE = {
+    **dict.fromkeys(
+        ("device", "cuda", "gpu", "use_cuda"),
+        "pictures are made on the processor, and a model stays on the device that it is on",
+    ),
+    **dict.fromkeys(("lr", "learning_rate", "step_size", "alpha", "momentum"), "steps are an option of a policy"),
+}
+
+WORDS = {
+    "str": "a text", "Path": "a path", "bool": "True or False", "int": "a whole number", "float": "a number",
+    "None": "None", "Mapping": "a mapping", "Sequence": "a list", "Callable": "a function",
+}  # fmt: skip
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+def unexpected(function: str, given: Mapping[str, object], known: Sequence[str]) -> TypeError | None:
+    """Return the error for the first keyword that a function has not, with what it may be called here; None where all
+    are known."""
+    for name in given:
+        if name in known:
+            continue
+        meant = [one for one, others in SYNONYMS.items() if one in known and name.lower() in others.split()]
+        meant = meant or resembling(name, known)[:2]
+        hint = f"; did you mean {' or '.join(f'`{one}`' for one in meant)}?" if meant else ""
+        reason = f" ({NOWHERE[name.lower()]})" if name.lower() in NOWHERE else ""
+        return TypeError(f"{function}() got an unexpected keyword argument {name!r}{hint}{reason}")
+    return None
+
+
+def check_types(parameters: Mapping[str, inspect.Parameter], given: Mapping[str, object]) -> None:
+    """Check values against the annotations of a function's own parameters, as far as these name plain types and classes.
+
+    Raises:
+        InputError: a value is of none of them.
+    """
+    for name, value in given.items():
+        one = parameters.get(name)
+        if one is None or value is one.default or hasattr(value, "tolist"):
+            continue
+        kinds = _kinds(str(one.annotation))
+        if kinds and not any(_fits(kind, value) for kind in kinds):
+            *words, last = [WORDS.get(kind, f"a {kind.rpartition('.')[2]}") for kind in kinds]
+            expected = f"{', '.join(words)} or {last}" if words else last
+            raise InputError(f"{name}: expected {expected}, got {told(value)}")
+        if name == "run" and isinstance(value, str) and not value.strip():
+            raise InputError("run: expected the name of a run or a folder, got an empty text; leave it out for no run")
+
+
+def _kinds(annotation: str) -> list[str]:
+    """The types that an annotation names; none where it has names of other things."""
+    plain, depth = "", 0
+    for letter in annotation:
+        depth += (letter == "[") - (letter == "]")
+        plain += letter if depth == 0 and letter != "]" else ""
+    kinds = [one.strip().replace("os.PathLike", "Path") for one in plain.split("|")]
+    aliases = {kind for kind in kinds if kind.startswith("Any")} | {*kinds} & {
+        "Controls",
+        "Watched",
+        "Given",
+        "Texture",
+    }
+    aliases |= {*kinds} & {"Read", "MakeOptimiser", "Examples", "Unpack", "Literal", "Names", "Named", "Tensor"}
+    return [] if aliases else list(dict.fromkeys(kinds))
+
+
+def _fits(kind: str, value: object) -> bool:
+    if kind == "None":
+        return value is None
+    if kind in ("int", "float"):
+        return (
+            isinstance(value, (int, float)) and not isinstance(value, bool) and (kind == "float" or value == value // 1)
+        )
+    if kind == "Path":
+        return isinstance(value, Path) or hasattr(value, "__fspath__")
+    if kind == "Callable":
+        return callable(value)
+    if kind == "Mapping":
+        return isinstance(value, Mapping)
+    if kind == "Sequence":
+        return isinstance(value, Sequence) and not isinstance(value, (str, bytes))
+    return any(kind.rpartition(".")[2] == base.__name__ for base in type(value).__mro__)
+
+
+def helped(function: Function) -> Function:
+    """Have a function of the interface refuse keywords that it has not, and values of wrong types, as said above."""
+    signature = inspect.signature(function)
+
+    @wraps(function)
+    def called(*args: Any, **given: Any) -> Any:
+        if error := unexpected(function.__name__, given, list(signature.parameters)):
+            raise error
+        check_types(signature.parameters, {**dict(zip(signature.parameters, args, strict=False)), **given})
+        return function(*args, **given)
+
+    return called  # type: ignore[return-value]
