@@ -35,19 +35,19 @@ def _copied(value: Any) -> Any:
     if isinstance(value, MappingProxyType):
         return MappingProxyType({key: _copied(one) for key, one in value.items()})
     if isinstance(value, list):
-        made = copy.copy(value)
-        made[:] = [_copied(one) for one in value]
-        return made
+        entries = copy.copy(value)
+        entries[:] = [_copied(one) for one in value]
+        return entries
     if isinstance(value, tuple):
         parts = [_copied(one) for one in value]
         return type(value)(*parts) if hasattr(value, "_fields") else type(value)(parts)
     if isinstance(value, SimpleNamespace):
         return SimpleNamespace(**_copied(vars(value)))
     if is_dataclass(value) and not isinstance(value, type) and not getattr(value, "gives_copies", False):
-        made = copy.copy(value)
+        other = copy.copy(value)
         for one in fields(value):
-            object.__setattr__(made, one.name, _copied(getattr(value, one.name)))
-        return made
+            object.__setattr__(other, one.name, _copied(getattr(value, one.name)))
+        return other
     return value
 
 

@@ -89,7 +89,7 @@ RULES = {
     "testing": Rule({"questions", "engine", "config"}, set()),
     "api": Rule(None),
     "cli": Rule(None),
-    "": Rule({"api", "engine", "losses", "models", "questions", "testing"}, set()),
+    "": Rule({"api", "attacks", "controls", "engine", "losses", "models", "questions", "tasks", "testing"}, set()),
 }
 """As in docs/design.md, "Packages and imports". The empty name is `advsearch/__init__.py`."""
 
