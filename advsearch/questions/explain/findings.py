@@ -41,7 +41,7 @@ CHANCE = 0.01
 """Probability that any pair is told to decide together where none does; each is tested at its part (Bonferroni)."""
 
 LEAST_SPREAD = 0.1
-"""What chance adds, at least, of what it adds to independent answers: units that deviate in nothing are a few of many."""
+"""What chance adds for units, at least, of what it adds to independent answers, though units deviate in nothing."""
 
 Places = npt.NDArray[np.int64]
 
@@ -134,7 +134,7 @@ def _by_chance(parts: Places, found: Observations) -> float:
     whole = float((together**2).sum()) * found.count / (found.count - 1) / len(right)
     mean = float(right.mean())
     adds = (alone - whole) / (mean * (1.0 - mean))
-    return max(adds, LEAST_SPREAD * ((seen > 0).sum() - 1))
+    return max(adds, LEAST_SPREAD * float((seen > 0).sum() - 1))
 
 
 def _exceeds(more: float, freedom: int, by_chance: list[float], found: Observations) -> float:
