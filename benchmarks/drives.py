@@ -41,8 +41,8 @@ DRIVES = (3, 5, 10, 30, 100)
 MEANS: dict[str, tuple[Callable[[Random, int], Floats], float]] = {
     "any share": (lambda rng, n: rng.beta(2, 5, n), 2 / 7),
     "nearly always right": (lambda rng, n: np.where(rng.random(n) < 0.9, 1.0, rng.random(n) * 0.5), 0.925),
-    "all or none": (lambda rng, n: (rng.random(n) < 0.95) * 1.0, 0.95),
-    "half of them": (lambda rng, n: (rng.random(n) < 0.5) * 1.0, 0.5),
+    "all or none": (lambda rng, n: (rng.random(n) < 0.95).astype(np.float64), 0.95),
+    "half of them": (lambda rng, n: (rng.random(n) < 0.5).astype(np.float64), 0.5),
 }
 
 ANSWERS: dict[str, Callable[[Random, int, float], Flags]] = {
@@ -181,7 +181,7 @@ def explained(runs: int) -> int:
                 over = (found.values[:, place] > 0.5).reshape(drives, FRAMES)
                 low, high = (ANSWERS["shares of their own"](rng, drives, p) for p in (0.4, 0.9))
                 same = Observations(
-                    FACTORS[:1], 1.0 * over.reshape(-1, 1), np.where(over, high, low).ravel(), found.units
+                    FACTORS[:1], over.reshape(-1, 1).astype(np.float64), np.where(over, high, low).ravel(), found.units
                 )
                 (weight,) = find_importance(same)
                 covered += weight.interval[0] <= true <= weight.interval[1]

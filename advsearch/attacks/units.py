@@ -38,8 +38,7 @@ Units = npt.NDArray[np.int64]
 def per_unit(values: npt.ArrayLike, units: Units) -> Numbers:
     """Return the sums (m,) of values (n,) over each of the units that the rows (n,) belong to, in their order."""
     _, places = np.unique(units, return_inverse=True)
-    sums: Numbers = np.bincount(places, np.asarray(values, dtype=np.float64))
-    return sums
+    return np.bincount(places.reshape(-1), np.asarray(values, dtype=np.float64)).astype(np.float64)
 
 
 def share_interval(counted: npt.ArrayLike, of: npt.ArrayLike, confidence: float = CONFIDENCE) -> tuple[float, float]:

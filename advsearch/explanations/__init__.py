@@ -148,7 +148,7 @@ class Observations:
         """The 95 % interval of the share of right answers, over units; 0 to 1 where there is no row."""
         if not len(self):
             return 0.0, 1.0
-        return share_interval(*(per_unit(one, self.units) for one in (self.right, np.ones(len(self)))))
+        return share_interval(per_unit(self.right, self.units), per_unit(np.ones(len(self)), self.units))
 
     def where(self, mask: Mask) -> Observations:
         """Return some of the rows, by a mask (n,)."""
@@ -318,9 +318,8 @@ class CountedRule:
         units = np.concatenate([self.inside.units, self.elsewhere.units])
         under = np.arange(len(units)) < self.of
         right = np.concatenate([self.inside.right, self.elsewhere.right])
-        return fewer_by_chance(
-            *(per_unit(one, units) for one in (under & right, under, ~under & right, ~under)), times=times
-        )
+        k, a, r, b = (per_unit(one, units) for one in (under & right, under, ~under & right, ~under))
+        return fewer_by_chance(k, a, r, b, times)
 
 
 @dataclass(frozen=True)

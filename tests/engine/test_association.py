@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2_contingency
 
-from advsearch.engine.sweeps.surface import SHARINGS, PartCounts, _likelihood_ratio, _newcombe, association
+from advsearch.engine.sweeps.surface import SHARINGS, PartCounts, _likelihood_ratio, _newcombe, association, exchange
 
 
 def test_the_interval_of_a_difference_is_newcombe_s() -> None:
@@ -54,3 +54,31 @@ def test_a_part_that_decides_is_told_and_one_that_is_always_there_is_not_compare
     assert found.compared.tolist() == [False, True, False] and found.told.tolist() == [False, True, False]
     assert found.difference[1] == 1.0 and found.low[1] == found.strength[1] > 0.6 and np.isnan(found.p[0])
     assert association(counts, slice(1, 2), 5).p.tolist() == [1 / (1 + SHARINGS)]
+
+
+def test_answers_of_a_drive_are_exchanged_whole() -> None:
+    wrong, draws = np.array([1, 1, 0, 0, 1, 0], np.int8), np.array([0, 1, 2, 0, 1, 2])
+    packed = exchange(wrong, draws, seed=0)
+    assert packed is not None and exchange(wrong, np.arange(6), seed=0) is None
+    shared = np.unpackbits(packed, axis=0, count=SHARINGS)
+    order = np.argsort(draws, kind="stable").reshape(3, 2)
+    drives = {tuple(one) for one in wrong[order].tolist()}
+    assert all({tuple(one) for one in dealt[order].tolist()} == drives for dealt in shared), "whole drives, each once"
+    assert len({tuple(one) for one in shared.tolist()}) == 6, "in all orders"
+
+
+def test_parts_that_some_drives_show_are_told_from_chance_by_drive() -> None:
+    """Six drives of ten frames, each all wrong or all right: row by row, a part that three show would be told."""
+    told = 0
+    for trial in range(40):
+        random = np.random.default_rng(trial)
+        draws, wrong = np.repeat(np.arange(6), 10), np.repeat(random.random(6) < 0.5, 10)
+        shows = np.repeat(random.random((6, 8)) < 0.5, 10, axis=0)
+        exchanged = exchange(wrong.astype(np.int8), draws, seed=trial)
+        counts = PartCounts(8, 60, int(wrong.sum()), seed=trial, exchanged=exchanged)
+        for seen, failed in zip(shows, wrong, strict=True):
+            counts.add(np.flatnonzero(seen), bool(failed))
+        found = association(counts, slice(0, 8), 5)
+        told += bool(found.told.any())
+        assert np.isnan(found.low).all() and (found.strength[found.compared] >= 0.0).all()
+    assert told <= 6

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sqlite3
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,8 @@ from test_sweep_workers import Disorder, rows, summary
 from torch import Tensor, nn
 
 import advsearch
+from advsearch.attacks import clopper_pearson
+from advsearch.attacks.units import share_interval
 from advsearch.cli.output import shown_text as answer
 from advsearch.config import SweepConfig
 from advsearch.engine.journal import answering
@@ -23,9 +26,11 @@ from advsearch.engine.sweeps.loop import Sweep
 from advsearch.engine.sweeps.swept_scene import Scenes
 from advsearch.errors import InputError
 from advsearch.progress import NullProgress
+from advsearch.questions.sweep.answer import claims
 from advsearch.questions.sweep.carry_out import job_of
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.sweep import DriveRates
+from advsearch.viewer.columns import read_columns
 
 SMALL: dict[str, Any] = {"resolution": 16, "spp": 1, "trials": 0, "batch": 4}
 
@@ -124,9 +129,41 @@ def test_the_worst_of_several_drives_is_the_one_that_is_kept(tmp_path: Path, mon
         80,
         90,
     ]
+    shares = ([5, 2, 4, 4], [5] * 4)
+    assert result.summary.interval == pytest.approx(share_interval(*shares)), "over drives, not over 20 frames"
+    times = [row for row in result.summary.axes if row.axis == "path.time"]
+    assert times[0].interval == clopper_pearson(times[0].correct, 4), "at one time each drive has one frame"
+    (yaw, *_) = [row for row in result.summary.axes if row.axis == "pose.yaw"]
+    assert yaw.interval is not None and yaw.interval[1] - yaw.interval[0] > 0.95, "one drive of five frames"
+    assert "4 drives can show little" in " ".join(result.summary.warnings)
+    assert len(set(read_columns(path).unit.tolist())) == 4
+    with sqlite3.connect(path / "results.sqlite") as older:
+        older.execute("DELETE FROM meta WHERE key = 'units'")
+    assert len(set(read_columns(path).unit.tolist())) == 4, "an older run's summary says it, too"
+    (claim, *_) = claims(result.summary)
+    assert "frames of 4 drives" in claim.statement and "sampler" not in claim.statement
     text = answer(result.summary)
     assert "4 drives of 5 frames in 4 s, clock" in text and "75 %" in text and "40 %" in text and "drive.webp" in text
     assert "Whole drives" in (path / "report.html").read_text()
+
+
+def test_two_models_are_compared_and_explained_by_drive(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One is right in the last frames of each drive, the other in the first: as often, and row by row far apart."""
+    monkeypatch.setattr(swept_scene, "make_renderer", Timed)
+    models = [
+        advsearch.load_model(Clock(right * 12), labels=("mug", "vase"), input_size=16, name=name)
+        for right, name in (("11100", "early"), ("11000", "late"))
+    ]
+    path, drive = tmp_path / "run", {**DRIVE, "grid": {"pose.yaw": "0:330:12"}}
+    table = advsearch.sweep("mug", models, run=path, **SMALL, **drive)
+    assert table.summary.configurations == 120 and [one.drives for one in table.summary.drives or ()] == [12, 12]
+    assert table.summary.interval == pytest.approx(share_interval([5] * 12, [10] * 12)), "both saw the same drives"
+    (pair,) = advsearch.compare(path, pictures=0, run=tmp_path / "compared").pairs
+    assert pair.units == 12 and (pair.first_only, pair.second_only) == (12, 0)
+    assert pair.p > 0.05 and pair.interval[0] < 0.0, "12 pairs of 60, one of each drive, are no proof"
+    told = advsearch.explain(path, confirm=0, pairs=0, clusters=0, run=tmp_path / "explained")
+    assert told.units == 12 and told.interval == pytest.approx(table.summary.interval)
+    assert "few show little" in told.warnings[0]
 
 
 @pytest.mark.parametrize("grid", [{}, {"path.time": [0, 4, 2], "pose.yaw": [0, 90]}, {"pose.yaw": [0, 90]}])

@@ -177,6 +177,48 @@ def test_rows_are_a_table_of_what_varies() -> None:
         observed([])
 
 
+def of_drives(seed: int, drives: int = 40, frames: int = 10, twice: bool = False) -> Observations:
+    """Frames of drives that are right in shares of their own, whatever the parameters; or pictures that two models see
+    and answer alike."""
+    rng = np.random.default_rng(seed)
+    own, right = rng.beta(0.7, 0.3, drives), rng.random((drives, 1)) < 0.7
+    values = np.repeat(rng.random((drives, 2)), frames, axis=0)
+    times = np.tile(np.linspace(0.0, 1.0, frames), drives)[:, None]
+    factors = (Factor("pose.yaw"), Factor("camera.elevation"), *([] if twice else [Factor("path.time")]))
+    answers = np.repeat(right, frames, axis=1) if twice else rng.random((drives, frames)) < own[:, None]
+    table = values if twice else np.concatenate([values, times], axis=1)
+    return Observations(factors, table, answers.ravel(), np.repeat(np.arange(drives), frames))
+
+
+@pytest.mark.parametrize("twice", [False, True])
+def test_where_drives_differ_by_themselves_nothing_is_told(twice: bool) -> None:
+    """Counted row by row, a rule is told in about a half of these and a parameter decides in nearly all."""
+    found = [of_drives(seed, *((120, 2) if twice else (40, 10)), twice=twice) for seed in range(40)]
+    rules = [find_rules(*one.halves(seed), seed=seed).told for seed, one in enumerate(found[:10])]
+    assert sum(map(bool, rules)) <= 1
+    decides = [one.interval[0] > 0.0 for each in found for one in find_importance(each) if len(one.places) == 1]
+    assert np.mean(decides) < 0.08  # 2.5 % each
+    assert all(find_envelope(*one.halves(0), accuracy=0.95) is None for one in found[:10])
+
+
+def test_a_law_over_drives_is_told_and_its_intervals_are_over_drives() -> None:
+    given = of_drives(0, drives=160)
+    wrong = (given.values[:, 0] > 0.6) & (given.values[:, 2] > 0.5)
+    found = Observations(given.factors, given.values, ~wrong, given.units)
+    (rule,) = find_rules(*found.halves(0), seed=0).told
+    assert {one.place for one in rule.conditions} == {0, 2} and rule.right == 0
+    assert rule.inside.interval[1] > 2 * 3.7 / rule.of, "an interval of as many rows would end sooner"
+    assert find_importance(found)[0].interval[0] > 0.05
+
+
+def test_halves_are_of_whole_units_and_rows_that_are_alike_but_for_the_time_are_one() -> None:
+    found = of_drives(3, drives=9)
+    one, other = found.halves(1)
+    assert not set(one.units) & set(other.units) and (one.count, other.count) == (4, 5)
+    unsaid = Observations(found.factors, found.values, found.right)
+    assert unsaid.count == 9 and not unsaid.independent and unsaid.interval == found.interval
+
+
 def test_halves_share_no_row() -> None:
     found = planted("none", rows=11)
     one, other = found.halves(3)

@@ -472,6 +472,13 @@ def test_a_better_random_search_and_a_failing_control_group_are_said() -> None:
     ]
 
 
+def test_of_a_path_each_trial_has_another_moment() -> None:
+    said = {(): "", ("camera", "light"): ", each with another camera and light"}
+    said |= {("path",): ", each at another moment of the path"}
+    said |= {("path", "camera"): ", each with another camera and at another moment of the path"}
+    assert {over: wording.another_text(over) for over in said} == said
+
+
 def test_the_ends_of_an_interval_have_the_digits_that_fit_and_are_not_clamped() -> None:
     assert wording.interval_text(clopper_pearson(1, 120)) == "0.02-4.6 %"
     assert wording.interval_text(clopper_pearson(119, 120)) == "95.4-99.98 %"

@@ -560,6 +560,17 @@ def test_intervals_are_those_of_clopper_and_pearson(browser: Browser, sweep: Pat
         assert mine == pytest.approx(clopper_pearson(right, count), abs=2e-7), (right, count)
 
 
+def test_intervals_over_drives_are_those_of_the_summary(browser: Browser) -> None:
+    from advsearch.attacks.units import share_interval
+
+    code = asset("sweep.js")
+    part, page = code[code.index("  const STAKES") : code.index("  function colour")], browser.new_page()
+    for units in ([[5, 5, 3], [2, 5, 1], [0, 5, 2]], [[3, 5, 1], [0, 2, 4]], [[4, 4, 5]], [[0, 3, 2]]):
+        right, of = zip(*((right, of) for right, of, times in units for _ in range(times)), strict=True)
+        mine = page.evaluate(f"(() => {{ {part}; return intervalOver({units}); }})()")
+        assert mine == pytest.approx(share_interval(right, of), abs=1e-6), units
+
+
 # ---- photographs ----------------------------------------------------------------------------------------------------
 
 

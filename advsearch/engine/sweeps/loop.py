@@ -357,7 +357,7 @@ class Sweep:
             worst=worst,
             grid={axis.name: len(axis.values) for axis in job.axes},
             samples=job.samples,
-            sampler=job.config.sampler if job.controls else None,
+            sampler=job.config.sampler if self.points.draws else None,
             spp=self.samples,
             renders={
                 "sweep": self._traced,

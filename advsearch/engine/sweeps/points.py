@@ -188,6 +188,11 @@ class Points:
                 parts[:, number] = np.take(one.shares, parts[:, number])
         return Picks(before + first, digits, shares, parts.tolist())
 
+    @property
+    def draws(self) -> bool:
+        """Whether anything is drawn: not where controls have all from the grid, as a path its time."""
+        return self._draws.dimensions + self._noise.dimensions > 0
+
     def digits(self, number: int) -> tuple[int, ...]:
         return self.grid.digits(number // self.samples)
 

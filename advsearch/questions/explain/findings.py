@@ -40,6 +40,9 @@ ROWS_IN_A_CELL = 25
 CHANCE = 0.01
 """Probability that any pair is told to decide together where none does; each is tested at its part (Bonferroni)."""
 
+LEAST_SPREAD = 0.1
+"""What chance adds for units, at least, of what it adds to independent answers, though units deviate in nothing."""
+
 Places = npt.NDArray[np.int64]
 
 
@@ -104,7 +107,7 @@ def _weight(places: tuple[int, ...], parts: Places, found: Observations) -> Fact
         spread, others = 1.0, math.inf
     else:
         others = float(found.count - k)
-    statistic = n * counted / max(spread, 1e-9)
+    statistic = n * counted / spread
     low = spread * _noncentrality(statistic, k - 1, others, 1.0 - tail) / n
     high = spread * _noncentrality(max(statistic, k - 1.0), k - 1, others, tail) / n  # fewer: less than chance gives
     share = 1.0 - (1.0 - counted) * (n - 1) / max(n - k, 1) if found.independent else counted - by_chance / n
@@ -130,7 +133,8 @@ def _by_chance(parts: Places, found: Observations) -> float:
     together = np.bincount(both % (units.max() + 1), away)
     whole = float((together**2).sum()) * found.count / (found.count - 1) / len(right)
     mean = float(right.mean())
-    return max(alone - whole, 1e-9) / (mean * (1.0 - mean))
+    adds = (alone - whole) / (mean * (1.0 - mean))
+    return max(adds, LEAST_SPREAD * float((seen > 0).sum() - 1))
 
 
 def _exceeds(more: float, freedom: int, by_chance: list[float], found: Observations) -> float:
@@ -154,7 +158,7 @@ def _noncentrality(statistic: float, freedom: int, others: float, probability: f
             less = ncf.cdf(share, freedom, others, at) if at > 0.0 else fisher.cdf(share, freedom, others)
         else:
             less = ncx2.cdf(statistic, freedom, at) if at > 0.0 else chi2.cdf(statistic, freedom)
-        return float(less) - probability
+        return float(np.nan_to_num(less)) - probability  # where the distribution is too far away to be computed: 0
 
     if over(0.0) <= 0.0:
         return 0.0
