@@ -17,8 +17,8 @@ import time
 from collections.abc import Sequence
 
 from advsearch import threads
+from advsearch.attacks import Ending
 from advsearch.config import AttackConfig
-from advsearch.engine.stages import Ending
 from advsearch.questions.attack.carry_out import attack_once
 
 

@@ -284,10 +284,9 @@ def write_pictures(run: RunDirectory, problem: Problem, findings: Findings, show
     run.save_image("difference", images.difference(shown["clean"].picture, shown["adversarial"].picture))
     checked = findings.verification
     kind = "verification" if findings.beaten is None else "baseline verification"
-    for number in (
-        () if checked is None else range(checked.begin, checked.begin + len(checked.adversarial_trials))[:KEPT]
-    ):
-        save_trial(run, problem, findings, (kind, number), f"verification-{number:02d}", checked.u)
+    if checked is not None:
+        for number in range(checked.begin, checked.begin + len(checked.adversarial_trials))[:KEPT]:
+            save_trial(run, problem, findings, (kind, number), f"verification-{number:02d}", checked.u)
     if findings.frames:
         last = shown["adversarial"].picture
         if problem.conditions is not None and findings.search is not None:  # the frames see the scene as it comes
