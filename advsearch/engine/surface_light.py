@@ -28,7 +28,8 @@ from advsearch.scene.surface.arrangement import CAMERAS, COLOR, MAP
 from advsearch.scene.surface.renderer import Look, Sketch, SurfaceRenderer
 
 WORTH = 32
-"""Pictures of a search from which on the light pays: it and a comparison take as long as some 25 rendered ones."""
+"""Pictures of a search from which on the light pays: it and a comparison take as long as some 25 rendered ones, or 45
+where the first views do not decide."""
 NO_CAMERA = "no camera moves"
 """The reason where light on surfaces has no advantage."""
 LIGHTS = 64

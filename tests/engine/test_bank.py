@@ -13,7 +13,7 @@ from stand_ins import Impatient, rows, shared
 import advsearch
 from advsearch.attacks.domain import Block, Domain
 from advsearch.config import AttackConfig
-from advsearch.engine import bank, transport
+from advsearch.engine import acceptance, bank
 from advsearch.engine.attack_result import AttackResult
 from advsearch.engine.bank import Bank, stratified
 from advsearch.engine.problem import hard_first
@@ -53,7 +53,7 @@ def grow(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let it compare every six evaluations, and go on growing after each comparison."""
     for name, value in {"EVERY": 6, "UNSEEN": 2, "SURE": -1e9, "FIRST": 3, "GROWTH": 4}.items():
         monkeypatch.setattr(bank, name, value)
-    monkeypatch.setattr(transport, "CHANGE_SPP", 4)
+    monkeypatch.setattr(acceptance, "CHECK_SPP", 4)
     monkeypatch.setattr(surface_renderer, "why_not", lambda renderer, varying: "matrices are tested")
 
 
