@@ -317,7 +317,7 @@ def _of_camodocal(data: Mapping[str, Any]) -> dict[str, Any]:
     groups = [one for name in GROUPS if isinstance(one := data.get(name), dict)]
     found = {name: one for name, one in data.items() if not (name in GROUPS and isinstance(one, dict))}
     for group in groups:
-        found |= {KANNALA.get(key, key) if "mu" in group else key: one for key, one in group.items()}
+        found |= {KANNALA.get(str(key), str(key)) if "mu" in group else str(key): one for key, one in group.items()}
     return found
 
 

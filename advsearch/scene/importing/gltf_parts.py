@@ -317,8 +317,9 @@ def read_gltf(path: Path, data: bytes) -> tuple[list[ImportedPart], list[str]]:
 
     def in_place(key: tuple[int, int], node: int, pose: Doubles) -> ImportedPart:
         skin, by = header.nodes[node].skin, found[key].bound
-        moved = skin is not None and by is not None
-        return posed(path, finished[key], by, skins[skin]) if moved else placed(finished[key], pose)
+        if skin is None or by is None:
+            return placed(finished[key], pose)
+        return posed(path, finished[key], by, skins[skin])
 
     parts = [
         replace(in_place((mesh, number), node, pose), node=node)

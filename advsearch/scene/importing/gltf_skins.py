@@ -34,7 +34,9 @@ def bound(path: Path, header: Header, buffers: Buffers, primitive: Primitive, us
     Raises:
         FileFormatError: it says it of other vertices, or without weights.
     """
-    held, joints, weights = primitive.attributes, [], []
+    held = primitive.attributes
+    joints: list[Ints] = []
+    weights: list[Doubles] = []
     while f"JOINTS_{len(joints)}" in held:
         pair = [held.get(f"{kind}_{len(joints)}") for kind in ("JOINTS", "WEIGHTS")]
         for one in pair:
