@@ -94,8 +94,7 @@ def _check_numbers(plugin: Mapping[str, object], where: str) -> None:
                 right = False
             if not right:
                 raise InputError(
-                    f"{where}: expected {expected} as {key} of its {plugin['type']}, got "
-                    f"{shown(str(value))}"
+                    f"{where}: expected {expected} as {key} of its {plugin['type']}, got {shown(str(value))}"
                 )
         elif isinstance(value, Mapping) and "type" in value:
             _check_numbers(value, where if plugin["type"] != "scene" else f"{where}: {shown(key, quoted=False)}")
