@@ -992,7 +992,7 @@ def test_lines_come_where_nothing_is_counted_too(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr("advsearch.progress.PATIENCE", 0.0)
     with watch_progress() as progress:
         progress.stage("compiling")
-        for _ in range(100):
+        for _ in range(1200):
             if stream.getvalue():
                 break
             time.sleep(0.05)

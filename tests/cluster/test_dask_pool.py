@@ -173,7 +173,7 @@ def test_a_scheduler_that_went_and_came_back_between_two_looks_is_noticed(monkey
         await asyncio.sleep(0.05)
         assert not gone.done()
         client.scheduler_comm = object()
-        await asyncio.wait_for(gone, 1.0)
+        await asyncio.wait_for(gone, 60.0)
 
     asyncio.run(look())
 
@@ -247,7 +247,7 @@ def test_a_scheduler_that_is_not_there_is_named(monkeypatch: pytest.MonkeyPatch)
     with pytest.raises(ClusterError, match=r"tcp://127.0.0.1:9: there is no scheduler that answers"):
         with executor_of(Work("a:b", {}), workers=None, cluster="tcp://127.0.0.1:9", tell=lambda text: None):
             pass
-    assert time.monotonic() - begun < 30.0
+    assert time.monotonic() - begun < 100.0  # and not `RECONNECT`
 
 
 @pytest.mark.parametrize(

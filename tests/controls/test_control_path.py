@@ -304,6 +304,7 @@ def test_a_file_that_changes_is_read_again(scene: SceneDescription, tmp_path: Pa
         ("time,x,y,z,heading\n0,1,1,1,0\n1,1,1,1,0\n", "expected columns"),
         ("time,x,y,z,object_x\n0,1,1,1,0\n1,1,1,1,0\n", "expected columns"),
         ("time,x,x,y,z\n0,1,1,1,0\n1,1,1,1,0\n", "expected columns"),
+        ("time,x,y,z\n0,1,1," + 200_000 * "1" + "\n", "expected a table of waypoints, got one with a field larger"),
         ("time,x,y,z\n0,1,1,1\n", "expected 2 to 100000 waypoints, got 1"),
         ("time,x,y,z\n0,1,1,1\n1,a,1,1\n", "expected 4 numbers in each row"),
         ("time,x,y,z\n0,1,1,1\n1,1,1\n", "expected 4 numbers in each row"),

@@ -55,6 +55,11 @@ INSERTED = (
     b'<ref id="nobody"/>',
     b'<texture type="bitmap"/>',
     b'<medium type="homogeneous"/>',
+    b'<shape type="cylinder" id="0"><float name="radius" value="0"/></shape>',
+    b'<shape type="sphere" id="0"><string name="radius" value="wide"/></shape>',
+    b'<sensor type="perspective"><rgb name="fov" value="1"/></sensor>',
+    b'<shape type="cube" id="' + b"n" * 3_000 + b'"/>',
+    b'<shape type="sphere" id="same"/>' * 40_000,
 )
 
 

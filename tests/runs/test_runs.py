@@ -427,7 +427,7 @@ GONE_ON: dict[str, Callable[[RunDirectory], object]] = {
 def test_a_run_whose_folder_went_ends_with_a_sentence_and_leaves_nothing(tmp_path: Path, what: str, how: str) -> None:
     """Nor does it touch a run that another process has put in its place."""
     path, other = tmp_path / "run", tmp_path / "moved"
-    with pytest.raises(StorageError, match="removed or renamed while the run went on.*advsearch resume"):
+    with pytest.raises(StorageError, match=r"removed or renamed while the run went on.*advsearch resume"):
         with RunDirectory.create(path) as run:
             run.record(Row("search", 0))
             shutil.rmtree(path) if how == "removed" else path.rename(other)

@@ -185,6 +185,36 @@ def test_a_hostile_file_is_refused(tmp_path: Path, text: str, reason: str) -> No
         contents(path)
 
 
+WRONG = {
+    '<shape type="cylinder" id="it"><float name="radius" value="0"/></shape>': "expected a cylinder of some size",
+    '<shape type="cylinder" id="it"><point name="p1" value="0"/></shape>': "expected a cylinder of some size",
+    '<shape type="sphere" id="it"><float name="radius" value="0"/></shape>': "expected a sphere of some size",
+    '<shape type="sphere" id="it"><string name="radius" value="wide"/></shape>': "expected a number as radius of its",
+    '<shape type="sphere" id="it"><rgb name="center" value="1"/></shape>': "expected three numbers as center of its",
+    '<shape type="cylinder" id="it"><float name="p0" value="1"/></shape>': "expected three numbers as p0 of its",
+    '<shape type="disk" id="it"><float name="to_world" value="1"/></shape>': "expected a transform as to_world of its",
+    '<shape type="cube" id="it"/><sensor type="perspective"><string name="fov" value="a"/></sensor>': "number as fov",
+    '<shape type="cube" id="it"/><sensor type="perspective"><float name="fov" value="9"/><film type="hdrfilm">'
+    '<integer name="width" value="0"/></film></sensor>': "expected a film of at least 1 x 1 pixels",
+    '<shape type="cube" id="it"/><emitter type="point"><float name="position" value="1"/></emitter>': "as position of",
+    '<shape type="cube" id="it"/><emitter type="directional"><string name="direction" value="x"/></emitter>': "three",
+}
+
+
+@pytest.mark.parametrize(("inside", "message"), WRONG.items())
+def test_a_text_or_nothing_in_the_place_of_a_number_is_told(tmp_path: Path, inside: str, message: str) -> None:
+    path = tmp_path / "a.xml"
+    path.write_text(f'<scene version="3.0.0">{inside}<emitter type="constant"/></scene>')
+    with pytest.raises(InputError, match=message):
+        import_plugins(path, "it")
+
+
+def test_an_id_of_thousands_of_letters_is_found(tmp_path: Path) -> None:
+    path = tmp_path / "a.xml"
+    path.write_text(f'<scene version="3.0.0"><shape type="cube" id="{"n" * 3_000}"/><emitter type="constant"/></scene>')
+    assert len(advsearch.load_scene(f"{path}#{'n' * 3_000}").description.object.name) < 100
+
+
 def test_what_mitsuba_refuses_is_told_in_its_words(box: Path) -> None:
     box.write_text(
         BOX.replace('<bsdf type="dielectric"/>', '<bsdf type="dielectric"><float name="oops" value="1"/></bsdf>')

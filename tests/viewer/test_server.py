@@ -34,7 +34,7 @@ from advsearch.viewer.thumbnails import Kept
 def ask(server: Dashboard, path: str, method: str = "GET", **headers: str) -> tuple[HTTPResponse, bytes]:
     """The answer to one request, whatever the path looks like."""
     made = HTTPConnection if server.scheme == "http" else partial(HTTPSConnection, context=_create_unverified_context())
-    connection = made("127.0.0.1", server.server_port, timeout=20)
+    connection = made("127.0.0.1", server.server_port, timeout=120)
     given = {
         "Host": f"127.0.0.1:{server.server_port}",
         **{name.replace("_", "-"): text for name, text in headers.items()},
