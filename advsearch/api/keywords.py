@@ -212,11 +212,11 @@ def asks(config: type[Config], keywords: type[Any]) -> Callable[[Function], Func
         def asked(*args: Any, **given: Any) -> Any:
             if error := unexpected(function.__name__, given, list(signature.parameters)):
                 raise error
+            check_types({**own.parameters, **RUN}, {**dict(zip(own.parameters, args, strict=False)), **given})
             try:
                 bound = signature.bind(*args, **given)
             except TypeError as error:
                 raise TypeError(f"{function.__name__}() {error}") from None
-            check_types({**own.parameters, **RUN}, bound.arguments)
             allow_named({**bound.arguments, **given})
             kept = ("scene", "model", "beside", "progress", "metrics")
             plain = {key: one if key in kept or not is_shallow(one) else as_python(one) for key, one in given.items()}

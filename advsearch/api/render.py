@@ -113,7 +113,6 @@ class ModelKeywords(TypedDict, total=False):
     read: Read | None
 
 
-@helped
 def load_model(
     spec: str | Path | nn.Module | Model, *, task: AnyTask | None = None, **options: Unpack[ModelKeywords]
 ) -> Model:
@@ -123,6 +122,7 @@ def load_model(
 
 load_model.__doc__ = models.load_model.__doc__
 load_model.__signature__ = inspect.signature(models.load_model)  # type: ignore[attr-defined]
+load_model = helped(load_model)
 
 
 render = names_code(helped(in_turn()(shows_progress(rendering.render))))

@@ -99,16 +99,18 @@ def read_drawn(where: str, parameter: Parameter, given: Mapping[str, object]) ->
     if not sound:
         shapes = f"{family.shapes}, " if family.shapes else ""
         raise InputError(f"{where}: expected {{distribution: {name}}} with numbers for {shapes}loc, scale, got {text}")
-    outside = float(frozen.cdf(parameter.low) + frozen.sf(parameter.high))
+    with np.errstate(all="ignore"):  # far from where it is, some formulas overflow
+        least, most = float(frozen.cdf(parameter.low)), float(frozen.cdf(parameter.high))
+        outside = least + float(frozen.sf(parameter.high))
+        ends = np.isfinite(frozen.ppf(np.array([0.0, 1.0])))
     if outside > MOST_OUTSIDE:
         raise InputError(
             f"{where}: {100.0 * outside:.3g} % of {text} lies outside of {parameter.low:g} to {parameter.high:g} "
             f"({parameter.unit}), and at most {100.0 * MOST_OUTSIDE:g} % is cut off; choose a narrower one, or cut it "
             "yourself (truncnorm)"
         )
-    least, most = float(frozen.cdf(parameter.low)), float(frozen.cdf(parameter.high))
-    least = least if least > 0.0 else 0.0 if np.isfinite(frozen.ppf(0.0)) else TAIL
-    most = most if most < 1.0 else 1.0 if np.isfinite(frozen.ppf(1.0)) else 1.0 - TAIL
+    least = least if least > 0.0 else 0.0 if ends[0] else TAIL
+    most = most if most < 1.0 else 1.0 if ends[1] else 1.0 - TAIL
     return _between(where, frozen.ppf, least, most, text)
 
 

@@ -142,7 +142,7 @@ def _weighted(where: str, choice: OneOf, weights: object) -> OneOf:
             f"{where}: expected a weight of at least 0 for each of {len(values)} values, and one over 0, got {weights!r}"
         )
     shares = [one / sum(numbers) for one in numbers]
-    exact = (n for n in range(1, MOST_SHARES) if all(abs(n * one - round(n * one)) < CLOSE * n for one in shares))
+    exact = (n for n in range(1, MOST_SHARES) if all(abs(n * one - round(n * one)) < 1e-9 for one in shares))
     count = next(exact, MOST_SHARES)
     ends = [0, *(round(count * sum(shares[: number + 1])) for number in range(len(shares)))]
     counts = [high - low for low, high in pairwise(ends)]

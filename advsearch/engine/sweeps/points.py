@@ -58,8 +58,8 @@ class Picks:
 @dataclass(frozen=True)
 class Drawn:
     """A drawn number, as the table shows it: its column of `Picks.shares`, and what equal parts of [0, 1] stand for:
-    pairs of ends, or values of a list; if `settled`, in every scene. Where values have weights, `shares` says which part
-    each of more equal shares stands for."""
+    pairs of ends, or values of a list; if `settled`, in every scene. Where values have weights, `shares` says which
+    part each of more equal shares stands for."""
 
     name: str
     unit: str

@@ -1,0 +1,178 @@
+"""Values that vary by chance: distributions of torch, scipy and Python, and choices with weights, through the inverse
+CDF."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from scipy import stats
+from torch.distributions import Beta, Exponential, Gumbel, Kumaraswamy, LogNormal, Normal, Uniform
+from torch.distributions import Laplace as TorchLaplace
+
+from advsearch.attacks.draws import Draws
+from advsearch.config import AttackConfig
+from advsearch.controls import CameraControl, EnvironmentControl, PatchControl
+from advsearch.controls.drawn import Drawn
+from advsearch.controls.numbers import BoundNumbers
+from advsearch.distributions import as_setting
+from advsearch.engine.attack_parts import controls_given
+from advsearch.engine.loading import as_controls, load_scene, only_here, settings_of
+from advsearch.errors import InputError
+
+MUG = load_scene("mug").description
+NORM = {"distribution": "norm", "loc": 30.0, "scale": 10.0}
+
+
+def azimuths(given: Any, shares: np.ndarray) -> np.ndarray:
+    """The azimuths at coordinates, as a search over these conditions has them."""
+    bound = CameraControl(azimuth=given).bind(MUG)
+    return np.array([float(bound.values(torch.tensor([share]))["azimuth"]) for share in shares.tolist()])
+
+
+@pytest.mark.parametrize(
+    ("given", "setting"),
+    [
+        (Normal(30.0, 10.0), NORM),
+        (stats.norm(30, 10), NORM),
+        (stats.norm(loc=30, scale=10), NORM),
+        (NORM, NORM),
+        (Uniform(0.0, 90.0), {"distribution": "uniform", "loc": 0.0, "scale": 90.0}),
+        (stats.truncnorm(-1, 2, scale=9), {"distribution": "truncnorm", "a": -1.0, "b": 2.0, "loc": 0.0, "scale": 9.0}),
+        ({"studio": 0.7, "noon": 0.3}, {"choices": ["studio", "noon"], "weights": [0.7, 0.3]}),
+        ([0, 90], [0, 90]),
+    ],
+)
+def test_what_a_file_says_of_a_distribution(given: Any, setting: Any) -> None:
+    assert as_setting(given) == setting
+    assert json.loads(json.dumps(setting)) == setting
+
+
+@pytest.mark.parametrize(
+    "distribution",
+    [
+        *(Normal(20.0, 5.0), Uniform(1.0, 3.0), LogNormal(1.0, 0.5), Beta(2.0, 5.0), Exponential(0.5)),
+        *(Gumbel(3.0, 1.0), TorchLaplace(1.0, 2.0)),
+    ],
+    ids=lambda one: type(one).__name__,
+)
+def test_torchs_distributions_are_scipys_of_other_names(distribution: torch.distributions.Distribution) -> None:
+    """Of so many of torch's own samples the two ends and the middle are where the quantiles are."""
+    torch.manual_seed(0)
+    drawn = distribution.sample((40_000,)).double().numpy()
+    spec = CameraControl(azimuth=distribution).specs["azimuth"]
+    assert isinstance(spec, Drawn)
+    for share in (0.1, 0.5, 0.9):
+        value = float(spec.at(torch.tensor([(share - spec.least) / (spec.most - spec.least)], dtype=torch.float64)))
+        assert abs((drawn < value).mean() - share) < 0.01
+
+
+def test_even_draws_of_u_have_the_distribution_and_stay_even() -> None:
+    """Sobol points stay a net: what they draw is nearer to the distribution than independent draws could be."""
+    points = Draws(1, "sobol", 0).points(0, 512)[:, 0]
+    found = azimuths(Normal(30.0, 10.0), points)
+    assert stats.kstest(found, stats.norm(30, 10).cdf).statistic < 0.005
+    assert abs(found.mean() - 30.0) < 0.1 and abs(found.std() - 10.0) < 0.1
+
+
+def test_a_function_is_an_inverse_cdf() -> None:
+    shares = np.linspace(0.0, 1.0, 9)
+    assert azimuths(lambda share: 30.0 + 60.0 * share, shares) == pytest.approx(30.0 + 60.0 * shares, abs=1e-4)
+    own = Kumaraswamy(torch.tensor(2.0), torch.tensor(3.0))  # scipy has none, and torch has its icdf
+    assert azimuths(own, np.array([0.5])) == pytest.approx(float(own.icdf(torch.tensor(0.5))), abs=1e-4)
+
+
+def test_the_clean_scene_has_its_value_where_the_distribution_has_it() -> None:
+    near, far = (CameraControl(azimuth=Normal(at, 5.0)).bind(MUG) for at in (45.0, 200.0))
+    assert float(near.values(near.start)["azimuth"]) == pytest.approx(40.0, abs=1e-3) and not near.moved
+    (moved,) = far.moved  # 32 deviations away: the nearest that is ever drawn, and it is said
+    assert moved.used == pytest.approx(176.2, abs=0.1) == float(far.values(far.start)["azimuth"])
+
+
+def test_derivatives_reach_what_is_drawn() -> None:
+    bound = CameraControl(azimuth=Normal(30.0, 10.0)).bind(MUG)
+    u = torch.tensor([0.5], requires_grad=True)
+    (slope,) = torch.autograd.grad(bound.values(u)["azimuth"], u)
+    assert float(slope) == pytest.approx(10.0 * np.sqrt(2.0 * np.pi), rel=1e-2)
+
+
+@pytest.mark.parametrize(
+    ("weights", "counts"),
+    [
+        ({"studio": 0.7, "noon": 0.3}, {"studio": 7, "noon": 3}),
+        ({"studio": 2, "noon": 1}, {"studio": 2, "noon": 1}),
+        ({"studio": 1, "noon": 0}, {"studio": 1}),
+        ({"studio": 0.7123, "noon": 0.2877}, {"studio": 712, "noon": 288}),
+    ],
+)
+def test_weights_are_shares(weights: dict[str, float], counts: dict[str, int]) -> None:
+    control = EnvironmentControl(which=weights)
+    bound = control.bind(control.prepare(MUG))
+    assert isinstance(bound, BoundNumbers)
+    size = sum(counts.values())
+    assert bound.groups[0].options == size if len(counts) > 1 else True
+    places = (torch.arange(size) + 0.5) / size
+    assert Counter(bound.describe(one[None])["environment.which"]["value"] for one in places) == counts
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (Normal(torch.zeros(2), 1.0), "distribution norm: expected one of a single number"),
+        (stats.poisson(3), "distribution poisson: expected one of real numbers, got one of whole ones"),
+        (lambda share: -share, "camera.azimuth: expected an inverse CDF, whose values rise with the share"),
+        (lambda share: 1e9, r"camera.azimuth: expected values from -3600 to 3600 \(degrees\) of <lambda>, got 1e\+09"),
+        (lambda: 3.0, "distribution <lambda>: expected a function from a share in .* it raised TypeError"),
+        ({"distribution": "nrom"}, "unknown distribution of camera.azimuth 'nrom'. Did you mean 'norm'"),
+        ({"distribution": "rv_continuous"}, "unknown distribution of camera.azimuth 'rv_continuous'"),
+        ({"distribution": "norm", "sigma": 3}, "expected {distribution: norm} with numbers for loc, scale"),
+        ({"distribution": "norm", "loc": "a"}, "expected {distribution: norm} with numbers for loc, scale"),
+        ({"distribution": "norm", "loc": 3600, "scale": 9}, "50 % of norm.* lies outside of -3600 to 3600"),
+        ({"distribution": "from Python", "name": "f"}, "drawn by f, which only the Python session .* pass it again"),
+        ({"choices": [1, 2], "weights": [1]}, "expected a weight of at least 0 for each of 2 values"),
+        ({"choices": [1, 2], "weights": [0, 0]}, "expected a weight of at least 0 for each of 2 values"),
+        ({1: 1e-6, 2: 1.0}, "camera.azimuth: 1 has less than a 1000th of the weight"),
+        ([350, 10], r"write \[-10, 10\] for the 20 degrees from 350 through 0 to 10, or \[10, 350\] for the other 340"),
+    ],
+)
+def test_what_is_no_distribution_is_told(given: Any, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        CameraControl(azimuth=given)
+
+
+def test_colours_in_a_ball_and_pixels_have_none() -> None:
+    with pytest.raises(InputError, match=r"environment.harmonics: it has a ball and no distribution"):
+        EnvironmentControl(harmonics=Normal(0.0, 0.1)).bind(MUG)
+    with pytest.raises(InputError, match=r"patch.pixels: expected .* got a distribution"):
+        PatchControl(pixels={"distribution": "uniform"})
+
+
+def test_a_search_refuses_what_says_how_likely_values_are() -> None:
+    given = {"camera": {"azimuth": NORM}}
+    config = AttackConfig(object="mug", controls=given)
+    with pytest.raises(InputError, match=r"camera.azimuth: .* put it into `over`"):
+        controls_given(config, given, {})
+    drawn = controls_given(AttackConfig(object="mug", controls={"pose": {}}, over=given), {"pose": {}}, given)[1]
+    assert [one.name for one in drawn] == ["camera"]
+
+
+def test_a_run_says_what_only_python_has_and_repeats_the_rest() -> None:
+    over = {"camera": {"azimuth": Normal(30.0, 10.0), "elevation": lambda share: 20.0 + share}}
+    settings = settings_of(over)
+    assert only_here(over) == ["camera.elevation (drawn by <lambda>)"]
+    config = AttackConfig(object="mug", controls={"pose": {}}, over=settings)
+    assert config.over["camera"]["azimuth"] == NORM
+    elevation = config.over["camera"]["elevation"]
+    assert elevation == {"distribution": "from Python", "name": "<lambda>", "quantiles": [20.05, 20.5, 20.95]}
+    (control,) = as_controls(config.over)
+    assert float(control.bind(MUG).values(torch.tensor([0.5, 0.5]))["elevation"]) == pytest.approx(20.5, abs=1e-4)
+
+
+@pytest.mark.parametrize("given", [[5, 30], {"range": [5, 30]}])
+def test_a_range_has_two_forms(given: Any) -> None:
+    bound = CameraControl(elevation=given).bind(MUG)
+    assert float(bound.values(torch.tensor([1.0]))["elevation"]) == 30.0
