@@ -49,7 +49,8 @@ def named_in(run: Path) -> None:
     """Let the settings of a run name the code as its model, and where a patch is to be printed as its control."""
     file = run / "run.yaml"
     settings = yaml.safe_load(file.read_text())
-    settings |= {"controls": {"planted:Make": {}}} if "patch" in settings["controls"] else {"model": NAME}
+    printed = "patch" in settings["controls"]
+    settings["controls" if printed else "model"] = {"planted:Make": {}} if printed else NAME
     file.write_text(HEADER + yaml.safe_dump(settings))
 
 
