@@ -314,7 +314,7 @@ def readable(path: Path) -> Iterator[None]:
     """Turn what SQLite says of a damaged file inside the block into an error that names it."""
     try:
         yield
-    except sqlite3.Error as error:
+    except (sqlite3.Error, UnicodeDecodeError) as error:
         text = repr(str(error))[1:-1][:200]  # it quotes what is in the file
         raise FileFormatError(f"{path}: expected a results.sqlite of advsearch, got {text}; {DAMAGED}") from error
 

@@ -23,6 +23,7 @@ from advsearch.runs import summary
 from advsearch.runs.directory import RunDirectory, find_run
 from advsearch.runs.files import write_text
 from advsearch.runs.listing import listed_run
+from advsearch.runs.results.base import Result
 from advsearch.runs.store import Row, Store, Told
 from advsearch.settings import HEADER
 from advsearch.viewer import thumbnails
@@ -247,7 +248,7 @@ def test_a_small_picture_that_is_a_link_is_none(run: Path, tmp_path: Path) -> No
             thumbnails.read_thumbnail(run, number)
 
 
-CONFUSED = {
+CONFUSED: dict[str, list[Any]] = {
     "values_json": ['{"a": 5}', '{"a": {"value": 1.0}}', '{"a": {"value": {}, "unit": ""}}',
                     '{"a": {"value": [[1]], "unit": ""}}', '{"a": {"value": NaN, "unit": ""}}',
                     '{"a": {"value": 1e999, "unit": ""}}', "[1]", "x",
@@ -291,7 +292,12 @@ def test_a_bad_run_does_not_take_the_list_along(run: Path, capsys: pytest.Captur
 def test_a_run_is_listed_anew_only_where_it_has_changed(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     read = list[Path]()
     real = summary.read_result
-    monkeypatch.setattr(summary, "read_result", lambda path: (read.append(path), real(path))[1])
+
+    def counted(path: Path) -> Result:
+        read.append(path)
+        return real(path)
+
+    monkeypatch.setattr(summary, "read_result", counted)
     first = listed_run(run)
     assert listed_run(run) is first and len(read) == 1
     write_text(run / "summary.json", json.dumps(SUMMARY | {"ending": "found"}))

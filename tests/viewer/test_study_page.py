@@ -145,7 +145,7 @@ def test_the_dashboard_and_a_bundle_have_the_pages_of_the_attacks(tmp_path: Path
     run = make_study(tmp_path / "study", a_gap())
     with serving(run) as server:
         assert "parts/pose/report.html" in got(f"{server.address}runs/study/")
-        assert got(f"{server.address}runs/study/parts/pose/report.html") == "the attack pose"
+        assert got(f"{server.address}runs/study/parts/pose/report.html").endswith("the attack pose")
         (run / "parts" / "camera" / "report.html").unlink()
         for path in ("camera", "none", "..", "%2e%2e", "..%2f..%2fstudy"):
             with pytest.raises(HTTPError, match="404"):
