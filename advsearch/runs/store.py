@@ -134,7 +134,7 @@ class Store:
             self._db = connect_to_read(path) if read_only else connect_to_write(path)
             check_version(self._db, path)
             check_schema(self._db, path)
-        self._closed: Callable[[], None] = (lambda: None) if read_only else note_open(path)
+        self._closed: Callable[[], None] | None = None if read_only else note_open(path)
 
     def append(self, rows: Sequence[Row], told: Told | None = None) -> None:
         """Add rows in one transaction; they survive a kill of the process when this returns, and where the disk is full
@@ -263,7 +263,8 @@ class Store:
     def close(self) -> None:
         """Close the file; a second call does nothing."""
         self._db.close()
-        self._closed()
+        if self._closed is not None:
+            self._closed()
 
     def __enter__(self) -> Store:
         return self
