@@ -77,7 +77,7 @@ def unexpected(function: str, given: Mapping[str, object], known: Sequence[str])
 
 
 def check_types(parameters: Mapping[str, inspect.Parameter], given: Mapping[str, object]) -> None:
-    """Check values against the annotations of a function's own parameters, as far as these name plain types and classes.
+    """Check values against the annotations of a function's own parameters, as far as these name types and classes.
 
     Raises:
         InputError: a value is of none of them.

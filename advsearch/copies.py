@@ -24,6 +24,7 @@ def copied(value: Value) -> Value:
 
 
 def _copied(value: Any) -> Any:
+    made: Any
     if hasattr(value, "requires_grad"):
         return value.clone()
     if isinstance(value, np.ndarray):

@@ -396,8 +396,8 @@ def _warn_of_direction(name: str, values: Tensor, output: Tensor, target: Any) -
     classes = [one for one in target if isinstance(one, int)] if isinstance(target, tuple) else []
     if slope is not None and classes and bool((slope[:, classes].sum(dim=1) < 0.0).all()):
         warnings.warn(
-            f"objective {name!r} falls as the target becomes more likely, and an objective is maximised: the search walks "
-            "away from the target. Negate it, or take a loss of advsearch.losses that begins with targeted_.",
+            f"objective {name!r} falls as the target becomes more likely, and an objective is maximised: the search "
+            "walks away from the target. Negate it, or take a loss of advsearch.losses that begins with targeted_.",
             stacklevel=2,
         )
 

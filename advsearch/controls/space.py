@@ -217,8 +217,8 @@ EXPECTED: Mapping[str, tuple[tuple[int | None, ...] | None, float, float]] = {
     "exposure": ((), -math.inf, math.inf), "shift": ((2,), -math.inf, math.inf),
     **dict.fromkeys(("roughness", "metallic", "specular", "clearcoat"), (None, 0.0, 1.0)),
 }  # fmt: skip
-"""Shape and range of the inputs that a control of another package may set, by the last part of their names; None for any
-number or any shape."""
+"""Shape and range of the inputs that a control of another package may set, by the last part of their names; None for
+any number or any shape."""
 
 SLACK = 1e-4
 """How far past its range rounding may put a colour."""

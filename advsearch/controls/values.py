@@ -3,9 +3,11 @@
     pose: {yaw: [0, 360], pitch: 10, scale: {choices: [0.8, 1.0, 1.2]}}
 
 Two numbers in a list are a range; three or more, or names, are a choice. `{range: [low, high]}` and `{choices: [...]}`
-say which. Values that are drawn may have weights, or a distribution (`advsearch.controls.drawn`). Where a control leaves out a value of the
-clean scene that was asked for, the two contradict each other, and that is refused. Where it leaves out only a default,
-the clean scene has the nearest value that the control allows, and that is said: a `Moved`.
+say which. Values that are drawn may have weights, or a distribution (`advsearch.controls.drawn`).
+
+Where a control leaves out a value of the clean scene that was asked for, the two contradict each other, and that is
+refused. Where it leaves out only a default, the clean scene has the nearest value that the control allows, and that is
+said: a `Moved`.
 """
 
 from __future__ import annotations
@@ -136,10 +138,12 @@ MOST_SHARES = 1000
 def _weighted(where: str, choice: OneOf, weights: object) -> OneOf:
     """A choice that has each value as often as its weight says, so that equal shares of u draw it so."""
     values = choice.values
-    numbers = [one for one in weights if is_number(one) and one >= 0.0] if _is_list(weights) else []  # type: ignore[attr-defined]
-    if len(numbers) != len(values) or not _is_list(weights) or len(weights) != len(values) or not sum(numbers):  # type: ignore[arg-type]
+    given = list(weights) if isinstance(weights, (list, tuple)) else []
+    numbers = [one for one in given if is_number(one) and one >= 0.0]
+    if not len(numbers) == len(given) == len(values) or not sum(numbers):
         raise InputError(
-            f"{where}: expected a weight of at least 0 for each of {len(values)} values, and one over 0, got {weights!r}"
+            f"{where}: expected a weight of at least 0 for each of {len(values)} values, and one over 0, got "
+            f"{weights!r:.80}"
         )
     shares = [one / sum(numbers) for one in numbers]
     exact = (n for n in range(1, MOST_SHARES) if all(abs(n * one - round(n * one)) < 1e-9 for one in shares))

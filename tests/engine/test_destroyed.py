@@ -301,7 +301,7 @@ UNTOUCHED = {
         *("search_range", "budget", "estimators", "moved"),
     },
 }
-"""Methods that get no tensors which anybody else reads; those of a control's declaration get its own copy of a scene."""
+"""Methods that get no tensors which anybody else reads; those of a declaration get the control's copy of a scene."""
 
 
 @pytest.mark.parametrize("base", UNTOUCHED, ids=lambda base: base.__name__)
