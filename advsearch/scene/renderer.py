@@ -201,9 +201,9 @@ class Renderer:
             inputs = self.scene.assembly(self.space.inputs(u))
             hide = "backdrop.color" in inputs
             traced = {name: value for name, value in inputs.items() if name not in ON_PICTURE}
-            noisy = self.like(denoiser="none")
+            undenoised = self.like(denoiser="none")
             numbers = [seeds.stream(seed, "traced", half) for half in range(2)]
-            one, other = (noisy._rendered(traced, number, spp, hide) for number in numbers)
+            one, other = (undenoised._rendered(traced, number, spp, hide) for number in numbers)
             both = (one + other) / 2.0
             noise = seeds.stream(self.root_seed, "guides", numbers[0])
             clean = denoise(both[..., :3].contiguous(), *self.scene.guides(traced, noise, spp))
