@@ -192,7 +192,7 @@ def colours() -> Model:
             found: Tensor = self.last(nn.functional.adaptive_avg_pool2d(x, 4).flatten(1))
             return found
 
-    return load_model(Colours(), labels=load_model("reference").labels.names, input_size=32, name="colours")
+    return load_model(Colours(), labels=list(load_model("reference").labels), input_size=32, name="colours")
 
 
 def make_files(folder: Path) -> None:

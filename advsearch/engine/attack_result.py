@@ -107,7 +107,8 @@ class AttackResult:
     @property
     def history(self) -> list[float]:
         """The objective of each evaluation of the search, in order; `rows("search")` has all that is known of them."""
-        return [row.objective for row in self.rows("search") if row.phase != "ranking"]
+        rows = [row for row in self.rows("search") if row.phase != "ranking"]
+        return [row.objective for row in rows if row.objective is not None]
 
     @names_code
     @in_turn()
