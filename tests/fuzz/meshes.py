@@ -141,13 +141,6 @@ def hostile_obj(random: Random) -> Case:
         "5,000 material files": lambda: (
             b"mtllib " + b" ".join(b"m%d.mtl" % k for k in range(5000)) + b"\n" + vertices + b"f 1 2 3\n"
         ),
-        "lines of material files": lambda: (
-            b"".join(b"mtllib m%d.mtl\n" % k for k in range(random.choice((9_000, 100_000)))) + vertices + b"f 1 2 3\n"
-        ),
-        "many materials without colours": lambda: (
-            b"mtllib none.mtl\n" + vertices + b"".join(b"usemtl m%d\nf 1 2 3\n" % k for k in range(50_000))
-        ),
-        "a long number": lambda: b"mtllib thing.mtl\n" + vertices + b"usemtl plain\nf 1 2 3\n",
         "smoothing for every face": lambda: (
             vertices + b"".join(b"s %d\nf 1 2 %d\n" % (k, k % 40 + 3) for k in range(5000))
         ),
@@ -160,7 +153,6 @@ def hostile_obj(random: Random) -> Case:
     }
     what = random.choice(sorted(kinds))
     mtl = MTL + b"map_Ka " + b"-s 1 1 1 " * 200_000 if "options" in what else MTL
-    mtl += b"map_Kd -o " + b"1" * 200_000 + b"x.png\n" if what == "a long number" else b""
     files = {"thing.obj": kinds[what](), "thing.mtl": mtl, "wood.png": sample("PNG")}
     return Case(f"obj: {what}", "object", "thing.obj", files)
 
