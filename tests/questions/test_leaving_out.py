@@ -238,7 +238,7 @@ QUICK = [ENDS[int("".join(map(str, ends)), 2)] for ends in ((1, 1, 0, 0), (0, 0,
 @pytest.mark.parametrize("ends", only(QUICK, ENDS), ids=lambda one: "".join(f"{end:g}" for end in one.values()))
 def test_a_material_looks_the_same_however_its_numbers_come_and_whatever_is_left_out(ends: dict[str, float]) -> None:
     """Fixed, searched, and searched from the other ends, at both ends of every number."""
-    searched = MaterialControl(**{name: [0.0, 1.0] for name in NUMBERS})  # type: ignore[arg-type]
+    searched = MaterialControl(**{name: [0.0, 1.0] for name in NUMBERS})
     other = {name: 1.0 - value for name, value in ends.items()}
     pictures = []
     for control, start in ((CameraControl(exposure=[0, 1]), ends), (searched, ends), (searched, other)):

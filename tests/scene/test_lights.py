@@ -190,7 +190,7 @@ def test_a_prediction_that_is_off_ends_in_rendering_and_goes_on_so(
 ) -> None:
     """Also in a run that was stopped after that."""
     monkeypatch.setattr(searching, "EVERY", 6)
-    off = searching.Deviation(9.0, 0.0, 2.0, pictures=6)
+    off = acceptance.Deviation(9.0, 0.0, 2.0, pictures=6)
     monkeypatch.setattr(searching, "compared", lambda view: off)
     settings = {**SEARCH, "deterministic": True}
     whole = advsearch.attack("mug", run=tmp_path / "whole", **settings).summary
