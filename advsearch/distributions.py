@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -84,8 +85,7 @@ def _is_number(given: object) -> bool:
 def _called(given: object, method: Callable[[Any], Any]) -> Callable[[float], float]:
     if not type(given).__module__.startswith("torch"):
         return method
-    import torch  # it is there: the distribution is one of its own
-
+    torch = sys.modules["torch"]  # it is there: the distribution is one of its own
     return lambda share: float(method(torch.tensor(share, dtype=torch.float64)))
 
 

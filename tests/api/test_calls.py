@@ -22,6 +22,7 @@ from advsearch.engine.loading import load_scene
 from advsearch.errors import InputError
 from advsearch.tasks import Classification
 
+ANY: Any = advsearch
 FUNCTIONS = [name for name in advsearch.__all__ if inspect.isfunction(getattr(advsearch, name))]
 
 
@@ -52,7 +53,7 @@ def test_a_keyword_of_elsewhere_is_told_what_it_is_called_here(name: str, keywor
 
 def test_a_device_has_no_name_here() -> None:
     with pytest.raises(TypeError, match=r"'device'.*a model stays on the device that it is on"):
-        advsearch.attack("mug", device="cuda")
+        ANY.attack("mug", device="cuda")
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)
@@ -81,17 +82,17 @@ def test_a_run_is_a_name_or_a_folder(name: str, run: Any) -> None:
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (partial(advsearch.attack, False), "scene: expected a Scene, a text, a path or a mapping, got False"),
-        (partial(advsearch.attack, "mug", resume=1), "resume: expected True or False, got 1"),
-        (partial(advsearch.attack, "mug", metrics=[]), r"metrics: expected a mapping or None, got \[\]"),
-        (partial(advsearch.attack, "mug", policy={}), "policy: expected a name, a mapping with a `name`"),
-        (partial(advsearch.attack, "mug", policy=""), "policy: expected a name, a mapping with a `name`"),
-        (partial(advsearch.attack, "mug", objective=3), "objective: expected a text, a function or None, got 3"),
-        (partial(advsearch.load_scene, 3.5), "object: expected a text, a path or a ObjectAsset, got 3.5"),
-        (partial(advsearch.load_scene, "mug", camera=True), "camera: expected a text or None, got True"),
-        (partial(advsearch.render, "mug", spp="a"), "spp: expected a whole number, got 'a'"),
-        (partial(advsearch.render, "mug", seed=0.5), "seed: expected a whole number, got 0.5"),
-        (partial(advsearch.load_model, 3), "spec: expected a text, a path, a Module or a Model, got 3"),
+        (partial(ANY.attack, False), "scene: expected a Scene, a text, a path or a mapping, got False"),
+        (partial(ANY.attack, "mug", resume=1), "resume: expected True or False, got 1"),
+        (partial(ANY.attack, "mug", metrics=[]), r"metrics: expected a mapping or None, got \[\]"),
+        (partial(ANY.attack, "mug", policy={}), "policy: expected a name, a mapping with a `name`"),
+        (partial(ANY.attack, "mug", policy=""), "policy: expected a name, a mapping with a `name`"),
+        (partial(ANY.attack, "mug", objective=3), "objective: expected a text, a function or None, got 3"),
+        (partial(ANY.load_scene, 3.5), "object: expected a text, a path or a ObjectAsset, got 3.5"),
+        (partial(ANY.load_scene, "mug", camera=True), "camera: expected a text or None, got True"),
+        (partial(ANY.render, "mug", spp="a"), "spp: expected a whole number, got 'a'"),
+        (partial(ANY.render, "mug", seed=0.5), "seed: expected a whole number, got 0.5"),
+        (partial(ANY.load_model, 3), "spec: expected a text, a path, a Module or a Model, got 3"),
     ],
 )
 def test_a_value_of_another_type_is_refused_in_a_sentence(call: Callable[[], Any], message: str) -> None:

@@ -169,7 +169,9 @@ def test_a_run_says_what_only_python_has_and_repeats_the_rest() -> None:
     elevation = config.over["camera"]["elevation"]
     assert elevation == {"distribution": "from Python", "name": "<lambda>", "quantiles": [20.05, 20.5, 20.95]}
     (control,) = as_controls(config.over)
-    assert float(control.bind(MUG).values(torch.tensor([0.5, 0.5]))["elevation"]) == pytest.approx(20.5, abs=1e-4)
+    bound = control.bind(MUG)
+    assert isinstance(bound, BoundNumbers)
+    assert float(bound.values(torch.tensor([0.5, 0.5]))["elevation"]) == pytest.approx(20.5, abs=1e-4)
 
 
 @pytest.mark.parametrize("given", [[5, 30], {"range": [5, 30]}])

@@ -291,7 +291,7 @@ def test_a_network_that_writes_into_its_input_changes_no_picture(layout: str, pr
     assert torch.equal(first, kept) and torch.equal(first[0], output[0])
 
 
-UNTOUCHED = {
+UNTOUCHED: dict[Any, set[str]] = {
     Task: {"read", "on", "seeking", "check", "truth", "check_numbers"},
     Policy: {"propose", "takes_differences", "counts", "answer", "failures"},
     BoundControl: set(),
@@ -323,13 +323,15 @@ def partial_of(method: Any) -> Any:
 
 def test_what_is_copied() -> None:
     at = torch.ones(2, requires_grad=True)
-    value = {
+    value: Any = {
         "a": [at * 2.0, np.zeros(2)],
         "b": (SimpleNamespace(c=torch.zeros(1)), Evaluation(1.0, torch.ones(1), True)),
     }
     found = copied(value)
     destroy(found)
-    assert [one.tolist() for one in value["a"]] == [[2.0, 2.0], [0.0, 0.0]]  # type: ignore[attr-defined]
+    assert [one.tolist() for one in value["a"]] == [[2.0, 2.0], [0.0, 0.0]]
+    held: Any
+    evaluation: Any
     held, evaluation = value["b"]
-    assert held.c.tolist() == [0.0] and evaluation.gradient.tolist() == [1.0]  # type: ignore[union-attr]
+    assert held.c.tolist() == [0.0] and evaluation.gradient.tolist() == [1.0]
     assert copied([at * 2.0])[0].requires_grad and copied("text") == "text"

@@ -191,10 +191,16 @@ def test_the_gradient_agrees_with_differences() -> None:
 def test_it_is_compared_with_the_distance_along_the_axis() -> None:
     sight = Sight(MASK, 2.0 * TRUTH.z, TRUTH.z)
     truth = TASK.truth(Facts("mug", look=lambda: sight))
-    assert truth.z is TRUTH.z and TASK.truth_names(truth) == (AS_FAR,)
+    assert torch.equal(truth.z, TRUTH.z) and TASK.truth_names(truth) == (AS_FAR,)
     for kind in (DISPARITY, RELATIVE, METRIC):
         true, right = TASK.marks(said(moved(2.0), kind), truth)[0]
-        assert true.true and true.mask is MASK and right.mask is not None and not right.mask.any()
+        assert (
+            true.true
+            and true.mask is not None
+            and torch.equal(true.mask, MASK)
+            and right.mask is not None
+            and not right.mask.any()
+        )
         assert true.map is not None and torch.allclose(true.map, INVERSE)
         assert right.map is not None and torch.allclose(right.map, moved(2.0), atol=1e-4)
 
