@@ -10,7 +10,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from contextlib import ExitStack, contextmanager
 from importlib import import_module
 from pathlib import Path
@@ -184,11 +184,13 @@ class Answer:
     def __init__(self, status: str, comes: Any) -> None:
         self.status, self.comes, self.released = status, comes, False
 
-    def __await__(self) -> Iterator[Any]:
+    def __await__(self) -> Generator[None, None, Any]:
+        return self._answer().__await__()
+
+    async def _answer(self) -> Any:
         if isinstance(self.comes, BaseException):
             raise self.comes
         return self.comes
-        yield  # as a coroutine does
 
     def release(self) -> None:
         self.released = True

@@ -13,9 +13,8 @@ import numpy as np
 import pytest
 from test_gltf import SQUARE, File
 
-from advsearch.engine.loading import describe
 from advsearch.errors import FileFormatError, InputError
-from advsearch.scene.description import SceneDescription
+from advsearch.scene.description import SceneDescription, describe
 from advsearch.scene.geometry import camera_to_world
 from advsearch.scene.importing.objects import import_object, read_parts
 from advsearch.scene.importing.scenes import LUMENS, import_scene
