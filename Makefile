@@ -51,11 +51,11 @@ fuzz: $(STAMP) ## load 400 hostile files and run folders, each in bounds of time
 
 check: lint typecheck test docs ## everything that has to pass before a commit
 
-lint: $(STAMP) ## look for mistakes, for code that is not formatted for pages that are not true of the code and for bundled files that its scripts do not make
+lint: $(STAMP) ## look for mistakes, for code that is not formatted for pages that are not true of the code and for bundled files that the scripts in scenes/ do not make
 	@$(BIN)/ruff check $(SOURCES)
 	@$(BIN)/ruff format --check --quiet $(SOURCES) || { echo "not formatted: run make format"; exit 1; }
 	@$(BIN)/python tools/check_docs.py
-	@$(BIN)/python -m advsearch.bundled.build --check
+	@$(BIN)/python scenes/build.py --check
 
 format: $(STAMP) ## format the code and mend what can be mended
 	@$(BIN)/ruff format $(SOURCES)
@@ -83,6 +83,7 @@ reference: $(STAMP) ## render, train and evaluate the bundled classifier again (
 	@$(BIN)/python tools/reference_model.py all $(ARGS)
 
 wheel: $(STAMP) ## build the wheel into dist/, with a list of what it was built and tested with (SBOM)
+	@rm -rf build/lib  # modules that have gone since the last build
 	@$(BIN)/pip wheel --quiet --no-deps --no-build-isolation --wheel-dir dist .
 	@$(BIN)/python tools/sbom.py dist
 	@ls -l dist/*.whl

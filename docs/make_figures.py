@@ -177,7 +177,7 @@ def objects(record: Record) -> str:
 
 def environments(record: Record) -> str:
     """The bundled environments and the half that each belongs to."""
-    from advsearch.bundled.environments import ENVIRONMENTS
+    from scenes.environments import ENVIRONMENTS
 
     half = {"train": "training", "heldout": "held out", "street": "a street, in neither"}
     return table(["environment", "half"], [[f"`{one.name}`", half[one.split]] for one in ENVIRONMENTS.values()])

@@ -1,1 +1,1 @@
-"""The bundled objects and environments, and the scripts that make them. Installed as `advsearch.bundled`."""
+"""Scripts that make the bundled files, in `advsearch/bundled/data`."""

@@ -1,7 +1,6 @@
-"""Writes scenes/data from the generators, or checks that it is what they make.
+"""Writes advsearch/bundled/data from the generators, or checks that it is what they make.
 
-``python -m advsearch.bundled.build`` rewrites every file; ``--check`` writes nothing, names the
-files that differ and exits 3.
+``python scenes/build.py`` rewrites every file; ``--check`` writes nothing, names the files that differ and exits 3.
 """
 
 from __future__ import annotations
@@ -16,13 +15,13 @@ from pathlib import Path
 
 import numpy as np
 
+from advsearch.bundled.objects import OBJECTS, ObjectFamily
 from advsearch.scene.assets import Mesh
+from scenes.environments import ENVIRONMENTS, EnvironmentFamily
+from scenes.files import exr, ply, png
 
-from .environments import ENVIRONMENTS, EnvironmentFamily
-from .files import exr, ply, png
-from .objects import OBJECTS, ObjectFamily
-
-DATA = Path(__file__).resolve().parent / "data"
+FOLDER = "advsearch/bundled/data"
+DATA = Path(__file__).resolve().parents[1] / FOLDER
 
 
 def object_files(family: ObjectFamily) -> dict[str, bytes]:
@@ -33,7 +32,8 @@ def object_files(family: ObjectFamily) -> dict[str, bytes]:
         "name": asset.name,
         "label": asset.label,
         "material": asdict(asset.material),
-        "source": asset.source,
+        # the family's file has moved to advsearch/bundled/objects; what is shipped keeps its bytes
+        "source": f"scenes/objects/{family.make.__module__.rpartition('.')[2]}.py",
         "triangles": len(asset.mesh.faces),
     }
     if asset.metres is not None:
@@ -88,16 +88,14 @@ def differing() -> list[str]:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command; returns its exit status."""
-    parser = argparse.ArgumentParser(
-        prog="python -m advsearch.bundled.build", description="Rebuild the bundled scenes."
-    )
+    parser = argparse.ArgumentParser(prog="python scenes/build.py", description="Rebuild the bundled scenes.")
     parser.add_argument(
         "--check", action="store_true", help="write nothing; exit 3 if a file is not what would be written"
     )
     if parser.parse_args(arguments).check:
         wrong = differing()
         for name in wrong:
-            print(f"differs: scenes/data/{name}", file=sys.stderr)
+            print(f"differs: {FOLDER}/{name}", file=sys.stderr)
         return 3 if wrong else 0
     total = 0
     for name, content in everything():

@@ -2,7 +2,7 @@
 
 Those of the street are drawn by docs/make_street_image.py.
 
-Run as ``python -m advsearch.bundled.contact_sheet [--out docs/images] [--size 256] [--spp 64]``. It needs
+Run as ``python scenes/contact_sheet.py [--out docs/images] [--size 256] [--spp 64]``. It needs
 `mitsuba-oidn` and takes some minutes.
 """
 
@@ -15,12 +15,11 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from advsearch.bundled.objects import HOUSEHOLD, OBJECTS
 from advsearch.scene.assets import EnvironmentAsset, ObjectAsset
 from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.parts import mesh_part
-
-from .environments import ENVIRONMENTS
-from .objects import HOUSEHOLD, OBJECTS
+from scenes.environments import ENVIRONMENTS
 
 Floats = npt.NDArray[np.float32]
 VARIANTS = 3

@@ -20,7 +20,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).resolve().parents[1]
-SOURCES = {"advsearch": ROOT / "advsearch", "advsearch.bundled": ROOT / "scenes"}
+PACKAGE = ROOT / "advsearch"
 
 RENDERER = {"mitsuba", "drjit", "mitsuba_oidn"}
 COMMON = {
@@ -107,10 +107,9 @@ OPTIONAL = {"pyarrow": "parquet", "textual_image": "terminal", "distributed": "d
 def python_files() -> list[tuple[str, Path]]:
     """Every module of the package: dotted name and file."""
     found = []
-    for package, folder in SOURCES.items():
-        for path in sorted(folder.rglob("*.py")):
-            parts = path.relative_to(folder).with_suffix("").parts
-            found.append((".".join((package, *parts)).removesuffix(".__init__"), path))
+    for path in sorted(PACKAGE.rglob("*.py")):
+        parts = path.relative_to(ROOT).with_suffix("").parts
+        found.append((".".join(parts).removesuffix(".__init__"), path))
     return found
 
 
@@ -128,7 +127,7 @@ def imports(module: str, path: Path) -> frozenset[str]:
                 parent = package.split(".")[: len(package.split(".")) - node.level + 1]
                 base = ".".join([*parent, *([node.module] if node.module else [])])
             # `from advsearch import threads` names the module threads, `from advsearch import __version__` does not
-            names.update(f"{base}.{a.name}" if base in ("advsearch", "advsearch.bundled") else base for a in node.names)
+            names.update(f"{base}.{a.name}" if base == "advsearch" else base for a in node.names)
     return frozenset(names)
 
 
@@ -141,8 +140,7 @@ def room(module: str) -> str:
     name = module.split(".")[1] if "." in module else ""
     if name == "__main__" or (name == "questions" and module.count(".") == 2):
         return "cli"
-    folder = SOURCES["advsearch"]
-    return name if name == "bundled" or (folder / name).is_dir() or (folder / f"{name}.py").is_file() else ""
+    return name if (PACKAGE / name).is_dir() or (PACKAGE / f"{name}.py").is_file() else ""
 
 
 def broken_rules() -> Iterator[str]:
@@ -244,7 +242,7 @@ def test_the_reader_of_imports_sees_all_of_them(tmp_path: Path, module: str, sou
 
 
 def test_only_the_backend_speaks_mitsuba() -> None:
-    """And the probe of `advsearch doctor`, and two scripts that draw what is bundled; a mesh's names stand once."""
+    """And the probe of `advsearch doctor`; a mesh's names stand once."""
     backend = "advsearch.scene.mitsuba_backend"
     variant = f"{backend}.variant"
     users: dict[str, set[str]] = {}
@@ -254,8 +252,7 @@ def test_only_the_backend_speaks_mitsuba() -> None:
                 if name == variant or name.split(".")[0] in RENDERER:
                     users.setdefault(name, set()).add(module)
     probe = "advsearch.cli.doctor_probe"
-    scripts = {"advsearch.bundled.contact_sheet", "advsearch.bundled.environments.skies"}
-    assert users == {"drjit": {probe}, "mitsuba_oidn": {probe}, variant: {probe, *scripts}}
+    assert users == {"drjit": {probe}, "mitsuba_oidn": {probe}, variant: {probe}}
     for name, only in (("vertex_positions", f"{backend}.meshes"), ("llvm_ad_rgb", variant)):
         assert [module for module, path in python_files() if name in path.read_text(encoding="utf-8")] == [only]
 
@@ -371,7 +368,7 @@ def test_messages_name_settings_as_python_has_them_and_no_flags() -> None:
     flags = [
         f"{path.relative_to(ROOT)}:{line}: {text}"
         for module, path in python_files()
-        if room(module) not in ("bundled", "cli") and not module.startswith(NOT_MESSAGES)
+        if room(module) != "cli" and not module.startswith(NOT_MESSAGES)
         for line, text in texts_of_people(path.read_text(encoding="utf-8"))
         if re.search(r"(?<![\w-])--[a-z]", text)
     ]
@@ -405,12 +402,13 @@ def test_every_folder_with_python_files_is_listed_as_a_package() -> None:
     assert set(setup_cfg()["options"]["packages"].split()) == packages
     unlisted = {path.parent for _, path in python_files() if not (path.parent / "__init__.py").is_file()}
     assert unlisted == set(), "Python files in a folder without __init__.py are not shipped"
+    assert [path for path in PACKAGE.rglob("*") if path.is_symlink()] == [], "what is shipped lies in the package"
 
 
 def test_every_data_file_is_listed_as_package_data() -> None:
     patterns = {package: value.split(", ") for package, value in setup_cfg()["options.package_data"].items()}
-    folders = {"advsearch.bundled": ROOT / "scenes", "advsearch.models": ROOT / "advsearch" / "models"}
-    for package, folder in folders.items():
+    for package in ("advsearch.bundled", "advsearch.models"):
+        folder = ROOT.joinpath(*package.split("."))
         for path in (folder / "data").rglob("*"):
             name = path.relative_to(folder).as_posix()
             shipped = any(fnmatch.fnmatch(name, pattern.replace("**/", "*")) for pattern in patterns[package])

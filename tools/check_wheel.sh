@@ -19,15 +19,21 @@ cd "$work"
 "$work/venv/bin/advsearch" --help >/dev/null
 "$work/venv/bin/advsearch" doctor
 "$work/venv/bin/python" - <<'PYTHON'
+import importlib.util
 import pathlib
 
+import numpy as np
+
 import advsearch
+from advsearch.bundled.objects import OBJECTS
 from advsearch.models import load_model
 from advsearch.scene.library import list_environments, list_objects, load_environment, load_object
 
 assert "venv" in pathlib.Path(advsearch.__file__).parts, advsearch.__file__
+assert importlib.util.find_spec("scenes") is None, "the scripts that make the bundled files are in the wheel"
 for name in list_objects():
     load_object(name)
+    OBJECTS[name].generate(np.random.default_rng(1))  # as `advsearch harden` does
 for name in list_environments():
     load_environment(name)
 model = load_model("reference")

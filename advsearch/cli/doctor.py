@@ -191,7 +191,7 @@ def check_llvm() -> Component:
 
 def bundled_scenes() -> Component:
     """The objects and environments that travel inside the package."""
-    name, fix = "bundled scenes", "reinstall advsearch; in a checkout: git restore scenes/data"
+    name, fix = "bundled scenes", "reinstall advsearch; in a checkout: git restore advsearch/bundled/data"
     try:
         from advsearch.scene.library import list_environments, list_objects  # what is tried
 

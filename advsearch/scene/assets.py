@@ -1,6 +1,6 @@
 """What a scene is made of before Mitsuba sees it: meshes, materials, environments, as plain numpy arrays.
 
-This module imports numpy only, so that the scripts in `scenes/` and the importers can share it.
+This module imports numpy only, so that the families of bundled objects and the importers can share it.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The bundled scene library: reads what `scenes/` has built; makes nothing itself.
+"""The bundled scene library: reads what the scripts in `scenes/` have built; makes nothing itself.
 
 The files travel inside the package (`advsearch.bundled`, its `data` folder) and are read through `importlib.resources`.
 """
@@ -52,6 +52,8 @@ def finished(mesh: Mesh, finishes: Mapping[str, Material], main: Material) -> di
 if TYPE_CHECKING:
     from importlib.abc import Traversable
 
+BUNDLED_OBJECT = "bundled object"
+"""Source of an object that is bundled, or another member of its family."""
 BUNDLED_ENVIRONMENT = "bundled environment"
 """Source of an environment that is bundled."""
 _PLY = (
@@ -112,7 +114,7 @@ def load_object(name: str) -> ObjectAsset:
             base_color=_image((folder / "base_color.png").read_bytes()),
             material=material,
             label=facts["label"],
-            source=f"bundled object, made by {facts['source']}",
+            source=BUNDLED_OBJECT,
             surface=finished(mesh, finishes, material) if finishes else None,
             finishes=finishes,
             metres=facts.get("metres"),
@@ -139,7 +141,7 @@ def load_environment(name: str) -> EnvironmentAsset:
 
 
 def _mesh(content: bytes) -> Mesh:
-    """Decode a binary PLY as `scenes/` writes it: vertices, normals and texture coordinates, then triangles.
+    """Decode a binary PLY as `scenes/files.py` writes it: vertices, normals and texture coordinates, then triangles.
 
     Raises:
         ValueError: it is another PLY.

@@ -8,9 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from advsearch.bundled import build
-from advsearch.bundled.environments import ENVIRONMENTS
-from advsearch.bundled.environments.panorama import HEIGHT, LEVEL, WIDTH, brightness, directions, irradiance
 from advsearch.bundled.objects import HOUSEHOLD, OBJECTS, STREET
 from advsearch.bundled.objects.carving import carved
 from advsearch.bundled.objects.draw import Draw
@@ -18,6 +15,9 @@ from advsearch.bundled.objects.shapes import grid
 from advsearch.errors import UnknownNameError
 from advsearch.scene import library
 from advsearch.scene.assets import Mesh, ObjectAsset, normalised
+from scenes import build
+from scenes.environments import ENVIRONMENTS
+from scenes.environments.panorama import HEIGHT, LEVEL, WIDTH, brightness, directions, irradiance
 
 SEEDS = (None, 1, 2, 3)  # None is the canonical instance
 CLASSES = {
@@ -29,8 +29,7 @@ INSTANCES = [pytest.param(name, seed, id=f"{name}-{seed}") for name in sorted(OB
 
 @functools.cache
 def instance(name: str, seed: int | None) -> ObjectAsset:
-    made: ObjectAsset = OBJECTS[name].generate(None if seed is None else np.random.default_rng(seed))
-    return made
+    return OBJECTS[name].generate(None if seed is None else np.random.default_rng(seed))
 
 
 def corners(mesh: Mesh) -> np.ndarray:
@@ -232,7 +231,7 @@ def test_the_check_command_names_a_file_that_differs(
     (tmp_path / "left-over").write_bytes(b"")
     assert build.main(["--check"]) == 3
     assert capsys.readouterr().err.split() == [
-        word for name in ("a/b.txt", "c.txt", "left-over") for word in ("differs:", f"scenes/data/{name}")
+        word for name in ("a/b.txt", "c.txt", "left-over") for word in ("differs:", f"advsearch/bundled/data/{name}")
     ]
 
 

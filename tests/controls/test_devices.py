@@ -13,7 +13,7 @@ import advsearch
 from advsearch.controls import CONTROLS, compose, make_control
 from advsearch.controls.corruption import NAMES
 
-PICTURE = str(ROOT / "scenes/data/objects/book/base_color.png")
+PICTURE = str(ROOT / "advsearch/bundled/data/objects/book/base_color.png")
 
 FORMS: dict[str, tuple[dict[str, Any], ...]] = {
     "camera": (

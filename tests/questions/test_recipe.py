@@ -43,7 +43,7 @@ from advsearch.runs.results.attack import AnswerDistribution, FoundValue
 from advsearch.runs.results.sweep import SurfaceMap
 from advsearch.runs.summary import read_result
 
-SCENES = Path(__file__).resolve().parents[2] / "scenes" / "data" / "environments"
+SCENES = Path(__file__).resolve().parents[2] / "advsearch/bundled/data/environments"
 
 TINY = """
 title: Is the mug seen?

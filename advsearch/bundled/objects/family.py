@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from advsearch.scene.assets import Material, ObjectAsset
-from advsearch.scene.library import finished
+from advsearch.scene.library import BUNDLED_OBJECT, finished
 
 from .atlas import SIZE, joined, pack, painted
 from .draw import Draw
@@ -64,11 +64,6 @@ class ObjectFamily:
         """The class in words: the name with spaces for hyphens."""
         return self.name.replace("-", " ")
 
-    @property
-    def script(self) -> str:
-        """The file that makes it, within this repository."""
-        return f"scenes/objects/{self.make.__module__.rsplit('.', 1)[-1]}.py"
-
     def generate(self, rng: np.random.Generator | None) -> ObjectAsset:
         """Return the canonical instance (None), or one with drawn proportions, texture and material.
 
@@ -89,7 +84,7 @@ class ObjectFamily:
             base_color=painted(instance.patches, slots, instance.paints, self.texels),
             material=instance.material,
             label=self.label,
-            source=self.script,
+            source=BUNDLED_OBJECT,
             surface=finished(mesh, instance.finishes, instance.material) if instance.finishes else None,
             finishes=instance.finishes,
             metres=None if self.metres is None else round(float(extent) * self.metres, 4),
