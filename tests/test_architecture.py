@@ -257,6 +257,14 @@ def test_only_the_backend_speaks_mitsuba() -> None:
         assert [module for module, path in python_files() if name in path.read_text(encoding="utf-8")] == [only]
 
 
+def test_every_picture_is_opened_as_one_of_some_formats() -> None:
+    """Pillow runs Ghostscript for what is an EPS, whatever its file is called."""
+    opened = [
+        text for _, path in python_files() for text in re.findall(r"Image\.open\([^\n]*", path.read_text("utf-8"))
+    ]
+    assert len(opened) > 8 and [text for text in opened if "formats=" not in text] == []
+
+
 def test_the_design_in_one_glance() -> None:
     """As in docs/design.md, "Packages and imports": bottom never reaches top, the command line is the roof."""
     assert not any("cli" in (rule.rooms or ()) for rule in RULES.values())

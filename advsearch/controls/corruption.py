@@ -92,7 +92,7 @@ def coded(image: Tensor, quality: int) -> Tensor:
     levels = levels_of(image.clamp(0.0, 1.0)).cpu().numpy()
     file = io.BytesIO()
     Image.fromarray(levels).save(file, "JPEG", quality=quality)
-    with Image.open(file) as read:
+    with Image.open(file, formats=("JPEG",)) as read:
         read_back = torch.from_numpy(np.asarray(read, dtype=np.float32) / 255.0)
     return image + (read_back.to(image.device) - image).detach()
 

@@ -69,6 +69,7 @@ def replacing(path: Path, *, durable: bool = False) -> Iterator[Path]:
     try:
         with storage_errors(path):
             path.parent.mkdir(parents=True, exist_ok=True)
+            part.unlink(missing_ok=True)  # what lies there may be somebody else's link
             yield part
             if durable:
                 _flush(part)
@@ -291,6 +292,10 @@ MIGRATIONS = (
 """What turns a file of version n into one of version n + 1. Never change one that was released; add another."""
 
 
+_JOURNAL = bytes.fromhex("d9d505f920a163d7")
+"""The last bytes of a journal that names a file (https://www.sqlite.org/fileformat2.html)."""
+
+
 def is_results_database(path: Path) -> bool:
     """Return whether the file at `path` starts like a results.sqlite of advsearch; a link does not."""
     if path.is_symlink():
@@ -346,6 +351,7 @@ def connect_to_write(path: Path) -> sqlite3.Connection:
         raise FileFormatError(f"{path}: expected a file of this run, got a link to another; {DAMAGED}")
     if path.exists():
         open_regular(path, "a results.sqlite", LARGEST).close()
+    _check_journal(path.with_name(f"{path.name}-journal"))
     with storage_errors(path):
         db = sqlite3.connect(path)
         if _version(db) == 0:  # there is nothing in it to lose yet, so the disk isn't waited for
@@ -354,6 +360,16 @@ def connect_to_write(path: Path) -> sqlite3.Connection:
             db.execute("PRAGMA journal_mode = WAL")
         _migrate(db)
     return db
+
+
+def _check_journal(journal: Path) -> None:
+    """Refuse a journal that ends with the name of a file: SQLite would delete that file. None of ours does."""
+    if not os.path.lexists(journal):
+        return
+    with open_regular(journal, "a journal of SQLite", LARGEST) as file:
+        file.seek(-min(len(_JOURNAL), os.fstat(file.fileno()).st_size), os.SEEK_END)
+        if file.read() == _JOURNAL:
+            raise FileFormatError(f"{journal}: expected the journal of one file, got one that names another; remove it")
 
 
 def connect_to_read(path: Path) -> sqlite3.Connection:

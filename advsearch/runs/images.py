@@ -21,6 +21,9 @@ from advsearch.runs.files import replacing, write_bytes
 Bytes = npt.NDArray[np.uint8]
 Floats = npt.NDArray[np.float32]
 
+BAD_PICTURE = (OSError, SyntaxError, ValueError, Image.DecompressionBombError)
+"""What Pillow raises of a file that is no picture, a damaged one or one that is far too large."""
+
 DIFFERENCE_GAIN = 5.0
 
 ANIMATION_BYTES = 3_000_000
@@ -58,7 +61,7 @@ def png_bytes(image: Any) -> bytes:
 def smaller_png(data: bytes, side: int) -> bytes:
     """Return the picture of a PNG as a PNG whose longest side is at most `side` pixels."""
     buffer = io.BytesIO()
-    with Image.open(io.BytesIO(data)) as image:
+    with Image.open(io.BytesIO(data), formats=("PNG",)) as image:
         image.thumbnail((side, side))
         image.save(buffer, "PNG")
     return buffer.getvalue()
@@ -72,10 +75,10 @@ def write_png(path: Path, image: Any) -> Path:
 def read_png(path: Path) -> Floats:
     """Return the display-referred picture, (H, W, 3) in [0, 1], in a PNG."""
     try:
-        with Image.open(path) as image:
+        with Image.open(path, formats=("PNG",)) as image:
             values: Floats = np.asarray(image.convert("RGB"), dtype=np.float32) / np.float32(255.0)
             return values
-    except (OSError, SyntaxError) as error:
+    except BAD_PICTURE as error:
         raise FileFormatError(f"{path}: expected a PNG picture, got {error}") from None
 
 

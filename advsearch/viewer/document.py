@@ -10,7 +10,7 @@ import hashlib
 import json
 import os
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from importlib import resources
 from pathlib import Path
@@ -98,8 +98,22 @@ def _own_digests() -> frozenset[str]:
 def has_other_scripts(page: bytes) -> bool:
     """Whether a page has a script that is none of `SCRIPTS`, such as that of another version, and so will not run where
     `served_policy` holds."""
-    found = re.findall(rb"<script(?! type=\"application/)[^>]*>(.*?)</script", page, re.DOTALL | re.IGNORECASE)
-    return any(_digest(code) not in _own_digests() for code in found)
+    return any(_digest(code) not in _own_digests() for code in _scripts(page))
+
+
+def _scripts(page: bytes) -> Iterator[bytes]:
+    """Yield the scripts of a page, without those that are data, in one pass: the page may be somebody else's."""
+    end = 0
+    for found in re.finditer(rb"<script", page, re.IGNORECASE):
+        if found.start() < end:
+            continue
+        begin = page.find(b">", found.end()) + 1
+        if not begin:
+            return
+        close = re.compile(rb"</script", re.IGNORECASE).search(page, begin)
+        end = close.start() if close else len(page)
+        if not page.startswith(b' type="application/', found.end()):
+            yield page[begin:end]
 
 
 def _policy(digests: Iterable[str], *, connects: bool) -> str:

@@ -25,7 +25,7 @@ from advsearch.files import read_bytes
 from advsearch.runs.directory import AOV_FOLDER, CONFIG, IMAGES, SMALL_PICTURES
 from advsearch.runs.fiftyone import Pictured
 from advsearch.runs.files import write_bytes
-from advsearch.runs.images import Bytes, to_8bit
+from advsearch.runs.images import BAD_PICTURE, Bytes, to_8bit
 from advsearch.runs.results.attack import AttackSummary, PicturedAnswer
 from advsearch.runs.results.base import Result
 from advsearch.runs.results.sweep import SweepSummary
@@ -69,7 +69,7 @@ def cover(run: Path) -> bytes:
     for file in (*first, *sorted((run / IMAGES).glob("*.png"))):
         if not file.is_file():
             continue
-        with suppress(OSError, SyntaxError, Image.DecompressionBombError), Image.open(file) as image:
+        with suppress(*BAD_PICTURE), Image.open(file, formats=("PNG",)) as image:
             if image.width * image.height <= LARGEST_COVER:
                 return _jpeg(image.convert("RGB"))
     return _jpeg(Image.new("RGB", (1, 1), (128, 128, 128)))
@@ -131,9 +131,9 @@ class Kept:
             return None
         stream = io.BytesIO()
         try:
-            with Image.open(io.BytesIO(data)) as image:
+            with Image.open(io.BytesIO(data), formats=("JPEG",)) as image:
                 image.save(stream, "PNG")
-        except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):
+        except BAD_PICTURE:
             file = path_of(self.run, step // self.models)
             raise FileFormatError(f"{file}: expected a small picture of the run, got something else") from None
         return stream.getvalue()

@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 import sqlite3
+import struct
 from collections.abc import Callable
 from contextlib import closing, suppress
 from pathlib import Path
@@ -22,6 +23,7 @@ from advsearch.errors import AdvsearchError, FileFormatError, InputError
 from advsearch.runs import summary
 from advsearch.runs.directory import RunDirectory, find_run
 from advsearch.runs.files import write_text
+from advsearch.runs.images import read_png
 from advsearch.runs.listing import listed_run
 from advsearch.runs.results.base import Result
 from advsearch.runs.store import Row, Store, Told
@@ -246,6 +248,50 @@ def test_a_small_picture_that_is_a_link_is_none(run: Path, tmp_path: Path) -> No
         assert thumbnails.kept_file(run, number) is None
         with pytest.raises(FileNotFoundError):
             thumbnails.read_thumbnail(run, number)
+
+
+def test_a_journal_cannot_delete_another_file(run: Path, tmp_path: Path) -> None:
+    """SQLite removes the "super-journal" that the journal of a file names, once that is rolled back."""
+    mine, results = tmp_path / "mine", run / "results.sqlite"
+    mine.write_text("alias ll='ls -l'\n")
+    magic, named = bytes.fromhex("d9d505f920a163d7"), os.fsencode(mine)
+    header = magic + struct.pack(">IIIII", 0, 1, results.stat().st_size // 4096, 512, 4096)
+    ending = struct.pack(">I", (1 << 30) // 4096 + 1) + named + struct.pack(">II", len(named), sum(named)) + magic
+    Path(f"{results}-journal").write_bytes(header.ljust(512, b"\0") + ending)
+    assert main(["show", "it"]) == main(["runs"]) == main(["export", "it"]) == 0
+    with pytest.raises(FileFormatError, match="-journal: expected the journal of one file, got one that names another"):
+        RunDirectory.resume("it")
+    assert mine.is_file()
+
+
+def test_a_link_in_place_of_what_is_being_written_is_not_written_through(run: Path, tmp_path: Path) -> None:
+    (tmp_path / "mine").write_text("mine")
+    for name in ("report.html", "summary.json"):
+        (run / f".part-{os.getpid()}-{name}").symlink_to(tmp_path / "mine")
+        write_text(run / name, "written")
+        assert (run / name).read_text() == "written" and not (run / name).is_symlink()
+    assert (tmp_path / "mine").read_text() == "mine"
+
+
+def test_a_picture_of_another_format_runs_no_program(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Pillow asks Ghostscript for what is an EPS, whatever its file is called."""
+    program = tmp_path / "programs" / "gs"
+    program.parent.mkdir()
+    program.write_text(f"#!/bin/sh\ntouch {tmp_path}/ran\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", str(program.parent), prepend=os.pathsep)
+    eps = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n%%EndComments\n%%EOF\n"
+    (run / "images").mkdir()
+    (run / "images" / "clean.png").write_bytes(eps)
+    thumbnails.keep(run, 3, eps)
+    assert thumbnails.cover(run)[:2] == b"\xff\xd8"
+    with pytest.raises(FileFormatError, match="expected a PNG picture"):
+        read_png(run / "images" / "clean.png")
+    with pytest.raises(FileFormatError, match="expected a small picture"):
+        thumbnails.Kept(run, 1, some=False).png_of(3)
+    assert not (tmp_path / "ran").exists()
 
 
 CONFUSED: dict[str, list[Any]] = {

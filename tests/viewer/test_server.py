@@ -26,7 +26,7 @@ from advsearch.errors import InputError
 from advsearch.questions.photographs.answer import PhotoAgreement
 from advsearch.runs.directory import RunDirectory
 from advsearch.viewer import clients
-from advsearch.viewer.document import document
+from advsearch.viewer.document import document, has_other_scripts
 from advsearch.viewer.server import Dashboard
 from advsearch.viewer.thumbnails import Kept
 
@@ -351,6 +351,11 @@ def test_a_page_whose_scripts_are_others_says_so(attack_run: Path, tmp_path: Pat
         said = b"Its scripts are of another advsearch and do not run here; advsearch view other"
         assert said in ask(server, "/runs/other/")[1]
         assert said[:20] not in ask(server, "/runs/attack/")[1]
+
+
+@pytest.mark.parametrize("part", [b"<script", b"<script>", b'<script type="application/', b"</script>", b"<script>a"])
+def test_a_page_of_many_scripts_is_looked_through_once(part: bytes) -> None:
+    assert has_other_scripts(part * 100_000) == (part[:8] == b"<script>")
 
 
 def test_scripts_of_a_page_are_those_that_are_named() -> None:

@@ -20,6 +20,7 @@ from advsearch.engine.sweeps import KIND
 from advsearch.engine.sweeps.axes import Axis
 from advsearch.engine.sweeps.points import Drawn, Picks
 from advsearch.errors import FileFormatError
+from advsearch.pictures import FORMATS
 from advsearch.report.figures import new_axes, sweep_axes, sweep_figure
 from advsearch.report.markup import answer_html
 from advsearch.report.shown import shown
@@ -433,7 +434,7 @@ def read_picture(path: Path) -> object:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", Image.DecompressionBombWarning)
-            opened = Image.open(path)
+            opened = Image.open(path, formats=FORMATS)
         with opened as image:
             if image.width * image.height > MOST_PIXELS:
                 raise FileFormatError(

@@ -398,12 +398,12 @@ def _read_frames(file: Path) -> list[str]:
     """Return the frames of an animation as data URLs; none where it is missing or damaged."""
     frames = []
     try:
-        with Image.open(file) as animation:
+        with Image.open(file, formats=("GIF",)) as animation:
             for frame in ImageSequence.Iterator(animation):
                 stream = io.BytesIO()
                 frame.convert("RGB").save(stream, "JPEG", quality=FRAME_QUALITY)
                 frames.append(data_url(stream.getvalue(), "image/jpeg"))
-    except (OSError, SyntaxError, Image.DecompressionBombError):
+    except images.BAD_PICTURE:
         return []
     return frames if len(frames) > 1 else []
 

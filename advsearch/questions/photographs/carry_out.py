@@ -128,7 +128,7 @@ class Photographs:
     def _add(self, run: Path, rendering: str, data: bytes, source: str) -> PhotoAgreement:
         """Judge and keep a photograph that was aligned with a rendering; `source` is the name of its file."""
         file = rendering_file(run, rendering)
-        with Image.open(file) as image:
+        with Image.open(file, formats=("PNG", "JPEG")) as image:
             sound = sound_photo(data, image.size)
         with RunDirectory.resume(run) as held:
             number = held.store.last_step(PHOTO) + 1
@@ -189,7 +189,7 @@ class _PhotoJudge:
         The picture is resized in 8 bits with Lanczos' filter, which averages where it shrinks.
         """
         height, width = self.size
-        with Image.open(io.BytesIO(data)) as image:
+        with Image.open(io.BytesIO(data), formats=("JPEG", "PNG", "WEBP")) as image:
             small = image.convert("RGB").resize((width, height), Image.Resampling.LANCZOS)
         pixels = torch.from_numpy(np.asarray(small, dtype=np.float32) / np.float32(255.0))
         truth = self.truth(rendering, name)
