@@ -61,14 +61,21 @@ def as_setting(given: object) -> object:
         InputError: it is of several numbers, or of whole ones, or a function that is no inverse CDF.
     """
     if isinstance(given, Mapping):
-        if not given or given.keys() & {DISTRIBUTION, CHOICES} or not all(map(_is_number, given.values())):
+        weights = [one.item() if getattr(one, "ndim", 1) == 0 else one for one in given.values()]  # numpy's, torch's
+        if not given or given.keys() & {DISTRIBUTION, CHOICES} or not all(map(_is_number, weights)):
             return given
-        return {CHOICES: list(given), WEIGHTS: [float(one) for one in given.values()]}
+        return {CHOICES: list(given), WEIGHTS: [float(one) for one in weights]}
     kind = type(given)
     if kind.__module__.startswith("torch.distributions") and kind.__name__ in TORCH:
         name, parameters = TORCH[kind.__name__]
         return _named(name, parameters(given))
-    if kind.__module__.startswith("scipy.stats") and hasattr(given, "dist"):
+    family = getattr(given, "dist", given)
+    if hasattr(family, "pmf") and hasattr(family, "ppf"):
+        raise InputError(
+            f"distribution {getattr(family, 'name', kind.__name__)}: expected one of real numbers, got one of whole "
+            "ones; give its values as {choices: [...], weights: [...]}"
+        )
+    if family is not given and _is_scipys(family):
         return _of_scipy(given)
     for method in ("icdf", "ppf"):
         if hasattr(given, method):
@@ -89,12 +96,13 @@ def _called(given: object, method: Callable[[Any], Any]) -> Callable[[float], fl
     return lambda share: float(method(torch.tensor(share, dtype=torch.float64)))
 
 
+def _is_scipys(family: object) -> bool:
+    """Return whether a family is the one that scipy has under its name, which one's own may have too."""
+    stats = sys.modules.get("scipy.stats")
+    return type(family) is type(getattr(stats, str(getattr(family, "name", "")), NotImplemented))
+
+
 def _of_scipy(given: Any) -> dict[str, object]:
-    if hasattr(given.dist, "pmf"):
-        raise InputError(
-            f"distribution {given.dist.name}: expected one of real numbers, got one of whole ones; give its values as "
-            "{choices: [...], weights: [...]}"
-        )
     shapes, loc, scale = given.dist._parse_args(*given.args, **given.kwds)
     names = [one.strip() for one in (given.dist.shapes or "").split(",") if one.strip()]
     return _named(given.dist.name, {**dict(zip(names, shapes, strict=True)), "loc": loc, "scale": scale})

@@ -2,6 +2,7 @@
 
     python benchmarks/gradients.py [--size 224] [--repeats 6]
     python benchmarks/gradients.py --steps [--size 96] [--repeats 6]
+    python benchmarks/gradients.py --denoised [--size 64] [--repeats 16]
 
 The parameters are a rotation vector and a shift of the bundled mug, the loss is linear and smooth. Each estimator gives
 several gradients with seeds of their own; its error is measured against the mean of many central differences. Mitsuba's
@@ -11,6 +12,9 @@ nothing to compare the six camera parameters with: their differences are measure
 With `--steps` it compares the widths of differences of the model's own loss over poses and cameras, at equal renders:
 how often they have the sign of what the loss does over 2 to 5 % of the range, which is how far a search goes at a time,
 and their noise as a multiple of that slope.
+
+With `--denoised` it compares the adjoint of a texture, which takes the denoiser as the identity, with central
+differences, which have it: of the model's loss, along several directions, with as many samples, over common seeds.
 """
 
 from __future__ import annotations
@@ -58,7 +62,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--size", type=int, default=224, help="side of the picture (default 224)")
     parser.add_argument("--repeats", type=int, default=6, help="gradients of each estimator (default 6)")
     parser.add_argument("--steps", action="store_true", help="compare the widths of differences of the model's loss")
+    parser.add_argument("--denoised", action="store_true", help="compare a texture's adjoint with differences")
     args = parser.parse_args(argv)
+    if args.denoised:
+        return compare_denoised(args.size, args.repeats)
     if args.steps:
         return compare_steps(args.size, args.repeats)
     scene = load_scene("mug")
@@ -126,6 +133,79 @@ def difference(renderer: Renderer, loss: Loss, group: Group, half: float, seed: 
         with torch.no_grad():
             values.append(float(loss(renderer(u, seed=seed, spp=spp))))
     return (values[0] - values[1]) / (2.0 * half)
+
+
+TEXELS, HALF = 64, 0.02
+BLOCKS = (1, 4, 16)
+"""Side of the squares of texels that have one sign."""
+ALONG, FEWEST = 4, 4
+"""Directions of each kind, and seeds at least, where pictures have many samples."""
+
+
+def compare_denoised(size: int, repeats: int) -> int:
+    """Print, for each kind of direction, the adjoint's slopes along several of them over those of differences."""
+    print(f"mug, studio, {size} x {size}, {TEXELS} x {TEXELS} texels: slopes by the adjoint / by differences")
+    print("(+- its deviation by noise), and the cosine of both over the directions")
+    for denoise in ("oidn", "none"):
+        config = AttackConfig(
+            object="mug", resolution=(size, size), controls={"texture": {"resolution": TEXELS}}, denoise=denoise
+        )
+        problem, _ = problem_from_config(config)
+        renderer, loss = problem.renderer, problem.loss
+        start = renderer.start * (1.0 - 2.0 * HALF) + HALF
+        own = estimated(renderer, loss, start, "adjoint", {"texture.texels"}, 999, 256)
+        kinds = directions(own)
+        for spp in (4, 16, 64, 256):
+            seeds = max(FEWEST, min(repeats, 16 * repeats // spp))
+            print(f"{denoise}, {spp} samples a pixel, {seeds} seeds")
+            for kind, some in kinds.items():
+                ratio, noise, cosine = slopes(renderer, loss, start, some, seeds, spp)
+                print(f"  {kind:12} {ratio:5.2f} +- {noise:4.2f}  {cosine:5.2f}", flush=True)
+    return 0
+
+
+def directions(own: Tensor) -> dict[str, Tensor]:
+    """Directions (n, d) of each kind, up to 1: the gradient's own and its signs, waves, and random signs in squares."""
+    generator = torch.Generator().manual_seed(0)
+    side = torch.linspace(0.0, 2.0 * torch.pi, TEXELS)
+    waves = []
+    for _ in range(ALONG):
+        across, down, phase = torch.randint(0, 3, (3, 3), generator=generator).float()
+        waves.append((across * side[None, :, None] + down * side[:, None, None] + phase).cos().flatten())
+    found = {"its own": own[None] / own.abs().max(), "its signs": own.sign()[None], "waves": torch.stack(waves)}
+    for block in BLOCKS:
+        cells = torch.randint(0, 2, (ALONG, TEXELS // block, TEXELS // block, 3), generator=generator).float() * 2 - 1
+        signs = cells.repeat_interleave(block, dim=1).repeat_interleave(block, dim=2)
+        found[f"signs of {block}"] = signs.flatten(1)
+    return found
+
+
+def slopes(
+    renderer: Renderer, loss: Loss, start: Tensor, some: Tensor, repeats: int, spp: int
+) -> tuple[float, float, float]:
+    """Return the ratio of the slopes along directions (n, d) by the adjoint and by differences, its deviation by noise,
+    and their cosine. Products are of different seeds, so that noise adds nothing to them."""
+    adjoint, differences = [], []
+    for seed in range(repeats):
+        adjoint.append(some @ renderer.gradient(loss, start, seed, spp)[1])
+        with torch.no_grad():
+            sides = [[float(loss(renderer(start + s * HALF * one, seed, spp))) for one in some] for s in (1.0, -1.0)]
+        differences.append((torch.tensor(sides[0]) - torch.tensor(sides[1])) / (2.0 * HALF))
+    mine, theirs = torch.stack(adjoint), torch.stack(differences)
+
+    def product(a: Tensor, b: Tensor) -> float:
+        return float(a.sum(0) @ b.sum(0) - (a * b).sum())
+
+    parts = torch.tensor([product(mine[k], theirs[k]) / product(theirs[k], theirs[k]) for k in _others(repeats)])
+    noise = float(((repeats - 1) * (parts - parts.mean()).square().mean()).sqrt())
+    both = product(mine, theirs)
+    squares = product(mine, mine) * product(theirs, theirs)
+    return both / product(theirs, theirs), noise, both / squares**0.5 if squares > 0.0 else float("nan")
+
+
+def _others(count: int) -> list[Tensor]:
+    """All but each one, for a jackknife."""
+    return [torch.arange(count) != one for one in range(count)]
 
 
 def measure(renderer: Renderer, estimators: Sequence[str], repeats: int) -> Iterator[tuple[str, float, float, float]]:

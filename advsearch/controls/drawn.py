@@ -88,7 +88,8 @@ def read_drawn(where: str, parameter: Parameter, given: Mapping[str, object]) ->
         raise UnknownNameError(
             f"distribution of {where}", str(name), COMMON, "It is one of scipy.stats, of real numbers."
         )
-    text = f"{name}({', '.join(f'{key}={value:g}' for key, value in numbers.items() if is_number(value))})"
+    shown = (f"{key}={value:g}" if is_number(value) else f"{key}={value!r:.20}" for key, value in numbers.items())
+    text = f"{name}({', '.join(shown)})"
     try:
         if not all(map(is_number, numbers.values())):
             raise TypeError("expected numbers")
@@ -109,8 +110,7 @@ def read_drawn(where: str, parameter: Parameter, given: Mapping[str, object]) ->
             f"({parameter.unit}), and at most {100.0 * MOST_OUTSIDE:g} % is cut off; choose a narrower one, or cut it "
             "yourself (truncnorm)"
         )
-    least = least if least > 0.0 else 0.0 if ends[0] else TAIL
-    most = most if most < 1.0 else 1.0 if ends[1] else 1.0 - TAIL
+    least, most = max(least, 0.0 if ends[0] else TAIL), min(most, 1.0 if ends[1] else 1.0 - TAIL)
     return _between(where, frozen.ppf, least, most, text)
 
 

@@ -168,14 +168,16 @@ class Problem:
             return replace(said, objective=objective)
 
     def view(
-        self, predict: Callable[[Tensor], Tensor], whole: Tensor, seed: int, spp: int, *, climbed: bool = True
+        self, predict: Callable[[Tensor], Tensor], whole: Tensor, seed: int, spp: int, *, drawn: Tensor | None = None
     ) -> View:
         """Compare a picture (H, W, 3) that is predicted of the whole space at `whole` with traced ones; `spp` are the
-        samples a pixel of a rendered one. `climbed` is whether the search moved it away from its start."""
+        samples a pixel of a rendered one. Of what is searched, the search has not moved what is `drawn`, (d,) bool."""
         with torch.no_grad():
             predicted = predict(whole)
             start = torch.cat([self.domain.start, whole[self.domain.dim :]])
-            before = predict(start) if climbed and not torch.equal(start, whole) else None
+            if drawn is not None:
+                start[: self.domain.dim][drawn] = whole[: self.domain.dim][drawn]
+            before = None if torch.equal(start, whole) else predict(start)
         return view_of(self.renderer, predicted, whole, seed, spp, lambda *at: self.judge(*at).margin, before)
 
     def marks(self, picture: Tensor, whole: Tensor) -> list[Mark]:

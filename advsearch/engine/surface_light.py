@@ -313,9 +313,11 @@ class SurfaceLight(Predictor):
         places[0] = u
         wholes = [torch.cat(both) for both in zip(places, self._drawn(query, VIEWS), strict=True)]
 
+        drawn = self._moving if self._colored else torch.ones_like(self._moving)
+
         def view(number: int) -> View:
             seen = seeds.stream(seed, "view", number)
-            return problem.view(self.renderer, wholes[number], seen, problem.spp, climbed=self._colored)
+            return problem.view(self.renderer, wholes[number], seen, problem.spp, drawn=drawn)
 
         self.deviations.append(compared(view))
         self.seconds += time.perf_counter() - begun

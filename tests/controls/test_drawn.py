@@ -86,6 +86,24 @@ def test_a_function_is_an_inverse_cdf() -> None:
     assert azimuths(own, np.array([0.5])) == pytest.approx(float(own.icdf(torch.tensor(0.5))), abs=1e-4)
 
 
+def test_a_family_of_ones_own_is_not_scipys_of_the_same_name() -> None:
+    class Rising(stats.rv_continuous):
+        def _cdf(self, x: Any) -> Any:
+            return x**2
+
+    rising = Rising(a=0.0, b=1.0, name="norm")
+    for given in (rising, rising()):
+        assert azimuths(given, np.array([0.0, 0.25, 1.0])) == pytest.approx([0.0, 0.5, 1.0], abs=1e-4)
+    counts = stats.rv_histogram(np.histogram([1.0, 2.0, 3.0], 3))
+    assert azimuths(counts(loc=5.0), np.array([0.0, 1.0])) == pytest.approx([6.0, 8.0], abs=1e-4)
+
+
+def test_an_endless_tail_is_left_out_on_both_sides() -> None:
+    """Also where a parameter's bound is far beyond it: 4.75 deviations."""
+    spec = CameraControl(exposure=Normal(0.0, 0.5)).specs["exposure"]
+    assert isinstance(spec, Drawn) and (spec.low, spec.high) == pytest.approx((-2.377, 2.377), abs=1e-3)
+
+
 def test_the_clean_scene_has_its_value_where_the_distribution_has_it() -> None:
     near, far = (CameraControl(azimuth=Normal(at, 5.0)).bind(MUG) for at in (45.0, 200.0))
     assert float(near.values(near.start)["azimuth"]) == pytest.approx(40.0, abs=1e-3) and not near.moved
@@ -106,6 +124,7 @@ def test_derivatives_reach_what_is_drawn() -> None:
         ({"studio": 0.7, "noon": 0.3}, {"studio": 7, "noon": 3}),
         ({"studio": 2, "noon": 1}, {"studio": 2, "noon": 1}),
         ({"studio": 1, "noon": 0}, {"studio": 1}),
+        ({"studio": np.float32(3.0), "noon": torch.tensor(1.0)}, {"studio": 3, "noon": 1}),
         ({"studio": 0.7123, "noon": 0.2877}, {"studio": 712, "noon": 288}),
     ],
 )
@@ -124,6 +143,8 @@ def test_weights_are_shares(weights: dict[str, float], counts: dict[str, int]) -
     [
         (Normal(torch.zeros(2), 1.0), "distribution norm: expected one of a single number"),
         (stats.poisson(3), "distribution poisson: expected one of real numbers, got one of whole ones"),
+        (stats.rv_discrete(values=([1, 2], [0.5, 0.5])), "expected one of real numbers, got one of whole ones"),
+        ({"distribution": "norm", "loc": float("nan")}, r"got norm\(loc=nan\)"),
         (lambda share: -share, "camera.azimuth: expected an inverse CDF, whose values rise with the share"),
         (lambda share: 1e9, r"camera.azimuth: expected values from -3600 to 3600 \(degrees\) of <lambda>, got 1e\+09"),
         (lambda: 3.0, "distribution <lambda>: expected a function from a share in .* it raised TypeError"),

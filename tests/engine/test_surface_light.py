@@ -8,14 +8,17 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 from stand_ins import Impatient, rows, shared
+from torch import Tensor
 
 import advsearch
 from advsearch.attacks import make_policy
 from advsearch.attacks.evaluation import Query
 from advsearch.config import AttackConfig
 from advsearch.engine import acceptance, surface_light
-from advsearch.engine.acceptance import Deviation
+from advsearch.engine import problem as problems
+from advsearch.engine.acceptance import Deviation, View
 from advsearch.engine.attack_parts import parts_of, problem_of_parts
 from advsearch.engine.attack_result import AttackResult
 from advsearch.engine.surface_light import SurfaceLight
@@ -173,6 +176,24 @@ def test_a_texture_and_its_viewpoint_are_searched_together() -> None:
     summary = advsearch.attack("mug", **CAMERA | {"controls": {"texture": {"resolution": 8}, "camera": {}}}).summary
     assert summary.transport is not None and summary.transport.way == "surface light"
     assert (summary.renders["products"], summary.renders["gradient"]) == (80, 0)
+
+
+def test_a_camera_that_was_drawn_is_no_progress_of_the_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the search has moved is the texture: before it that is nothing, whatever the camera."""
+    controls = {"texture": {"resolution": 8}, "camera": {}}
+    problem, _ = problem_of_parts(parts_of(AttackConfig(object="mug", **CAMERA | {"controls": controls})))
+    before: list[Tensor | None] = []
+
+    def view_of(*given: Any) -> View:
+        before.append(given[-1])
+        return View(8.0, 9.0, 0.0, 3)
+
+    monkeypatch.setattr(problems, "view_of", view_of)
+    light = SurfaceLight(problem, 40)
+    light.prepare()
+    assert before == [None] * acceptance.FIRST
+    light._compare(problem.domain.sample(torch.Generator().manual_seed(0), 1)[0], 6)
+    assert len(before) == 2 * acceptance.FIRST and all(one is not None for one in before[acceptance.FIRST :])
 
 
 def test_a_random_search_looks_through_the_same_cameras_again() -> None:

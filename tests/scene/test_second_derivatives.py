@@ -1,0 +1,80 @@
+"""Own operations of torch: those that are exact any number of times are, and no other is differentiated twice."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.sparse
+import torch
+from scipy.sparse import linalg
+from torch import Tensor
+
+import advsearch
+from advsearch.controls.geometry import _Solve
+from advsearch.scene.mitsuba_backend.transport import Vertices
+from advsearch.scene.surface.arrangement import SparseProduct
+from advsearch.scene.transport.matrix import COARSE, TextureTransport
+
+ONCE = {"_Radiance", "_Differences", "_Once"}
+"""They refuse a second derivative (`tests/scene/test_renderer.py`)."""
+
+ROUNDED = 2e-3
+"""Shares of a transport matrix have 16 bits, each way by itself."""
+
+
+def solved() -> Callable[[Tensor], Tensor]:
+    matrix = scipy.sparse.diags([[4.0] * 5, [-1.0] * 4, [-1.0] * 4], [0, 1, -1]).tocsc()
+    return lambda x: _Solve.apply(x.reshape(5, 2), linalg.splu(matrix))  # type: ignore[no-any-return, no-untyped-call]
+
+
+def sparse() -> Callable[[Tensor], Tensor]:
+    matrix = scipy.sparse.random(7, 5, 0.5, "csr", random_state=0)
+    return lambda x: SparseProduct.apply(matrix, x.reshape(5, 2))  # type: ignore[no-any-return, no-untyped-call]
+
+
+def transport() -> Callable[[Tensor], Tensor]:
+    """Of two texels, beside each other, four pixels see some."""
+    made, shape = TextureTransport((2, 2), (COARSE, COARSE)), (COARSE, COARSE, 3)
+    places = torch.tensor([[0.1, 0.3], [0.2, 0.3], [0.3, 0.3], [0.3, 0.4]])
+    weight = torch.arange(1.0, 13.0).reshape(4, 3) / 6.0
+    made.add([Vertices(torch.arange(4), places, weight, torch.tensor([True, True, False, True]))], share=1.0)
+    made.finish()
+    spread = torch.randn(10, *shape, generator=torch.Generator().manual_seed(1)) / COARSE
+    return lambda x: made(torch.einsum("n,nhwc->hwc", x.float(), spread)).double()
+
+
+OPERATIONS = {"_Solve": solved, "SparseProduct": sparse, "_Product": transport}
+
+
+@pytest.mark.parametrize("name", OPERATIONS)
+def test_an_exact_operation_is_differentiated_any_number_of_times(name: str) -> None:
+    """As the dense matrix of the same numbers is: of the sum of cubes, three times."""
+    operation = OPERATIONS[name]()
+    dense = torch.stack([operation(one).detach().flatten() for one in torch.eye(10, dtype=torch.float64)], dim=1)
+    x = torch.from_numpy(np.random.default_rng(0).normal(size=10)).requires_grad_()
+    found = []
+    for of in (lambda at: operation(at).flatten(), lambda at: dense @ at):
+        value, derivatives = of(x).pow(3).sum(), list[Tensor]()
+        for _ in range(3):
+            (slope,) = torch.autograd.grad(value, x, create_graph=True)
+            derivatives.append(slope.detach())
+            value = (slope * torch.arange(1.0, 11.0)).sum()
+        found.append(torch.stack(derivatives))
+    size = found[1].abs().amax(dim=1, keepdim=True)
+    assert bool((size > 0.0).all())
+    torch.testing.assert_close(found[0] / size, found[1] / size, rtol=0.0, atol=ROUNDED)
+
+
+def test_every_operation_is_one_of_these() -> None:
+    """A new one is exact, and is tested above, or refuses a second derivative."""
+    found = set()
+    for file in Path(advsearch.__file__).parent.rglob("*.py"):
+        text = file.read_text(encoding="utf-8")
+        for node in ast.walk(ast.parse(text)) if "autograd.Function" in text else ():
+            if isinstance(node, ast.ClassDef) and "Function" in "".join(map(ast.unparse, node.bases)):
+                found.add(node.name)
+    assert found == ONCE | OPERATIONS.keys()
