@@ -46,9 +46,11 @@ SYNONYMS = {
 }
 """Keywords of Python's functions, and what else they are called elsewhere."""
 
+DEVICES = ("device", "cuda", "gpu", "use_cuda")
+
 NOWHERE = {
     **dict.fromkeys(
-        ("device", "cuda", "gpu", "use_cuda"),
+        DEVICES,
         "pictures are made on the processor, and a model stays on the device that it is on",
     ),
     **dict.fromkeys(("lr", "learning_rate", "step_size", "alpha", "momentum"), "steps are an option of a policy"),
@@ -69,7 +71,7 @@ def unexpected(function: str, given: Mapping[str, object], known: Sequence[str])
         if name in known:
             continue
         meant = [one for one, others in SYNONYMS.items() if one in known and name.lower() in others.split()]
-        meant = meant or resembling(name, known)[:2]
+        meant = meant or (() if name.lower() in DEVICES else resembling(name, known)[:2])
         hint = f"; did you mean {' or '.join(f'`{one}`' for one in meant)}?" if meant else ""
         reason = f" ({NOWHERE[name.lower()]})" if name.lower() in NOWHERE else ""
         return TypeError(f"{function}() got an unexpected keyword argument {name!r}{hint}{reason}")

@@ -71,7 +71,7 @@ def make_sweep(
                 "interval": (0.5, 0.9),
             }
             axis = {"axis": "pose.yaw", "unit": "degrees", "value": 45.0, **counts}
-            summary = sweep(**counts, planned=len(rows), run=str(path), axes=[axis], **summarised)
+            summary = sweep(**counts, planned=len(rows), run=str(path), **{"axes": [axis], **summarised})
             run.write_summary(summary)
             write_sweep_page(run.path, summary)
     return path

@@ -13,7 +13,7 @@ from typing import NamedTuple
 from advsearch.cli import output
 from advsearch.cli.output import at_work, output_errors
 from advsearch.cli.question import Command
-from advsearch.errors import InputError
+from advsearch.errors import InputError, UnknownNameError
 from advsearch.runs.directory import PARTS, find_run
 from advsearch.runs.export import FORMATS, write_rows, write_threedb
 from advsearch.runs.fiftyone import write_fiftyone
@@ -152,6 +152,8 @@ def _export(args: argparse.Namespace) -> int:
     for name in ("size", "sheets", "paper", "icc"):
         if format != "print" and getattr(args, name) is not None:
             raise InputError(f"--{name}: belongs to --format print; leave it out")
+    if args.format and format not in (*FORMATS, *WRITERS):
+        raise UnknownNameError("format", format, [*FORMATS, *WRITERS])
     if format not in WRITERS:
         return _table(args, out, by_name)
     if out is None:
@@ -185,7 +187,7 @@ def _table(args: argparse.Namespace, out: Path | None, by_name: str) -> int:
     if out is not None and args.json:
         output.print_json({"schema": 1, "command": "export", "rows": count, "format": format, "out": str(out)})
     elif out is not None:
-        print(f"{count} rows in {out}", file=sys.stderr)
+        print(f"{count} rows in {out}" + ("" if by_name == format else f", as {format}"), file=sys.stderr)
     return 0
 
 

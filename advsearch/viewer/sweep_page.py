@@ -145,10 +145,11 @@ def _going_on(run: Path) -> JsonObject:
 
 
 def _judged(summary: SweepSummary) -> JsonObject:
-    """The task, and height and width in pixels of what was judged, where that is one size: boxes are told in them."""
+    """The task, the axes of the grid, and height and width in pixels of what was judged, where that is one size: boxes
+    are told in them."""
     formed = summary.image_formation
     size = None if formed is None or "," in summary.model else list[JsonValue](formed.resolution)
-    return {"task": summary.task, "size": size}
+    return {"task": summary.task, "size": size, "grid": list(dict.fromkeys(one.axis for one in summary.axes))}
 
 
 def _header(runs: Sequence[tuple[Path, SweepSummary | None]]) -> Html:

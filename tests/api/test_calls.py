@@ -52,11 +52,11 @@ def test_a_keyword_of_elsewhere_is_told_what_it_is_called_here(name: str, keywor
 
 
 def test_a_device_has_no_name_here() -> None:
-    with pytest.raises(TypeError, match=r"'device'.*a model stays on the device that it is on"):
+    with pytest.raises(TypeError, match=r"'device' \(pictures.*a model stays on the device that it is on"):
         ANY.attack("mug", device="cuda")
 
 
-@pytest.mark.parametrize("name", FUNCTIONS)
+@pytest.mark.parametrize("name", [name for name in FUNCTIONS if name != "allow_code"])
 def test_every_function_says_which_keywords_it_has_not(name: str) -> None:
     """A function that is not `helped` would raise Python's own error, without a word about what is meant."""
     known = list(inspect.signature(getattr(advsearch, name)).parameters)

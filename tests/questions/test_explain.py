@@ -20,7 +20,7 @@ from advsearch.errors import FileFormatError, InputError
 from advsearch.explanations import Answered, CountedRule, Factor, Observations, RuleCondition
 from advsearch.questions.explain import renders as explaining
 from advsearch.questions.explain.answer import ExplainResult, pairs_text
-from advsearch.questions.explain.renders import along, lies_inside, sweep_inside
+from advsearch.questions.explain.renders import along, can_be_given, lies_inside, sweep_inside
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import NAME, Row, Store
 from advsearch.runs.summary import read_result
@@ -159,7 +159,7 @@ def test_what_cannot_be_explained_is_refused_in_words(tmp_path: Path, capsys: py
     with pytest.raises(InputError, match="unknown run"):
         advsearch.explain("nothing")
     assert main(["explain"]) == 2 and "expected the run of a sweep" in capsys.readouterr().err
-    assert main(["explain", ","]) == 2 and "unknown run ','" in capsys.readouterr().err
+    assert main(["explain", ","]) == 2 and "expected names or folders" in capsys.readouterr().err
     same = stored(tmp_path / "same", lambda elevation: False, rows=120)
     kept = advsearch.explain(same, confirm=0, pairs=0, run=tmp_path / "run")
     assert kept.rules == []
@@ -222,6 +222,23 @@ def test_a_sweep_along_a_factor_keeps_the_rest() -> None:
     assert made.grid["light.power"] == [0.5] and made.plain()["set"] == {} and made.workers is None
     lit = along(config, row, FOUND.factors[1], FOUND, 3)
     assert lit.environment == "noon,studio" and lit.grid["pose.yaw"] == [90.0]
+
+
+def test_numbers_that_follow_from_others_and_axes_are_not_asked_for_again() -> None:
+    """A row of a drive has its distance, which follows from the time; a control may be drawn beside an axis of it."""
+    row: dict[str, float | str] = {
+        "object": "mug", "environment": "noon", "model": "reference", "path.time": 1.0, "path.distance": 4.0,
+    }  # fmt: skip
+    factors = Factor("path.time", "s"), Factor("path.distance", "object sizes"), Factor("camera.fov", "degrees")
+    found = Observations(factors, np.array([[0.0, 5.0, 30.0], [1.0, 4.0, 40.0]]), np.array([False, True]))
+    drive = SweepConfig(object="mug", path="approach", fps=1.0, controls={"path": {"reach": 8.0}})
+    made = along(drive, row, factors[0], found, 3)
+    assert list(made.grid) == ["path.time"] and not can_be_given(drive, "path.distance")
+    conditions = tuple(RuleCondition(place, low=0.0) for place in range(3))
+    assert sweep_inside(drive, found, conditions, 20, 7).controls == {"path": {"reach": 8.0}}
+    beside = SweepConfig(object="mug", grid={"camera.fov": [30.0, 40.0]}, controls={"camera": {"roll": [-5, 5]}})
+    inside = sweep_inside(beside, found, (RuleCondition(2, low=35.0),), 20, 7)
+    assert inside.controls == {"camera": {"roll": [-5, 5]}} and inside.grid == {"camera.fov": [40.0]}
 
 
 class Read:

@@ -244,6 +244,16 @@ def test_keys_reach_every_map(browser: Browser, sweep: Path) -> None:
         assert faults(page) == []
 
 
+def test_the_map_begins_with_the_axes_of_the_grid(browser: Browser, tmp_path: Path) -> None:
+    """Numbers of a row that follow from others, such as the distance on a path, are offered and not chosen."""
+    counts = {"configurations": 12, "correct": 6, "accuracy": 0.5, "interval": (0.2, 0.8)}
+    axes = [{"axis": "camera.elevation", "unit": "degrees", "value": 10.0, **counts}]
+    with opened(browser, (make_sweep(tmp_path / "grid", axes=axes) / "report.html").as_uri()) as page:
+        page.wait_for_selector("[data-cell]")
+        roles = [page.get_by_label(f"{name}: how it is shown") for name in ("camera.elevation", "pose.yaw")]
+        assert [one.input_value() for one in roles] == ["across", "up"]
+
+
 def test_a_cell_that_was_pointed_at_does_not_outlive_its_map(browser: Browser, sweep: Path) -> None:
     with opened(browser, (sweep / "report.html").as_uri()) as page:
         page.wait_for_selector("[data-cell]")

@@ -17,6 +17,7 @@ from torch import Tensor
 from advsearch import seeds
 from advsearch.api.studies import carry_out_part
 from advsearch.config import SweepConfig
+from advsearch.controls import CONTROLS
 from advsearch.errors import FileFormatError, InputError, ModelError
 from advsearch.explanations import (
     Answered,
@@ -32,6 +33,7 @@ from advsearch.explanations import (
 )
 from advsearch.interrupts import interruptible
 from advsearch.models.features import Features, features_of
+from advsearch.options import BY_KEY
 from advsearch.progress import Progress
 from advsearch.questions.explain.answer import FailureCluster, FailureClusters, NearestRight, RightOf
 from advsearch.questions.explain.findings import find_clusters
@@ -69,7 +71,7 @@ def sweep_inside(
         grid[longest] = values[::2]
     points = math.prod(map(_size, grid.values())) * others
     cut = {one.place: one for one in conditions}
-    controls = {name: {**settings, **_ranges(name, found, mask, cut)} for name, settings in config.controls.items()}
+    controls = {name: {**given, **_ranges(config, name, found, mask, cut)} for name, given in config.controls.items()}
     draws = math.ceil(samples / points) if controls else None
     return _quiet(config, grid=grid, controls=controls, samples=draws, seed=seed, **outer)
 
@@ -86,7 +88,7 @@ def along(
         column = found.values[:, place]
         spread = [float(f"{one:.4g}") for one in np.linspace(column.min(), column.max(), ALONG)]
         values = [own, *(one for one in dict.fromkeys(spread) if one != own)]
-    grid: dict[str, object] = {name: [value] for name, value in row.items() if "." in name}
+    grid: dict[str, object] = {name: [row[name]] for name in row if "." in name and can_be_given(config, name)}
     outer = {name: next(iter(_like(config, name, str(row[name]))), None) for name in OUTER}
     if factor.name in OUTER:
         several = [one for value in values for one in _like(config, factor.name, str(value))]
@@ -97,6 +99,16 @@ def along(
     alone = {"workers": None, "cluster": None}  # ten pictures take less than a worker takes to load
     kept: dict[str, object] = {"keep_pictures": "all", "set": fixed, **alone}
     return _quiet(config, grid=grid, controls={}, samples=None, seed=seed, **kept, **outer)
+
+
+def can_be_given(config: SweepConfig, name: str) -> bool:
+    """Whether a sweep can be told a value of its rows; others follow from those, as `path.distance` from the time."""
+    instance, dot, parameter = name.partition(".")
+    given = config.controls.get(instance, {})
+    kind = str(given.get("kind", instance.partition(":")[0]))
+    if not dot or kind == BY_KEY or kind not in CONTROLS:
+        return True
+    return parameter in {one.name for one in CONTROLS[kind].declared(given)}
 
 
 def lies_inside(conditions: RuleConditions, factors: tuple[Factor, ...], row: Mapping[str, float | str]) -> bool:
@@ -148,11 +160,18 @@ def _like(config: SweepConfig, name: str, value: str) -> list[str]:
     return [one for one in given if value in (one, figure_value(one))] or list(given[:1])
 
 
-def _ranges(control: str, found: Observations, mask: Mask, cut: Mapping[int, RuleCondition]) -> dict[str, object]:
-    """The ranges of what a control draws, where a condition cuts them."""
+def _ranges(
+    config: SweepConfig, control: str, found: Observations, mask: Mask, cut: Mapping[int, RuleCondition]
+) -> dict[str, object]:
+    """The ranges of what a control draws, where a condition cuts them; not of an axis of the grid, frames among them,
+    nor of what follows from other numbers."""
     ranges: dict[str, object] = {}
+    axes = {*config.grid, *([f"{control}.time"] if config.path else [])}
     for place, condition in cut.items():
-        instance, dot, parameter = found.factors[place].name.partition(".")
+        name = found.factors[place].name
+        instance, dot, parameter = name.partition(".")
+        if name in axes or not can_be_given(config, name):
+            continue
         if instance == control and dot and condition.options is None:
             column = found.values[:, place]
             low, high = max(condition.low, float(column.min())), min(condition.high, float(column.max()))
@@ -205,8 +224,8 @@ class Renders:
         try:
             done = carry_out_part(path, own, self.progress)
         except InputError as error:
-            text = f"Nothing was rendered for {name}: {error}"
-            self.warnings += [text] if text not in self.warnings else []
+            said = any(one.endswith(f": {error}") for one in self.warnings)  # once for all pairs of a kind
+            self.warnings += [] if said else [f"Nothing was rendered for {name}: {error}"]
             return None
         assert isinstance(done, SweepSummary)
         self.interrupted = done.goes_on
@@ -306,6 +325,8 @@ class Renders:
 
     def _nearest(self, name: str, one: AskedSweep, row: Answered, factor: Factor) -> NearestRight | None:
         """Go along one factor until the answer is right, twice with other noise; the failure fails in both."""
+        if not can_be_given(one.config, factor.name):
+            return None
         self.progress.message(f"{name}: the nearest right answer along {factor.name}")
         label = f"{name}-{factor.name.replace('.', '_')}"
         passes: list[list[Answered]] = []

@@ -312,8 +312,9 @@
     read() {
       const given = new URLSearchParams(location.hash.slice(1));
       const state = this.state;
-      // First the parameters of a grid, then those that were drawn, then names.
-      const rank = (axis) => (axis.names ? 2 : axis.parts ? 1 : 0);
+      // First the axes of the grid, then numbers that follow from these, then those that were drawn, then names.
+      const grid = new Set(this.table.sources.flatMap((one) => one.grid || []));
+      const rank = (axis) => (axis.names ? 3 : axis.parts ? 2 : grid.has(axis.name) ? 0 : 1);
       const order = [...this.axes].sort((a, b) => rank(a) - rank(b));
       const pick = (name, other) => (this.byName.has(name) ? name : (order.find((axis) => axis.name !== other) || {}).name || null);
       state.across = pick(given.get("across"), given.get("up"));
@@ -786,7 +787,7 @@
     const body = make("div", {});
     place.append(body);
     const explorer = new Explorer(body, table);
-    table.sources = runs.map((run) => ({ name: run.name, picture: pictures(run), task: run.task, size: run.size }));
+    table.sources = runs.map((run) => ({ name: run.name, picture: pictures(run), task: run.task, size: run.size, grid: run.grid }));
     const renew = () => {
       for (const still of document.querySelectorAll("[data-still]")) still.hidden = true;
       explorer.renew();
