@@ -64,7 +64,10 @@ def as_setting(given: object) -> object:
         weights = [one.item() if getattr(one, "ndim", 1) == 0 else one for one in given.values()]  # numpy's, torch's
         if not given or given.keys() & {DISTRIBUTION, CHOICES} or not all(map(_is_number, weights)):
             return given
-        return {CHOICES: list(given), WEIGHTS: [float(one) for one in weights]}
+        try:
+            return {CHOICES: list(given), WEIGHTS: [float(one) for one in weights]}
+        except OverflowError:  # of no float: whoever reads the setting says what it takes
+            return given
     kind = type(given)
     if kind.__module__.startswith("torch.distributions") and kind.__name__ in TORCH:
         name, parameters = TORCH[kind.__name__]

@@ -411,7 +411,7 @@ def is_run(path: Path) -> bool:
     if files.is_results_database(path / store.NAME):
         return True
 
-    if (path / CONFIG).is_symlink():
+    if os.path.islink(path / CONFIG):
         return False
     try:
         with open_regular(path / CONFIG, "a run.yaml", LARGEST) as file:

@@ -298,7 +298,7 @@ _JOURNAL = bytes.fromhex("d9d505f920a163d7")
 
 def is_results_database(path: Path) -> bool:
     """Return whether the file at `path` starts like a results.sqlite of advsearch; a link does not."""
-    if path.is_symlink():
+    if os.path.islink(path):
         return False
     try:
         with open_regular(path, "a results.sqlite", LARGEST) as file:
@@ -347,7 +347,7 @@ def _schema(db: sqlite3.Connection) -> frozenset[Any]:
 
 def connect_to_write(path: Path) -> sqlite3.Connection:
     """Open or make the file and bring it up to date."""
-    if path.is_symlink():
+    if os.path.islink(path):
         raise FileFormatError(f"{path}: expected a file of this run, got a link to another; {DAMAGED}")
     if path.exists():
         open_regular(path, "a results.sqlite", LARGEST).close()

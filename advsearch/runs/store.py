@@ -250,7 +250,7 @@ class Store:
         """Return the JSON value that was noted under `key`, or None."""
         text = self.note(key)
         try:
-            return None if text is None else parse_json(text, finite=True)
+            return None if text is None else parse_json(text)
         except ValueError as error:
             raise FileFormatError(f"{self.path}: expected JSON in the note {key!r}, got {error}; {DAMAGED}") from None
 

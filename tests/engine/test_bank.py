@@ -187,6 +187,8 @@ def test_conditions_that_are_all_alike_count_the_same() -> None:
 def test_a_bank_that_teaches_enough_stops_growing(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where unseen conditions are no better for the model, there are no more after the first comparison."""
     monkeypatch.setattr(bank, "SURE", 1e9)
+    for limit in ("MARGIN", "BOUND"):  # predictions are good enough
+        monkeypatch.setattr(acceptance, limit, 1e9)
     told = advsearch.attack("mug", **SMALL).summary.transport
     assert told is not None and told.conditions is not None
     assert (told.conditions.made, told.conditions.grown) == (9, 0)

@@ -716,7 +716,7 @@ def test_unknown_names() -> None:
         load_model("resnet50")
     with pytest.raises(InputError, match=r"write 'nets:build', without the '.py'"):
         load_model("nets.py:build")
-    with pytest.raises(InputError, match=r"got the class Tiny \(pass an instance\)"):
+    with pytest.raises(InputError, match=r"got the class Tiny; write Tiny\(\)"):
         load_model(Tiny)  # type: ignore[arg-type]
 
 

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 import advsearch
 from advsearch.models import load_model
 from advsearch.models.guards import PLAIN, Switches, plainly
+from advsearch.registry import allow_code
 
 TURNED = {
     "type": Switches(dtype=torch.float64),
@@ -65,6 +66,7 @@ def test_what_the_code_of_a_network_turns_stays_with_it(tmp_path: Path, monkeypa
         "def make():\n    return OfItsType()\n"
     )
     monkeypatch.syspath_prepend(tmp_path)
+    allow_code("turning_nets:make")
     model = load_model("turning_nets:make", input_size=16)
     assert Switches.now() == PLAIN and model.dtype == torch.float64 and model.differentiable
     assert model(torch.zeros(16, 16, 3)).dtype == torch.float32 and Switches.now() == PLAIN
