@@ -32,6 +32,15 @@ DRIVE_HEADS = ("", "mean", "95 % interval", "worst drive")
 """What stands above the rows."""
 
 
+def over_drives(summary: SweepSummary) -> str:
+    """Return what the interval of a sweep over drives is over; nothing where there are none."""
+    if not summary.drives:
+        return ""
+    if summary.units is None and any(one.frames > 1 for one in summary.drives):  # of an earlier version
+        return ", too narrow: it takes frames of a drive as independent; `explain` has it over drives"
+    return ", over drives"
+
+
 def drive_title(one: DriveRates) -> str:
     """Return what drives they are, and of which model."""
     what = f"{count(one.drives, 'drive')} of {one.frames} frames in {one.seconds:g} s, {one.model}"

@@ -198,7 +198,7 @@ def sweep_verdict(summary: SweepSummary) -> str:
         return "No configuration was looked at."
     if summary.beside and summary.beside.pairs:
         return " ".join(beside_text(summary.beside.answer, one) for one in summary.beside.pairs)
-    over = ", over drives" if summary.drives else ""
+    over = sweeps.over_drives(summary)
     share = f"{percent(summary.accuracy)}, 95 % interval {wording.interval_text(summary.interval)}{over}"
     ended = "" if summary.configurations == summary.planned else f" so far, of {summary.planned} planned"
     return f"Right in {summary.correct} of {summary.configurations} configurations{ended} ({share})."

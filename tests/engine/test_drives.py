@@ -28,6 +28,7 @@ from advsearch.errors import InputError
 from advsearch.progress import NullProgress
 from advsearch.questions.sweep.answer import claims
 from advsearch.questions.sweep.carry_out import job_of
+from advsearch.report.sweeps import over_drives as told_over
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.sweep import DriveRates
 from advsearch.viewer.columns import read_columns
@@ -131,6 +132,8 @@ def test_the_worst_of_several_drives_is_the_one_that_is_kept(tmp_path: Path, mon
     ]
     shares = ([5, 2, 4, 4], [5] * 4)
     assert result.summary.interval == pytest.approx(share_interval(*shares)), "over drives, not over 20 frames"
+    assert result.summary.units == 4 and told_over(result.summary) == ", over drives"
+    assert "too narrow" in told_over(result.summary.model_copy(update={"units": None})), "a run of an earlier version"
     times = [row for row in result.summary.axes if row.axis == "path.time"]
     assert times[0].interval == clopper_pearson(times[0].correct, 4), "at one time each drive has one frame"
     (yaw, *_) = [row for row in result.summary.axes if row.axis == "pose.yaw"]

@@ -349,6 +349,7 @@ class Sweep:
             drawn={one.name: one.varied for one in self._shown},
             planned=self.total,
             **vars(tally.whole.rate()),
+            units=tally.whole.units,
             not_finite=tally.not_finite,
             answers=tally.frequent(),
             axes=tally.table(),

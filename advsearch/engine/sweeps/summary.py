@@ -96,6 +96,11 @@ class UnitCount:
         else:
             self._open[unit] = seen + 1, correct + right
 
+    @property
+    def units(self) -> int | None:
+        """How many were seen; None where each is one answer."""
+        return None if self._open is None or self._whole is None else self._whole.total() + len(self._open)
+
     def rate(self) -> CountedAnswers:
         """Return count, accuracy and its interval over units; None where nothing was seen."""
         if self.of_a_unit == 1 or not self.seen or self._open is None or self._whole is None:

@@ -14,6 +14,7 @@ from advsearch.report.sweeps import (
     distance_sentence,
     drive_rows,
     drive_title,
+    over_drives,
     surface_sentences,
 )
 from advsearch.runs.results.base import INTERRUPTED
@@ -171,11 +172,6 @@ def claims(result: SweepSummary) -> Iterator[Claim]:
     if worst is not None:
         text = f"In the worst of these configurations the model is wrong in {wording.rate_text(worst)}."
         yield claim("measured", f"{text} No search looked for a worse one.", extent_of("wrong", worst))
-
-
-def over_drives(summary: SweepSummary) -> str:
-    """Return that an interval is over drives, where it is."""
-    return ", over drives" if summary.drives else ""
 
 
 def _in_each(result: SweepSummary) -> str:

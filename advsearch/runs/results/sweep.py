@@ -200,6 +200,11 @@ class SweepSummary(CountedAnswers, RunResult):
     drives: list[DriveRates] | None = Field(
         default=None, description="of [whole drives](drives.md); absent where no frames of a path are swept"
     )
+    units: int | None = Field(
+        default=None,
+        description="draws that the configurations are of, such as [drives](drives.md), and intervals over; absent "
+        "where none share one",
+    )
     grid: dict[str, int] = Field(description="how many values each axis of the grid has")
     gains: dict[str, float] | None = Field(
         default=None, description="the gain of each scene, by object and environment; absent of one scene"
