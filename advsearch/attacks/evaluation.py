@@ -96,7 +96,7 @@ class Evaluation:
         layers: ground truth of it by name, and notes, where they are kept.
         seconds: that it took; None where whoever asks has to look at the clock.
         machine: on which it was made, by its name among the workers' machines; None where that is like this one.
-        lost: whether nobody could answer, since every worker that tried died.
+        lost: true if every worker that tried it died.
     """
 
     objective: float

@@ -62,7 +62,12 @@ def _show(args: argparse.Namespace) -> int:
                 print(text, end="")
             return 0
         case [name]:
-            return show_run(name, args.json, picture=args.picture)
+            try:
+                return show_run(name, args.json, picture=args.picture)
+            except UnknownNameError as error:
+                raise InputError(
+                    f"{error} Of anything else say what it is, as in: advsearch show control pose"
+                ) from None
     kinds = "control NAME, policy NAME, task NAME, recipe NAME"
     raise InputError(f"expected the name of a run, or one of {kinds}, got {' '.join(args.what)!r}")
 

@@ -98,7 +98,7 @@ class PointLamp(ScenePart):
 
     Attributes:
         name: of the lamp.
-        dark: its intensity is 0 whatever happens.
+        dark: its intensity stays 0.
         position: base value, object sizes.
         intensity: base value, linear radiant intensity for each colour channel.
     """
@@ -128,7 +128,7 @@ class SpotLamp(ScenePart):
 
     Attributes:
         name: of the lamp.
-        dark: its intensity is 0 whatever happens.
+        dark: its intensity stays 0.
         position: object sizes.
         direction: unit vector along its axis; z down where that is 0.
         intensity: base value on the axis, linear radiant intensity for each colour channel.

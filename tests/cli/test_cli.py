@@ -831,6 +831,7 @@ def test_show_control(capsys: pytest.CaptureFixture[str]) -> None:
         "  name    allowed   default   description\n"
         "  steps   1 to 9    5         How many.\n"
     )
+    assert main(["show", "camera"]) == 2 and "as in: advsearch show control pose" in capsys.readouterr().err
     assert main(["show", "control", "camra"]) == 2
     assert "unknown control 'camra'. Did you mean 'camera'?" in capsys.readouterr().err
 

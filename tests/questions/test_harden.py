@@ -19,7 +19,7 @@ from advsearch.config import AttackConfig
 from advsearch.engine.attack_parts import executor_for, problem_of
 from advsearch.engine.loading import Scene
 from advsearch.engine.surface_light import reason_against
-from advsearch.errors import InputError
+from advsearch.errors import InputError, ModelError
 from advsearch.models import Model
 from advsearch.models.reference import Trainable, load
 from advsearch.progress import NullProgress
@@ -245,3 +245,12 @@ def test_the_command_asks_what_its_flags_say(monkeypatch: pytest.MonkeyPatch, ca
     flags = "harden --model reference --control texture --epsilon 0.03 --quick --held-out a.glb --json"
     assert main(flags.split()) == 2 and "stop here" in capsys.readouterr().err
     assert given == [HardenConfig(controls={"texture": {}}, epsilon=0.03, quick=True, held_out="a.glb")]
+
+
+def test_a_detector_is_refused_in_words_that_harden_can_follow(tmp_path: Path) -> None:
+    class Boxes(torch.nn.Module):
+        def forward(self, x: torch.Tensor) -> Any:
+            return x.new_zeros(len(x), 3, 4), x.new_zeros(len(x), 3, 2)
+
+    with pytest.raises(ModelError, match="what a detector gives; harden trains classifiers"):
+        advsearch.harden(Boxes(), object="mug", run=tmp_path / "run")

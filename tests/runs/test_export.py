@@ -97,13 +97,18 @@ def test_the_command_writes_by_the_name_of_the_file(run: Path, format: str, caps
     assert main(["export", str(run), "--json", "--out", f"again.{format}"]) == 0
     assert json.loads(capsys.readouterr().out)["rows"] == 3
     assert Path(f"rows.{format}").read_bytes() == Path(f"again.{format}").read_bytes()
-    assert main(["export", "one", "--out", "rows.coco"]) == 0 and "3 rows in rows.coco, as csv" in capsys.readouterr().err
+    assert (
+        main(["export", "one", "--out", "rows.coco"]) == 0 and "3 rows in rows.coco, as csv" in capsys.readouterr().err
+    )
 
 
 def test_what_is_wrong_is_told(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for words, message in (
         (["export", "two"], "unknown run 'two'"),
-        (["export", "one", "--format", "xls"], "unknown format 'xls'. Known: 3db, csv, fiftyone, gltf, json, mitsuba, parq"),
+        (
+            ["export", "one", "--format", "xls"],
+            "unknown format 'xls'. Known: 3db, csv, fiftyone, gltf, json, mitsuba, parq",
+        ),
         (["export", "one", "--kind", "serch"], "unknown kind of rows 'serch'. Did you mean 'search'?"),
         (["export", "one", "--json", "--format", "csv"], "--json: prints JSON, but --format asks for csv"),
         (["export", "one", "--out", "."], "--out: expected the name of a file, got the folder"),

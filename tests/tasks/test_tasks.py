@@ -254,7 +254,7 @@ def test_python_takes_a_task_with_options_of_its_own(tolerance: float, right: in
     )  # fmt: skip
     assert found.summary.ending == ("budget spent" if right else "already wrong")
     assert (found.summary.task, found.summary.objective) == ("yaw", "score")
-    with pytest.raises(InputError, match="model Level: expected logits, and it was loaded for another task"):
+    with pytest.raises(InputError, match="model Level: expected logits, and it was loaded for another task; give that"):
         advsearch.attack("mug", network, **fast)
 
 

@@ -23,7 +23,7 @@ from advsearch.engine.attack_parts import LOADING, executor_for
 from advsearch.engine.journal import check_made_of
 from advsearch.engine.loading import Controls
 from advsearch.engine.naming import AnyModel, check_not_spread, check_run_settings, load_models, model_name
-from advsearch.errors import ClusterError, InputError
+from advsearch.errors import ClusterError, InputError, ModelError
 from advsearch.interrupts import interruptible
 from advsearch.models.reference import trainable
 from advsearch.models.source import split_weights
@@ -149,7 +149,10 @@ def harden_from_config(
     progress.stage(LOADING)
     check_run_settings(config)
     task = make_task(config.task)
-    (loaded, *_), warnings = load_models([config.model if model is None else model], task, config)
+    try:
+        (loaded, *_), warnings = load_models([config.model if model is None else model], task, config)
+    except ModelError as error:
+        raise ModelError(f"{str(error).partition(': use `task=')[0]}; harden trains classifiers") from error
     course = Course(trainable(loaded, config.layers), loaded, config, optimiser, beside)
     splits = splits_of(config, loaded)
     with RunDirectory.of(config, resumed) as run:

@@ -193,7 +193,7 @@ def _same(one: Tensor, other: Tensor) -> bool:
 
 
 PLACES = (0.02, 0.29, 0.61, 0.97)
-"""Places in the range of what varies at which is looked what it changes."""
+"""Places in the range of what varies that are checked for what they change."""
 
 
 def why_not(renderer: Renderer, varying: Collection[str]) -> str | None:
