@@ -24,7 +24,7 @@ from advsearch.attacks.evaluation import (
 )
 from advsearch.attacks.policies.choices import Race, Raced, line_up, with_choices
 from advsearch.attacks.policies.evolution import CMAES
-from advsearch.attacks.policies.pgd import PGD, PGDState
+from advsearch.attacks.policies.pgd import PGD, Ascent
 from advsearch.attacks.policies.surrogate import Coordinates, Observed, box_coordinates
 from advsearch.errors import InputError
 
@@ -88,7 +88,7 @@ class AutoState:
     seed: int
     screen: Tensor
     spent: int = 0
-    ascent: PGDState | None = None
+    ascent: Ascent | None = None
     climbing: bool = False
     last: float = -math.inf
     trial: Tried | None = None
