@@ -109,9 +109,8 @@ class Race:
         ranked = sorted(self.field, key=lambda k: runners[k].best, reverse=True)
         able = [k for k in ranked[: -(-len(ranked) // 2)] if not runners[k].over]
         if self.round + 1 >= self.rounds or not able:  # nobody left who can go on: the renders are for whoever can
-            able = sorted((k for k, runner in enumerate(runners) if not runner.over), key=lambda k: -runners[k].best)[
-                :1
-            ]
+            left = (k for k, runner in enumerate(runners) if not runner.over)
+            able = sorted(left, key=lambda k: -runners[k].best)[:1]
         return self.begun(able, min(self.round + 1, self.rounds - 1))
 
     def _asking(self, n: int) -> tuple[tuple[Proposal, ...], Race]:

@@ -22,7 +22,7 @@ CHUNK = 2**20
 
 
 @dataclass(frozen=True, eq=False)
-class Listed:
+class PointsState:
     """Where a search stands that does not look at evaluations: how many configurations are done, and what the next ones
     come from, if not from the seed alone: points (n, k), the whole grid or so many of a sequence."""
 
@@ -32,13 +32,13 @@ class Listed:
     done: int = 0
 
 
-class Unlearning(Policy[Listed]):
+class Unlearning(Policy[PointsState]):
     """A policy that proposes what it would propose anyway."""
 
     uses_gradient: ClassVar[bool] = False
     handles_choices: ClassVar[bool] = True
 
-    def update(self, state: Listed, evaluated: Evaluated) -> Listed:
+    def update(self, state: PointsState, evaluated: Evaluated) -> PointsState:
         return state
 
 
@@ -53,10 +53,10 @@ class Random(Unlearning):
 
     name: ClassVar[str] = "random"
 
-    def start(self, domain: Domain, generator: torch.Generator, steps: int) -> Listed:
-        return Listed(domain, draw_seed(generator))
+    def start(self, domain: Domain, generator: torch.Generator, steps: int) -> PointsState:
+        return PointsState(domain, draw_seed(generator))
 
-    def propose(self, state: Listed, n: int) -> tuple[tuple[Proposal, ...], Listed]:
+    def propose(self, state: PointsState, n: int) -> tuple[tuple[Proposal, ...], PointsState]:
         numbers = range(state.done, state.done + n)
         us = (state.domain.sample(seeded(state.seed, k), extreme=k % 2 == 0)[0] for k in numbers)
         return tuple(map(Proposal, us)), replace(state, done=state.done + n)
@@ -80,7 +80,7 @@ class Sobol(Unlearning):
 
     name: ClassVar[str] = "sobol"
 
-    def start(self, domain: Domain, generator: torch.Generator, steps: int) -> Listed:
+    def start(self, domain: Domain, generator: torch.Generator, steps: int) -> PointsState:
         size = domain.dim + sum(block.norm == "l2" for block in domain.blocks)
         if size > MOST:
             raise InputError(
@@ -89,9 +89,9 @@ class Sobol(Unlearning):
         seed = draw_seed(generator)
         most = max(1, CHUNK // size)
         count = 2 ** max(0, min(steps - 1, most - 1).bit_length())
-        return Listed(domain, seed, draw(size, seed, 0, count))
+        return PointsState(domain, seed, draw(size, seed, 0, count))
 
-    def propose(self, state: Listed, n: int) -> tuple[tuple[Proposal, ...], Listed]:
+    def propose(self, state: PointsState, n: int) -> tuple[tuple[Proposal, ...], PointsState]:
         count, size = state.points.shape
         if state.done and state.done % count == 0:
             state = replace(state, points=draw(size, state.seed, state.done, count))
@@ -154,15 +154,15 @@ class Grid(Unlearning):
         if self.points < 0 or self.points == 1:
             raise InputError(f"points: expected at least 2, or 0 for as many as fit, got {self.points}")
 
-    def start(self, domain: Domain, generator: torch.Generator, steps: int) -> Listed:
+    def start(self, domain: Domain, generator: torch.Generator, steps: int) -> PointsState:
         counts = _counts(domain, steps, self.points)
         low, high = _bounds(domain)
         blocks = [block for block in domain.blocks for _ in range(block.size)]
         axes = map(_axis, blocks, counts, low.tolist(), high.tolist())
         points = torch.cartesian_prod(*axes).reshape(-1, domain.dim)
-        return Listed(domain, points=points[_coarse_to_fine(blocks, counts)])
+        return PointsState(domain, points=points[_coarse_to_fine(blocks, counts)])
 
-    def propose(self, state: Listed, n: int) -> tuple[tuple[Proposal, ...], Listed]:
+    def propose(self, state: PointsState, n: int) -> tuple[tuple[Proposal, ...], PointsState]:
         points = state.points[state.done : state.done + n]
         us = map(state.domain.project, points)
         return tuple(map(Proposal, us)), replace(state, done=state.done + len(points))
