@@ -71,6 +71,62 @@ class ArchiveState:
     wrong: tuple[bool, ...] = ()
     seen: Observed | None = None
 
+    def kept(self) -> ArchiveState:
+        """Let a copy of the archive take in what is evaluated of a generation; what could not be has no cell."""
+        values = np.array(self.values)
+        finite = np.isfinite(values)
+        archive = copy.deepcopy(self.archive)
+        if finite.any():
+            points = self.points[: len(values)][torch.from_numpy(finite)]
+            measures = points[:, self.spanned].double().numpy()
+            archive.add(points.numpy(), values[finite], measures, wrong=np.array(self.wrong)[finite])
+        return replace(self, archive=archive)
+
+    def bred(self, samples: Tensor, rng: torch.Generator) -> Tensor:
+        """Return (n, d), each made of two kept ones and maybe out of bounds; options are those of the first, now and
+        then of a sample (n, d)."""
+        count, dim = samples.shape
+        archive = copy.deepcopy(self.archive)  # it draws with a generator of its own
+        drawn = archive.sample_elites((TOURNAMENT + 1) * count)
+        kept = torch.from_numpy(drawn["solution"]).unflatten(0, (TOURNAMENT + 1, count))
+        best = torch.from_numpy(drawn["objective"]).unflatten(0, (TOURNAMENT + 1, count))[1:].argmax(0)
+        first, second = kept[1 + best, torch.arange(count)], kept[0]
+        noise = torch.randn(count, dim, generator=rng)
+        noise[:, self.spanned] *= WIDER
+        along = LINE * torch.randn(count, 1, generator=rng)
+        points: Tensor = first + SIGMA * self.half * noise + along * (second - first)
+        anew = torch.rand(count, dim, generator=rng) < ANEW
+        for block, part in self.domain.parts():
+            if block.options:
+                points[:, part] = torch.where(anew[:, part], samples[:, part], first[:, part])
+        return points
+
+    def candidates(self, box: Coordinates, rng: torch.Generator) -> Tensor:
+        """Return (n, d) configurations of a box to choose from: bred ones, some of which are moved to any cell."""
+        samples = box.low + box.width * torch.rand(CANDIDATES, box.count, generator=rng)
+        points, moved = self.bred(samples, rng), int(ELSEWHERE * CANDIDATES)
+        points[:moved, self.spanned] = samples[:moved, self.spanned]
+        return box.put(points, box.tidy((points - box.low) / box.width))
+
+    def likeliest(self, surrogate: Surrogate, points: Tensor, count: int) -> Tensor:
+        """Return (count, d) of the candidates (n, d), of different cells as long as there are: those that most likely
+        fail where nothing fails yet. Where something does, being worse than it counts for `BETTER` as much."""
+        mean, deviation = surrogate.predict(surrogate.space.take(points))
+        kept = self.archive.data()
+        objective, wrong = torch.from_numpy(kept["objective"]), torch.from_numpy(kept["wrong"])
+        enough = float(objective[wrong].min() if bool(wrong.any()) else objective.max())
+        failing = dict(zip(kept["index"][kept["wrong"]].tolist(), objective[wrong].tolist(), strict=True))
+        cells = self.archive.index_of(points[:, self.spanned].double().numpy()).tolist()
+        to_beat = torch.tensor([failing.get(cell, enough) for cell in cells])
+        weight = torch.tensor([BETTER if cell in failing else 1.0 for cell in cells])
+        likely = weight * torch.special.ndtr((mean - to_beat) / deviation)
+        order = likely.argsort(descending=True, stable=True).tolist()
+        first = dict[int, int]()  # the likeliest of each cell, in order
+        for number in order:
+            first.setdefault(cells[number], number)
+        others = [number for number in order if first[cells[number]] != number]
+        return points[[*first.values(), *others][:count]]
+
 
 @dataclass(frozen=True)
 class MapElites(Policy[ArchiveState]):
@@ -123,7 +179,7 @@ class MapElites(Policy[ArchiveState]):
     def start(self, domain: Domain, generator: torch.Generator, steps: int) -> ArchiveState:
         if domain.dim > MOST:
             raise InputError(f"policy 'archive': expected at most {MOST} numbers, got {domain.dim}; use pgd or auto")
-        seed, spanned = draw_seed(generator), _spanned(domain, self.over)
+        seed, spanned = draw_seed(generator), self._spanned(domain)
         sizes = [block.options or self.cells for block, part in domain.parts() for _ in range(block.size)]
         dims = [sizes[place] for place in spanned.tolist()]
         if math.prod(dims) > MOST_CELLS:
@@ -154,11 +210,11 @@ class MapElites(Policy[ArchiveState]):
         wrong = tuple(evaluation.success for _, evaluation in evaluated)
         seen = None if state.seen is None else state.seen.extended(evaluated)
         state = replace(state, values=(*state.values, *values), wrong=(*state.wrong, *wrong), seen=seen)
-        return state if len(state.values) < len(state.points) else self._next(_kept(state))
+        return state if len(state.values) < len(state.points) else self._next(state.kept())
 
     def failures(self, state: ArchiveState) -> Failures:
         """Return the cells whose configuration is a success; those of a generation that is not whole yet count."""
-        archive = _kept(state).archive
+        archive = state.kept().archive
         kept = archive.data()
         wrong = np.flatnonzero(kept["wrong"])
         at = archive.int_to_grid_index(kept["index"][wrong])
@@ -185,82 +241,22 @@ class MapElites(Policy[ArchiveState]):
         anew = int((torch.rand(self.population, generator=rng) < ANEW).sum())
         samples, seen = state.domain.sample(rng, self.population), state.seen
         if seen is None:
-            bred = [state.domain.project(u) for u in self._bred(state, samples[anew:], rng)]
+            bred = [state.domain.project(u) for u in state.bred(samples[anew:], rng)]
             return replace(state, points=torch.stack([*samples[:anew], *bred]))
         with one_thread():
             surrogate, seen = seen.surrogate()
-            points = _likeliest(state, surrogate, self._candidates(state, seen.space, rng), self.population - anew)
+            points = state.likeliest(surrogate, state.candidates(seen.space, rng), self.population - anew)
         return replace(state, points=torch.cat([samples[:anew], points]), seen=seen)
 
-    def _candidates(self, state: ArchiveState, box: Coordinates, rng: torch.Generator) -> Tensor:
-        """Return (n, d) configurations of a box to choose from: bred ones, some of which are moved to any cell."""
-        samples = box.low + box.width * torch.rand(CANDIDATES, box.count, generator=rng)
-        points, moved = self._bred(state, samples, rng), int(ELSEWHERE * CANDIDATES)
-        points[:moved, state.spanned] = samples[:moved, state.spanned]
-        return box.put(points, box.tidy((points - box.low) / box.width))
-
-    def _bred(self, state: ArchiveState, samples: Tensor, rng: torch.Generator) -> Tensor:
-        """Return (n, d), each made of two kept ones and maybe out of bounds; options are those of the first, now and
-        then of a sample (n, d)."""
-        count, dim = samples.shape
-        archive = copy.deepcopy(state.archive)  # it draws with a generator of its own
-        drawn = archive.sample_elites((TOURNAMENT + 1) * count)
-        kept = torch.from_numpy(drawn["solution"]).unflatten(0, (TOURNAMENT + 1, count))
-        best = torch.from_numpy(drawn["objective"]).unflatten(0, (TOURNAMENT + 1, count))[1:].argmax(0)
-        first, second = kept[1 + best, torch.arange(count)], kept[0]
-        noise = torch.randn(count, dim, generator=rng)
-        noise[:, state.spanned] *= WIDER
-        along = LINE * torch.randn(count, 1, generator=rng)
-        points: Tensor = first + SIGMA * state.half * noise + along * (second - first)
-        anew = torch.rand(count, dim, generator=rng) < ANEW
-        for block, part in state.domain.parts():
-            if block.options:
-                points[:, part] = torch.where(anew[:, part], samples[:, part], first[:, part])
-        return points
-
-
-def _likeliest(state: ArchiveState, surrogate: Surrogate, points: Tensor, count: int) -> Tensor:
-    """Return (count, d) of the candidates (n, d), of different cells as long as there are: those that most likely fail
-    where nothing fails yet. Where something does, being worse than it counts for `BETTER` as much."""
-    archive = state.archive
-    mean, deviation = surrogate.predict(surrogate.space.take(points))
-    kept = archive.data()
-    objective, wrong = torch.from_numpy(kept["objective"]), torch.from_numpy(kept["wrong"])
-    enough = float(objective[wrong].min() if bool(wrong.any()) else objective.max())
-    failing = dict(zip(kept["index"][kept["wrong"]].tolist(), objective[wrong].tolist(), strict=True))
-    cells = archive.index_of(points[:, state.spanned].double().numpy()).tolist()
-    to_beat = torch.tensor([failing.get(cell, enough) for cell in cells])
-    weight = torch.tensor([BETTER if cell in failing else 1.0 for cell in cells])
-    likely = weight * torch.special.ndtr((mean - to_beat) / deviation)
-    order = likely.argsort(descending=True, stable=True).tolist()
-    first = dict[int, int]()  # the likeliest of each cell, in order
-    for number in order:
-        first.setdefault(cells[number], number)
-    others = [number for number in order if first[cells[number]] != number]
-    return points[[*first.values(), *others][:count]]
-
-
-def _kept(state: ArchiveState) -> ArchiveState:
-    """Let a copy of the archive take in what is evaluated of a generation; what could not be has no cell."""
-    values = np.array(state.values)
-    finite = np.isfinite(values)
-    archive = copy.deepcopy(state.archive)
-    if finite.any():
-        points = state.points[: len(values)][torch.from_numpy(finite)]
-        measures = points[:, state.spanned].double().numpy()
-        archive.add(points.numpy(), values[finite], measures, wrong=np.array(state.wrong)[finite])
-    return replace(state, archive=archive)
-
-
-def _spanned(domain: Domain, over: str) -> Tensor:
-    """Return (k,) positions of the parameters of these names; of the first two without names."""
-    names = [name.strip() for name in over.split(",") if name.strip()]
-    if not names:
-        return torch.arange(min(2, domain.dim))
-    places = {name: place for place, name in enumerate(domain.names)}
-    for name in names:
-        if name not in places:
-            raise UnknownNameError("parameter in `over` of policy 'archive':", name, places)
-    if len(set(names)) != len(names) or len(names) > MOST_SPANNED:
-        raise InputError(f"over: expected 1 to {MOST_SPANNED} different parameters, got {', '.join(names)}")
-    return torch.tensor([places[name] for name in names])
+    def _spanned(self, domain: Domain) -> Tensor:
+        """Return (k,) positions of the parameters of these names; of the first two without names."""
+        names = [name.strip() for name in self.over.split(",") if name.strip()]
+        if not names:
+            return torch.arange(min(2, domain.dim))
+        places = {name: place for place, name in enumerate(domain.names)}
+        for name in names:
+            if name not in places:
+                raise UnknownNameError("parameter in `over` of policy 'archive':", name, places)
+        if len(set(names)) != len(names) or len(names) > MOST_SPANNED:
+            raise InputError(f"over: expected 1 to {MOST_SPANNED} different parameters, got {', '.join(names)}")
+        return torch.tensor([places[name] for name in names])

@@ -24,7 +24,7 @@ from advsearch.attacks.evaluation import (
 )
 from advsearch.attacks.policies.choices import Race, Raced, line_up, with_choices
 from advsearch.attacks.policies.evolution import CMAES
-from advsearch.attacks.policies.pgd import PGD, PGDState
+from advsearch.attacks.policies.pgd import PGD, Ascent
 from advsearch.attacks.policies.surrogate import Coordinates, Observed, box_coordinates
 from advsearch.errors import InputError
 
@@ -68,6 +68,28 @@ class Plan:
     gradient: WhichGradient
 
 
+def make_plan(domain: Domain, box: Coordinates, steps: int) -> Plan:
+    """Return what `steps` renders are for."""
+    if box.count == 0:
+        return Plan(steps, 0, 0, True)
+    if box.count < domain.dim:
+        screen, until = math.ceil(SCREEN_MIXED * steps), math.ceil(UNTIL_MIXED * steps)
+        return Plan(steps, screen, until, "free" if domain.gradient_cost and domain.partial_gradients else True)
+    ways = int((box.options == 0).sum())
+    screen = math.ceil(SCREEN * steps * min(1.0, LOW / max(ways, 1)))
+    until = math.ceil(UNTIL * steps) if ways <= LOW else screen
+    cost = domain.gradient_cost
+    if ways and PAYS * cost <= ways and PAYS * (1 + cost) <= steps - until:
+        return Plan(steps, screen, until, True)
+    return Plan(steps, math.ceil(SCREEN * steps), steps, True)
+
+
+def _pgd(domain: Domain) -> PGD:
+    if domain.drawn:
+        return PGD(momentum=MOMENTUM_DRAWN)
+    return PGD(momentum=MOMENTUM) if domain.exact else PGD()
+
+
 @dataclass(frozen=True, eq=False)
 class Tried:
     """A random move of the box coordinates during an ascent: where they stood, and the objective there."""
@@ -88,7 +110,7 @@ class AutoState:
     seed: int
     screen: Tensor
     spent: int = 0
-    ascent: PGDState | None = None
+    ascent: Ascent | None = None
     climbing: bool = False
     last: float = -math.inf
     trial: Tried | None = None
@@ -96,6 +118,10 @@ class AutoState:
     @property
     def box(self) -> Coordinates:
         return self.seen.space
+
+    def at(self, x: Tensor) -> Tensor:
+        """Return the configuration (d,) whose box coordinates are x and whose norm balls are at their start."""
+        return self.domain.project(self.box.put(self.domain.begin, x))
 
 
 @dataclass(frozen=True)
@@ -134,19 +160,21 @@ class Auto(Policy[AutoState]):
         state = replace(state, climbing=False, trial=None)
         if state.ascent is None and state.spent >= state.plan.until:
             with one_thread():
-                state = _begin_ascent(state)
+                state = self._begin_ascent(state)
         if state.ascent is not None:
             steps, _ = _pgd(state.domain).propose(state.ascent, n)
             if steps:
-                proposal, state = _climb(state, steps[0])
+                proposal, state = self._climb(state, state.ascent, steps[0])
                 return (proposal,), state
             if state.box.count < state.domain.dim:
                 return (), state
-        us = _screen(state, n)
+        done = len(state.seen.values)
+        us = [] if done else [state.domain.begin]
+        us += map(state.at, state.screen[max(0, done - 1) :][: n - len(us)])
         if not us:
             with one_thread():
-                x, state = _next_point(state)
-            us = [_at(state, x)]
+                x, state = self._next_point(state)
+            us = [state.at(x)]
         return tuple(map(Proposal, us)), state
 
     def update(self, state: AutoState, evaluated: Evaluated) -> AutoState:
@@ -165,90 +193,44 @@ class Auto(Policy[AutoState]):
         return domain.gradient_cost > 0 and plan.until < steps and plan.gradient is True
 
     def counts(self, state: AutoState) -> Counts:
-        return NO_COUNTS if state.ascent is None else _pgd(state.domain).counts(state.ascent)
+        return NO_COUNTS if state.ascent is None else state.ascent.counts
 
-
-def make_plan(domain: Domain, box: Coordinates, steps: int) -> Plan:
-    """Return what `steps` renders are for."""
-    if box.count == 0:
-        return Plan(steps, 0, 0, True)
-    if box.count < domain.dim:
-        screen, until = math.ceil(SCREEN_MIXED * steps), math.ceil(UNTIL_MIXED * steps)
-        return Plan(steps, screen, until, "free" if domain.gradient_cost and domain.partial_gradients else True)
-    ways = int((box.options == 0).sum())
-    screen = math.ceil(SCREEN * steps * min(1.0, LOW / max(ways, 1)))
-    until = math.ceil(UNTIL * steps) if ways <= LOW else screen
-    cost = domain.gradient_cost
-    if ways and PAYS * cost <= ways and PAYS * (1 + cost) <= steps - until:
-        return Plan(steps, screen, until, True)
-    return Plan(steps, math.ceil(SCREEN * steps), steps, True)
-
-
-# ---- the surrogate --------------------------------------------------------------------------------------------------
-
-
-def _screen(state: AutoState, most: int) -> list[Tensor]:
-    """Return up to so many configurations (d,): the start, then the screen; none where both are done."""
-    done = len(state.seen.values)
-    before = [] if done else [state.domain.begin]
-    rest = [_at(state, x) for x in state.screen[max(0, done - 1) :][: most - len(before)]]
-    return before + rest
-
-
-def _at(state: AutoState, x: Tensor) -> Tensor:
-    """Return the configuration (d,) whose box coordinates are x and whose norm balls are at their start."""
-    return state.domain.project(state.box.put(state.domain.begin, x))
-
-
-def _next_point(state: AutoState) -> tuple[Tensor, AutoState]:
-    """Return what the surrogate likes best: (k,) in the unit box."""
-    generator = seeded(state.seed, len(state.seen.values))
-    if not state.seen.finite:
-        return state.box.tidy(torch.rand(state.box.count, generator=generator)), state
-    surrogate, seen = state.seen.surrogate()
-    best = surrogate.x[surrogate.predict(surrogate.x)[0].argsort(descending=True, stable=True)]
-    centres = torch.randint(0, min(CENTRES, len(best)), (NEAR,), generator=generator)
-    centres[: NEAR // 2] = 0
-    near = state.box.moves(best[centres], generator)
-    far = state.box.tidy(torch.rand(FAR, state.box.count, generator=generator))
-    candidates = torch.cat([best[:1], near, far])
-    mean, deviation = surrogate.predict(candidates)
-    return candidates[int((mean + CURIOSITY * deviation).argmax())], replace(state, seen=seen)
-
-
-# ---- the ascent -----------------------------------------------------------------------------------------------------
-
-
-def _pgd(domain: Domain) -> PGD:
-    if domain.drawn:
-        return PGD(momentum=MOMENTUM_DRAWN)
-    return PGD(momentum=MOMENTUM) if domain.exact else PGD()
-
-
-def _begin_ascent(state: AutoState) -> AutoState:
-    """Let PGD go on from the best of the points seen so far, with small steps in the box."""
-    x = state.box.take(state.domain.begin)
-    if state.seen.finite:
+    def _next_point(self, state: AutoState) -> tuple[Tensor, AutoState]:
+        """Return what the surrogate likes best: (k,) in the unit box."""
+        box, generator = state.box, seeded(state.seed, len(state.seen.values))
+        if not state.seen.finite:
+            return box.tidy(torch.rand(box.count, generator=generator)), state
         surrogate, seen = state.seen.surrogate()
-        state = replace(state, seen=seen)
-        x = surrogate.x[int(surrogate.predict(surrogate.x)[0].argmax())]
-    blocks = tuple(
-        replace(block, reach=REACH * block.radius) if block.norm == "box" else block for block in state.domain.blocks
-    )
-    domain = replace(state.domain, blocks=blocks)
-    ascent = _pgd(domain).start(domain, seeded(state.seed, 0), max(1, state.plan.steps - state.spent))
-    return replace(state, ascent=replace(ascent, u=domain.project(state.box.put(domain.begin, x))))
+        best = surrogate.x[surrogate.predict(surrogate.x)[0].argsort(descending=True, stable=True)]
+        centres = torch.randint(0, min(CENTRES, len(best)), (NEAR,), generator=generator)
+        centres[: NEAR // 2] = 0
+        near = box.moves(best[centres], generator)
+        far = box.tidy(torch.rand(FAR, box.count, generator=generator))
+        candidates = torch.cat([best[:1], near, far])
+        mean, deviation = surrogate.predict(candidates)
+        return candidates[int((mean + CURIOSITY * deviation).argmax())], replace(state, seen=seen)
 
+    def _begin_ascent(self, state: AutoState) -> AutoState:
+        """Let PGD go on from the best of the points seen so far, with small steps in the box."""
+        x = state.box.take(state.domain.begin)
+        if state.seen.finite:
+            surrogate, seen = state.seen.surrogate()
+            state = replace(state, seen=seen)
+            x = surrogate.x[int(surrogate.predict(surrogate.x)[0].argmax())]
+        blocks = (replace(one, reach=REACH * one.radius) if one.norm == "box" else one for one in state.domain.blocks)
+        domain = replace(state.domain, blocks=tuple(blocks))
+        ascent = _pgd(domain).start(domain, seeded(state.seed, 0), max(1, state.plan.steps - state.spent))
+        return replace(state, ascent=replace(ascent, u=state.at(x)))
 
-def _climb(state: AutoState, proposal: Proposal) -> tuple[Proposal, AutoState]:
-    """The ascent's proposal; with a gradient for the balls alone, every second one with a random move in the box."""
-    state = replace(state, climbing=True)
-    if state.plan.gradient is not True and state.ascent is not None and state.ascent.count % 2:
+    def _climb(self, state: AutoState, ascent: Ascent, proposal: Proposal) -> tuple[Proposal, AutoState]:
+        """Return the ascent's proposal; every second one moves in the box too, where only the balls have a gradient."""
+        state, gradient = replace(state, climbing=True), state.plan.gradient
+        if gradient is True or ascent.count % 2 == 0:
+            return replace(proposal, gradient=gradient), state
         x = state.box.take(proposal.u)
-        moved = state.box.moves(x[None], seeded(state.seed, state.plan.steps + state.ascent.count))[0]
+        moved = state.box.moves(x[None], seeded(state.seed, state.plan.steps + ascent.count))[0]
         u = state.domain.project(state.box.put(proposal.u, moved))
-        return replace(proposal, u=u, gradient=state.plan.gradient), replace(state, trial=Tried(x, state.last))
-    return replace(proposal, gradient=state.plan.gradient), state
+        return replace(proposal, u=u, gradient=gradient), replace(state, trial=Tried(x, state.last))
 
 
 @dataclass(frozen=True)

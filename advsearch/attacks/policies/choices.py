@@ -55,6 +55,111 @@ class Race:
     spent: int = 0
     asked: tuple[int, ...] = ()
 
+    @property
+    def leader(self) -> int:
+        """The number of the search that has met the largest objective so far, the first of equals."""
+        return max(range(len(self.runners)), key=lambda k: self.runners[k].best)
+
+    def propose(self, n: int) -> tuple[tuple[Proposal, ...], Race]:
+        """Return the next proposals of this round, up to n; of the next round where this one is done."""
+        race = self
+        while True:
+            batch, race = race._asking(n)
+            if batch or all(runner.over for runner in race.runners):
+                return batch, race
+            race = race._next_round()
+
+    def update(self, evaluated: Evaluated) -> Race:
+        """Tell each search what came of its proposals, or of the first of them; every u and its evaluation are as its
+        own domain has them."""
+        told = defaultdict[int, list[Any]](list)
+        for number, (u, evaluation) in zip(self.asked, evaluated, strict=False):
+            told[number].append((u, evaluation))
+        runners = list(self.runners)
+        for number, own in told.items():
+            runner, reached = runners[number], max(evaluation.objective for _, evaluation in own)
+            state = runner.policy.update(runner.state, own)
+            runners[number] = replace(runner, state=state, best=max(runner.best, reached))
+        spent = self.spent + sum(evaluation.cost for _, evaluation in evaluated)
+        return replace(self, runners=tuple(runners), spent=spent, asked=())
+
+    def answer(self) -> Distribution | None:
+        """Return the leader's distribution, if it has one."""
+        runner = self.runners[self.leader]
+        return runner.policy.answer(runner.state)
+
+    def failures(self) -> Failures | None:
+        """Return the different failures of the search that has met the most; None where none looks for such."""
+        found = (runner.policy.failures(runner.state) for runner in self.runners)
+        return max((one for one in found if one is not None), key=lambda one: one.found, default=None)
+
+    def counts(self) -> Counts:
+        """Return the sum over all searches."""
+        return sum((runner.policy.counts(runner.state) for runner in self.runners), NO_COUNTS)
+
+    def begun(self, field: Iterable[int], number: int) -> Race:
+        """Return the race at the beginning of a round, with equal shares for those that are in it."""
+        field = tuple(field)
+        share = max(1, (self.steps - self.spent) // (self.rounds - number) // len(field))
+        runners = [replace(runner, left=share if k in field else 0) for k, runner in enumerate(self.runners)]
+        return replace(self, runners=tuple(runners), field=field, round=number)
+
+    def _next_round(self) -> Race:
+        runners = self.runners
+        ranked = sorted(self.field, key=lambda k: runners[k].best, reverse=True)
+        able = [k for k in ranked[: -(-len(ranked) // 2)] if not runners[k].over]
+        if self.round + 1 >= self.rounds or not able:  # nobody left who can go on: the renders are for whoever can
+            left = (k for k, runner in enumerate(runners) if not runner.over)
+            able = sorted(left, key=lambda k: -runners[k].best)[:1]
+        return self.begun(able, min(self.round + 1, self.rounds - 1))
+
+    def _asking(self, n: int) -> tuple[tuple[Proposal, ...], Race]:
+        """Return up to n proposals of this round that do not wait for each other; none where it is done."""
+        runners, field = list(self.runners), self.field
+        queue = _queue(runners, field)
+        each = -(-n // max(1, len(queue)))
+        given, taken = dict[int, tuple[Proposal, ...]](), Counter[int]()
+        batch, asked = list[Proposal](), list[int]()
+        while queue and len(batch) < n:
+            _, place = queue[0]
+            k = field[place]
+            runner = runners[k]
+            if k not in given:
+                given[k], state = runner.policy.propose(runner.state, min(each, runner.left))
+                runner = replace(runner, state=state)
+            if not given[k]:
+                # take out a search that has nothing more to propose; its share is for those left in the round
+                share, runners[k] = runners[k].left, replace(runners[k], left=0, over=True)
+                others = [other for other in field if not runners[other].over]
+                for other in others:
+                    runners[other] = replace(runners[other], left=runners[other].left + share // len(others))
+                queue = _queue(runners, field)
+                continue
+            if taken[k] == len(given[k]):  # what it proposes next, these evaluations say
+                break
+            wanted = given[k][taken[k]]
+            capped = replace(wanted, samples=min(runner.left, wanted.samples))
+            later = self.round + 1 < self.rounds  # there will be renders to use a gradient
+            batch.append(affordable(capped, runner.domain, runner.left + later))
+            asked.append(k)
+            taken[k] += 1
+            runners[k] = replace(runner, left=runner.left - batch[-1].cost(runner.domain))
+            heappop(queue)
+            if runners[k].left:
+                heappush(queue, (-runners[k].left, place))
+        for k, count in taken.items():
+            if count < len(given[k]):  # it shall not count on more than was taken
+                _, state = runners[k].policy.propose(self.runners[k].state, count)
+                runners[k] = replace(runners[k], state=state)
+        return tuple(batch), replace(self, runners=tuple(runners), asked=tuple(asked))
+
+
+def _queue(runners: Sequence[Runner], field: Sequence[int]) -> list[tuple[int, int]]:
+    """Return a heap of places in the field, first that of whoever has most left: the first of equals."""
+    queue = [(-runners[k].left, place) for place, k in enumerate(field) if runners[k].left]
+    heapify(queue)
+    return queue
+
 
 def count_rounds(runners: int) -> int:
     """Return how many rounds a race has: 1 + ceil(log2 runners)."""
@@ -83,141 +188,26 @@ def line_up(
         Runner(policy, domain, policy.start(domain, seeded(seed, number), max(1, int(planned))))
         for number, (policy, domain) in enumerate(searches)
     )
-    return _begin(Race(runners, steps, rounds), range(len(runners)), 0)
-
-
-def propose(race: Race, n: int) -> tuple[tuple[Proposal, ...], Race]:
-    """Return the next proposals of this round, up to n; of the next round where this one is done."""
-    while True:
-        batch, race = _ask(race, n)
-        if batch or all(runner.over for runner in race.runners):
-            return batch, race
-        race = _next_round(race)
-
-
-def update(race: Race, evaluated: Evaluated) -> Race:
-    """Tell each search what came of its proposals, or of the first of them; every u and its evaluation are as its own
-    domain has them."""
-    told = defaultdict[int, list[Any]](list)
-    for number, (u, evaluation) in zip(race.asked, evaluated, strict=False):
-        told[number].append((u, evaluation))
-    runners = list(race.runners)
-    for number, own in told.items():
-        runner, reached = runners[number], max(evaluation.objective for _, evaluation in own)
-        state = runner.policy.update(runner.state, own)
-        runners[number] = replace(runner, state=state, best=max(runner.best, reached))
-    spent = race.spent + sum(evaluation.cost for _, evaluation in evaluated)
-    return replace(race, runners=tuple(runners), spent=spent, asked=())
-
-
-def leader(race: Race) -> int:
-    """Return the number of the search that has met the largest objective so far, the first of equals."""
-    return max(range(len(race.runners)), key=lambda k: race.runners[k].best)
-
-
-def answer(race: Race) -> Distribution | None:
-    """Return the leader's distribution, if it has one."""
-    runner = race.runners[leader(race)]
-    return runner.policy.answer(runner.state)
-
-
-def failures(race: Race) -> Failures | None:
-    """Return the different failures of the search that has met the most; None where none looks for such."""
-    found = (runner.policy.failures(runner.state) for runner in race.runners)
-    return max((one for one in found if one is not None), key=lambda one: one.found, default=None)
-
-
-def counts(race: Race) -> Counts:
-    """Return the sum over all searches."""
-    return sum((runner.policy.counts(runner.state) for runner in race.runners), NO_COUNTS)
+    return Race(runners, steps, rounds).begun(range(len(runners)), 0)
 
 
 class Raced(Policy[Race]):
     """A policy that is a race; its `start` lines it up."""
 
     def propose(self, state: Race, n: int) -> tuple[tuple[Proposal, ...], Race]:
-        return propose(state, n)
+        return state.propose(n)
 
     def update(self, state: Race, evaluated: Evaluated) -> Race:
-        return update(state, evaluated)
+        return state.update(evaluated)
 
     def answer(self, state: Race) -> Distribution | None:
-        return answer(state)
+        return state.answer()
 
     def failures(self, state: Race) -> Failures | None:
-        return failures(state)
+        return state.failures()
 
     def counts(self, state: Race) -> Counts:
-        return counts(state)
-
-
-# ---- turns and rounds -----------------------------------------------------------------------------------------------
-
-
-def _begin(race: Race, field: Iterable[int], number: int) -> Race:
-    field = tuple(field)
-    share = max(1, (race.steps - race.spent) // (race.rounds - number) // len(field))
-    runners = [replace(runner, left=0) for runner in race.runners]
-    for k in field:
-        runners[k] = replace(runners[k], left=share)
-    return replace(race, runners=tuple(runners), field=field, round=number)
-
-
-def _next_round(race: Race) -> Race:
-    runners = race.runners
-    ranked = sorted(race.field, key=lambda k: runners[k].best, reverse=True)
-    able = [k for k in ranked[: -(-len(ranked) // 2)] if not runners[k].over]
-    if race.round + 1 >= race.rounds or not able:  # nobody left who can go on: the renders are for whoever still can
-        able = sorted((k for k, runner in enumerate(runners) if not runner.over), key=lambda k: -runners[k].best)[:1]
-    return _begin(race, able, min(race.round + 1, race.rounds - 1))
-
-
-def _ask(race: Race, n: int) -> tuple[tuple[Proposal, ...], Race]:
-    """Return up to n proposals of this round that do not wait for each other; none where it is done."""
-    runners, field = list(race.runners), race.field
-    queue = _queue(runners, field)
-    each = -(-n // max(1, len(queue)))
-    given, taken = dict[int, tuple[Proposal, ...]](), Counter[int]()
-    batch, asked = list[Proposal](), list[int]()
-    while queue and len(batch) < n:
-        _, place = queue[0]
-        k = field[place]
-        runner = runners[k]
-        if k not in given:
-            given[k], state = runner.policy.propose(runner.state, min(each, runner.left))
-            runner = replace(runner, state=state)
-        if not given[k]:
-            # take out a search that has nothing more to propose; its share is for those that are left in the round
-            share, runners[k] = runners[k].left, replace(runners[k], left=0, over=True)
-            others = [other for other in field if not runners[other].over]
-            for other in others:
-                runners[other] = replace(runners[other], left=runners[other].left + share // len(others))
-            queue = _queue(runners, field)
-            continue
-        if taken[k] == len(given[k]):  # what it proposes next, these evaluations say
-            break
-        wanted = given[k][taken[k]]
-        capped = replace(wanted, samples=min(runner.left, wanted.samples))
-        later = race.round + 1 < race.rounds  # there will be renders to use a gradient
-        batch.append(affordable(capped, runner.domain, runner.left + later))
-        asked.append(k)
-        taken[k] += 1
-        runners[k] = replace(runner, left=runner.left - batch[-1].cost(runner.domain))
-        heappop(queue)
-        if runners[k].left:
-            heappush(queue, (-runners[k].left, place))
-    for k, count in taken.items():
-        if count < len(given[k]):  # it shall not count on more than was taken
-            _, state = runners[k].policy.propose(race.runners[k].state, count)
-            runners[k] = replace(runners[k], state=state)
-    return tuple(batch), replace(race, runners=tuple(runners), asked=tuple(asked))
-
-
-def _queue(runners: Sequence[Runner], field: Sequence[int]) -> list[tuple[int, int]]:
-    """Return a heap of places in the field, first that of whoever has most left: the first of equals."""
-    queue = [(-runners[k].left, place) for place, k in enumerate(field) if runners[k].left]
-    heapify(queue)
-    return queue
+        return state.counts()
 
 
 @dataclass(frozen=True)
@@ -255,6 +245,13 @@ class ChoicesState:
     choices: Tensor
     combinations: Tensor
     race: Race
+
+    def whole(self, numbers: Tensor, combination: int) -> Tensor:
+        """Return the configuration (d,) of these numbers, beside a combination of options."""
+        u = self.domain.begin.clone()
+        u[self.numbers] = numbers[: len(self.numbers)]
+        u[self.choices] = self.combinations[combination]
+        return u
 
 
 @dataclass(frozen=True)
@@ -299,28 +296,28 @@ class Choices(Policy[ChoicesState]):
         return ChoicesState(domain, numbers, choices, combinations, race)
 
     def propose(self, state: ChoicesState, n: int) -> tuple[tuple[Proposal, ...], ChoicesState]:
-        proposals, race = propose(state.race, n)
-        state = replace(state, race=race)
+        proposals, race = state.race.propose(n)
         asked = zip(proposals, race.asked, strict=True)
-        return tuple(replace(proposal, u=_whole(state, proposal.u, number)) for proposal, number in asked), state
+        us = tuple(replace(proposal, u=state.whole(proposal.u, number)) for proposal, number in asked)
+        return us, replace(state, race=race)
 
     def update(self, state: ChoicesState, evaluated: Evaluated) -> ChoicesState:
         inner, numbers = [], state.numbers
         for u, one in evaluated:
             gradient = None if one.gradient is None else one.gradient[numbers]
             inner.append((u[numbers], replace(one, gradient=gradient)))
-        return replace(state, race=update(state.race, inner))
+        return replace(state, race=state.race.update(inner))
 
     def counts(self, state: ChoicesState) -> Counts:
-        return counts(state.race)
+        return state.race.counts()
 
     def answer(self, state: ChoicesState) -> Distribution | None:
-        inner = answer(state.race)
+        inner = state.race.answer()
         if inner is None:
             return None
         deviation = torch.zeros_like(state.domain.start)
         deviation[state.numbers] = inner.deviation
-        return Distribution(_whole(state, inner.mean, leader(state.race)), deviation)
+        return Distribution(state.whole(inner.mean, state.race.leader), deviation)
 
 
 def with_choices(policy: Policy[Any], domain: Domain) -> Policy[Any]:
@@ -340,13 +337,6 @@ def _without(domain: Domain, numbers: Tensor) -> Domain | None:
         return None
     first = None if domain.first is None else domain.first[numbers]
     return replace(domain, start=domain.start[numbers], blocks=blocks, first=first)
-
-
-def _whole(state: ChoicesState, numbers: Tensor, combination: int) -> Tensor:
-    u = state.domain.begin.clone()
-    u[state.numbers] = numbers[: len(state.numbers)]
-    u[state.choices] = state.combinations[combination]
-    return u
 
 
 def _combinations(counts: list[int], begin: Tensor, most: int, generator: torch.Generator) -> Tensor:

@@ -21,6 +21,33 @@ from advsearch.attacks.evaluation import Evaluated, Policy, Proposal, draw_seed,
 from advsearch.errors import InputError
 from advsearch.seeds import stream
 
+FULL = 80
+"""Up to so many numbers have a full covariance matrix; more have its diagonal (Ros and Hansen 2008). Also about the
+size from which the linear algebra would use several threads, whose last bits may differ."""
+
+MOST = 10_000
+"""More numbers are refused: a generation would take longer than renders, and the ascent along a gradient is far ahead
+long before."""
+
+WIDEST, NARROWEST = 10.0, 1e-3
+"""In half ranges: the step size grows no further (it does where all objectives are equal), and a run is over when its
+largest deviation is no more than this."""
+
+Doubles = npt.NDArray[np.float64]
+
+
+def utilities(values: Sequence[float]) -> list[float]:
+    """Return weights that sum to zero, larger for larger objectives; equal objectives share theirs."""
+    n = len(values)
+    by_rank = [max(0.0, math.log(n / 2 + 1) - math.log(rank)) for rank in range(1, n + 1)]
+    total = math.fsum(by_rank)
+    ranked = sorted(values, reverse=True)
+    weight = {}
+    for value in set(values):
+        first, count = ranked.index(value), ranked.count(value)
+        weight[value] = math.fsum(by_rank[first : first + count]) / count / total - 1.0 / n
+    return [weight[value] for value in values]
+
 
 @dataclass(frozen=True, eq=False)
 class NESState:
@@ -36,6 +63,13 @@ class NESState:
     population: int
     generation: int = 0
     values: tuple[float, ...] = ()
+
+    def noise(self, number: int) -> Tensor:
+        """Return sample `number` of the generation, (d,) standard normal; odd ones mirror the one before."""
+        pair, mirrored = divmod(number, 2)
+        generator = seeded(self.seed, self.generation * (self.population // 2) + pair)
+        noise = torch.randn(self.domain.dim, generator=generator)
+        return noise.neg_() if mirrored else noise
 
 
 @dataclass(frozen=True)
@@ -91,65 +125,45 @@ class NES(Policy[NESState]):
 
     def propose(self, state: NESState, n: int) -> tuple[tuple[Proposal, ...], NESState]:
         numbers = range(len(state.values), min(len(state.values) + n, state.population))
-        moves = (state.scale * state.deviation * _noise(state, number) for number in numbers)
+        moves = (state.scale * state.deviation * state.noise(number) for number in numbers)
         return tuple(Proposal(state.domain.project(state.mean + move)) for move in moves), state
 
     def update(self, state: NESState, evaluated: Evaluated) -> NESState:
         state = replace(state, values=(*state.values, *(evaluation.objective for _, evaluation in evaluated)))
-        return state if len(state.values) < state.population else _learn(state)
+        if len(state.values) < state.population:
+            return state
+        weights, d = utilities(state.values), state.domain.dim
+        towards, wider = torch.zeros(d), torch.zeros(d)
+        for first in range(0, state.population, 2):
+            noise = state.noise(first)
+            towards.add_(noise, alpha=weights[first] - weights[first + 1])
+            wider.addcmul_(noise, noise, value=weights[first] + weights[first + 1])
+        rate = (3.0 + math.log(d)) / (5.0 * math.sqrt(d))  # weights sum to zero, so the -1 of every term drops out
+        deviation = (state.deviation * wider.mul_(rate / 2.0).exp_()).clamp_(NARROWEST, WIDEST)
+        mean = state.domain.project(state.mean + state.scale * state.deviation * towards)
+        return replace(state, mean=mean, deviation=deviation, generation=state.generation + 1, values=())
 
     def answer(self, state: NESState) -> Distribution:
         return Distribution(state.mean, state.scale * state.deviation)
 
 
-def _noise(state: NESState, number: int) -> Tensor:
-    """Return sample `number` of the generation, (d,) standard normal; odd ones mirror the one before."""
-    pair, mirrored = divmod(number, 2)
-    generator = seeded(state.seed, state.generation * (state.population // 2) + pair)
-    noise = torch.randn(state.domain.dim, generator=generator)
-    return noise.neg_() if mirrored else noise
+def _normal(*shape: int) -> Doubles:
+    """Standard normal numbers from numpy's global generator. A copy of pycma's default, a method of that generator,
+    would carry a generator of its own along."""
+    return np.random.standard_normal(shape)  # noqa: NPY002
 
 
-def utilities(values: Sequence[float]) -> list[float]:
-    """Return weights that sum to zero, larger for larger objectives; equal objectives share theirs."""
-    n = len(values)
-    by_rank = [max(0.0, math.log(n / 2 + 1) - math.log(rank)) for rank in range(1, n + 1)]
-    total = math.fsum(by_rank)
-    ranked = sorted(values, reverse=True)
-    weight = {}
-    for value in set(values):
-        first, count = ranked.index(value), ranked.count(value)
-        weight[value] = math.fsum(by_rank[first : first + count]) / count / total - 1.0 / n
-    return [weight[value] for value in values]
-
-
-def _learn(state: NESState) -> NESState:
-    weights = utilities(state.values)
-    d = state.domain.dim
-    towards, wider = torch.zeros(d), torch.zeros(d)
-    for first in range(0, state.population, 2):
-        noise = _noise(state, first)
-        towards.add_(noise, alpha=weights[first] - weights[first + 1])
-        wider.addcmul_(noise, noise, value=weights[first] + weights[first + 1])
-    rate = (3.0 + math.log(d)) / (5.0 * math.sqrt(d))  # weights sum to zero, so the -1 of every term drops out
-    deviation = (state.deviation * wider.mul_(rate / 2.0).exp_()).clamp_(NARROWEST, WIDEST)
-    mean = state.domain.project(state.mean + state.scale * state.deviation * towards)
-    return replace(state, mean=mean, deviation=deviation, generation=state.generation + 1, values=())
-
-
-FULL = 80
-"""Up to so many numbers have a full covariance matrix; more have its diagonal (Ros and Hansen 2008). Also about the
-size from which the linear algebra would use several threads, whose last bits may differ."""
-
-MOST = 10_000
-"""More numbers are refused: a generation would take longer than renders, and the ascent along a gradient is far ahead
-long before."""
-
-WIDEST, NARROWEST = 10.0, 1e-3
-"""In half ranges: the step size grows no further (it does where all objectives are equal), and a run is over when its
-largest deviation is no more than this."""
-
-Doubles = npt.NDArray[np.float64]
+@contextmanager
+def _own_random(seed: int, generation: int) -> Iterator[None]:
+    """Let pycma draw numbers of its own from numpy's global generator, and put that back; its warnings are not ours."""
+    before = np.random.get_state()  # noqa: NPY002
+    np.random.seed(stream(seed, "pycma", generation))  # noqa: NPY002
+    try:
+        with warnings.catch_warnings(), one_thread():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        np.random.set_state(before)  # noqa: NPY002
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,6 +185,49 @@ class CMAESState:
     outside: tuple[float, ...] = ()
     best: float = -math.inf
     before: tuple[float, Distribution] | None = None
+
+    @property
+    def deviations(self) -> Doubles:
+        """(d,) of the distribution, in half ranges."""
+        return np.asarray(self.strategy.stds, dtype=np.float64)
+
+    @property
+    def distribution(self) -> Distribution:
+        """The distribution that this run has reached."""
+        mean, _ = self.projected(np.asarray(self.strategy.mean))
+        return Distribution(mean, torch.from_numpy(self.deviations).float() * self.scale)
+
+    def projected(self, x: Doubles) -> tuple[Tensor, float]:
+        """Return the configuration for coordinates x, and how far outside they lie: mean square over the elements."""
+        wanted = torch.add(self.origin, self.scale * torch.from_numpy(x).float())
+        u = self.domain.project(wanted)
+        excess = ((wanted - u) / self.scale).masked_fill_(self.wraps, 0.0)
+        return u, float(torch.dot(excess, excess)) / len(x)
+
+    def ask(self) -> CMAESState:
+        """Draw a generation; the strategy belongs to nobody else yet."""
+        number = self.generation + 1
+        with _own_random(self.seed, number):
+            points = np.array(self.strategy.ask())
+        return replace(self, generation=number, points=points, values=(), outside=())
+
+    def tell(self) -> CMAESState:
+        """Let a copy of the strategy learn from a whole generation."""
+        values = np.array(self.values)
+        finite = np.isfinite(values)
+        spread = 0.0
+        if finite.any():
+            low, high = np.percentile(values[finite], (25, 75))
+            spread = float(high - low)
+            values[~finite] = values[finite].min() - spread
+        else:
+            values[:] = 0.0
+        strategy = copy.deepcopy(self.strategy)
+        penalty = spread * np.array(self.outside) / max(strategy.sigma, 1e-30) ** 2
+        with _own_random(self.seed, self.generation):
+            strategy.tell(list(self.points), list(penalty - values))
+        strategy.sigma = min(strategy.sigma, WIDEST)
+        return replace(self, strategy=strategy)
 
 
 @dataclass(frozen=True)
@@ -222,119 +279,51 @@ class CMAES(Policy[CMAESState]):
             raise InputError(f"policy 'cmaes': expected at most {MOST} numbers, got {d}; use policy pgd, auto or nes")
         population = self.population or 4 + int(3 * math.log(d))
         seed = draw_seed(generator)
-        strategy = _strategy(d, self.sigma, population, seed)
+        strategy = self._strategy(d, population, seed)
         scale, around, none = half_widths(domain), wraps(domain), np.empty((0, d))
-        return _ask(CMAESState(domain, seed, domain.begin, scale, around, strategy, 0, none))
+        return CMAESState(domain, seed, domain.begin, scale, around, strategy, 0, none).ask()
 
     def propose(self, state: CMAESState, n: int) -> tuple[tuple[Proposal, ...], CMAESState]:
         points = state.points[len(state.values) :][:n]
-        return tuple(Proposal(_projected(state, x)[0]) for x in points), state
+        return tuple(Proposal(state.projected(x)[0]) for x in points), state
 
     def update(self, state: CMAESState, evaluated: Evaluated) -> CMAESState:
         values = [evaluation.objective for _, evaluation in evaluated]
-        outside = [_projected(state, x)[1] for x in state.points[len(state.values) :][: len(values)]]
+        outside = [state.projected(x)[1] for x in state.points[len(state.values) :][: len(values)]]
         best = max(state.best, *values)
         state = replace(state, values=(*state.values, *values), outside=(*state.outside, *outside), best=best)
         if len(state.values) < len(state.points):
             return state
-        state = _tell(state)
-        return _ask(state if float(_deviations(state).max()) > NARROWEST else _anew(state, self.sigma))
+        state = state.tell()
+        return (state if float(state.deviations.max()) > NARROWEST else self._anew(state)).ask()
 
     def answer(self, state: CMAESState) -> Distribution:
         if state.before is not None and state.before[0] > state.best:
             return state.before[1]
-        return _distribution(state)
+        return state.distribution
 
+    def _strategy(self, d: int, population: int, seed: int) -> Any:
+        """Return pycma's object for a run, before its first generation."""
+        options = {
+            "CMA_diagonal": d > FULL,
+            "popsize": population,
+            "randn": _normal,
+            "seed": math.nan,
+            "signals_filename": "",
+            "verbose": -9,
+            "verb_log": 0,
+        }
+        with _own_random(seed, 0):
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                import cma  # takes most of a second, and complains where there is no matplotlib
+            return cma.CMAEvolutionStrategy(np.zeros(d), self.sigma, options)
 
-# ---- generations ----------------------------------------------------------------------------------------------------
-
-
-def _strategy(d: int, sigma: float, population: int, seed: int) -> Any:
-    """Return pycma's object for a run, before its first generation."""
-    options = {
-        "CMA_diagonal": d > FULL,
-        "popsize": population,
-        "randn": _normal,
-        "seed": math.nan,
-        "signals_filename": "",
-        "verbose": -9,
-        "verb_log": 0,
-    }
-    with _own_random(seed, 0):
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            import cma  # takes most of a second, and complains where there is no matplotlib
-        return cma.CMAEvolutionStrategy(np.zeros(d), sigma, options)
-
-
-def _anew(state: CMAESState, sigma: float) -> CMAESState:
-    """Begin another run elsewhere with twice the population, and remember the better one of those that are over."""
-    before = state.before
-    if before is None or state.best > before[0]:
-        before = (state.best, _distribution(state))
-    strategy = _strategy(state.domain.dim, sigma, 2 * len(state.points), state.seed)
-    origin = state.domain.sample(seeded(state.seed, state.generation))[0]
-    return replace(state, origin=origin, strategy=strategy, best=-math.inf, before=before)
-
-
-def _deviations(state: CMAESState) -> Doubles:
-    return np.asarray(state.strategy.stds, dtype=np.float64)
-
-
-def _distribution(state: CMAESState) -> Distribution:
-    deviation = torch.from_numpy(_deviations(state)).float() * state.scale
-    return Distribution(_projected(state, np.asarray(state.strategy.mean))[0], deviation)
-
-
-def _projected(state: CMAESState, x: Doubles) -> tuple[Tensor, float]:
-    """Return the configuration for coordinates x, and how far outside they lie: mean square over the elements."""
-    wanted = torch.add(state.origin, state.scale * torch.from_numpy(x).float())
-    u = state.domain.project(wanted)
-    excess = ((wanted - u) / state.scale).masked_fill_(state.wraps, 0.0)
-    return u, float(torch.dot(excess, excess)) / len(x)
-
-
-def _ask(state: CMAESState) -> CMAESState:
-    """Draw a generation; the strategy belongs to nobody else yet."""
-    number = state.generation + 1
-    with _own_random(state.seed, number):
-        points = np.array(state.strategy.ask())
-    return replace(state, generation=number, points=points, values=(), outside=())
-
-
-def _tell(state: CMAESState) -> CMAESState:
-    """Let a copy of the strategy learn from a whole generation."""
-    values = np.array(state.values)
-    finite = np.isfinite(values)
-    spread = 0.0
-    if finite.any():
-        low, high = np.percentile(values[finite], (25, 75))
-        spread = float(high - low)
-        values[~finite] = values[finite].min() - spread
-    else:
-        values[:] = 0.0
-    strategy = copy.deepcopy(state.strategy)
-    penalty = spread * np.array(state.outside) / max(strategy.sigma, 1e-30) ** 2
-    with _own_random(state.seed, state.generation):
-        strategy.tell(list(state.points), list(penalty - values))
-    strategy.sigma = min(strategy.sigma, WIDEST)
-    return replace(state, strategy=strategy)
-
-
-def _normal(*shape: int) -> Doubles:
-    """Standard normal numbers from numpy's global generator. A copy of pycma's default, a method of that generator,
-    would carry a generator of its own along."""
-    return np.random.standard_normal(shape)  # noqa: NPY002
-
-
-@contextmanager
-def _own_random(seed: int, generation: int) -> Iterator[None]:
-    """Let pycma draw numbers of its own from numpy's global generator, and put that back; its warnings are not ours."""
-    before = np.random.get_state()  # noqa: NPY002
-    np.random.seed(stream(seed, "pycma", generation))  # noqa: NPY002
-    try:
-        with warnings.catch_warnings(), one_thread():
-            warnings.simplefilter("ignore")
-            yield
-    finally:
-        np.random.set_state(before)  # noqa: NPY002
+    def _anew(self, state: CMAESState) -> CMAESState:
+        """Begin another run elsewhere with twice the population, and remember the better one of those that are over."""
+        before = state.before
+        if before is None or state.best > before[0]:
+            before = (state.best, state.distribution)
+        strategy = self._strategy(state.domain.dim, 2 * len(state.points), state.seed)
+        origin = state.domain.sample(seeded(state.seed, state.generation))[0]
+        return replace(state, origin=origin, strategy=strategy, best=-math.inf, before=before)

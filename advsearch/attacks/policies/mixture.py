@@ -87,6 +87,27 @@ class Components:
         option = torch.multinomial(self.options[k], 1, generator=generator)[:, 0]
         return torch.where(ranges.counts > 0, (option + 0.5) / ranges.counts.clamp(min=1), x)
 
+    def maximised(self, x: Tensor, weights: Tensor, ranges: Ranges, even: Tensor) -> Components:
+        """Return the components that make the weighted draws (n, d) x likelier, each with its prior; `even` is that of
+        options (k, d, most options)."""
+        shared = self.logs(x, ranges).softmax(dim=1) * weights[:, None]
+        counts = shared.sum(dim=0)
+        portion = (shared / counts.clamp(min=1e-12)).T
+        away = ranges.away(x[:, None], self.means)
+        shift = torch.einsum("kn,nkd->kd", portion, away)
+        spread = torch.einsum("kn,nkd->kd", portion, (away - shift).square())
+        own = counts[:, None]
+        variance = ((own * spread + PRIOR * EVEN**2) / (own + PRIOR)).clamp(max=0.999 * EVEN**2)
+        deviations = (1.0 / (1.0 / variance - 1.0 / EVEN**2)).sqrt().clamp(NARROWEST, FLAT)  # the even one divided out
+        means = self.means + shift
+        tilted = (deviations.square() * (means / variance - 0.5 / EVEN**2)).clamp(0.0, 1.0)
+        means = torch.where(ranges.around, torch.remainder(means, 1.0), tilted)
+        chosen = torch.nn.functional.one_hot((x * ranges.counts).long().clamp(max=even.shape[2] - 1), even.shape[2])
+        often = torch.einsum("kn,ndo->kdo", portion, chosen.double())
+        options = (own[..., None] * often + PRIOR * even) / (own[..., None] + PRIOR)
+        share = counts / counts.sum()
+        return Components(0.75 * share + 0.25 / len(share), means, deviations, options)
+
 
 @dataclass(frozen=True, eq=False)
 class MixtureState:
@@ -103,6 +124,29 @@ class MixtureState:
     seen: Tensor
     log: Tensor
     told: int = 0
+
+    def configuration(self, x: Tensor) -> Tensor:
+        """Return the configuration (d,) for shares x of the ranges."""
+        return self.domain.project((self.domain.lower + x * (self.domain.upper - self.domain.lower)).float())
+
+    def telling(self, mixture: Components, k: int) -> dict[int, tuple[float, float]]:
+        """Return the ranges that tell a component apart: two deviations to both sides, or the likeliest option."""
+        lower, width = self.domain.lower.double(), (self.domain.upper - self.domain.lower).double()
+        ranges: dict[int, tuple[float, float]] = {}
+        for place, count in enumerate(self.ranges.counts.tolist()):
+            mean, reach = float(mixture.means[k, place]), 2.0 * float(mixture.deviations[k, place])
+            ends = (max(0.0, mean - reach), min(1.0, mean + reach))
+            if count:
+                likeliest = int(mixture.options[k, place].argmax())
+                ends = (likeliest / count, (likeliest + 1) / count)
+                telling = float(mixture.options[k, place, likeliest]) > TELLING
+            else:
+                across = bool(self.ranges.around[place]) and (mean - reach < 0.0 or mean + reach > 1.0)
+                telling = reach < 2.0 * TELLING * EVEN and not across
+            if telling:
+                low, high = (float(lower[place] + end * width[place]) for end in ends)
+                ranges[place] = low, high
+        return ranges
 
 
 @dataclass(frozen=True)
@@ -156,7 +200,7 @@ class Mixture(Policy[MixtureState]):
         return self._drawn(state, None)
 
     def propose(self, state: MixtureState, n: int) -> tuple[tuple[Proposal, ...], MixtureState]:
-        return tuple(Proposal(_configuration(state, x)) for x in state.points[state.told :][:n]), state
+        return tuple(Proposal(state.configuration(x)) for x in state.points[state.told :][:n]), state
 
     def update(self, state: MixtureState, evaluated: Evaluated) -> MixtureState:
         points = state.points[state.told :][: len(evaluated)]
@@ -184,11 +228,11 @@ class Mixture(Policy[MixtureState]):
             for k in sorted(set(nearest.tolist()), key=lambda k: -float(current.weights[k])):
                 own = (nearest == k).nonzero().flatten()
                 worst = int(own[objectives[own].argmax()])
-                u = _configuration(state, points[worst])
-                listed.append(FoundFailure(u, float(objectives[worst]), _telling(state, current, k)))
+                u = state.configuration(points[worst])
+                listed.append(FoundFailure(u, float(objectives[worst]), state.telling(current, k)))
         elif bool(failed.any()):
             worst = int(torch.where(failed, log[:, 0], -math.inf).argmax())
-            listed.append(FoundFailure(_configuration(state, state.seen[worst]), float(log[worst, 0]), {}))
+            listed.append(FoundFailure(state.configuration(state.seen[worst]), float(log[worst, 0]), {}))
         whole = all(block.norm != "l2" for block in state.domain.blocks)
         with one_thread():
             share = failure_share(state.log[:, 3], state.log[:, 4], state.log[:, 1] > 0, state.log[:, 2] > 0)
@@ -239,51 +283,5 @@ class Mixture(Policy[MixtureState]):
             start = torch.full((len(means),), 1.0 / len(means), dtype=torch.float64)
             mixture = Components(start, means, torch.full_like(means, 0.5 * EVEN), even)
             for _ in range(ROUNDS):
-                mixture = _maximised(mixture, x, weights, ranges, even)
+                mixture = mixture.maximised(x, weights, ranges, even)
         return mixture
-
-
-def _maximised(mixture: Components, x: Tensor, weights: Tensor, ranges: Ranges, even: Tensor) -> Components:
-    """Return the components that make the weighted draws (n, d) x likelier, each with its prior."""
-    shared = mixture.logs(x, ranges).softmax(dim=1) * weights[:, None]
-    counts = shared.sum(dim=0)
-    portion = (shared / counts.clamp(min=1e-12)).T
-    away = ranges.away(x[:, None], mixture.means)
-    shift = torch.einsum("kn,nkd->kd", portion, away)
-    spread = torch.einsum("kn,nkd->kd", portion, (away - shift).square())
-    own = counts[:, None]
-    variance = ((own * spread + PRIOR * EVEN**2) / (own + PRIOR)).clamp(max=0.999 * EVEN**2)
-    deviations = (1.0 / (1.0 / variance - 1.0 / EVEN**2)).sqrt().clamp(NARROWEST, FLAT)  # the even one divided out
-    means = mixture.means + shift
-    tilted = (deviations.square() * (means / variance - 0.5 / EVEN**2)).clamp(0.0, 1.0)
-    means = torch.where(ranges.around, torch.remainder(means, 1.0), tilted)
-    chosen = torch.nn.functional.one_hot((x * ranges.counts).long().clamp(max=even.shape[2] - 1), even.shape[2])
-    often = torch.einsum("kn,ndo->kdo", portion, chosen.double())
-    options = (own[..., None] * often + PRIOR * even) / (own[..., None] + PRIOR)
-    share = counts / counts.sum()
-    return Components(0.75 * share + 0.25 / len(share), means, deviations, options)
-
-
-def _configuration(state: MixtureState, x: Tensor) -> Tensor:
-    domain = state.domain
-    return domain.project((domain.lower + x * (domain.upper - domain.lower)).float())
-
-
-def _telling(state: MixtureState, mixture: Components, k: int) -> dict[int, tuple[float, float]]:
-    """Return the ranges that tell a component apart: two deviations to both sides, or the likeliest option."""
-    lower, width = state.domain.lower.double(), (state.domain.upper - state.domain.lower).double()
-    ranges: dict[int, tuple[float, float]] = {}
-    for place, count in enumerate(state.ranges.counts.tolist()):
-        mean, reach = float(mixture.means[k, place]), 2.0 * float(mixture.deviations[k, place])
-        ends = (max(0.0, mean - reach), min(1.0, mean + reach))
-        if count:
-            likeliest = int(mixture.options[k, place].argmax())
-            ends = (likeliest / count, (likeliest + 1) / count)
-            telling = float(mixture.options[k, place, likeliest]) > TELLING
-        else:
-            across = bool(state.ranges.around[place]) and (mean - reach < 0.0 or mean + reach > 1.0)
-            telling = reach < 2.0 * TELLING * EVEN and not across
-        if telling:
-            low, high = (float(lower[place] + end * width[place]) for end in ends)
-            ranges[place] = low, high
-    return ranges

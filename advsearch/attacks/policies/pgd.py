@@ -5,7 +5,8 @@ methods good for attention models?), at the price of a bias."""
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from abc import abstractmethod
+from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 import torch
@@ -131,12 +132,16 @@ class Window:
         return Window(length, (), self.values[-1], 0, best, halved)
 
 
+NOTHING = torch.zeros(())
+
+
 @dataclass(frozen=True, eq=False)
-class PGDState:
-    """Where an ascent of so many evaluations stands: u (d,) to propose next, the accumulated gradient (d,), the
-    objective at the start, the step size in units of each block's radius, evaluations in a row whose gradient was zero
-    (`flat`), windows in a row that added nothing (`idle`, without noise only), and lengths of gradients as `clipped`
-    wants them."""
+class Ascent:
+    """Where an ascent of so many evaluations stands: u (d,) to propose next, the accumulated gradient (d,), of Adam its
+    mean and the mean (d,) of squares, the step size, the best evaluation, evaluations so far (`count`), gradients in
+    these means (`taken`), zero gradients in a row (`flat`), and lengths of gradients as `clipped` wants them. PGD has
+    besides the objective at the start, a window, and windows in a row that added nothing (`idle`, without noise only).
+    """
 
     domain: Domain
     steps: int
@@ -144,25 +149,69 @@ class PGDState:
     u: Tensor
     direction: Tensor
     step_size: float
-    peak: Peak | None
-    window: Window
-    first: float = math.nan
-    flat: int = 0
-    idle: int = 0
+    square: Tensor = NOTHING
+    peak: Peak | None = None
     count: int = 0
+    taken: int = 0
+    flat: int = 0
     lengths: tuple[float, ...] = ()
     counts: Counts = NO_COUNTS
+    window: Window = field(default_factory=lambda: Window(FEWEST))
+    first: float = math.nan
+    idle: int = 0
 
-    @property
-    def pace(self) -> float:
-        """The step size now, in units of each block's radius: where renders bring no noise, it falls in a line."""
-        if not (self.domain.exact or self.domain.drawn):
-            return self.step_size
-        return self.step_size * max(SLOWEST, 1.0 - self.count / self.steps)
+    def falling(self, number: int) -> float:
+        """Return the step size of evaluation `number` where it falls in a line."""
+        return self.step_size * max(SLOWEST, 1.0 - number / self.steps)
+
+
+class Climbing(Policy[Ascent]):
+    """A policy that follows gradients, one evaluation after the other."""
+
+    uses_gradient: ClassVar[bool] = True
+
+    def propose(self, state: Ascent, n: int) -> tuple[tuple[Proposal, ...], Ascent]:
+        if state.flat >= PATIENCE or state.idle >= ENOUGH:
+            return (), state
+        return (Proposal(state.u, gradient=True, step_size=self.pace(state)),), state
+
+    def update(self, state: Ascent, evaluated: Evaluated) -> Ascent:
+        ((u, evaluation),) = evaluated
+        state = replace(state, count=state.count + 1)
+        if not evaluation.finite:
+            counts = state.counts + Counts(rejected=1)
+            return self.retreat(replace(state, step_size=state.step_size / 2, counts=counts))
+        if evaluation.gradient is not None:  # without one nothing is known: go on as before
+            gradient, lengths, outliers = clipped(state.domain, evaluation.gradient, state.lengths)
+            state = replace(state, lengths=lengths, counts=state.counts + outliers, flat=state.flat + 1)
+            if bool(gradient.any()):
+                state = replace(self.learn(state, gradient), taken=state.taken + 1, flat=0)
+        if state.peak is None or evaluation.objective > state.peak.objective:
+            state = replace(state, peak=Peak(evaluation.objective, u, state.direction))
+        return self.step(state, u, evaluation.objective)
+
+    def counts(self, state: Ascent) -> Counts:
+        return state.counts
+
+    @abstractmethod
+    def pace(self, state: Ascent) -> float:
+        """Return the step size of the next evaluation."""
+
+    @abstractmethod
+    def retreat(self, state: Ascent) -> Ascent:
+        """Return the state after an objective that could not be computed; the step size is halved already."""
+
+    @abstractmethod
+    def learn(self, state: Ascent, gradient: Tensor) -> Ascent:
+        """Return the state with a gradient (d,), not all zero, among those accumulated."""
+
+    @abstractmethod
+    def step(self, state: Ascent, u: Tensor, objective: float) -> Ascent:
+        """Return the state with the next configuration, after u with its objective."""
 
 
 @dataclass(frozen=True)
-class PGD(Policy[PGDState]):
+class PGD(Climbing):
     """Projected gradient ascent (Madry et al. 2018) for a noisy objective.
 
     One step, with P the projection onto the domain and `steepest` the sign of a vector in an l-infinity block and the
@@ -204,7 +253,6 @@ class PGD(Policy[PGDState]):
     random_start: bool = False
 
     name: ClassVar[str] = "pgd"
-    uses_gradient: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         if not 0.0 < self.step_size <= 2.0:
@@ -214,122 +262,72 @@ class PGD(Policy[PGDState]):
         if not 0.0 <= self.momentum < 1.0:
             raise InputError(f"momentum: expected a number in [0, 1), got {self.momentum}; try 0.5")
 
-    def start(self, domain: Domain, generator: torch.Generator, steps: int) -> PGDState:
+    def start(self, domain: Domain, generator: torch.Generator, steps: int) -> Ascent:
         seed = draw_seed(generator)
         u = domain.sample(seeded(seed, 0))[0] if self.random_start else domain.begin
         steps = max(1, steps // (1 + domain.gradient_cost))
         fewest, share = (FEWEST_EXACT, SHORTEST) if domain.exact else (FEWEST, FIRST_WINDOW)
         window = Window(max(fewest, round(share * steps)))
-        return PGDState(domain, steps, seed, u, torch.zeros_like(u), self.step_size, None, window)
+        return Ascent(domain, steps, seed, u, torch.zeros_like(u), self.step_size, window=window)
 
-    def propose(self, state: PGDState, n: int) -> tuple[tuple[Proposal, ...], PGDState]:
-        if state.flat >= PATIENCE or state.idle >= ENOUGH:
-            return (), state
-        return (Proposal(state.u, gradient=True, step_size=state.pace),), state
+    def pace(self, state: Ascent) -> float:
+        return state.falling(state.count) if state.domain.exact or state.domain.drawn else state.step_size
 
-    def update(self, state: PGDState, evaluated: Evaluated) -> PGDState:
-        ((u, evaluation),) = evaluated
-        state = replace(state, count=state.count + 1)
-        if not evaluation.finite:
-            state = replace(state, step_size=state.step_size / 2, counts=state.counts + Counts(rejected=1))
-            if state.peak is None:
-                return _step(state, state.domain.begin, torch.zeros_like(state.u))
-            return replace(state, u=state.peak.u, direction=state.peak.direction)
-        gradient = evaluation.gradient
-        if gradient is not None:
-            gradient, lengths, outliers = clipped(state.domain, gradient, state.lengths)
-            state = replace(state, lengths=lengths, counts=state.counts + outliers)
-        state = _accumulate(state, gradient, self.momentum)
-        if state.peak is None or evaluation.objective > state.peak.objective:
-            state = replace(state, peak=Peak(evaluation.objective, u, state.direction))
+    def retreat(self, state: Ascent) -> Ascent:
+        if state.peak is None:
+            return self._moved(replace(state, direction=torch.zeros_like(state.u)), state.domain.begin)
+        return replace(state, u=state.peak.u, direction=state.peak.direction)
+
+    def learn(self, state: Ascent, gradient: Tensor) -> Ascent:
+        scaled = gradient / float(gradient.abs().amax())  # sums of huge or tiny elements stay within float32
+        direction = (state.direction * self.momentum).add_(scaled, alpha=1.0 / float(scaled.abs().mean()))
+        return replace(state, direction=direction)
+
+    def step(self, state: Ascent, u: Tensor, objective: float) -> Ascent:
         if math.isnan(state.first):
-            state = replace(state, first=evaluation.objective)
+            state = replace(state, first=objective)
         if state.domain.drawn:
-            return _step(state, u, state.direction)
-        state = replace(state, window=state.window.add(evaluation.objective))
+            return self._moved(state, u)
+        state = replace(state, window=state.window.add(objective))
         if len(state.window.values) < state.window.length:
-            return _step(state, u, state.direction)
-        return _slower(state, u) if state.domain.exact else _checkpoint(state, u)
+            return self._moved(state, u)
+        return self._slower(state, u) if state.domain.exact else self._checkpoint(state, u)
 
-    def counts(self, state: PGDState) -> Counts:
-        return state.counts
+    def _checkpoint(self, state: Ascent, u: Tensor) -> Ascent:
+        """Halve the step size if the window has stalled, and go on from the best configuration if it lags behind."""
+        window, peak = state.window, state.peak
+        best = peak.objective if peak else -math.inf
+        stalled = window.stalled(best)
+        if stalled:
+            state = replace(state, step_size=state.step_size / 2)
+        if peak is not None and stalled and window.lags(best):
+            u = peak.u
+            state = replace(state, direction=peak.direction, counts=state.counts + Counts(rejected=1))
+        return self._moved(replace(state, window=window.next(state.steps, best, stalled)), u)
 
+    def _slower(self, state: Ascent, u: Tensor) -> Ascent:
+        """Without noise: halve the step size where the window added nothing to the one before.
 
-def _accumulate(state: PGDState, gradient: Tensor | None, momentum: float) -> PGDState:
-    """Add a gradient, divided by the mean of its absolute values, to the accumulated ones."""
-    if gradient is None:  # nothing was asked, so nothing is known: go on as before
-        return state
-    largest = float(gradient.abs().amax())
-    if largest == 0.0:
-        return replace(state, flat=state.flat + 1)
-    scaled = gradient / largest  # so that sums of huge or tiny elements neither overflow nor vanish
-    direction = (state.direction * momentum).add_(scaled, alpha=1.0 / float(scaled.abs().mean()))
-    return replace(state, direction=direction, flat=0)
+        Windows are compared and not the best of all, which may stem from another matrix of light transport.
+        """
+        window = state.window
+        best = max(window.values)
+        idle = best - window.best <= GAIN * (best - state.first)
+        step_size = state.step_size / 2 if idle else state.step_size
+        state = replace(state, step_size=step_size, idle=state.idle + 1 if idle else 0)
+        return self._moved(replace(state, window=Window(window.length, best=best)), u)
 
-
-def _checkpoint(state: PGDState, u: Tensor) -> PGDState:
-    """Halve the step size if the window has stalled, and go on from the best configuration if it lags behind that."""
-    window, peak = state.window, state.peak
-    best = peak.objective if peak else -math.inf
-    stalled = window.stalled(best)
-    direction = state.direction
-    if peak is not None and stalled and window.lags(best):
-        u, direction = peak.u, peak.direction
-        state = replace(state, counts=state.counts + Counts(rejected=1))
-    step_size = state.step_size / 2 if stalled else state.step_size
-    window = window.next(state.steps, best, stalled)
-    state = replace(state, step_size=step_size, direction=direction, window=window)
-    return _step(state, u, direction)
-
-
-def _slower(state: PGDState, u: Tensor) -> PGDState:
-    """Without noise: halve the step size where the window added nothing to the one before.
-
-    Windows are compared and not the best of all, which may stem from another matrix of light transport.
-    """
-    window = state.window
-    best = max(window.values)
-    idle = best - window.best <= GAIN * (best - state.first)
-    step_size = state.step_size / 2 if idle else state.step_size
-    state = replace(state, step_size=step_size, idle=state.idle + 1 if idle else 0)
-    return _step(replace(state, window=Window(window.length, best=best)), u, state.direction)
-
-
-def _step(state: PGDState, u: Tensor, direction: Tensor) -> PGDState:
-    """Move from u along the direction, or at random where there is none."""
-    uphill = direction
-    if not bool(direction.any()):
-        uphill = torch.randn(u.numel(), generator=seeded(state.seed, state.count))
-    move = torch.add(u, state.domain.steepest(u, uphill), alpha=state.pace)
-    return replace(state, u=state.domain.project(move), direction=direction)
-
-
-@dataclass(frozen=True, eq=False)
-class AdamState:
-    """Where an ascent of so many evaluations stands: half ranges (d,), the unit of a step, u (d,) to propose next,
-    decaying means (d,) of the gradients and of their squares, gradients so far (`taken`), the best objective and its
-    peak (d,), and what the rate is multiplied by; half of it is gone after every objective that could not be computed.
-    """
-
-    domain: Domain
-    steps: int
-    seed: int
-    scale: Tensor
-    u: Tensor
-    mean: Tensor
-    square: Tensor
-    taken: int = 0
-    count: int = 0
-    flat: int = 0
-    best: float = -math.inf
-    peak: Tensor | None = None
-    shrunk: float = 1.0
-    lengths: tuple[float, ...] = ()
-    counts: Counts = NO_COUNTS
+    def _moved(self, state: Ascent, u: Tensor) -> Ascent:
+        """Move from u along the accumulated gradient, or at random where there is none."""
+        uphill = state.direction
+        if not bool(uphill.any()):
+            uphill = torch.randn(u.numel(), generator=seeded(state.seed, state.count))
+        move = torch.add(u, state.domain.steepest(u, uphill), alpha=self.pace(state))
+        return replace(state, u=state.domain.project(move))
 
 
 @dataclass(frozen=True)
-class Adam(Policy[AdamState]):
+class Adam(Climbing):
     """Adam (Kingma and Ba 2015, algorithm 1) uphill, projected onto the domain after every step:
 
         m <- beta1 m + (1 - beta1) g,   v <- beta2 v + (1 - beta2) g^2
@@ -357,7 +355,6 @@ class Adam(Policy[AdamState]):
     beta2: float = 0.9
 
     name: ClassVar[str] = "adam"
-    uses_gradient: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         if not 0.0 < self.step_size <= 2.0:
@@ -368,60 +365,31 @@ class Adam(Policy[AdamState]):
             if not 0.0 <= value < 1.0:
                 raise InputError(f"{name}: expected a number in [0, 1), got {value}; try 0.9")
 
-    def start(self, domain: Domain, generator: torch.Generator, steps: int) -> AdamState:
+    def start(self, domain: Domain, generator: torch.Generator, steps: int) -> Ascent:
         steps = max(1, steps // (1 + domain.gradient_cost))
         zero = torch.zeros_like(domain.start)
-        return AdamState(domain, steps, draw_seed(generator), half_widths(domain), domain.begin, zero, zero)
+        return Ascent(domain, steps, draw_seed(generator), domain.begin, zero, self.step_size)
 
-    def propose(self, state: AdamState, n: int) -> tuple[tuple[Proposal, ...], AdamState]:
-        if state.flat >= PATIENCE:
-            return (), state
-        return (Proposal(state.u, gradient=True, step_size=self._rate(state)),), state
+    def pace(self, state: Ascent) -> float:
+        return state.falling(state.count)
 
-    def update(self, state: AdamState, evaluated: Evaluated) -> AdamState:
-        ((u, evaluation),) = evaluated
-        rate = self._rate(state)
-        state = replace(state, count=state.count + 1)
-        if not evaluation.finite:
-            return _retreat(state)
-        if evaluation.objective > state.best:
-            state = replace(state, best=evaluation.objective, peak=u)
-        if evaluation.gradient is not None:
-            gradient, lengths, outliers = clipped(state.domain, evaluation.gradient, state.lengths)
-            counts = state.counts + outliers
-            state = replace(self._learn(state, gradient), lengths=lengths, counts=counts)
-        return replace(state, u=state.domain.project(torch.addcmul(u, state.scale, self._way(state), value=rate)))
+    def retreat(self, state: Ascent) -> Ascent:
+        u = state.domain.begin if state.peak is None else state.peak.u
+        return replace(state, u=u, direction=torch.zeros_like(u), square=NOTHING, taken=0)
 
-    def counts(self, state: AdamState) -> Counts:
-        return state.counts
-
-    def _way(self, state: AdamState) -> Tensor:
-        """Return the step for the rate 1, in units of `scale`; at random as long as nothing is known."""
-        if not state.taken:
-            return torch.randn(state.u.numel(), generator=seeded(state.seed, state.count)).sign_()
-        mean = state.mean / (1.0 - self.beta1**state.taken)
-        return mean / (state.square / (1.0 - self.beta2**state.taken)).sqrt_().clamp_(min=1e-30)
-
-    def _rate(self, state: AdamState) -> float:
-        """Return the step size of this evaluation."""
-        return self.step_size * state.shrunk * max(0.05, 1.0 - state.count / state.steps)
-
-    def _learn(self, state: AdamState, gradient: Tensor) -> AdamState:
-        """Add a gradient to both means."""
-        if not bool(gradient.any()):
-            return replace(state, flat=state.flat + 1)
-        mean = torch.lerp(gradient, state.mean, self.beta1)
+    def learn(self, state: Ascent, gradient: Tensor) -> Ascent:
         squares = gradient.square()
         for block, part in state.domain.parts():
             if block.norm == "l2":
                 squares[part] = squares[part].mean()
-        square = torch.lerp(squares, state.square, self.beta2)
-        return replace(state, mean=mean, square=square, taken=state.taken + 1, flat=0)
+        mean = torch.lerp(gradient, state.direction, self.beta1)
+        return replace(state, direction=mean, square=torch.lerp(squares, state.square, self.beta2))
 
-
-def _retreat(state: AdamState) -> AdamState:
-    """Go back to the best configuration, or else to where the search began, and forget the gradients."""
-    zero = torch.zeros_like(state.u)
-    u = state.domain.begin if state.peak is None else state.peak
-    counts = state.counts + Counts(rejected=1)
-    return replace(state, u=u, mean=zero, square=zero, taken=0, shrunk=state.shrunk / 2, counts=counts)
+    def step(self, state: Ascent, u: Tensor, objective: float) -> Ascent:
+        if state.taken:
+            mean = state.direction / (1.0 - self.beta1**state.taken)
+            way = mean / (state.square / (1.0 - self.beta2**state.taken)).sqrt_().clamp_(min=1e-30)
+        else:  # at random as long as nothing is known
+            way = torch.randn(u.numel(), generator=seeded(state.seed, state.count)).sign_()
+        rate = state.falling(state.count - 1)  # of the evaluation that this step follows
+        return replace(state, u=state.domain.project(torch.addcmul(u, half_widths(state.domain), way, value=rate)))

@@ -4,7 +4,7 @@ which fill the domain more evenly; and a grid, as fine as the renders allow."""
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 import torch
@@ -14,18 +14,36 @@ from advsearch.attacks.domain import Block, Domain, centre_of_option
 from advsearch.attacks.evaluation import Evaluated, Policy, Proposal, draw_seed, seeded
 from advsearch.errors import InputError
 
+MOST = 21_201
+"""Scipy has direction numbers for so many dimensions (Joe and Kuo 2008)."""
+
+CHUNK = 2**20
+"""So many numbers at most of a Sobol sequence are drawn and kept at once, as long as that is one point at least."""
+
 
 @dataclass(frozen=True, eq=False)
-class RandomState:
-    """Where a random search stands: it remembers nothing but how many samples it has drawn."""
+class PointsState:
+    """Where a search stands that does not look at evaluations: how many configurations are done, and what the next ones
+    come from, if not from the seed alone: points (n, k), the whole grid or so many of a sequence."""
 
     domain: Domain
-    seed: int
-    drawn: int
+    seed: int = 0
+    points: Tensor = field(default_factory=lambda: torch.empty(0, 0))
+    done: int = 0
+
+
+class Unlearning(Policy[PointsState]):
+    """A policy that proposes what it would propose anyway."""
+
+    uses_gradient: ClassVar[bool] = False
+    handles_choices: ClassVar[bool] = True
+
+    def update(self, state: PointsState, evaluated: Evaluated) -> PointsState:
+        return state
 
 
 @dataclass(frozen=True)
-class Random(Policy[RandomState]):
+class Random(Unlearning):
     """Independent samples within the budget, by turns at the extremes of the norm balls and in their interior.
 
     The first is an extreme one: in many dimensions the corners of an l-infinity ball beat its interior (a random
@@ -34,41 +52,18 @@ class Random(Policy[RandomState]):
     """
 
     name: ClassVar[str] = "random"
-    uses_gradient: ClassVar[bool] = False
-    handles_choices: ClassVar[bool] = True
 
-    def start(self, domain: Domain, generator: torch.Generator, steps: int) -> RandomState:
-        return RandomState(domain, draw_seed(generator), 0)
+    def start(self, domain: Domain, generator: torch.Generator, steps: int) -> PointsState:
+        return PointsState(domain, draw_seed(generator))
 
-    def propose(self, state: RandomState, n: int) -> tuple[tuple[Proposal, ...], RandomState]:
-        numbers = range(state.drawn, state.drawn + n)
+    def propose(self, state: PointsState, n: int) -> tuple[tuple[Proposal, ...], PointsState]:
+        numbers = range(state.done, state.done + n)
         us = (state.domain.sample(seeded(state.seed, k), extreme=k % 2 == 0)[0] for k in numbers)
-        return tuple(map(Proposal, us)), replace(state, drawn=state.drawn + n)
-
-    def update(self, state: RandomState, evaluated: Evaluated) -> RandomState:
-        return state
-
-
-MOST = 21_201
-"""Scipy has direction numbers for so many dimensions (Joe and Kuo 2008)."""
-
-CHUNK = 2**20
-"""So many numbers at most are drawn and kept at once, as long as that is one point at least."""
-
-
-@dataclass(frozen=True, eq=False)
-class SobolState:
-    """Where the sequence stands: its points (n, k) from number `begin` on, n a power of two, and how many are done."""
-
-    domain: Domain
-    seed: int
-    points: Tensor
-    begin: int
-    done: int
+        return tuple(map(Proposal, us)), replace(state, done=state.done + n)
 
 
 @dataclass(frozen=True)
-class Sobol(Policy[SobolState]):
+class Sobol(Unlearning):
     """A scrambled Sobol sequence over the whole domain (Sobol 1967; scrambled as by Owen 1998, Matousek 1998).
 
     - bounds and l-infinity balls: the sequence's number, stretched to what bounds and ball leave;
@@ -84,10 +79,8 @@ class Sobol(Policy[SobolState]):
     """
 
     name: ClassVar[str] = "sobol"
-    uses_gradient: ClassVar[bool] = False
-    handles_choices: ClassVar[bool] = True
 
-    def start(self, domain: Domain, generator: torch.Generator, steps: int) -> SobolState:
+    def start(self, domain: Domain, generator: torch.Generator, steps: int) -> PointsState:
         size = domain.dim + sum(block.norm == "l2" for block in domain.blocks)
         if size > MOST:
             raise InputError(
@@ -96,18 +89,15 @@ class Sobol(Policy[SobolState]):
         seed = draw_seed(generator)
         most = max(1, CHUNK // size)
         count = 2 ** max(0, min(steps - 1, most - 1).bit_length())
-        return SobolState(domain, seed, draw(size, seed, 0, count), 0, 0)
+        return PointsState(domain, seed, draw(size, seed, 0, count))
 
-    def propose(self, state: SobolState, n: int) -> tuple[tuple[Proposal, ...], SobolState]:
-        if state.done - state.begin == len(state.points):
-            count, size = state.points.shape
-            state = replace(state, points=draw(size, state.seed, state.done, count), begin=state.done)
-        points = state.points[state.done - state.begin :][:n]
+    def propose(self, state: PointsState, n: int) -> tuple[tuple[Proposal, ...], PointsState]:
+        count, size = state.points.shape
+        if state.done and state.done % count == 0:
+            state = replace(state, points=draw(size, state.seed, state.done, count))
+        points = state.points[state.done % count :][:n]
         us = (to_domain(state.domain, x) for x in points)
         return tuple(map(Proposal, us)), replace(state, done=state.done + len(points))
-
-    def update(self, state: SobolState, evaluated: Evaluated) -> SobolState:
-        return state
 
 
 def draw(size: int, seed: int, begin: int, count: int) -> Tensor:
@@ -136,19 +126,8 @@ def to_domain(domain: Domain, x: Tensor) -> Tensor:
     return domain.project(u)
 
 
-@dataclass(frozen=True, eq=False)
-class GridState:
-    """Where a grid stands: the (m_i,) values of each element of u, the numbers (n,) of the points, coarse ones first,
-    and how many are done."""
-
-    domain: Domain
-    axes: tuple[Tensor, ...]
-    order: Tensor
-    done: int
-
-
 @dataclass(frozen=True)
-class Grid(Policy[GridState]):
+class Grid(Unlearning):
     """Every combination of evenly spaced values, then nothing more.
 
     A number takes both its ends and what lies evenly between; an angle does not repeat its end; a discrete choice takes
@@ -170,35 +149,23 @@ class Grid(Policy[GridState]):
     points: int = 0
 
     name: ClassVar[str] = "grid"
-    uses_gradient: ClassVar[bool] = False
-    handles_choices: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         if self.points < 0 or self.points == 1:
             raise InputError(f"points: expected at least 2, or 0 for as many as fit, got {self.points}")
 
-    def start(self, domain: Domain, generator: torch.Generator, steps: int) -> GridState:
+    def start(self, domain: Domain, generator: torch.Generator, steps: int) -> PointsState:
         counts = _counts(domain, steps, self.points)
         low, high = _bounds(domain)
         blocks = [block for block in domain.blocks for _ in range(block.size)]
-        axes = tuple(map(_axis, blocks, counts, low.tolist(), high.tolist()))
-        return GridState(domain, axes, _coarse_to_fine(blocks, counts), 0)
+        axes = map(_axis, blocks, counts, low.tolist(), high.tolist())
+        points = torch.cartesian_prod(*axes).reshape(-1, domain.dim)
+        return PointsState(domain, points=points[_coarse_to_fine(blocks, counts)])
 
-    def propose(self, state: GridState, n: int) -> tuple[tuple[Proposal, ...], GridState]:
-        numbers = state.order[state.done : state.done + n].tolist()
-        proposals = tuple(Proposal(_point(state, number)) for number in numbers)
-        return proposals, replace(state, done=state.done + len(numbers))
-
-    def update(self, state: GridState, evaluated: Evaluated) -> GridState:
-        return state
-
-
-def _point(state: GridState, number: int) -> Tensor:
-    values = []
-    for axis in reversed(state.axes):
-        number, place = divmod(number, len(axis))
-        values.append(axis[place])
-    return state.domain.project(torch.stack(values[::-1]))
+    def propose(self, state: PointsState, n: int) -> tuple[tuple[Proposal, ...], PointsState]:
+        points = state.points[state.done : state.done + n]
+        us = map(state.domain.project, points)
+        return tuple(map(Proposal, us)), replace(state, done=state.done + len(points))
 
 
 def _counts(domain: Domain, steps: int, points: int) -> list[int]:

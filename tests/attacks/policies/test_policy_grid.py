@@ -112,7 +112,7 @@ def test_choices_alone_are_enumerated() -> None:
 def test_one_number_takes_every_render(steps: int) -> None:
     domain = Domain(torch.tensor([0.5]), (Block(1, periodic=True),))
     state = Grid().start(domain, seeded(0, 0), max(2, steps))
-    assert len(state.order) == max(2, steps)
+    assert len(state.points) == max(2, steps)
 
 
 # ---- sobol
