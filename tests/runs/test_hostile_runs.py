@@ -220,7 +220,7 @@ def test_a_link_in_a_run_is_followed_by_nobody(
         *commands,
         ["report", "it", "--evidence"],
         ["replay", "it"],
-        ["compare", "it", "it"],
+        ["compare", "it", "runs/it"],
         ["explain", "it"],
     ]:
         assert main(command) == 2, command
