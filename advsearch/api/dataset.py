@@ -7,7 +7,7 @@ import json
 import os
 import tempfile
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -15,18 +15,19 @@ import numpy as np
 from torch import Tensor
 
 import advsearch
+from advsearch import rooms
 from advsearch.config import AttackConfig, SweepConfig
 from advsearch.described import Value
 from advsearch.engine.attack_parts import SEARCHED_WITH, parts_in, problem_of_parts
 from advsearch.engine.judging import facts_of
 from advsearch.engine.sweeps import KIND
+from advsearch.engine.sweeps.swept_scene import Scenes
 from advsearch.engine.verifier import kept_answer
 from advsearch.errors import FileFormatError, InputError
 from advsearch.files import JsonObject, JsonValue
 from advsearch.models import find_label_set
 from advsearch.models.labels import names_nothing
 from advsearch.progress import Progress
-from advsearch.questions.sweep.carry_out import scenes_of
 from advsearch.runs.directory import CONFIG, PARTS, find_run, is_run, only_here
 from advsearch.runs.files import placed_by, storage_errors, write_text
 from advsearch.runs.images import write_png
@@ -109,10 +110,10 @@ def write_dataset(run: str | Path, out: Path, format: str, *, every: bool, progr
         every: also pictures that all models are right about.
 
     Returns:
-        How many pictures there are, and sentences that a reader has to know.
+        How many pictures there are (of 0, nothing is written), and sentences that a reader has to know.
 
     Raises:
-        InputError: the run has no such pictures, its scene is not to be had any more, or `out` is not empty.
+        InputError: the scene of the run is not to be had any more, or `out` is not empty.
         UnknownNameError: there is no such run.
         FileFormatError: the run is of another command, or has not ended.
     """
@@ -134,7 +135,7 @@ def write_dataset(run: str | Path, out: Path, format: str, *, every: bool, progr
                 if format == "yolo":
                     write_text(place / LABELS / f"{shown.name}.txt", _lines(listed, *shown.picture.shape[:2]))
             if not images:
-                raise InputError(f"{folder}: no model is wrong in any picture that can be rendered again; try --all")
+                return 0, []
             if format == "yolo":
                 names: JsonObject = {"train": IMAGES, "val": IMAGES, "names": [*categories.labels]}
                 write_text(place / YOLO, json.dumps(names, indent=1) + "\n")
@@ -173,6 +174,7 @@ def _pictures(folder: Path, categories: Categories, every: bool, progress: Progr
 
 def _swept(folder: Path, categories: Categories, every: bool, progress: Progress) -> Iterator[Shown]:
     """The pictures of a sweep as its first model sees them."""
+    scenes_of: Callable[[SweepConfig], Scenes] = rooms.in_room("sweep", "carry_out", "scenes_of")
     scenes = scenes_of(SweepConfig.from_yaml(folder / CONFIG).model_copy(update={"metrics": {}}))
     job, rows = scenes.job, defaultdict[int, list[Row]](list)
     with Store(folder / NAME, read_only=True) as store:
@@ -207,7 +209,7 @@ def _attacked(folder: Path, categories: Categories, every: bool, progress: Progr
     chosen = [row for rows in tried.values() for row in (rows if problem.conditions else rows[:1])]
     progress.stage("rendering pictures", len(chosen))
     for row in chosen:
-        u, seed, spp = kinds[row.kind], row.seed or 0, row.spp or problem.spp
+        u, seed, spp = kinds[row.kind], max(0, row.seed or 0), row.spp or problem.spp
         picture, whole = problem.picture(u, seed, spp), problem.whole(u, seed)
         things = categories.things(problem.task, problem.facts(dict, None), problem.renderer, whole)
         same = row.correct in (None, problem.judge(picture, whole).right)

@@ -48,6 +48,8 @@ def _dataset(format: str) -> Callable[[argparse.Namespace, Path], Written]:
             from advsearch.api.dataset import write_dataset  # takes seconds
 
             count, notes = write_dataset(args.run, out, format, every=bool(args.all), progress=progress)
+        if not count:
+            raise InputError(f"{args.run}: no model is wrong in a picture of its rows; --all takes the others too")
         return {"pictures": count, "notes": notes}, " ".join([f"{count} pictures in {out}.", *notes])
 
     return write

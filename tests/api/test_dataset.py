@@ -17,6 +17,7 @@ from samples import make_answered
 from small_models import easy
 
 import advsearch
+from advsearch.api.dataset import _runs
 from advsearch.cli.main import main
 from advsearch.config import AttackConfig
 from advsearch.engine.attack_parts import parts_in, problem_of_parts
@@ -60,6 +61,14 @@ def decoded(segmentation: Any) -> npt.NDArray[np.bool_]:
 def rows_of(run: Path) -> list[Row]:
     with Store(run / NAME, read_only=True) as store:
         return list(store.rows("sweep"))
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
+def test_runs_come_back_as_the_mask(share: float) -> None:
+    mask = np.random.default_rng(3).random((5, 7)) < share
+    counts = _runs(mask)
+    assert sum(counts) == mask.size and all(counts[1:])
+    assert (decoded({"size": [5, 7], "counts": counts}) == mask).all()
 
 
 def test_a_sweep_is_what_its_model_saw(swept: Path, tmp_path: Path) -> None:
@@ -171,7 +180,7 @@ def test_what_cannot_be_written_is_said(swept: Path, tmp_path: Path, capsys: pyt
         before = rows.execute("SELECT MAX(step) FROM evaluations").fetchone()
         rows.execute("UPDATE evaluations SET correct = 1")
         rows.commit()
-        assert "--all" in refused(run)
+        assert "--all takes the others" in refused(run)
         rows.execute("UPDATE evaluations SET step = 999999, correct = 0 WHERE step = ?", before)
         rows.commit()
         assert "expected rows of its 6 pictures" in refused(run)
