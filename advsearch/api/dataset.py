@@ -10,6 +10,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from torch import Tensor
@@ -24,7 +25,7 @@ from advsearch.engine.sweeps import KIND
 from advsearch.engine.sweeps.swept_scene import Scenes
 from advsearch.engine.verifier import kept_answer
 from advsearch.errors import FileFormatError, InputError
-from advsearch.files import JsonObject, JsonValue
+from advsearch.files import JsonObject
 from advsearch.models import find_label_set
 from advsearch.models.labels import names_nothing
 from advsearch.progress import Progress
@@ -83,7 +84,8 @@ class Categories:
     def things(self, task: Task, facts: Facts, renderer: Renderer, u: Tensor) -> list[tuple[SeenThing, int]]:
         """Return the things that a configuration (d,) shows, each with the number of its category."""
         own = task.tasks[0] if isinstance(task, Together) else task
-        labels, right = (facts.label or facts.own_label or facts.object,), 0
+        labels: tuple[str, ...] = (facts.label or facts.own_label or facts.object,)
+        right = 0
         if isinstance(own, ClassTask) and own.labels:
             labels, right = own.labels, own.right_classes(facts)[0]
         if self.labels not in ((), labels):
@@ -199,7 +201,8 @@ def _swept(folder: Path, categories: Categories, every: bool, progress: Progress
 
 def _attacked(folder: Path, categories: Categories, every: bool, progress: Progress) -> Iterator[Shown]:
     """The trials of an attack's answer, and of the scene without it; where nothing varies, the first of each."""
-    summary, (problem, _) = attack_of(folder), problem_of_parts(parts_in(folder))
+    summary, parts = attack_of(folder), parts_in(folder)
+    problem, _ = problem_of_parts(parts)
     answered = summary.adversarial is not None
     kinds = dict.fromkeys(CLEAN, problem.domain.start)
     if answered:
@@ -211,7 +214,9 @@ def _attacked(folder: Path, categories: Categories, every: bool, progress: Progr
     for row in chosen:
         u, seed, spp = kinds[row.kind], max(0, row.seed or 0), row.spp or problem.spp
         picture, whole = problem.picture(u, seed, spp), problem.whole(u, seed)
-        things = categories.things(problem.task, problem.facts(dict, None), problem.renderer, whole)
+        things = categories.things(
+            problem.task, facts_of(parts.scene, parts.config.object, parts.config.label, dict), problem.renderer, whole
+        )
         same = row.correct in (None, problem.judge(picture, whole).right)
         values = {**problem.describe(u, seed), **row.values}
         yield Shown(f"{row.kind.replace(' ', '-')}-{row.step:02d}", picture, things, [row], values, same)
@@ -238,16 +243,17 @@ def _coco(categories: Categories, images: list[JsonObject], things: list[JsonObj
 
 def _image(number: int, shown: Shown) -> JsonObject:
     height, width = shown.picture.shape[:2]
-    answers: list[JsonValue] = [
+    answers: list[dict[str, Any]] = [
         {
-            "row": row.id, "kind": row.kind, "step": row.step, "model": row.values.get("model", {}).get("value"),
-            "right": row.correct, "label": row.label, "probability": row.probability, "margin": row.margin,
+            "row": row.id, "kind": row.kind, "step": row.step, "right": row.correct, "label": row.label,
+            "probability": row.probability, "margin": row.margin,
+            **{name: one["value"] for name, one in row.values.items() if name == "model"},
         }
         for row in shown.rows
     ]  # fmt: skip
-    values: JsonObject = {name: {**one} for name, one in shown.values.items() if name != "model"}
-    extras: JsonObject = {
-        "right": all(row.correct for row in shown.rows), "answers": answers, "configuration": values,
+    extras: dict[str, Any] = {
+        "right": all(row.correct for row in shown.rows), "answers": answers,
+        "configuration": {name: dict(one) for name, one in shown.values.items() if name != "model"},
     }  # fmt: skip
     return {"id": number, "file_name": f"{shown.name}.png", "height": height, "width": width, "advsearch": extras}
 
@@ -272,14 +278,14 @@ def _runs(mask: Bools) -> list[int]:
     """The lengths of runs down the columns of a mask, from left to right, the first of pixels outside of it."""
     flat = mask.ravel(order="F")
     ends = [0, *(np.flatnonzero(np.diff(flat)) + 1).tolist(), flat.size]
-    return [0] * bool(flat[0]) + np.diff(ends).tolist()
+    return [*[0][: int(flat[0])], *map(int, np.diff(ends))]
 
 
-def _lines(things: list[JsonObject], height: int, width: int) -> str:
+def _lines(things: Sequence[Mapping[str, Any]], height: int, width: int) -> str:
     """Number of the class, middle of the box and its size, as shares of the picture."""
     lines = []
     for one in things:
-        left, top, across, down = one["bbox"]  # type: ignore[misc]
+        left, top, across, down = one["bbox"]
         box = ((left + across / 2) / width, (top + down / 2) / height, across / width, down / height)
         lines.append(f"{one['category_id']} " + " ".join(f"{side:.6f}" for side in box))
     return "\n".join([*lines, ""])

@@ -55,7 +55,8 @@ def decoded(segmentation: Any) -> npt.NDArray[np.bool_]:
     (height, width), filled, values = segmentation["size"], False, list[bool]()
     for count in segmentation["counts"]:
         values, filled = values + [filled] * count, not filled
-    return np.array(values).reshape(width, height).T
+    found: npt.NDArray[np.bool_] = np.array(values).reshape(width, height).T
+    return found
 
 
 def rows_of(run: Path) -> list[Row]:
