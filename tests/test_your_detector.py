@@ -45,8 +45,8 @@ def test_the_steps_can_be_typed(
     torch.export.save(program, "net.pt2")
     Path("labels.json").write_text(json.dumps(["cup", "bowl", "dog"]), "utf-8")
     commands = [shlex.split(line) for block in blocks(PAGE, "sh") for line in block.splitlines()]
-    assert [command[1] for command in commands] == ["render", "attack", "sweep"]
-    for command in commands:
+    assert [command[1] for command in commands] == ["render", "attack", "sweep", "export"]
+    for command in commands[:-1]:
         assert command[command.index("--model") + 1] == NETWORK
         typed = ["net.pt2" if word == NETWORK else word for word in command[1:]]
         labels = ["--labels", "labels.json"]
@@ -56,4 +56,7 @@ def test_the_steps_can_be_typed(
     searched, swept = (json.loads(Path(f"runs/{run}/summary.json").read_text("utf-8")) for run in ("first", "average"))
     assert searched["clean"]["label"] == "cup" and searched["ending"] in ("found", "not found", "budget spent")
     assert swept["configurations"] == 12
+    assert main(commands[-1][1:]) == 0
+    missed = json.loads(Path("missed/annotations.json").read_text("utf-8"))
+    assert 0 < len(missed["images"]) < 12 and [one["name"] for one in missed["categories"]] == ["cup", "bowl", "dog"]
     assert Path("mug-answer.png").is_file() and Path("runs/first/report.html").is_file()

@@ -16,10 +16,9 @@ from advsearch.cli.question import Command
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.runs.directory import PARTS, find_run
 from advsearch.runs.export import FORMATS, write_rows, write_threedb
-from advsearch.runs.fiftyone import write_fiftyone
 from advsearch.runs.files import placed_by, replacing
 from advsearch.runs.store import NAME, Store
-from advsearch.viewer.thumbnails import kept_pictures, name_of_object, pictured
+from advsearch.viewer.thumbnails import kept_pictures
 
 Written = tuple[dict[str, object], str]
 """What to tell of a file, as JSON and in words."""
@@ -43,10 +42,17 @@ class Writer(NamedTuple):
     ending: str = ""
 
 
-def _fiftyone(args: argparse.Namespace, out: Path) -> Written:
-    folder = find_run(args.run)
-    count = write_fiftyone(lambda: pictured(folder), out, folder.resolve().name, name_of_object(folder))
-    return {"samples": count}, f"{count} samples in {out}, a fiftyone.types.FiftyOneDataset"
+def _dataset(format: str) -> Callable[[argparse.Namespace, Path], Written]:
+    def write(args: argparse.Namespace, out: Path) -> Written:
+        with at_work(as_json=True, quiet=False) as progress:
+            from advsearch.api.dataset import write_dataset  # takes seconds
+
+            count, notes = write_dataset(args.run, out, format, every=bool(args.all), progress=progress)
+        if not count:
+            raise InputError(f"{args.run}: no model is wrong in a picture of its rows; --all takes the others too")
+        return {"pictures": count, "notes": notes}, " ".join([f"{count} pictures in {out}.", *notes])
+
+    return write
 
 
 def _gltf(args: argparse.Namespace, out: Path) -> Written:
@@ -98,9 +104,13 @@ def _threedb(args: argparse.Namespace, out: Path) -> Written:
 
 
 WRITERS = {
-    "fiftyone": Writer(
-        "The kept pictures as a dataset for FiftyOne.", "a folder",
-        "export mug-sweep-001 --format fiftyone --out folder", _fiftyone,
+    "coco": Writer(
+        "The pictures with boxes and masks, as COCO has them.", "a folder",
+        "export mug-sweep-001 --format coco --out folder", _dataset("coco"),
+    ),
+    "yolo": Writer(
+        "The pictures with boxes, to train a YOLO.", "a folder", "export mug-sweep-001 --format yolo --out folder",
+        _dataset("yolo"),
     ),
     "gltf": Writer(
         "The adversarial object as glTF.", "a .glb file", "export mug-texture-001 --format gltf --out mug.glb", _gltf,
@@ -140,6 +150,10 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
         "--sheets", metavar="N", type=int, help="print: sheets that may be written; more are refused (default: 200)"
     )
     parser.add_argument("--paper", help="print: a4, a3 or letter (default: a4)")
+    parser.add_argument(
+        "--all", action="store_true", default=None,
+        help="coco, yolo: right answers too (default: pictures that a model is wrong about)",
+    )  # fmt: skip
     output.add_code_flag(parser)
     parser.add_argument("--icc", metavar="FILE", help="print: ICC profile of an RGB printer (default: sRGB)")
 
@@ -149,11 +163,14 @@ def _export(args: argparse.Namespace) -> int:
     by_name = "" if out is None else out.suffix.removeprefix(".").lower()
     endings = {one.ending or format: format for format, one in WRITERS.items()}
     format = args.format or endings.get(by_name, by_name)
-    for name in ("size", "sheets", "paper", "icc"):
-        if format != "print" and getattr(args, name) is not None:
-            raise InputError(f"--{name}: belongs to --format print; leave it out")
-    if args.format and format not in (*FORMATS, *WRITERS):
-        raise UnknownNameError("format", format, [*FORMATS, *WRITERS])
+    if format == "fiftyone":
+        raise InputError("--format: fiftyone is gone, as FiftyOne reads COCO; say --format coco")
+    if args.format and format not in (*WRITERS, *FORMATS):
+        raise UnknownNameError("format", format, (*WRITERS, *FORMATS))
+    of = {"all": ("coco", "yolo"), **dict.fromkeys(("size", "sheets", "paper", "icc"), ("print",))}
+    for name, formats in of.items():
+        if format not in formats and getattr(args, name) is not None:
+            raise InputError(f"--{name}: belongs to --format {' and '.join(formats)}; leave it out")
     if format not in WRITERS:
         return _table(args, out, by_name)
     if out is None:

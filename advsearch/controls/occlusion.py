@@ -173,7 +173,7 @@ class OcclusionControl(NumberControl):
         away = _put_away(torch.from_numpy(camera_to_world(scene))).numpy()
         for option in self._candidates():
             asset = self._asset(option)
-            part = MeshPart(self._part(option), asset.mesh, away, asset.base_color, asset.material)
+            part = MeshPart(self._part(option), asset.mesh, away, asset.base_color, asset.material, label=asset.label)
             scene = scene.with_part(part)
         return scene
 

@@ -62,6 +62,7 @@ class MeshPart(ScenePart):
         opacity: (h, w) float32 in [0, 1] of the principled surface, which cuts it out; None where it is 1.
         normal_map: (h, w, 3) float32 of the principled surface, as `ObjectAsset.normal_map`.
         emission: (h, w, 3) or (1, 1, 3) float32, as `ObjectAsset.emission`.
+        label: as `ObjectAsset.label`.
     """
 
     mesh: Mesh
@@ -72,6 +73,7 @@ class MeshPart(ScenePart):
     opacity: Floats | None = None
     normal_map: Floats | None = None
     emission: Floats | None = None
+    label: str | None = None
 
 
 def mesh_part(name: str, asset: ObjectAsset, to_world: Doubles, material: Material) -> MeshPart:
@@ -86,6 +88,7 @@ def mesh_part(name: str, asset: ObjectAsset, to_world: Doubles, material: Materi
         asset.opacity,
         asset.normal_map,
         asset.emission,
+        asset.label,
     )
 
 

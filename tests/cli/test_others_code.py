@@ -101,6 +101,7 @@ IMPORTING = {
         "export theirs --format gltf --out a.glb",
         "export theirs --format mitsuba --out folder",
         "export patched --format print --out a.pdf",
+        "export kept --format coco --out b",
     ],
     "explain": ["explain swept --confirm 0 --pairs 0 --clusters 4"],
     "compare": ["compare swept beside"],
@@ -114,7 +115,7 @@ READING = {
     "view": ["view theirs", "view swept --bundle site"],
     "runs": ["runs"],
     "report": ["report theirs swept --evidence"],
-    "export": ["export swept", "export kept --format 3db --out a", "export kept --format fiftyone --out b"],
+    "export": ["export swept", "export kept --format 3db --out a"],
 }
 """And those that look at them."""
 

@@ -105,7 +105,6 @@ QUESTIONS = (
 EXPORTS = (
     ("export", "{run}", "--out", "made/rows.csv"),
     ("export", "{run}", "--out", "made/rows.json"),
-    ("export", "{run}", "--format", "fiftyone", "--out", "made/fiftyone"),
 )
 OF_SWEEPS = (
     ("export", "{run}", "--format", "3db", "--out", "made/3db"),

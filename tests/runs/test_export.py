@@ -105,10 +105,9 @@ def test_the_command_writes_by_the_name_of_the_file(run: Path, format: str, caps
 def test_what_is_wrong_is_told(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for words, message in (
         (["export", "two"], "unknown run 'two'"),
-        (
-            ["export", "one", "--format", "xls"],
-            "unknown format 'xls'. Known: 3db, csv, fiftyone, gltf, json, mitsuba, parq",
-        ),
+        (["export", "one", "--format", "xls"], "unknown format 'xls'. Known: 3db, coco, csv, gltf, json, mitsuba, "),
+        (["export", "one", "--format", "fiftyone", "--out", "x"], "fiftyone is gone, as FiftyOne reads COCO; say "),
+        (["export", "one", "--all"], "--all: belongs to --format coco and yolo"),
         (["export", "one", "--kind", "serch"], "unknown kind of rows 'serch'. Did you mean 'search'?"),
         (["export", "one", "--json", "--format", "csv"], "--json: prints JSON, but --format asks for csv"),
         (["export", "one", "--out", "."], "--out: expected the name of a file, got the folder"),

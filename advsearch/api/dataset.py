@@ -1,0 +1,291 @@
+"""The pictures of a run as a dataset to look at, to label and to train on: at the size that the model sees, rendered
+again from what the rows say, with every thing in them that has a name: as COCO's JSON, or for trainers of YOLO."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+import advsearch
+from advsearch import rooms
+from advsearch.config import AttackConfig, SweepConfig
+from advsearch.described import Value
+from advsearch.engine.attack_parts import SEARCHED_WITH, parts_in, problem_of_parts
+from advsearch.engine.judging import facts_of
+from advsearch.engine.sweeps import KIND
+from advsearch.engine.sweeps.swept_scene import Scenes
+from advsearch.engine.verifier import kept_answer
+from advsearch.errors import FileFormatError, InputError
+from advsearch.files import JsonObject
+from advsearch.models import find_label_set
+from advsearch.models.labels import names_nothing
+from advsearch.progress import Progress
+from advsearch.runs.directory import CONFIG, PARTS, find_run, is_run, only_here
+from advsearch.runs.files import placed_by, storage_errors, write_text
+from advsearch.runs.images import write_png
+from advsearch.runs.store import NAME, Row, Store
+from advsearch.runs.summary import attack_of
+from advsearch.scene.assets import Bools
+from advsearch.scene.description import OBJECT
+from advsearch.scene.outlines import SeenThing, seen_things
+from advsearch.scene.renderer import Renderer
+from advsearch.settings import read_yaml
+from advsearch.tasks import Facts, Task
+from advsearch.tasks.classification import ClassTask
+from advsearch.tasks.together import Together
+
+IMAGES, LABELS, COCO, YOLO = "images", "labels", "annotations.json", "data.yaml"
+"""What is in the folder of a dataset."""
+
+CLEAN = ("first control", "control")
+"""Kinds of rows of an attack that look at the scene without its answer."""
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """One picture of a run.
+
+    Attributes:
+        name: of its file, without ending.
+        picture: (H, W, 3) sRGB in [0, 1], rounded to 8 bits: what the model sees.
+        things: that it shows, each with the number of its category.
+        rows: what the models of the run say of it.
+        values: the configuration by parameter.
+        same: whether the first model is right, or wrong, as its row says.
+    """
+
+    name: str
+    picture: Tensor
+    things: Sequence[tuple[SeenThing, int]]
+    rows: Sequence[Row]
+    values: Mapping[str, Value]
+    same: bool
+
+
+@dataclass
+class Categories:
+    """The labels of the models, in the order of their outputs; of models without, what the object is called.
+
+    `unnamed` are the things that were seen and have no category.
+    """
+
+    labels: tuple[str, ...] = ()
+    unnamed: set[str] = field(default_factory=set)
+
+    def things(self, task: Task, facts: Facts, renderer: Renderer, u: Tensor) -> list[tuple[SeenThing, int]]:
+        """Return the things that a configuration (d,) shows, each with the number of its category."""
+        own = task.tasks[0] if isinstance(task, Together) else task
+        labels: tuple[str, ...] = (facts.label or facts.own_label or facts.object,)
+        right = 0
+        if isinstance(own, ClassTask) and own.labels:
+            labels, right = own.labels, own.right_classes(facts)[0]
+        if self.labels not in ((), labels):
+            raise InputError(
+                f"RUN: its parts have other categories, {facts.object} among them; export one of its parts"
+            )
+        self.labels, meshes, found = labels, renderer.scene.made[0].meshes, []
+        for one in seen_things(renderer, u):
+            try:
+                name = meshes[one.name].label or one.name
+                found.append((one, right if one.name == OBJECT else find_label_set(name, labels).indices[0]))
+            except InputError:
+                self.unnamed.add(one.name)
+        return found
+
+
+def write_dataset(run: str | Path, out: Path, format: str, *, every: bool, progress: Progress) -> tuple[int, list[str]]:
+    """Write the pictures of a run with what is true of them, whole or not at all.
+
+    Args:
+        run: name or folder of a run of `sweep` or `attack`, or of one with such parts (a suite, a study).
+        out: a folder; it is made, or empty.
+        format: "coco" or "yolo".
+        every: also pictures that all models are right about.
+
+    Returns:
+        How many pictures there are (of 0, nothing is written), and sentences that a reader has to know.
+
+    Raises:
+        InputError: the scene of the run is not to be had any more, or `out` is not empty.
+        UnknownNameError: there is no such run.
+        FileFormatError: the run is of another command, or has not ended.
+    """
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise InputError(f"out: {out} is there already and not empty; name another folder")
+    folder, categories = find_run(run), Categories()
+    with placed_by("out"):
+        with storage_errors(out):
+            out.parent.mkdir(parents=True, exist_ok=True)
+            kept = tempfile.TemporaryDirectory(prefix=".export-", dir=out.parent)
+        with kept:
+            place, images = Path(kept.name) / "dataset", list[JsonObject]()
+            things, others = list[JsonObject](), 0
+            for number, shown in enumerate(_pictures(folder, categories, every, progress), 1):
+                write_png(place / IMAGES / f"{shown.name}.png", shown.picture.numpy())
+                images.append(_image(number, shown))
+                listed = [_thing(len(things) + k, number, *one) for k, one in enumerate(shown.things, 1)]
+                things, others = things + listed, others + (not shown.same)
+                if format == "yolo":
+                    write_text(place / LABELS / f"{shown.name}.txt", _lines(listed, *shown.picture.shape[:2]))
+            if not images:
+                return 0, []
+            if format == "yolo":
+                names: JsonObject = {"train": IMAGES, "val": IMAGES, "names": [*categories.labels]}
+                write_text(place / YOLO, json.dumps(names, indent=1) + "\n")
+            else:
+                write_text(place / COCO, json.dumps(_coco(categories, images, things), allow_nan=False))
+            with storage_errors(out):
+                os.replace(place, out)
+    notes = []
+    if categories.unnamed:
+        notes.append(f"Without a category, as no label is called so: {', '.join(sorted(categories.unnamed))}.")
+    if others:
+        notes.append(f"In {others} of them the model says otherwise than the run's rows: something has changed since.")
+    return len(images), notes
+
+
+# ---- pictures -------------------------------------------------------------------------------------------------------
+
+
+def _pictures(folder: Path, categories: Categories, every: bool, progress: Progress) -> Iterator[Shown]:
+    """Render what can be rendered again of a run, or of its parts."""
+    parts = [one for one in sorted((folder / PARTS).glob("*")) if is_run(one)]
+    for part in parts:
+        for shown in _pictures(part, categories, every, progress):
+            yield replace(shown, name=f"{part.name}-{shown.name}")
+    if parts:
+        return
+    command = str(read_yaml(folder / CONFIG).get("command"))
+    if command not in READ:
+        raise InputError(
+            f"{folder}: expected a run of {' or '.join(READ)}, or one with such parts, got one of {command}"
+        )
+    if needed := [one for one in only_here(folder) if not one.startswith(SEARCHED_WITH)]:
+        raise InputError(f"{folder}: {', '.join(needed)}: only the Python session that asked has what renders it")
+    yield from READ[command](folder, categories, every, progress)
+
+
+def _swept(folder: Path, categories: Categories, every: bool, progress: Progress) -> Iterator[Shown]:
+    """The pictures of a sweep as its first model sees them."""
+    scenes_of: Callable[[SweepConfig], Scenes] = rooms.in_room("sweep", "carry_out", "scenes_of")
+    scenes = scenes_of(SweepConfig.from_yaml(folder / CONFIG).model_copy(update={"metrics": {}}))
+    job, rows = scenes.job, defaultdict[int, list[Row]](list)
+    with Store(folder / NAME, read_only=True) as store:
+        for row in store.rows(KIND):
+            rows[row.step // len(job.models)].append(row)
+    chosen = sorted(number for number, some in rows.items() if every or not all(row.correct for row in some))
+    count = job.per_scene * len(job.places)
+    if chosen and not 0 <= chosen[0] <= chosen[-1] < count:
+        raise FileFormatError(f"{folder / NAME}: expected rows of its {count} pictures, got one of another")
+    progress.stage("rendering pictures", len(chosen))
+    for number in chosen:
+        ((scene, _, query), *_) = job.queries(range(number, number + 1))
+        view, place, some = scenes.named(scene), job.places[int(scene)], sorted(rows[number], key=lambda row: row.step)
+        facts, size = facts_of(place.scene, place.object, job.config.label, dict), job.sizes[0]
+        picture = view.pictures([query])[0]
+        things = categories.things(job.tasks[0], facts, view.renderers[size], query.u)
+        first = next((row.correct for row in some if row.step % len(job.models) == 0), None)
+        same = first in (None, view.judge(0, query.u, picture).right)
+        yield Shown(f"{number:06d}", picture, things, some, some[0].values, same)
+        progress.advance(1)
+
+
+def _attacked(folder: Path, categories: Categories, every: bool, progress: Progress) -> Iterator[Shown]:
+    """The trials of an attack's answer, and of the scene without it; where nothing varies, the first of each."""
+    summary, parts = attack_of(folder), parts_in(folder)
+    problem, _ = problem_of_parts(parts)
+    answered = summary.adversarial is not None
+    kinds = dict.fromkeys(CLEAN, problem.domain.start)
+    if answered:
+        kinds["baseline verification" if summary.answer_from else "verification"] = kept_answer(folder, problem)
+    with Store(folder / NAME, read_only=True) as store:
+        tried = {kind: [row for row in store.rows(kind) if every or not row.correct] for kind in kinds}
+    chosen = [row for rows in tried.values() for row in (rows if problem.conditions else rows[:1])]
+    progress.stage("rendering pictures", len(chosen))
+    for row in chosen:
+        u, seed, spp = kinds[row.kind], max(0, row.seed or 0), row.spp or problem.spp
+        picture, whole = problem.picture(u, seed, spp), problem.whole(u, seed)
+        things = categories.things(
+            problem.task, facts_of(parts.scene, parts.config.object, parts.config.label, dict), problem.renderer, whole
+        )
+        same = row.correct in (None, problem.judge(picture, whole).right)
+        values = {**problem.describe(u, seed), **row.values}
+        yield Shown(f"{row.kind.replace(' ', '-')}-{row.step:02d}", picture, things, [row], values, same)
+        progress.advance(1)
+
+
+READ = {SweepConfig.command: _swept, AttackConfig.command: _attacked}
+
+
+# ---- as COCO has them -----------------------------------------------------------------------------------------------
+
+
+def _coco(categories: Categories, images: list[JsonObject], things: list[JsonObject]) -> JsonObject:
+    """Labels that name nothing, such as a background, are no categories, and the others keep their numbers."""
+    named = [(number, name) for number, name in enumerate(categories.labels) if not names_nothing(name)]
+    return {
+        "info": {"description": "pictures of advsearch", "version": advsearch.__version__},
+        "licenses": [],
+        "images": [*images],
+        "annotations": [*things],
+        "categories": [{"id": number, "name": name, "supercategory": ""} for number, name in named],
+    }
+
+
+def _image(number: int, shown: Shown) -> JsonObject:
+    height, width = shown.picture.shape[:2]
+    answers: list[dict[str, Any]] = [
+        {
+            "row": row.id, "kind": row.kind, "step": row.step, "right": row.correct, "label": row.label,
+            "probability": row.probability, "margin": row.margin,
+            **{name: one["value"] for name, one in row.values.items() if name == "model"},
+        }
+        for row in shown.rows
+    ]  # fmt: skip
+    extras: dict[str, Any] = {
+        "right": all(row.correct for row in shown.rows), "answers": answers,
+        "configuration": {name: dict(one) for name, one in shown.values.items() if name != "model"},
+    }  # fmt: skip
+    return {"id": number, "file_name": f"{shown.name}.png", "height": height, "width": width, "advsearch": extras}
+
+
+def _thing(number: int, image: int, thing: SeenThing, category: int) -> JsonObject:
+    rows, columns = (np.flatnonzero(thing.mask.any(axis=side)) for side in (1, 0))
+    left, top = int(columns[0]), int(rows[0])
+    return {
+        "id": number,
+        "image_id": image,
+        "category_id": category,
+        "bbox": [left, top, int(columns[-1]) + 1 - left, int(rows[-1]) + 1 - top],
+        "area": int(thing.mask.sum()),
+        "segmentation": {"size": [*thing.mask.shape], "counts": [*_runs(thing.mask)]},
+        "iscrowd": 0,
+        "visible_share": None if thing.share is None else round(thing.share, 4),
+        "truncated": thing.truncated,
+    }
+
+
+def _runs(mask: Bools) -> list[int]:
+    """The lengths of runs down the columns of a mask, from left to right, the first of pixels outside of it."""
+    flat = mask.ravel(order="F")
+    ends = [0, *(np.flatnonzero(np.diff(flat)) + 1).tolist(), flat.size]
+    return [*[0][: int(flat[0])], *map(int, np.diff(ends))]
+
+
+def _lines(things: Sequence[Mapping[str, Any]], height: int, width: int) -> str:
+    """Number of the class, middle of the box and its size, as shares of the picture."""
+    lines = []
+    for one in things:
+        left, top, across, down = one["bbox"]
+        box = ((left + across / 2) / width, (top + down / 2) / height, across / width, down / height)
+        lines.append(f"{one['category_id']} " + " ".join(f"{side:.6f}" for side in box))
+    return "\n".join([*lines, ""])

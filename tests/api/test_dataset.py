@@ -1,0 +1,188 @@
+"""Pictures of runs as datasets: what stands in the files, against the runs themselves, by a reader of its own."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+import torch
+from samples import make_answered
+from small_models import easy
+
+import advsearch
+from advsearch.api.dataset import _runs
+from advsearch.cli.main import main
+from advsearch.config import AttackConfig
+from advsearch.engine.attack_parts import parts_in, problem_of_parts
+from advsearch.runs.directory import PARTS, RunDirectory
+from advsearch.runs.images import read_png
+from advsearch.runs.store import NAME, Row, Store
+from advsearch.scene.geometry import camera_to_world
+
+pytestmark = pytest.mark.usefixtures("two_threads")
+
+EASY = "small_models:easy"
+
+
+@pytest.fixture(scope="module")
+def swept(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A mug before which a vase comes, right in some pictures and wrong in others."""
+    folder = tmp_path_factory.mktemp("runs") / "suite"
+    controls: Any = {"occlusion": {"which": "vase", "coverage": [0.0, 0.7], "direction": [0, 360]}, "camera": {}}
+    with RunDirectory.create(folder):
+        pass
+    advsearch.sweep(
+        "mug", EASY, controls=controls, samples=6, spp=2, resolution=32, denoise="none", trials=0,
+        run=folder / PARTS / "views", keep_pictures="none",
+    )  # fmt: skip
+    return folder
+
+
+def exported(run: Path, out: Path, *more: str) -> Any:
+    assert main(["export", str(run), "--format", "coco", "--out", str(out), "--code", EASY, *more]) == 0
+    return json.loads((out / "annotations.json").read_text())
+
+
+def decoded(segmentation: Any) -> npt.NDArray[np.bool_]:
+    """The mask of uncompressed runs, which go down the columns, as COCO's paper has them."""
+    (height, width), filled, values = segmentation["size"], False, list[bool]()
+    for count in segmentation["counts"]:
+        values, filled = values + [filled] * count, not filled
+    found: npt.NDArray[np.bool_] = np.array(values).reshape(width, height).T
+    return found
+
+
+def rows_of(run: Path) -> list[Row]:
+    with Store(run / NAME, read_only=True) as store:
+        return list(store.rows("sweep"))
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
+def test_runs_come_back_as_the_mask(share: float) -> None:
+    mask = np.random.default_rng(3).random((5, 7)) < share
+    counts = _runs(mask)
+    assert sum(counts) == mask.size and all(counts[1:])
+    assert (decoded({"size": [5, 7], "counts": counts}) == mask).all()
+
+
+def test_a_sweep_is_what_its_model_saw(swept: Path, tmp_path: Path) -> None:
+    found = exported(swept / PARTS / "views", tmp_path / "out", "--all")
+    assert found["categories"] == [{"id": k, "name": n, "supercategory": ""} for k, n in enumerate(["mug", "vase"])]
+    rows, model = rows_of(swept / PARTS / "views"), easy()
+    assert [one["advsearch"]["answers"][0]["row"] for one in found["images"]] == [row.id for row in rows]
+    assert [one["id"] for one in found["annotations"]] == list(range(1, len(found["annotations"]) + 1))
+    for image, row in zip(found["images"], rows, strict=True):
+        picture = torch.from_numpy(read_png(tmp_path / "out" / "images" / image["file_name"]))
+        assert picture.shape[:2] == (image["height"], image["width"]) == (32, 32)
+        mug, vase = model(picture)[0].tolist()
+        assert vase - mug == pytest.approx(row.margin, abs=1e-4)
+        assert image["advsearch"]["right"] is row.correct
+        assert image["advsearch"]["configuration"]["camera.azimuth"] == row.values["camera.azimuth"]
+    for one in found["annotations"]:
+        mask = decoded(one["segmentation"])
+        y, x = np.nonzero(mask)
+        assert one["bbox"] == [x.min(), y.min(), x.max() + 1 - x.min(), y.max() + 1 - y.min()]
+        assert one["area"] == mask.sum() and one["iscrowd"] == 0
+        if one["category_id"] == 0 and not one["truncated"]:
+            hidden = rows[one["image_id"] - 1].values["occlusion.hidden"]["value"]
+            assert one["visible_share"] == pytest.approx(1.0 - float(hidden), abs=0.05)
+    both = [decoded(one["segmentation"]) for one in found["annotations"] if one["image_id"] == 1]
+    assert len(both) == 2 and not (both[0] & both[1]).any()
+
+
+def test_failures_alone_are_taken_by_default_and_parts_are_read(swept: Path, tmp_path: Path) -> None:
+    found, rows = exported(swept, tmp_path / "out"), rows_of(swept / PARTS / "views")
+    wrong = [f"views-{row.step:06d}.png" for row in rows if not row.correct]
+    assert 0 < len(wrong) < len(rows) and [one["file_name"] for one in found["images"]] == wrong
+    assert sorted(one.name for one in (tmp_path / "out" / "images").iterdir()) == wrong
+
+
+def test_boxes_are_where_vertices_are_projected(tmp_path: Path) -> None:
+    grid: Any = {"camera.azimuth": [10.0, 130.0], "camera.elevation": [5.0, 40.0]}
+    advsearch.sweep("mug", EASY, grid, spp=1, resolution=(48, 64), denoise="none", trials=0, run=tmp_path / "run")
+    found = exported(tmp_path / "run", tmp_path / "out", "--all")
+    own = advsearch.load_scene("mug").description
+    assert len(found["images"]) == 4
+    for image, one in zip(found["images"], found["annotations"], strict=True):
+        told = {name: said["value"] for name, said in image["advsearch"]["configuration"].items() if "." in name}
+        scene = advsearch.load_scene("mug", settings=told).description
+        pose = camera_to_world(scene, 64 / 48)
+        x, y, z = ((own.meshes["object"].mesh.vertices @ own.meshes["object"].to_world[:3, :3].T
+                    + own.meshes["object"].to_world[:3, 3] - pose[:3, 3]) @ pose[:3, :3]).T  # fmt: skip
+        focal = 32.0 / np.tan(np.radians(scene.number("camera.fov")) / 2.0)
+        across, down = 32.0 - focal * x / z, 24.0 - focal * y / z
+        left, top, width, height = one["bbox"]
+        got = [left, top, left + width, top + height]
+        assert got == pytest.approx([across.min(), down.min(), across.max(), down.max()], abs=1.0)
+        assert one["visible_share"] == pytest.approx(1.0, abs=0.01) and one["truncated"] is False
+
+
+def answered(path: Path, **more: Any) -> Path:
+    config = AttackConfig(object="mug", model=EASY, controls={"pose": {}}, resolution=16, denoise="none", **more)
+    run = make_answered(path, config, np.full(6, 0.25))
+    with RunDirectory.resume(run) as held:
+        for kind, wrong in (("control", False), ("verification", True)):
+            held.record(*(Row(kind, k, seed=k, spp=1, correct=not wrong, label="a") for k in range(3)))
+    return run
+
+
+def test_an_attack_has_its_answer_and_the_clean_scene(tmp_path: Path) -> None:
+    run = answered(tmp_path / "run")
+    assert [one["file_name"] for one in exported(run, tmp_path / "a")["images"]] == ["verification-00.png"]
+    found = exported(run, tmp_path / "b", "--all")
+    assert [one["file_name"] for one in found["images"]] == ["control-00.png", "verification-00.png"]
+    assert [one["advsearch"]["right"] for one in found["images"]] == [True, False]
+    assert found["images"][1]["advsearch"]["configuration"]["pose.yaw"]["unit"] == "degrees"
+    problem, _ = problem_of_parts(parts_in(run))
+    for name, u in (("control", problem.domain.start), ("verification", torch.full((6,), 0.25))):
+        picture = torch.from_numpy(read_png(tmp_path / "b" / "images" / f"{name}-00.png"))
+        assert torch.allclose(picture, problem.picture(u, 0, 1), atol=1e-6)
+    over = exported(answered(tmp_path / "over", over={"camera": {}}), tmp_path / "c")
+    assert len(over["images"]) == 3 and len({json.dumps(one["segmentation"]) for one in over["annotations"]}) == 3
+
+
+def test_yolo_has_a_line_for_each_box(swept: Path, tmp_path: Path) -> None:
+    run = swept / PARTS / "views"
+    found = exported(run, tmp_path / "coco")
+    assert main(["export", str(run), "--format", "yolo", "--out", str(tmp_path / "yolo"), "--code", EASY]) == 0
+    assert json.loads((tmp_path / "yolo" / "data.yaml").read_text())["names"] == ["mug", "vase"]
+    for image in found["images"]:
+        text = (tmp_path / "yolo" / "labels" / image["file_name"]).with_suffix(".txt").read_text()
+        lines = [[float(number) for number in line.split()] for line in text.splitlines()]
+        own = [one for one in found["annotations"] if one["image_id"] == image["id"]]
+        for (label, x, y, width, height), one in zip(lines, own, strict=True):
+            box = [32 * (x - width / 2), 32 * (y - height / 2), 32 * width, 32 * height]
+            assert label == one["category_id"] and box == pytest.approx(one["bbox"], abs=1e-4)
+
+
+def test_what_cannot_be_written_is_said(swept: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def refused(run: Path, *more: str) -> str:
+        assert (
+            main(["export", str(run), "--format", "coco", "--out", str(tmp_path / "out"), "--code", EASY, *more]) == 2
+        )
+        return capsys.readouterr().err
+
+    run = shutil.copytree(swept / PARTS / "views", tmp_path / "run")
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "mine").touch()
+    assert "not empty" in refused(run)
+    (tmp_path / "out" / "mine").unlink()
+    with RunDirectory.create(tmp_path / "other") as other:
+        (other.path / "run.yaml").write_text("# advsearch run configuration\nschema: 1\ncommand: gap\n")
+    assert "expected a run of sweep or attack" in refused(tmp_path / "other")
+    with closing(sqlite3.connect(run / NAME)) as rows, rows:
+        before = rows.execute("SELECT MAX(step) FROM evaluations").fetchone()
+        rows.execute("UPDATE evaluations SET correct = 1")
+        rows.commit()
+        assert "--all takes the others" in refused(run)
+        rows.execute("UPDATE evaluations SET step = 999999, correct = 0 WHERE step = ?", before)
+        rows.commit()
+        assert "expected rows of its 6 pictures" in refused(run)
+    assert not list((tmp_path / "out").iterdir()) and not list(tmp_path.glob(".export-*"))

@@ -1,0 +1,63 @@
+"""How much of a thing a picture shows, against a picture of twice the width and height round the same one."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import advsearch
+from advsearch.scene import outlines
+from advsearch.scene.outlines import SeenThing, seen_things
+from advsearch.scene.renderer import Renderer
+
+pytestmark = pytest.mark.usefixtures("two_threads")
+
+SIDE = 64
+
+
+def renderer(controls: Any, fov: float, side: int, camera: str | None = None) -> Renderer:
+    scene = advsearch.load_scene("mug", settings={"camera.distance": 2.2, "camera.fov": fov})
+    return scene.renderer(controls, resolution=side, denoise="none")
+
+
+def seen(one: Renderer) -> SeenThing:
+    (found,) = seen_things(one, one.start)
+    return found
+
+
+@pytest.mark.parametrize("shift", [[0.0, 0.0], [0.45, -0.3]])
+def test_the_share_is_that_of_a_larger_picture(shift: list[float]) -> None:
+    wide = math.degrees(2.0 * math.atan(2.0 * math.tan(math.radians(15.0))))
+    moved = seen(renderer({"camera": {"shift_x": shift[0], "shift_y": shift[1]}}, 30.0, SIDE))
+    around = seen(renderer({"camera": {"shift_x": shift[0] / 2, "shift_y": shift[1] / 2}}, wide, 2 * SIDE))
+    middle = around.mask[SIDE // 2 : -SIDE // 2, SIDE // 2 : -SIDE // 2]
+    assert (middle != moved.mask).mean() < 0.002
+    assert moved.share == pytest.approx(moved.mask.sum() / around.mask.sum(), abs=0.01)
+    assert moved.truncated is bool(middle.sum() < around.mask.sum())
+    assert around.truncated is False and around.share == pytest.approx(1.0, abs=0.01)
+
+
+def test_a_lens_bends_the_outline() -> None:
+    scene = advsearch.load_scene("mug", camera="fisheye")
+    found = seen(scene.renderer({"pose": {}}, resolution=SIDE, denoise="none"))
+    assert found.truncated is False and found.share == pytest.approx(1.0, abs=0.03)
+
+
+def test_an_outline_that_is_elsewhere_is_not_believed(monkeypatch: pytest.MonkeyPatch) -> None:
+    places = outlines._places
+    one = renderer({"pose": {}}, 60.0, SIDE)
+    assert seen(one).share == pytest.approx(1.0, abs=0.01)
+
+    def beside(*given: Any) -> Any:
+        where, before = places(*given)
+        return where + 4.0, before
+
+    monkeypatch.setattr(outlines, "_places", beside)
+    assert seen(one).share is None
+    monkeypatch.setattr(outlines, "_places", lambda *given: (places(*given)[0], np.zeros(len(given[2]), np.bool_)))
+    assert (seen(one).share, seen(one).truncated) == (None, None)
+    assert torch.equal(torch.from_numpy(seen(one).mask), one.surfaces(one.start).seen("object"))
