@@ -71,7 +71,7 @@ def unexpected(function: str, given: Mapping[str, object], known: Sequence[str])
         if name in known:
             continue
         meant = [one for one, others in SYNONYMS.items() if one in known and name.lower() in others.split()]
-        meant = meant or (() if name.lower() in DEVICES else resembling(name, known)[:2])
+        meant = meant or ([] if name.lower() in DEVICES else resembling(name, known)[:2])
         hint = f"; did you mean {' or '.join(f'`{one}`' for one in meant)}?" if meant else ""
         reason = f" ({NOWHERE[name.lower()]})" if name.lower() in NOWHERE else ""
         return TypeError(f"{function}() got an unexpected keyword argument {name!r}{hint}{reason}")

@@ -28,12 +28,12 @@ ROUNDED = 2e-3
 
 def solved() -> Callable[[Tensor], Tensor]:
     matrix = scipy.sparse.diags([[4.0] * 5, [-1.0] * 4, [-1.0] * 4], [0, 1, -1]).tocsc()
-    return lambda x: _Solve.apply(x.reshape(5, 2), linalg.splu(matrix))  # type: ignore[no-any-return, no-untyped-call]
+    return lambda x: _Solve.apply(x.reshape(5, 2), linalg.splu(matrix))  # type: ignore[no-untyped-call]
 
 
 def sparse() -> Callable[[Tensor], Tensor]:
     matrix = scipy.sparse.random(7, 5, 0.5, "csr", random_state=0)
-    return lambda x: SparseProduct.apply(matrix, x.reshape(5, 2))  # type: ignore[no-any-return, no-untyped-call]
+    return lambda x: SparseProduct.apply(matrix, x.reshape(5, 2))  # type: ignore[no-untyped-call]
 
 
 def transport() -> Callable[[Tensor], Tensor]:
