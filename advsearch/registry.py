@@ -109,17 +109,18 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
 
 
 _ALLOWED: set[str] = set()
-"""The Python code that whoever uses this process has named. Of the process, so that it holds in every thread; empty at
-first, so that what only a file names is refused, whoever reads that file."""
+"""The Python code, and the models of libraries, that whoever uses this process has named. Of the process, so that it
+holds in every thread; empty at first, so that what only a file names is refused, whoever reads that file."""
 
-_CODE = re.compile(r"[^\W\d][\w.]*:[^\W\d][\w.]*")
+_CODE = re.compile(r"[^\W\d][\w.]*:[^\W\d][\w.]*|(?:hf|timm|torchvision):\S+")
 
 
 def allow_code(*names: str) -> None:
     """Allow this process to import Python code that a file names, such as the `run.yaml` of a run: read it before.
 
     Args:
-        names: "package.module:attribute", each as it stands in the file, without weights behind an @.
+        names: "package.module:attribute", each as it stands in the file, without weights behind an @; or a model of a
+            library, "hf:OWNER/NAME", whose weights may then be fetched.
 
     Raises:
         InputError: a name is none of this form.
@@ -179,6 +180,11 @@ def nothing_allowed() -> Iterator[None]:
     finally:
         _ALLOWED.clear()
         _ALLOWED.update(before)
+
+
+def may_fetch(model: str) -> bool:
+    """Return whether a person has named a model of a library, so that its weights may be fetched."""
+    return model in _ALLOWED or model.partition("@")[0] in _ALLOWED
 
 
 def check_import(name: str) -> None:

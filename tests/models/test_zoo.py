@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import socket
 import struct
 import subprocess
 import sys
@@ -19,6 +20,8 @@ from torch import Tensor, nn
 
 from advsearch.errors import FileFormatError, ModelError, UnknownNameError
 from advsearch.models import ModelWarning, load_model
+from advsearch.models.zoo.library import reading
+from advsearch.registry import allow_named, nothing_allowed
 from advsearch.tasks import Detection
 
 IMAGES = torch.rand((2, 8, 8, 3), generator=torch.Generator().manual_seed(0))
@@ -202,6 +205,26 @@ def timm(monkeypatch: pytest.MonkeyPatch) -> Any:
     )
     monkeypatch.setitem(sys.modules, "timm", library)
     return library
+
+
+def test_a_model_that_only_a_file_names_is_fetched_from_nowhere() -> None:
+    """Whatever a library does to reach a server; what it has in its cache is read all the same."""
+    with socket.create_server(("127.0.0.1", 0)) as server, nothing_allowed():
+
+        def fetch() -> None:
+            socket.create_connection(server.getsockname(), 10.0).close()
+
+        with pytest.raises(ModelError, match="a file names the model timm:tiny, which is not on this machine"):
+            with reading("timm:tiny", ""):
+                fetch()
+        with reading("timm:tiny", ""):
+            pass
+        fetch()  # outside of the block nothing is changed
+        for given in ({"model": "reference,timm:tiny@own.safetensors"}, {"model": ["hf:owner/tiny"]}):
+            allow_named(given)
+        for spec in ("timm:tiny", "timm:tiny@own.safetensors", "hf:owner/tiny"):
+            with reading(spec, ""):
+                fetch()
 
 
 def test_timm_brings_its_weights_and_what_belongs_to_them(timm: Any, tmp_path: Path) -> None:

@@ -10,6 +10,8 @@ import contextlib
 import importlib
 import logging
 import os
+import socket
+import threading
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -25,6 +27,7 @@ from advsearch.errors import ModelError
 from advsearch.models.model import ModelWarning, Triple
 from advsearch.models.probe import first_line
 from advsearch.models.source import Purpose, Source, source_of
+from advsearch.registry import may_fetch
 
 
 def library(name: str, spec: str, extra: str) -> Any:
@@ -56,18 +59,52 @@ def without_unpickling() -> Iterator[None]:
 
 
 @contextlib.contextmanager
+def connecting(allowed: bool, tries: list[object]) -> Iterator[None]:
+    """Let this thread connect to nobody inside the block, unless that is allowed: what a library has in its cache is
+    read all the same. Each try is noted in `tries`."""
+    if allowed:
+        yield
+        return
+    names, thread = ("connect", "connect_ex"), threading.get_ident()
+    before = {name: getattr(socket.socket, name) for name in names}
+
+    def refusing(name: str) -> Callable[[socket.socket, Any], Any]:
+        def connect(self: socket.socket, address: Any) -> Any:
+            if threading.get_ident() != thread:
+                return before[name](self, address)
+            tries.append(address)
+            raise ConnectionRefusedError("only a file names this model")
+
+        return connect
+
+    for name in names:
+        setattr(socket.socket, name, refusing(name))
+    try:
+        yield
+    finally:
+        for name in names:
+            setattr(socket.socket, name, before[name])
+
+
+@contextlib.contextmanager
 def reading(spec: str, advice: str) -> Iterator[None]:
     """Turn what a library raises while it fetches and reads a model's weights into a ModelError, which advises what
-    else its user may give; it never unpickles."""
+    else its user may give; it never unpickles, and connects to nobody for a model that only a file names."""
     disabled = logging.root.manager.disable
     logging.disable(logging.WARNING)  # of single tries to connect: an error is raised in the end
+    tries: list[object] = []
     try:
-        with without_unpickling(), warnings.catch_warnings():
+        with without_unpickling(), warnings.catch_warnings(), connecting(may_fetch(spec), tries):
             warnings.simplefilter("ignore")
             yield
     except ModelError:
         raise
     except Exception as error:  # a library raises nearly anything for what is not there or damaged
+        if tries:
+            raise ModelError(
+                f"a file names the model {spec}, which is not on this machine and would be fetched; if you trust it, "
+                f"allow it yourself: in Python with advsearch.allow_code({spec!r}), or with `code={spec}`"
+            ) from error
         raise ModelError(
             f"model {spec}: cannot be fetched or read ({first_line(error)}). Weights come from the library's cache on "
             f"this machine, else from where it publishes them; they are never unpickled. {advice}"
