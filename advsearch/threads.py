@@ -43,12 +43,16 @@ def cores(quota: Path = _CPU_MAX) -> int:
     return allowed
 
 
+MOST = 4
+"""Threads for each core, at most. More only wait for each other, and a file of somebody else may ask for any number."""
+
+
 def configure(threads: int | None = None, *, rendering: bool = True) -> int:
     """Give Dr.Jit a number of threads and torch half as many, now and (Dr.Jit) when Mitsuba is imported later.
 
     Args:
-        threads: how many, at least 1; None means what ``OMP_NUM_THREADS`` said when this module was imported, and
-            without it every core that this process may use.
+        threads: how many, at least 1; at most `MOST` for each core are taken. None means what ``OMP_NUM_THREADS`` said
+            when this module was imported, and without it every core that this process may use.
         rendering: whether renders and the model take turns; if not, torch gets all threads too.
 
     Returns:
@@ -60,7 +64,7 @@ def configure(threads: int | None = None, *, rendering: bool = True) -> int:
     global _chosen
     if threads is not None and threads < 1:
         raise InputError(f"threads: expected a number of at least 1, got {threads}")
-    _chosen = threads if threads is not None else _default()
+    _chosen = min(threads if threads is not None else _default(), MOST * cores())
     for_torch = max(1, _chosen // 2) if rendering else _chosen
     if "torch" in sys.modules:
         sys.modules["torch"].set_num_threads(for_torch)

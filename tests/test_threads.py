@@ -58,6 +58,13 @@ def test_a_containers_quota_bounds_the_cores(tmp_path: Path, text: str, expected
     assert threads.cores(quota) == (expected or threads.cores(tmp_path / "absent"))
 
 
+def test_a_file_that_asks_for_very_many_threads_gets_a_few_for_each_core() -> None:
+    try:
+        assert threads.configure(1024) == threads.MOST * threads.cores()
+    finally:
+        threads.configure()
+
+
 @pytest.mark.parametrize("wrong", [0, -2])
 def test_fewer_than_one_thread_is_an_error(wrong: int) -> None:
     with pytest.raises(InputError, match=rf"threads: expected a number of at least 1, got {wrong}"):
