@@ -187,15 +187,15 @@ FAULTS = (
     Fault(
         "policies: every generation has the same noise",
         "advsearch/attacks/policies/evolution.py",
-        "seeded(state.seed, state.generation * (state.population // 2) + pair)",
-        "seeded(state.seed, pair)",
+        "seeded(self.seed, self.generation * (self.population // 2) + pair)",
+        "seeded(self.seed, pair)",
         ("tests/attacks/policies/test_policy_evolution.py",),
     ),
     Fault(
         "policies: a mean keeps its bias",
         "advsearch/attacks/policies/pgd.py",
-        "mean = state.mean / (1.0 - self.beta1**state.taken)",
-        "mean = state.mean",
+        "mean = state.direction / (1.0 - self.beta1**state.taken)",
+        "mean = state.direction",
         ("tests/attacks/policies/test_policy_adam.py",),
     ),
     Fault(
@@ -215,8 +215,8 @@ FAULTS = (
     Fault(
         "sweeps: a rate of another group",
         "advsearch/engine/sweeps/summary.py",
-        "answer=rate(both + answer_only, len(before)),",
-        "answer=rate(both + clean_only, len(before)),",
+        "answer=counted(per_unit(after, units), of),",
+        "answer=counted(per_unit(before, units), of),",
         ("tests/engine/test_sweep.py",),
     ),
     Fault(
@@ -306,8 +306,8 @@ FAULTS = (
     Fault(
         "explanations: a rule is counted on the rows that chose it",
         "advsearch/explanations/__init__.py",
-        "here, elsewhere = counting.right[inside], counting.right[~inside]",
-        "here, elsewhere = (choosing.right[covered(conditions, choosing) == one] for one in (True, False))",
+        "rule = CountedRule(conditions, counting.where(inside), counting.where(~inside))",
+        "rule = CountedRule(conditions, choosing.where(covered(conditions, choosing)), choosing)",
         ("tests/questions/test_explanations.py",),
     ),
     Fault(

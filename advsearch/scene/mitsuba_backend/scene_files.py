@@ -86,7 +86,9 @@ def _check_numbers(plugin: Mapping[str, object], where: str) -> None:
         InputError: one is a text, a colour or the like.
     """
     for key, value in plugin.items():
-        if key in NUMBERS:
+        if isinstance(value, Mapping) and value.get("type", "rgb") not in ("rgb", "spectrum"):  # of whatever name
+            _check_numbers(value, where if plugin["type"] != "scene" else f"{where}: {shown(key, quoted=False)}")
+        elif key in NUMBERS:
             shape, expected = NUMBERS[key]
             try:
                 right = np.asarray(value, np.float64).shape == shape
@@ -96,8 +98,6 @@ def _check_numbers(plugin: Mapping[str, object], where: str) -> None:
                 raise InputError(
                     f"{where}: expected {expected} as {key} of its {plugin['type']}, got {shown(str(value))}"
                 )
-        elif isinstance(value, Mapping) and "type" in value:
-            _check_numbers(value, where if plugin["type"] != "scene" else f"{where}: {shown(key, quoted=False)}")
 
 
 @dataclass(frozen=True)
