@@ -106,8 +106,8 @@ def commands() -> dict[str, list[list[str]]]:
 
 
 def predictions() -> dict[str, list[list[str]]]:
-    """Return searches that are long enough to be predicted. Sweeps, and searches over cameras alone, are not among them:
-    pictures of this size are rendered as soon as predicted."""
+    """Return searches that are long enough to be predicted; not sweeps, nor searches over cameras alone, whose pictures
+    are rendered as soon as predicted at this size."""
     texture, few = FORMS["texture"], ["--trials", "6", "--verify-spp", "4", "--measure", "no"]
     wide = ["--epsilon", "0.3", "--steps", "40", "--trials", "20", "--measure", "no"]
     found = {
