@@ -7,6 +7,7 @@ import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum
+from functools import partial
 
 from torch import Tensor
 
@@ -324,21 +325,14 @@ def verify(
         allowed = rule.allowed(rule.counted(beside) if len(looks) == 1 else looks[-1])
         return len(made) >= least and tried(made).count(False) > allowed
 
+    more = partial(run_trials, evaluate, spp=spp, seed=seed, begin=begin)
+
     def clean_until(counted: int) -> int:
         """Try the clean configuration until so many trials count, or all are made; return how many that takes."""
         nonlocal renders
         count = counted
         while True:
-            missing = run_trials(
-                evaluate,
-                domain.start,
-                spp=spp,
-                seed=seed,
-                trials=count,
-                first=len(beside),
-                begin=begin,
-                kind=control,
-            )
+            missing = more(domain.start, trials=count, first=len(beside), kind=control)
             beside.extend(missing)
             renders += len(missing)
             short = counted - rule.counted(beside[:count])
@@ -349,18 +343,7 @@ def verify(
     for look in looks:
         count = clean_until(look)
         until = lost if curtailed or len(looks) > 1 else None
-        made = run_trials(
-            evaluate,
-            u,
-            spp=spp,
-            seed=seed,
-            trials=count,
-            first=len(done),
-            begin=begin,
-            kind=kind,
-            keep=keep,
-            until=until,
-        )
+        made = more(u, trials=count, first=len(done), kind=kind, keep=keep, until=until)
         done, renders = [*done, *made], renders + len(made)
         early = count < looks[-1]
         needed = rule.needed(rule.counted(beside[:count]), early=early)
