@@ -53,7 +53,7 @@ from advsearch import threads
 threads.configure()
 
 from advsearch.config import AttackConfig, SweepConfig  # noqa: E402
-from advsearch.engine.acceptance import VIEWS, Deviation, View, compared, view_of  # noqa: E402
+from advsearch.engine.acceptance import VIEWS, ComparedView, Deviation, compared, view_of  # noqa: E402
 from advsearch.engine.loading import load_scene  # noqa: E402
 from advsearch.engine.sweeps.loop import Sweep  # noqa: E402
 from advsearch.engine.sweeps.summary import SweepResult  # noqa: E402
@@ -220,7 +220,7 @@ def ruled(scene: str, searches: int) -> None:
 
 def compare(
     renderer: Renderer, light: SurfaceRenderer, whole: Tensor, search: int, model: Model, label: str | None
-) -> list[View]:
+) -> list[ComparedView]:
     """One view, predicted and with each mistake planted; all beside the same traced pictures."""
     inputs = renderer.scene.assembly(renderer.space.inputs(whole))
     color, lit = light.color(inputs), light.light(inputs)
@@ -253,7 +253,7 @@ def simulated(searches: int = 4000) -> None:
         normal = generator.normal(size=(2, searches, VIEWS))
         squares, moved = share**2 * np.exp(sigma * normal[0] - sigma**2 / 2.0), bias + deviation * normal[1]
         good = sum(
-            compared(lambda n, one=one: View(16.0 * float(squares[one, n]), 16.0, float(moved[one, n]), 3)).good  # type: ignore[misc]
+            compared(lambda n, one=one: ComparedView(16.0 * float(squares[one, n]), 16.0, float(moved[one, n]), 3)).good  # type: ignore[misc]
             for one in range(searches)
         )
         return f"{100.0 * good / searches:5.1f}"

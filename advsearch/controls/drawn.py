@@ -35,7 +35,7 @@ NEAR = 1e-4
 
 
 @dataclass(frozen=True)
-class Drawn(Range):
+class DrawnRange(Range):
     """Values from `low` to `high`, the shares `least` to `most` of a distribution: its quantiles, and what it is."""
 
     quantiles: Quantiles
@@ -65,7 +65,7 @@ class Drawn(Range):
         return above if above < 1.0 else below
 
 
-def read_drawn(where: str, parameter: Parameter, given: Mapping[str, object]) -> Drawn:
+def read_drawn(where: str, parameter: Parameter, given: Mapping[str, object]) -> DrawnRange:
     """Return the spec of a parameter from its distribution, `{distribution: NAME, PARAMETER: NUMBER, ...}`.
 
     Raises:
@@ -114,7 +114,7 @@ def read_drawn(where: str, parameter: Parameter, given: Mapping[str, object]) ->
     return _between(where, frozen.ppf, least, most, text)
 
 
-def _own(where: str, parameter: Parameter, given: OwnQuantiles) -> Drawn:
+def _own(where: str, parameter: Parameter, given: OwnQuantiles) -> DrawnRange:
     """The spec of a function from Python."""
     name = str(given["name"])
 
@@ -140,8 +140,8 @@ def _own(where: str, parameter: Parameter, given: OwnQuantiles) -> Drawn:
     return _between(where, quantiles, float(shares[0]), float(shares[-1]), name)
 
 
-def _between(where: str, quantiles: Quantiles, least: float, most: float, text: str) -> Drawn:
+def _between(where: str, quantiles: Quantiles, least: float, most: float, text: str) -> DrawnRange:
     low, high = (float(one) for one in quantiles(np.array([least, most])))
     if not low < high:
         raise InputError(f"{where}: {text} has only the value {low:g}; write that to fix it")
-    return Drawn(low, high, quantiles, least, most, text)
+    return DrawnRange(low, high, quantiles, least, most, text)

@@ -39,7 +39,7 @@ MarginOf = Callable[[Tensor, Tensor], float]
 
 
 @dataclass(frozen=True)
-class View:
+class ComparedView:
     """A predicted picture beside traced ones: mean squares over the object, levels of 255, of what it is off and of
     what a rendered one is (below 0 by chance where both are small); by how much its margin is larger; the pictures that
     were traced; and by how much the search has moved the margin of what is predicted."""
@@ -64,7 +64,7 @@ class Deviation:
     margin: float = MARGIN
 
     @classmethod
-    def of(cls, views: Sequence[View]) -> Deviation:
+    def of(cls, views: Sequence[ComparedView]) -> Deviation:
         square, allowed = (statistics.fmean(getattr(one, name) for one in views) for name in ("square", "allowed"))
         logits = statistics.fmean(one.margin for one in views)
         margin = max(MARGIN, OF_MOVED * statistics.fmean(one.moved for one in views))
@@ -89,7 +89,7 @@ class Deviation:
         return f"{self.logits:+.2f} off in the margin, where {self.margin:.2f} would do"
 
 
-def compared(view: Callable[[int], View]) -> Deviation:
+def compared(view: Callable[[int], ComparedView]) -> Deviation:
     """Compare predictions, in few views where these decide.
 
     Args:
@@ -111,7 +111,7 @@ def view_of(
     spp: int,
     margin: MarginOf,
     before: Tensor | None = None,
-) -> View:
+) -> ComparedView:
     """Compare a predicted picture of a configuration with traced ones.
 
     Args:
@@ -130,7 +130,7 @@ def view_of(
     square, allowed = (squares_off(one, halves, seen) for one in (predicted, rendered))
     found = margin(predicted, u)
     moved = 0.0 if before is None else abs(found - margin(before, u))
-    return View(square, allowed, found - margin(clean, u), pictures=3, moved=moved)
+    return ComparedView(square, allowed, found - margin(clean, u), pictures=3, moved=moved)
 
 
 def squares_off(picture: Tensor, halves: Sequence[Tensor], seen: Tensor | None = None) -> float:

@@ -19,7 +19,7 @@ from advsearch.attacks import Evaluate, Evaluation
 from advsearch.attacks.domain import Domain, centre_of_option
 from advsearch.attacks.draws import Draws
 from advsearch.attacks.evaluation import Query, WhichGradient
-from advsearch.engine.acceptance import Deviation, View, compared
+from advsearch.engine.acceptance import ComparedView, Deviation, compared
 from advsearch.engine.problem import Problem
 from advsearch.engine.transport import Conditions, Predictor, Tick
 from advsearch.files import scaled
@@ -234,7 +234,7 @@ class Bank(Predictor):
         self.gaps.append(statistics.fmean(seen) - statistics.fmean(unseen))
         error = math.sqrt(sum(statistics.pvariance(some) / len(some) for some in (seen, unseen)))
 
-        def view(number: int) -> View:
+        def view(number: int) -> ComparedView:
             which = number % len(chosen)
             return problem.view(chosen[which].renderer, wholes[which], seeds.stream(noise, "view", number), SPP)
 

@@ -18,7 +18,7 @@ from advsearch.attacks.evaluation import Query, WhichGradient
 from advsearch.attacks.verification import EASIER, OVER_CONDITIONS, WORST_CASE, Rule
 from advsearch.controls import Space
 from advsearch.described import Value
-from advsearch.engine.acceptance import View, view_of
+from advsearch.engine.acceptance import ComparedView, view_of
 from advsearch.engine.judging import Described, KnownTruths, Looked, Metrics, judgements, mean_metrics
 from advsearch.engine.objective import Asked, domain_of
 from advsearch.models import Model
@@ -169,7 +169,7 @@ class Problem:
 
     def view(
         self, predict: Callable[[Tensor], Tensor], whole: Tensor, seed: int, spp: int, *, drawn: Tensor | None = None
-    ) -> View:
+    ) -> ComparedView:
         """Compare a picture (H, W, 3) that is predicted of the whole space at `whole` with traced ones; `spp` are the
         samples a pixel of a rendered one. Of what is searched, the search has not moved what is `drawn`, (d,) bool."""
         with torch.no_grad():

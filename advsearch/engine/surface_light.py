@@ -17,7 +17,7 @@ from advsearch import seeds
 from advsearch.attacks import Evaluate, Evaluation, Policy
 from advsearch.attacks.evaluation import Query
 from advsearch.controls import Space
-from advsearch.engine.acceptance import VIEWS, Deviation, View, compared
+from advsearch.engine.acceptance import VIEWS, ComparedView, Deviation, compared
 from advsearch.engine.bank import stratified
 from advsearch.engine.problem import Problem
 from advsearch.engine.transport import Conditions, Predictor, Tick
@@ -315,7 +315,7 @@ class SurfaceLight(Predictor):
 
         drawn = self._moving if self._colored else torch.ones_like(self._moving)
 
-        def view(number: int) -> View:
+        def view(number: int) -> ComparedView:
             seen = seeds.stream(seed, "view", number)
             return problem.view(self.renderer, wholes[number], seen, problem.spp, drawn=drawn)
 

@@ -17,7 +17,7 @@ from torch.distributions import Laplace as TorchLaplace
 from advsearch.attacks.draws import Draws
 from advsearch.config import AttackConfig
 from advsearch.controls import CameraControl, EnvironmentControl, PatchControl
-from advsearch.controls.drawn import Drawn
+from advsearch.controls.drawn import DrawnRange
 from advsearch.controls.numbers import BoundNumbers
 from advsearch.distributions import as_setting
 from advsearch.engine.attack_parts import controls_given
@@ -65,7 +65,7 @@ def test_torchs_distributions_are_scipys_of_other_names(distribution: torch.dist
     torch.manual_seed(0)
     drawn = distribution.sample((40_000,)).double().numpy()
     spec = CameraControl(azimuth=distribution).specs["azimuth"]
-    assert isinstance(spec, Drawn)
+    assert isinstance(spec, DrawnRange)
     for share in (0.1, 0.5, 0.9):
         value = float(spec.at(torch.tensor([(share - spec.least) / (spec.most - spec.least)], dtype=torch.float64)))
         assert abs((drawn < value).mean() - share) < 0.01
@@ -101,7 +101,7 @@ def test_a_family_of_ones_own_is_not_scipys_of_the_same_name() -> None:
 def test_an_endless_tail_is_left_out_on_both_sides() -> None:
     """Also where a parameter's bound is far beyond it: 4.75 deviations."""
     spec = CameraControl(exposure=Normal(0.0, 0.5)).specs["exposure"]
-    assert isinstance(spec, Drawn) and (spec.low, spec.high) == pytest.approx((-2.377, 2.377), abs=1e-3)
+    assert isinstance(spec, DrawnRange) and (spec.low, spec.high) == pytest.approx((-2.377, 2.377), abs=1e-3)
 
 
 def test_the_clean_scene_has_its_value_where_the_distribution_has_it() -> None:

@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from advsearch.engine.acceptance import BOUND, VIEWS, View, compared, squares_off, view_of
+from advsearch.engine.acceptance import BOUND, VIEWS, ComparedView, compared, squares_off, view_of
 
 SEARCHES = 400
 
@@ -23,7 +23,7 @@ def accepted(share: float, bias: float = 0.0, deviation: float = 0.2) -> float:
     good = 0
     for normal in random.normal(size=(SEARCHES, 2, VIEWS)):
         squares, margins = share**2 * np.exp(sigma * normal[0] - sigma**2 / 2.0), bias + deviation * normal[1]
-        good += compared(lambda n, s=squares, m=margins: View(9.0 * s[n], 9.0, m[n], 3)).good  # type: ignore[misc]
+        good += compared(lambda n, s=squares, m=margins: ComparedView(9.0 * s[n], 9.0, m[n], 3)).good  # type: ignore[misc]
     return good / SEARCHES
 
 
@@ -47,18 +47,18 @@ def test_right_predictions_are_accepted_and_wrong_ones_seldom(
 
 def test_few_views_decide_where_they_are_clear() -> None:
     for square, margin, pictures in ((1.0, 0.0, 6), (90.0, 0.0, 6), (8.0, 0.0, 18), (1.0, 0.5, 18)):
-        assert compared(lambda number, s=square, m=margin: View(s, 9.0, m, 3)).pictures == pictures  # type: ignore[misc]
+        assert compared(lambda number, s=square, m=margin: ComparedView(s, 9.0, m, 3)).pictures == pictures  # type: ignore[misc]
 
 
 def test_what_the_search_moved_allows_as_small_a_part_of_it() -> None:
-    assert compared(lambda number: View(1.0, 9.0, 1.0, 3, moved=30.0)).good
-    assert not compared(lambda number: View(1.0, 9.0, 1.0, 3, moved=10.0)).good
+    assert compared(lambda number: ComparedView(1.0, 9.0, 1.0, 3, moved=30.0)).good
+    assert not compared(lambda number: ComparedView(1.0, 9.0, 1.0, 3, moved=10.0)).good
 
 
 @pytest.mark.parametrize("broken", [{"margin": math.nan}, {"square": math.nan}, {"margin": math.inf}])
 def test_what_is_no_number_is_refused(broken: dict[str, float]) -> None:
     given: dict[str, Any] = {"square": 1.0, "allowed": 9.0, "margin": 0.0, "pictures": 3, **broken}
-    assert not compared(lambda number: View(**given)).good
+    assert not compared(lambda number: ComparedView(**given)).good
 
 
 class Tracer:

@@ -18,7 +18,7 @@ from advsearch.attacks.evaluation import Query
 from advsearch.config import AttackConfig
 from advsearch.engine import acceptance, surface_light
 from advsearch.engine import problem as problems
-from advsearch.engine.acceptance import Deviation, View
+from advsearch.engine.acceptance import ComparedView, Deviation
 from advsearch.engine.attack_parts import parts_of, problem_of_parts
 from advsearch.engine.attack_result import AttackResult
 from advsearch.engine.surface_light import SurfaceLight
@@ -184,9 +184,9 @@ def test_a_camera_that_was_drawn_is_no_progress_of_the_search(monkeypatch: pytes
     problem, _ = problem_of_parts(parts_of(AttackConfig(object="mug", **CAMERA | {"controls": controls})))
     before: list[Tensor | None] = []
 
-    def view_of(*given: Any) -> View:
+    def view_of(*given: Any) -> ComparedView:
         before.append(given[-1])
-        return View(8.0, 9.0, 0.0, 3)
+        return ComparedView(8.0, 9.0, 0.0, 3)
 
     monkeypatch.setattr(problems, "view_of", view_of)
     light = SurfaceLight(problem, 40)

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from advsearch import seeds
 from advsearch.attacks.draws import Product
-from advsearch.engine.acceptance import CHECK_SPP, VIEWS, Deviation, MarginOf, View, compared, view_of
+from advsearch.engine.acceptance import CHECK_SPP, VIEWS, ComparedView, Deviation, MarginOf, compared, view_of
 from advsearch.engine.sweeps.axes import Axis
 from advsearch.engine.sweeps.points import Points
 from advsearch.files import scaled
@@ -223,7 +223,7 @@ class SweptPredictor(ABC):
         seed = seeds.stream(self.seed, "light", self.before + group)
         made = self._made(self._configuration(number, 0), seed)
 
-        def view(check: int) -> View:
+        def view(check: int) -> ComparedView:
             u = self._configuration(number, seeds.stream(seed, "check", check) % self._groups.size)
             (predicted,) = self._predicted(made, [u])
             return view_of(self.renderer, predicted, u, seeds.stream(seed, "traced", check), self.spp, self.score)
