@@ -45,7 +45,7 @@ from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.results.base import RenderResult, Result
 from advsearch.runs.results.sweep import SweepSummary
 from advsearch.scene import environments, exposure, library
-from advsearch.scene.description import FRAME_FILL
+from advsearch.scene.geometry import FRAME_FILL
 from advsearch.scene.importing.pictures import TEXTURE_LIMIT
 from advsearch.scene.mitsuba_backend import scene as mitsuba_scene
 from advsearch.scene.settings import SETTINGS
