@@ -26,7 +26,7 @@ from advsearch.attacks import POLICIES, candidates, clopper_pearson, planned_ren
 from advsearch.attacks.objectives import OBJECTIVE_KINDS
 from advsearch.attacks.policies import pgd
 from advsearch.attacks.verification import WORST_CASE
-from advsearch.cli.main import COMMANDS
+from advsearch.cli.commands import COMMANDS
 from advsearch.cli.names import REGISTRIES
 from advsearch.config import TRIALS, TRIALS_OVER, AttackConfig
 from advsearch.config.attack import FEWEST_TRIALS

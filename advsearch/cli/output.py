@@ -27,6 +27,10 @@ if TYPE_CHECKING:
     from advsearch.runs.results.base import Result
 
 
+OK, BAD_INPUT, FELL_SHORT, INTERRUPTED = 0, 2, 3, 130
+"""Exit statuses of a command that did its work, was given what it cannot take, is a check that fell short, and was
+interrupted."""
+
 LONGEST_WORD = 300
 """Most characters of a name in a message; of a longer one the ends are shown."""
 
@@ -167,9 +171,6 @@ def print_json(value: Any) -> None:
 def finish(result: Result, answer: Callable[[Any], str], *, as_json: bool) -> int:
     """Print the last word of a command, as JSON or as the text for a person that `answer` makes, and return its exit
     status."""
-    # late: it imports this module
-    from advsearch.cli.main import INTERRUPTED, OK
-
     if as_json:
         print_json(result)
     else:
@@ -197,8 +198,8 @@ def go_on_command(run: str | Path) -> str:
 
 def _code_in(file: Path) -> Sequence[str]:
     """The Python code that a run.yaml names."""
-    # late: it imports this module; and so that --help answers at once
-    from advsearch.cli.run import command_in, config_of_file
+    # late, so that --help answers at once
+    from advsearch.cli.flags import command_in, config_of_file
     from advsearch.config import SceneConfig
     from advsearch.settings import split_names
 

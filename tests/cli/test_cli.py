@@ -27,8 +27,9 @@ from samples import ATTACK, AVERAGE, BRACKET, EASIER, SUMMARY, TARGET, make_run,
 import advsearch
 from advsearch import __version__
 from advsearch.cli import names
+from advsearch.cli.commands import COMMANDS, help_of
 from advsearch.cli.flags import with_flags
-from advsearch.cli.main import COMMANDS, help_of, main
+from advsearch.cli.main import main
 from advsearch.cli.output import aligned, finish, watch_progress
 from advsearch.cli.output import shown_text as answer
 from advsearch.config import AttackConfig, SweepConfig
