@@ -21,7 +21,7 @@ from typing import IO, TYPE_CHECKING, Any, TextIO, cast
 
 from advsearch.errors import AdvsearchError, StorageError
 from advsearch.interrupts import INTERRUPTS
-from advsearch.progress import NullProgress, Progress, bars, lines
+from advsearch.progress import Progress, watched
 
 if TYPE_CHECKING:
     from advsearch.runs.results.base import Result
@@ -278,26 +278,13 @@ def _descriptor_redirected(source: int, target: int) -> Iterator[None]:
 @contextmanager
 def at_work(*, as_json: bool, quiet: bool) -> Iterator[Progress]:
     """Watch a command's work; where JSON is to be printed, keep everything else off standard output meanwhile."""
-    with output_kept_clean() if as_json else nullcontext(), watch_progress(quiet=quiet) as watcher:
+    from advsearch.cli.flags import with_flags  # late, so that --help answers at once
+
+    with output_kept_clean() if as_json else nullcontext(), watched(not quiet, with_flags) as watcher:
         progress = LookingProgress(watcher)
         progress.stage("starting: loading PyTorch and Mitsuba")
         yield progress
         INTERRUPTS.look()
-
-
-@contextmanager
-def watch_progress(*, quiet: bool = False) -> Iterator[Progress]:
-    """Yield the progress that suits standard error: none when `quiet`, bars on a terminal, lines elsewhere."""
-    from advsearch.cli.flags import with_flags  # late, so that --help answers at once
-
-    if quiet:
-        yield NullProgress()
-    elif sys.stderr.isatty():
-        with bars(raw(sys.stderr), with_flags) as drawn:
-            yield drawn
-    else:
-        with lines(sys.stderr, with_flags) as told:
-            yield told
 
 
 class LookingProgress:
