@@ -1,33 +1,32 @@
-"""The answers of a recipe's runs as one table, and what every figure makes of it: numbers, sentences, a picture."""
+"""The answers of a recipe's runs as one table, and what figures make of it: counts, sentences, a picture."""
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any
 
+import numpy as np
+import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 
-from advsearch.attacks import clopper_pearson
+from advsearch.attacks.trials import CONFIDENCE
+from advsearch.attacks.units import per_unit, share_interval
 from advsearch.errors import InputError
-from advsearch.explanations import (
-    ANSWER,
-    GROUP,
-    OTHERS,
-    PART,
-    PHOTOGRAPHS,
-    TRIAL,
-    Answered,
-    figure_value,
-    rows_of,
-)
-from advsearch.questions.photographs.answer import LOOSE_PHOTO, PHOTO
-from advsearch.questions.recipe.answer import NamedCount, RecipeFigure
+from advsearch.explanations import ANSWER, GROUP, OTHERS, PART, PHOTOGRAPHS, TRIAL, Answered, figure_value
+from advsearch.questions.recipe.answer import Cell
+from advsearch.report.figures import BLUE, GREY, RED
 from advsearch.report.phrases import percent
 from advsearch.report.wording import interval_text
-from advsearch.runs.results.sweep import SurfaceMap, SweepSummary
+from advsearch.runs.results.base import Interval
+from advsearch.runs.results.sweep import SurfaceMap
+
+COLOURS = (BLUE, RED, "#1f7a45", "#b4540a", "#6b3fa0", GREY)
+MARKS = "os^DvP"
+
+COUNT = ["of", "share", "low", "high"]
+"""Columns of a count behind the one of what is counted."""
 
 
 @dataclass(frozen=True)
@@ -39,36 +38,36 @@ class Table:
         groups: names of groups, each with the names of objects in it.
         surfaces: by the names of runs, which parts of the object go with wrong answers.
         cores: that this process may use.
+        folder: of the recipe's run.
     """
 
     rows: Sequence[Answered]
-    groups: Mapping[str, Sequence[str]]
+    groups: Mapping[str, Sequence[str]] = field(default_factory=dict)
     surfaces: Mapping[str, SurfaceMap] = field(default_factory=dict)
     cores: int = 1
+    folder: Path = Path()
 
     def of(self, parts: Sequence[str]) -> Table:
         """Return the answers of some parts; of all that were rendered where none is named."""
-        rows = [row for row in self.rows if (row.part in parts if parts else row.part != PHOTOGRAPHS)]
-        return replace(self, rows=rows)
+        return self.where(row for row in self.rows if (row.part in parts if parts else row.part != PHOTOGRAPHS))
+
+    def where(self, rows: Iterable[Answered]) -> Table:
+        """Return the table with some of its rows."""
+        return replace(self, rows=list(rows))
 
     def value(self, row: Answered, column: str) -> float | str:
-        """Return what a row has in a column: a value, the answer, or the group of its object; an InputError where there
-        is none."""
-        if column == ANSWER:
-            return row.answer
-        if column == PART:
-            return row.part
-        if column == GROUP:
-            name = str(row.values["object"])
-            return next((group for group, inside in self.groups.items() if name in inside), OTHERS)
-        if column not in row.values:
-            known = ", ".join([*row.values, ANSWER, PART, *([GROUP] if self.groups else [])])
-            raise InputError(f"figures: expected one of {known}, got {column[:60]!r}")
-        return row.values[column]
+        """Return what a row has in a column: a value, the answer, the part, or the group of its object; an InputError
+        where there is none."""
+        own = {**row.values, ANSWER: row.answer, PART: row.part}
+        if self.groups:
+            named = [group for group, objects in self.groups.items() if own["object"] in objects]
+            own[GROUP] = named[0] if named else OTHERS
+        if column not in own:
+            raise InputError(f"figures: expected one of {', '.join(own)}, got {column[:60]!r}")
+        return own[column]
 
     def numbers(self, column: str) -> list[float]:
-        """Return what each row has in a column of numbers; an InputError where there is no such column, or it has
-        names."""
+        """Return what each row has in a column of numbers; an InputError where it has names."""
         values = [self.value(row, column) for row in self.rows]
         numbers = [value for value in values if isinstance(value, (int, float))]
         if len(numbers) < len(values):
@@ -76,48 +75,107 @@ class Table:
         return numbers
 
     def unit(self, column: str) -> str:
-        """Return the unit of a column; empty where it has none."""
-        return next((row.units.get(column, "") for row in self.rows if column in row.units), "")
+        """Return the unit of a column as it stands behind a number: a space and the unit, or nothing."""
+        unit = next((row.units[column] for row in self.rows if column in row.units), "")
+        return f" {unit}" if unit not in ("", "1", "name") else ""
 
     def by(self, column: str) -> dict[str, list[Answered]]:
         """Return the rows by what they have in a column, in the order in which that first comes; numbers by size."""
-        found: dict[float | str, list[Answered]] = {}
+        groups: dict[float | str, list[Answered]] = {}
         for row in self.rows:
-            found.setdefault(self.value(row, column), []).append(row)
-        numbers = all(isinstance(value, (int, float)) for value in found)
-        keys = sorted(found) if numbers else list(found)
-        return {figure_value(key): found[key] for key in keys}
+            groups.setdefault(self.value(row, column), []).append(row)
+        numbers = all(isinstance(value, (int, float)) for value in groups)
+        return {figure_value(key): groups[key] for key in (sorted(groups) if numbers else groups)}
 
 
-def counted(name: str, rows: Iterable[Answered]) -> NamedCount:
-    """Return in how many of some rows the model is right."""
-    right = [row.correct for row in rows]
-    return count_of(name, sum(right), len(right))
+@dataclass(frozen=True, eq=False)
+class Count:
+    """How many of some rows are counted: of each independent unit, such as a drive, `counted` (n,) of its `of` (n,)."""
+
+    name: str
+    counted: npt.NDArray[np.float64]
+    of: npt.NDArray[np.float64]
+
+    @classmethod
+    def over(
+        cls, name: str, rows: Sequence[Answered], counts: Callable[[Answered], bool] = lambda row: row.correct
+    ) -> Count:
+        """Count rows: those with right answers, or those that `counts` says."""
+        flags = np.array([counts(row) for row in rows], dtype=np.float64)
+        if all(row.unit is None for row in rows):
+            return cls(name, flags, np.ones(len(rows)))
+        units = np.array([row.unit or f"row {number}" for number, row in enumerate(rows)])
+        return cls(name, per_unit(flags, units), per_unit(np.ones(len(rows)), units))
+
+    @property
+    def cells(self) -> list[Cell]:
+        """What is counted, and the values of `COUNT`."""
+        return [round(self.counted.sum()), self.total, self.share, *(self.interval() or (None, None))]
+
+    @property
+    def total(self) -> int:
+        """How many rows there are."""
+        return round(self.of.sum())
+
+    @property
+    def share(self) -> float | None:
+        """What is counted of all rows; None where there are none."""
+        return float(self.counted.sum() / self.of.sum()) if self.total else None
+
+    def interval(self, among: int = 1) -> Interval | None:
+        """Return the 95 % interval of the share, widened for a choice among so many (Bonferroni)."""
+        return share_interval(self.counted, self.of, 1.0 - (1.0 - CONFIDENCE) / max(among, 1)) if self.total else None
+
+    def told(self, verb: str = "right") -> str:
+        """Return ``right in 12 of 20 (60 %, 95 % interval 36-81 %)``; `verb` is what is counted."""
+        counted, total = round(self.counted.sum()), self.total
+        return f"{verb} in {counted} of {total} ({percent(self.share)}, 95 % interval {interval_text(self.interval())})"
+
+    def below(self, other: Count, among: int = 1) -> bool:
+        """Return whether the interval of this share lies below that of another, both widened."""
+        own, others = self.interval(among), other.interval(among)
+        return own is not None and others is not None and own[1] < others[0]
 
 
-def count_of(name: str, correct: int, configurations: int) -> NamedCount:
-    """Return a count with its share and the 95 % interval of that."""
-    return NamedCount(
-        name=name,
-        configurations=configurations,
-        correct=correct,
-        accuracy=correct / configurations if configurations else None,
-        interval=clopper_pearson(correct, configurations) if configurations else None,
-    )
+def extremes(counts: Sequence[Count], worst: str, best: str, thing: str, verb: str = "right") -> list[str]:
+    """Return which of several has the lowest share and which the highest, and whether that is more than chance.
+
+    The two were chosen among k for being extreme, so that they are compared by intervals of confidence 1 - 0.05 / k,
+    which hold for all k together. Where these overlap, no difference is shown. They are called, say, "Hardest" and
+    "easiest", several of them "environments", and `verb` is what is counted.
+    """
+    known = [one for one in counts if one.total]
+    if len(known) < 2:
+        return [f"{one.name}: {one.told(verb)}." for one in known]
+    shares = [one.share or 0.0 for one in known]
+    low, high = known[int(np.argmin(shares))], known[int(np.argmax(shares))]
+    if min(shares) == max(shares):
+        return [f"All {len(known)} {thing} have the same share, {percent(low.share)}: no difference is shown."]
+
+    def named(one: Count) -> str:
+        ties = shares.count(one.share or 0.0) - 1
+        return f"is {one.name}" + (f" (as {ties} other{'s' if ties > 1 else ''})" if ties else "")
+
+    widened = f"the intervals of the two, widened for having been chosen among {len(known)},"
+    return [
+        f"{worst} {named(low)}: {low.told(verb)}; {best} {named(high)}: {high.told(verb)}.",
+        f"The difference is shown: {widened} do not overlap."
+        if low.below(high, len(known))
+        else f"No difference between the {thing} is shown: {widened} overlap.",
+    ]
 
 
-def most_frequent(rows: Iterable[Answered]) -> list[tuple[str, int]]:
-    """Return the answers with how often each was given, the most frequent first."""
-    return sorted(Counter(row.answer for row in rows).items(), key=lambda one: (-one[1], one[0]))
+def plural(column: str) -> str:
+    """Return what several values of a column are called: ``environments``, ``materials``, ``values of pose.yaw``."""
+    if column == TRIAL:
+        return "kinds of trials"
+    control, _, parameter = column.partition(".")
+    return f"values of {column}" if parameter not in ("", "which") else f"{control}s"
 
 
-def photographs_of(folder: Path, summary: SweepSummary) -> list[Answered]:
-    """Return the answers about the photographs that a sweep has, as `rows_of` does: one that was aligned with a
-    rendering has all values of that, others have no parameters."""
-    return rows_of(PHOTOGRAPHS, folder, summary, (PHOTO, LOOSE_PHOTO))
-
-
-CONFIDENCE = 0.95
+def bare(name: str) -> str:
+    """Return a parameter's name without its control: ``milk`` for ``contents.milk``."""
+    return name.rpartition(".")[2]
 
 
 class Options(BaseModel):
@@ -135,77 +193,14 @@ class Options(BaseModel):
         return self.of
 
 
-Chosen = TypeVar("Chosen", bound=Options)
-FigureType = TypeVar("FigureType", bound=RecipeFigure)
-
-
 @dataclass(frozen=True)
-class FigureKind(Generic[Chosen, FigureType]):
-    """One kind of figure: the options that it takes, its numbers, what makes these from the answers, and what draws
-    them on a figure of matplotlib, which may look into the recipe's folder, of a size in inches.
+class MadeFigure:
+    """A figure: title, sentences, a table of its numbers, and what draws it, but for the title, on a figure of
+    matplotlib of a size in inches."""
 
-    With `tells_models` it tells several models apart by itself; of others each model has one.
-    """
-
-    options: type[Chosen]
-    result: type[FigureType]
-    compute: Callable[[Table, Chosen], FigureType]
-    draw: Callable[[FigureType, Any, Path], None]
-    size: Callable[[FigureType], tuple[float, float]]
-    tells_models: bool = False
-
-
-def rate_with_interval(one: NamedCount, verb: str = "right") -> str:
-    """Return ``right in 12 of 20 (60 %, 95 % interval 36-81 %)``; `verb` is what is counted."""
-    return (
-        f"{verb} in {one.correct} of {one.configurations} "
-        f"({percent(one.accuracy)}, 95 % interval {interval_text(one.interval)})"
-    )
-
-
-def extremes(counts: Sequence[NamedCount], worst: str, best: str, thing: str, verb: str = "right") -> list[str]:
-    """Return which of several has the lowest accuracy and which the highest, and whether that is more than chance.
-
-    The two were chosen among k for being extreme, so that they are compared by intervals of confidence 1 - 0.05 / k,
-    which hold for all k together (Bonferroni). Where these overlap, no difference is shown. They are called, say,
-    "Hardest" and "easiest", several of them "environments", and `verb` is what is counted.
-    """
-    known = [one for one in counts if one.configurations]
-    if len(known) < 2:
-        return [f"{one.name}: {rate_with_interval(one, verb)}." for one in known]
-    low, high = (pick(known, key=lambda one: one.accuracy or 0.0) for pick in (min, max))
-    if low.accuracy == high.accuracy:
-        return [f"All {len(known)} {thing} have the same share, {percent(low.accuracy)}: no difference is shown."]
-    least, most = rate_with_interval(low, verb), rate_with_interval(high, verb)
-    said = f"{worst} {_tied(low, known)}: {least}; {best} {_tied(high, known)}: {most}."
-    widened = f"the intervals of the two, widened for having been chosen among {len(known)},"
-    if intervals_apart(low, high, len(known)):
-        return [said, f"The difference is shown: {widened} do not overlap."]
-    return [said, f"No difference between the {thing} is shown: {widened} overlap."]
-
-
-def _tied(one: NamedCount, counts: Sequence[NamedCount]) -> str:
-    """``is kitchen``, and where others have the same share ``is kitchen (as 2 others)``."""
-    others = sum(other.accuracy == one.accuracy for other in counts) - 1
-    return f"is {one.name}" + (f" (as {others} other{'s' if others > 1 else ''})" if others else "")
-
-
-def intervals_apart(low: NamedCount, high: NamedCount, among: int = 1) -> bool:
-    """Return whether the intervals of two rates do not overlap, each widened for a choice among so many."""
-    confidence = 1.0 - (1.0 - CONFIDENCE) / max(among, 1)
-    _, top = clopper_pearson(low.correct, low.configurations, confidence)
-    bottom, _ = clopper_pearson(high.correct, high.configurations, confidence)
-    return top < bottom
-
-
-def counted_by(table: Table, column: str) -> list[NamedCount]:
-    """Return how often the model is right, by what rows have in a column."""
-    return [counted(name, rows) for name, rows in table.by(column).items()]
-
-
-def plural(column: str) -> str:
-    """Return what several values of a column are called: ``environments``, ``materials``, ``values of pose.yaw``."""
-    if column == TRIAL:
-        return "kinds of trials"
-    control, _, parameter = column.partition(".")
-    return f"values of {column}" if parameter not in ("", "which") else f"{control}s"
+    title: str
+    text: Sequence[str]
+    columns: Sequence[str]
+    rows: Sequence[Sequence[Cell]]
+    draw: Callable[[Any], None]
+    size: tuple[float, float]
