@@ -106,15 +106,18 @@ def commands() -> dict[str, list[list[str]]]:
 
 
 def predictions() -> dict[str, list[list[str]]]:
-    """Return searches that are long enough to be predicted; not sweeps, nor searches over cameras alone, whose pictures
-    are rendered as soon as predicted at this size."""
+    """Return searches and sweeps that are long enough to be predicted, and large enough that it pays."""
     texture, few = FORMS["texture"], ["--trials", "6", "--verify-spp", "4", "--measure", "no"]
     wide = ["--epsilon", "0.3", "--steps", "40", "--trials", "20", "--measure", "no"]
+    large = ["--resolution", "96", "--spp", "8"]
     found = {
         "matrix": ["attack", "--control", texture, "--steps", "20", *few],
         "light": ["attack", "--control", "light.power", "--steps", "40", "--policy", "random", *few],
         "bank": ["attack", "--control", texture, "--over", "light", *wide],
         "over-camera": ["attack", "--control", texture, "--over", "camera", *wide],
+        "sweep-light": ["sweep", "--control", "light.power", "--samples", "100", "--trials", "0", "--spp", "32"],
+        "sweep-camera": ["sweep", "--control", "camera", "--samples", "150", "--trials", "0", *large],
+        "camera": ["attack", "--control", "camera", "--steps", "40", "--policy", "random", *few, *large],
     }
     return {f"{PREDICTED}{name}": [command] for name, command in found.items()}
 
@@ -288,7 +291,7 @@ def answer(command: Sequence[str], run: str) -> dict[str, Any]:
     shared = SHARED.get(command[0], SMALL)
     twice = shared[:2] == SMALL[:2] and {"--object", "compare"} & {*command}
     where = {"render": (), "report": ("--out", run)}.get(command[0], ("--run", str(Path.cwd() / run)))
-    said = written([*command, *(shared[2:] if twice else shared), *where, "--json"])
+    said = written([command[0], *(shared[2:] if twice else shared), *command[1:], *where, "--json"])
     found: dict[str, Any] = {"answer": json.loads(said) if said.strip() else None}
     if command[0] in ("attack", "sweep"):
         found["rows"] = list(csv.DictReader(io.StringIO(written(["export", run]))))
