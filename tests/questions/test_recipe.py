@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,6 @@ from advsearch.config import AttackConfig, SweepConfig
 from advsearch.engine.attack_parts import parts_of, problem_of_parts
 from advsearch.engine.surface_light import reason_against
 from advsearch.errors import AdvsearchError, FileFormatError, InputError, UnknownNameError
-from advsearch.explanations import Answered
 from advsearch.questions.recipe import carry_out as carrying_out
 from advsearch.questions.recipe.answer import RecipeFigure, RecipeResult, told_once
 from advsearch.questions.recipe.description import Recipe, planned, read_recipe, recipe_names, titles
@@ -48,6 +47,31 @@ figures:
 """
 
 
+@dataclass(frozen=True)
+class Answered:
+    """A row: what it shows, with units, and what was said of it."""
+
+    part: str
+    values: dict[str, Any]
+    units: dict[str, str]
+    answer: str
+    correct: bool
+    time: float | None = None
+    margin: float | None = None
+    unit: str | None = None
+
+
+def tabled(given: Sequence[Answered], groups: dict[str, list[str]] | None = None, **more: Any) -> Table:
+    """Rows as the table of a recipe."""
+    said = ("part", "answer", "correct", "time", "margin")
+    listed = [
+        {"model": "m", **one.values, **{name: getattr(one, name) for name in said}, "unit": one.unit or f"row {n}"}
+        for n, one in enumerate(given)
+    ]
+    units = {name: unit for one in given for name, unit in one.units.items()}
+    return Table.of(listed, groups or {}, units=units, **more)
+
+
 def rows(counts: dict[str, tuple[int, int]], **more: float | str) -> list[Answered]:
     """Rows with so many right of so many for each environment."""
     return [
@@ -66,7 +90,7 @@ def figure(
     described: dict[str, object], answered: Sequence[Answered], groups: dict[str, list[str]] | None = None
 ) -> MadeFigure:
     """The only figure of these rows."""
-    (made,) = make(Table(answered, groups or {}), *read_options(described, "here"))
+    (made,) = make(tabled(answered, groups), *read_options(described, "here"))
     return made
 
 
@@ -166,7 +190,7 @@ def test_what_no_command_takes_is_refused_before_anything_is_done(
         (
             {"figure": "rates", "by": "weather"},
             InputError,
-            "figures: expected one of environment, object, answer, part, got",
+            "figures: expected one of model, environment, object, part, answer, got",
         ),
     ],
 )
@@ -390,23 +414,9 @@ def test_what_is_drawn_has_the_mean_and_the_deviation_that_a_search_answers_with
 # ---- what figures say -----------------------------------------------------------------------------------------------
 
 
-def test_of_few_answers_it_is_not_said_that_none_is_right() -> None:
-    def told(given: dict[str, tuple[int, int]]) -> Sequence[str]:
-        return figure({"figure": "rates", "form": "map", "by": "object", "series": "environment"}, rows(given)).text
-
-    few = told({"noon": (0, 4), "loft": (3, 4)})
-    assert few[-1] == "1 of the pairs without a right answer has under 20 pictures: too few to say."
-    assert not any("No answer is right" in one for one in few)
-    many = told({"noon": (0, 40), "gallery": (0, 4), "loft": (30, 40)})
-    assert (
-        many[-2] == "No answer is right in 1 of 3 pairs: mug with noon (right in 0 of 40 (0 %, 95 % interval 0-9 %))."
-    )
-    assert not any("never" in one for one in many)
-
-
 def test_intervals_are_over_drives_where_frames_of_one_share_a_draw() -> None:
     frames = [replace(row, unit=f"drive {n // 10}") for n, row in enumerate(rows({"noon": (40, 100)}))]
-    alone, together = (Count.over("noon", some) for some in (rows({"noon": (40, 100)}), frames))
+    alone, together = (Count.over("noon", tabled(some).rows) for some in (rows({"noon": (40, 100)}), frames))
     own, others = alone.interval(), together.interval()
     assert own is not None and others is not None and alone.cells[:3] == together.cells[:3] == [40, 100, 0.4]
     assert own == clopper_pearson(40, 100) and others[0] < own[0] and others[1] > own[1]
@@ -485,7 +495,7 @@ def told_by(answer: Any, shapes: int, textures: int, seed: int) -> str:
         for _ in range(8)
     ]
     made = figure({"figure": "cues"}, answered)
-    assert sum(given for given, _, _ in predicted(Table(answered), CuesOptions())) == len(answered)
+    assert sum(given for given, _, _ in predicted(tabled(answered), CuesOptions())) == len(answered)
     (text,) = [one for one in made.text if "most frequent answer about the same object" in one]
     return next(
         kind for kind in ("by shape than by texture", "by texture than by shape", "no difference") if kind in text
@@ -582,32 +592,27 @@ def test_curves_along_two_parameters_say_once_what_holds_for_both() -> None:
     assert both in two.text and both in told_once([one, two])[0] and both not in told_once([one, two])[1]
 
 
-def test_a_fall_is_told_of_the_group_that_has_one() -> None:
+def test_values_that_come_round_are_counted_by_the_shorter_way() -> None:
     """Mugs are right near 0 and wrong behind, balls as often everywhere; 350 degrees are near 0."""
-    made = figure(
-        {
-            "figure": "rates",
-            "form": "lines",
-            "by": "yaw",
-            "series": "group",
-            "range": (0, 360),
-            "away_from": 0,
-            "turn": 360,
-        },
-        [
-            answered({"object": name, "yaw": yaw}, (yaw < 90 or yaw > 270) if name == "mug" else n % 2 == 0)
-            for name in ("mug", "ball")
-            for yaw in (10.0, 60.0, 120.0, 200.0, 300.0, 350.0)
-            for n in range(20)
-        ],
-        {"round objects": ["ball"]},
+    asked = {"figure": "rates", "by": "yaw", "series": "group", "away_from": 0, "turn": 360, "bins": 2}
+    answered_ = [
+        answered({"object": name, "yaw": yaw}, (yaw < 90 or yaw > 270) if name == "mug" else n % 2 == 0)
+        for name in ("mug", "ball")
+        for yaw in (10.0, 60.0, 120.0, 200.0, 300.0, 350.0)
+        for n in range(20)
+    ]
+    made = figure({**asked, "range": (0, 180)}, answered_, {"round objects": ["ball"]})
+    assert counts(made) == {
+        ("0 to 90", "other objects"): (80, 80), ("90 to 180", "other objects"): (0, 40),
+        ("0 to 90", "round objects"): (40, 80), ("90 to 180", "round objects"): (20, 40),
+        ("all", "other objects"): (80, 120), ("all", "round objects"): (60, 120),
+    }  # fmt: skip
+    mug, shown, ball, _ = made.text
+    assert mug.startswith(
+        "For other objects, the lowest share where the distance of yaw from 0 is 90 to 180: right in 0 "
     )
-    mug, ball, both = made.text[-3:]
-    assert mug.startswith("other objects: right in 80 of 80") and mug.endswith("it falls.")
-    assert "where yaw is within 90 of 0, right in 0 of 40" in mug and "accuracy falls by 100 points" in mug
-    assert ball.endswith("accuracy falls by 0 points (95 % interval -20 to 20): no fall is shown.")
-    assert both.startswith("Accuracy falls by 100 points") and both.endswith(
-        "more for other objects than for round objects: the difference is shown."
+    assert shown.startswith("The difference is shown") and ball.endswith(
+        "the same share, 50 %: no difference is shown."
     )
 
 
@@ -679,11 +684,11 @@ def test_the_mean_corruption_error_is_relative_to_the_first_model() -> None:
 def test_each_model_has_a_figure_unless_it_tells_them_apart() -> None:
     answered = [*rows({"noon": (2, 6)}, model="one"), *rows({"noon": (5, 6)}, model="two")]
     described = {"figure": "rates", "by": "environment", "title": "Hard"}
-    found = list(make(Table(answered), *read_options(described, "here")))
+    found = list(make(tabled(answered), *read_options(described, "here")))
     assert [made.title for made in found] == ["Hard: one", "Hard: two"]
     assert [made.text[0][:29] for made in found] == ["noon: right in 2 of 6 (33 %, ", "noon: right in 5 of 6 (83 %, "]
     for told in ({"figure": "rates", "by": "model"}, {"figure": "rates", "by": "environment", "series": "model"}):
-        assert len(list(make(Table(answered), *read_options(told, "here")))) == 1
+        assert len(list(make(tabled(answered), *read_options(told, "here")))) == 1
 
 
 def test_a_curve_puts_each_value_in_its_part_of_the_range() -> None:
@@ -699,7 +704,7 @@ def test_a_curve_puts_each_value_in_its_part_of_the_range() -> None:
 def test_every_figure_is_drawn_and_is_a_table(name: str, tmp_path: Path) -> None:
     write_png(tmp_path / "parts" / "views-00-mug" / "images" / "surface.png", np.zeros((8, 8, 3)))
     own = {"agreement": PICTURED, "scaling": TIMED}
-    table = Table(own.get(name, EXAMPLE_ROWS), {"round": ["mug"]}, {"views-00-mug": SURFACE}, folder=tmp_path)
+    table = tabled(own.get(name, EXAMPLE_ROWS), {"round": ["mug"]}, surfaces={"views-00-mug": SURFACE}, folder=tmp_path)
     (made,) = make(table, *read_options(EXAMPLES[name], "here"))
     assert made.title and made.text and all(one.endswith(".") for one in made.text)
     assert made.rows and all(len(row) == len(made.columns) for row in made.rows)

@@ -17,6 +17,9 @@ from advsearch.runs.results.base import Fields, RunResult
 
 Cell = str | int | float | None
 
+PHOTOGRAPHS = "photographs"
+"""The part that photographs are of."""
+
 SHARES = ("share", "low", "high")
 """Columns of a figure's numbers that are a share and the ends of its 95 % interval."""
 

@@ -6,25 +6,22 @@ import json
 import math
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import Any
 
 import torch
-from typing_extensions import Unpack
 
-from advsearch.api.keywords import Named, Names, RunKeywords, asks, configured
+from advsearch.api.keywords import asks, configured
 from advsearch.api.studies import carry_out_part
 from advsearch.config import AttackConfig, SweepConfig
 from advsearch.config.scene import DEFAULT_ENVIRONMENT, SceneConfig, name_in
 from advsearch.controls import CONTROLS
 from advsearch.engine.attack_parts import check_from_config
 from advsearch.errors import InputError
-from advsearch.explanations import PHOTOGRAPHS, TRIAL, WORKERS, Answered, rows_of
 from advsearch.progress import NullProgress, Progress, Watched, watcher
 from advsearch.questions.photographs.answer import LOOSE_PHOTO, PHOTO
 from advsearch.questions.photographs.carry_out import Photographs, photographs_in
-from advsearch.questions.recipe.answer import RecipeFigure, RecipePart, RecipeResult
+from advsearch.questions.recipe.answer import PHOTOGRAPHS, RecipeFigure, RecipePart, RecipeResult
 from advsearch.questions.recipe.description import (
     PlannedRun,
     Recipe,
@@ -37,7 +34,7 @@ from advsearch.questions.recipe.description import (
 )  # fmt: skip
 from advsearch.questions.recipe.figures import ANY, check_figures, files_of, make, read_options
 from advsearch.questions.recipe.settings import RecipeConfig
-from advsearch.questions.recipe.table import Table
+from advsearch.questions.recipe.table import TRIAL, TRIALS, WORKERS, Table, read_rows
 from advsearch.questions.sweep.carry_out import scenes_of
 from advsearch.report.phrases import DETECTION
 from advsearch.runs.directory import IMAGES, PARTS, RunDirectory
@@ -52,32 +49,14 @@ from advsearch.runs.summary import attack_of, read_result
 from advsearch.threads import cores
 from advsearch.viewer.pages import keep_answer
 
-
-class RecipeKeywords(RunKeywords, total=False):
-    quick: bool
-    photographs: str | Path | None
-    object: Path | Names | None
-    environment: Path | Names | None
-    up: Literal["y", "z"] | None
-    resolution: int | str | tuple[int, int] | None
-    model: Path | Names | None
-    labels: Path | Names | None
-    prompt: Names | None
-    task: Named | None
-    label: str | Mapping[str, str]
-    seed: int
-    threads: int | None
-    deterministic: bool
-
-
 TURN = 360.0
 
 NOTE = "recipe"
 """Under which a run's store keeps the recipe, so that it goes on as it began."""
 
 
-@asks(RecipeConfig, RecipeKeywords)
-def recipe(recipe: str | Path, *, progress: Watched = None, **settings: Unpack[RecipeKeywords]) -> RecipeResult:
+@asks(RecipeConfig)
+def recipe(recipe: str | Path, *, progress: Watched = None, **settings: Any) -> RecipeResult:
     """Carry out a recipe: its runs, its figures, and what they say (docs/recipes.md).
 
     Args:
@@ -97,15 +76,16 @@ def recipe_from_config(
     begun = time.perf_counter()
     if config.photographs is not None and not Path(config.photographs).is_dir():
         raise InputError(f"photographs: expected a folder, got {config.photographs}")
-    described = None if resumed is not None and _noted(resumed) else read_recipe(config.recipe)
-    if described is not None:
-        check_powers(described, config)
+    noted = None  # a run that was stopped at once has noted no recipe
+    if resumed is not None and (resumed / STORE).is_file():
+        with Store(resumed / STORE, read_only=True) as store:
+            noted = store.noted(NOTE)
+    described = recipe_of(noted, f"{resumed}: the recipe that it began with") if noted else read_recipe(config.recipe)
+    check_powers(described, config)
+    if not noted:
         check(described, config)
         check_figures(described, check_runs(planned(described, config)), config.recipe)
     with RunDirectory.of(config, resumed) as run:
-        if described is None:
-            described = recipe_of(run.store.noted(NOTE) or {}, f"{run.path}: the recipe that it began with")
-            check_powers(described, config)
         run.store.set_note(NOTE, json.dumps(described.model_dump(mode="json")))
         done, warnings = _carried_out(planned(described, config), run, progress or NullProgress())
         interrupted = any(result.goes_on for _, result in done)
@@ -121,11 +101,15 @@ def recipe_from_config(
         warnings += [text for _, result in done for text in getattr(result, "warnings", ())]
         parts = [
             RecipePart(
-                name=each.name, part=each.part, command=each.config.command, object=each.config.object,
-                ending=result.ending, renders=sum(result.renders.values()),
+                name=each.name,
+                part=each.part,
+                command=each.config.command,
+                object=each.config.object,
+                ending=result.ending,
+                renders=sum(result.renders.values()),
             )
             for each, result in done
-        ]  # fmt: skip
+        ]
         result = RecipeResult(
             run=str(run.path),
             recipe=config.recipe,
@@ -145,14 +129,6 @@ def recipe_from_config(
             command_line=config.command_line(),
         )
         return keep_answer(run, result)
-
-
-def _noted(path: Path) -> bool:
-    """Whether a run has the recipe that it began with; one that was stopped at once has not."""
-    if not (path / STORE).is_file():
-        return False
-    with Store(path / STORE, read_only=True) as store:
-        return store.noted(NOTE) is not None
 
 
 def check(described: Recipe, config: RecipeConfig) -> None:
@@ -283,18 +259,19 @@ def _figures(
     described: Recipe, config: RecipeConfig, done: Sequence[DoneRun], run: RunDirectory
 ) -> Iterator[RecipeFigure]:
     """Make and draw the figures of a recipe."""
-    rows, surfaces = list[Answered](), {}
+    rows, units, surfaces = list[dict[str, Any]](), dict[str, str](), {}
     for each, result in done:
-        folder, workers = run.path / PARTS / each.name, getattr(each.config, WORKERS, None)
-        counted = {} if workers is None else {WORKERS: workers}
-        for row in rows_of(each.part, folder, result):
-            # draws of one seed are the same ones, also in another part
-            unit = None if row.unit is None else f"{each.config.seed} {row.unit}"
-            rows.append(replace(row, values={**row.values, **counted}, unit=unit))
-        if isinstance(result, SweepSummary):
-            rows += rows_of(PHOTOGRAPHS, folder, result, (PHOTO, LOOSE_PHOTO))
-            surfaces |= {each.name: result.surface} if result.surface else {}
-    table = Table(rows, described.groups, surfaces, cores(), run.path)
+        swept, workers = isinstance(result, SweepSummary), getattr(each.config, WORKERS, None)
+        for part, kinds in (
+            (each.part, ("sweep",) if swept else tuple(TRIALS)),
+            *([(PHOTOGRAPHS, (PHOTO, LOOSE_PHOTO))] if swept else []),
+        ):
+            found, named = read_rows(part, run.path / PARTS / each.name, result, each.config.seed, kinds)
+            rows += [row if workers is None else {**row, WORKERS: workers} for row in found]
+            units |= named
+        if isinstance(result, SweepSummary) and result.surface:
+            surfaces[each.name] = result.surface
+    table = Table.of(rows, described.groups, units=units, surfaces=surfaces, cores=cores(), folder=run.path)
     number = 0
     for figure in described.figures:
         kind, options = read_options(figure, config.recipe)

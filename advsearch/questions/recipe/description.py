@@ -19,7 +19,7 @@ from advsearch import seeds
 from advsearch.config import CONFIGS
 from advsearch.config.scene import DEFAULT_ENVIRONMENT, SceneConfig
 from advsearch.errors import FileFormatError, InputError, UnknownNameError
-from advsearch.explanations import PHOTOGRAPHS
+from advsearch.questions.recipe.answer import PHOTOGRAPHS
 from advsearch.questions.recipe.settings import RecipeConfig
 from advsearch.runs.directory import default_name
 from advsearch.settings import read_yaml, split_names

@@ -9,17 +9,14 @@ from typing import Any
 from pydantic import ValidationError
 
 from advsearch.errors import FileFormatError, InputError, UnknownNameError
-from advsearch.explanations import ANSWER, GROUP, PART, PHOTOGRAPHS, figure_value
+from advsearch.questions.recipe.answer import PHOTOGRAPHS
 from advsearch.questions.recipe.description import Recipe
 from advsearch.questions.recipe.given import AnswersOptions, CuesOptions, answers, cues
 from advsearch.questions.recipe.of_runs import AgreementOptions, agreement, scaling, surface
 from advsearch.questions.recipe.rates import RatesOptions, rates
-from advsearch.questions.recipe.table import MadeFigure, Options, Table
+from advsearch.questions.recipe.table import ANSWER, GROUP, MODEL, PART, MadeFigure, Options, Table
 from advsearch.questions.recipe.ternary import TernaryOptions, ternary
 from advsearch.report.figures import Figures, drawn
-
-MODEL = "model"
-"""The column that says which model answered."""
 
 
 @dataclass(frozen=True)
@@ -60,15 +57,15 @@ def read_options(described: Mapping[str, object], where: str) -> tuple[str, Opti
 def make(table: Table, kind: str, options: Options) -> Iterator[MadeFigure]:
     """Yield a figure; where it does not tell several models apart, one of each. An InputError where it needs what the
     answers do not have."""
-    shown = table.of(options.parts)
+    parts = table.rows[PART]
+    shown = table.where(parts.isin(options.parts) if options.parts else parts != PHOTOGRAPHS)
     together = FIGURES[kind].tells_models or MODEL in vars(options).values()
-    models = [] if together else list(dict.fromkeys(row.values.get(MODEL) for row in shown.rows))
+    models = {} if together or MODEL not in shown.rows else shown.by(MODEL)
     if len(models) < 2:
         yield FIGURES[kind].make(shown, options)
-        return
-    for name in models:
-        made = FIGURES[kind].make(shown.where(row for row in shown.rows if row.values.get(MODEL) == name), options)
-        yield replace(made, title=f"{made.title}: {figure_value(name or '')}")
+    for name, rows in models.items() if len(models) > 1 else ():
+        made = FIGURES[kind].make(replace(shown, rows=rows), options)
+        yield replace(made, title=f"{made.title}: {name}")
 
 
 def files_of(made: MadeFigure) -> Figures:

@@ -3,14 +3,24 @@
 from __future__ import annotations
 
 import random
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
+import pandas as pd
 from pydantic import Field
 
-from advsearch.explanations import Answered
-from advsearch.questions.recipe.table import COUNT, Count, MadeFigure, Options, Table, extremes, plural
+from advsearch.questions.recipe.table import (
+    ANSWER,
+    COUNT,
+    Count,
+    MadeFigure,
+    Options,
+    Table,
+    extremes,
+    most_frequent,
+    plural,
+)
 from advsearch.report.figures import BLUE, GREY, RED
 from advsearch.report.phrases import percent
 
@@ -18,11 +28,6 @@ LETTERS = 85
 """Letters that a bar of the whole width has room for."""
 FEWEST_LETTERS = 4
 """Of a name that is cut short."""
-
-
-def most_frequent(rows: Sequence[Answered]) -> list[tuple[str, int]]:
-    """Return the answers with how often each was given, the most frequent first."""
-    return sorted(Counter(row.answer for row in rows).items(), key=lambda one: (-one[1], one[0]))
 
 
 class AnswersOptions(Options):
@@ -36,14 +41,12 @@ def answers(table: Table, options: AnswersOptions) -> MadeFigure:
     """Count the most frequent answers for each value of something."""
     groups: dict[str, list[tuple[Count, int]]] = {}  # how often each was given, and how often it was a right one
     for value, rows in table.by(options.by).items():
+        most = most_frequent(rows)[: options.most]
+        given = {answer: rows[ANSWER] == answer for answer, _ in most}
         groups[value] = [
-            (
-                Count.over(answer, rows, lambda row, answer=answer: row.answer == answer),  # type: ignore[misc]
-                sum(row.correct for row in rows if row.answer == answer),
-            )
-            for answer, _ in most_frequent(rows)[: options.most]
+            (Count.over(answer, rows, flags), int(rows["correct"][flags].sum())) for answer, flags in given.items()
         ]
-    wrong = {value: given[0] for value, given in groups.items() if 2 * given[0][1] < given[0][0].counted.sum()}
+    wrong = {value: each[0] for value, each in groups.items() if 2 * each[0][1] < each[0][0].times}
     known, thing = len(groups) - len(wrong), plural(options.by)
     text = [f"For {known} of {len(groups)} {thing} the most frequent answer is mostly a right one."]
     text += [
@@ -57,7 +60,7 @@ def answers(table: Table, options: AnswersOptions) -> MadeFigure:
         for place, given in enumerate(groups.values()):
             left = 0.0
             for one, right in given:
-                share, colour = one.share or 0.0, BLUE if 2 * right >= one.counted.sum() else RED
+                share, colour = one.share or 0.0, BLUE if 2 * right >= one.times else RED
                 axes.barh(place, share, left=left, color=colour, alpha=0.5, height=0.72, edgecolor="white")
                 axes.text(left + share / 2, place, fitting(one.name, share), ha="center", va="center", fontsize=7)
                 left += share
@@ -100,16 +103,16 @@ def cues(table: Table, options: CuesOptions) -> MadeFigure:
     """Count how often the answer is the object and how often the texture, and which of both predicts answers better."""
     textures = table.by(options.texture)
     shapes = {name: Count.over(name, rows) for name, rows in textures.items()}
-    named = {
-        name: Count.over(name, rows, lambda row, name=name: _names(row.answer, options.classes.get(name, [])))  # type: ignore[misc]
+    naming = {
+        name: rows[ANSWER].map(lambda answer, name=name: _names(answer, options.classes.get(name, [])))  # type: ignore[misc]
         for name, rows in textures.items()
     }
+    named = {name: Count.over(name, rows, naming[name]) for name, rows in textures.items()}
     asked = [name for name in textures if options.classes.get(name)]
     text = [f"The answer is the object, whatever its texture: {Count.over('', table.rows).told('so')}."]
     if asked:
-        of_these = [(row, name) for name in asked for row in textures[name]]
-        classes = {id(row): options.classes[name] for row, name in of_these}
-        total = Count.over("", [row for row, _ in of_these], lambda row: _names(row.answer, classes[id(row)]))
+        flags = pd.concat([naming[name] for name in asked])
+        total = Count.over("", table.rows.loc[flags.index], flags)
         text.append(f"The answer names the texture ({', '.join(asked)}): {total.told('so')}.")
         if not total.share:
             text.append("A model that has no class for a texture cannot name it.")
@@ -129,7 +132,7 @@ def cues(table: Table, options: CuesOptions) -> MadeFigure:
         axes.grid(True, axis="x")
         figure.legend(loc="outside lower center", ncols=2, title="the answer names")
 
-    rows = [[name, *shapes[name].cells, round(named[name].counted.sum())] for name in textures]
+    rows = [[name, *shapes[name].cells, named[name].times] for name in textures]
     columns = [options.texture, "the object", *COUNT, "the texture"]
     return MadeFigure(title, text, columns, rows, draw, (6.0, 1.7 + 0.27 * len(textures)))
 
@@ -147,9 +150,8 @@ def predicted(table: Table, options: CuesOptions) -> list[Predicted]:
     answers is among them, so that a model which answers by neither cue is predicted as well by both.
     """
     generator = random.Random(SEED)
-    pairs: dict[tuple[float | str, float | str], list[str]] = defaultdict(list)
-    for row in table.rows:
-        pairs[table.value(row, options.shape), table.value(row, options.texture)].append(row.answer)
+    groups = table.rows.groupby([table.column(options.shape), table.column(options.texture)], sort=False)
+    pairs = {pair: list(rows[ANSWER]) for pair, rows in groups}
     counts = []
     for (shape, texture), given in pairs.items():
         same_shape = [one for (s, t), more in pairs.items() if s == shape and t != texture for one in more]

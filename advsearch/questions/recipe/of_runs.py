@@ -3,15 +3,25 @@
 from __future__ import annotations
 
 import statistics
-from collections import Counter
-from collections.abc import Hashable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from pydantic import Field
 
 from advsearch.errors import InputError
-from advsearch.explanations import PHOTOGRAPHS, WORKERS, Answered
-from advsearch.questions.recipe.table import COLOURS, COUNT, MARKS, Cell, Count, MadeFigure, Options, Table
+from advsearch.questions.recipe.answer import PHOTOGRAPHS, Cell
+from advsearch.questions.recipe.table import (
+    ANSWER,
+    COUNT,
+    PART,
+    WORKERS,
+    Count,
+    MadeFigure,
+    Options,
+    Rows,
+    Table,
+    draw_bars,
+)
 from advsearch.report.figures import BLUE
 from advsearch.report.phrases import percent
 from advsearch.report.sweeps import surface_sentences
@@ -23,9 +33,6 @@ NO_PHOTOGRAPHS = (
     "runs in parts/, or name a folder of them (photographs=FOLDER), and let advsearch resume go on with this run."
 )
 ALL = "all objects"
-
-Outcome = tuple[bool, bool]
-"""Whether the model is right about a rendering, and about the other picture of the same."""
 
 
 class AgreementOptions(Options):
@@ -43,61 +50,47 @@ class AgreementOptions(Options):
 
 def agreement(table: Table, options: AgreementOptions) -> MadeFigure:
     """Count in how many pairs the model is right, or wrong, about a rendering and another picture of the same alike."""
-    renderings = [row for row in table.rows if row.part == options.of[0]]
-    if not renderings:
+    renderings = table.rows[table.rows[PART] == options.of[0]].dropna(axis=1, how="all")
+    if renderings.empty:
         raise InputError(f"figures: agreement: expected answers of a part {options.of[0]!r}, got none")
-    names = list(renderings[0].values)
-
-    def key(row: Answered) -> Hashable:  # the values that renderings have; other pictures may have more
-        return tuple(row.values.get(name) for name in names)
-
-    by_values = {key(row): row for row in renderings}
-    objects = [ALL, *dict.fromkeys(str(row.values["object"]) for row in renderings)]
+    # the values that renderings have; other pictures may have more
+    names = [name for name in renderings if name not in (ANSWER, PART, "correct", "margin", "time", "unit")]
+    objects = [ALL, *renderings["object"].unique()]
     text, rows, series = list[str](), list[list[Cell]](), dict[str, dict[str, Count]]()
     for part in (PHOTOGRAPHS, *options.of[1:]):
-        others = [row for row in table.rows if row.part == part]
-        pairs = [(shown, row) for row in others if (shown := by_values.get(key(row))) is not None]
-        alone, name = len(others) - len(pairs), options.names.get(part, part)
+        others, name = table.rows[table.rows[PART] == part], options.names.get(part, part)
+        pairs = others.merge(renderings, on=names, suffixes=("", " rendered"))
+        alone = len(others) - len(pairs)
         if part != PHOTOGRAPHS and alone:
             raise InputError(f"figures: agreement: expected {part} to have the configurations of {options.of[0]}")
-        if part == PHOTOGRAPHS and not others:
+        if part == PHOTOGRAPHS and others.empty:
             text.append(NO_PHOTOGRAPHS)
             continue
-        agreed = {id(row): shown.correct == row.correct for shown, row in pairs}
         series[name] = {}
         for thing in objects:
-            some = [pair for pair in pairs if thing in (ALL, pair[0].values["object"])]
-            outcomes: Counter[Outcome] = Counter((shown.correct, row.correct) for shown, row in some)
-            same_answer = sum(shown.answer == row.answer for shown, row in some)
-            agreeing = Count.over(thing, [row for _, row in some], lambda row: agreed[id(row)])  # noqa: B023
+            some = pairs if thing == ALL else pairs[pairs["object"] == thing]
+            first, second = some["correct rendered"], some["correct"]
+            same_answer = int((some[f"{ANSWER} rendered"] == some[ANSWER]).sum())
+            agreeing = Count.over(thing, some, first == second)
             series[name][thing] = agreeing
-            four = [outcomes[a, b] for a in (True, False) for b in (True, False)]
+            four = [int(((first == a) & (second == b)).sum()) for a in (True, False) for b in (True, False)]
             rows.append([name, thing, *four, same_answer, *agreeing.cells])
-            if thing == ALL and some:
+            if thing == ALL and len(some):
                 same = f"{same_answer} of {len(some)} ({percent(same_answer / len(some))})"
                 text.append(
                     f"Renderings and {name}: {agreeing.told('right about both or wrong about both')}. "
                     f"{_where(True, some)} {_where(False, some)} The answer is the same in {same}."
                 )
         if part == PHOTOGRAPHS:
-            text += ["The intervals take photographs as independent."] if pairs else []
+            text += ["The intervals take photographs as independent."] if len(pairs) else []
             belong = "belongs" if alone == 1 else "belong"
             text += [f"{alone} of the photographs {belong} to no rendering and so to no pair."] if alone else []
     title = options.title or "Renderings and other pictures of the same"
 
     def draw(figure: Any) -> None:
         axes = figure.subplots()
-        for number, (name, counts) in enumerate(series.items()):
-            colour, label = COLOURS[number % len(COLOURS)], name
-            for row, one in enumerate(counts.values()):
-                place = row + (number - (len(series) - 1) / 2) * 0.22
-                if interval := one.interval():
-                    axes.plot(interval, [place] * 2, color=colour, alpha=0.45, linewidth=3)
-                    axes.plot(one.share, place, MARKS[number % len(MARKS)], color=colour, ms=5, label=label)
-                    label = "_"
-        axes.set_yticks(range(len(objects)), objects)
-        axes.set(xlabel="share that agrees, with 95 % interval", xlim=(-0.03, 1.03), ylim=(len(objects) - 0.4, -0.6))
-        axes.grid(True, axis="x")
+        draw_bars(axes, {thing: [counts[thing] for counts in series.values()] for thing in objects}, list(series))
+        axes.set(xlabel="share that agrees, with 95 % interval")
         figure.legend(loc="outside lower center", ncols=1)
 
     both = ["right, right", "right, wrong", "wrong, right", "wrong, wrong"]
@@ -105,24 +98,21 @@ def agreement(table: Table, options: AgreementOptions) -> MadeFigure:
     return MadeFigure(title, text, columns, rows, draw, (6.0, 1.7 + 0.2 * len(series) + 0.34 * (len(objects) - 1)))
 
 
-def _where(right: bool, pairs: Sequence[tuple[Answered, Answered]]) -> str:
+def _where(right: bool, pairs: Rows) -> str:
     """How often the model is right, or wrong, about the other picture where it is so about the rendering."""
-    verb, some = "right" if right else "wrong", [row for shown, row in pairs if shown.correct is right]
-    if not some:
+    verb, some = "right" if right else "wrong", pairs[pairs["correct rendered"] == right]
+    if some.empty:
         return f"It is {verb} about none of the renderings."
-    told = Count.over("", some, lambda row: row.correct is right).told(verb)
+    told = Count.over("", some, some["correct"] == right).told(verb)
     return f"Where it is {verb} about the rendering, it is {told} about the other."
 
 
 def scaling(table: Table, options: Options) -> MadeFigure:
     """Say how many more pictures a second more workers make, each beside the fewest with the same object."""
-    runs: dict[tuple[int, str], list[float]] = {}
-    for row in table.rows:
-        if isinstance(workers := row.values.get(WORKERS), (int, float)):
-            runs.setdefault((int(workers), str(row.values["object"])), []).append(row.time or 0.0)
-    if not runs:
+    if WORKERS not in table.rows:
         raise InputError("figures: scaling: expected sweeps with `workers` among the parts, got none")
-    rates = {key: _rate(sorted(times)) for key, times in runs.items()}
+    runs = table.rows.groupby([WORKERS, "object"], sort=False)["time"]  # without rows of sweeps that say none
+    rates = {(int(workers), str(name)): _rate(sorted(times)) for (workers, name), times in runs}
     counts = sorted({workers for workers, _ in rates})
     by_count = {each: [rate for (workers, _), rate in rates.items() if workers == each] for each in counts}
     linear = statistics.median(by_count[counts[0]]) / counts[0]

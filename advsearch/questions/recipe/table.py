@@ -2,25 +2,43 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import pandas as pd
 from pydantic import BaseModel, ConfigDict, Field
 
 from advsearch.attacks.trials import CONFIDENCE
 from advsearch.attacks.units import per_unit, share_interval
 from advsearch.errors import InputError
-from advsearch.explanations import ANSWER, GROUP, OTHERS, PART, PHOTOGRAPHS, TRIAL, Answered, figure_value
 from advsearch.questions.recipe.answer import Cell
 from advsearch.report.figures import BLUE, GREY, RED
 from advsearch.report.phrases import percent
-from advsearch.report.wording import interval_text
+from advsearch.report.wording import interval_text, short_name
+from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.results.base import Interval
-from advsearch.runs.results.sweep import SurfaceMap
+from advsearch.runs.results.sweep import SurfaceMap, SweepSummary
+from advsearch.runs.store import NAME, Store
+from advsearch.runs.units import units_of
+
+ANSWER, GROUP, PART, TRIAL, MODEL, WORKERS = "answer", "group", "part", "trial", "model", "workers"
+"""Columns beside parameters: what the model said, the group that an object is in, the part of the recipe, which trial
+of an attack it is, the model, and the number of processes that shared a sweep, of sweeps that say it."""
+
+OTHERS = "other objects"
+
+TRIALS = {
+    "first control": "clean scene",
+    "control": "clean scene",
+    "verification": "answer",
+    "baseline verification": "random search",
+}
+"""The rows of an attack that are in the table, and what figures call them."""
 
 COLOURS = (BLUE, RED, "#1f7a45", "#b4540a", "#6b3fa0", GREY)
 MARKS = "os^DvP"
@@ -28,64 +46,103 @@ MARKS = "os^DvP"
 COUNT = ["of", "share", "low", "high"]
 """Columns of a count behind the one of what is counted."""
 
+Rows = Any  # pd.DataFrame, which has no types
+
+
+def figure_value(value: float | str) -> str:
+    """Return a value as figures write it; of a file, its name without folder and suffix."""
+    if isinstance(value, str):
+        return Path(short_name(value)).stem if "/" in value else value
+    return f"{value:.4g}"
+
+
+def read_rows(
+    part: str, folder: Path, summary: AttackSummary | SweepSummary, seed: int, kinds: Sequence[str]
+) -> tuple[list[dict[str, Any]], dict[str, str]]:
+    """Return the answers of some kinds that a run has stored, and the units of their parameters.
+
+    Each has what it shows (`object`, `environment`, `model`, and parameters), what was said of it (`answer`,
+    `correct`, `margin`), the `time` when it was stored, seconds since 1970, and the `unit` of what it shares with rows
+    that are not independent of it: draws of one seed are the same ones, also in another part.
+    """
+    outer = {"object": summary.object, "environment": summary.environment, MODEL: summary.model}
+    rows, units = list[dict[str, Any]](), dict[str, str]()
+    with Store(folder / NAME, read_only=True) as store:
+        drawn = units_of(store, summary) if isinstance(summary, SweepSummary) else None
+        # without draws, samples of a point differ by noise alone
+        alike = summary.samples if isinstance(summary, SweepSummary) and summary.sampler is None else 1
+        for row in store.rows():
+            if row.kind not in kinds:
+                continue
+            values = {name: one["value"] for name, one in row.values.items()}
+            units |= {name: one["unit"] for name, one in row.values.items()}
+            unit = f"{folder.name} {row.kind} {row.id}"
+            if row.kind == "sweep" and drawn is not None:
+                unit = f"{seed} {drawn.of(row.step) // alike}"
+            if row.kind in TRIALS:
+                values[TRIAL], unit = TRIALS[row.kind], f"{seed} {row.step}"
+            values |= {name: figure_value(str(values.get(name, of_all))) for name, of_all in outer.items()}
+            said = {ANSWER: row.label or "none", "correct": bool(row.correct), "margin": row.margin, "time": row.time}
+            rows.append({**values, **said, PART: part, "unit": unit})
+    return rows, units
+
 
 @dataclass(frozen=True)
 class Table:
     """All answers of a recipe.
 
     Attributes:
-        rows: of its sweeps, the trials of its attacks, and photographs (part `PHOTOGRAPHS`).
-        groups: names of groups, each with the names of objects in it.
+        rows: a frame of what `read_rows` returns, of sweeps, trials of attacks, and photographs.
+        units: of parameters.
         surfaces: by the names of runs, which parts of the object go with wrong answers.
         cores: that this process may use.
         folder: of the recipe's run.
     """
 
-    rows: Sequence[Answered]
-    groups: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    rows: Rows
+    units: Mapping[str, str] = field(default_factory=dict)
     surfaces: Mapping[str, SurfaceMap] = field(default_factory=dict)
     cores: int = 1
     folder: Path = Path()
 
-    def of(self, parts: Sequence[str]) -> Table:
-        """Return the answers of some parts; of all that were rendered where none is named."""
-        return self.where(row for row in self.rows if (row.part in parts if parts else row.part != PHOTOGRAPHS))
+    @classmethod
+    def of(cls, rows: Sequence[Mapping[str, Any]], groups: Mapping[str, Sequence[str]], **more: Any) -> Table:
+        """Return a table of rows, with the groups of their objects if there are any: their names, each with those of
+        the objects in it."""
+        frame = pd.DataFrame(rows)
+        if groups:
+            named = {one: group for group, objects in reversed(groups.items()) for one in objects}
+            frame[GROUP] = [named.get(one, OTHERS) for one in frame["object"]]
+        return cls(frame, **more)
 
-    def where(self, rows: Iterable[Answered]) -> Table:
+    def where(self, mask: Any) -> Table:
         """Return the table with some of its rows."""
-        return replace(self, rows=list(rows))
+        return replace(self, rows=self.rows[mask])
 
-    def value(self, row: Answered, column: str) -> float | str:
-        """Return what a row has in a column: a value, the answer, the part, or the group of its object; an InputError
-        where there is none."""
-        own = {**row.values, ANSWER: row.answer, PART: row.part}
-        if self.groups:
-            named = [group for group, objects in self.groups.items() if own["object"] in objects]
-            own[GROUP] = named[0] if named else OTHERS
-        if column not in own:
-            raise InputError(f"figures: expected one of {', '.join(own)}, got {column[:60]!r}")
-        return own[column]
+    def column(self, name: str) -> Any:
+        """Return what each row has in a column; an InputError where some have nothing."""
+        if name not in self.rows or self.rows[name].isna().any():
+            own = self.rows.columns.drop(["correct", "margin", "time", "unit"])
+            known = ", ".join(one for one in own if self.rows[one].notna().all())
+            raise InputError(f"figures: expected one of {known}, got {name[:60]!r}")
+        return self.rows[name]
 
-    def numbers(self, column: str) -> list[float]:
+    def numbers(self, name: str) -> Any:
         """Return what each row has in a column of numbers; an InputError where it has names."""
-        values = [self.value(row, column) for row in self.rows]
-        numbers = [value for value in values if isinstance(value, (int, float))]
-        if len(numbers) < len(values):
-            raise InputError(f"figures: {column}: expected a parameter with numbers, got names")
-        return numbers
+        values = self.column(name)
+        if not pd.api.types.is_numeric_dtype(values):
+            raise InputError(f"figures: {name}: expected a parameter with numbers, got names")
+        return values
 
-    def unit(self, column: str) -> str:
+    def unit(self, name: str) -> str:
         """Return the unit of a column as it stands behind a number: a space and the unit, or nothing."""
-        unit = next((row.units[column] for row in self.rows if column in row.units), "")
+        unit = self.units.get(name, "")
         return f" {unit}" if unit not in ("", "1", "name") else ""
 
-    def by(self, column: str) -> dict[str, list[Answered]]:
+    def by(self, name: str) -> dict[str, Rows]:
         """Return the rows by what they have in a column, in the order in which that first comes; numbers by size."""
-        groups: dict[float | str, list[Answered]] = {}
-        for row in self.rows:
-            groups.setdefault(self.value(row, column), []).append(row)
-        numbers = all(isinstance(value, (int, float)) for value in groups)
-        return {figure_value(key): groups[key] for key in (sorted(groups) if numbers else groups)}
+        numbers = pd.api.types.is_numeric_dtype(self.column(name))
+        return {figure_value(value): rows for value, rows in self.rows.groupby(name, sort=numbers)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,20 +154,20 @@ class Count:
     of: npt.NDArray[np.float64]
 
     @classmethod
-    def over(
-        cls, name: str, rows: Sequence[Answered], counts: Callable[[Answered], bool] = lambda row: row.correct
-    ) -> Count:
-        """Count rows: those with right answers, or those that `counts` says."""
-        flags = np.array([counts(row) for row in rows], dtype=np.float64)
-        if all(row.unit is None for row in rows):
-            return cls(name, flags, np.ones(len(rows)))
-        units = np.array([row.unit or f"row {number}" for number, row in enumerate(rows)])
-        return cls(name, per_unit(flags, units), per_unit(np.ones(len(rows)), units))
+    def over(cls, name: str, rows: Rows, flags: Any = None) -> Count:
+        """Count rows: those with right answers, or those that flags (n,) say."""
+        counted = np.asarray(rows["correct"] if flags is None else flags, dtype=np.float64)
+        units = pd.factorize(rows["unit"])[0]
+        return cls(name, per_unit(counted, units), per_unit(np.ones(len(rows)), units))
+
+    def called(self, name: str) -> Count:
+        """Return it under another name."""
+        return replace(self, name=name)
 
     @property
-    def cells(self) -> list[Cell]:
-        """What is counted, and the values of `COUNT`."""
-        return [round(self.counted.sum()), self.total, self.share, *(self.interval() or (None, None))]
+    def times(self) -> int:
+        """How many are counted."""
+        return round(self.counted.sum())
 
     @property
     def total(self) -> int:
@@ -122,14 +179,19 @@ class Count:
         """What is counted of all rows; None where there are none."""
         return float(self.counted.sum() / self.of.sum()) if self.total else None
 
+    @property
+    def cells(self) -> list[Cell]:
+        """What is counted, and the values of `COUNT`."""
+        return [self.times, self.total, self.share, *(self.interval() or (None, None))]
+
     def interval(self, among: int = 1) -> Interval | None:
         """Return the 95 % interval of the share, widened for a choice among so many (Bonferroni)."""
         return share_interval(self.counted, self.of, 1.0 - (1.0 - CONFIDENCE) / max(among, 1)) if self.total else None
 
     def told(self, verb: str = "right") -> str:
         """Return ``right in 12 of 20 (60 %, 95 % interval 36-81 %)``; `verb` is what is counted."""
-        counted, total = round(self.counted.sum()), self.total
-        return f"{verb} in {counted} of {total} ({percent(self.share)}, 95 % interval {interval_text(self.interval())})"
+        share = f"{percent(self.share)}, 95 % interval {interval_text(self.interval())}"
+        return f"{verb} in {self.times} of {self.total} ({share})"
 
     def below(self, other: Count, among: int = 1) -> bool:
         """Return whether the interval of this share lies below that of another, both widened."""
@@ -163,6 +225,11 @@ def extremes(counts: Sequence[Count], worst: str, best: str, thing: str, verb: s
         if low.below(high, len(known))
         else f"No difference between the {thing} is shown: {widened} overlap.",
     ]
+
+
+def most_frequent(rows: Rows) -> list[tuple[str, int]]:
+    """Return the answers with how often each was given, the most frequent first."""
+    return sorted(Counter(rows[ANSWER]).items(), key=lambda one: (-one[1], one[0]))
 
 
 def plural(column: str) -> str:
@@ -204,3 +271,18 @@ class MadeFigure:
     rows: Sequence[Sequence[Cell]]
     draw: Callable[[Any], None]
     size: tuple[float, float]
+
+
+def draw_bars(axes: Any, cells: Mapping[str, Sequence[Count]], series: Sequence[str]) -> None:
+    """Draw a row for each of the cells, in which a dot with its interval is the count of each of the series."""
+    for number, name in enumerate(series):
+        colour, label = COLOURS[number % len(COLOURS)], name
+        for row, counts in enumerate(cells.values()):
+            place = row + (number - (len(series) - 1) / 2) * min(0.22, 0.8 / len(series))
+            if interval := counts[number].interval():
+                axes.plot(interval, [place] * 2, color=colour, alpha=0.45, linewidth=3)
+                axes.plot(counts[number].share, place, MARKS[number % len(MARKS)], color=colour, ms=5, label=label)
+                label = "_"
+    axes.set_yticks(range(len(cells)), list(cells))
+    axes.set(xlim=(-0.03, 1.03), ylim=(len(cells) - 0.4, -0.6))
+    axes.grid(True, axis="x")

@@ -3,17 +3,30 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from statistics import NormalDist, fmean, stdev
+from collections.abc import Mapping, Sequence
+from statistics import NormalDist
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
 from pydantic import Field
 
 from advsearch.attacks.trials import CONFIDENCE
-from advsearch.questions.recipe.given import most_frequent
-from advsearch.questions.recipe.table import Cell, Count, MadeFigure, Options, Table, bare, extremes
+from advsearch.questions.recipe.answer import Cell
+from advsearch.questions.recipe.table import (
+    ANSWER,
+    COUNT,
+    Count,
+    MadeFigure,
+    Options,
+    Table,
+    bare,
+    extremes,
+    most_frequent,
+)
 from advsearch.report.phrases import percent
 
+Doubles = npt.NDArray[np.float64]
 Shares = tuple[float, float, float]
 Corners = tuple[Shares, Shares, Shares]
 
@@ -35,47 +48,33 @@ class TernaryOptions(Options):
 
 def ternary(table: Table, options: TernaryOptions) -> MadeFigure:
     """Count where in a mixture each answer is given; where all are the same, how far the right one leads."""
-    amounts = zip(*(table.numbers(name) for name in options.shares), strict=True)
-    mixtures = [tuple(one / (sum(three) or 1.0) for one in three) for three in amounts]
-    triangles = [triangle_of(mixture, options.side) for mixture in mixtures]
-    most = [mixture.index(max(mixture)) for mixture in mixtures]  # of what most of each mixture is
-    names = [bare(name) for name in options.shares]
-    given = most_frequent(table.rows)
-    leads: list[list[float]] = [[], [], []]
-    for row, at in zip(table.rows, most, strict=True):
-        if row.margin is not None:
-            leads[at].append(-row.margin)
-    by_lead = len(given) == 1 and min(map(len, leads)) >= 2
-    text, columns, rows = list[str](), list[str](), list[list[Cell]]()
+    amounts = np.stack([table.numbers(name) for name in options.shares], axis=1)
+    sums = amounts.sum(axis=1, keepdims=True)
+    mixtures = amounts / np.where(sums == 0.0, 1.0, sums)
+    rows, names = table.rows, [bare(name) for name in options.shares]
+    most = mixtures.argmax(axis=1)  # of what most of each mixture is
+    triangles, corners = [triangle_of(mixture, options.side) for mixture in mixtures], all_triangles(options.side)
+    inside = {triangle: np.array([at == triangle for at in triangles], dtype=bool) for triangle in corners}
+    given, lead = most_frequent(rows), -rows["margin"].astype(float).to_numpy()
+    leads = {name: lead[(most == number) & ~np.isnan(lead)] for number, name in enumerate(names)}
+    by_lead = len(given) == 1 and min(map(len, leads.values())) >= 2
+    text, table_rows = list[str](), list[list[Cell]]()
+    columns = ["answer", "where most is", "given in", *COUNT]
     panels: list[tuple[str, list[float | None]]] = []
-    corners = all_triangles(options.side)
     for answer, times in given[: options.most]:
-        values = list[float | None]()
-        for triangle in corners:
-            inside = [row for row, at in zip(table.rows, triangles, strict=True) if at == triangle]
-            known = [-row.margin for row in inside if row.margin is not None]
-            if by_lead:
-                values.append(fmean(known) if known else None)
-            else:
-                values.append(sum(row.answer == answer for row in inside) / len(inside) if inside else None)
-        panels.append((answer, values))
+        flags = (rows[ANSWER] == answer).to_numpy()
+        values = lead if by_lead else flags
+        known = {triangle: values[own & ~np.isnan(values)] for triangle, own in inside.items()}
+        panels.append((answer, [float(some.mean()) if len(some) else None for some in known.values()]))
         if not by_lead:
-            by_most = [
-                Count.over(
-                    name,
-                    [row for row, at in zip(table.rows, most, strict=True) if at == number],
-                    lambda row, answer=answer: row.answer == answer,  # type: ignore[misc]
-                )
-                for number, name in enumerate(names)
-            ]
-            text += _told_shares(answer, times / len(table.rows), by_most)
-            rows += [[answer, name, *count.cells] for name, count in zip(names, by_most, strict=True)]
-            columns = ["answer", "where most is", "given in", "of", "share", "low", "high"]
+            by_most = [Count.over(name, rows[most == k], flags[most == k]) for k, name in enumerate(names)]
+            text += _told_shares(answer, times / len(rows), by_most)
+            table_rows += [[answer, count.name, *count.cells] for count in by_most]
     if by_lead:
-        text = [MEANINGLESS.format(given[0][0]), _told_leads(dict(zip(names, leads, strict=True)))]
+        text = [MEANINGLESS.format(given[0][0]), _told_leads(leads)]
         columns = ["where most is", "pictures", "mean lead of the right answer", "standard error"]
-        rows = [[name, len(own), fmean(own), _error(own)] for name, own in zip(names, leads, strict=True)]
-    empty = len(corners) - len({*triangles})
+        table_rows = [[name, len(own), float(own.mean()), _error(own)] for name, own in leads.items()]
+    empty = sum(not own.any() for own in inside.values())
     if empty:
         text.append(f"No picture was drawn in {empty} of {len(corners)} parts of the diagram, which are hatched.")
     title = options.title or f"Answers over {', '.join(names)}"
@@ -93,7 +92,7 @@ def ternary(table: Table, options: TernaryOptions) -> MadeFigure:
         if not options.normalised:
             figure.colorbar(colours, ax=list(each), shrink=0.7 / len(each), location="bottom", label=label)
 
-    return MadeFigure(title, text, columns, rows, draw, (max(2.4 * len(panels), 4.8), 3.5))
+    return MadeFigure(title, text, columns, table_rows, draw, (max(2.4 * len(panels), 4.8), 3.5))
 
 
 Triangle = tuple[int, int, bool]
@@ -132,16 +131,16 @@ def _told_shares(answer: str, share: float, by_most: Sequence[Count]) -> list[st
     return extremes(known, least, "most frequent where most of it", "ingredients", "given")
 
 
-def _told_leads(leads: dict[str, list[float]]) -> str:
+def _told_leads(leads: Mapping[str, Doubles]) -> str:
     """The smallest mean lead beside the largest, by intervals of the normal distribution widened for a choice among
     all."""
-    least, most = (pick(leads, key=lambda name: fmean(leads[name])) for pick in (min, max))
+    least, most = (pick(leads, key=lambda name: leads[name].mean()) for pick in (min, max))
     wide = NormalDist().inv_cdf(1.0 - (1.0 - CONFIDENCE) / (2.0 * len(leads)))
-    shown = fmean(leads[least]) + wide * _error(leads[least]) < fmean(leads[most]) - wide * _error(leads[most])
+    shown = leads[least].mean() + wide * _error(leads[least]) < leads[most].mean() - wide * _error(leads[most])
     own = NormalDist().inv_cdf(0.5 + CONFIDENCE / 2.0)
 
     def told(name: str) -> str:
-        mean, half, count = fmean(leads[name]), own * _error(leads[name]), len(leads[name])
+        mean, half, count = leads[name].mean(), own * _error(leads[name]), len(leads[name])
         return f"{name}: {mean:.3g} (95 % interval {mean - half:.3g} to {mean + half:.3g}, {count} pictures)"
 
     verdict = "The difference is shown: {} do not overlap" if shown else "No difference is shown: {} overlap"
@@ -152,8 +151,8 @@ def _told_leads(leads: dict[str, list[float]]) -> str:
     )
 
 
-def _error(values: Sequence[float]) -> float:
-    return stdev(values) / math.sqrt(len(values))
+def _error(values: Doubles) -> float:
+    return float(values.std(ddof=1)) / math.sqrt(len(values))
 
 
 def _panel(
