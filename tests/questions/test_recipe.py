@@ -429,7 +429,7 @@ def test_a_difference_is_claimed_where_intervals_are_apart_and_not_where_they_ov
         {"figure": "rates", "by": "environment"}, rows({"noon": (5, 50), "studio": (45, 50), "loft": (30, 50)})
     )
     assert shown.text[0].startswith(
-        "The lowest share is noon: right in 5 of 50 (10 %, 95 % interval 3.3-22 %); the highest is studio"
+        "Lowest is noon: right in 5 of 50 (10 %, 95 % interval 3.3-22 %); highest is studio"
     )
     assert shown.text[1].startswith("The difference is shown")
     assert list(counts(shown)) == ["studio", "loft", "noon"]
@@ -456,7 +456,7 @@ def test_sentences_call_values_what_they_are() -> None:
     names = {"thin": "the object as it is", "thick": "the object in fog"}
     asked = {"figure": "rates", "form": "lines", "by": "yaw", "series": "trial", "bins": 2, "names": names}
     lines = figure(asked, fogs)
-    assert lines.text[1].startswith("For the object in fog, the lowest share where yaw is")
+    assert lines.text[1].startswith("For the object in fog, lowest where yaw is")
     assert any("No difference between the kinds of trials is shown" in text for text in lines.text)
 
 
@@ -608,9 +608,7 @@ def test_values_that_come_round_are_counted_by_the_shorter_way() -> None:
         ("all", "other objects"): (80, 120), ("all", "round objects"): (60, 120),
     }  # fmt: skip
     mug, shown, ball, _ = made.text
-    assert mug.startswith(
-        "For other objects, the lowest share where the distance of yaw from 0 is 90 to 180: right in 0 "
-    )
+    assert mug.startswith("For other objects, lowest where the distance of yaw from 0 is 90 to 180: right in 0 ")
     assert shown.startswith("The difference is shown") and ball.endswith(
         "the same share, 50 %: no difference is shown."
     )
@@ -697,7 +695,7 @@ def test_a_curve_puts_each_value_in_its_part_of_the_range() -> None:
     ]
     made = figure({"figure": "rates", "by": "yaw", "bins": 4, "range": [0, 360]}, answered)
     assert list(counts(made).values()) == [(90, 90), (90, 90), (0, 90), (0, 91)]
-    assert made.text[0].startswith("The lowest share where yaw is 180 to 270 degrees (as 1 other): right in 0 of 90")
+    assert made.text[0].startswith("Lowest where yaw is 180 to 270 degrees (as 1 other): right in 0 of 90")
 
 
 @pytest.mark.parametrize("name", EXAMPLES)

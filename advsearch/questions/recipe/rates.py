@@ -93,9 +93,9 @@ def rates(table: Table, options: RatesOptions) -> MadeFigure:
         text += extremes(pairs, "The lowest pair", "the highest", f"pairs of {thing}", verb)
     else:
         for number, name in enumerate(series):
-            whose = f"For {name}, the" if len(series) > 1 else "The"
+            worst = f"For {name}, lowest" if len(series) > 1 else "Lowest"
             along = [one[number].called(row) for row, one in cells.items()]
-            text += extremes(along, f"{whose} lowest share{where}", f"the highest{where}", plural(options.by), verb)
+            text += extremes(along, f"{worst}{where}", f"highest{where}", plural(options.by), verb)
     if len(series) > 1:  # in one text, so that figures by other columns do not repeat it
         overall = [one.called(f"that of {name}") for name, one in zip(series, totals, strict=True)]
         text.append(" ".join(extremes(overall, "Over all, the lowest share", "the highest", of_series, verb)))
@@ -122,7 +122,8 @@ def rates(table: Table, options: RatesOptions) -> MadeFigure:
             _draw_map(figure, axes, cells, series, (options.by, options.series or "", label))
         elif options.form == "lines":
             _draw_lines(axes, cells, series, middles or range(len(cells)))
-            axes.set(xlabel=f"{_of_what(options)}{table.unit(options.by)}", ylabel=f"{label} with 95 % interval")
+            unit = f" [{table.unit(options.by)[1:]}]" if table.unit(options.by) else ""
+            axes.set(xlabel=f"{_of_what(options)}{unit}", ylabel=f"{label} with 95 % interval")
         else:
             draw_bars(axes, {**apart, **cells}, series)
             axes.set(xlabel=f"{label} with 95 % interval")
