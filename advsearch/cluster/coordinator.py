@@ -134,7 +134,7 @@ class Coordinator:
 
     def _prepare(self, worker: _Worker, *, send: bool = False) -> None:
         """Have a worker get ready; `send` it the files then, which it may have already."""
-        files = self._files if send else self._files.named_only
+        files = self._files if send else Files(self._files.digests, {})
         self._submit(worker, prepare, self._key, self._work, files, self._version)
 
     def _submit(self, worker: _Worker, function: Callable[..., Any], *args: Any) -> None:
