@@ -33,7 +33,7 @@ from advsearch.engine.attack_result import save_trial
 from advsearch.engine.journal import Journal, Shared
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import KEPT, Findings, Stages, verified_rate
-from advsearch.engine.transport import Predictor
+from advsearch.engine.transport import PredictedSearch
 from advsearch.errors import InputError
 from advsearch.progress import Progress
 from advsearch.report.wording import count as plural
@@ -78,7 +78,7 @@ class Verifier:
         return self.looks[-1]
 
     def answers(
-        self, queries: Sequence[Query], *, in_samples: bool = False, predictor: Predictor | None = None
+        self, queries: Sequence[Query], *, in_samples: bool = False, predictor: PredictedSearch | None = None
     ) -> Iterator[Evaluation]:
         """Answer trials, keep their pictures, and count each once; the bar counts them, or their samples a pixel. A
         `predictor` answers what it can in place of renders, which alone are counted."""
@@ -179,7 +179,7 @@ class Verifier:
         configurations: Mapping[int, Tensor],
         *,
         sought: bool = True,
-        predictor: Predictor | None = None,
+        predictor: PredictedSearch | None = None,
     ) -> Iterator[Judgement]:
         """Try configurations once each, every one with a seed of its own, by their numbers among those of a kind; a
         `predictor` as for `answers`."""

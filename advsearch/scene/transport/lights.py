@@ -12,8 +12,7 @@ off below zero is why they need not meet it.
 
 from __future__ import annotations
 
-import copy
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -25,8 +24,9 @@ from advsearch.scene.assembly import ON_PICTURE
 from advsearch.scene.geometry import real_harmonics
 from advsearch.scene.gradients import Group
 from advsearch.scene.parts import PluginPart
+from advsearch.scene.predictor import NOISE, Predictor
 from advsearch.scene.renderer import Renderer
-from advsearch.scene.transport.matrix import SPP, LinearRenderer, PredictingRenderer, linear_inputs, passes
+from advsearch.scene.transport.matrix import SPP, LinearRenderer, Tick, linear_inputs, passes
 
 ENVIRONMENT = "environment.padded"
 LAMPS = (".intensity", ".radiance")
@@ -240,9 +240,16 @@ class Lights:
         self._still = bool(still) or not (self._lamps or lit)
         self.alone: list[Inputs] = [{**dark, **still}] if self._still else []
         self.alone += [{**dark, name: torch.ones(3)} for name in self._lamps]
-        self._span = Span(_basis_maps(renderer, own[ENVIRONMENT], bool(lighting.harmonic))) if lit else None
-        if self._span is not None:
-            self.alone += [{**dark, ENVIRONMENT: one} for one in self._span.maps]
+        self._span: Span | None = None
+        if lit:
+            there = own[ENVIRONMENT]
+            maps = there[None]
+            if lighting.harmonic:  # added where the environment is not cut off
+                start = renderer.scene.assembly(renderer.space.inputs(renderer.start))[ENVIRONMENT]
+                whole = (there > 0.0) | (start <= 0.0 if start.shape == there.shape else torch.zeros_like(there).bool())
+                maps = torch.cat([maps, _harmonic_maps(there) * whole.to(torch.float32)])
+            self._span = Span(maps)
+            self.alone += [{**dark, ENVIRONMENT: one} for one in maps]
 
     def weights(self, inputs: Inputs) -> Tensor:
         """Return how much of each light there is in a configuration, (lights, 3); differentiable."""
@@ -253,23 +260,14 @@ class Lights:
         return torch.cat(found)
 
 
-def _basis_maps(renderer: Renderer, there: Tensor, harmonic: bool) -> Tensor:
-    """The basis maps (k, H, W, 3) of an environment: itself, and spherical harmonics where it is not cut off."""
-    if not harmonic:
-        return there[None]
-    start = renderer.scene.assembly(renderer.space.inputs(renderer.start))[ENVIRONMENT]
-    whole = (there > 0.0) | (start <= 0.0 if start.shape == there.shape else torch.zeros_like(there).bool())
-    return torch.cat([there[None], _harmonic_maps(there) * whole.to(torch.float32)])
-
-
-class BasisRenderer(PredictingRenderer):
-    """A renderer whose pictures are put together from one basis picture a light.
+class BasisRenderer(Predictor):
+    """Puts pictures together from one basis picture a light.
 
     Where base colours are searched too, each light has matrices of its own, so that radiance is bilinear in both: to
     first order in the base colours, under any light.
 
     Args:
-        renderer: the one that traces paths.
+        traced: the renderer that traces paths.
         u: where base colours are linearised; what does not move is as it is there.
         seed: number of the noise.
         tick: told of samples a pixel as they are traced, `samples_to_collect` in all.
@@ -278,24 +276,23 @@ class BasisRenderer(PredictingRenderer):
 
     def __init__(
         self,
-        renderer: Renderer,
+        traced: Renderer,
         u: Tensor,
         seed: int,
-        tick: Callable[[int], None] = lambda samples: None,
+        tick: Tick = lambda samples: None,
         *,
         moving: Lighting | None = None,
     ) -> None:
-        vars(self).update(vars(copy.copy(renderer)))
-        self.products = 0
+        super().__init__(traced)
         with torch.no_grad():
-            moving = moving or lighting(renderer)
-            inputs = self.scene.assembly(self.space.inputs(moving.at_its_brightest(u)))
-            self._lights = Lights(renderer, moving, inputs)
+            moving = moving or lighting(traced)
+            brightest = traced.scene.assembly(traced.space.inputs(moving.at_its_brightest(u)))
+            self._lights = Lights(traced, moving, brightest)
             self._of_each = [
-                LinearRenderer(renderer, u, seeds.stream(seed, "light", number), tick, light=alone)
+                LinearRenderer(traced, u, seeds.stream(seed, "light", number), tick, light=alone)
                 for number, alone in enumerate(self._lights.alone)
             ]
-        self.non_finite += sum(one.non_finite - renderer.non_finite for one in self._of_each)
+        self.non_finite = sum(one.non_finite for one in self._of_each)
 
     @property
     def lights(self) -> int:
@@ -310,16 +307,14 @@ class BasisRenderer(PredictingRenderer):
     def bytes(self) -> int:
         return sum(one.bytes for one in self._of_each)
 
-    def _rendered(self, inputs: Mapping[str, Tensor], seed: int, spp: int, hide: bool) -> Tensor:
-        pictures = [one._rendered(inputs, seed, spp, hide) for one in self._of_each]
+    def radiance(self, inputs: Inputs) -> Tensor:
+        pictures = [one.radiance(inputs) for one in self._of_each]
         radiance = torch.einsum("lc,lhwc->hwc", self._lights.weights(inputs), torch.stack(pictures)[..., :3])
-        self.products += 1
-        return torch.cat([radiance, pictures[0][..., 3:]], dim=-1) if hide else radiance
+        return torch.cat([radiance, pictures[0][..., 3:]], dim=-1)
 
 
 HAZE = "there is haze"
-NOISE = "noise is part of the picture without the denoiser"
-"""Reasons that stand alone: without haze, or with the denoiser, pictures of the same space could be predicted."""
+"""A reason that stands alone: without haze, pictures of the same space could be predicted."""
 
 
 def why_not(renderer: Renderer, varying: Collection[str] = ()) -> str | None:
@@ -332,14 +327,17 @@ def why_not(renderer: Renderer, varying: Collection[str] = ()) -> str | None:
     plan, linear = renderer.plan, linear_inputs(renderer)
     searched = [group for group in plan.groups if group.control not in varying]
     lit = {} if varying else lighting(renderer).groups
+    hazes = tuple(f"{part.name}." for part in renderer.scene.made[0].parts if part.volumetric)
     for group in searched:
         if "forced" in group.reason and group.estimator not in ("none", "image"):
             return f"the estimator of {group.name} is forced"
-        if group.estimator == "image" or group.name in lit or _of_haze(renderer, group.name):
+        reached = renderer.routes.get(group.name, frozenset())
+        of_haze = bool(reached) and all(name.startswith(hazes) for name in reached)
+        if group.estimator == "image" or group.name in lit or of_haze:
             continue
-        if renderer.routes.get(group.name, frozenset()) & light_inputs(renderer) and fixed_lights(renderer):
+        if reached & light_inputs(renderer) and fixed_lights(renderer):
             return f"{group.name} changes light, and the scene has other lights of its own"
-        if group.estimator != "adjoint" or not renderer.routes.get(group.name, frozenset()) <= linear:
+        if group.estimator != "adjoint" or not reached <= linear:
             return f"{group.name} changes more than base colours{'' if varying else ' and light'}"
     if not any(renderer.routes.get(group.name) or lit.get(group.name) for group in searched):
         return "nothing that is searched needs a render to be differentiated"
@@ -348,16 +346,7 @@ def why_not(renderer: Renderer, varying: Collection[str] = ()) -> str | None:
     return None if renderer.formation.denoiser == "oidn" else NOISE
 
 
-def _of_haze(renderer: Renderer, group: str) -> bool:
-    """Whether a group of coordinates changes haze alone."""
-    hazes = tuple(f"{part.name}." for part in renderer.scene.made[0].parts if part.volumetric)
-    inputs = renderer.routes.get(group, frozenset())
-    return bool(inputs) and all(name.startswith(hazes) for name in inputs)
-
-
-def predicting(
-    renderer: Renderer, u: Tensor, seed: int, tick: Callable[[int], None] = lambda samples: None
-) -> PredictingRenderer:
+def predicting(renderer: Renderer, u: Tensor, seed: int, tick: Tick = lambda samples: None) -> Predictor:
     """Return what predicts the pictures of a renderer's space, made at u; arguments as for `LinearRenderer`."""
     moving = lighting(renderer)
     if moving.moved:
