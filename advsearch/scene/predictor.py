@@ -66,6 +66,11 @@ class Predictor(ABC):
         return 1
 
 
+def differs(one: Tensor | None, other: Tensor | None) -> bool:
+    """Whether two inputs of a scene are not the same, bit for bit."""
+    return one is None or other is None or one.shape != other.shape or not torch.equal(one, other)
+
+
 class LinearMap(torch.autograd.Function):
     """A linear map as a torch operation: `times`, with its transpose as the derivative, any number of times."""
 

@@ -9,7 +9,6 @@ import json
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
-from typing import Any
 
 from advsearch.attacks import Evaluation, Query
 from advsearch.attacks.draws import batches
@@ -85,8 +84,7 @@ class Sweep:
         self.samples = job.spp
         self._scenes = Scenes(job)
         self._executor = InProcess(answering(self._scenes.named)) if executor is None else executor
-        scenes: Any = self._scenes
-        self.journal = Journal(run, Shared(scenes, executor))
+        self.journal = Journal(run, Shared(None, executor))
         self._rendered = self._traced = self._predicted = self._lost = 0
         self._transport: dict[tuple[str, int], list[LinearTransport | None]] = {}
         self._not_finite = run is not None and run.store.note(NOT_FINITE) is not None

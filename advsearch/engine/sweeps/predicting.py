@@ -18,12 +18,14 @@ from torch import Tensor
 from advsearch import seeds
 from advsearch.attacks import Query
 from advsearch.attacks.draws import Product
-from advsearch.engine.acceptance import CHECK_SPP, VIEWS, ComparedView, Deviation, MarginOf, compared, view_of
+from advsearch.engine.acceptance import CHECK_SPP, VIEWS, ComparedView, Deviation, compared, view_of
+from advsearch.engine.problem import Problem
 from advsearch.engine.sweeps.axes import Axis
 from advsearch.engine.sweeps.points import Points
 from advsearch.files import scaled
 from advsearch.runs.results.attack import LinearTransport, PredictionError
 from advsearch.scene.assembly import ON_PICTURE
+from advsearch.scene.formation import to_8_bit
 from advsearch.scene.mitsuba_backend.surface import RAYS
 from advsearch.scene.predictor import MOST_BYTES, NOISE, Predictor
 from advsearch.scene.renderer import Renderer
@@ -234,16 +236,14 @@ class SweptPicture:
 
 @dataclass
 class PredictedSweep:
-    """Makes pictures of one scene at one size; `before` it the other scenes have so many. Every picture is rendered
-    for a `reason`, if there is one, which is empty where nothing moves that its way follows, and in groups that are
-    `left` since predictions were too far off. `score` is the margin of a picture."""
+    """Makes pictures of one scene at one size, as a problem of one of the models has them; `before` it the other scenes
+    have so many. Every picture is rendered for a `reason`, if there is one, which is empty where nothing moves that its
+    way follows, and in groups that are `left` since predictions were too far off."""
 
-    renderer: Renderer
+    problem: Problem
     points: Points
     axes: tuple[Axis, ...]
-    spp: int
     seed: int
-    score: MarginOf
     specialise: bool
     before: int = 0
     deviations: list[Deviation] = field(default_factory=list)
@@ -254,6 +254,7 @@ class PredictedSweep:
 
     def __post_init__(self) -> None:
         """Choose basis pictures where they pay, or light on surfaces."""
+        self.renderer = self.problem.renderer
         basis = BasisPictures(self.renderer)
         self.way, self.reason = basis, self._reason_against(basis)
         if self.reason is not None:
@@ -266,7 +267,7 @@ class PredictedSweep:
     def _reason_against(self, way: Way) -> str | None:
         if not way.moves:
             return ""
-        return way.reason_against(self._fall, self.spp) if self.specialise else "nothing is left out"
+        return way.reason_against(self._fall, self.problem.spp) if self.specialise else "nothing is left out"
 
     def _fall(self, follows: frozenset[str]) -> Groups:
         of_grid = [axis.name for axis in self.axes]
@@ -284,7 +285,7 @@ class PredictedSweep:
             group = self._groups.group(number)
             predictor = None if self.reason is not None else self._of(group, number)
             if predictor is None:
-                picture = self.renderer(query.u, seed=query.seed, spp=self.spp)
+                picture = self.renderer(query.u, seed=query.seed, spp=self.problem.spp)
                 pictures[number] = SweptPicture(picture, predicted=0, traced=self._spent_on(number) + 1)
             else:
                 made[group] = predictor
@@ -313,7 +314,8 @@ class PredictedSweep:
         def view(check: int) -> ComparedView:
             u = self._configuration(number, seeds.stream(seed, "check", check) % self._groups.size)
             (predicted,) = made.pictures([u])
-            return view_of(self.renderer, predicted, u, seeds.stream(seed, "traced", check), self.spp, self.score)
+            noise = seeds.stream(seed, "traced", check)
+            return view_of(self.renderer, predicted, u, noise, self.problem.spp, self._margin)
 
         with torch.no_grad():
             deviation = compared(view)
@@ -324,6 +326,9 @@ class PredictedSweep:
         self._held[group] = made if deviation.good else None
         self.seconds += time.perf_counter() - begun
         return self._held[group]
+
+    def _margin(self, picture: Tensor, u: Tensor) -> float:
+        return self.problem.judge(to_8_bit(picture), u).margin
 
     def _configuration(self, number: int, place: int) -> Tensor:
         member = self._groups.member(number, place)

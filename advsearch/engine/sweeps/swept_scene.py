@@ -68,19 +68,18 @@ class SweptScene:
             )
             for size, model, task in zip(job.sizes, job.models, job.tasks, strict=True)
         )
-        self.predicted = {size: self._predicted(size) for size in self.renderers}
-
-    def _predicted(self, size: tuple[int, int]) -> PredictedSweep:
-        job, config, points = self.job, self.job.config, self.points[size]
-        problem = self.problems[job.sizes.index(size)]
-
-        def margin(picture: Tensor, u: Tensor) -> float:
-            return problem.judge(to_8_bit(picture), u).margin
-
-        seed, before = seeds.stream(config.seed, "sweep light", self.number), self.number * points.count
-        return PredictedSweep(
-            self.renderers[size], points, job.axes, job.spp, seed, margin, config.specialise, before=before
-        )
+        seed = seeds.stream(config.seed, "sweep light", number)
+        self.predicted = {
+            size: PredictedSweep(
+                self.problems[job.sizes.index(size)],
+                points,
+                job.axes,
+                seed,
+                config.specialise,
+                before=number * points.count,
+            )
+            for size, points in self.points.items()
+        }
 
     @property
     def not_finite(self) -> int:

@@ -16,7 +16,7 @@ from torch import Tensor
 from advsearch.files import scaled
 from advsearch.scene.description import OBJECT
 from advsearch.scene.mitsuba_backend.surface import RAYS
-from advsearch.scene.predictor import MOST_BYTES, NOISE, Predictor
+from advsearch.scene.predictor import MOST_BYTES, NOISE, Predictor, differs
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.surface.arrangement import CAMERAS, COLOR, FREE, MAP, Arrangement, Light, SurfaceView
 
@@ -253,8 +253,3 @@ def varied(renderer: Renderer, varying: Collection[str]) -> frozenset[str]:
             there = renderer.scene.assembly(renderer.space.inputs(u))
             found |= {name for name in start.keys() | there.keys() if differs(start.get(name), there.get(name))}
     return frozenset(found)
-
-
-def differs(one: Tensor | None, other: Tensor | None) -> bool:
-    """Whether two inputs are not the same, bit for bit."""
-    return one is None or other is None or one.shape != other.shape or not torch.equal(one, other)

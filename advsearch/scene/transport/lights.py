@@ -24,7 +24,7 @@ from advsearch.scene.assembly import ON_PICTURE
 from advsearch.scene.geometry import real_harmonics
 from advsearch.scene.gradients import Group
 from advsearch.scene.parts import PluginPart
-from advsearch.scene.predictor import NOISE, Predictor
+from advsearch.scene.predictor import NOISE, Predictor, differs
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.transport.matrix import SPP, LinearRenderer, Tick, linear_inputs, passes
 
@@ -96,68 +96,59 @@ def lighting(renderer: Renderer) -> Lighting:
     with torch.no_grad():
         here = renderer.scene.assembly(renderer.space.inputs(middle))
         for group in renderer.space.groups:
-            found: set[str] = set()
+            changed: set[str] = set()
             most, brightest = -1.0, middle
             for place in _places(group, middle):
                 there = renderer.scene.assembly(renderer.space.inputs(place))
-                changes = _changes(here, there, group.size)
-                if None in changes.values():
+                ways = {name: _change(name, here.get(name), there.get(name), group.size) for name in here | there}
+                if None in ways.values():
                     break
                 if ENVIRONMENT in there and float(there[ENVIRONMENT].sum()) > most:
                     most, brightest = float(there[ENVIRONMENT].sum()), place
-                found |= changes.keys()
-                if changes.get(ENVIRONMENT) == "harmonics":
+                changed |= {name for name, way in ways.items() if way}
+                if ways.get(ENVIRONMENT) == "harmonics":
                     harmonic.add(group.name)
             else:
-                if not found <= ON_PICTURE and fixed_lights(renderer):
+                if not changed <= ON_PICTURE and fixed_lights(renderer):
                     continue
-                groups[group.name] = frozenset(found)
-                if ENVIRONMENT in found and group.name not in harmonic:
+                groups[group.name] = frozenset(changed)
+                if ENVIRONMENT in changed and group.name not in harmonic:
                     bright.append((group.coordinates, brightest[group.coordinates]))
     return Lighting(groups, frozenset(harmonic & groups.keys()), tuple(bright))
 
 
 def _places(group: Group, middle: Tensor) -> Iterator[Tensor]:
     """Configurations that differ in one group."""
+    values = list(BETWEEN)
     if group.options:
-        step = -(-group.options // PROBED)
-        values = [(number + 0.5) / group.options for number in range(0, group.options, step)]
-    else:
-        values = list(BETWEEN)
+        values = [(number + 0.5) / group.options for number in range(0, group.options, -(-group.options // PROBED))]
     numbers = [torch.full((group.size,), value) for value in values]
     if group.size > 1:
         numbers.append(torch.rand(group.size, generator=torch.Generator().manual_seed(0)))
-    for one in numbers:
+    for chosen in numbers:
         place = middle.clone()
-        place[group.coordinates] = one
+        place[group.coordinates] = chosen
         yield place
 
 
-def _changes(here: Inputs, there: Inputs, numbers: int) -> dict[str, str | None]:
-    """The inputs that differ by so many numbers, with how, in words; None of one that is more than light."""
-    found: dict[str, str | None] = {name: None for name in here.keys() ^ there.keys()}
-    for name in here.keys() & there.keys():
-        one, other = here[name], there[name]
-        if one.shape == other.shape and torch.equal(one, other):
-            continue
-        if name in ON_PICTURE or name.endswith(LAMPS):
-            found[name] = "power"
-        else:
-            found[name] = _change_of_map(one, other, numbers) if name == ENVIRONMENT else None
-    return found
-
-
-def _change_of_map(one: Tensor, other: Tensor, numbers: int) -> str | None:
-    """How a map (H, W, 3) differs from another one: times a colour, or plus spherical harmonics; None if neither."""
-    if one.shape != other.shape:
+def _change(name: str, here: Tensor | None, there: Tensor | None, numbers: int) -> str | None:
+    """How so many numbers change an input: in power and colour, by spherical harmonics, or not at all (empty); None if
+    in more than light."""
+    if here is None or there is None:
         return None
-    if _explained(one[None], other):
+    if not differs(here, there):
+        return ""
+    if name in ON_PICTURE or name.endswith(LAMPS):
+        return "power"
+    if name != ENVIRONMENT or here.shape != there.shape:
+        return None
+    if _explained(here[None], there):
         return "power"
     if numbers == 1:  # one number adds no harmonics of a choice
         return None
-    basis = torch.cat([one[None], _harmonic_maps(one)])
-    some = basis[:, ::FEW, ::FEW], other[::FEW, ::FEW]  # tells most others apart in a tenth of the time
-    return "harmonics" if _explained(*some) and _explained(basis, other) else None
+    basis = torch.cat([here[None], _harmonic_maps(here)])
+    some = basis[:, ::FEW, ::FEW], there[::FEW, ::FEW]  # tells most others apart in a tenth of the time
+    return "harmonics" if _explained(*some) and _explained(basis, there) else None
 
 
 def _explained(basis: Tensor, lit: Tensor) -> bool:
