@@ -59,13 +59,15 @@ def ladder_of(config: SceneConfig) -> Sequence[int]:
 class Verifier:
     """Makes the trials of one run: sample count (of a ladder; a single one is taken as it is), control group, answers,
     and configurations one at a time. Each group has as many trials as the last of `looks`; after those before, the
-    verdict may stand. What comes of them, pictures and the count of renders are in `findings`."""
+    verdict may stand. What comes of them, pictures and the count of renders are in `findings`. Rows say of a success
+    where some answer is `sought`."""
 
     journal: Journal
     ladder: Sequence[int]
     stages: Stages
     findings: Findings = field(default_factory=Findings)
     looks: tuple[int, ...] = (0,)
+    sought: bool = True
     _clean_spp: int = 0
     _clean_kind: str = "control"
     _asked: set[tuple[str, int]] = field(default_factory=set)
@@ -83,6 +85,7 @@ class Verifier:
         """Answer trials, keep their pictures, and count each once; the bar counts them, or their samples a pixel. A
         `predictor` answers what it can in place of renders, which alone are counted."""
         made = None if predictor is None else partial(predictor.answered, traced=self.journal.traced)
+        queries = queries if self.sought else [replace(query, sought=False) for query in queries]
         for query, answer in zip(queries, self.journal.answers(queries, made), strict=True):
             if answer.picture is not None:
                 self.findings.pictures[query.kind, query.number] = answer.picture

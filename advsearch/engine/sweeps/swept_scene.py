@@ -13,8 +13,7 @@ import torch
 from torch import Tensor
 
 from advsearch import seeds
-from advsearch.attacks import Evaluation, Query, Trials, choose_spp, run_trials
-from advsearch.attacks.trials import margins_of, most_samples
+from advsearch.attacks import Evaluation, Query, Trials, run_trials
 from advsearch.config import SweepConfig
 from advsearch.engine.journal import Journal, Shared
 from advsearch.engine.judging import facts_of
@@ -24,7 +23,7 @@ from advsearch.engine.record import Stages, rate_of
 from advsearch.engine.sweeps import Job
 from advsearch.engine.sweeps.points import Picks, Points
 from advsearch.engine.sweeps.predicting import PredictedSweep, SweptPicture
-from advsearch.engine.verifier import ladder_of
+from advsearch.engine.verifier import Verifier, ladder_of
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.sweep import WorstVerified
 from advsearch.scene.description import OBJECT
@@ -160,10 +159,6 @@ class Scenes:
         return self.named(sent[0][0]).pictures([query for _, _, query in sent])[0]
 
 
-PROBES = "sample count worst"
-"""Rows of the renders that chose the sample count."""
-
-
 def check_worst(
     problem: Problem, config: SweepConfig, u: Tensor, run: RunDirectory | None, stages: Stages
 ) -> WorstVerified | None:
@@ -171,29 +166,12 @@ def check_worst(
     stored already are not made again."""
     if config.trials == 0:
         return None
-    seed, ladder = config.seed, ladder_of(config)
-    stages.begin(
-        "verification",
-        "finding how many samples the check needs",
-        most_samples(1, ladder),
-        hint="the worst configuration, counted in samples a pixel; `verify_spp=NUMBER` leaves it out",
-        at_most=True,
-    )
-    journal = Journal(run, Shared(problem))
-
-    def answers(queries: Sequence[Query], *, in_samples: bool = False) -> Iterator[Evaluation]:
-        asked = [replace(one, drawn=False, sought=False) for one in queries]
-        for query, answer in zip(asked, journal.answers(asked), strict=True):
-            stages.progress.advance(query.spp if in_samples else 1)
-            yield answer
-
-    margins = margins_of(partial(answers, in_samples=True), PROBES, u, sought=False)
-    count = choose_spp({"worst": margins}, seed=seed, ladder=ladder)
-    hint = f"{config.trials} pictures of {count.spp} samples a pixel; `trials` or `verify_spp` shorten it"
-    stages.begin("verification", "checking the worst configuration with fresh renders", config.trials, hint=hint)
-    tried = run_trials(answers, u, spp=count.spp, seed=seed, trials=config.trials)
-    settled = count.converged or len(ladder) == 1
-    renders = count.renders + len(tried)
+    verifier = Verifier(Journal(run, Shared(problem)), ladder_of(config), stages, sought=False)
+    verifier.choose_spp({"worst": u})
+    verifier.begin("checking the worst configuration with fresh renders", config.trials)
+    spp, count = verifier.findings.spp, verifier.findings.sample_count
+    tried = run_trials(verifier.answers, u, spp=spp, seed=config.seed, trials=config.trials)
     wrong = [trial for trial in tried if trial.success]
-    rate = rate_of(Trials(len(wrong), len(tried), count.spp), tried, wrong)
-    return WorstVerified(**vars(rate), converged=settled, renders=renders)
+    rate = rate_of(Trials(len(wrong), len(tried), spp), tried, wrong)
+    settled = len(verifier.ladder) == 1 or (count is not None and count.converged)
+    return WorstVerified(**vars(rate), converged=settled, renders=verifier.findings.verification_renders)
