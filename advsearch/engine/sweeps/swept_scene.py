@@ -5,7 +5,7 @@ alone, so that anybody may. Pictures that differ in light alone are put together
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -21,7 +21,7 @@ from advsearch.engine.loading import framed, make_renderer
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Stages, rate_of
 from advsearch.engine.sweeps import Job
-from advsearch.engine.sweeps.points import Picks, Points
+from advsearch.engine.sweeps.points import Points
 from advsearch.engine.sweeps.predicting import PredictedSweep, SweptPicture
 from advsearch.engine.verifier import Verifier, ladder_of
 from advsearch.runs.directory import RunDirectory
@@ -29,7 +29,6 @@ from advsearch.runs.results.sweep import WorstVerified
 from advsearch.scene.description import OBJECT
 from advsearch.scene.formation import to_8_bit
 from advsearch.scene.renderer import Renderer
-from advsearch.scene.surfaces import Surfaces
 from advsearch.tasks import Judgement
 from advsearch.viewer import thumbnails
 
@@ -128,12 +127,6 @@ class SweptScene:
         """Return the pictures (n, H, W, 3) of rows as the first model sees them."""
         made, models = self._made(self.job.sizes[0], queries), len(self.job.models)
         return torch.stack([made[number].picture for number in dict.fromkeys(one.number // models for one in queries)])
-
-    def surfaces(self, picks: Picks, size: tuple[int, int], fineness: int = 1) -> Iterator[Surfaces]:
-        """What is seen in the pixels of pictures of a size, one after the other, in `fineness` parts of each side of a
-        pixel."""
-        for u in self.points[size].configurations(picks):
-            yield self.renderers[size].surfaces(u, fineness)
 
 
 class Scenes:
