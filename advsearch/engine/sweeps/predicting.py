@@ -7,10 +7,8 @@ from __future__ import annotations
 
 import math
 import time
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -103,43 +101,22 @@ Fall = Callable[[frozenset[str]], Groups]
 """How pictures fall into groups that may differ in some groups of coordinates (`control.parameter`)."""
 
 
-class Way(ABC):
-    """A way to predict pictures of one scene at one size."""
-
-    name: ClassVar[str]
-    samples: ClassVar[int]
-    """Samples a pixel of what predicts."""
-
-    follows: frozenset[str]
-    """The groups of coordinates in which the pictures of a group may differ; `moves` if one changes more than the
-    finished picture."""
-    moves: bool
-
-    @abstractmethod
-    def reason_against(self, fall: Fall, spp: int) -> str | None:
-        """Why pictures of so many samples a pixel are rendered, in words; None if they are predicted."""
-
-    @abstractmethod
-    def made(self, u: Tensor, seed: int) -> Predictor:
-        """Return what predicts the pictures that have everything else in common with a configuration."""
-
-    @property
-    def bytes(self) -> int:
-        """Memory of what groups share."""
-        return 0
-
-
-class BasisPictures(Way):
-    """By a basis picture of each light."""
+class BasisPictures:
+    """Predicts pictures of one scene at one size by a basis picture of each light. It `follows` groups of coordinates:
+    the pictures of a group may differ in these, and one `moves` if it changes more than the finished picture."""
 
     name = "basis pictures"
     samples = SPP
+    """Samples a pixel of what predicts."""
+    bytes = 0
+    """Memory of what groups share."""
 
     def __init__(self, renderer: Renderer) -> None:
         self._renderer, self._moving = renderer, lighting(renderer)
         self.follows, self.moves = frozenset(self._moving.groups), any(self._moving.groups.values())
 
     def reason_against(self, fall: Fall, spp: int) -> str | None:
+        """Why pictures of so many samples a pixel are rendered, in words; None if they are predicted."""
         renderer, groups = self._renderer, fall(self.follows)
         if renderer.formation.denoiser != "oidn":
             return NOISE
@@ -154,6 +131,7 @@ class BasisPictures(Way):
         return None
 
     def made(self, u: Tensor, seed: int) -> Predictor:
+        """Return what predicts the pictures that have everything else in common with a configuration."""
         return BasisRenderer(self._renderer, u, seed, moving=self._moving)
 
 
@@ -176,9 +154,10 @@ def pays_from(renderer: Renderer, spp: int, arrangements: float = 1.0) -> int:
     return math.ceil(PAYS * samples / (spp - SHOWN))
 
 
-class LightOnSurfaces(Way):
-    """By light that is kept on surfaces. Groups in which object and surroundings stand the same share what these see of
-    each other; its rays are the same wherever things stand, so that it does not matter which of the groups is first."""
+class LightOnSurfaces:
+    """The same by light that is kept on surfaces. Groups in which object and surroundings stand the same share what
+    these see of each other; its rays are the same wherever things stand, so that it does not matter which of the groups
+    is first."""
 
     name = "surface light"
     samples = RAYS
@@ -256,7 +235,8 @@ class PredictedSweep:
         """Choose basis pictures where they pay, or light on surfaces."""
         self.renderer = self.problem.renderer
         basis = BasisPictures(self.renderer)
-        self.way, self.reason = basis, self._reason_against(basis)
+        self.way: BasisPictures | LightOnSurfaces = basis
+        self.reason = self._reason_against(basis)
         if self.reason is not None:
             surfaces = LightOnSurfaces(self.renderer, self.seed)
             reason = self._reason_against(surfaces)
@@ -264,7 +244,7 @@ class PredictedSweep:
                 self.way, self.reason = surfaces, reason
         self._groups = self._fall(self.way.follows)
 
-    def _reason_against(self, way: Way) -> str | None:
+    def _reason_against(self, way: BasisPictures | LightOnSurfaces) -> str | None:
         if not way.moves:
             return ""
         return way.reason_against(self._fall, self.problem.spp) if self.specialise else "nothing is left out"
