@@ -54,6 +54,7 @@ from advsearch.runs.results.sweep import SweepSummary
 from advsearch.runs.store import Row
 from advsearch.runs.summary import write_answer
 from advsearch.scene.formation import ImageFormation
+from advsearch.scene.gradients import GradientPlan
 from advsearch.settings import settings
 from advsearch.viewer.columns import read_columns
 
@@ -85,7 +86,7 @@ class FakeRenderer:
     ) -> None:
         self.space, self.size, self.non_finite = space, size, 0
         self.start, self.scene = space.start, SimpleNamespace(assembly=dict)  # nothing of it is light
-        self.formation = ImageFormation(denoiser=denoise, resolution=size)
+        self.formation, self.plan = ImageFormation(denoiser=denoise, resolution=size), GradientPlan(())
         self.seen: list[tuple[Tensor, int, int]] = []
         FakeRenderer.made.append(self)
 
