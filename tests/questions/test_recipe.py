@@ -353,6 +353,24 @@ def test_a_recipe_is_carried_out_and_goes_on_where_it_was_stopped(
     assert json.loads(capsys.readouterr().out)["figures"][1]["columns"][0] == "environment"
 
 
+def test_frames_of_a_drive_count_as_one_draw(tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text("""
+title: Is the mug seen on the way?
+settings: {object: mug, resolution: 16, spp: 1}
+parts:
+  drives:
+    command: sweep
+    settings: {path: approach, fps: 1, controls: {light: {}}, samples: 3, sampler: random, trials: 0}
+figures: [{figure: rates, by: object}]
+""")
+    result = advsearch.recipe(path, run=tmp_path / "run")
+    ((name, right, of, _, low, high),) = result.figures[0].rows
+    assert name == "mug" and of > 3 and of % 3 == 0
+    alone = clopper_pearson(int(right), int(of))
+    assert high - low > alone[1] - alone[0]
+
+
 def test_photographs_come_from_a_folder_and_their_figure_is_made_anew(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
