@@ -97,7 +97,10 @@ def rates(table: Table, options: RatesOptions) -> MadeFigure:
             along = [one[number].called(row) for row, one in cells.items()]
             text += extremes(along, f"{worst}{where}", f"highest{where}", plural(options.by), verb)
     if len(series) > 1:  # in one text, so that figures by other columns do not repeat it
-        overall = [one.called(f"that of {name}") for name, one in zip(series, totals, strict=True)]
+        overall = [
+            one.called(f"that of {_named(name, options.series or '')}")
+            for name, one in zip(series, totals, strict=True)
+        ]
         text.append(" ".join(extremes(overall, "Over all, the lowest share", "the highest", of_series, verb)))
     if options.wrong and options.series == MODEL:
         text += _relative(cells, series)
