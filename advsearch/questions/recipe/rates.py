@@ -95,7 +95,8 @@ def rates(table: Table, options: RatesOptions) -> MadeFigure:
         for number, name in enumerate(series):
             worst = f"For {name}, lowest" if len(series) > 1 else "Lowest"
             along = [one[number].called(row) for row, one in cells.items()]
-            text += extremes(along, f"{worst}{where}", f"highest{where}", plural(options.by), verb)
+            if len(series) < 2 or sum(one.total > 0 for one in along) > 1:  # of one row all is said below
+                text += extremes(along, f"{worst}{where}", f"highest{where}", plural(options.by), verb)
     if len(series) > 1:  # in one text, so that figures by other columns do not repeat it
         overall = [
             one.called(f"that of {_named(name, options.series or '')}")
