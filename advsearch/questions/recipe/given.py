@@ -104,7 +104,7 @@ def cues(table: Table, options: CuesOptions) -> MadeFigure:
     textures = table.by(options.texture)
     shapes = {name: Tally.over(name, rows) for name, rows in textures.items()}
     naming = {
-        name: rows[ANSWER].map(lambda answer, name=name: _names(answer, options.classes.get(name, [])))  # type: ignore[misc]
+        name: rows[ANSWER].map(lambda answer, name=name: _names(answer, options.classes.get(name, [])))
         for name, rows in textures.items()
     }
     named = {name: Tally.over(name, rows, naming[name]) for name, rows in textures.items()}

@@ -111,7 +111,7 @@ class Table:
         the objects in it."""
         frame = pd.DataFrame(rows)
         if groups:
-            named = {one: group for group, objects in reversed(groups.items()) for one in objects}
+            named = {one: group for group, objects in reversed(list(groups.items())) for one in objects}
             frame[GROUP] = [named.get(one, OTHERS) for one in frame["object"]]
         return cls(frame, **more)
 
@@ -167,12 +167,12 @@ class Tally:
     @property
     def times(self) -> int:
         """How many are counted."""
-        return round(self.counted.sum())
+        return round(float(self.counted.sum()))
 
     @property
     def total(self) -> int:
         """How many rows there are."""
-        return round(self.of.sum())
+        return round(float(self.of.sum()))
 
     @property
     def share(self) -> float | None:
