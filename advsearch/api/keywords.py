@@ -85,35 +85,6 @@ class DerivativeKeywords(PictureKeywords, total=False):
     specialise: bool
 
 
-class SearchKeywords(DerivativeKeywords, total=False):
-    """Of every search."""
-
-    measure: Literal["no", "quick", "full"]
-    steps: int | None
-    seconds: float | None
-    target: int | Names | None
-    minimise: bool
-    path: str | None
-    draws: int | None
-    average: int
-    baseline: bool
-    verify_spp: int | None
-    trials: int | None
-
-
-class AttackKeywords(SearchKeywords, total=False):
-    """Of `attack`."""
-
-    smallest: bool
-    printable: bool
-    aov: str | None
-    log: Literal["mlflow", "tensorboard", "wandb"] | None
-    ensemble: Literal["mean", "worst"] | None
-    workers: int | None
-    cluster: str | None
-    overwrite: bool
-
-
 class SampledKeywords(PictureKeywords, total=False):
     """Of what sweeps."""
 
@@ -125,18 +96,6 @@ class SampledKeywords(PictureKeywords, total=False):
     workers: int | None
     cluster: str | None
     overwrite: bool
-
-
-class SweepKeywords(SampledKeywords, total=False):
-    """Of `sweep`."""
-
-    aov: str | None
-    surface: bool
-    log: Literal["mlflow", "tensorboard", "wandb"] | None
-    trials: int
-    verify_spp: int | None
-    path: str | None
-    fps: float | None
 
 
 LOADED = (loading.Scene, Model, nn.Module)

@@ -19,6 +19,7 @@ from advsearch.report.markup import NARROW, WIDE, Html, element, join_html, stud
 from advsearch.report.shown import AnswerPart, Picture, ShownAnswer, facts_of, remarks_of, shown, subject_of
 from advsearch.runs.directory import IMAGES, OBJECT_FILE, PARTS, REPORT, RunDirectory
 from advsearch.runs.files import placed_by, write_bytes, write_text
+from advsearch.runs.images import smaller_png
 from advsearch.runs.results.base import Result
 from advsearch.runs.results.sweep import SweepSummary
 from advsearch.runs.summary import read_result
@@ -44,14 +45,13 @@ def read_object(run: Path) -> bytes:
     return data if _header(data) else b""
 
 
-def object_section(data: bytes) -> Html | None:
-    """Return where the script puts the object; hidden until it does, so that without it the pictures stand alone."""
+def object_part(data: bytes) -> AnswerPart:
+    """Return where the script puts the object; empty where there is none."""
     if not data:
-        return None
+        return AnswerPart()
     extras = _header(data).get("asset", {}).get("extras", {})
     note = str(extras.get("note", "")) if isinstance(extras, dict) else ""
-    words = element("p", " ".join(filter(None, (_WORDS, note))), class_="soft")
-    return element("div", element("h2", "The object, to turn"), element("div", id="object"), words, hidden="hidden")
+    return AnswerPart("The object, to turn", note=" ".join(filter(None, (_WORDS, note))), live="object")
 
 
 def object_data(data: bytes) -> list[Html]:
@@ -71,6 +71,15 @@ def _header(data: bytes) -> dict[str, dict[str, object]]:
 
 LARGEST_FIGURE = 2_000_000
 """Bytes of a figure or a picture that the page takes along."""
+
+LARGEST_PNG = 50_000_000
+"""Bytes of a picture that is read to be made smaller."""
+
+LARGE_PICTURE = 1_000_000
+"""Bytes above which a PNG is put into the page at a smaller size; the file itself stays as it is."""
+
+SMALLER_SIDE = 640
+"""Longest side in pixels of such a smaller picture."""
 
 KINDS = {".png": "image/png", ".jpg": "image/jpeg", ".jpeg": "image/jpeg"}
 """Media types of pictures."""
@@ -101,8 +110,11 @@ def keep_answer(run: RunDirectory, result: Answer) -> Answer:
     return result
 
 
-def shown_page(run: Path, result: Result, given: ShownAnswer) -> str:
-    """Return what is shown of an answer as the page of the run in the folder `run`."""
+def shown_page(
+    run: Path, result: Result, given: ShownAnswer, *, data: Sequence[Html] = (), scripts: Sequence[str] = ()
+) -> str:
+    """Return what is shown of an answer as the page of the run in the folder `run`; data and scripts fill the parts
+    that are `live`."""
     parts = list(getattr(result, "parts", ()))
     facts = {name[:1].upper() + name[1:]: text for name, text in facts_of(result, given).items()}
     drawn = any(one.draw or one.figure or one.pictures for one in given.sections)
@@ -112,21 +124,21 @@ def shown_page(run: Path, result: Result, given: ShownAnswer) -> str:
         *(_section(run, one, given.said) for one in given.sections if one.only in ("", "page") and not one.empty),
         _links(run, parts) if parts and all(isinstance(one, str) for one in parts) else None,
         join_html(element("h2", "Cost and conditions"), document.facts_table(facts)),
-        document.again(str(getattr(result, "command_line", None) or f"advsearch show {run.name}")),
+        document.again(run, getattr(result, "command_line", ""), goes_on=result.goes_on),
     )
     subject = subject_of(result, given)
     what = join_html(result.command, "; " if subject else None, document.subject_html(*(("", one) for one in subject)))
     header = document.heading(what, given.said, remarks_of(result, given))
-    return document.document(
-        f"{run.name}, {result.command}", header, main, footer=f"run {run.name}. This page needs no other file."
-    )
+    footer = f"run {run.name}. This page needs no other file."
+    title = f"{run.name}, {result.command}"
+    return document.document(title, header, main, data=data, scripts=scripts, footer=footer)
 
 
-def kept(run: Path, name: str | Path) -> Path | None:
+def kept(run: Path, name: str | Path, largest: int = LARGEST_FIGURE) -> Path | None:
     """Return the file of a picture in the folder of a run; None where it is missing, elsewhere or too large."""
     file = run / name
     inside = file.resolve().is_relative_to(run.resolve()) and file.is_file()  # a summary may name any
-    return file if inside and file.stat().st_size <= LARGEST_FIGURE else None
+    return file if inside and file.stat().st_size <= largest else None
 
 
 def _section(run: Path, one: AnswerPart, said: str) -> Html:
@@ -136,7 +148,7 @@ def _section(run: Path, one: AnswerPart, said: str) -> Html:
         words = " ".join([f"{one.title}.", *(one.text or [said])])
         chart = element("div", *(study_chart(one.draw, words, width, one.height) for width in (WIDE, NARROW)))
     table = (
-        document.study_table(one.heads, one.rows, document.part_links(run, one.parts), one.shares)
+        document.study_table(one.heads, one.rows, document.part_links(run, one.parts), one.shares, one.bars)
         if one.heads
         else None
     )
@@ -144,26 +156,32 @@ def _section(run: Path, one: AnswerPart, said: str) -> Html:
         *(element("p", text) for text in one.text if text and one.draw is None),
         chart or _figure(run, one.figure, " ".join(one.text) or one.title),
         (table or document.facts_table({row[0]: row[1] for row in one.rows})) if one.rows else None,
-        *(_pictures(run, group) for group in one.pictures),
+        *(_pictures(run, group, one.layout) for group in one.pictures),
         element("p", one.note, class_="soft") if one.note else None,
     )
+    if one.live:
+        title = element("h2", one.title) if one.title else None
+        return element("div", title, element("div", id=one.live), inside, hidden="hidden", class_="screen")
     if one.folded:
         return element("details", element("summary", one.title), inside)
     return join_html(element("h2", one.title) if one.title else None, inside)
 
 
-def _pictures(run: Path, group: Iterable[Picture]) -> Html | None:
+def _pictures(run: Path, group: Iterable[Picture], layout: str) -> Html | None:
     """Pictures side by side, of those that are there."""
-    figures = [
-        element(
-            "figure",
-            element("img", src=document.data_url(file.read_bytes(), KINDS[file.suffix.lower()]), alt=one.caption),
-            element("figcaption", one.caption),
-        )
-        for one in group
-        if (file := kept(run, one.file)) is not None
-    ]
-    return element("div", *figures, class_="pictures pair" if len(figures) < 3 else "pictures") if figures else None
+    figures = []
+    for one in group:
+        png = one.file.lower().endswith(".png")
+        if (file := kept(run, one.file, LARGEST_PNG if png else LARGEST_FIGURE)) is None:
+            continue
+        data, kind = file.read_bytes(), KINDS[file.suffix.lower()]
+        data = smaller_png(data, SMALLER_SIDE) if png and len(data) > LARGE_PICTURE else data
+        alt = ": ".join(filter(None, (one.name, one.caption)))
+        picture = element("img", src=document.data_url(data, kind), alt=alt, data_picture=file.stem)
+        name = [element("strong", one.name), ": "] if one.name else []
+        figures.append(element("figure", picture, element("figcaption", *name, one.caption)))
+    layout = layout or ("pair" if len(figures) < 3 else "")
+    return element("div", *figures, class_=f"pictures {layout}".strip()) if figures else None
 
 
 def _figures(run: Path, said: str) -> Iterator[Html]:
