@@ -27,7 +27,6 @@ _HOMES = {
     "SweepResult": "advsearch.engine.sweeps.summary",
     "Task": "advsearch.tasks",
     "allow_code": "advsearch.registry",
-    "attack": "advsearch.questions.attack.carry_out",
     "check": "advsearch.questions.check.carry_out",
     "compare": "advsearch.questions.compare.carry_out",
     "explain": "advsearch.questions.explain.carry_out",
@@ -41,7 +40,6 @@ _HOMES = {
     "recipe": "advsearch.questions.recipe.carry_out",
     "render": "advsearch.api.render",
     "stability": "advsearch.questions.stability.carry_out",
-    "sweep": "advsearch.questions.sweep.carry_out",
 }
 """The public names, and the module of each; besides, every question that
 `advsearch.question` makes."""

@@ -5,20 +5,16 @@ from advsearch.api.keywords import Named
 from advsearch.api.keywords import Names
 from advsearch.api.render import load_model as load_model
 from advsearch.api.render import load_run as load_run
-from advsearch.attacks.evaluation import Policy
 from advsearch.attacks.evaluation import Policy as Policy
 from advsearch.controls.base import Control as Control
-from advsearch.engine.attack_result import AttackResult
 from advsearch.engine.attack_result import AttackResult as AttackResult
 from advsearch.engine.judging import Metric
 from advsearch.engine.loading import Controls
-from advsearch.engine.loading import Scene
 from advsearch.engine.loading import Scene as Scene
 from advsearch.engine.loading import load_scene as load_scene
 from advsearch.engine.naming import AnyModel
 from advsearch.engine.rendering import Rendering as Rendering
 from advsearch.engine.rendering import render as render
-from advsearch.engine.sweeps.summary import SweepResult
 from advsearch.engine.sweeps.summary import SweepResult as SweepResult
 from advsearch.models.model import Model as Model
 from advsearch.progress import Watched

@@ -59,7 +59,7 @@ def text() -> str:
             lines.append(f"{one.name}: {hints[-1]}{'' if one.default is one.empty else ' = ...'}")
         for hint in hints:
             for word in re.findall(r"(?<![\w.'\"])[A-Za-z_]\w*(?![\w.'\"])", hint):
-                if not hasattr(builtins, word):
+                if not hasattr(builtins, word) and word not in advsearch.__all__:
                     imports.add(f"from {home(word, inner.__globals__)} import {word}")
         arguments = "".join(f"    {line},\n" for line in lines)
         functions.append(f"def {name}(\n{arguments}) -> {hints[0]}: ...\n")

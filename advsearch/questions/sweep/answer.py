@@ -21,9 +21,6 @@ from advsearch.runs.results.base import INTERRUPTED
 from advsearch.runs.results.sweep import AxisRow, PairedRates, SweepSummary, WorstConfiguration
 from advsearch.settings import split_names
 
-RESULT = SweepSummary
-
-
 READING = "How often it is right at each value, over all others, with the 95 % interval:"
 
 BAR = 20
