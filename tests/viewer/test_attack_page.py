@@ -40,7 +40,8 @@ from advsearch.report.shown import shown
 from advsearch.runs.directory import OBJECT_FILE
 from advsearch.runs.images import read_png
 from advsearch.viewer.document import asset
-from advsearch.viewer.pages import LARGE_PICTURE, LARGEST, SMALLER_SIDE, object_part, read_object
+from advsearch.viewer.pages import LARGEST, object_part, read_object
+from advsearch.viewer.parts import LARGE_PICTURE, SMALLER_SIDE
 
 VOID = {"meta", "img", "br", "hr", "link"}
 
