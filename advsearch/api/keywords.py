@@ -218,9 +218,9 @@ WRITTEN = {
 def hint_of(field: str, kind: Any) -> str:
     """Return what Python callers may write for a setting that is declared as `kind`: for a text also a path, and for
     what may be several names a list."""
-    if field in WRITTEN:
-        return WRITTEN[field]
     text = inspect.formatannotation(kind).replace("typing.", "").replace("NoneType", "None")
+    if field in WRITTEN and not (field == "label" and "dict" in text):  # a recipe's may be one of each object
+        return WRITTEN[field]
     match = re.fullmatch(r"Optional\[(.*)\]", text)
     parts = [match[1], "None"] if match else re.split(r" \| (?![^\[]*\])", text)
     wider = {"str": "Path | Names" if field in (*SEVERAL, "prompt", "vary", "ways") else "str | Path"}
