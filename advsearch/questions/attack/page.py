@@ -53,7 +53,7 @@ def page(run: Path, result: Result) -> str | None:
         _changes(result),
         _textures(run),
         *_failures(result),
-        replace(given.sections[0], **_rates(result)),
+        _rates(result, given.sections[0]),
         _curve(result, curves),
         AnswerPart("How the search worked", rows=_named(method_facts(result)), folded=True),
         AnswerPart(plan_text(result), heads=PLAN_HEADS, rows=plan_rows(result), folded=True),
@@ -197,21 +197,20 @@ def _failures(summary: AttackSummary) -> Iterator[AnswerPart]:
     yield replace(failures_part(known), title="Different failures", text=said, pictures=[pictures] if pictures else [])
 
 
-def _rates(summary: AttackSummary) -> dict[str, object]:
-    """What the page adds to the table of rates: a bar for each, with its interval."""
-    rated = [summary.clean.control, summary.verified if summary.adversarial else None]
-    rated = rated if summary.adversarial else rated[:1]
+def _rates(summary: AttackSummary, table: AnswerPart) -> AnswerPart:
+    """The table of rates, these first, for a phone cuts what is on the right, with a bar for each; empty where nothing
+    was rated."""
+    baseline, average = summary.baseline, summary.average
+    rated = [summary.clean.control, *([summary.verified] if summary.adversarial else [])]
+    rated += [baseline.verified] if baseline else []
     bars = [None if one is None else (*one.interval, one.rate) for one in rated]
-    if summary.baseline:
-        random = summary.baseline.verified
-        bars.append(None if random is None else (*random.interval, random.rate))
-    if summary.average:
-        bars.append((*summary.average.interval, summary.average.accuracy))
+    bars += [(*average.interval, average.accuracy)] if average else []
     if not any(bars):
-        return {"rows": ()}
+        return AnswerPart()
     spp = f", {summary.verified.spp} samples per pixel" if summary.verified else ""
     note = f"Fresh seeds, pictures rounded to 8 bits, Clopper-Pearson intervals{spp}."
-    return {"title": "Verified rates", "bars": bars, "note": note}
+    heads, *rows = ([row[0], *row[3:], *row[1:3]] for row in (table.heads, *table.rows))
+    return replace(table, title="Verified rates", heads=heads, rows=rows, bars=bars, note=note)
 
 
 def _curve(summary: AttackSummary, curves: dict[str, list[float | None]]) -> AnswerPart:
