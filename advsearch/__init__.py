@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from advsearch.questions.gap.carry_out import gap as gap
     from advsearch.questions.harden.carry_out import harden as harden
     from advsearch.questions.photographs.carry_out import photo_agreement as photo_agreement
-    from advsearch.questions.plan.carry_out import plan as plan
     from advsearch.questions.precision.carry_out import precision as precision
     from advsearch.questions.recipe.carry_out import recipe as recipe
     from advsearch.questions.region.carry_out import region as region
@@ -65,7 +64,6 @@ _HOMES = {
     "load_run": "advsearch.api.render",
     "load_scene": "advsearch.engine.loading",
     "photo_agreement": "advsearch.questions.photographs.carry_out",
-    "plan": "advsearch.questions.plan.carry_out",
     "precision": "advsearch.questions.precision.carry_out",
     "recipe": "advsearch.questions.recipe.carry_out",
     "region": "advsearch.questions.region.carry_out",
@@ -87,6 +85,8 @@ def __getattr__(name: str) -> Any:
     if name in __all__:
         import_module("advsearch.api")  # sets the threads before torch is imported
         return import_module(f"advsearch.{name}") if name in _MODULES else getattr(import_module(_HOMES[name]), name)
+    if name == "plan":
+        raise AttributeError("`plan` is a part of `check` now: use advsearch.check(..., loss='model')")
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 

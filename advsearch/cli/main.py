@@ -55,7 +55,6 @@ GROUPS = {
         "test": "advsearch.questions.test",
         "replay": "advsearch.questions.replay",
         "check": "advsearch.questions.check",
-        "plan": "advsearch.questions.plan",
         "precision": "advsearch.questions.precision",
         "stability": "advsearch.questions.stability",
         "doctor": "advsearch.cli.doctor:DOCTOR check every part that a run needs, with versions and how to mend it",
@@ -156,6 +155,8 @@ def _run_and_tell(given: list[str]) -> int:
 
 def _run(given: list[str]) -> int:
     command = given[0] if given and not given[0].startswith("-") else None
+    if command == "plan":
+        raise InputError("`plan` is a part of `check` now: use advsearch check --loss model, with the same flags")
     if command is not None and command not in COMMANDS:
         raise UnknownNameError("command", command, COMMANDS, "See advsearch --help.")
     try:

@@ -20,7 +20,7 @@ from advsearch.settings import Config, parse_assignment, read_yaml
 from advsearch.settings.values import put
 
 COMMANDS = (
-    *("attack", "sweep", "recipe", "gap", "region", "precision", "check", "plan", "stability", "harden", "explain"),
+    *("attack", "sweep", "recipe", "gap", "region", "precision", "check", "stability", "harden", "explain"),
     *("compare", "test"),
 )
 """What the `command` of a file may say."""
@@ -121,7 +121,7 @@ RESUME = Command(
     "; what it has evaluated is not rendered again",
     (
         "resume mug-texture-001",
-        "resume mug-plan-001 seconds=600",
+        "resume mug-check-001 seconds=600",
         "resume mug-sweep-001 surface=true",
         "resume realism-001 photographs=my-photographs",
     ),
