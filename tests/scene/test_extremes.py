@@ -134,7 +134,8 @@ def changed_threads() -> None:
 
 def in_a_process(call: str) -> None:
     """Call a function of this file in a process of its own, which has to end well."""
-    code = f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r}); import {Path(__file__).stem} as this; this.{call}"
+    here = Path(__file__)
+    code = f"import sys; sys.path.insert(0, {str(here.parent)!r}); import {here.stem} as this; this.{call}"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=300)
     assert done.returncode == 0, done.stderr[-500:]
 

@@ -186,7 +186,8 @@ class Pictures:
         families, rows = list(dict.fromkeys(map(denoiser_of, self._lines))), []
         for number, family in enumerate(families):
             share = budget.share(1.0 / (len(families) - number))
-            take = partial(self._radiance, REFERENCE_SAMPLER + OIDN * (family == "oidn"))
+            name = REFERENCE_SAMPLER + OIDN * (family == "oidn")
+            take = partial(self._radiance, name)
             spp = part_samples(partial(take, 0), share.left)
             parts = [flat(radiance) for radiance in gather(partial(take, spp=spp), share, on_done, seed)]
 
@@ -198,7 +199,8 @@ class Pictures:
             margin = reference_of(parts, lambda mean: np.array([self._margin(shown(mean))]))
             self._references["margin", family] = margin
             self._references["picture", family] = self._references.get(("picture", "none"), picture)
-            rows += [_row("picture", family, picture, spp), _row("margin", family, margin, spp)]
+            rows += [_row("picture", name, picture, spp)] if family == "none" else []
+            rows.append(_row("margin", name, margin, spp))
         return rows
 
     def floor(self, setting: Setting, quantity: str) -> float:
