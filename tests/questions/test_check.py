@@ -207,7 +207,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(f"advsearch.engine.planning.{name}", value)
     monkeypatch.setattr(checking, "CONVERGED", 2)
     monkeypatch.setattr(INTERRUPTS, "count", 0)
-    row = {"item": "tracing", "what": "tracing", "gain": 2.0, "seconds": 1.0, "safe": True}
+    row = {"item": "tracing", "what": "tracing", "time_gain": 2.0, "seconds": 1.0, "safe": True}
     gain = GainRow.of({**row, "picture_difference": 0.0, "gradient_difference": 0.0})
     monkeypatch.setattr(checking, "measured_gains", lambda *_, **__: [gain])
     length = PathLength(depth=3, full=6, cuts=[], configurations=1, reason="few")

@@ -34,7 +34,7 @@ class GainRow(Fields):
 
     item: str
     what: str
-    gain: float = Field(description="a gradient's time x the picture's variance with it, over those without it")
+    time_gain: float = Field(description="a gradient's time x the picture's variance with it, over those without it")
     picture_difference: JsonFloat = Field(description="root mean square at one seed, over that of two seeds")
     gradient_difference: JsonFloat = Field(description="the same of gradients; 0 where there are none")
     safe: bool = Field(description="whether pictures and gradients agree to within their noise")
@@ -124,7 +124,7 @@ GROUPS: Mapping[str, Column] = {
 }
 GAINS: Mapping[str, Column] = {
     "left out": "{0.what}",
-    "a gradient with it takes": "x {0.gain:.2f}",
+    "a gradient with it takes": "x {0.time_gain:.2f}",
     "picture differs": lambda row: _difference(row.picture_difference),
     "gradient differs": lambda row: _difference(row.gradient_difference),
     "": lambda row: "" if row.safe else "MORE THAN ITS NOISE",

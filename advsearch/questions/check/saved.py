@@ -97,7 +97,7 @@ def _gain(item: str, without: Samples, having: Samples) -> GainRow:
     return GainRow(
         item=item,
         what=WHAT[item],
-        gain=((noise / lean_noise) ** 2 if lean_noise > 0.0 else 1.0) * having.seconds / without.seconds,
+        time_gain=((noise / lean_noise) ** 2 if lean_noise > 0.0 else 1.0) * having.seconds / without.seconds,
         picture_difference=picture,
         gradient_difference=gradient,
         safe=max(picture, gradient) <= AGREES,
