@@ -184,7 +184,7 @@ def test_a_stopped_suite_goes_on_with_the_case_that_it_was_at(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """`show` and `runs` know it, and the rows end up those of a suite that nobody stopped."""
-    good, bad = suite.CASES
+    good, bad = chosen()
     assert main(["stability", "--quiet", "--json", "--run", "whole"]) == 3
     whole = json.loads(capsys.readouterr().out)["rows"]
     assert main(["stability", "--quiet", "--seconds", "1e-9", "--run", "short"]) == 0
@@ -234,7 +234,8 @@ def test_seconds_and_ctrl_c_end_the_suite_and_say_what_was_not_run(
     def interrupted() -> Outcome:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(suite, "CASES", (suite.CASES[0], replace(suite.CASES[1], find=interrupted)))
+    good, bad = chosen()
+    monkeypatch.setattr(suite, "CASES", (good, replace(bad, find=interrupted)))
     assert main(["stability", "--json"]) == 130
     told = capsys.readouterr()
     assert json.loads(told.out)["not_run"] == ["bad"] and len(json.loads(told.out)["rows"]) == 1

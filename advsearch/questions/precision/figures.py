@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from advsearch.questions.precision.answer import WARM_UP, PrecisionPoint, PrecisionResult
 from advsearch.report.figures import BLUE, GREY, RED, Figures, drawn
@@ -65,9 +65,9 @@ def _draw_errors(axes: Axes, points: Sequence[PrecisionPoint], result: Precision
     axes.set_xlabel("seconds of processor time")
     axes.set_ylabel("relative error, %")
     axes.grid(True, which="major")
-    legend = axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.2, handlelength=1.6)
-    legend.set_title("slope against samples", {"size": 8})
-    legend.set_alignment("left")
+    place: dict[str, Any] = {"bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.2, "handlelength": 1.6}
+    place |= {"title": "slope against samples", "title_fontsize": 8, "alignment": "left"}
+    axes.legend(loc="upper left", **place)
 
 
 def _draw_line(axes: Axes, line: Sequence[PrecisionPoint], number: int, label: str) -> None:
