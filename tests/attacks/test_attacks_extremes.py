@@ -31,7 +31,8 @@ from advsearch.attacks.domain import project_l2_box
 from advsearch.attacks.evaluation import one_thread
 from advsearch.attacks.objectives import OBJECTIVE_KINDS
 from advsearch.controls.base import Parameter
-from advsearch.controls.values import Range, read, to_unit, to_value
+from advsearch.controls.ranges import Range
+from advsearch.controls.values import read, to_unit, to_value
 from advsearch.files import JsonObject
 from advsearch.models import load_model
 from advsearch.models.model import Model, Preprocessing

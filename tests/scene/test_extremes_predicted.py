@@ -57,7 +57,7 @@ def predicted(
     traced = shown(renderer, u, 5, TRACED) - shown(renderer, start, 5, TRACED)
     with torch.no_grad():
         change = linear(u) - linear(start)
-    _, slope = linear.gradient(lambda picture: picture.square().mean(), u, 0, 1)
+    _, slope = linear.renderer.gradient(lambda picture: picture.square().mean(), u, 0, 1)
     size = float(traced.square().mean().sqrt())
     error = float((change - traced).square().mean().sqrt()) / size if size else float(change.abs().max())
     checks = [
@@ -110,7 +110,7 @@ def test_a_lamp_that_goes_out_is_predicted() -> None:
     traced = shown(beside, out, 5, TRACED) - shown(beside, on, 5, TRACED)
     with torch.no_grad():
         change, black = basis(out) - basis(on), alone(out)
-    _, slope = alone.gradient(lambda picture: picture.square().mean(), out, 0, 1)
+    _, slope = alone.renderer.gradient(lambda picture: picture.square().mean(), out, 0, 1)
     error = float((change - traced).norm() / traced.norm())
     finite = all(bool(torch.isfinite(values).all()) for values in (change, black, slope))
     checks = [
@@ -151,8 +151,8 @@ def lit(
     textured = torch.zeros(len(u))
     for group in renderer.space.groups:
         textured[group.coordinates] = float(group.control == "texture")
-    light.formation = renderer.like(transfer="linear").formation
-    gradient = light.gradient(smooth_loss(light.formation.resolution), u, 0, 1)[1] * textured
+    light.traced = renderer.like(transfer="linear")
+    gradient = light.renderer.gradient(smooth_loss(renderer.formation.resolution), u, 0, 1)[1] * textured
     given, wanted = inward(renderer, gradient, textured, 1, 4 * REFERENCE_SPP)
     error = abs(given / wanted - 1.0) if wanted else abs(given)
     seen = (
@@ -161,7 +161,7 @@ def lit(
         else check("error of the derivative by the texture", error, most=slope)
     )
     hidden = textured * (gradient == 0.0)
-    light.formation = renderer.formation
+    light.traced = renderer
     with torch.no_grad():
         unseen = float((light(u * (1.0 - hidden)) - picture).abs().max())
     checks = [
