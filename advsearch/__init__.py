@@ -35,7 +35,6 @@ _HOMES = {
     "load_run": "advsearch.api.render",
     "load_scene": "advsearch.engine.loading",
     "photo_agreement": "advsearch.questions.photographs.carry_out",
-    "plan": "advsearch.questions.plan.carry_out",
     "precision": "advsearch.questions.precision.carry_out",
     "recipe": "advsearch.questions.recipe.carry_out",
     "render": "advsearch.api.render",
@@ -57,6 +56,8 @@ def __getattr__(name: str) -> Any:
         if name in made_questions():
             return made_question(name).python
         return import_module(f"advsearch.{name}") if name in _MODULES else getattr(import_module(_HOMES[name]), name)
+    if name == "plan":
+        raise AttributeError("`plan` is a part of `check` now: use advsearch.check(..., loss='model')")
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 

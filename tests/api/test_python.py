@@ -25,7 +25,7 @@ def test_dir_lists_the_public_names() -> None:
 
 
 QUESTIONS = (
-    *("attack", "sweep", "gap", "region", "replay", "recipe", "plan", "check", "precision", "stability", "harden"),
+    *("attack", "sweep", "gap", "region", "replay", "recipe", "check", "precision", "stability", "harden"),
     *("explain", "compare"),
 )
 
