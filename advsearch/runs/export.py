@@ -5,7 +5,6 @@ each value, its unit in the name: ``pose.yaw [degrees]``, ``camera.target[0]`` (
 from __future__ import annotations
 
 import csv
-import importlib
 import io
 import itertools
 import json
@@ -67,44 +66,6 @@ def as_record(row: Row) -> JsonObject:
     """Return a row as column to value."""
     own = {one.name: getattr(row, one.name) for one in fields(row) if one.name not in ("values", "metrics")}
     return own | dict(row.metrics) | _values(row.values)
-
-
-def to_pandas(rows: Iterable[Row]) -> Any:
-    """Return rows as a `pandas.DataFrame`, with the columns of an export under plain names.
-
-    A value is called ``pose.yaw``, and ``attrs["units"]["pose.yaw"]`` says its unit: "degrees".
-
-    Raises:
-        InputError: pandas is not installed.
-    """
-    pandas, listed = _pandas(), list(rows)
-    names = {one: one.partition(" [")[0] for one in as_columns(listed)}
-    units = {plain: one.removeprefix(f"{plain} [").removesuffix("]") for one, plain in names.items() if plain != one}
-    records = [{names[name]: value for name, value in as_record(row).items()} for row in listed]
-    frame = pandas.DataFrame(records, columns=list(names.values()))
-    frame.attrs = {"units": units}
-    return frame
-
-
-def table_to_pandas(rows: Sequence[JsonObject]) -> Any:
-    """Return a table of a result as a `pandas.DataFrame`: a column for each value, named ``average.accuracy``."""
-    pandas, flat = _pandas(), [dict(_leaves(row)) for row in rows]
-    return pandas.DataFrame(flat, columns=list(dict.fromkeys(name for row in flat for name in row)))
-
-
-def _leaves(values: JsonObject, before: str = "") -> Iterator[tuple[str, JsonValue]]:
-    for name, value in values.items():
-        if isinstance(value, dict):
-            yield from _leaves(value, f"{before}{name}.")
-        else:
-            yield before + name, value
-
-
-def _pandas() -> Any:
-    try:
-        return importlib.import_module("pandas")
-    except ImportError:
-        raise InputError("to_pandas: needs pandas; pip install pandas, or export the run as csv or parquet") from None
 
 
 def _records(rows: Iterable[Row]) -> Iterator[JsonObject]:

@@ -28,8 +28,8 @@ from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.sweep import SweepSummary
 from advsearch.runs.store import Row
 from advsearch.runs.summary import read_result
+from advsearch.runs.tables import EDGES
 from advsearch.viewer import thumbnails
-from advsearch.viewer.columns import EDGES
 
 PICTURES = 400
 EDGES_OF_ELEVATION = (5.0, 25.0, 45.0, 65.0, 85.0)

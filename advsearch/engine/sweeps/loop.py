@@ -38,10 +38,10 @@ from advsearch.runs.results.attack import DescribedValue, LinearTransport, Share
 from advsearch.runs.results.base import Formation
 from advsearch.runs.results.sweep import WorstConfiguration, WorstVerified
 from advsearch.runs.store import Row
+from advsearch.runs.tables import EDGES
 from advsearch.runs.units import NOTE
 from advsearch.tasks import Judgement
 from advsearch.viewer import thumbnails
-from advsearch.viewer.columns import EDGES
 from advsearch.viewer.sweep_page import write_sweep_page
 
 NOT_FINITE = "pictures not finite"

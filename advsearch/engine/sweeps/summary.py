@@ -26,7 +26,7 @@ from advsearch.report.markup import answer_html
 from advsearch.report.shown import shown
 from advsearch.runs import store
 from advsearch.runs.directory import RunDirectory, default_name
-from advsearch.runs.export import read_threedb, to_pandas
+from advsearch.runs.export import read_threedb
 from advsearch.runs.results.sweep import AxisRow, CountedAnswers, MapAxis, PairedRates, SweepMap, SweepSummary
 from advsearch.runs.store import Row
 from advsearch.runs.units import Units
@@ -305,10 +305,9 @@ class SweepResult:
         """Return every configuration as a row of a `pandas.DataFrame`.
 
         Columns are those of an export (docs/runs.md) under plain names; `attrs["units"]` has the units.
-
-        Raises:
-            InputError: pandas is not installed.
         """
+        from advsearch.runs.tables import to_pandas  # pandas takes half a second
+
         return to_pandas(self.rows())
 
     def plot(self, axes: Any = None) -> Any:

@@ -18,9 +18,10 @@ from advsearch.errors import InputError, ModelError
 from advsearch.interrupts import interruptible
 from advsearch.progress import NullProgress, Progress, Watched, watcher
 from advsearch.questions.compare.answer import ComparedPair, ComparedSide, CompareResult, PairPicture
+from advsearch.questions.compare.pairs import Side, compared, differing, far_apart, read_sides
 from advsearch.questions.compare.settings import CompareConfig
-from advsearch.questions.compare.sides import Side, compared, differing, far_apart, interval_of, read_sides, varying
 from advsearch.questions.sweep.carry_out import scenes_of
+from advsearch.rules import interval_of
 from advsearch.runs.directory import PARTS, RunDirectory, find_run
 from advsearch.runs.files import write_bytes
 from advsearch.runs.results.base import INTERRUPTED
@@ -79,11 +80,14 @@ def compare_from_config(
             done = carry_out_part(part, config.sweep().with_only_here(config.only_here), progress)
             swept = sum(getattr(done, "renders", {}).values())
             sides = [] if done.goes_on else read_sides([part])
-        pictures = _Pictures(run.path, progress)
-        pairs = []
+        pictures, pairs, warnings = _Pictures(run.path, progress), list[ComparedPair](), _cautions(sides)
         for number, other in enumerate(sides[1:], start=1):
             progress.stage("counting pairs")
-            pair = _counted(sides[0], other, config.seed, pictures)
+            try:
+                pair = compared(sides[0], other, config.seed)
+            except InputError as error:  # the library that finds rules is missing
+                warnings.append(f"Where one side is worse was not looked for: {error}")
+                pair = compared(sides[0], other, config.seed, rules=False)
             shown = list(pictures.of(sides[0], other, config.pictures, number))
             pairs.append(pair.model_copy(update={"shown": shown}))
         first = sides[0] if sides else None
@@ -99,7 +103,7 @@ def compare_from_config(
             pairs=pairs,
             renders=swept + pictures.rendered,
             ending=INTERRUPTED if pictures.interrupted or not sides else "done",
-            warnings=[*_cautions(sides), *pictures.warnings],
+            warnings=list(dict.fromkeys([*warnings, *pictures.warnings])),
             seconds={"total": time.perf_counter() - begun},
             seed=config.seed,
             command_line=config.command_line(),
@@ -107,22 +111,18 @@ def compare_from_config(
         return keep_answer(run, result)
 
 
-def _counted(first: Side, second: Side, seed: int, pictures: _Pictures) -> ComparedPair:
-    """Two sides counted; without rules, and why, where the library that finds them is missing."""
-    try:
-        return compared(first, second, seed)
-    except InputError as error:
-        text = f"Where one side is worse was not looked for: {error}"
-        pictures.warnings += [text] if text not in pictures.warnings else []
-        return compared(first, second, seed, rules=False)
-
-
 def _side(side: Side) -> ComparedSide:
-    right, total = int(side.right.sum()), len(side)
-    counts = {"configurations": total, "correct": right, "accuracy": right / total}
-    interval = interval_of(side.right, side.units)
-    named = {"name": side.name, "run": str(side.folder), **side.named}
-    return ComparedSide(**named, **counts, interval=interval, seconds=side.seconds)
+    right, total = int(side.right.sum()), len(side.rows)
+    return ComparedSide(
+        name=side.name,
+        run=str(side.folder),
+        **side.named,
+        configurations=total,
+        correct=right,
+        accuracy=right / total,
+        interval=interval_of(side.rows),
+        seconds=float(side.rows["seconds"].mean()),
+    )
 
 
 def _together(names: Sequence[str]) -> str:
@@ -143,7 +143,7 @@ def _cautions(sides: Sequence[Side]) -> list[str]:
     tasks = {side.summary.task for side in sides}
     if len(tasks) > 1:
         found.append(f"What counts as right is judged by different tasks: {', '.join(sorted(tasks))}.")
-    return list(dict.fromkeys(found))
+    return found
 
 
 @dataclass
@@ -159,60 +159,46 @@ class _Pictures:
 
     def of(self, first: Side, second: Side, most: int, pair: int) -> Iterator[PairPicture]:
         """Yield what one side alone gets right, at most so many of each, with pictures as far as they are to be had."""
-        numbers, columns = far_apart(first, second, most), varying(first.columns)
-        together = first.folder == second.folder and bool((first.numbers == second.numbers).all())
-        sides = [first] if together else [first, second]
+        together = first.folder == second.folder and first.rows["number"].equals(second.rows["number"])
+        sides = {"a": first} if together else {"a": first, "b": second}
+        places = far_apart(first, second, most)
+        files = {(place, one): f"images/pair-{pair}-{place}-{one}.jpg" for place in places for one in sides}
+        self.interrupted = True  # unless it comes to its end
         with suppress(KeyboardInterrupt), interruptible():
-            self._make(numbers, sides, pair)
-        for number in numbers:
-            names = [
-                name for place in range(len(sides)) if (self.folder / (name := _name(pair, number, place))).is_file()
-            ]
+            self._make([(sides[one], place, self.folder / name) for (place, one), name in files.items()])
+            self.interrupted = False
+        for place in places:
+            names = [files[place, one] for one in sides]
+            values = first.rows.loc[place, first.varying].items()
             yield PairPicture(
-                number=number,
-                values={
-                    one.name: float(f"{float(one.data[number]):.6g}")
-                    if one.levels is None
-                    else one.levels[int(one.data[number])]
-                    for one in columns
-                },
-                right=(first if first.right[number] else second).name,
-                answers=(str(first.answers[number]), str(second.answers[number])),
-                pictures=names if len(names) == len(sides) else [],
+                number=place,
+                values={name: one if isinstance(one, str) else float(f"{one:.6g}") for name, one in values},
+                right=(first if first.right[place] else second).name,
+                answers=(first.rows["label"][place], second.rows["label"][place]),
+                pictures=names if all((self.folder / name).is_file() for name in names) else [],
             )
 
-    def _make(self, numbers: Sequence[int], sides: Sequence[Side], pair: int) -> None:
-        """Put the pictures of some pairs into the folder."""
-        self.interrupted = True  # unless it comes to its end
+    def _make(self, wanted: Sequence[tuple[Side, int, Path]]) -> None:
+        """Put the pictures at some places of sides into files, where they are not there."""
         missing: list[tuple[Side, int, Path]] = []
-        for place, side in enumerate(sides):
-            for number in numbers:
-                file = self.folder / _name(pair, number, place)
-                kept = thumbnails.kept_file(side.folder, int(side.numbers[number]))
-                if kept is not None:
-                    write_bytes(file, kept.read_bytes(), durable=False)
-                elif not file.is_file():
-                    missing.append((side, int(side.numbers[number]), file))
+        for side, place, file in wanted:
+            number = int(side.rows["number"][place])
+            kept = thumbnails.kept_file(side.folder, number)
+            if kept is not None:
+                write_bytes(file, kept.read_bytes(), durable=False)
+            elif not file.is_file():
+                missing.append((side, number, file))
         if missing:
             self.progress.stage("rendering pictures again", len(missing), hint="`pictures` says how many")
         for side, number, file in sorted(missing, key=lambda one: (str(one[0].folder), one[1])):
-            scenes = self._scenes(side)
+            if side.folder not in self.scenes:
+                self.scenes[side.folder] = None
+                try:
+                    self.scenes[side.folder] = scenes_of(side.config)
+                except (InputError, ModelError) as error:  # scene or model are not to be had any more
+                    self.warnings.append(f"Pictures of {side.folder.name} are not shown: {error}")
+            scenes = self.scenes[side.folder]
             if scenes is not None:
                 write_bytes(file, thumbnails.thumbnail(scenes.picture(number)), durable=False)
                 self.rendered += 1
             self.progress.advance(1)
-        self.interrupted = False
-
-    def _scenes(self, side: Side) -> Scenes | None:
-        """What renders pictures of a sweep as it did; None where scene or model are not to be had any more."""
-        if side.folder not in self.scenes:
-            self.scenes[side.folder] = None
-            try:
-                self.scenes[side.folder] = scenes_of(side.config)
-            except (InputError, ModelError) as error:
-                self.warnings.append(f"Pictures of {side.folder.name} are not shown: {error}")
-        return self.scenes[side.folder]
-
-
-def _name(pair: int, number: int, place: int) -> str:
-    return f"images/pair-{pair}-{number}-{'ab'[place]}.jpg"

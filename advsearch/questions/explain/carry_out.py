@@ -8,26 +8,18 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 from typing_extensions import Unpack
 
 from advsearch.api.keywords import RunKeywords, asks, configured
 from advsearch.config import SweepConfig
 from advsearch.errors import InputError
-from advsearch.explanations import (
-    CHANCE,
-    FEWEST_ROWS,
-    CountedRule,
-    Factor,
-    Observations,
-    condition_rows,
-    find_rules,
-    observed,
-)
 from advsearch.progress import NullProgress, Progress, Watched, watcher
 from advsearch.questions.explain.answer import EnvelopeRow, ExplainResult, ParameterWeight, RuleNotTold, RuleRow
 from advsearch.questions.explain.findings import Envelope, FactorWeight, find_envelope, find_importance
-from advsearch.questions.explain.renders import AskedSweep, Renders, right_of
+from advsearch.questions.explain.renders import AskedSweep, Renders, read_answers, right_of
 from advsearch.questions.explain.settings import ExplainConfig
+from advsearch.rules import CHANCE, FEWEST_ROWS, CountedRule, find_rules, halves, is_independent, observed
 from advsearch.runs.directory import PARTS, RunDirectory, find_run
 from advsearch.runs.results.base import INTERRUPTED
 from advsearch.runs.summary import read_result
@@ -69,54 +61,47 @@ def explain_from_config(
     begun, progress = time.perf_counter(), progress or NullProgress()
     progress.stage("reading rows")
     asked = [AskedSweep.of(folder) for name in split_names(config.sweeps) for folder in _sweeps_of(find_run(name))]
-    rows = [row for one in asked for row in one.rows]
+    rows = read_answers(asked)
     if len(rows) < FEWEST_ROWS:
         raise InputError(f"explain: expected at least {FEWEST_ROWS} rows, got {len(rows)}; sweep more configurations")
-    values = ({name: (value, row.units.get(name, "")) for name, value in row.values.items()} for row in rows)
-    shown = [(one, row.correct) for one, row in zip(values, rows, strict=True)]
-    found = observed(shown, [unit for one in asked for unit in one.units])
-    choosing, counting = found.halves(config.seed)
+    table = observed(rows, rows.attrs["units"])
+    if not table.attrs["units"]:
+        raise InputError("explain: expected rows in which something varies that all of them have, got none")
+    choosing, counting = halves(table, config.seed)
     progress.stage("seeking rules on one half of the rows")
-    sought = find_rules(choosing, counting, config.seed)
-    rules = sought.told
+    found = find_rules(choosing, counting, config.seed)
     progress.stage("measuring which parameters matter")
-    importance = find_importance(found)
+    importance = find_importance(table)
     envelope = find_envelope(choosing, counting, config.accuracy)
     with RunDirectory.of(config, resumed) as run:
-        renders = Renders(run.path, progress, config, found)
-        table = [
-            RuleRow(**_told(rule, found.factors), confirmed=renders.confirmed(rule, n, asked))
-            for n, rule in enumerate(rules)
-        ]
-        pairs = list(renders.pairs(rules, rows, asked))
-        clusters = renders.clusters(asked, run)
-        first = asked[0].summary
-        right = int(found.right.sum())
+        renders = Renders(run.path, progress, config, asked, rows, table)
+        rules = [RuleRow(**_counts(one), confirmed=renders.confirmed(one, n)) for n, one in enumerate(found.told)]
+        pairs = list(renders.pairs(found.told))
+        clusters = renders.clusters(run)
+        answers = right_of(table)
         result = ExplainResult(
             run=str(run.path),
             sweeps=[str(one.folder) for one in asked],
             object=_together(one.summary.object for one in asked),
             model=_together(one.summary.model for one in asked),
             environment=_together(one.summary.environment for one in asked),
-            controls=first.controls,
-            parameters=[one.name for one in found.factors],
-            right=right,
-            total=len(found),
-            interval=found.interval,
-            units=None if found.independent else found.count,
-            rules=table,
-            not_told=_not_told(sought.next, found),
+            controls=asked[0].summary.controls,
+            parameters=list(table.attrs["units"]),
+            **vars(answers),
+            units=None if is_independent(table) else table["unit"].nunique(),
+            rules=rules,
+            not_told=_not_told(found.next, len(table)),
             importance=[
-                ParameterWeight(**{**vars(one), "parameters": [found.factors[place].name for place in one.places]})
+                ParameterWeight(parameters=[*one.factors], share=one.share, interval=one.interval, parts=one.parts)
                 for one in importance
             ],
-            envelope=_envelope_row(envelope, found.factors, config.accuracy),
+            envelope=None if envelope is None else _envelope_row(envelope, config.accuracy),
             pairs=pairs,
-            pairs_sought=min(config.pairs, len(found) - right),
+            pairs_sought=min(config.pairs, answers.total - answers.right),
             clusters=clusters,
             renders=renders.count,
             ending=INTERRUPTED if renders.interrupted else "done",
-            warnings=[*renders.warnings, *_cautions(found, importance)],
+            warnings=[*renders.warnings, *_cautions(table, importance)],
             seconds={"total": time.perf_counter() - begun},
             seed=config.seed,
             command_line=config.command_line(),
@@ -140,36 +125,35 @@ def _together(names: Iterator[str] | Sequence[str]) -> str:
     return ",".join(dict.fromkeys(one for name in names for one in split_names(name)))
 
 
-def _cautions(found: Observations, importance: Sequence[FactorWeight]) -> list[str]:
-    right, told = int(found.right.sum()), list[str]()
-    if found.count < FEWEST_ROWS:
-        told = [f"The rows are of {found.count} draws, each with several, which are not independent: few show little."]
-    if right in (0, len(found)):
-        return [*told, f"The model is {'right' if right else 'wrong'} in every row: there is nothing to tell apart."]
+def _cautions(table: pd.DataFrame, importance: Sequence[FactorWeight]) -> list[str]:
+    cautions, draws = list[str](), table["unit"].nunique()
+    if draws < FEWEST_ROWS:
+        cautions = [f"The rows are of {draws} draws, each with several, which are not independent: few show little."]
+    if table["correct"].nunique() < 2:
+        always = "right" if table["correct"].all() else "wrong"
+        return [*cautions, f"The model is {always} in every row: there is nothing to tell apart."]
     if all(one.interval[0] <= 0.0 for one in importance):
-        return [*told, "No parameter is shown to decide anything: the intervals of all their shares begin at 0."]
-    return told
+        return [*cautions, "No parameter is shown to decide anything: the intervals of all their shares begin at 0."]
+    return cautions
 
 
-def _told(rule: CountedRule, factors: Sequence[Factor]) -> dict[str, Any]:
-    """What a rule is, and how often it holds."""
-    conditions = condition_rows(rule.conditions, factors)
+def _counts(rule: CountedRule) -> dict[str, Any]:
+    """What a rule is, and how often the model is right under it and elsewhere."""
+    conditions = [one.row for one in rule.conditions]
     return {"conditions": conditions, **vars(right_of(rule.inside)), "elsewhere": right_of(rule.elsewhere)}
 
 
-def _not_told(rule: CountedRule | None, found: Observations) -> RuleNotTold | None:
+def _not_told(rule: CountedRule | None, rows: int) -> RuleNotTold | None:
     if rule is None:
         return None
     times = rule.times_needed()
-    rows = None if times is None else round_up(times * len(found))
-    return RuleNotTold(**_told(rule, found.factors), chance=rule.chance, asked=CHANCE, rows=rows)
+    needed = None if times is None else round_up(times * rows)
+    return RuleNotTold(**_counts(rule), chance=rule.chance, asked=CHANCE, rows=needed)
 
 
-def _envelope_row(one: Envelope | None, factors: Sequence[Factor], accuracy: float) -> EnvelopeRow | None:
-    if one is None:
-        return None
-    rows = condition_rows(one.conditions, factors)
-    return EnvelopeRow(conditions=rows, **vars(right_of(one.inside)), accuracy=accuracy, held=one.held)
+def _envelope_row(box: Envelope, accuracy: float) -> EnvelopeRow:
+    conditions = [one.row for one in box.conditions]
+    return EnvelopeRow(conditions=conditions, **vars(right_of(box.inside)), accuracy=accuracy, held=box.held)
 
 
 def round_up(rows: float) -> int:
