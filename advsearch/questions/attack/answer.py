@@ -75,16 +75,11 @@ class CurveResult(InNotebook, StudyResult):
     """Robust accuracy against epsilon, over objects."""
 
     command: ClassVar[str] = "attack"
+    tabular: ClassVar[str] = "curve"
 
     epsilons: list[float | None] = Field(description="those that were tried; null: the own of each control")
     table: list[ObjectRow]
     curve: list[CurvePoint]
-
-    def to_pandas(self) -> Any:
-        """Return a row for each epsilon as a `pandas.DataFrame`; columns are called as in `summary.json`."""
-        from pandas import json_normalize  # takes half a second
-
-        return json_normalize([point.to_dict() for point in self.curve])
 
 
 class MatrixModel(Fields):
