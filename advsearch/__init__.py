@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from advsearch.models import Model as Model
     from advsearch.questions.attack.carry_out import attack as attack
     from advsearch.questions.check.carry_out import check as check
-    from advsearch.questions.compare.carry_out import compare as compare
-    from advsearch.questions.explain.carry_out import explain as explain
+    from advsearch.questions.compare import compare as compare
+    from advsearch.questions.explain import explain as explain
     from advsearch.questions.gap import gap as gap
     from advsearch.questions.harden.carry_out import harden as harden
     from advsearch.questions.photographs.carry_out import photo_agreement as photo_agreement
@@ -59,8 +59,6 @@ _HOMES = {
     "allow_code": "advsearch.registry",
     "attack": "advsearch.questions.attack.carry_out",
     "check": "advsearch.questions.check.carry_out",
-    "compare": "advsearch.questions.compare.carry_out",
-    "explain": "advsearch.questions.explain.carry_out",
     "harden": "advsearch.questions.harden.carry_out",
     "load_model": "advsearch.api.render",
     "load_run": "advsearch.api.render",

@@ -215,8 +215,8 @@ FAULTS = (
     Fault(
         "sweeps: a rate of another group",
         "advsearch/engine/sweeps/summary.py",
-        "answer=counted(per_unit(after, units), of),",
-        "answer=counted(per_unit(before, units), of),",
+        "answer=counted(per_unit(after, draws), of),",
+        "answer=counted(per_unit(before, draws), of),",
         ("tests/engine/test_sweep.py",),
     ),
     Fault(
@@ -264,8 +264,8 @@ FAULTS = (
     Fault(
         "viewer: the best pictures come first",
         "advsearch/viewer/thumbnails.py",
-        "np.argsort(-np.nan_to_num(columns.margin, nan=-np.inf)",
-        "np.argsort(np.nan_to_num(columns.margin, nan=-np.inf)",
+        "np.argsort(-np.nan_to_num(margins, nan=-np.inf)",
+        "np.argsort(np.nan_to_num(margins, nan=-np.inf)",
         ("tests/viewer/test_columns.py",),
     ),
     Fault(
@@ -304,7 +304,7 @@ FAULTS = (
         ("tests/config/test_config.py",),
     ),
     Fault(
-        "rules: a rule is counted on the rows that chose it",
+        "explain: a rule is counted on the rows that chose it",
         "advsearch/rules.py",
         "rule = CountedRule(conditions, counting[inside], counting[~inside])",
         "rule = CountedRule(conditions, choosing[covered(conditions, choosing)], choosing)",

@@ -128,9 +128,10 @@ class Kept:
 
     def embedded(self, rows: pd.DataFrame, most: int) -> Iterator[tuple[str, str]]:
         """Yield number and data address of thumbnails, of the worst margins first, up to `most` bytes."""
-        order = np.argsort(-np.nan_to_num(rows["margin"].to_numpy(), nan=-np.inf), kind="stable")
+        steps, margins = rows["step"].to_numpy(), rows["margin"].to_numpy()
+        order = np.argsort(-np.nan_to_num(margins, nan=-np.inf), kind="stable")
         there, spent = set(self.numbers), 0
-        for step in rows["step"].to_numpy()[order]:
+        for step in steps[order]:
             number = int(step) // self.models
             if number not in there:
                 continue

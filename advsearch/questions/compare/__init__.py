@@ -1,16 +1,490 @@
-"""`advsearch compare`: two models, objects or answers beside each other, on the same pictures."""
+"""Compare models, objects or answers on the same pictures, pair by pair."""
 
-from advsearch.cli.question import Positional, QuestionCommand
+from __future__ import annotations
 
-HELP = "compare models, objects or answers on the same pictures, pair by pair"
-EXAMPLES = (
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
+
+from pydantic import Field, ValidatorFunctionWrapHandler, field_validator, model_validator
+
+from advsearch.config.scene import SceneConfig
+from advsearch.config.sweep import SweepConfig
+from advsearch.errors import InputError
+from advsearch.question import Asked, question
+from advsearch.report import wording
+from advsearch.report.markup import InNotebook
+from advsearch.report.phrases import percent, share_of_text
+from advsearch.report.shown import AnswerPart, Claim, Column, Extent, Picture, ShownAnswer
+from advsearch.report.wording import conditions_text
+from advsearch.runs.directory import PARTS, find_run
+from advsearch.runs.results.base import INTERRUPTED, ConditionRow, Fields, Interval, JsonFloat, RunResult
+from advsearch.runs.results.sweep import AxisValue, CountedAnswers
+from advsearch.settings import each_once, setting, setting_as_in, settings, split_names, texts
+
+if TYPE_CHECKING:
+    from advsearch.questions.compare.pairs import Side
+
+ALWAYS = ("compared", "pictures", "seed", "threads", "deterministic", "run", "overwrite")
+"""The settings that mean something for stored sweeps, too."""
+
+
+class CompareConfig(SweepConfig):
+    """Everything that decides what `compare` does: which stored sweeps it reads, or the sweep that it makes first."""
+
+    command: ClassVar[str] = "compare"
+    without: ClassVar[tuple[str, ...]] = (
+        *("model", "answer_of", "surface", "aov", "metrics", "log", "trials", "verify_spp", "path", "fps"),
+    )
+
+    compared: str = setting(
+        ...,
+        "compare",
+        "what is compared, separated by commas: sweeps that are stored (one of several models, or several of the same "
+        "draws), or models, where `object` says what they are shown",
+        "names or folders of runs of sweep, or models",
+    )
+    pictures: int = setting(
+        6,
+        "compare",
+        "pictures of what one side alone gets right that are shown, for each side; 0 for none",
+        unit="pictures",
+        ge=0,
+        le=1000,
+    )
+    object: str = setting_as_in(
+        SweepConfig,
+        "object",
+        default="",
+        description="the object that models are shown, where models are compared; several, separated by commas",
+    )
+    keep_pictures: Literal["all", "wrong", "none"] = setting_as_in(SweepConfig, "keep_pictures", default="wrong")
+    run: str | None = setting_as_in(SceneConfig, "run", otherwise="runs/WHAT-compare-NNN")
+
+    _named = texts(several=["compared"])
+    _different = each_once("compared")
+
+    @field_validator("object", mode="wrap")
+    @classmethod
+    def _or_empty(cls, value: Any, read: ValidatorFunctionWrapHandler) -> Any:
+        """Accept no object, which files have as an empty text."""
+        return "" if value in ("", None) else read(value)
+
+    @model_validator(mode="after")
+    def _of_stored_or_made(self) -> CompareConfig:
+        """Refuse what says how pictures are made where stored ones are compared, and a single model."""
+        if not self.object:
+            for one in settings(type(self)):
+                if one.field not in ALWAYS and getattr(self, one.field) != one.default:
+                    raise InputError(
+                        f"{one.name}: says how models are shown pictures, and no `object` is named; add `object`, or "
+                        "leave it out to compare stored sweeps"
+                    )
+        elif len(split_names(self.compared)) < 2:
+            raise InputError(f"compared: expected at least two models, got {self.compared[:60]}; name another one")
+        return self
+
+    @property
+    def title(self) -> tuple[str, ...]:
+        """What is compared, and that it is."""
+        return "-".join(Path(name).stem for name in split_names(self.object or self.compared)), self.command
+
+    def sweep(self) -> SweepConfig:
+        """Return the sweep of the models that has to be made first."""
+        return SweepConfig.of(self, model=self.compared, trials=0)
+
+
+class ComparedSide(CountedAnswers):
+    """One of the things that are compared, and how often the model is right with it."""
+
+    name: str = Field(description="what tells it from the others")
+    run: str = Field(description="folder of the sweep that has its rows")
+    object: str
+    model: str
+    answer: str = Field(default="", description="the run whose answer was swept; absent without")
+    seconds: JsonFloat = Field(description="of a picture and its answers, shared evenly among the models that saw it")
+
+
+class CountOf(Fields):
+    """How many of some pairs."""
+
+    count: int
+    total: int = Field(alias="of", description="pairs")
+    interval: Interval = Field(description="of the share, 95 %")
+
+
+class PairCounts(Fields):
+    """Pairs by what both sides say of them."""
+
+    both: int = Field(description="pairs that both get right")
+    first_only: int = Field(description="that the first alone gets right")
+    second_only: int = Field(description="that the second alone gets right")
+    neither: int = Field(description="that none gets right")
+    difference: float = Field(description="accuracy of the second less that of the first")
+    interval: Interval = Field(description="of that difference, 95 %, of pairs")
+
+    @property
+    def pairs(self) -> int:
+        """How many there are."""
+        return self.both + self.first_only + self.second_only + self.neither
+
+    @property
+    def right(self) -> tuple[int, int]:
+        """Right answers of the first, and of the second."""
+        return self.both + self.first_only, self.both + self.second_only
+
+
+class PairRule(CountOf):
+    """Values under which one side alone is right more often than elsewhere, counted on pairs that did not choose it."""
+
+    conditions: list[ConditionRow] = Field(description="all of which hold")
+    elsewhere: CountOf = Field(description="pairs under no rule so far")
+
+
+class PairPart(PairCounts):
+    """The pairs with one value, or one part of the range, of one parameter."""
+
+    parameter: str
+    unit: str
+    value: AxisValue
+
+
+class PairPicture(Fields):
+    """A pair that one side alone gets right."""
+
+    number: int = Field(description="of the pair, from 0")
+    values: dict[str, str | float] = Field(description="of the parameters")
+    right: str = Field(description="the side that is right")
+    answers: tuple[str, str] = Field(description="what is said of the first side, and of the second")
+    pictures: list[str] = Field(description="files in the run's folder: of each side, or one that both were shown")
+
+
+class ComparedPair(PairCounts):
+    """Two sides, pair by pair."""
+
+    first: str = Field(description="name of the side")
+    second: str = Field(description="name of the other")
+    units: int | None = Field(
+        default=None,
+        description="draws that the pairs are of, such as [drives](drives.md), where some share one; absent where none "
+        "do",
+    )
+    p: float = Field(
+        description="how likely a split so uneven of the pairs that one alone gets right is where both are right "
+        "equally often (two-sided; McNemar's exact test, or where pairs share draws a bound by bets)"
+    )
+    worse: list[PairRule] | None = Field(description="where the first alone is right; null where it was not looked for")
+    better: list[PairRule] | None = Field(description="where the second alone is right; null likewise")
+    parts: list[PairPart] = Field(description="by the values of each parameter, cut as the sweep's tables are")
+    shown: list[PairPicture] = Field(description="pairs that one side alone gets right, the farthest apart first")
+
+
+class CompareResult(InNotebook, RunResult):
+    """Two sides or more on the same pictures; of more than two, each with the first."""
+
+    command: ClassVar[str] = "compare"
+
+    object: str
+    model: str
+    task: str = Field(description="what judges the answers")
+    differ: list[str] = Field(description="the settings in which the sweeps differ")
+    sides: list[ComparedSide] = Field(description="in the order in which they were named; empty if interrupted before")
+    pairs: list[ComparedPair] = Field(description="the first side with each of the others")
+    renders: int = Field(description="pictures that were rendered now")
+    warnings: list[str] = Field(description="sentences that a reader has to know")
+
+    @property
+    def brief(self) -> str:
+        """Accuracy of each side."""
+        return ", ".join(f"{one.name} {one.accuracy:.1%}" for one in self.sides if one.accuracy is not None)
+
+
+@question(
     "compare mug-sweep-001",
     "compare mug-sweep-001 mug-sweep-002 --json",
     "compare reference hardened.pt2 --object mug --control pose,camera --samples 200",
+    place=("compared",),
+    about="compared",
+    expected=("WHAT", "the run of a sweep, or models and what they are shown", "", True),
+)
+def compare(asked: Asked[CompareConfig]) -> CompareResult:
+    """Compare models, objects or answers on the same pictures, pair by pair (docs/compare.md).
+
+    All other arguments are the settings of `advsearch compare`. The run is kept, in `run` or under runs/. Models that
+    exist in Python alone are swept first (`sweep(scene, [one, other], run=...)`), and then the run is compared.
+
+    Args:
+        compared: names or folders of runs of `sweep`: one of several models, or several of the same draws. With
+            `object`, names of models, which are shown it first.
+    """
+    # these import torch and pandas
+    from advsearch.api.studies import carry_out_part
+    from advsearch.questions.compare.pairs import compared, differing, read_sides
+    from advsearch.questions.compare.pictures import Pictures
+    from advsearch.rules import interval_of
+
+    config, progress, renders = asked.config, asked.progress, 0
+    if config.object:
+        swept = asked.run.path / PARTS / "sweep"
+        done = carry_out_part(swept, config.sweep().with_only_here(config.only_here), progress)
+        renders = sum(getattr(done, "renders", {}).values())
+        sides = [] if done.goes_on else read_sides([swept])
+    else:
+        progress.stage("reading rows")
+        sides = read_sides([find_run(name) for name in split_names(config.compared)])
+    differ = differing(sides) if sides else []
+    pictures, pairs, warnings = Pictures(asked), list[ComparedPair](), _cautions(sides, differ)
+    for number, other in enumerate(sides[1:], start=1):
+        progress.stage("counting pairs")
+        try:
+            pair = compared(sides[0], other, config.seed)
+        except InputError as error:  # the library that finds rules is missing
+            warnings.append(f"Where one side is worse was not looked for: {error}")
+            pair = compared(sides[0], other, config.seed, rules=False)
+        pairs.append(pair.model_copy(update={"shown": list(pictures.of(sides[0], other, number))}))
+    if not sides:
+        asked.ending = INTERRUPTED
+
+    def together(names: list[str]) -> str:
+        return ",".join(dict.fromkeys(one for name in names for one in split_names(name)))
+
+    return asked.result(
+        CompareResult,
+        environment=together([one.summary.environment for one in sides]) or config.lit_by,
+        controls=sides[0].summary.controls if sides else list(config.controls),
+        object=together([one.named["object"] for one in sides]) or config.object,
+        model=together([one.named["model"] for one in sides]) or config.compared,
+        task=sides[0].summary.task if sides else config.task_name,
+        differ=differ,
+        sides=[
+            ComparedSide(
+                name=one.name,
+                run=str(one.folder),
+                **one.named,
+                configurations=len(one.rows),
+                correct=int(one.right.sum()),
+                accuracy=float(one.right.mean()),
+                interval=interval_of(one.rows),
+                seconds=float(one.rows["seconds"].mean()),
+            )
+            for one in sides
+        ],
+        pairs=pairs,
+        renders=renders + pictures.rendered,
+        warnings=list(dict.fromkeys([*warnings, *pictures.warnings])),
+    )
+
+
+def _cautions(sides: Sequence[Side], names: Sequence[str]) -> list[str]:
+    """What a reader has to know of the sweeps, which differ in some settings."""
+    if not sides:
+        return []
+    found = [text for side in sides for text in side.summary.warnings]
+    if len(names) > 1:
+        listed = f"{', '.join(names[:-1])} and {names[-1]}"
+        found.append(f"The sweeps differ in {listed}: what is told here is of all of that together.")
+    if not names:
+        found.append("The sweeps have the same settings: what differs is in files, in versions, or in the machine.")
+    tasks = {side.summary.task for side in sides}
+    if len(tasks) > 1:
+        found.append(f"What counts as right is judged by different tasks: {', '.join(sorted(tasks))}.")
+    return found
+
+
+LIKELY = (
+    "p: how likely a split so uneven of the pairs that one side alone gets right is where both are right equally often "
+)
+NOTE = (
+    f"{LIKELY}(exact McNemar test, two-sided). Intervals of differences are Newcombe's for pairs, of shares "
+    "Clopper-Pearson's, each for its row by itself."
+)
+NOTE_OF_UNITS = (
+    f"{LIKELY}(at most, two-sided). Frames of one drive are not independent: p and intervals are over drives, by bets, "
+    "each for its row by itself."
 )
 
-COMMAND = QuestionCommand(
-    "compare",
-    about="compared",
-    place=Positional("WHAT", "the run of a sweep, or models and what they are shown", several=True),
-)
+LEVEL = 0.05
+"""A p-value up to this is called a difference."""
+
+MOST_TABLES, MOST_PICTURES = 4, 3
+"""Parameters, and pictures of what one side alone gets right, that a terminal shows; the page has all."""
+
+
+def shown(result: CompareResult) -> ShownAnswer:
+    """Return each side's accuracy, the pairs, where one is worse, and pictures that one alone gets right."""
+    sides: Mapping[str, Column] = {
+        "": "{0.name}",
+        "right in": "{0.correct} of {0.configurations}",
+        "accuracy": lambda one: percent(one.accuracy),
+        "95 % interval": lambda one: wording.interval_text(one.interval),
+        "time an answer": lambda one: cost_text(one.seconds),
+    }
+    sections = [AnswerPart.table(result.sides, sides, title="How often each is right")]
+    for pair in result.pairs:
+        sections += _of_pair(pair, several=len(result.pairs) > 1)
+    said = headline(result.pairs[0]) if result.pairs else "Interrupted before anything was compared."
+    sweeps = ", ".join(dict.fromkeys(one.run for one in result.sides))
+    return ShownAnswer(said, sections, {"sweeps": sweeps, "they differ in": ", ".join(result.differ)})
+
+
+def _of_pair(pair: ComparedPair, *, several: bool) -> Iterator[AnswerPart]:
+    """Two sides: the pairs in a table of two by two, where one is worse, pictures, and the values of parameters."""
+    said = [headline(pair), alone_text(pair)] if several else [alone_text(pair)]
+    heads = ["", f"{pair.second} right", f"{pair.second} wrong"]
+    rows = [
+        [f"{pair.first} right", str(pair.both), str(pair.first_only)],
+        [f"{pair.first} wrong", str(pair.second_only), str(pair.neither)],
+    ]
+    note = NOTE if pair.units is None else NOTE_OF_UNITS
+    yield AnswerPart(f"{pair.first} and {pair.second}, pair by pair", said, heads, rows, note)
+    yield AnswerPart("Where one is worse", rules_texts(pair))
+    tables = parts_of(pair)
+    told = telling(tables, MOST_TABLES)
+    heads = ["", "pairs", pair.first, pair.second, "difference, points (95 % interval)"]
+    heads += [f"{pair.first} alone", f"{pair.second} alone"]
+    for name, parts in tables.items():
+        lines = [[wording.value_text(one.value), *_count_cells(one)] for one in parts]
+        yield AnswerPart(name, heads=heads, rows=lines, only="" if name in told else "page")
+    if len(told) < len(tables):
+        more = f"The difference varies most over these; the page has all {len(tables)} parameters."
+        yield AnswerPart(text=[more], only="text")
+    for name in (pair.first, pair.second):
+        listed = [one for one in pair.shown if one.right == name]
+        title = f"Only {name} gets right:"
+        rows = [[picture_text(one, pair), *one.pictures] for one in listed[:MOST_PICTURES]]
+        yield AnswerPart(title, rows=rows, only="text")
+        missing = [picture_text(one, pair) for one in listed if not one.pictures]
+        yield AnswerPart(title, missing, pictures=_pictures(listed, pair), only="page")
+
+
+def _pictures(listed: Sequence[PairPicture], pair: ComparedPair) -> list[list[Picture]]:
+    """A picture of each pair where both sides were shown the same, or else the two beside each other."""
+    groups = []
+    for one in listed:
+        said = _said(one, pair)
+        captions = said if len(one.pictures) == len(said) else ["; ".join(said)]
+        captions = [f"{captions[0]}; {values_text(one)}", *captions[1:]]
+        groups.append([Picture(file, text) for file, text in zip(one.pictures, captions, strict=False)])
+    if all(len(group) == 1 for group in groups):
+        return [[one for group in groups for one in group]] if groups else []
+    return [group for group in groups if group]
+
+
+def cost_text(seconds: float) -> str:
+    """Return what an answer took: ``31 ms``; empty where that is not known."""
+    if seconds != seconds:
+        return ""
+    return f"{1000.0 * seconds:.2g} ms" if seconds < 0.1 else wording.seconds_text(seconds)
+
+
+def headline(pair: ComparedPair) -> str:
+    """Return the first thing that a reader should know of two sides, in a sentence."""
+    n, (before, after) = pair.pairs, pair.right
+    return (
+        f"{pair.first} is right in {percent(before / n)} and {pair.second} in {percent(after / n)} of the same "
+        f"{wording.count(n, 'picture')}{'' if pair.units is None else f' of {pair.units} drives'}: a difference of "
+        f"{100.0 * pair.difference:+.1f} points "
+        f"(95 % interval {points_text(pair.interval)})."
+    )
+
+
+def alone_text(pair: ComparedPair) -> str:
+    """Return what the pairs say that one side alone gets right, in a sentence."""
+    if not pair.first_only and not pair.second_only:
+        return "Both are right about the same pictures."
+    shown = "" if pair.p <= LEVEL else ". That there is a difference is not shown"
+    return (
+        f"{pair.first} alone is right in {pair.first_only} and {pair.second} alone in {pair.second_only} "
+        f"({'exact McNemar test, ' if pair.units is None else 'by drive, '}p {p_text(pair.p)}){shown}."
+    )
+
+
+def points_text(interval: Interval) -> str:
+    """Return an interval of a difference: ``-25.2 to -8.1``."""
+    return " to ".join(f"{100.0 * end:+.1f}" for end in interval)
+
+
+def p_text(p: float) -> str:
+    """Return a p-value: ``= 0.012``, or ``< 0.0001``."""
+    return f"= {p:.2g}" if p >= 0.0001 else "< 0.0001"
+
+
+def rules_texts(pair: ComparedPair) -> list[str]:
+    """Return where each side alone is right, in sentences; none where it was not looked for."""
+    found = []
+    ways = (
+        (pair.worse, pair.first_only, pair.first, pair.second),
+        (pair.better, pair.second_only, pair.second, pair.first),
+    )
+    for rules, alone_right, alone, other in ways:
+        if rules is None or not alone_right:
+            continue
+        if not rules:
+            found.append(f"Where {other} is worse than {alone}: no values stand out from chance.")
+        found += [f"Where {other} is worse than {alone}: {_rule_text(one, n)}" for n, one in enumerate(rules)]
+    return found
+
+
+def _rule_text(rule: PairRule, number: int) -> str:
+    rest = "elsewhere" if number == 0 else "in what no rule before covers"
+    inside, outside = (share_of_text(one.count, one.total, one.interval) for one in (rule, rule.elsewhere))
+    return f"{conditions_text(rule.conditions)}, in {inside} pairs; {rest} in {outside}."
+
+
+def parts_of(pair: ComparedPair) -> dict[str, list[PairPart]]:
+    """Return the parts by parameter, called with its unit."""
+    found: dict[str, list[PairPart]] = {}
+    for one in pair.parts:
+        unit = f", {one.unit}" if one.unit not in ("", "1", "name") else ""
+        found.setdefault(f"{one.parameter}{unit}", []).append(one)
+    return found
+
+
+def telling(tables: dict[str, list[PairPart]], most: int) -> dict[str, list[PairPart]]:
+    """Return so many of the parameters, those whose differences are farthest apart, in the order in which they come."""
+
+    def spread(name: str) -> float:
+        differences = [one.difference for one in tables[name]]
+        return max(differences) - min(differences)
+
+    chosen = sorted(tables, key=spread, reverse=True)[:most]
+    return {name: parts for name, parts in tables.items() if name in chosen}
+
+
+def _count_cells(one: PairCounts) -> list[str]:
+    first, second = (percent(right / one.pairs) for right in one.right)
+    difference = f"{100.0 * one.difference:+.0f} ({points_text(one.interval)})"
+    return [str(one.pairs), first, second, difference, str(one.first_only), str(one.second_only)]
+
+
+def picture_text(one: PairPicture, pair: ComparedPair) -> str:
+    """Return what both sides say of a pair, and where it is."""
+    return "; ".join([*_said(one, pair), values_text(one)])
+
+
+def _said(one: PairPicture, pair: ComparedPair) -> list[str]:
+    """What each side says of a pair, and which of them is right."""
+    names = zip((pair.first, pair.second), one.answers, strict=True)
+    return [f"{name}: {text}{' (right)' if name == one.right else ''}" for name, text in names]
+
+
+def values_text(one: PairPicture) -> str:
+    """Return the values of a pair on one line."""
+    return ", ".join(
+        f"{name} {value if isinstance(value, str) else format(value, '.3g')}" for name, value in one.values.items()
+    )
+
+
+def claims(result: CompareResult) -> Iterator[Claim]:
+    """Yield what the run stands for: what was counted of each pair of sides."""
+    for pair in result.pairs:
+        how = "Newcombe's, of pairs" if pair.units is None else "over drives"
+        text = f"{headline(pair)} {alone_text(pair)} The interval of the difference is {how}."
+        side = next(one for one in result.sides if one.name == pair.second)
+        extent = Extent(
+            what=f"configurations in which {pair.second} is right",
+            count=side.correct,
+            total=side.configurations,
+            interval=side.interval or (0.0, 1.0),
+        )
+        yield Claim(kind="measured", statement=text, extent=extent)

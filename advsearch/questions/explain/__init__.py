@@ -1,12 +1,445 @@
-"""`advsearch explain`: where a model is wrong and why, in words, from the rows of sweeps."""
+"""Say in words where a model is wrong, from the rows of sweeps, and confirm it by fresh renders."""
 
-from advsearch.cli.question import Positional, QuestionCommand
+from __future__ import annotations
 
-HELP = "say in words where a model is wrong, from the rows of sweeps, and confirm it by fresh renders"
-EXAMPLES = (
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import ClassVar
+
+from pydantic import Field
+
+from advsearch.config.scene import SceneConfig
+from advsearch.errors import InputError
+from advsearch.question import Asked, question
+from advsearch.report import wording
+from advsearch.report.phrases import percent, share_of_text
+from advsearch.report.shown import (
+    AnswerPart,
+    Claim,
+    Column,
+    Extent,
+    Picture,
+    ShownAnswer,
+    claim,
+    nothing_claimed,
+    share_text,
+)
+from advsearch.report.wording import conditions_text, interval_text
+from advsearch.runs.directory import PARTS, find_run
+from advsearch.runs.results.base import INTERRUPTED, ConditionRow, Fields, Interval, JsonFloat, RunResult
+from advsearch.runs.summary import read_result
+from advsearch.settings import Clash, Config, each_once, setting, setting_as_in, split_names, texts
+
+
+class ExplainConfig(Config):
+    """Everything that decides what `explain` does: whose rows it reads, and what it renders to see whether it is so."""
+
+    command: ClassVar[str] = "explain"
+    clashes: ClassVar[tuple[Clash, ...]] = tuple(one for one in SceneConfig.clashes if one.setting == "overwrite")
+
+    sweeps: str = setting(
+        ...,
+        "explain",
+        "the sweeps whose rows are read together, separated by commas",
+        "names or folders of runs of sweep, or of recipes with sweeps",
+    )
+    confirm: int = setting(
+        100,
+        "explain",
+        "fresh configurations inside each rule that are rendered to confirm it; 0 for none",
+        unit="renders",
+        ge=0,
+        le=100_000,
+    )
+    pairs: int = setting(
+        12,
+        "explain",
+        "failures for which the nearest right configuration is looked for; 0 for none",
+        unit="failures",
+        ge=0,
+        le=100,
+    )
+    clusters: int = setting(
+        100,
+        "explain",
+        "failures that are rendered again and grouped by what the model decides by; 0 for none",
+        unit="failures",
+        ge=0,
+        le=10_000,
+    )
+    accuracy: float = setting(
+        0.95, "explain", "accuracy that the envelope promises, at 95 % confidence", gt=0.0, le=0.999
+    )
+    seed: int = setting_as_in(SceneConfig, "seed")
+    threads: int | None = setting_as_in(SceneConfig, "threads")
+    run: str | None = setting_as_in(SceneConfig, "run", otherwise="runs/RUN-explain-NNN")
+    overwrite: bool = setting_as_in(SceneConfig, "overwrite")
+
+    _named = texts("run", several=["sweeps"])
+    _different = each_once("sweeps")
+
+    @property
+    def title(self) -> tuple[str, ...]:
+        """The first run, and what is asked of it."""
+        return Path(split_names(self.sweeps)[0]).name, self.command
+
+
+class RightOf(Fields):
+    """In how many of some configurations the model is right."""
+
+    right: int = Field(description="right answers")
+    total: int = Field(alias="of", description="how many")
+    interval: Interval = Field(description="of the share, 95 %")
+
+
+class RuleRow(RightOf):
+    """A rule under which the model is wrong more often than elsewhere, counted on rows that did not choose it."""
+
+    conditions: list[ConditionRow] = Field(description="all of which hold")
+    elsewhere: RightOf = Field(description="rows under no rule so far")
+    confirmed: RightOf | None = Field(description="fresh renders drawn inside the rule; null where none were asked for")
+
+
+class RuleNotTold(RightOf):
+    """The best rule that is not told from chance, counted on rows that did not choose it."""
+
+    conditions: list[ConditionRow] = Field(description="all of which hold")
+    elsewhere: RightOf = Field(description="rows under no rule so far")
+    chance: float = Field(description="how likely so few right answers are by chance")
+    asked: float = Field(description="how unlikely they would have to be")
+    rows: int | None = Field(description="of so many rows, with these shares, it would be told; null where of none")
+
+
+class ParameterWeight(Fields):
+    """What one parameter, or two together, decide of the answer."""
+
+    parameters: list[str]
+    share: JsonFloat = Field(description="of the variance of the answers, by which of its parts a value lies in")
+    interval: Interval = Field(description="of the share, 95 %")
+    parts: int = Field(default=0, description="into how many its values were cut, of two all pairs of parts")
+
+
+class EnvelopeRow(RightOf):
+    """A box inside which the model is right at least so often."""
+
+    conditions: list[ConditionRow] = Field(description="all of which hold; empty for everything that was looked at")
+    accuracy: float = Field(description="what was asked for")
+    held: bool = Field(description="whether the rows that did not choose the box show it")
+
+
+class NearestRight(Fields):
+    """A failure and the nearest configuration that is right and differs in one value."""
+
+    values: dict[str, str | float] = Field(description="of the failure")
+    parameter: str = Field(description="the one that differs")
+    unit: str
+    wrong_at: str | float
+    right_at: str | float
+    answered: str = Field(description="what the model says of the failure")
+    answered_there: str = Field(description="what it says of the other")
+    pictures: list[str] = Field(description="files in the run's folder: of the failure, and of the other")
+
+
+class FailureCluster(Fields):
+    """Failures that look alike to the model."""
+
+    failures: int = Field(description="how many of those that were rendered again")
+    answers: dict[str, int] = Field(description="what the model says of them, and how often")
+    values: dict[str, str | float] = Field(description="of the most typical one")
+    picture: str = Field(description="of it: a file in the run's folder")
+
+
+class FailureClusters(Fields):
+    """Failures, grouped by the numbers that the model decides by."""
+
+    features: str = Field(description="what these are")
+    failures: int = Field(description="failures that were rendered again")
+    silhouette: float | None = Field(description="how well they are apart, -1 to 1; null where all are one cluster")
+    apart: bool = Field(description="whether they are farther apart than groups of a cloud without any")
+    listed: list[FailureCluster] = Field(description="the largest first")
+
+
+class ExplainResult(RunResult, RightOf):
+    """Where a model is wrong and why, in words, from the rows of sweeps; `right` and `of` are those of all rows."""
+
+    command: ClassVar[str] = "explain"
+
+    sweeps: list[str] = Field(description="folders of the runs whose rows were read")
+    object: str
+    model: str
+    units: int | None = Field(
+        default=None,
+        description="draws that the rows are of, such as [drives](drives.md), where some share one; absent where none "
+        "do",
+    )
+    parameters: list[str] = Field(description="what varies in all of the rows")
+    rules: list[RuleRow]
+    not_told: RuleNotTold | None = Field(default=None, description="the next rule, which is not told; absent without")
+    importance: list[ParameterWeight] = Field(description="empty where all answers are the same")
+    envelope: EnvelopeRow | None = Field(description="null where no box promises it")
+    pairs: list[NearestRight]
+    pairs_sought: int = Field(
+        default=0, description="failures for which one was looked for, the most typical; others are left out"
+    )
+    clusters: FailureClusters | None = Field(default=None, description="null where nothing was rendered for them")
+    renders: int = Field(description="pictures that were rendered")
+    warnings: list[str] = Field(description="sentences that a reader has to know")
+
+    @property
+    def brief(self) -> str:
+        """How many rules there are."""
+        return f"{len(self.rules)} rules over {self.total} rows"
+
+
+@question(
     "explain mug-sweep-001",
     "explain mug-sweep-001 mug-sweep-002 --confirm 200 --accuracy 0.9",
     "explain mug-sweep-001 --confirm 0 --pairs 0 --json",
+    place=("sweeps",),
+    about="sweeps",
+    expected=("RUN", "the run of a sweep", "", True),
 )
+def explain(asked: Asked[ExplainConfig]) -> ExplainResult:
+    """Say in words where a model is wrong, from the rows of sweeps, and confirm it by renders (docs/explain.md).
 
-COMMAND = QuestionCommand("explain", about="sweeps", place=Positional("RUN", "the run of a sweep", several=True))
+    Args:
+        sweeps: name or folder of a run of `sweep` that has ended, or several, whose rows are read together; of a
+            recipe, its sweeps.
+    """
+    # these import torch, scipy and pandas
+    from advsearch.questions.explain.findings import (
+        cautions,
+        find_envelope,
+        find_importance,
+        not_told,
+        right_of,
+        rule_counts,
+    )
+    from advsearch.questions.explain.renders import AskedSweep, Renders, read_answers
+    from advsearch.rules import FEWEST_ROWS, find_rules, halves, is_independent, observed
+
+    config, progress = asked.config, asked.progress
+    progress.stage("reading rows")
+    sweeps = [AskedSweep.of(folder) for name in split_names(config.sweeps) for folder in _sweeps_of(find_run(name))]
+    rows = read_answers(sweeps)
+    if len(rows) < FEWEST_ROWS:
+        raise InputError(f"explain: expected at least {FEWEST_ROWS} rows, got {len(rows)}; sweep more configurations")
+    table = observed(rows, rows.attrs["units"])
+    if not table.attrs["units"]:
+        raise InputError("explain: expected rows in which something varies that all of them have, got none")
+    choosing, counting = halves(table, config.seed)
+    progress.stage("seeking rules on one half of the rows")
+    found = find_rules(choosing, counting, config.seed)
+    progress.stage("measuring which parameters matter")
+    importance = find_importance(table)
+    box = find_envelope(choosing, counting, config.accuracy)
+    renders = Renders(asked, sweeps, rows, table)
+    rules = [RuleRow(**rule_counts(one), confirmed=renders.confirmed(one, n)) for n, one in enumerate(found.told)]
+    pairs = list(renders.pairs(found.told))
+    clusters = renders.clusters()
+    if renders.interrupted:
+        asked.ending = INTERRUPTED
+    answers = right_of(table)
+
+    def together(names: Iterator[str]) -> str:
+        return ",".join(dict.fromkeys(one for name in names for one in split_names(name)))
+
+    return asked.result(
+        ExplainResult,
+        sweeps=[str(one.folder) for one in sweeps],
+        object=together(one.summary.object for one in sweeps),
+        model=together(one.summary.model for one in sweeps),
+        environment=together(one.summary.environment for one in sweeps),
+        controls=sweeps[0].summary.controls,
+        parameters=list(table.attrs["units"]),
+        **vars(answers),
+        units=None if is_independent(table) else table["unit"].nunique(),
+        rules=rules,
+        not_told=not_told(found.next, len(table)),
+        importance=[ParameterWeight(**{**vars(one), "parameters": [*one.factors]}) for one in importance],
+        envelope=box
+        and EnvelopeRow(
+            conditions=[one.row for one in box.conditions],
+            **vars(right_of(box.inside)),
+            accuracy=config.accuracy,
+            held=box.held,
+        ),
+        pairs=pairs,
+        pairs_sought=min(config.pairs, answers.total - answers.right),
+        clusters=clusters,
+        renders=renders.count,
+        warnings=[*renders.warnings, *cautions(table, importance)],
+    )
+
+
+def _sweeps_of(folder: Path) -> list[Path]:
+    """The folder of a sweep, or those of the sweeps that a recipe consists of."""
+    made = read_result(folder)
+    if made.command != "recipe":
+        return [folder]
+    parts = [folder / PARTS / part.name for part in getattr(made, "parts", ()) if part.command == "sweep"]
+    if not parts:
+        raise InputError(f"explain: expected sweeps, got {folder}, a recipe without one")
+    return parts
+
+
+CHOSEN = (
+    "Chosen on one half of the rows and counted on the other, each beyond the rules before it; 95 % intervals. "
+    "Chance alone would tell any rule in one of a hundred cases at most."
+)
+DECIDES = (
+    "The share of the variance of the answers, right or wrong, that is between parts of a parameter's values with "
+    "equally many rows: its first-order Sobol index, by parts. Two parameters stand together where they decide "
+    "more than each by itself. What differs inside a part is not counted."
+)
+MOST_WEIGHTS = 12
+"""Rows of it that are shown."""
+MOST_ANSWERS = 3
+"""Answers of a cluster that are named."""
+
+
+def shown(result: ExplainResult) -> ShownAnswer:
+    """Return the rules, what decides, the envelope, and failures beside the nearest right answers."""
+    rules = [f"{number + 1}. {rule_text(number, rule)}" for number, rule in enumerate(result.rules)]
+    weights: Mapping[str, Column] = {
+        "parameters": lambda one: " with ".join(one.parameters),
+        "decides": lambda one: percent(one.share),
+        "95 % interval": lambda one: interval_text(one.interval),
+        "by parts": lambda one: str(one.parts or ""),
+    }
+    found = result.clusters
+    return ShownAnswer(
+        explain_text(result),
+        [
+            AnswerPart("Rules", [*rules, not_told_text(result)], note=CHOSEN if rules else ""),
+            AnswerPart.table(result.importance[:MOST_WEIGHTS], weights, title="What decides", note=DECIDES),
+            AnswerPart("Where it can be relied on", [envelope_text(result)]),
+            AnswerPart("One thing changed", [pairs_text(result)]) if result.pairs_sought else AnswerPart(),
+            *(AnswerPart(text=[pair_text(one)], pictures=[_beside(one)]) for one in result.pairs),
+            AnswerPart("Kinds of failures", [clusters_text(found)], pictures=[_typical(found)])
+            if found
+            else AnswerPart(),
+        ],
+        {
+            "rows": f"right in {right_share_text(result)}"
+            + (f", of {result.units:,} independent draws" if result.units else ""),
+            "sweeps": ", ".join(result.sweeps),
+            "parameters": ", ".join(result.parameters),
+        },
+        about=[result.object, result.model],
+    )
+
+
+def claims(result: ExplainResult) -> Iterator[Claim]:
+    """Yield what the envelope stands for."""
+    box = result.envelope
+    if box is None or not box.held or not box.total:
+        yield nothing_claimed(
+            "no box of values was shown to keep the accuracy that was asked for", envelope_text(result)
+        )
+        return
+    extent = Extent(
+        what="right, of rows that did not choose the box", count=box.right, total=box.total, interval=box.interval
+    )
+    text = f"Inside {conditions_text(box.conditions)} the model is right in {share_text(extent)} configurations"
+    yield claim("measured", f"{text} that did not choose this box; the sweeps drew no others.", extent)
+
+
+def explain_text(result: ExplainResult) -> str:
+    """Return the first thing that a reader should know, in a sentence."""
+    if not result.rules:
+        return (
+            f"No rule is told from chance in {result.total:,} rows, of which one half chooses and the other counts: "
+            f"the model is right in {right_share_text(result)}."
+        )
+    return f"{wording.count(len(result.rules), 'rule')} under which the model is wrong more often than elsewhere."
+
+
+def rule_text(number: int, rule: RuleRow) -> str:
+    """Return a rule as a sentence."""
+    rest = "elsewhere" if number == 0 else "in what no rule before covers"
+    share, others = right_share_text(rule), right_share_text(rule.elsewhere)
+    text = f"{conditions_text(rule.conditions)}: right in {share}; {rest} {others}."
+    fresh = rule.confirmed
+    return text if fresh is None else f"{text} Fresh renders inside it: right in {right_share_text(fresh)}."
+
+
+def not_told_text(result: ExplainResult) -> str:
+    """Return the best rule that is not told, why not, and how many rows it would take; empty where there is none."""
+    rule = result.not_told
+    if rule is None:
+        return ""
+    others = f"{rule.elsewhere.right} of {rule.elsewhere.total}"
+    text = (
+        f"Not told{' either' if result.rules else ''}, but the best that one half of the rows suggests: "
+        f"{conditions_text(rule.conditions)}. In the other half the model is right in {rule.right} of {rule.total} "
+        f"under it and in {others} elsewhere"
+    )
+    if rule.rows is None:
+        return f"{text}, which is no difference that more rows would tell."
+    shown = f"chance does that with a probability of {rule.chance:.2g}, and at most {rule.asked:g} is asked"
+    return f"{text}; {shown}. About {rule.rows:,} rows with these shares would tell it: sweep more."
+
+
+def right_share_text(counted: RightOf) -> str:
+    """Return a share with its interval and what it is of: ``12 % (9 to 16) of 340``."""
+    return share_of_text(counted.right, counted.total, counted.interval)
+
+
+def envelope_text(result: ExplainResult) -> str:
+    """Return what the envelope promises."""
+    box = result.envelope
+    if box is None:
+        return "No box of enough rows promises the accuracy that was asked for."
+    where = conditions_text(box.conditions)
+    if not box.held:
+        return f"Not shown: inside {where} the rows that did not choose it are right in {right_share_text(box)}."
+    return f"At least {100 * box.accuracy:g} % at 95 % confidence: {where}; right in {right_share_text(box)}."
+
+
+def pair_text(pair: NearestRight) -> str:
+    """Return a failure beside the nearest right answer."""
+    unit = f" {pair.unit}" if pair.unit not in ("", "1") else ""
+    return (
+        f"{pair.parameter} {_value(pair.wrong_at)}{unit}: {pair.answered}; at {_value(pair.right_at)}{unit}: "
+        f"{pair.answered_there}."
+    )
+
+
+def _beside(pair: NearestRight) -> list[Picture]:
+    """The pictures of a failure and of the nearest right answer, of which were kept."""
+    said = (f"wrong: {pair.answered}", f"right: {pair.answered_there}")
+    return [Picture(name, text) for name, text in zip(pair.pictures, said, strict=False)]
+
+
+def pairs_text(result: ExplainResult) -> str:
+    """Return for how many failures a right configuration near was sought, and for how many it was found."""
+    failures = result.total - result.right
+    left = failures - result.pairs_sought
+    others = f" The other {left} were not tried; `pairs` says how many are." if left else ""
+    return (
+        f"Of the {result.pairs_sought} most typical of {failures} failures, {len(result.pairs)} are right once one "
+        f"parameter is another.{others}"
+    )
+
+
+def clusters_text(found: FailureClusters) -> str:
+    """Return how many kinds of failures there are."""
+    again = f"the {found.failures} failures that were rendered again"
+    if found.silhouette is None:
+        return f"One kind: {again} are alike by {found.features}."
+    shading = "" if found.apart else "; they shade into one another: groups of any cloud may be as far apart"
+    kinds = f"{len(found.listed)} kinds among {again}, by {found.features}"
+    return f"{kinds} (silhouette {found.silhouette:.2f}{shading})."
+
+
+def _typical(found: FailureClusters) -> list[Picture]:
+    """The most typical failure of each cluster, how many it has, and what the model calls them."""
+    said = [
+        ", ".join(f"{name} {number}" for name, number in [*one.answers.items()][:MOST_ANSWERS]) for one in found.listed
+    ]
+    return [Picture(one.picture, f"{one.failures}: {text}") for one, text in zip(found.listed, said, strict=True)]
+
+
+def _value(value: str | float) -> str:
+    return value if isinstance(value, str) else f"{value:.4g}"

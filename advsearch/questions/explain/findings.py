@@ -20,9 +20,10 @@ the other half, which has seen no choice, is asked once whether it keeps what is
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -33,7 +34,18 @@ from scipy.stats import chi2, ncf, ncx2
 from scipy.stats import f as fisher
 
 from advsearch.attacks.trials import CONFIDENCE
-from advsearch.rules import RuleCondition, RuleConditions, covered, import_library, interval_of, is_independent
+from advsearch.questions.explain import RightOf, RuleNotTold
+from advsearch.rules import CHANCE as RULES_CHANCE
+from advsearch.rules import (
+    FEWEST_ROWS,
+    CountedRule,
+    RuleCondition,
+    RuleConditions,
+    covered,
+    import_library,
+    interval_of,
+    is_independent,
+)
 
 MOST_PARTS = 20
 ROWS_IN_A_CELL = 25
@@ -228,6 +240,48 @@ def _peeled(conditions: RuleConditions, inside: pd.DataFrame) -> Iterator[RuleCo
             if one != before and one.low < one.high:
                 box = {**own, factor: one}
                 yield tuple(box[name] for name in inside.attrs["units"] if name in box)
+
+
+# ---- rules as answers have them -----------------------------------------------------------------------------------
+
+
+def right_of(rows: pd.DataFrame) -> RightOf:
+    """Return a count with the interval of its share."""
+    return RightOf(right=int(rows["correct"].sum()), total=len(rows), interval=interval_of(rows))
+
+
+def cautions(table: pd.DataFrame, importance: Sequence[FactorWeight]) -> list[str]:
+    """Return what a reader has to know of the rows of a table and of what decides."""
+    found, draws = list[str](), table["unit"].nunique()
+    if draws < FEWEST_ROWS:
+        found = [f"The rows are of {draws} draws, each with several, which are not independent: few show little."]
+    if table["correct"].nunique() < 2:
+        always = "right" if table["correct"].all() else "wrong"
+        return [*found, f"The model is {always} in every row: there is nothing to tell apart."]
+    if all(one.interval[0] <= 0.0 for one in importance):
+        return [*found, "No parameter is shown to decide anything: the intervals of all their shares begin at 0."]
+    return found
+
+
+def rule_counts(rule: CountedRule) -> dict[str, Any]:
+    """Return what a rule is, and how often the model is right under it and elsewhere."""
+    conditions = [one.row for one in rule.conditions]
+    return {"conditions": conditions, **vars(right_of(rule.inside)), "elsewhere": right_of(rule.elsewhere)}
+
+
+def not_told(rule: CountedRule | None, rows: int) -> RuleNotTold | None:
+    """Return what is said of a rule that is not told, found in so many rows."""
+    if rule is None:
+        return None
+    times = rule.times_needed()
+    needed = None if times is None else round_up(times * rows)
+    return RuleNotTold(**rule_counts(rule), chance=rule.chance, asked=RULES_CHANCE, rows=needed)
+
+
+def round_up(rows: float) -> int:
+    """Return a number of rows with two digits that mean something: 173.2 becomes 180."""
+    step: int = 10 ** max(0, math.floor(math.log10(rows)) - 1)
+    return math.ceil(rows / step) * step
 
 
 MOST, FEWEST = 6, 8

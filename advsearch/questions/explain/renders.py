@@ -25,12 +25,12 @@ from advsearch.interrupts import interruptible
 from advsearch.models.features import Features, features_of
 from advsearch.options import BY_KEY
 from advsearch.progress import Progress
-from advsearch.questions.explain.answer import FailureCluster, FailureClusters, NearestRight, RightOf
-from advsearch.questions.explain.findings import find_clusters
-from advsearch.questions.explain.settings import ExplainConfig
+from advsearch.question import Asked
+from advsearch.questions.explain import ExplainConfig, FailureCluster, FailureClusters, NearestRight, RightOf
+from advsearch.questions.explain.findings import find_clusters, right_of
 from advsearch.questions.sweep.carry_out import scenes_of
-from advsearch.rules import CountedRule, Mask, RuleConditions, covered, interval_of
-from advsearch.runs.directory import CONFIG, PARTS, RunDirectory
+from advsearch.rules import CountedRule, Mask, RuleConditions, covered
+from advsearch.runs.directory import CONFIG, PARTS
 from advsearch.runs.results.sweep import SweepSummary
 from advsearch.runs.summary import read_result
 from advsearch.runs.tables import read_sweep
@@ -94,11 +94,6 @@ def values_of(rows: pd.DataFrame, place: int) -> dict[str, float | str]:
     """Return what a row has, by parameter."""
     known = rows.loc[place, list(rows.attrs["units"])].dropna().items()
     return {name: value if isinstance(value, str) else float(value) for name, value in known}
-
-
-def right_of(rows: pd.DataFrame) -> RightOf:
-    """Return a count with the interval of its share."""
-    return RightOf(right=int(rows["correct"].sum()), total=len(rows), interval=interval_of(rows))
 
 
 # ---- sweeps to make -------------------------------------------------------------------------------------------------
@@ -204,15 +199,16 @@ class Renders:
     """Sweeps in the folder of the run; none any more after an interrupt. `rows` are those of the sweeps that are asked
     about, `table` what varies among them."""
 
-    folder: Path
-    progress: Progress
-    config: ExplainConfig
-    asked: Sequence[AskedSweep]
+    asked: Asked[ExplainConfig]
+    sweeps: Sequence[AskedSweep]
     rows: pd.DataFrame
     table: pd.DataFrame
     count: int = 0
     interrupted: bool = False
     warnings: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.config, self.progress, self.folder = self.asked.config, self.asked.progress, self.asked.run.path
 
     def _rendered(self, name: str, config: SweepConfig) -> pd.DataFrame | None:
         """The rows of a sweep; None if it was interrupted, or the scene is not to be had any more."""
@@ -236,15 +232,15 @@ class Renders:
         if not self.config.confirm:
             return None
         fresh = []
-        for place, one in enumerate(self.asked):
-            seed = seeds.stream(self.config.seed, "confirm", number * len(self.asked) + place)
-            samples = -(-self.config.confirm // len(self.asked))
+        for place, one in enumerate(self.sweeps):
+            seed = seeds.stream(self.config.seed, "confirm", number * len(self.sweeps) + place)
+            samples = -(-self.config.confirm // len(self.sweeps))
             self.progress.message(f"rule {number + 1}: rendering about {samples} configurations inside it")
             own = sweep_inside(one.config, self.table, rule.conditions, samples, seed)
             rows = self._rendered(f"rule-{number + 1}-{place}", own)
             if rows is not None:
                 inside = rows[covered(rule.conditions, rows)]
-                fresh.append(inside.assign(unit=inside["unit"] * len(self.asked) + place))
+                fresh.append(inside.assign(unit=inside["unit"] * len(self.sweeps) + place))
         kept = pd.concat(fresh) if fresh else self.rows[:0]
         return None if kept.empty else right_of(kept)
 
@@ -272,7 +268,7 @@ class Renders:
 
     def _nearest(self, name: str, place: int, factor: str) -> NearestRight | None:
         """Go along one factor until the answer is right, twice with other noise; the failure fails in both."""
-        config, row = self.asked[self.rows["sweep"][place]].config, values_of(self.rows, place)
+        config, row = self.sweeps[self.rows["sweep"][place]].config, values_of(self.rows, place)
         if not can_be_given(config, factor):
             return None
         self.progress.message(f"{name}: the nearest right answer along {factor}")
@@ -303,15 +299,15 @@ class Renders:
             pictures=[str(path.relative_to(self.folder)) for path in kept if path.is_file()],
         )
 
-    def clusters(self, run: RunDirectory) -> FailureClusters | None:
+    def clusters(self) -> FailureClusters | None:
         """Render failures of one model's sweeps again, and group them by what it decides by."""
-        alone = [number for number, one in enumerate(self.asked) if len(one.config.models) == 1]
-        alike = [number for number in alone if self.asked[number].config.models == self.asked[alone[0]].config.models]
+        alone = [number for number, one in enumerate(self.sweeps) if len(one.config.models) == 1]
+        alike = [number for number in alone if self.sweeps[number].config.models == self.sweeps[alone[0]].config.models]
         failing = self.rows[~self.rows["correct"] & self.rows["sweep"].isin(alike)]
         if self.interrupted or not self.config.clusters or failing.empty:
             return None
-        if len(alike) < len(self.asked):
-            name = self.asked[alike[0]].config.model
+        if len(alike) < len(self.sweeps):
+            name = self.sweeps[alike[0]].config.model
             self.warnings.append(f"Kinds are of the failures of model {name} alone, where it was swept by itself.")
         generator = np.random.default_rng(seeds.stream(self.config.seed, "clusters"))
         picked = failing.iloc[np.sort(generator.permutation(len(failing))[: self.config.clusters])]
@@ -319,7 +315,7 @@ class Renders:
         try:
             with interruptible():
                 again = [
-                    pictures_again(self.asked[number].config, rows["step"].tolist(), self.progress)
+                    pictures_again(self.sweeps[number].config, rows["step"].tolist(), self.progress)
                     for number, rows in picked.groupby("sweep")
                 ]
         except KeyboardInterrupt:
@@ -333,7 +329,7 @@ class Renders:
         found = find_clusters(features(pictures).double().numpy(), self.config.seed)
         listed = []
         for number, members in enumerate(found.members, start=1):
-            path = run.save_image(f"cluster-{number}", pictures[members[0]])
+            path = self.asked.run.save_image(f"cluster-{number}", pictures[members[0]])
             own = picked.iloc[list(members)]
             listed.append(
                 FailureCluster(
