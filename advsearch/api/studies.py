@@ -158,7 +158,7 @@ def share(config: AttackConfig, chains: Sequence[Chain], run: Path, progress: Pr
     left = [number for number, chain in enumerate(chains) if not any(is_run(run / PARTS / one.name) for one in chain)]
     plain = config.to_repeat().model_copy(update={"workers": None, "cluster": None}).plain()
     settings, threads = {"command": config.command, **plain}, config.used_threads or 1
-    work = Work("advsearch.api.studies:attacks_of", settings, FILES, threads, seconds=LONGEST, ahead=False)
+    work = Work("advsearch.api.studies:attacks_of", settings, FILES, threads, seconds=LONGEST)
     workers, cluster = (config.workers, config.cluster) if left else (None, None)
     with executor_of(work, workers=workers, cluster=cluster, tell=progress.message) as executor:
         if executor is None:

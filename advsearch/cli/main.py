@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import importlib
-import os
 import re
 import shutil
 import signal
@@ -117,7 +116,6 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _interruptible(given: list[str]) -> int:
     """As `_status`, with Ctrl-C for as long as there is something to interrupt, and never a traceback of it."""
     sys.unraisablehook = unless_interrupted
-    os.environ.setdefault("PYTHONSAFEPATH", "1")  # of workers, which would look for modules here first
     try:
         signal.signal(signal.SIGINT, INTERRUPTS)
         end_at_the_second()

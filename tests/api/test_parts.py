@@ -42,7 +42,7 @@ class Backwards:
 
     def __init__(self, work: Work, lost: str) -> None:
         self.call, self.lost = parts.attacks_of(work.settings), lost
-        assert work.function == "advsearch.api.studies:attacks_of" and not work.ahead
+        assert work.function == "advsearch.api.studies:attacks_of"
 
     def results(self, ranges: Iterable[range]) -> Iterator[Done]:
         for one in reversed(list(ranges)):
