@@ -84,7 +84,6 @@ RULES = {
     ),
     "report": Rule({"runs", "config", "settings"}, {"numpy", "pandas", "PIL", "matplotlib", "pydantic"}, HEAVY),
     "viewer": Rule({"runs", "report", "config", "settings"}, {"numpy", "pandas", "PIL"}, HEAVY),
-    "explanations": Rule({"attacks", "runs", "report"}, {"numpy", "scipy"}, HEAVY),
     "rules": Rule({"attacks", "runs"}, {"numpy", "pandas"}, HEAVY),
     "losses": Rule({"attacks", "engine"}, {"torch"}),
     "question": Rule({"runs", "report", "viewer", "api", "settings"}, {"pydantic"}, HEAVY),

@@ -20,7 +20,6 @@ from advsearch.api.studies import carry_out_part
 from advsearch.config import SweepConfig
 from advsearch.controls import CONTROLS
 from advsearch.errors import FileFormatError, InputError, ModelError
-from advsearch.explanations import figure_value
 from advsearch.interrupts import interruptible
 from advsearch.models.features import Features, features_of
 from advsearch.options import BY_KEY
@@ -29,6 +28,7 @@ from advsearch.question import Asked
 from advsearch.questions.explain import ExplainConfig, FailureCluster, FailureClusters, NearestRight, RightOf
 from advsearch.questions.explain.findings import find_clusters, right_of
 from advsearch.questions.sweep.carry_out import scenes_of
+from advsearch.report.wording import figure_value
 from advsearch.rules import CountedRule, Mask, RuleConditions, covered
 from advsearch.runs.directory import CONFIG, PARTS
 from advsearch.runs.results.sweep import SweepSummary
