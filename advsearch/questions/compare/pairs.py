@@ -62,7 +62,7 @@ class Side:
     @property
     def right(self) -> Mask:
         """Whether the model is right (n,)."""
-        return np.asarray(self.rows["correct"] == 1)
+        return np.asarray(self.rows["correct"])
 
     @property
     def varying(self) -> list[str]:
@@ -114,6 +114,7 @@ def _sides_of(folder: Path, *, alone: bool) -> Iterator[Side]:
         )
     models = len(config.models)
     rows = rows.sort_values("step", ignore_index=True)
+    rows["correct"] = rows["correct"] == 1
     rows["number"], model_of = rows["step"] // models, rows["step"] % models
     with_answer = rows["number"] >= summary.planned // models // 2
     halves_of = [~with_answer, with_answer][0 if alone else 1 :] if config.answer_of else [rows["number"] >= 0]
