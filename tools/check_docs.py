@@ -26,7 +26,7 @@ from advsearch.attacks import POLICIES, candidates, clopper_pearson, planned_ren
 from advsearch.attacks.objectives import OBJECTIVE_KINDS
 from advsearch.attacks.policies import pgd
 from advsearch.attacks.verification import WORST_CASE
-from advsearch.cli.main import COMMANDS
+from advsearch.cli.commands import COMMANDS
 from advsearch.cli.names import REGISTRIES
 from advsearch.config import TRIALS, TRIALS_OVER, AttackConfig
 from advsearch.config.attack import FEWEST_TRIALS
@@ -45,7 +45,7 @@ from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.results.base import RenderResult, Result
 from advsearch.runs.results.sweep import SweepSummary
 from advsearch.scene import environments, exposure, library
-from advsearch.scene.description import FRAME_FILL
+from advsearch.scene.geometry import FRAME_FILL
 from advsearch.scene.importing.pictures import TEXTURE_LIMIT
 from advsearch.scene.mitsuba_backend import scene as mitsuba_scene
 from advsearch.scene.settings import SETTINGS

@@ -15,9 +15,6 @@ from advsearch.errors import InputError
 if TYPE_CHECKING:
     from advsearch.settings import Config
 
-FELL_SHORT = 3
-"""Exit status of a check that fell short."""
-
 
 @dataclass(frozen=True)
 class Command:
@@ -131,4 +128,4 @@ class QuestionCommand:
 
             result = carry_out(config, progress=progress, resumed=resumed)
         status = output.finish(result, self.answer, as_json=as_json)
-        return status or (FELL_SHORT if self.short(result) else 0)
+        return status or (output.FELL_SHORT if self.short(result) else 0)

@@ -26,7 +26,7 @@ ORDER = (
 )
 """In which lists have controls; one that is not named comes last."""
 SHARED = (
-    *("base", "drawn", "numbers", "space", "values"),
+    *("base", "ranges", "numbers", "space", "values"),
     *("corruption_filters", "material_patterns", "patch_sticker"),
 )
 """Modules of this folder that are no control."""

@@ -14,7 +14,8 @@ from typing import Any, ClassVar
 
 from torch import Tensor
 
-from advsearch.controls.values import Moved, is_number, is_whole
+from advsearch.controls.ranges import is_number
+from advsearch.controls.values import Moved, is_whole
 from advsearch.copies import hand_copies
 from advsearch.described import Value as Value
 from advsearch.errors import InputError, UnknownNameError

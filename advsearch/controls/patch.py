@@ -18,8 +18,9 @@ from torch import Tensor
 from advsearch.controls.base import NOTHING, WHOLE_RANGE, BoundControl, Budget, Choice, Control, Group, Parameter, Value
 from advsearch.controls.numbers import BoundNumbers, NumberControl
 from advsearch.controls.patch_sticker import Sticker, towards_camera
+from advsearch.controls.ranges import Range
 from advsearch.controls.texture import resampled
-from advsearch.controls.values import LARGEST_EPSILON, Fixed, Moved, Number, OneOf, Range, in_words, read
+from advsearch.controls.values import LARGEST_EPSILON, Fixed, Moved, Number, OneOf, in_words, read
 from advsearch.errors import FileFormatError, InputError
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.description import SceneDescription

@@ -278,17 +278,8 @@ def transport_of(findings: Findings) -> results.LinearTransport:
     transport = findings.transport
     if transport is None:
         return results.LinearTransport(used=False, reason=findings.rendered_because or "nothing was searched")
-    return results.LinearTransport(
-        used=True,
-        way=transport.way,
-        reason=transport.given_up or findings.surface_refused or None,
-        conditions=None if transport.conditions is None else results.BankOfConditions.of(transport.conditions),
-        entries=transport.size()[0],
-        bytes=transport.size()[1],
-        seconds=transport.seconds,
-        renewed=transport.renewed,
-        error=results.PredictionError.of(transport.deviations[-1]) if transport.deviations else None,
-    )
+    said = transport.summary()
+    return said.model_copy(update={"reason": said.reason or findings.surface_refused or None})
 
 
 def _renders(findings: Findings, problem: Problem) -> dict[str, int]:

@@ -20,7 +20,8 @@ from advsearch.attacks.draws import Draws, Product
 from advsearch.controls import NumberControl, Parameter, Space
 from advsearch.controls.base import BoundControl, Value
 from advsearch.controls.numbers import BoundNumbers
-from advsearch.controls.values import Fixed, OneOf, Range, to_value
+from advsearch.controls.ranges import Range
+from advsearch.controls.values import Fixed, OneOf, to_value
 from advsearch.engine.sweeps.axes import Axis
 from advsearch.runs.results.base import VariedValue
 from advsearch.runs.units import Units

@@ -209,7 +209,7 @@ def _by_sweep(config: SweepConfig) -> Sequence[_PhotoJudge]:
         if number >= job.per_scene * len(job.places):
             raise InputError(f"rendering: the sweep has no picture {rendering}; it belongs to another run")
         scene, _, query = job.queries(range(number, number + 1))[model]
-        return scenes.named(scene).truth(model, query.u, query.values)
+        return scenes.named(scene).problems[model].truth(query.u, query.values)
 
     return [
         _PhotoJudge(model, task, size, partial(truth, number))

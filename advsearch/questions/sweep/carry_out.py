@@ -322,13 +322,18 @@ def _places(config: SweepConfig) -> tuple[NamedScene, ...]:
 
 def _models(models: Sequence[AnyModel], config: SweepConfig, task: Task) -> tuple[tuple[Model, ...], list[str]]:
     """Load the models; their warnings become sentences of the run."""
-    names = [model_name(one) for one in models]
+    _check_different([model_name(one) for one in models])
+    loaded, warnings = load_models(models, task, config)
+    _check_different([one.name for one in loaded])  # what a file or a function gives may have the name of another
+    return loaded, warnings
+
+
+def _check_different(names: Sequence[str]) -> None:
     if len(set(names)) < len(names):
         raise InputError(
             f"model: expected models with different names, got {', '.join(names)}; from Python, "
             "load_model(..., name=...) gives one"
         )
-    return load_models(models, task, config)
 
 
 def _stopped(config: SweepConfig) -> Path | None:
