@@ -27,8 +27,8 @@ from advsearch.cli.main import add_command
 from advsearch.config import CONFIGS, AttackConfig
 from advsearch.controls import OWN
 from advsearch.questions.attack.answer import CurveResult, MatrixResult
-from advsearch.questions.compare import CompareResult
-from advsearch.questions.explain import ExplainResult
+from advsearch.questions.compare.answer import CompareResult
+from advsearch.questions.explain.answer import ExplainResult
 from advsearch.questions.gap import GapResult
 from advsearch.questions.harden.answer import HardenResult
 from advsearch.questions.recipe.description import recipe_names as recipe_names

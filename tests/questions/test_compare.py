@@ -20,7 +20,8 @@ from advsearch.cli.main import main
 from advsearch.config import SweepConfig
 from advsearch.described import Value
 from advsearch.errors import FileFormatError, InputError
-from advsearch.questions.compare import CompareConfig, ComparedPair, CompareResult
+from advsearch.questions.compare import CompareConfig
+from advsearch.questions.compare.answer import ComparedPair, CompareResult
 from advsearch.questions.report.evidence import claims_of
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.sweep import SweepSummary

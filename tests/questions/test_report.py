@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import samples
 
-from advsearch.questions.explain import ExplainResult
+from advsearch.questions.explain.answer import ExplainResult
 from advsearch.questions.harden.answer import HardenResult
 from advsearch.questions.photographs.answer import PhotoAgreement
 from advsearch.questions.recipe.answer import RecipeResult

@@ -36,7 +36,7 @@ from samples import attack as attack_with
 from stored_sweeps import described, make_sweep, serving
 
 from advsearch.config import AttackConfig
-from advsearch.questions.explain import ExplainResult
+from advsearch.questions.explain.answer import ExplainResult
 from advsearch.questions.harden.answer import HardenResult
 from advsearch.questions.photographs.carry_out import Photographs
 from advsearch.questions.recipe.answer import RecipeResult

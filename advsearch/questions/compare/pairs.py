@@ -21,7 +21,7 @@ from advsearch import seeds
 from advsearch.attacks.units import paired_by_unit
 from advsearch.config import SweepConfig
 from advsearch.errors import FileFormatError, InputError
-from advsearch.questions.compare import ComparedPair, CountOf, PairPart, PairRule
+from advsearch.questions.compare.answer import ComparedPair, CountOf, PairPart, PairRule
 from advsearch.report.wording import short_names
 from advsearch.rules import FEWEST_ROWS, find_rules, halves, interval_of, observed
 from advsearch.runs.directory import CONFIG

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from advsearch.engine.sweeps.swept_scene import Scenes
 from advsearch.errors import InputError, ModelError
 from advsearch.question import Asked
-from advsearch.questions.compare import CompareConfig, PairPicture
+from advsearch.questions.compare.answer import PairPicture
 from advsearch.questions.compare.pairs import Side, far_apart
 from advsearch.questions.sweep.carry_out import scenes_of
 from advsearch.runs.files import write_bytes
@@ -20,7 +21,7 @@ from advsearch.viewer import thumbnails
 class Pictures:
     """Small pictures of pairs in the folder of the run: those that sweeps kept, or rendered again."""
 
-    asked: Asked[CompareConfig]
+    asked: Asked[Any]
     rendered: int = 0
     warnings: list[str] = field(default_factory=list)
     scenes: dict[Path, Scenes | None] = field(default_factory=dict)

@@ -34,7 +34,7 @@ from scipy.stats import chi2, ncf, ncx2
 from scipy.stats import f as fisher
 
 from advsearch.attacks.trials import CONFIDENCE
-from advsearch.questions.explain import RightOf, RuleNotTold
+from advsearch.questions.explain.answer import RightOf, RuleNotTold
 from advsearch.rules import CHANCE as RULES_CHANCE
 from advsearch.rules import (
     FEWEST_ROWS,

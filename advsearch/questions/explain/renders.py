@@ -25,7 +25,7 @@ from advsearch.models.features import Features, features_of
 from advsearch.options import BY_KEY
 from advsearch.progress import Progress
 from advsearch.question import Asked
-from advsearch.questions.explain import ExplainConfig, FailureCluster, FailureClusters, NearestRight, RightOf
+from advsearch.questions.explain.answer import FailureCluster, FailureClusters, NearestRight, RightOf
 from advsearch.questions.explain.findings import find_clusters, right_of
 from advsearch.questions.sweep.carry_out import scenes_of
 from advsearch.report.wording import figure_value
@@ -199,7 +199,7 @@ class Renders:
     """Sweeps in the folder of the run; none any more after an interrupt. `rows` are those of the sweeps that are asked
     about, `table` what varies among them."""
 
-    asked: Asked[ExplainConfig]
+    asked: Asked[Any]
     sweeps: Sequence[AskedSweep]
     rows: pd.DataFrame
     table: pd.DataFrame

@@ -1,0 +1,281 @@
+"""The result of `compare`, and what is shown of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import ClassVar
+
+import numpy as np
+from pydantic import Field
+
+from advsearch.report import wording
+from advsearch.report.markup import InNotebook
+from advsearch.report.phrases import percent, share_of_text
+from advsearch.report.shown import AnswerPart, Claim, Column, Extent, Picture, ShownAnswer
+from advsearch.report.wording import conditions_text
+from advsearch.runs.results.base import ConditionRow, Fields, Interval, JsonFloat, RunResult
+from advsearch.runs.results.sweep import AxisValue, CountedAnswers
+
+
+class ComparedSide(CountedAnswers):
+    """One of the things that are compared, and how often the model is right with it."""
+
+    name: str = Field(description="what tells it from the others")
+    run: str = Field(description="folder of the sweep that has its rows")
+    object: str
+    model: str
+    answer: str = Field(default="", description="the run whose answer was swept; absent without")
+    seconds: JsonFloat = Field(description="of a picture and its answers, shared evenly among the models that saw it")
+
+
+class CountOf(Fields):
+    """How many of some pairs."""
+
+    count: int
+    total: int = Field(alias="of", description="pairs")
+    interval: Interval = Field(description="of the share, 95 %")
+
+
+class PairCounts(Fields):
+    """Pairs by what both sides say of them."""
+
+    both: int = Field(description="pairs that both get right")
+    first_only: int = Field(description="that the first alone gets right")
+    second_only: int = Field(description="that the second alone gets right")
+    neither: int = Field(description="that none gets right")
+    difference: float = Field(description="accuracy of the second less that of the first")
+    interval: Interval = Field(description="of that difference, 95 %, of pairs")
+
+    @property
+    def pairs(self) -> int:
+        """How many there are."""
+        return self.both + self.first_only + self.second_only + self.neither
+
+    @property
+    def right(self) -> tuple[int, int]:
+        """Right answers of the first, and of the second."""
+        return self.both + self.first_only, self.both + self.second_only
+
+
+class PairRule(CountOf):
+    """Values under which one side alone is right more often than elsewhere, counted on pairs that did not choose it."""
+
+    conditions: list[ConditionRow] = Field(description="all of which hold")
+    elsewhere: CountOf = Field(description="pairs under no rule so far")
+
+
+class PairPart(PairCounts):
+    """The pairs with one value, or one part of the range, of one parameter."""
+
+    parameter: str
+    unit: str
+    value: AxisValue
+
+
+class PairPicture(Fields):
+    """A pair that one side alone gets right."""
+
+    number: int = Field(description="of the pair, from 0")
+    values: dict[str, str | float] = Field(description="of the parameters")
+    right: str = Field(description="the side that is right")
+    answers: tuple[str, str] = Field(description="what is said of the first side, and of the second")
+    pictures: list[str] = Field(description="files in the run's folder: of each side, or one that both were shown")
+
+
+class ComparedPair(PairCounts):
+    """Two sides, pair by pair."""
+
+    first: str = Field(description="name of the side")
+    second: str = Field(description="name of the other")
+    units: int | None = Field(
+        default=None,
+        description="draws that the pairs are of, such as [drives](drives.md), where some share one; absent where none "
+        "do",
+    )
+    p: float = Field(
+        description="how likely a split so uneven of the pairs that one alone gets right is where both are right "
+        "equally often (two-sided; McNemar's exact test, or where pairs share draws a bound by bets)"
+    )
+    worse: list[PairRule] | None = Field(description="where the first alone is right; null where it was not looked for")
+    better: list[PairRule] | None = Field(description="where the second alone is right; null likewise")
+    parts: list[PairPart] = Field(description="by the values of each parameter, cut as the sweep's tables are")
+    shown: list[PairPicture] = Field(description="pairs that one side alone gets right, the farthest apart first")
+
+
+class CompareResult(InNotebook, RunResult):
+    """Two sides or more on the same pictures; of more than two, each with the first."""
+
+    command: ClassVar[str] = "compare"
+
+    object: str
+    model: str
+    task: str = Field(description="what judges the answers")
+    differ: list[str] = Field(description="the settings in which the sweeps differ")
+    sides: list[ComparedSide] = Field(description="in the order in which they were named; empty if interrupted before")
+    pairs: list[ComparedPair] = Field(description="the first side with each of the others")
+    renders: int = Field(description="pictures that were rendered now")
+    warnings: list[str] = Field(description="sentences that a reader has to know")
+
+    @property
+    def brief(self) -> str:
+        """Accuracy of each side."""
+        return ", ".join(f"{one.name} {one.accuracy:.1%}" for one in self.sides if one.accuracy is not None)
+
+
+LIKELY = (
+    "p: how likely a split so uneven of the pairs that one side alone gets right is where both are right equally often "
+)
+NOTE = (
+    f"{LIKELY}(exact McNemar test, two-sided). Intervals of differences are Newcombe's for pairs, of shares "
+    "Clopper-Pearson's, each for its row by itself."
+)
+NOTE_OF_UNITS = (
+    f"{LIKELY}(at most, two-sided). Frames of one drive are not independent: p and intervals are over drives, by bets, "
+    "each for its row by itself."
+)
+
+LEVEL = 0.05
+"""A p-value up to this is called a difference."""
+
+MOST_TABLES, MOST_PICTURES = 4, 3
+"""Parameters, and pictures of what one side alone gets right, that a terminal shows; the page has all."""
+
+
+def shown(result: CompareResult) -> ShownAnswer:
+    """Return each side's accuracy, the pairs, where one is worse, and pictures that one alone gets right."""
+
+    def cost(one: ComparedSide) -> str:
+        if one.seconds != one.seconds:
+            return ""
+        return f"{1000.0 * one.seconds:.2g} ms" if one.seconds < 0.1 else wording.seconds_text(one.seconds)
+
+    columns: Mapping[str, Column] = {
+        "": "{0.name}",
+        "right in": "{0.correct} of {0.configurations}",
+        "accuracy": lambda one: percent(one.accuracy),
+        "95 % interval": lambda one: wording.interval_text(one.interval),
+        "time an answer": cost,
+    }
+    sections = [AnswerPart.table(result.sides, columns, title="How often each is right")]
+    for pair in result.pairs:
+        sections += _of_pair(pair, several=len(result.pairs) > 1)
+    said = headline(result.pairs[0]) if result.pairs else "Interrupted before anything was compared."
+    sweeps = ", ".join(dict.fromkeys(one.run for one in result.sides))
+    return ShownAnswer(said, sections, {"sweeps": sweeps, "they differ in": ", ".join(result.differ)})
+
+
+def headline(pair: ComparedPair) -> str:
+    """Return the first thing that a reader should know of two sides, in a sentence."""
+    n, (before, after) = pair.pairs, pair.right
+    return (
+        f"{pair.first} is right in {percent(before / n)} and {pair.second} in {percent(after / n)} of the same "
+        f"{wording.count(n, 'picture')}{'' if pair.units is None else f' of {pair.units} drives'}: a difference of "
+        f"{100.0 * pair.difference:+.1f} points "
+        f"(95 % interval {points_text(pair.interval)})."
+    )
+
+
+def points_text(interval: Interval) -> str:
+    """Return an interval of a difference: ``-25.2 to -8.1``."""
+    return " to ".join(f"{100.0 * end:+.1f}" for end in interval)
+
+
+def alone_text(pair: ComparedPair) -> str:
+    """Return what the pairs say that one side alone gets right, in a sentence."""
+    if not pair.first_only and not pair.second_only:
+        return "Both are right about the same pictures."
+    shown = "" if pair.p <= LEVEL else ". That there is a difference is not shown"
+    p = f"= {pair.p:.2g}" if pair.p >= 0.0001 else "< 0.0001"
+    return (
+        f"{pair.first} alone is right in {pair.first_only} and {pair.second} alone in {pair.second_only} "
+        f"({'exact McNemar test, ' if pair.units is None else 'by drive, '}p {p}){shown}."
+    )
+
+
+def _of_pair(pair: ComparedPair, *, several: bool) -> Iterator[AnswerPart]:
+    """Two sides: the pairs in a table of two by two, where one is worse, the values of parameters, and pictures."""
+    said = [headline(pair), alone_text(pair)] if several else [alone_text(pair)]
+    heads = ["", f"{pair.second} right", f"{pair.second} wrong"]
+    rows = [
+        [f"{pair.first} right", str(pair.both), str(pair.first_only)],
+        [f"{pair.first} wrong", str(pair.second_only), str(pair.neither)],
+    ]
+    note = NOTE if pair.units is None else NOTE_OF_UNITS
+    yield AnswerPart(f"{pair.first} and {pair.second}, pair by pair", said, heads, rows, note)
+    yield AnswerPart("Where one is worse", [*_rules_texts(pair)])
+    tables: dict[str, list[PairPart]] = {}
+    for part in pair.parts:
+        unit = f", {part.unit}" if part.unit not in ("", "1", "name") else ""
+        tables.setdefault(f"{part.parameter}{unit}", []).append(part)
+    spread = {name: np.ptp([one.difference for one in parts]) for name, parts in tables.items()}
+    told = sorted(tables, key=spread.__getitem__, reverse=True)[:MOST_TABLES]
+    heads = ["", "pairs", pair.first, pair.second, "difference, points (95 % interval)"]
+    heads += [f"{pair.first} alone", f"{pair.second} alone"]
+    for name, parts in tables.items():
+        rows = []
+        for one in parts:
+            shares = [percent(right / one.pairs) for right in one.right]
+            difference = f"{100.0 * one.difference:+.0f} ({points_text(one.interval)})"
+            alone = [str(one.first_only), str(one.second_only)]
+            rows.append([wording.value_text(one.value), str(one.pairs), *shares, difference, *alone])
+        yield AnswerPart(name, heads=heads, rows=rows, only="" if name in told else "page")
+    if len(told) < len(tables):
+        more = f"The difference varies most over these; the page has all {len(tables)} parameters."
+        yield AnswerPart(text=[more], only="text")
+    for name in (pair.first, pair.second):
+        yield from _alone(name, pair)
+
+
+def _rules_texts(pair: ComparedPair) -> Iterator[str]:
+    """Where each side alone is right, in sentences; none where it was not looked for."""
+    ways = (
+        (pair.worse, pair.first_only, pair.first, pair.second),
+        (pair.better, pair.second_only, pair.second, pair.first),
+    )
+    for rules, alone_right, alone, other in ways:
+        where = f"Where {other} is worse than {alone}:"
+        if rules == [] and alone_right:
+            yield f"{where} no values stand out from chance."
+        for number, rule in enumerate(rules if rules and alone_right else ()):
+            rest = "elsewhere" if number == 0 else "in what no rule before covers"
+            inside, outside = (share_of_text(one.count, one.total, one.interval) for one in (rule, rule.elsewhere))
+            yield f"{where} {conditions_text(rule.conditions)}, in {inside} pairs; {rest} in {outside}."
+
+
+def _alone(name: str, pair: ComparedPair) -> Iterator[AnswerPart]:
+    """What one side alone gets right: a picture of each pair where both were shown the same, or else the two beside
+    each other."""
+    title, lines, missing, groups = f"Only {name} gets right:", list[list[str]](), list[str](), list[list[Picture]]()
+    for one in pair.shown:
+        if one.right != name:
+            continue
+        numbers = {key: value if isinstance(value, str) else format(value, ".3g") for key, value in one.values.items()}
+        values = ", ".join(f"{key} {value}" for key, value in numbers.items())
+        sides = zip((pair.first, pair.second), one.answers, strict=True)
+        said = [f"{side}: {text}{' (right)' if side == name else ''}" for side, text in sides]
+        lines.append(["; ".join([*said, values]), *one.pictures])
+        captions = said if len(one.pictures) == 2 else ["; ".join(said)]
+        captions[0] += f"; {values}"
+        if one.pictures:
+            groups.append([Picture(file, text) for file, text in zip(one.pictures, captions, strict=True)])
+        else:
+            missing.append(lines[-1][0])
+    if all(len(group) == 1 for group in groups):
+        groups = [[picture for group in groups for picture in group]] if groups else []
+    yield AnswerPart(title, rows=lines[:MOST_PICTURES], only="text")
+    yield AnswerPart(title, missing, pictures=groups, only="page")
+
+
+def claims(result: CompareResult) -> Iterator[Claim]:
+    """Yield what the run stands for: what was counted of each pair of sides."""
+    for pair in result.pairs:
+        how = "Newcombe's, of pairs" if pair.units is None else "over drives"
+        text = f"{headline(pair)} {alone_text(pair)} The interval of the difference is {how}."
+        side = next(one for one in result.sides if one.name == pair.second)
+        extent = Extent(
+            what=f"configurations in which {pair.second} is right",
+            count=side.correct,
+            total=side.configurations,
+            interval=side.interval or (0.0, 1.0),
+        )
+        yield Claim(kind="measured", statement=text, extent=extent)

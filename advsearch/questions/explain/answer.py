@@ -1,0 +1,266 @@
+"""The result of `explain`, and what is shown of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import ClassVar
+
+from pydantic import Field
+
+from advsearch.report import wording
+from advsearch.report.phrases import percent, share_of_text
+from advsearch.report.shown import (
+    AnswerPart,
+    Claim,
+    Column,
+    Extent,
+    Picture,
+    ShownAnswer,
+    claim,
+    nothing_claimed,
+    share_text,
+)
+from advsearch.report.wording import conditions_text, interval_text
+from advsearch.runs.results.base import ConditionRow, Fields, Interval, JsonFloat, RunResult
+
+
+class RightOf(Fields):
+    """In how many of some configurations the model is right."""
+
+    right: int = Field(description="right answers")
+    total: int = Field(alias="of", description="how many")
+    interval: Interval = Field(description="of the share, 95 %")
+
+    @property
+    def text(self) -> str:
+        """A share with its interval and what it is of: ``12 % (9 to 16) of 340``."""
+        return share_of_text(self.right, self.total, self.interval)
+
+
+class RuleRow(RightOf):
+    """A rule under which the model is wrong more often than elsewhere, counted on rows that did not choose it."""
+
+    conditions: list[ConditionRow] = Field(description="all of which hold")
+    elsewhere: RightOf = Field(description="rows under no rule so far")
+    confirmed: RightOf | None = Field(description="fresh renders drawn inside the rule; null where none were asked for")
+
+
+class RuleNotTold(RightOf):
+    """The best rule that is not told from chance, counted on rows that did not choose it."""
+
+    conditions: list[ConditionRow] = Field(description="all of which hold")
+    elsewhere: RightOf = Field(description="rows under no rule so far")
+    chance: float = Field(description="how likely so few right answers are by chance")
+    asked: float = Field(description="how unlikely they would have to be")
+    rows: int | None = Field(description="of so many rows, with these shares, it would be told; null where of none")
+
+
+class ParameterWeight(Fields):
+    """What one parameter, or two together, decide of the answer."""
+
+    parameters: list[str]
+    share: JsonFloat = Field(description="of the variance of the answers, by which of its parts a value lies in")
+    interval: Interval = Field(description="of the share, 95 %")
+    parts: int = Field(default=0, description="into how many its values were cut, of two all pairs of parts")
+
+
+class EnvelopeRow(RightOf):
+    """A box inside which the model is right at least so often."""
+
+    conditions: list[ConditionRow] = Field(description="all of which hold; empty for everything that was looked at")
+    accuracy: float = Field(description="what was asked for")
+    held: bool = Field(description="whether the rows that did not choose the box show it")
+
+
+class NearestRight(Fields):
+    """A failure and the nearest configuration that is right and differs in one value."""
+
+    values: dict[str, str | float] = Field(description="of the failure")
+    parameter: str = Field(description="the one that differs")
+    unit: str
+    wrong_at: str | float
+    right_at: str | float
+    answered: str = Field(description="what the model says of the failure")
+    answered_there: str = Field(description="what it says of the other")
+    pictures: list[str] = Field(description="files in the run's folder: of the failure, and of the other")
+
+
+class FailureCluster(Fields):
+    """Failures that look alike to the model."""
+
+    failures: int = Field(description="how many of those that were rendered again")
+    answers: dict[str, int] = Field(description="what the model says of them, and how often")
+    values: dict[str, str | float] = Field(description="of the most typical one")
+    picture: str = Field(description="of it: a file in the run's folder")
+
+
+class FailureClusters(Fields):
+    """Failures, grouped by the numbers that the model decides by."""
+
+    features: str = Field(description="what these are")
+    failures: int = Field(description="failures that were rendered again")
+    silhouette: float | None = Field(description="how well they are apart, -1 to 1; null where all are one cluster")
+    apart: bool = Field(description="whether they are farther apart than groups of a cloud without any")
+    listed: list[FailureCluster] = Field(description="the largest first")
+
+
+class ExplainResult(RunResult, RightOf):
+    """Where a model is wrong and why, in words, from the rows of sweeps; `right` and `of` are those of all rows."""
+
+    command: ClassVar[str] = "explain"
+
+    sweeps: list[str] = Field(description="folders of the runs whose rows were read")
+    object: str
+    model: str
+    units: int | None = Field(
+        default=None,
+        description="draws that the rows are of, such as [drives](drives.md), where some share one; absent where none "
+        "do",
+    )
+    parameters: list[str] = Field(description="what varies in all of the rows")
+    rules: list[RuleRow]
+    not_told: RuleNotTold | None = Field(default=None, description="the next rule, which is not told; absent without")
+    importance: list[ParameterWeight] = Field(description="empty where all answers are the same")
+    envelope: EnvelopeRow | None = Field(description="null where no box promises it")
+    pairs: list[NearestRight]
+    pairs_sought: int = Field(
+        default=0, description="failures for which one was looked for, the most typical; others are left out"
+    )
+    clusters: FailureClusters | None = Field(default=None, description="null where nothing was rendered for them")
+    renders: int = Field(description="pictures that were rendered")
+    warnings: list[str] = Field(description="sentences that a reader has to know")
+
+    @property
+    def brief(self) -> str:
+        """How many rules there are."""
+        return f"{len(self.rules)} rules over {self.total} rows"
+
+
+CHOSEN = (
+    "Chosen on one half of the rows and counted on the other, each beyond the rules before it; 95 % intervals. "
+    "Chance alone would tell any rule in one of a hundred cases at most."
+)
+DECIDES = (
+    "The share of the variance of the answers, right or wrong, that is between parts of a parameter's values with "
+    "equally many rows: its first-order Sobol index, by parts. Two parameters stand together where they decide "
+    "more than each by itself. What differs inside a part is not counted."
+)
+MOST_WEIGHTS = 12
+"""Rows of it that are shown."""
+MOST_ANSWERS = 3
+"""Answers of a cluster that are named."""
+
+
+def shown(result: ExplainResult) -> ShownAnswer:
+    """Return the rules, what decides, the envelope, and failures beside the nearest right answers."""
+    said = f"{wording.count(len(result.rules), 'rule')} under which the model is wrong more often than elsewhere."
+    if not result.rules:
+        said = (
+            f"No rule is told from chance in {result.total:,} rows, of which one half chooses and the other counts: "
+            f"the model is right in {result.text}."
+        )
+    rules = [f"{number}. {rule_text(number, rule)}" for number, rule in enumerate(result.rules, start=1)]
+    weights: Mapping[str, Column] = {
+        "parameters": lambda one: " with ".join(one.parameters),
+        "decides": lambda one: percent(one.share),
+        "95 % interval": lambda one: interval_text(one.interval),
+        "by parts": lambda one: str(one.parts or ""),
+    }
+    sections = [
+        AnswerPart("Rules", [*rules, not_told_text(result)], note=CHOSEN if rules else ""),
+        AnswerPart.table(result.importance[:MOST_WEIGHTS], weights, title="What decides", note=DECIDES),
+        AnswerPart("Where it can be relied on", [envelope_text(result)]),
+    ]
+    if result.pairs_sought:
+        sections.append(AnswerPart("One thing changed", [pairs_text(result)]))
+    for pair in result.pairs:
+        unit = f" {pair.unit}" if pair.unit not in ("", "1") else ""
+        wrong, right = (one if isinstance(one, str) else f"{one:.4g}" for one in (pair.wrong_at, pair.right_at))
+        text = f"{pair.parameter} {wrong}{unit}: {pair.answered}; at {right}{unit}: {pair.answered_there}."
+        captions = f"wrong: {pair.answered}", f"right: {pair.answered_there}"
+        pictures = [Picture(file, one) for file, one in zip(pair.pictures, captions, strict=False)]
+        sections.append(AnswerPart(text=[text], pictures=[pictures]))
+    if result.clusters:
+        sections.append(_kinds(result.clusters))
+    draws = f", of {result.units:,} independent draws" if result.units else ""
+    facts = {
+        "rows": f"right in {result.text}{draws}",
+        "sweeps": ", ".join(result.sweeps),
+        "parameters": ", ".join(result.parameters),
+    }
+    return ShownAnswer(said, sections, facts, about=[result.object, result.model])
+
+
+def rule_text(number: int, rule: RuleRow) -> str:
+    """Return the rule with a number, from 1, as a sentence."""
+    rest = "elsewhere" if number == 1 else "in what no rule before covers"
+    text = f"{conditions_text(rule.conditions)}: right in {rule.text}; {rest} {rule.elsewhere.text}."
+    return f"{text} Fresh renders inside it: right in {rule.confirmed.text}." if rule.confirmed else text
+
+
+def not_told_text(result: ExplainResult) -> str:
+    """Return the best rule that is not told, why not, and how many rows it would take; empty where there is none."""
+    rule = result.not_told
+    if rule is None:
+        return ""
+    text = (
+        f"Not told{' either' if result.rules else ''}, but the best that one half of the rows suggests: "
+        f"{conditions_text(rule.conditions)}. In the other half the model is right in {rule.right} of {rule.total} "
+        f"under it and in {rule.elsewhere.right} of {rule.elsewhere.total} elsewhere"
+    )
+    if rule.rows is None:
+        return f"{text}, which is no difference that more rows would tell."
+    chance = f"chance does that with a probability of {rule.chance:.2g}, and at most {rule.asked:g} is asked"
+    return f"{text}; {chance}. About {rule.rows:,} rows with these shares would tell it: sweep more."
+
+
+def envelope_text(result: ExplainResult) -> str:
+    """Return what the envelope promises."""
+    box = result.envelope
+    if box is None:
+        return "No box of enough rows promises the accuracy that was asked for."
+    where = conditions_text(box.conditions)
+    if not box.held:
+        return f"Not shown: inside {where} the rows that did not choose it are right in {box.text}."
+    return f"At least {100 * box.accuracy:g} % at 95 % confidence: {where}; right in {box.text}."
+
+
+def pairs_text(result: ExplainResult) -> str:
+    """Return for how many failures a right configuration near was sought, and for how many it was found."""
+    failures = result.total - result.right
+    left = failures - result.pairs_sought
+    others = f" The other {left} were not tried; `pairs` says how many are." if left else ""
+    return (
+        f"Of the {result.pairs_sought} most typical of {failures} failures, {len(result.pairs)} are right once one "
+        f"parameter is another.{others}"
+    )
+
+
+def _kinds(found: FailureClusters) -> AnswerPart:
+    """How many kinds of failures there are, with the most typical of each and what the model calls them."""
+    again = f"the {found.failures} failures that were rendered again"
+    text = f"One kind: {again} are alike by {found.features}."
+    if found.silhouette is not None:
+        shading = "" if found.apart else "; they shade into one another: groups of any cloud may be as far apart"
+        kinds = f"{len(found.listed)} kinds among {again}, by {found.features}"
+        text = f"{kinds} (silhouette {found.silhouette:.2f}{shading})."
+    pictures = []
+    for one in found.listed:
+        answers = ", ".join(f"{name} {number}" for name, number in [*one.answers.items()][:MOST_ANSWERS])
+        pictures.append(Picture(one.picture, f"{one.failures}: {answers}"))
+    return AnswerPart("Kinds of failures", [text], pictures=[pictures])
+
+
+def claims(result: ExplainResult) -> Iterator[Claim]:
+    """Yield what the envelope stands for."""
+    box = result.envelope
+    if box is None or not box.held or not box.total:
+        yield nothing_claimed(
+            "no box of values was shown to keep the accuracy that was asked for", envelope_text(result)
+        )
+        return
+    extent = Extent(
+        what="right, of rows that did not choose the box", count=box.right, total=box.total, interval=box.interval
+    )
+    text = f"Inside {conditions_text(box.conditions)} the model is right in {share_text(extent)} configurations"
+    yield claim("measured", f"{text} that did not choose this box; the sweeps drew no others.", extent)
