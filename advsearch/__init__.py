@@ -28,8 +28,6 @@ _HOMES = {
     "Task": "advsearch.tasks",
     "allow_code": "advsearch.registry",
     "check": "advsearch.questions.check.carry_out",
-    "compare": "advsearch.questions.compare.carry_out",
-    "explain": "advsearch.questions.explain.carry_out",
     "harden": "advsearch.questions.harden.carry_out",
     "load_model": "advsearch.api.render",
     "load_run": "advsearch.api.render",

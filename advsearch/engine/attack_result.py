@@ -34,7 +34,6 @@ from advsearch.report.markup import answer_html, side_by_side
 from advsearch.report.shown import shown
 from advsearch.runs import images, store
 from advsearch.runs.directory import IMAGES, OBJECT_FILE, RunDirectory
-from advsearch.runs.export import to_pandas
 from advsearch.runs.files import write_bytes
 from advsearch.runs.results.attack import AnswerAlongDrive, AttackSummary
 from advsearch.scene.assets import Shape, simpler
@@ -179,11 +178,9 @@ class AttackResult:
             yield from results.rows(kind)
 
     def to_pandas(self, kind: str | None = None) -> Any:
-        """Return these rows as a `pandas.DataFrame`: columns as in an export (docs/runs.md), units in its `attrs`.
+        """Return these rows as a `pandas.DataFrame`: columns as in an export (docs/runs.md), units in its `attrs`."""
+        from advsearch.runs.tables import to_pandas  # pandas takes half a second
 
-        Raises:
-            InputError: pandas is not installed.
-        """
         return to_pandas(self.rows(kind))
 
     def plot(self, axes: Any = None) -> Any:

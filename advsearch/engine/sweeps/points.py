@@ -47,13 +47,11 @@ Tell = Callable[[Tensor, "Picks"], list[Mapping[str, Value]]]
 @dataclass(frozen=True, eq=False)
 class Picks:
     """Neighbouring pictures of a scene: the number of the first in the whole sweep; of each, its place on every axis of
-    the grid, shares (n, k) float64 in [0, 1], the coordinates drawn for small parameters, and the part of every drawn
-    number of the table in which it lies."""
+    the grid, and shares (n, k) float64 in [0, 1], the coordinates drawn for small parameters."""
 
     number: int
     digits: list[tuple[int, ...]]
     shares: Doubles
-    parts: list[list[int]]
 
 
 @dataclass(frozen=True)
@@ -182,12 +180,17 @@ class Points:
     def picks(self, first: int, count: int, before: int = 0) -> Picks:
         """Return the pictures from number `first` of the scene on; `before` is how many the scenes before it have."""
         digits = [self.digits(number) for number in range(first, first + count)]
-        shares = self._drawn(self._draws, before + first, count)
+        return Picks(before + first, digits, self._drawn(self._draws, before + first, count))
+
+    def parts_of(self, first: int, count: int) -> NDArray[np.int64]:
+        """Return in which part of each of the `drawn` numbers neighbouring pictures of a scene lie, (count, k), by the
+        number of the first in the whole sweep."""
+        shares = self._drawn(self._draws, first, count)
         parts = np.minimum((shares[:, self._columns] * self._sizes).astype(np.int64), self._sizes - 1)
         for number, one in enumerate(self.drawn):
             if one.shares:
                 parts[:, number] = np.take(one.shares, parts[:, number])
-        return Picks(before + first, digits, shares, parts.tolist())
+        return parts
 
     @property
     def draws(self) -> bool:

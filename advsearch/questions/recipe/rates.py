@@ -27,9 +27,9 @@ from advsearch.questions.recipe.table import (
     bare,
     draw_bars,
     extremes,
-    figure_value,
     plural,
 )
+from advsearch.report.wording import figure_value
 
 BINS = 12
 """Parts of a range where lines are drawn along it."""

@@ -19,7 +19,7 @@ from advsearch.errors import InputError
 from advsearch.questions.recipe.answer import Cell
 from advsearch.report.figures import BLUE, GREY, RED
 from advsearch.report.phrases import percent
-from advsearch.report.wording import interval_text, short_name
+from advsearch.report.wording import figure_value, interval_text
 from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.results.base import Interval
 from advsearch.runs.results.sweep import SurfaceMap, SweepSummary
@@ -47,13 +47,6 @@ COUNT = ["of", "share", "low", "high"]
 """Columns of a count behind the one of what is counted."""
 
 Rows = Any  # pd.DataFrame, which has no types
-
-
-def figure_value(value: float | str) -> str:
-    """Return a value as figures write it; of a file, its name without folder and suffix."""
-    if isinstance(value, str):
-        return Path(short_name(value)).stem if "/" in value else value
-    return f"{value:.4g}"
 
 
 def read_rows(
