@@ -10,7 +10,7 @@ import OpenEXR
 
 from advsearch.config import AttackConfig
 from advsearch.questions.attack.answer import CurveResult, MatrixResult
-from advsearch.questions.gap.answer import GapResult
+from advsearch.questions.gap import GapResult
 from advsearch.questions.region.answer import RegionResult
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.attack import AttackSummary
@@ -167,9 +167,9 @@ RECIPE: dict[str, Any] = {
     "quick": True, "objects": ["mug"], "model": "reference",
     "parts": [{"name": "views-00", "part": "views", "command": "sweep", "object": "mug", "ending": "finished",
                "renders": 8}],
-    "figures": [{"figure": "bars", "title": "Accuracy by environment", "text": ["All have the same share."],
-                 "by": "environment",
-                 "bars": [{"name": "studio", "configurations": 8, "correct": 6, **ACCURACY}]}],
+    "figures": [{"figure": "rates", "title": "Accuracy by environment", "text": ["All have the same share."],
+                 "columns": ["environment", "right", "of", "share", "low", "high"],
+                 "rows": [["studio", 6, 8, 0.75, 0.35, 0.97]]}],
 }  # fmt: skip
 STABILITY: dict[str, Any] = {
     "run": "", "ending": "done", "not_run": [], "seconds": {"total": 9.0}, "command_line": "advsearch stability",
@@ -240,7 +240,8 @@ def make_answered(path: Path, config: AttackConfig, u: np.ndarray) -> Path:
 def keep_object(run: Path) -> None:
     """Put the mug, and the same painted black and white, among what a run has to turn."""
     from advsearch.runs.directory import OBJECT_FILE
-    from advsearch.scene.glb import PosedMesh, web_glb
+    from advsearch.scene.assets import Shape
+    from advsearch.scene.glb import web_glb
     from advsearch.scene.library import load_object
 
     mug = load_object("mug")
@@ -248,7 +249,7 @@ def keep_object(run: Path) -> None:
     camera = np.eye(4)
     camera[:3, :3], camera[:3, 3] = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]), (3.0, 0.0, 0.5)
     clean, painted = (
-        PosedMesh("object", mug.mesh, color.astype(np.float32), mug.material) for color in (mug.base_color, squares)
+        Shape("object", mug.mesh, color.astype(np.float32), mug.material) for color in (mug.base_color, squares)
     )
     (run / OBJECT_FILE).parent.mkdir(parents=True, exist_ok=True)
     (run / OBJECT_FILE).write_bytes(web_glb([painted], [clean], camera, "It has fewer faces here."))

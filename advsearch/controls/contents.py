@@ -246,7 +246,7 @@ class ContentsControl(NumberControl):
         vessel = self._vessel(scene)
         mesh = _disc(_surface(vessel, torch.tensor(0.5)).numpy())
         color = np.zeros((4, 4, 3), dtype=np.float32)
-        return scene.with_part(MeshPart(self.name, mesh, object_to_world(scene), color, SURFACE))
+        return scene.with_part(MeshPart(self.name, mesh, color, SURFACE, to_world=object_to_world(scene)))
 
     def bind(self, scene: SceneDescription) -> BoundContents:
         return BoundContents(self, super().bind(scene))

@@ -173,8 +173,8 @@ class OcclusionControl(NumberControl):
         away = _put_away(torch.from_numpy(camera_to_world(scene))).numpy()
         for option in self._candidates():
             asset = self._asset(option)
-            part = MeshPart(self._part(option), asset.mesh, away, asset.base_color, asset.material, label=asset.label)
-            scene = scene.with_part(part)
+            looks = asset.base_color, asset.material, asset.label
+            scene = scene.with_part(MeshPart(self._part(option), asset.mesh, *looks, to_world=away))
         return scene
 
     def refines(self, scene: SceneDescription) -> frozenset[str]:

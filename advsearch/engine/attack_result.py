@@ -37,11 +37,11 @@ from advsearch.runs.directory import IMAGES, OBJECT_FILE, RunDirectory
 from advsearch.runs.export import to_pandas
 from advsearch.runs.files import write_bytes
 from advsearch.runs.results.attack import AnswerAlongDrive, AttackSummary
-from advsearch.scene.assets import simpler
+from advsearch.scene.assets import Shape, simpler
 from advsearch.scene.description import OBJECT
 from advsearch.scene.formation import to_8_bit
 from advsearch.scene.geometry import camera_to_world
-from advsearch.scene.glb import PosedMesh, posed, web_glb
+from advsearch.scene.glb import posed, web_glb
 from advsearch.scene.settings import Given
 from advsearch.settings import as_python
 from advsearch.tasks import Judgement, Mark
@@ -332,7 +332,7 @@ def write_object(run: RunDirectory, problem: Problem, u: Tensor) -> None:
     ]
     fewer = {part.name: simpler(part.mesh, MOST_FACES // len(parts)) for part in parts}
 
-    def shown(inputs: Mapping[str, Tensor]) -> list[PosedMesh]:
+    def shown(inputs: Mapping[str, Tensor]) -> list[Shape]:
         found = [posed(part, inputs) for part in parts]
         thing = next(one for one in found if one.name == OBJECT).mesh.vertices
         middle, reach = thing.mean(axis=0), NEAR * float(np.ptp(thing, axis=0).max())

@@ -91,29 +91,23 @@ class UpAxis:
 
 
 @dataclass(frozen=True, eq=False)
-class ObjectAsset:
-    """The object a model should recognise.
+class Shape:
+    """A mesh and what it looks like. Pictures have row 0 on top, at v = 1.
 
     Attributes:
         name: short name, used in paths.
         mesh: geometry.
-        base_color: (H, W, 3) float32 display-referred sRGB in [0, 1]; row 0 is the top of the image.
+        base_color: (H, W, 3) float32 display-referred sRGB in [0, 1].
         material: the remaining surface parameters.
         label: name of the class it belongs to in the reference model, or None when unknown.
-        source: where it came from, for messages and logs.
-        warnings: what the importer had to repair or leave out, one sentence each.
-        up: the axis of the file that was taken for up; None for what comes from no file.
-        surface: in place of the principled one, Mitsuba's own dictionary of it; see `advsearch.scene.parts.MeshPart`.
-        opacity: (H, W) float32 in [0, 1], the share of the light that does not pass through, row 0 on top; None where
-            it is 1.
-        normal_map: (H, W, 3) float32, `(n + 1) / 2` of unit normals in the frame of tangent (along u), normal x tangent
-            and normal, row 0 on top; None where there is none.
-        emission: (H, W, 3) float32 linear radiance of the front of its faces, row 0 on top; (1, 1, 3) where it is the
-            same everywhere, None where there is none.
-        finishes: of an object of several materials, what each of `mesh.materials` is like beside its base colour; what
-            none of them covers is like `material`.
-        metres: its largest extent in metres, where it has a size of its own; then distances of the camera are in
-            metres. None where distances are in object sizes.
+        surface: in place of the principled surface, Mitsuba's dictionary of one, with
+            `advsearch.scene.parts.BASE_COLOR` where the texture goes; None for the principled one.
+        opacity: (H, W) float32 in [0, 1] of the principled surface, the share of the light that does not pass through;
+            None where it is 1.
+        normal_map: (H, W, 3) float32 of the principled surface, `(n + 1) / 2` of unit normals in the frame of tangent
+            (along u), normal x tangent and normal; None where there is none.
+        emission: (H, W, 3) float32 linear radiance of the front of its faces; (1, 1, 3) where it is the same
+            everywhere, None where there is none.
     """
 
     name: str
@@ -121,13 +115,29 @@ class ObjectAsset:
     base_color: Floats
     material: Material = field(default_factory=Material)
     label: str | None = None
-    source: str = ""
-    warnings: tuple[str, ...] = ()
-    up: UpAxis | None = None
     surface: Mapping[str, object] | None = None
     opacity: Floats | None = None
     normal_map: Floats | None = None
     emission: Floats | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectAsset(Shape):
+    """The object a model should recognise.
+
+    Attributes:
+        source: where it came from, for messages and logs.
+        warnings: what the importer had to repair or leave out, one sentence each.
+        up: the axis of the file that was taken for up; None for what comes from no file.
+        finishes: of an object of several materials, what each of `mesh.materials` is like beside its base colour; what
+            none of them covers is like `material`.
+        metres: its largest extent in metres, where it has a size of its own; then distances of the camera are in
+            metres. None where distances are in object sizes.
+    """
+
+    source: str = ""
+    warnings: tuple[str, ...] = ()
+    up: UpAxis | None = None
     finishes: Mapping[str, Material] = field(default_factory=dict)
     metres: float | None = None
 

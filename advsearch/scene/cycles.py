@@ -22,11 +22,11 @@ from torch import Tensor
 
 from advsearch import files
 from advsearch.errors import AdvsearchError, FileFormatError
-from advsearch.scene.assets import Material, Mesh
+from advsearch.scene.assets import Material, Mesh, Shape
 from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.geometry import camera_to_world
-from advsearch.scene.glb import PosedMesh, glb, posed
+from advsearch.scene.glb import glb, posed
 from advsearch.scene.grounds import paved
 from advsearch.scene.importing.blender import command, last_line, surroundings
 from advsearch.scene.parts import BallLamp, MeshPart, PointLamp
@@ -215,12 +215,12 @@ class Cycles:
         return told, glb(meshes), radiance
 
 
-def _ground(scene: SceneDescription, reflectance: Tensor | None) -> list[PosedMesh]:
+def _ground(scene: SceneDescription, reflectance: Tensor | None) -> list[Shape]:
     """The ground as a mesh; none where there is none."""
     photograph = scene.photograph
     if photograph is not None:
         shown = photograph.base if reflectance is None else reflectance
-        return [PosedMesh("ground", photograph.mesh, linear_to_srgb(shown.clamp(0.0, 1.0)).numpy(), MATT)]
+        return [Shape("ground", photograph.mesh, linear_to_srgb(shown.clamp(0.0, 1.0)).numpy(), MATT)]
     half = scene.number("ground.size") / 2.0
     if half <= 0.0 or paved(scene):
         return []
@@ -232,7 +232,7 @@ def _ground(scene: SceneDescription, reflectance: Tensor | None) -> list[PosedMe
         up,
         corners[:, :2] * np.float32(0.5) + np.float32(0.5),
     )
-    return [PosedMesh("ground", mesh, np.full((1, 1, 3), scene.ground_color, np.float32), MATT)]
+    return [Shape("ground", mesh, np.full((1, 1, 3), scene.ground_color, np.float32), MATT)]
 
 
 class _Process:

@@ -10,7 +10,7 @@ import io
 import json
 import struct
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,7 @@ from PIL import Image
 from torch import Tensor
 
 from advsearch.scene.assembly import MovingMesh
-from advsearch.scene.assets import Doubles, Floats, Material, Mesh
+from advsearch.scene.assets import Doubles, Floats, Shape
 from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.parts import MeshPart
 
@@ -40,30 +40,8 @@ CAMERA = {"type": "perspective", "perspective": {"yfov": 0.7, "znear": 0.01}}
 """The camera of such a file: its place counts."""
 
 
-@dataclass(frozen=True, eq=False)
-class PosedMesh:
-    """A mesh as it is in a configuration.
-
-    Attributes:
-        name: of the part of the scene.
-        mesh: in world space, z up.
-        base_color: (h, w, 3) display-referred sRGB, row 0 at v = 1.
-        material: the rest of the surface.
-        opacity: (h', w') in [0, 1], or None where there are no cut-outs.
-        normal_map, emission: as those of `ObjectAsset`.
-    """
-
-    name: str
-    mesh: Mesh
-    base_color: Floats
-    material: Material
-    opacity: Floats | None = None
-    normal_map: Floats | None = None
-    emission: Floats | None = None
-
-
-def posed(part: MeshPart, inputs: Mapping[str, Tensor]) -> PosedMesh:
-    """Return a mesh of a scene as its inputs have it.
+def posed(part: MeshPart, inputs: Mapping[str, Tensor]) -> Shape:
+    """Return a mesh of a scene as its inputs have it, in world space, z up.
 
     Args:
         part: of the scene.
@@ -78,7 +56,7 @@ def posed(part: MeshPart, inputs: Mapping[str, Tensor]) -> PosedMesh:
         color = linear_to_srgb(given["base_color"].clamp(0.0, 1.0)).numpy()
     numbers = {key: float(given[key]) for key in vars(part.material) if key in given}
     material = replace(part.material, **numbers)
-    return PosedMesh(part.name, mesh, color, material, part.opacity, part.normal_map, part.emission)
+    return replace(part, mesh=mesh, base_color=color, material=material, to_world=np.eye(4))
 
 
 def _of(key: str) -> str:
@@ -89,13 +67,13 @@ def _rows(flat: Tensor) -> Floats:
     return flat.reshape(-1, 3).to(torch.float32).numpy()
 
 
-def glb(meshes: Sequence[PosedMesh]) -> bytes:
+def glb(meshes: Sequence[Shape]) -> bytes:
     """Return a binary glTF file of some meshes."""
     made = _Buffer()
     return made.file(_described(made, meshes, _png))
 
 
-def web_glb(answer: Sequence[PosedMesh], clean: Sequence[PosedMesh], camera: Doubles, note: str = "") -> bytes:
+def web_glb(answer: Sequence[Shape], clean: Sequence[Shape], camera: Doubles, note: str = "") -> bytes:
     """Return a small file with two scenes, the answer and "clean": what is the same in both is there once.
 
     Args:
@@ -120,7 +98,7 @@ def web_glb(answer: Sequence[PosedMesh], clean: Sequence[PosedMesh], camera: Dou
     return made.file(header)
 
 
-def _described(made: _Buffer, meshes: Sequence[PosedMesh], picture: Callable[[Floats], bytes]) -> dict[str, Any]:
+def _described(made: _Buffer, meshes: Sequence[Shape], picture: Callable[[Floats], bytes]) -> dict[str, Any]:
     """Return the header of a file with some meshes in one scene, and put their bytes into the buffer."""
     header: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": "advsearch"},
@@ -214,7 +192,7 @@ class _Buffer:
         return head + text + struct.pack("<II", len(rest), 0x004E4942) + rest
 
 
-def _material(one: PosedMesh, texture: int) -> dict[str, Any]:
+def _material(one: Shape, texture: int) -> dict[str, Any]:
     surface = one.material
     extensions: dict[str, Any] = {}
     if surface.specular != PLAIN:

@@ -197,7 +197,7 @@ def road(wet: bool, metres: float) -> MeshPart:
         np.tile(np.array([[0, 0, 1]], np.float32), (4, 1)),
         uvs.astype(np.float32),
     )
-    return MeshPart(ROAD, mesh, np.eye(4), _texture(wet), WET if wet else DRY)
+    return MeshPart(ROAD, mesh, _texture(wet), WET if wet else DRY)
 
 
 @lru_cache(maxsize=2)

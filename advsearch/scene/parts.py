@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import ClassVar
 
 import numpy as np
 
-from advsearch.scene.assets import Doubles, Floats, Material, Mesh, ObjectAsset
+from advsearch.scene.assets import Doubles, Material, Shape
 
 Triple = tuple[float, float, float]
 BASE_COLOR = "base color"
@@ -43,53 +43,25 @@ class ScenePart:
 
 
 @dataclass(frozen=True, eq=False)
-class MeshPart(ScenePart):
-    """A mesh with a principled surface and a base-colour texture.
+class MeshPart(Shape, ScenePart):
+    """A shape in the scene; "object" is the object itself.
 
     Takes `NAME.vertices` and `NAME.normals` (V, 3) in world space, `NAME.base_color` (h, w, 3) linear reflectance with
-    row 0 at v = 1, and `NAME.roughness`, `.metallic`, `.specular`, `.clearcoat` (1,) in [0, 1]; where it emits light,
-    `NAME.radiance`, linear, (3,) or (h, w, 3). `NAME.to_world` (4, 4) and `NAME.offsets` (V, 3) are turned into
-    vertices and normals by `advsearch.scene.assembly`.
+    row 0 at v = 1, and `NAME.roughness`, `.metallic`, `.specular`, `.clearcoat` (1,) in [0, 1], but for what a
+    `surface` lacks of these; where it emits light, `NAME.radiance`, linear, (3,) or (h, w, 3). `NAME.to_world` (4, 4)
+    and `NAME.offsets` (V, 3) are turned into vertices and normals by `advsearch.scene.assembly`.
 
     Attributes:
-        name: "object" for the object itself.
-        mesh: geometry in its own coordinates.
         to_world: (4, 4) its base pose.
-        base_color: (h, w, 3) float32 display-referred sRGB.
-        material: the rest of the surface.
-        surface: in place of the principled surface, Mitsuba's dictionary of one, with `BASE_COLOR` where the texture
-            goes. What it lacks of the inputs, the part has not.
-        opacity: (h, w) float32 in [0, 1] of the principled surface, which cuts it out; None where it is 1.
-        normal_map: (h, w, 3) float32 of the principled surface, as `ObjectAsset.normal_map`.
-        emission: (h, w, 3) or (1, 1, 3) float32, as `ObjectAsset.emission`.
-        label: as `ObjectAsset.label`.
     """
 
-    mesh: Mesh
-    to_world: Doubles
-    base_color: Floats
-    material: Material = field(default_factory=Material)
-    surface: Mapping[str, object] | None = None
-    opacity: Floats | None = None
-    normal_map: Floats | None = None
-    emission: Floats | None = None
-    label: str | None = None
+    to_world: Doubles = field(default_factory=lambda: np.eye(4))
 
 
-def mesh_part(name: str, asset: ObjectAsset, to_world: Doubles, material: Material) -> MeshPart:
-    """Return an object with another material under a pose (4, 4)."""
-    return MeshPart(
-        name,
-        asset.mesh,
-        to_world,
-        asset.base_color,
-        material,
-        asset.surface,
-        asset.opacity,
-        asset.normal_map,
-        asset.emission,
-        asset.label,
-    )
+def mesh_part(name: str, shape: Shape, to_world: Doubles, material: Material) -> MeshPart:
+    """Return a shape with another name and material under a pose (4, 4)."""
+    looks = {one.name: getattr(shape, one.name) for one in fields(Shape)}
+    return MeshPart(**{**looks, "name": name, "material": material}, to_world=to_world)
 
 
 @dataclass(frozen=True, eq=False)

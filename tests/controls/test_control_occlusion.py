@@ -135,8 +135,8 @@ def test_primary_rays_find_the_same_share(through: str, which: str) -> None:
     directions, inside = model.rays(torch.stack(torch.meshgrid(along, along, indexing="xy"), dim=-1).reshape(-1, 2))
     rays = (directions[inside > 0.0].numpy() * (-1.0, -1.0, 1.0)) @ camera[:3, :3].T
     pose = object_to_world(scene)
-    object_hit = met(MeshPart("object", scene.object.mesh, pose, scene.object.base_color), camera[:3, 3], rays)
-    cover_hit = met(MeshPart("cover", occluder.mesh, matrix, occluder.base_color), camera[:3, 3], rays)
+    object_hit = met(MeshPart("object", scene.object.mesh, scene.object.base_color, to_world=pose), camera[:3, 3], rays)
+    cover_hit = met(MeshPart("cover", occluder.mesh, occluder.base_color, to_world=matrix), camera[:3, 3], rays)
     assert float((object_hit & cover_hit).sum()) / float(object_hit.sum()) == pytest.approx(0.3, abs=ACCURACY)
 
 

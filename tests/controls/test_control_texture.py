@@ -136,7 +136,7 @@ def test_waves_are_smooth_and_few(scene: SceneDescription) -> None:
 
 def part(scene: SceneDescription) -> MeshPart:
     """A second mesh with a plain texture."""
-    return MeshPart("post", scene.object.mesh, np.eye(4), np.full((4, 4, 3), 0.25, dtype=np.float32))
+    return MeshPart("post", scene.object.mesh, np.full((4, 4, 3), 0.25, dtype=np.float32))
 
 
 def test_another_mesh_of_the_scene_can_be_painted(scene: SceneDescription) -> None:

@@ -31,7 +31,7 @@ def scene() -> SceneDescription:
     place = np.eye(4)
     place[:3, 3] = 1.9, -1.2, HEIGHT
     color = np.full((4, 4, 3), 0.25, dtype=np.float32)
-    return describe("mug").with_part(MeshPart("post", mesh, place, color, Material(roughness=0.7)))
+    return describe("mug").with_part(MeshPart("post", mesh, color, Material(roughness=0.7), to_world=place))
 
 
 def places(scene: SceneDescription, space: Space | None = None) -> np.ndarray:
@@ -88,7 +88,7 @@ def test_every_such_control_reaches_its_mesh_alone(scene: SceneDescription) -> N
         assert {name.partition(".")[0] for name in space.inputs(space.start)} == {"post"}, kind
         assert space.controls[0].name == f"{kind}:post"
     mug = describe("mug")
-    twin = mug.with_part(MeshPart("twin", mug.object.mesh, np.eye(4), mug.object.base_color))
+    twin = mug.with_part(MeshPart("twin", mug.object.mesh, mug.object.base_color))
     space = make_space([make_control("geometry:twin", {"modes": 4})], twin)
     assert set(space.inputs(space.start)) == {"twin.offsets"}
     assert list(space.files(space.start)) == ["geometry@twin.obj"]  # a name that every file system takes
