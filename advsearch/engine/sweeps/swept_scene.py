@@ -51,33 +51,15 @@ class SweptScene:
                 description, space, size, config.denoise, config.seed, sampler=config.pixel_sampler
             )
             self.points[size] = job.points(space)
-        facts = partial(facts_of, place.scene, place.object, config.label)
+        facts, spp, seed = partial(facts_of, place.scene, place.object, config.label), job.spp, config.seed
         self.problems = tuple(
-            Problem(
-                self.renderers[size],
-                spaces[size],
-                model,
-                task,
-                facts,
-                None,
-                job.spp,
-                config.seed,
-                metrics=job.metrics,
-            )
+            Problem(self.renderers[size], spaces[size], model, task, facts, None, spp, seed, metrics=job.metrics)
             for size, model, task in zip(job.sizes, job.models, job.tasks, strict=True)
         )
-        seed = seeds.stream(config.seed, "sweep light", number)
-        self.predicted = {
-            size: PredictedSweep(
-                self.problems[job.sizes.index(size)],
-                points,
-                job.axes,
-                seed,
-                config.specialise,
-                before=number * points.count,
-            )
-            for size, points in self.points.items()
-        }
+        seed, self.predicted = seeds.stream(seed, "sweep light", number), dict[tuple[int, int], PredictedSweep]()
+        for size, points in self.points.items():
+            problem, before = self.problems[job.sizes.index(size)], number * points.count
+            self.predicted[size] = PredictedSweep(problem, points, job.axes, seed, config.specialise, before)
 
     @property
     def not_finite(self) -> int:
