@@ -18,7 +18,7 @@ from advsearch.config import SweepConfig
 from advsearch.engine.journal import Journal, Shared
 from advsearch.engine.judging import facts_of
 from advsearch.engine.loading import framed, make_renderer
-from advsearch.engine.problem import Problem
+from advsearch.engine.problem import Prepared, Problem
 from advsearch.engine.record import Stages, rate_of
 from advsearch.engine.sweeps import Job
 from advsearch.engine.sweeps.points import Points
@@ -36,8 +36,6 @@ from advsearch.viewer import thumbnails
 class SweptScene:
     """One scene, ready to be rendered and shown to the models: a `Problem` for each of them. Points, renderers and what
     predicts pictures are there for each size of picture, on which what a control frames may depend."""
-
-    prepared: None = None
 
     def __init__(self, job: Job, number: int) -> None:
         place, config = job.places[number], job.config
@@ -66,9 +64,9 @@ class SweptScene:
         rendered = sum(renderer.non_finite for renderer in self.renderers.values())
         return rendered + sum(one.not_finite for one in self.predicted.values())
 
-    def answers(self, queries: Sequence[Query]) -> list[Evaluation]:
+    def answers(self, queries: Sequence[Query], prepared: Prepared | None = None) -> list[Evaluation]:
         """Answer queries of neighbouring rows: a picture is made once for each size, and a model sees all of its own at
-        once."""
+        once. Nothing is prepared for these."""
         begun, before, job = time.perf_counter(), self.not_finite, self.job
         models = len(job.models)
         made = {size: self._made(size, queries) for size in self.points}
