@@ -25,10 +25,7 @@ ORDER = (
     *("contents", "background", "haze", "lens", "sensor", "corruption", "mitsuba"),
 )
 """In which lists have controls; one that is not named comes last."""
-SHARED = (
-    *("base", "drawn", "numbers", "space", "values"),
-    *("corruption_filters", "material_patterns", "patch_sticker"),
-)
+SHARED = ("base", "drawn", "numbers", "space", "values", "corruption_filters", "material_patterns")
 """Modules of this folder that are no control."""
 
 

@@ -2,31 +2,53 @@
 
 After Brown et al. (2017, "Adversarial Patch", arXiv 1712.09665, section 2): the pixels are free, and what is around
 them stays. There the patch is pasted into pictures; here it lies on the surface, under the scene's light, and bends
-with it (`sticker`). It is part of the base colour, so that no outline moves and the adjoint is right.
+with it. It is part of the base colour, so that no outline moves and the adjoint is right.
+
+    base colour = (1 - m) base colour + m linear(pixels at (a, b)),     m = soft square in (a, b), front of the surface
+
+A place is where a ray from outside towards the middle of the object meets the surface; (a, b) are those in the tangent
+plane, unrolled along the direction in which the surface bends (exact for cylinders and spheres; Schmidt et al. 2006,
+"Interactive Decal Compositing with Discrete Exponential Maps"). Only what is connected and faces that way is painted.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
+import numpy as np
 import torch
 import torch.nn.functional as F
+from scipy import spatial
 from torch import Tensor
 
 from advsearch.controls.base import NOTHING, WHOLE_RANGE, Budget, Choice, Parameter, Value, change_in_colour
 from advsearch.controls.numbers import NumberControl, Slot, Values
-from advsearch.controls.patch_sticker import Sticker, towards_camera
 from advsearch.controls.texture import radius, resampled
 from advsearch.controls.values import LARGEST_EPSILON, Fixed, Moved, Number, OneOf, Range, Spec, in_words
 from advsearch.errors import FileFormatError, InputError
+from advsearch.scene.assets import Doubles, Mesh
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
+from advsearch.scene.description import SceneDescription
+from advsearch.scene.geometry import camera_to_world, object_to_world
 from advsearch.scene.importing.pictures import read_picture
+from advsearch.scene.raster import Charts, MeshSurface, rasterised
 
 BASE_COLOR = "object.base_color"
 NORMS = ("box", "linf", "l2")
 PRINT_SIDE = 512
 """Least side of the picture that is kept for printing, in pixels."""
+BASE_SIDES = (512, 1024)
+"""Smallest and largest side of the base-colour map that is painted into, in texels."""
+REACH = 0.75
+"""Radius around the middle, in sides of the square, within which the surface is painted: its corners are at 0.7071."""
+FACING = (0.1, 0.3)
+"""Cosines between the surface and the square's normal between which it fades in."""
+EDGE_TEXELS = 2.0
+"""Width of the soft edge in texels."""
 
 
 class PatchControl(NumberControl):
@@ -183,3 +205,203 @@ def enlarged(pixels: Tensor, factor: int) -> Tensor:
     linear = srgb_to_linear(pixels).permute(2, 0, 1)[None]
     larger = F.interpolate(linear, scale_factor=factor, mode="bilinear", align_corners=False)
     return linear_to_srgb(larger[0].permute(1, 2, 0))
+
+
+# ---- on the surface --------------------------------------------------------------------------------------------------
+
+
+def towards_camera(scene: SceneDescription) -> tuple[float, float]:
+    """Return azimuth (degrees) and height (0 to 1) of the place in the middle of the object as the camera sees it."""
+    middle, radius, half = _shape(scene.object.mesh)
+    camera = camera_to_world(scene)[:3, 3]
+    x, y, z = np.linalg.solve(object_to_world(scene), np.append(camera, 1.0))[:3] - middle
+    lift = math.atan2(z * radius, max(math.hypot(x, y), 1e-12) * half)
+    return math.degrees(math.atan2(y, x)) % 360.0, 0.5 + lift / math.pi
+
+
+def _shape(mesh: Mesh) -> tuple[Doubles, float, float]:
+    """Middle (3,) of a mesh, its largest half-width and its half-height."""
+    low, high = mesh.vertices.min(axis=0).astype(np.float64), mesh.vertices.max(axis=0).astype(np.float64)
+    half = np.maximum((high - low) / 2.0, 1e-6)
+    return (low + high) / 2.0, float(half[:2].max()), float(half[2])
+
+
+@dataclass(frozen=True, eq=False)
+class Spot:
+    """A place for a patch: the texels that it may cover and their coordinates around it.
+
+    Attributes:
+        texels: (N,) their numbers, row by row.
+        flat: (N, 2) their coordinates to the right and upwards, object sizes.
+        cover: (N,) in [0, 1]: how much they face the patch.
+        spacing: distance between neighbouring texels on the surface, object sizes.
+    """
+
+    texels: Tensor
+    flat: Tensor
+    cover: Tensor
+    spacing: float
+
+
+class Sticker:
+    """Paints a patch of `side` pixels into the object's base-colour map; the resting numbers are those at the start."""
+
+    def __init__(self, scene: SceneDescription, resting: Mapping[str, float], side: int) -> None:
+        mesh = scene.object.mesh
+        if mesh.repeats:
+            raise InputError(
+                "`controls` patch: the object's texture repeats on it, and so would a patch that is painted into it; "
+                "leave patch out, or search the whole texture"
+            )
+        self._shape = _shape(mesh)
+        self._resting, self._side = resting, side
+        self._surface = MeshSurface(mesh)
+        own = srgb_to_linear(torch.from_numpy(scene.object.base_color.copy()))
+        charts = _fine_enough(mesh, max(own.shape[:2]), resting["size"] / side)
+        self._own = _fitted(own, len(charts.face))
+        mask = charts.touched
+        self._texels, self._faces = np.flatnonzero(mask), charts.face[mask]
+        self._positions, self._normals, self._areas = (
+            array[mask].astype(np.float64) for array in (charts.positions(), charts.normals(), charts.areas())
+        )
+        self._spot = lru_cache(maxsize=4)(self._find_spot)
+
+    def paint(self, base: Tensor | None, pixels: Tensor, numbers: Mapping[str, Tensor]) -> Tensor:
+        """Return the base colour (h, w, 3), linear, with the patch of pixels (n, n, 3) sRGB on it; differentiable
+        except in the place (azimuth, height, size and rotation). The base is what other controls made of it; None takes
+        the object's own."""
+        device = pixels.device
+        base = self._own.to(device) if base is None else _fitted(base, len(self._own))
+        size = numbers["size"]
+        spot = self._spot(*(float(numbers[name].detach()) for name in ("azimuth", "height", "size")))
+        texels = spot.texels.to(device)
+        across = _turned(spot.flat.to(device), numbers["rotation"]) / size
+        edge = (0.5 - across.abs().amax(dim=1)) * size / (EDGE_TEXELS * spot.spacing) + 0.5
+        cover = (spot.cover.to(device) * _smooth(edge))[:, None]
+        grid = (across * across.new_tensor([2.0, -2.0]))[None, None]
+        linear = srgb_to_linear(pixels).permute(2, 0, 1)[None]
+        color = F.grid_sample(linear, grid, mode="bilinear", padding_mode="border", align_corners=False)[0, :, 0].T
+        flat = base.reshape(-1, 3)
+        under = flat.index_select(0, texels)
+        return flat.index_copy(0, texels, under + cover * (color - under)).reshape(base.shape)
+
+    def underneath(self) -> Tensor:
+        """Return what the object's own texture shows where the patch starts, as a patch (n, n, 3) sRGB."""
+        resting, side = self._resting, self._side
+        spot = self._spot(resting["azimuth"], resting["height"], resting["size"])
+        across = _turned(spot.flat, torch.tensor(resting["rotation"])) / resting["size"]
+        inside = (across.abs().amax(dim=1) < 0.5) & (spot.cover > 0.0)
+        if not bool(inside.any()):
+            return torch.full((side, side, 3), 0.5)
+        color = self._own.reshape(-1, 3)[spot.texels[inside]]
+        place = across[inside] * torch.tensor([1.0, -1.0]) + 0.5
+        column, row = (place * side).long().clamp(0, side - 1).T
+        index = row * side + column
+        sums = torch.zeros(side * side, 3).index_add(0, index, color)
+        counts = torch.zeros(side * side).index_add(0, index, torch.ones(len(index)))
+        found = sums / counts.clamp_min(1.0)[:, None]
+        centres = torch.stack(torch.meshgrid(*[torch.arange(side) + 0.5] * 2, indexing="ij"), dim=-1).reshape(-1, 2)
+        nearest = spatial.cKDTree(place.flip(1).numpy()).query(centres.numpy() / side)[1]
+        found = torch.where(counts[:, None] > 0.0, found, color[torch.from_numpy(nearest)])
+        return linear_to_srgb(found).reshape(side, side, 3)
+
+    def _find_spot(self, azimuth: float, height: float, size: float) -> Spot:
+        middle, radius, half = self._shape
+        angle, lift = math.radians(azimuth), (height - 0.5) * math.pi
+        outwards = np.array([math.cos(lift) * radius * math.cos(angle), math.cos(lift) * radius * math.sin(angle), 0.0])
+        outwards[2] = math.sin(lift) * half
+        outwards /= np.linalg.norm(outwards)
+        face, point = self._surface.hit(middle + 4.0 * (radius + half) * outwards, -outwards)
+        side = 1.0 if float(self._surface.normals[face] @ outwards) >= 0.0 else -1.0
+        normal = self._mean_normal(face, point, side)
+        level = math.hypot(outwards[0], outwards[1])
+        upwards = np.array([-outwards[2] * math.cos(angle), -outwards[2] * math.sin(angle), level])
+        return self._around(face, point, _frame(side * normal, upwards), side, REACH * size)
+
+    def _mean_normal(self, face: int, point: Doubles, side: float) -> Doubles:
+        """Unit normal (3,) of the surface around a point: the mean over half of the patch's side at the start."""
+        radius = 0.5 * self._resting["size"]
+        normal = self._surface.normals[face]
+        near = self._surface.region(face, point, normal, radius)[self._faces]
+        fall = np.maximum(1.0 - ((self._positions[near] - point) ** 2).sum(axis=1) / radius**2, 0.0) ** 2
+        total = (self._normals[near] * (fall * self._areas[near])[:, None]).sum(axis=0)
+        length = float(np.linalg.norm(total))
+        return np.asarray(total / length) if length > 1e-12 else normal
+
+    def _around(self, face: int, point: Doubles, frame: Doubles, side: float, radius: float) -> Spot:
+        chosen = np.flatnonzero(self._surface.region(face, point, side * frame[2], radius)[self._faces])
+        offsets = self._positions[chosen] - point
+        close = (offsets**2).sum(axis=1) <= radius**2
+        chosen, offsets = chosen[close], offsets[close]
+        flat, cosine = unrolled(offsets, side * self._normals[chosen], frame)
+        low, high = FACING
+        areas = self._areas[chosen]
+        return Spot(
+            torch.from_numpy(self._texels[chosen]),
+            torch.from_numpy(flat.astype(np.float32)),
+            _smooth(torch.from_numpy(((cosine - low) / (high - low)).astype(np.float32))),
+            math.sqrt(float(np.median(areas[areas > 0.0]))) if (areas > 0.0).any() else 1.0 / len(self._own),
+        )
+
+
+def _fine_enough(mesh: Mesh, own: int, pixel: float) -> Charts:
+    """Rasterise the charts at the side of a base-colour map whose texels are smaller than the square's pixels, whose
+    side is `pixel` object sizes; `own` is the side of the object's own map."""
+    smallest, largest = BASE_SIDES
+    side = max(smallest, own)
+    charts = rasterised(mesh, side)
+    areas = charts.areas()
+    spacing = math.sqrt(float(np.median(areas[areas > 0.0])))
+    wanted = side
+    while 2 * wanted <= largest and spacing * side / wanted > pixel:
+        wanted *= 2
+    return charts if wanted == side else rasterised(mesh, wanted)
+
+
+def _frame(normal: Doubles, upwards: Doubles) -> Doubles:
+    """Rows right, up, normal (3, 3) of a right-handed frame with `up` as near to a direction as the normal lets it."""
+    up = upwards - float(upwards @ normal) * normal
+    if float(np.linalg.norm(up)) < 1e-6:
+        up = np.eye(3)[int(np.abs(normal).argmin())]
+        up = up - float(up @ normal) * normal
+    up = up / np.linalg.norm(up)
+    return np.stack([np.cross(up, normal), up, normal])
+
+
+def unrolled(offsets: Doubles, normals: Doubles, frame: Doubles) -> tuple[Doubles, Doubles]:
+    """Return coordinates (N, 2) of points along a surface, to the right and upwards, and normals' cosines (N,).
+
+    In the tangent plane a point of a circle of radius R lies at `R sin(phi)` where its arc is `R phi`, phi being the
+    angle that the normal has turned. So the component along the direction of turning is stretched by `phi / sin(phi)`.
+    Offsets are (N, 3) from the middle; the rows of `frame` are right, up and normal there.
+    """
+    plane, tilt = offsets @ frame[:2].T, normals @ frame[:2].T
+    cosine = normals @ frame[2]
+    sine = np.linalg.norm(tilt, axis=1)
+    towards = tilt / np.maximum(sine, 1e-9)[:, None]
+    turned = np.arctan2(sine, np.maximum(cosine, 0.1))
+    stretch = np.where(sine > 1e-4, turned / np.maximum(np.sin(turned), 1e-9), 1.0)
+    along = (plane * towards).sum(axis=1)
+    return plane + ((stretch - 1.0) * along)[:, None] * towards, cosine
+
+
+def _turned(flat: Tensor, degrees: Tensor) -> Tensor:
+    """Coordinates (N, 2) on a patch that is turned counter-clockwise."""
+    angle = torch.deg2rad(degrees)
+    cosine, sine = torch.cos(angle), torch.sin(angle)
+    return torch.stack([flat[:, 0] * cosine + flat[:, 1] * sine, flat[:, 1] * cosine - flat[:, 0] * sine], dim=1)
+
+
+def _smooth(share: Tensor) -> Tensor:
+    """The step `3 t^2 - 2 t^3` between 0 and 1."""
+    clipped = share.clamp(0.0, 1.0)
+    return clipped.square() * (3.0 - 2.0 * clipped)
+
+
+def _fitted(base: Tensor, side: int) -> Tensor:
+    """Resize a base colour (h, w, 3) to (side, side, 3); differentiable."""
+    if base.shape[:2] == (side, side):
+        return base
+    planes, smaller = base.permute(2, 0, 1)[None], max(base.shape[:2]) > side
+    resized = F.interpolate(planes, size=(side, side), mode="bilinear", antialias=smaller, align_corners=False)
+    return resized[0].permute(1, 2, 0)

@@ -14,8 +14,7 @@ from torch import Tensor
 
 import advsearch
 from advsearch.controls import make_control, make_space
-from advsearch.controls.patch import BASE_COLOR, PatchControl
-from advsearch.controls.patch_sticker import towards_camera
+from advsearch.controls.patch import BASE_COLOR, PatchControl, towards_camera
 from advsearch.controls.texture import TextureControl
 from advsearch.errors import FileFormatError, InputError, UnknownNameError
 from advsearch.scene.assets import Floats, Mesh
