@@ -12,6 +12,8 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from advsearch.rooms import made_question, made_questions
+
 if TYPE_CHECKING:
     from advsearch import losses as losses
     from advsearch import testing as testing
@@ -30,7 +32,7 @@ if TYPE_CHECKING:
     from advsearch.questions.check.carry_out import check as check
     from advsearch.questions.compare.carry_out import compare as compare
     from advsearch.questions.explain.carry_out import explain as explain
-    from advsearch.questions.gap.carry_out import gap as gap
+    from advsearch.questions.gap import gap as gap
     from advsearch.questions.harden.carry_out import harden as harden
     from advsearch.questions.photographs.carry_out import photo_agreement as photo_agreement
     from advsearch.questions.plan.carry_out import plan as plan
@@ -59,7 +61,6 @@ _HOMES = {
     "check": "advsearch.questions.check.carry_out",
     "compare": "advsearch.questions.compare.carry_out",
     "explain": "advsearch.questions.explain.carry_out",
-    "gap": "advsearch.questions.gap.carry_out",
     "harden": "advsearch.questions.harden.carry_out",
     "load_model": "advsearch.api.render",
     "load_run": "advsearch.api.render",
@@ -74,18 +75,21 @@ _HOMES = {
     "stability": "advsearch.questions.stability.carry_out",
     "sweep": "advsearch.questions.sweep.carry_out",
 }
-"""The public names, and the module of each."""
+"""The public names, and the module of each; besides, every question that
+`advsearch.question` makes."""
 
 _MODULES = ("losses", "testing")
 """Public modules."""
 
-__all__ = [*_HOMES, *_MODULES]
+__all__ = [*_HOMES, *_MODULES, *made_questions()]
 
 
 def __getattr__(name: str) -> Any:
     """Import the interface on first use (PEP 562)."""
     if name in __all__:
         import_module("advsearch.api")  # sets the threads before torch is imported
+        if name in made_questions():
+            return made_question(name).python
         return import_module(f"advsearch.{name}") if name in _MODULES else getattr(import_module(_HOMES[name]), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 

@@ -29,6 +29,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Sequence
+from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -43,8 +44,6 @@ from simulated_cluster import Simulated, coordinator  # noqa: E402
 from sweep import ConstantRenderer, resident  # noqa: E402
 
 from advsearch.attacks import Evaluation  # noqa: E402
-from advsearch.cluster import Event  # noqa: E402
-from advsearch.cluster.coordinator import DEPTH  # noqa: E402
 from advsearch.config import SweepConfig  # noqa: E402
 from advsearch.engine.journal import Sent  # noqa: E402
 from advsearch.engine.sweeps import KIND, swept_scene  # noqa: E402
@@ -153,14 +152,15 @@ class Timed(Simulated):
 
     returned: float | None = None
 
-    def events(self, seconds: float) -> list[Event]:
+    def get(self, timeout: float) -> Future[Any]:
         if self.returned is not None:
             self.now += time.perf_counter() - self.returned
         now = self.now
-        found = super().events(seconds)
-        self.now = max(self.now, now)  # what was due meanwhile is late, not in the past
-        self.returned = time.perf_counter()
-        return found
+        try:
+            return super().get(timeout)
+        finally:
+            self.now = max(self.now, now)  # what was due meanwhile is late, not in the past
+            self.returned = time.perf_counter()
 
 
 def swept(workers: int, pictures: int, watch: Any = None) -> tuple[float, float, Simulated]:
@@ -208,7 +208,7 @@ def simulated(figure: Path | None) -> list[bool]:
                 f"  simulated  {workers:5d} workers: {pictures / seconds:8.1f} pictures a second, {share:.3f} of linear"
             )
             held.append(share >= ASKED_LINEAR)
-            assert pool.most <= workers * DEPTH
+            assert pool.most <= workers
     if figure is not None:
         draw(found, figure)
     return held

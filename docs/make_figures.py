@@ -29,7 +29,7 @@ from advsearch.controls import OWN
 from advsearch.questions.attack.answer import CurveResult, MatrixResult
 from advsearch.questions.compare.answer import CompareResult
 from advsearch.questions.explain.answer import ExplainResult
-from advsearch.questions.gap.answer import GapResult
+from advsearch.questions.gap import GapResult
 from advsearch.questions.harden.answer import HardenResult
 from advsearch.questions.recipe.description import recipe_names as recipe_names
 from advsearch.questions.region.answer import RegionResult

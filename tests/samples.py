@@ -10,7 +10,7 @@ import OpenEXR
 
 from advsearch.config import AttackConfig
 from advsearch.questions.attack.answer import CurveResult, MatrixResult
-from advsearch.questions.gap.answer import GapResult
+from advsearch.questions.gap import GapResult
 from advsearch.questions.region.answer import RegionResult
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.attack import AttackSummary

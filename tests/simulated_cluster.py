@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import heapq
+import queue
+from collections import deque
 from collections.abc import Callable, Collection
+from concurrent.futures import Future
 from dataclasses import dataclass, field
 from typing import Any
 
-from advsearch.cluster import Disconnected, Ended, Event, Joined, Left, Work
+from advsearch.cluster import SchedulerGoneError, Work
 from advsearch.cluster.coordinator import Coordinator
 from advsearch.cluster.worker import Carried, Failure, Files, Ready, prepare
 from advsearch.errors import ClusterError
@@ -34,6 +37,7 @@ class Simulated:
         where: how it is called.
         given: batches that were given to a worker, in order.
         most: calls that were under way at once.
+        gone: whether the scheduler has gone, and nobody has connected again.
     """
 
     call: Callable[[Any], Any] = list
@@ -50,25 +54,32 @@ class Simulated:
     where: str = "simulated"
     given: list[Any] = field(default_factory=list)
     most: int = 0
-    _events: list[tuple[float, int, Any]] = field(default_factory=list)
+    gone: bool = False
+    _events: list[tuple[float, int, Callable[[], None]]] = field(default_factory=list)
     _free_at: dict[str, float] = field(default_factory=dict)
-    _at: dict[int, str] = field(default_factory=dict)
+    _at: dict[Future[Any], str] = field(default_factory=dict)
+    _ended: deque[Future[Any]] = field(default_factory=deque)
     _made: int = 0
     _order: int = 0
+
+    @property
+    def ended(self) -> Any:
+        """The queue of a pool, whose time is simulated: `put`, `get` and `get_nowait` below."""
+        return self
 
     def clock(self) -> float:
         return self.now
 
     def add(self, count: int = 1, after: float = 0.0) -> None:
         for _ in range(count):
-            self._later(after, Joined(f"w{self._made}"))
+            self._later(after, lambda name=f"w{self._made}": self._free_at.setdefault(name, self.now))  # type: ignore[misc]
             self._made += 1
 
-    def _later(self, seconds: float, event: Event | Callable[[], None]) -> None:
+    def _later(self, seconds: float, action: Callable[[], object]) -> None:
         self._order += 1
-        heapq.heappush(self._events, (self.now + seconds, self._order, event))
+        heapq.heappush(self._events, (self.now + seconds, self._order, action))  # type: ignore[misc]
 
-    def at(self, time: float, action: Callable[[], None]) -> None:
+    def at(self, time: float, action: Callable[[], object]) -> None:
         """Do something to the workers at a time."""
         self._later(time - self.now, action)
 
@@ -76,36 +87,39 @@ class Simulated:
     def alive(self) -> list[str]:
         return list(self._free_at)
 
-    def end(self, worker: str, *, told: bool = False) -> None:
+    def end(self, worker: str) -> None:
         """A worker dies; what it had gets no answer."""
         if self._free_at.pop(worker, None) is None:
             return
-        self._at = {ticket: one for ticket, one in self._at.items() if one != worker}
-        self._later(0.0, Left(worker, told))
+        self._at = {future: one for future, one in self._at.items() if one != worker}
         if self.again is not None:
             self.add(after=self.again)
 
     def lose_scheduler(self) -> None:
-        workers, self._at = len(self._free_at), {}
+        self.add(len(self._free_at), after=3.0)
         self._free_at.clear()
-        self._later(0.0, Disconnected())
-        self.again, again = None, self.again
-        self.add(workers, after=3.0)
-        self.again = again
+        self._at.clear()
+        self.gone = True
 
     # ---- what the coordinator calls ---------------------------------------------------------------------------------
 
-    def submit(self, ticket: int, worker: str, function: Callable[..., Any], *args: Any) -> None:
+    def workers(self) -> Collection[str]:
+        if self.gone:
+            raise SchedulerGoneError
+        return list(self._free_at)
+
+    def submit(self, worker: str, function: Callable[..., Any], *args: Any) -> Future[Any]:
+        future: Future[Any] = Future()
         if worker not in self._free_at:
-            return
-        self._at[ticket] = worker
+            return future
+        self._at[future] = worker
         self.most = max(self.most, len(self._at))
         begin = max(self.now, self._free_at[worker])
         if function is prepare:
             told = self.answers.get(worker, Ready(HERE, self.load))
             self._free_at[worker] = begin + self.load
-            self._later(begin + self.load - self.now, self._answer(ticket, told))
-            return
+            self._answer(future, begin + self.load - self.now, told)
+            return future
         _, items = args
         self.given.append(items)
         seconds = sum(map(self.seconds, items))
@@ -115,40 +129,40 @@ class Simulated:
         elif any(number in self.hang for number in items):
             self._free_at[worker] = float("inf")
         elif begin + seconds < float("inf"):
-            until = begin + seconds + self.lag - self.now
-            self._later(until, self._answer(ticket, lambda: Carried(self.call(items), seconds)))
+            self._answer(future, begin + seconds + self.lag - self.now, lambda: Carried(self.call(items), seconds))
+        return future
 
-    def _answer(self, ticket: int, value: Any) -> Any:
-        def answer() -> Event | None:
-            if self._at.pop(ticket, None) is None:
-                return None
-            return Ended(ticket, value() if callable(value) else value)
+    def _answer(self, future: Future[Any], seconds: float, value: Any) -> None:
+        def answer() -> None:
+            if self._at.pop(future, None) is not None and future.set_running_or_notify_cancel():
+                future.set_result(value() if callable(value) else value)
 
-        return answer
-
-    def forget(self, ticket: int) -> None:
-        self._at.pop(ticket, None)
+        self._later(seconds, answer)
 
     def restart(self, worker: str) -> None:
         self.end(worker)
 
-    def events(self, seconds: float) -> list[Event]:
-        found: list[Event] = []
-        until = self.now + seconds
-        while self._events and not found and self._events[0][0] <= until:
-            self.now, _, event = heapq.heappop(self._events)
-            made = event() if callable(event) else event
-            if isinstance(made, Joined):
-                self._free_at[made.worker] = self.now
-            if made is not None:
-                found.append(made)
-        if not found:
+    def put(self, future: Future[Any]) -> None:
+        self._ended.append(future)
+
+    def get(self, timeout: float) -> Future[Any]:
+        until = self.now + timeout
+        while self._events and not self._ended and self._events[0][0] <= until:
+            self.now, _, action = heapq.heappop(self._events)
+            action()
+        if not self._ended:
             self.now = until
-        return found
+        return self.get_nowait()
+
+    def get_nowait(self) -> Future[Any]:
+        if not self._ended:
+            raise queue.Empty
+        return self._ended.popleft()
 
     def reconnect(self) -> None:
         if not self.returns:
             raise ClusterError("simulated: there is no scheduler that answers; go on with advsearch resume")
+        self.gone = False
 
     def close(self) -> None:
         pass

@@ -85,6 +85,7 @@ RULES = {
     "viewer": Rule({"runs", "report", "config", "settings"}, {"numpy", "PIL"}, HEAVY),
     "explanations": Rule({"attacks", "runs", "report"}, {"numpy", "scipy"}, HEAVY),
     "losses": Rule({"attacks", "engine"}, {"torch"}),
+    "question": Rule({"runs", "report", "viewer", "api", "settings"}, {"pydantic"}, HEAVY),
     "questions": Rule(None, None, frozenset(RENDERER)),
     "testing": Rule({"questions", "engine", "config"}, set()),
     "api": Rule(None),
@@ -135,12 +136,19 @@ def room(module: str) -> str:
     """The room of one of our modules: the first name below `advsearch`; empty for the package itself.
 
     `python -m advsearch` is the command line's front door, so `__main__` belongs to its room; so does the package of
-    a question, which is its command.
+    a question of the older form, which is its command.
     """
     name = module.split(".")[1] if "." in module else ""
-    if name == "__main__" or (name == "questions" and module.count(".") == 2):
+    if name == "__main__" or (name == "questions" and module.count(".") == 2 and is_command(module)):
         return "cli"
     return name if (PACKAGE / name).is_dir() or (PACKAGE / f"{name}.py").is_file() else ""
+
+
+@cache
+def is_command(module: str) -> bool:
+    """Whether a package of a question imports the command line."""
+    path = ROOT.joinpath(*module.split("."), "__init__.py")
+    return path.is_file() and any(name.startswith("advsearch.cli") for name in imports(module, path))
 
 
 def broken_rules() -> Iterator[str]:
@@ -176,7 +184,7 @@ def test_rooms_import_only_what_they_may() -> None:
 
 
 LIGHT = {"settings", "answer", "page"}
-"""What a room has for those who only read or show an answer."""
+"""What a room of the older form has for those who only read or show an answer."""
 
 
 def questions() -> Iterator[tuple[str, str, Path, list[str]]]:
@@ -327,8 +335,9 @@ SHOW_HEAVY = f"import sys; print([m for m in {LATE} if m in sys.modules])"
         "from advsearch.cli.main import main\n"
         "with contextlib.redirect_stdout(io.StringIO()) as text, contextlib.suppress(SystemExit): main(['--help'])\n"
         "assert 'attack' in text.getvalue()",
+        "from advsearch.rooms import Room, rooms\nassert [Room(name).result for name in rooms()]",
     ],
-    ids=["small modules", "rooms", "help"],
+    ids=["small modules", "rooms", "help", "questions"],
 )
 def test_nothing_heavy_is_imported_before_it_is_needed(code: str) -> None:
     done = subprocess.run([sys.executable, "-c", f"{code}\n{SHOW_HEAVY}"], capture_output=True, text=True, check=False)
@@ -360,11 +369,11 @@ NOT_MESSAGES = (
 
 
 def texts_of_people(source: str) -> Iterator[tuple[int, str]]:
-    """Every text in a module but docstrings and what describes a setting, which is the command line's help."""
+    """Every text in a module but docstrings and what describes a setting or a question: the command line's help."""
     tree = ast.parse(source)
     apart: set[int] = set()
     for node in ast.walk(tree):
-        helps = isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "setting"
+        helps = isinstance(node, ast.Call) and getattr(node.func, "id", "") in ("setting", "question")
         if helps or (isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)):
             apart.update(id(inner) for inner in ast.walk(node))
     for node in ast.walk(tree):

@@ -36,7 +36,7 @@ from advsearch.files import MESHES
 from advsearch.models import loading, reference
 from advsearch.models.loading import SOURCES as SOURCES_OF_MODELS
 from advsearch.questions.attack.answer import CurveResult, MatrixResult
-from advsearch.questions.gap.answer import GapResult
+from advsearch.questions.gap import GapResult
 from advsearch.questions.region import carry_out as mapping
 from advsearch.questions.region.settings import RegionConfig
 from advsearch.questions.test import counterexamples as tested

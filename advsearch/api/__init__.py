@@ -36,10 +36,10 @@ def carry_out(config: Config, *, progress: Progress | None = None, resumed: Path
     """
     keeps_run = resumed is None and getattr(config, "out", None) is None
     with begun(config) if keeps_run else nullcontext(resumed) as folder:  # before what is heavy is imported
-        name = f"{config.command}_from_config"
-        own = rooms.in_room(config.command, "carry_out", name)
-        answer = (own or getattr(import_module(f"advsearch.api.{config.command}"), name))(
-            config, progress=progress, **({} if folder is None else {"resumed": folder})
-        )
+        room = rooms.room(config.command)
+        own = room.from_config if room else None
+        if own is None:
+            own = getattr(import_module(f"advsearch.api.{config.command}"), f"{config.command}_from_config")
+        answer = own(config, progress=progress, **({} if folder is None else {"resumed": folder}))
     result: Result = answer if isinstance(answer, Result) else answer.summary
     return result

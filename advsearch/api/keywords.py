@@ -20,6 +20,7 @@ import numpy as np
 from torch import nn
 
 from advsearch.calls import check_types, unexpected
+from advsearch.config.scene import SEVERAL
 from advsearch.engine import loading
 from advsearch.engine.naming import check_not_of_scene, check_not_spread, exists_here, in_turn, model_name
 from advsearch.errors import InputError
@@ -138,16 +139,6 @@ class SweepKeywords(SampledKeywords, total=False):
     fps: float | None
 
 
-class GapKeywords(SearchKeywords, NamedKeywords, total=False):
-    """Of `gap`."""
-
-    objective: str | None
-    policy: Named
-    workers: int | None
-    cluster: str | None
-    over: loading.Controls
-
-
 LOADED = (loading.Scene, Model, nn.Module)
 """What a question may be given in place of a name."""
 
@@ -183,7 +174,7 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 Made = TypeVar("Made", bound=Config)
 
 
-def asks(config: type[Config], keywords: type[Any]) -> Callable[[Function], Function]:
+def asks(config: type[Config], keywords: type[Any] | None = None) -> Callable[[Function], Function]:
     """Give a function that takes settings as `**settings` the signature and the docstring that they come to.
 
     Every setting becomes a keyword with the default that it is declared with, and a line among the arguments. One that
@@ -191,9 +182,10 @@ def asks(config: type[Config], keywords: type[Any]) -> Callable[[Function], Func
 
     Args:
         config: declares the settings.
-        keywords: says what may be written for them.
+        keywords: says what may be written for them; None derives that from what they are.
     """
-    hints = {name: hint.__forward_arg__ for name, hint in keywords.__annotations__.items()}
+    written = {} if keywords is None else keywords.__annotations__
+    hints = {name: hint.__forward_arg__ for name, hint in written.items()}
 
     def decorate(function: Function) -> Function:
         own = inspect.signature(function)
@@ -203,7 +195,8 @@ def asks(config: type[Config], keywords: type[Any]) -> Callable[[Function], Func
             name = one.field.removesuffix("_")
             if name in own.parameters or one.required:
                 continue
-            added.append(inspect.Parameter(name, ONLY_BY_NAME, default=one.default, annotation=hints[name]))
+            hint = hints.get(name) or hint_of(one.field, config.model_fields[one.field].annotation)
+            added.append(inspect.Parameter(name, ONLY_BY_NAME, default=one.default, annotation=hint))
             lines.append(textwrap.fill(f"{name}: {one.text}", 110, subsequent_indent="    "))
         signature = _Signature([*plain, *added], return_annotation=own.return_annotation)
         signature.short = own
@@ -253,6 +246,26 @@ def asks(config: type[Config], keywords: type[Any]) -> Callable[[Function], Func
         return asked  # type: ignore[return-value]
 
     return decorate
+
+
+WRITTEN = {
+    "controls": "Controls", "over": "Controls", "label": "int | np.integer[Any] | Names | None",
+    "resolution": "int | str | tuple[int, int] | None", "set_": "Mapping[str, float | str | Sequence[float]] | None",
+    "estimators": "str | Mapping[str, str]",
+}  # fmt: skip
+"""What may be written for some settings beside what they become."""
+
+
+def hint_of(field: str, kind: Any) -> str:
+    """Return what Python callers may write for a setting that is declared as `kind`: for a text also a path, and for
+    what may be several names a list."""
+    if field in WRITTEN:
+        return WRITTEN[field]
+    text = inspect.formatannotation(kind).replace("typing.", "").replace("NoneType", "None")
+    match = re.fullmatch(r"Optional\[(.*)\]", text)
+    parts = [match[1], "None"] if match else re.split(r" \| (?![^\[]*\])", text)
+    wider = {"str": "Path | Names" if field in (*SEVERAL, "prompt", "vary", "ways") else "str | Path"}
+    return " | ".join(re.sub(r"^dict\[.*", "Mapping[str, Any]", wider.get(one, one)) for one in parts)
 
 
 def _docstring(text: str, names: Sequence[str], command: str, settings: Sequence[str]) -> str:

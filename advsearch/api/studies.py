@@ -8,11 +8,9 @@ are whole attacks, in a curve all those of an object, so that one whose worker d
 from __future__ import annotations
 
 import tempfile
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
 
 from advsearch import rooms
 from advsearch.api import carry_out
@@ -25,21 +23,18 @@ from advsearch.engine.naming import check_run_settings, different, load_models, 
 from advsearch.engine.transport import CleanMatrix
 from advsearch.errors import ClusterError
 from advsearch.files import JsonObject
-from advsearch.interrupts import interruptible
-from advsearch.progress import NullProgress, Progress
-from advsearch.report.markup import figure_of_answer
-from advsearch.report.shown import shown
+from advsearch.progress import Progress
+from advsearch.question import Asked
 from advsearch.runs import files
-from advsearch.runs.directory import CONFIG, PARTS, RunDirectory, default_name, is_run
+from advsearch.runs.directory import CONFIG, PARTS, default_name, is_run
 from advsearch.runs.files import PART, storage_errors, write_bytes
 from advsearch.runs.listing import finished
 from advsearch.runs.results.attack import AttackSummary
-from advsearch.runs.results.base import INTERRUPTED, Result, StudyResult
+from advsearch.runs.results.base import INTERRUPTED, Result
 from advsearch.runs.summary import attack_of, read_result
 from advsearch.scene.library import list_objects, load_object
 from advsearch.settings import FILES, Config
 from advsearch.tasks import make_task
-from advsearch.viewer.pages import keep_answer
 
 
 def carry_out_part(path: Path, config: Config, progress: Progress) -> Result:
@@ -51,9 +46,6 @@ def carry_out_part(path: Path, config: Config, progress: Progress) -> Result:
         return read_result(path)
     return carry_out(type(config).from_yaml(path / CONFIG, config.asked), progress=progress, resumed=path)
 
-
-Study = TypeVar("Study", bound=StudyResult)
-Rows = TypeVar("Rows")
 
 LONGEST = 6 * 3600.0
 """Seconds that one attack may take on a worker before it counts as hanging."""
@@ -166,7 +158,7 @@ def share(config: AttackConfig, chains: Sequence[Chain], run: Path, progress: Pr
     left = [number for number, chain in enumerate(chains) if not any(is_run(run / PARTS / one.name) for one in chain)]
     plain = config.to_repeat().model_copy(update={"workers": None, "cluster": None}).plain()
     settings, threads = {"command": config.command, **plain}, config.used_threads or 1
-    work = Work("advsearch.api.studies:attacks_of", settings, FILES, threads, seconds=LONGEST, ahead=False)
+    work = Work("advsearch.api.studies:attacks_of", settings, FILES, threads, seconds=LONGEST)
     workers, cluster = (config.workers, config.cluster) if left else (None, None)
     with executor_of(work, workers=workers, cluster=cluster, tell=progress.message) as executor:
         if executor is None:
@@ -197,43 +189,6 @@ def _place(folder: Path, name: str, before: str, files: Mapping[str, bytes]) -> 
 # ---- one study ------------------------------------------------------------------------------------------------------
 
 
-def carry_out_study(
-    config: AttackConfig,
-    attacks: Callable[[StudyRun], Rows],
-    result_of: Callable[[Rows, StudyResult], Study],
-    progress: Progress | None,
-    resumed: Path | None,
-) -> Study:
-    """Carry out the attacks of a study in its run: `attacks` does so and returns their rows, and `result_of` puts these
-    into a result, beside what all studies have in common."""
-    begun, progress = time.perf_counter(), progress or NullProgress()
-    with RunDirectory.of(config, resumed) as run:
-        notes = _label_for_all(config)
-        for text in notes:
-            progress.message(text)
-        study = StudyRun(config, run, progress)
-        rows = attacks(study)
-        common = StudyResult(
-            run=str(run.path),
-            objects=list(config.objects),
-            controls=list(config.controls),
-            environment=config.lit_by,
-            model=config.model,
-            task=config.task_name,
-            policy=config.policy_name,
-            warnings=[*notes, *study.warnings],
-            parts=study.names,
-            ending=INTERRUPTED if study.interrupted else "done",
-            seconds={"total": time.perf_counter() - begun},
-            seed=config.seed,
-            command_line=config.command_line(),
-        )
-        result = result_of(rows, common)
-        for suffix, data in figure_of_answer(shown(result)).items():
-            write_bytes(run.path / "images" / f"{config.command}.{suffix}", data)
-        return keep_answer(run, result)
-
-
 def _label_for_all(config: AttackConfig) -> list[str]:
     """What there is to say where several bundled objects have one label."""
     if config.label is None or len(config.objects) < 2:
@@ -251,16 +206,20 @@ class StudyRun:
     After an interrupt nothing more is carried out.
     """
 
-    def __init__(self, config: AttackConfig, run: RunDirectory, progress: Progress) -> None:
-        self.chains, self.run, self.progress = chains_of(config), run, progress
+    def __init__(self, asked: Asked[AttackConfig]) -> None:
+        self.asked, self.run, self.progress = asked, asked.run, asked.progress
+        self.warnings = _label_for_all(asked.config)
+        for text in self.warnings:
+            self.progress.message(text)
+        self.chains = chains_of(asked.config)
         self.names: list[str] = []
-        self.warnings: list[str] = []
-        self.interrupted = False
-        try:
-            with interruptible():
-                share(config, self.chains, run.path, progress)
-        except KeyboardInterrupt:
-            self.interrupted = True
+        with asked.until_interrupted():
+            share(asked.config, self.chains, self.run.path, self.progress)
+
+    @property
+    def interrupted(self) -> bool:
+        """Whether there was an interrupt."""
+        return self.asked.ending == INTERRUPTED
 
     def attack(self, one: StudyAttack, clean: CleanMatrix | None = None) -> AttackSummary | None:
         """Return the summary of one attack, or None if there was an interrupt; `clean` as for `attack_once`."""
@@ -282,5 +241,6 @@ class StudyRun:
             own = config.model_copy(update={"run": str(path), "overwrite": True})
             summary = attack_once()(own, progress=self.progress, clean=clean).summary
         self.warnings += [text for text in summary.warnings if text not in self.warnings]
-        self.interrupted = summary.ending == INTERRUPTED
+        if summary.ending == INTERRUPTED:
+            self.asked.ending = INTERRUPTED
         return None if self.interrupted else summary

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import importlib
-import os
 import re
 import shutil
 import signal
@@ -24,21 +23,23 @@ from typing import Any, NoReturn, cast
 
 from advsearch import __version__
 from advsearch.cli.output import end_output, open_descriptors, screens, shortened
+from advsearch.cli.question import Positional, QuestionCommand
 from advsearch.errors import AdvsearchError, InputError, UnknownNameError
 from advsearch.interrupts import INTERRUPTS, end_at_the_second, unless_interrupted
 from advsearch.registry import allow_code, nothing_allowed
-from advsearch.rooms import there
+from advsearch.rooms import help_of as help_of_question
+from advsearch.rooms import made_question, made_questions, rooms
 
 GROUPS = {
     "ask: what does a model get wrong?": {
-        "attack": "advsearch.questions.attack",
-        "sweep": "advsearch.questions.sweep",
-        "gap": "advsearch.questions.gap",
-        "region": "advsearch.questions.region",
-        "explain": "advsearch.questions.explain",
-        "compare": "advsearch.questions.compare",
-        "recipe": "advsearch.questions.recipe",
-        "harden": "advsearch.questions.harden",
+        "attack": "",
+        "sweep": "",
+        "gap": "",
+        "region": "",
+        "explain": "",
+        "compare": "",
+        "recipe": "",
+        "harden": "",
     },
     "look: at scenes, names and answers": {
         "render": "advsearch.cli.show:RENDER render a picture of a scene, and say what the model sees in it",
@@ -46,18 +47,18 @@ GROUPS = {
         "show what a run found, or the details of a control, a policy, a task or a recipe",
         "view": "advsearch.cli.dashboard:VIEW write the page of a run again, or a folder that any web server can serve",
         "dashboard": "advsearch.cli.dashboard:DASHBOARD show the pages of runs in a browser on this machine",
-        "report": "advsearch.questions.report",
+        "report": "",
         "list": "advsearch.cli.names:LIST "
         "list all names: objects, environments, controls, policies, tasks, objectives, models and recipes",
         "labels": "advsearch.cli.names:LABELS find the names of a model's classes, as --label takes them",
     },
     "trust: does an answer hold, and is the tool right?": {
-        "test": "advsearch.questions.test",
-        "replay": "advsearch.questions.replay",
-        "check": "advsearch.questions.check",
-        "plan": "advsearch.questions.plan",
-        "precision": "advsearch.questions.precision",
-        "stability": "advsearch.questions.stability",
+        "test": "",
+        "replay": "",
+        "check": "",
+        "plan": "",
+        "precision": "",
+        "stability": "",
         "doctor": "advsearch.cli.doctor:DOCTOR check every part that a run needs, with versions and how to mend it",
     },
     "files and runs: repeat, continue, bring in, take out": {
@@ -71,10 +72,16 @@ GROUPS = {
         "import-3db": "advsearch.cli.imports:IMPORT_3DB turn a folder that 3DB wrote into a run",
     },
 }
-"""Each command and its module, in the groups and the order in which the help shows them; of those of this package, the
-`Command` in it and what it does."""
+"""Each command, in the groups and the order in which the help shows them: empty for a question, which is found by its
+name; for another command its module, the `Command` in it and what it does. A question that `question`
+makes needs no line here: the help shows it behind the others that ask."""
 
-COMMANDS = {name: place for group in GROUPS.values() for name, place in group.items() if there(place)}
+for _name in set(made_questions()).difference(*GROUPS.values()):
+    next(iter(GROUPS.values()))[_name] = ""
+
+COMMANDS = {name: place for group in GROUPS.values() for name, place in group.items() if place or name in rooms()}
+
+ROOM = "advsearch.questions."
 
 OK, BAD_INPUT, INTERRUPTED = 0, 2, 130
 
@@ -109,7 +116,6 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _interruptible(given: list[str]) -> int:
     """As `_status`, with Ctrl-C for as long as there is something to interrupt, and never a traceback of it."""
     sys.unraisablehook = unless_interrupted
-    os.environ.setdefault("PYTHONSAFEPATH", "1")  # of workers, which would look for modules here first
     try:
         signal.signal(signal.SIGINT, INTERRUPTS)
         end_at_the_second()
@@ -214,11 +220,9 @@ def add_command(
     if not whole:
         return cast(argparse.ArgumentParser, subparsers.add_parser(name))
     command, text = found(name), help_of(name)
-    if " " in COMMANDS[name]:
-        more, lines = command.more, command.examples
-    else:
-        module = importlib.import_module(COMMANDS[name])
-        more, lines = getattr(module, "MORE", ""), getattr(module, "EXAMPLES", ())
+    module = command if COMMANDS[name] or made_question(name) else importlib.import_module(f"{ROOM}{name}")
+    more = getattr(module, "more", getattr(module, "MORE", ""))
+    lines = getattr(module, "examples", getattr(module, "EXAMPLES", ()))
     parser: argparse.ArgumentParser = subparsers.add_parser(
         name,
         description=f"{text[0].upper()}{text[1:]}{more}.",
@@ -247,15 +251,19 @@ def _unknown_argument(argument: str, parser: argparse.ArgumentParser) -> InputEr
 
 def found(name: str) -> Any:
     """Return what adds the arguments of a command and runs it: its `QuestionCommand` or `Command`, or a module."""
-    module, _, attribute = COMMANDS[name].partition(" ")[0].partition(":")
-    imported = importlib.import_module(module)
-    return getattr(imported, attribute or "COMMAND", imported)
+    if COMMANDS[name]:
+        place, _, attribute = COMMANDS[name].partition(" ")[0].partition(":")
+        return getattr(importlib.import_module(place), attribute)
+    if made := made_question(name):
+        unflagged = Positional(*made.expected) if made.expected else None
+        return QuestionCommand(name, about=made.about, place=unflagged, examples=made.examples, brought=made.brought)
+    module = importlib.import_module(f"{ROOM}{name}")
+    return getattr(module, "COMMAND", module)
 
 
 def help_of(name: str) -> str:
     """Return what a command does, in a line."""
-    place, _, text = COMMANDS[name].partition(" ")
-    return text or str(importlib.import_module(place).HELP)
+    return COMMANDS[name].partition(" ")[2] or help_of_question(name)
 
 
 if __name__ == "__main__":

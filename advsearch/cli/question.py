@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from advsearch.cli import output
@@ -12,8 +13,6 @@ from advsearch.cli.output import at_work
 from advsearch.errors import InputError
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from advsearch.settings import Config
 
 FELL_SHORT = 3
@@ -59,6 +58,7 @@ class QuestionCommand:
         about: the setting that names runs, or a file, which the question is about; `--code` allows Python code that
             these name.
         place: how that setting is given without its flag.
+        brought: returns the settings that the `run.yaml` of the run that it is about brings, by what was typed.
         more, examples: as of `Command`.
     """
 
@@ -67,6 +67,7 @@ class QuestionCommand:
     short: Callable[[Any], bool] = lambda result: False
     about: str = ""
     place: Positional | None = None
+    brought: Callable[[Path, Mapping[str, Any]], dict[str, Any]] | None = None
     more: str = ""
     examples: tuple[str, ...] = ()
 
@@ -118,6 +119,8 @@ class QuestionCommand:
         from advsearch.cli.flags import config_from
         from advsearch.config import CONFIGS
 
+        if self.brought and (file := self.file(args)):
+            over = {**self.brought(file, vars(args)), **over}
         return config_from(args, CONFIGS[self.name], **over)
 
     def carry_out(self, config: Config, *, as_json: bool, quiet: bool, resumed: Path | None = None) -> int:

@@ -19,10 +19,7 @@ from advsearch.runs.listing import finished, listed_runs
 from advsearch.settings import Config, parse_assignment, read_yaml
 from advsearch.settings.values import put
 
-COMMANDS = (
-    *("attack", "sweep", "recipe", "gap", "region", "precision", "check", "plan", "stability", "harden", "explain"),
-    *("compare", "test"),
-)
+COMMANDS = tuple(name for name in CONFIGS if name != "render")
 """What the `command` of a file may say."""
 
 

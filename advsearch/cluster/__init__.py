@@ -4,8 +4,10 @@ settings alone."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future
 from dataclasses import dataclass, field
+from queue import SimpleQueue
 from typing import Any, Protocol
 
 from advsearch.files import JsonObject
@@ -19,15 +21,14 @@ Call = Callable[[Sequence[Any]], Any]
 class Work:
     """What batches are of, so that another process can carry them out: ``"package.module:function"``, which takes the
     settings and returns a `Call`; which settings may hold paths, separated by commas, whose files go along; processor
-    threads of a worker; seconds that a batch may take at least (None: by the median); whether a worker has its next
-    batch `ahead`, not where batches take long; and the code that a worker may import by its name, as this process."""
+    threads of a worker; seconds that a batch may take at least (None: by the median); and the code that a worker may
+    import by its name, as this process."""
 
     function: str
     settings: JsonObject
     files: tuple[str, ...] = ()
     threads: int = 1
     seconds: float | None = None
-    ahead: bool = True
     code: tuple[str, ...] = field(default_factory=allowed_code)
 
 
@@ -46,9 +47,9 @@ class Done:
 
 @dataclass
 class Workforce:
-    """How the workers did: those that are ready, at once at most, went away untold, and cannot do the work; batches
-    that were given out again and came back; seconds spent on batches, on getting ready, and ready; machines that are
-    not like this one, by name, and the link of a page that shows the workers."""
+    """How the workers did: those that are ready, at once at most, died, and cannot do the work; batches that were given
+    out again and came back; seconds spent on batches, on getting ready, and ready; machines that are not like this one,
+    by name, and the link of a page that shows the workers."""
 
     workers: int = 0
     most: int = 0
@@ -95,70 +96,37 @@ class InProcess:
             yield Done(items, self._call(items))
 
 
-@dataclass(frozen=True)
-class Joined:
-    """The worker with that address is there."""
-
-    worker: str
+class WorkerDiedError(Exception):
+    """What the future of a call ends with whose worker has gone."""
 
 
-@dataclass(frozen=True)
-class Left:
-    """The worker with that address has gone, because it was told to or for another reason."""
-
-    worker: str
-    told: bool = False
-
-
-@dataclass(frozen=True)
-class Ended:
-    """The call with that ticket has ended, and has returned the value."""
-
-    ticket: int
-    value: Any
-
-
-@dataclass(frozen=True)
-class Dropped:
-    """The call with that ticket came to no end, because its worker or the connection went; the reason in words."""
-
-    ticket: int
-    reason: str = ""
-
-
-@dataclass(frozen=True)
-class Disconnected:
-    """The scheduler has gone, and all workers with it."""
-
-
-Event = Joined | Left | Ended | Dropped | Disconnected
+class SchedulerGoneError(Exception):
+    """The scheduler of a pool has gone, and all workers and calls with it."""
 
 
 class Pool(Protocol):
-    """A pool of workers, each of which does one call after the other in the order in which it was given them."""
+    """Workers, each of which does one call at a time."""
 
-    @property
-    def link(self) -> str:
-        """Of a page that shows the workers; empty where there is none."""
+    where: str
+    """What it is, in a user's words."""
 
-    @property
-    def where(self) -> str:
-        """What it is, in a user's words."""
+    link: str
+    """Of a page that shows the workers; empty where there is none."""
 
-    def submit(self, ticket: int, worker: str, function: Callable[..., Any], *args: Any) -> None:
-        """Have a worker call a function of a module; an `Ended` or `Dropped` with this ticket follows."""
+    ended: SimpleQueue[Future[Any]]
+    """Futures of calls that have ended, put there by who submitted them."""
+
+    def workers(self) -> Collection[str]:
+        """Return the addresses of the workers that are there. Raises SchedulerGoneError."""
+
+    def submit(self, worker: str, function: Callable[..., Any], *args: Any) -> Future[Any]:
+        """Have a worker call a function of a module. The future ends with a WorkerDiedError or never if it dies."""
 
     def restart(self, worker: str) -> None:
-        """End a worker that does not answer; another may join in its place."""
-
-    def forget(self, ticket: int) -> None:
-        """Nothing will be done with the answer of this call."""
-
-    def events(self, seconds: float) -> list[Event]:
-        """Return what has happened since the last time; wait so long at most where nothing has."""
+        """End a worker that does not answer; another may stand in its place, at another address."""
 
     def reconnect(self) -> None:
-        """Find the scheduler again, or start another."""
+        """Find the scheduler again, or start another. Raises ClusterError where there is none."""
 
     def close(self) -> None:
         """Let the workers go, those that were started for this pool for ever."""

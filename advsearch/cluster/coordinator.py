@@ -1,24 +1,22 @@
-"""Gives batches to workers, `DEPTH` at most to each, and takes what comes of them. A batch whose worker died is then
-the only one that a worker has, so that it is known what it died of: after `DEATHS` it is cut in halves, and a single
-item given up in words. A worker that takes far longer than the median counts as dead; its late answers change nothing.
-"""
+"""Gives batches to workers, one to each, and takes what comes of them. A batch of which `DEATHS` workers died is cut in
+halves, and a single item given up in words. A worker that takes far longer than the median counts as dead; its late
+answers change nothing."""
 
 from __future__ import annotations
 
+import queue
 import statistics
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from concurrent.futures import Future
+from dataclasses import dataclass
 from typing import Any
 
-from advsearch.cluster import Disconnected, Done, Dropped, Ended, Event, Joined, Left, Pool, Work, Workforce
+from advsearch.cluster import Done, Pool, SchedulerGoneError, Work, WorkerDiedError, Workforce
 from advsearch.cluster.worker import Carried, Failure, Files, MachineInfo, Ready, carry_out_batch, machine_name, prepare
 from advsearch.errors import ClusterError
 from advsearch.interrupts import INTERRUPTS
-
-DEPTH = 2
-"""Batches that a worker has at once: the one it is at, and the next (`Work.ahead`), so that it never waits."""
 
 DEATHS = 3
 """Workers that may die of a batch before it is cut in halves or given up."""
@@ -39,15 +37,15 @@ PATIENCE, LESS_PATIENCE = 300.0, 15.0
 """Seconds without any worker after which there is no hope; where those that are there are refused, fewer."""
 
 POLL = 0.5
-"""Seconds between two looks at the clock where nothing happens."""
+"""Seconds between two looks at the clock, and at who is there."""
 
 
 @dataclass(eq=False)
 class _Batch:
     items: Sequence[Any]
-    alone: bool = False
+    turn: int
+    """The call of `results` that wants it."""
     deaths: int = 0
-    wanted: bool = True
 
 
 @dataclass(eq=False)
@@ -56,7 +54,9 @@ class _Worker:
     ready: bool = False
     sent: bool = False
     machine: str | None = None
-    tickets: list[int] = field(default_factory=list)
+    call: Future[Any] | None = None
+    """What it is at since when: a batch, or, with none, it gets ready."""
+    batch: _Batch | None = None
     since: float = 0.0
 
 
@@ -75,173 +75,134 @@ class Coordinator:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.facts = Workforce(link=pool.link)
-        self._pool, self._key, self._tell, self._clock = pool, key, tell, clock
-        self._depth = DEPTH if work.ahead else 1
-        self._work, self._files, self._version = work, files, version
+        self._pool, self._tell, self._clock = pool, tell, clock
+        self._work, self._key, self._files, self._version = work, key, files, version
         self._here = machine_name(machine)
-        self._machines: dict[str, MachineInfo] = {}
         self._workers: dict[str, _Worker] = {}
-        self._refused: dict[str, str] = {}
-        self._tickets: dict[int, tuple[_Worker, _Batch | None]] = {}
-        self._next_ticket = self._under_way = 0
+        self._owners: dict[Future[Any], _Worker] = {}
+        self._avoided: dict[str, str] = {}  # those that are given nothing, as long as they are there: why, or empty
         self._todo: deque[_Batch] = deque()
-        self._call = 0
-        self._events: deque[Event] = deque()
-        self._free: deque[_Worker] = deque()
+        self._turn = self._under_way = 0  # calls of `results`, and batches of the last one that workers have
         self._per_item: deque[float] = deque(maxlen=MEDIAN_OF)
         self._load_deaths = self._seen = 0
-        self._counted_at = self._alone_since = self._looked_at = clock()
+        self._looked_at = float("-inf")
+        self._counted_at = self._alone_since = clock()
 
     def results(self, batches: Iterable[Sequence[Any]]) -> Iterator[Done]:
-        self._let_go()  # what an earlier call has left under way
-        self._call += 1
-        call, source = self._call, iter(batches)
+        self._turn += 1
+        turn, source = self._turn, iter(batches)
+        self._todo.clear()
+        self._under_way = 0  # what an earlier call has left comes to nothing
         self._per_item.clear()  # those before may have taken other times
         if not self._workers:
             self._alone_since = self._clock()
         try:
             while True:
                 INTERRUPTS.look()
-                if call != self._call:
+                if turn != self._turn:
                     raise RuntimeError("these results were given up when others were asked for")
+                if self._clock() - self._looked_at >= POLL:
+                    yield from self._look_around()
                 self._give_out(source)
                 if not self._todo and not self._under_way:
                     items = next(source, None)  # there may be more, and nobody yet who is ready for it
                     if items is None:
                         return
-                    self._todo.append(_Batch(items))
-                if not self._events:
-                    self._events.extend(self._pool.events(POLL))
-                while self._events:
-                    yield from self._happened(self._events.popleft())
-                self._count_time()
-                yield from self._look_at_clock()
+                    self._todo.append(_Batch(items, turn))
+                yield from self._answers()
         finally:
-            if call == self._call:
-                self._let_go()
-
-    def _let_go(self) -> None:
-        """Let what is under way come to nothing."""
-        self._todo.clear()
-        for _, one in self._tickets.values():
-            if one is not None:
-                one.wanted = False
+            if turn == self._turn:
+                self._turn += 1
+                self._todo.clear()
 
     # ---- giving out -------------------------------------------------------------------------------------------------
 
     def _give_out(self, source: Iterator[Sequence[Any]]) -> None:
-        while self._free:
-            worker = self._free[0]
-            if not self._is_there(worker):
-                self._free.popleft()
+        """Give batches to workers that have nothing to do."""
+        for worker in self._workers.values():
+            if not worker.ready or worker.call is not None:
                 continue
             if not self._todo:
                 items = next(source, None)
                 if items is None:
                     return
-                self._todo.append(_Batch(items))
-            one = self._todo.popleft()
-            if one.alone:
-                idle = next((free for free in self._free if not free.tickets and self._is_there(free)), None)
-                if idle is None:  # soon
-                    self._todo.appendleft(one)
-                    return
-                worker = idle
-                self._free = deque(free for free in self._free if free is not worker)
-            else:
-                self._free.popleft()
-            self._submit(worker, one)
+                self._todo.append(_Batch(items, self._turn))
+            worker.batch = batch = self._todo.popleft()
+            self._under_way += 1
+            self._submit(worker, carry_out_batch, self._key, batch.items)
 
-    def _is_there(self, worker: _Worker) -> bool:
-        return self._workers.get(worker.address) is worker
+    def _prepare(self, worker: _Worker, *, send: bool = False) -> None:
+        """Have a worker get ready; `send` it the files then, which it may have already."""
+        files = self._files if send else self._files.named_only
+        self._submit(worker, prepare, self._key, self._work, files, self._version)
 
-    def _submit(self, worker: _Worker, one: _Batch | None, *, send: bool = False) -> None:
-        """Give a worker a batch, or have it get ready; `send` it the files then, which it may have already."""
-        ticket, self._next_ticket = self._next_ticket, self._next_ticket + 1
-        if not worker.tickets:
-            worker.since = self._clock()
-        worker.tickets.append(ticket)
-        self._tickets[ticket] = worker, one
-        self._under_way += one is not None
-        if one is None:
-            files = self._files if send else self._files.named_only
-            self._pool.submit(ticket, worker.address, prepare, self._key, self._work, files, self._version)
-        else:
-            self._pool.submit(ticket, worker.address, carry_out_batch, self._key, one.items)
-
-    # ---- what happens -----------------------------------------------------------------------------------------------
-
-    def _happened(self, event: Event) -> Iterator[Done]:
-        if isinstance(event, Joined):
-            if event.worker not in self._workers and event.worker not in self._refused:
-                self._workers[event.worker] = worker = _Worker(event.worker)
-                self._seen = max(self._seen, len(self._workers))
-                self._submit(worker, None)
-        elif isinstance(event, Left):
-            self._refused.pop(event.worker, None)
-            yield from self._gone(event.worker, died=not event.told)
-        elif isinstance(event, Dropped):
-            found = self._tickets.get(event.ticket)
-            if found is not None:
-                yield from self._gone(found[0].address, died=True)
-        elif isinstance(event, Ended):
-            yield from self._answered(event)
-        elif isinstance(event, Disconnected):
-            self._tell(f"{self._pool.where}: the scheduler has gone; what was under way will be done again")
-            for address in list(self._workers):
-                yield from self._gone(address, died=False)
-            self._refused.clear()
-            self._pool.reconnect()
-            self.facts.link = self._pool.link
-            self._alone_since = self._clock()
-
-    def _answered(self, event: Ended) -> Iterator[Done]:
-        worker, one = self._tickets.pop(event.ticket, (None, None))
-        if worker is None:
-            return  # late
-        self._under_way -= one is not None
-        worker.tickets.remove(event.ticket)
+    def _submit(self, worker: _Worker, function: Callable[..., Any], *args: Any) -> None:
         worker.since = self._clock()
-        value = event.value
+        worker.call = self._pool.submit(worker.address, function, *args)
+        self._owners[worker.call] = worker
+        worker.call.add_done_callback(self._pool.ended.put)
+
+    # ---- what comes back --------------------------------------------------------------------------------------------
+
+    def _answers(self) -> Iterator[Done]:
+        """Wait a moment for a call that ends, and yield what came of all that have."""
+        ended = list[Future[Any]]()
+        try:
+            ended.append(self._pool.ended.get(timeout=POLL))
+            while True:
+                ended.append(self._pool.ended.get_nowait())
+        except queue.Empty:
+            pass
+        # as a list: nobody may go on asking
+        yield from [done for future in ended for done in self._answered(future)]
+
+    def _answered(self, future: Future[Any]) -> Iterator[Done]:
+        if future not in self._owners or future.cancelled():
+            return  # late, or the scheduler has gone, which the next look tells
+        worker = self._owners[future]
+        if isinstance(future.exception(), WorkerDiedError):
+            yield from self._died(worker)
+            return
+        value, batch = future.result(), worker.batch
+        del self._owners[future]
+        worker.call = worker.batch = None
+        wanted = batch is not None and batch.turn == self._turn
+        self._under_way -= wanted
         if isinstance(value, Ready):
             self._is_ready(worker, value)
-        elif isinstance(value, Carried) and one is not None:
+        elif isinstance(value, Carried) and batch is not None:
             self.facts.batches += 1
             self.facts.busy += value.seconds
-            self._per_item.append(value.seconds / max(1, len(one.items)))
-            self._set_free(worker, self._depth if one.alone else 1)
-            if one.wanted:
-                yield Done(one.items, value.value, worker.address, worker.machine)
-        elif isinstance(value, Failure):
-            if one is not None and one.wanted and (value.unfit or value.forgotten):
-                self._todo.appendleft(one)
+            self._per_item.append(value.seconds / max(1, len(batch.items)))
+            if wanted:
+                yield Done(batch.items, value.value, worker.address, worker.machine)
+        elif not isinstance(value, Failure):
+            raise TypeError(f"on {worker.address}: {value!r:.80}")
+        elif value.missing and not worker.sent:
+            worker.sent = True
+            self._prepare(worker, send=True)
+        elif value.unfit or value.missing or value.forgotten:
+            if batch is not None and wanted:
+                self._todo.appendleft(batch)
+            self._take_back(worker)
             if value.forgotten:
-                self._forget(worker)
-                self._requeue(worker)
                 self._workers[worker.address] = again = _Worker(worker.address)
-                self._submit(again, None)
-            elif value.missing and not worker.sent:
-                worker.sent = True
-                self._submit(worker, None, send=True)
-            elif value.unfit or value.missing:
-                # give a worker nothing more
-                self.facts.refused += 1
-                self._refused[worker.address] = value.text
-                self._tell(f"{worker.address} is given nothing: {value.text}")
-                self._forget(worker)
-                self._requeue(worker)
-            elif value.trace:
-                raise RuntimeError(f"on {worker.address}:\n{value.trace}")
+                self._prepare(again)
             else:
-                raise ClusterError(value.text)
+                self.facts.refused += 1
+                self._avoided[worker.address] = value.text
+                self._tell(f"{worker.address} is given nothing: {value.text}")
+        elif value.trace:
+            raise RuntimeError(f"on {worker.address}:\n{value.trace}")
+        else:
+            raise ClusterError(value.text)
 
     def _is_ready(self, worker: _Worker, value: Ready) -> None:
         name = machine_name(value.machine)
         if name != self._here:
             worker.machine = name
-            if name not in self._machines:
-                self._machines[name] = value.machine
-                self.facts.machines = dict(self._machines)
+            if name not in self.facts.machines:
+                self.facts.machines = {**self.facts.machines, name: value.machine}
                 told = ", ".join(f"{key} {text}" for key, text in value.machine.items())
                 self._tell(f"{worker.address} is another machine than this ({told}): last bits of rows may differ")
         self._count_time()
@@ -250,98 +211,93 @@ class Coordinator:
         worker.ready = True
         self.facts.workers += 1
         self.facts.most = max(self.facts.most, self.facts.workers)
-        self._set_free(worker, self._depth)
 
-    def _set_free(self, worker: _Worker, places: int) -> None:
-        """Note places for batches: the first one of a worker that has nothing to do in front of all others."""
-        idle = not worker.tickets
-        self._free.extendleft([worker] * idle)
-        self._free.extend([worker] * (places - idle))
+    # ---- workers that come and go -----------------------------------------------------------------------------------
 
-    def _gone(self, address: str, *, died: bool) -> Iterator[Done]:
-        """Take back what a worker had; what it was at when it died is suspected."""
-        worker = self._workers.get(address)
-        if worker is None:
+    def _look_around(self) -> Iterator[Done]:
+        """See who has come and gone, and who takes too long."""
+        self._count_time()
+        now = self._looked_at = self._clock()
+        try:
+            there = self._pool.workers()
+        except SchedulerGoneError:
+            self._tell(f"{self._pool.where}: the scheduler has gone; what was under way will be done again")
+            for worker in list(self._workers.values()):
+                self._take_back(worker)
+            self._avoided.clear()
+            self._pool.reconnect()
+            self.facts.link, self._alone_since = self._pool.link, self._clock()
+            self._looked_at = float("-inf")
             return
-        self._forget(worker)
-        head = self._tickets.get(worker.tickets[0]) if worker.tickets else None
-        if died:
-            self.facts.lost += 1
-        if died and head is not None and not worker.ready:
+        for worker in [one for one in self._workers.values() if one.address not in there]:
+            yield from self._died(worker)
+        self._avoided = {address: why for address, why in self._avoided.items() if address in there}
+        for address in there:
+            if address not in self._workers and address not in self._avoided:
+                self._workers[address] = worker = _Worker(address)
+                self._seen = max(self._seen, len(self._workers))
+                self._prepare(worker)
+        median = statistics.median(self._per_item) if len(self._per_item) >= ENOUGH else None
+        for worker in [one for one in self._workers.values() if one.call is not None]:
+            batch, deadline = worker.batch, FIRST_DEADLINE
+            if batch is not None and median is not None:
+                deadline = max(LEAST_DEADLINE, SLOW * median * len(batch.items))
+            if batch is not None and self._work.seconds is not None:
+                deadline = max(deadline, self._work.seconds)
+            if now - worker.since > deadline:
+                self._tell(f"{worker.address} has not answered for {now - worker.since:.0f} s, so it is ended")
+                self._pool.restart(worker.address)
+                yield from self._died(worker)
+        patience = LESS_PATIENCE if any(self._avoided.values()) else PATIENCE
+        if not self._workers and now - self._alone_since > patience:
+            self._give_up(f"there was no worker that can do it for {patience:.0f} s")
+
+    def _died(self, worker: _Worker) -> Iterator[Done]:
+        """Take back what a worker had, which it may have died of."""
+        self.facts.lost += 1
+        self._avoided[worker.address] = ""  # until it is seen to be gone
+        batch = self._take_back(worker)
+        if not worker.ready:
             self._load_deaths += 1
             if self._load_deaths >= LOADS * max(2, self._seen) and not self.facts.workers:
                 self._give_up(f"{self._load_deaths} workers died while they loaded the scene and the model")
-        held = [self._tickets[ticket][1] for ticket in worker.tickets] if died else []
-        suspects = [one for one in held if one is not None and one.wanted]
-        self._requeue(worker)
-        for one in suspects:
-            one.alone = True
-        if len(suspects) != 1:
+        if batch is None:
             return
-        (suspect,) = suspects
-        suspect.deaths += 1
-        if suspect.deaths < DEATHS:
+        batch.deaths += 1
+        if batch.deaths < DEATHS:
             return
-        self._todo.remove(suspect)
-        items = suspect.items
-        if len(items) > 1:
-            half = len(items) // 2
-            self._todo.appendleft(_Batch(items[half:], alone=True))
-            self._todo.appendleft(_Batch(items[:half], alone=True))
+        self._todo.remove(batch)
+        half = len(batch.items) // 2
+        if half:
+            self._todo.extendleft(_Batch(items, self._turn) for items in (batch.items[half:], batch.items[:half]))
         else:
-            yield Done(items, None, address, lost=f"no answer: {suspect.deaths} workers died of it")
+            yield Done(batch.items, None, worker.address, lost=f"no answer: {batch.deaths} workers died of it")
 
-    def _forget(self, worker: _Worker) -> None:
+    def _take_back(self, worker: _Worker) -> _Batch | None:
+        """Give a worker nothing more; put what it had back in front, and return it."""
         self._count_time()
         self._workers.pop(worker.address, None)
         self.facts.workers -= worker.ready
         if not self._workers:
             self._alone_since = self._clock()
-
-    def _requeue(self, worker: _Worker) -> None:
-        """Put what a worker had back in front, in its order."""
-        for ticket in reversed(worker.tickets):
-            _, one = self._tickets.pop(ticket, (None, None))
-            self._pool.forget(ticket)
-            if one is not None:
-                self._under_way -= 1
-            if one is not None and one.wanted:
-                self.facts.retried += 1
-                self._todo.appendleft(one)
-        worker.tickets.clear()
-
-    # ---- the clock --------------------------------------------------------------------------------------------------
+        if worker.call is not None:
+            del self._owners[worker.call]
+            worker.call.cancel()
+        batch = worker.batch
+        if batch is None or batch.turn != self._turn:
+            return None
+        self._under_way -= 1
+        self.facts.retried += 1
+        self._todo.appendleft(batch)
+        return batch
 
     def _count_time(self) -> None:
         now = self._clock()
         self.facts.alive += self.facts.workers * (now - self._counted_at)
         self._counted_at = now
 
-    def _look_at_clock(self) -> Iterator[Done]:
-        now = self._clock()
-        if now - self._looked_at < POLL:
-            return
-        self._looked_at = now
-        median = statistics.median(self._per_item) if len(self._per_item) >= ENOUGH else None
-        for worker in list(self._workers.values()):
-            if not worker.tickets:
-                continue
-            one = self._tickets[worker.tickets[0]][1]
-            deadline = FIRST_DEADLINE
-            if one is not None and median is not None:
-                deadline = max(LEAST_DEADLINE, SLOW * median * len(one.items))
-            if one is not None and self._work.seconds is not None:
-                deadline = max(deadline, self._work.seconds)
-            if now - worker.since > deadline:
-                self._tell(f"{worker.address} has not answered for {now - worker.since:.0f} s, so it is ended")
-                self._pool.restart(worker.address)
-                yield from self._gone(worker.address, died=True)
-        patience = LESS_PATIENCE if self._refused else PATIENCE
-        if not self._workers and now - self._alone_since > patience:
-            self._give_up(f"there was no worker that can do it for {patience:.0f} s")
-
     def _give_up(self, text: str) -> None:
-        reasons = "; ".join(dict.fromkeys(self._refused.values()))
+        reasons = "; ".join(dict.fromkeys(filter(None, self._avoided.values())))
         raise ClusterError(
             f"{self._pool.where}: {text}" + (f" ({reasons})" if reasons and reasons != text else "") + "; what was "
             "stored is kept, so that the run can go on with advsearch resume"

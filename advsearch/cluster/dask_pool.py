@@ -1,34 +1,28 @@
-"""From what a user says (`workers`, `cluster`) to an executor over workers of Dask, in an event loop of its own. Relied
-on (https://distributed.dask.org): the scheduler tells the topic "all" of each worker that it adds and removes; a call
-that is pinned to a worker runs nowhere else; a nanny starts a worker that died again, at another address; processes are
-spawned, and end with their parent."""
+"""Workers of a Dask scheduler, on other machines or this one. Relied on (https://distributed.dask.org): a call that is
+pinned to a worker runs nowhere else; a nanny starts a worker that died again, at another address."""
 
 from __future__ import annotations
 
-import ast
 import asyncio
 import hashlib
 import importlib
 import importlib.util
 import json
 import logging
-import queue
-import signal
-import sys
-import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from concurrent.futures import Future
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from multiprocessing import resource_tracker
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any
 
 from advsearch import threads
-from advsearch.cluster import Disconnected, Dropped, Ended, Event, Executor, Joined, Left, Work
+from advsearch.cluster import Executor, Pool, SchedulerGoneError, Work, WorkerDiedError
 from advsearch.cluster.coordinator import Coordinator
-from advsearch.cluster.worker import Failure, read_files, this_machine, version
+from advsearch.cluster.local_pool import LocalPool
+from advsearch.cluster.worker import Failure, Files, read_files, this_machine, version
 from advsearch.errors import ClusterError, FileFormatError, InputError
 from advsearch.settings import read_yaml
 
@@ -36,28 +30,23 @@ CONNECT, RECONNECT = 30.0, 120.0
 """Seconds to find a scheduler at first, and to find it again when it has gone."""
 
 LOOK = 0.5
-"""Seconds between two looks at whether the scheduler is there."""
-
-RESYNC = 10.0
-"""Seconds between two looks at who is there: an event may get lost."""
+"""Seconds between two tries to reach a scheduler."""
 
 RESTART = 20.0
-"""Seconds that a worker may take to end."""
+"""Seconds that a worker may take to end, and that a scheduler may take to say who is there."""
 
 SILENT = logging.CRITICAL + 1
 """Level of Dask's log: what matters of it is said in a user's words, and a worker that dies is no error here."""
 
 CONFIG = {
-    "distributed.worker.multiprocessing-method": "spawn",  # a fork would share what Mitsuba and torch hold
     "distributed.scheduler.allowed-failures": 1_000_000,  # who died of what is counted by the coordinator
     "distributed.admin.large-graph-warning-threshold": "2GiB",  # files of a scene are sent once a worker
-    "distributed.comm.timeouts.connect": "120s",  # a worker that starts on a busy machine takes its time,
-    "distributed.comm.timeouts.tcp": "120s",  # and one that gives up is not started again,
-    "distributed.deploy.lost-worker-timeout": "1h",  # nor is one that is not back after this
+    "distributed.comm.timeouts.connect": "120s",  # a worker that starts on a busy machine takes its time
+    "distributed.comm.timeouts.tcp": "120s",
+    "distributed.deploy.lost-worker-timeout": "1h",  # one that is not back after this is not started again
     "distributed.worker.profile.enabled": False,
     "distributed.admin.system-monitor.gil.enabled": False,
 }
-
 
 NO_WORKER = ("NoValidWorkerError", "NoWorkerError")
 """Errors by which a scheduler ends a call whose worker has not been there for long."""
@@ -75,137 +64,46 @@ class Site:
     count: int | None = None
 
 
-def local(workers: int) -> Site:
-    """Return the place of so many processes on this machine, which nobody else can reach."""
-
-    def start(**more: Any) -> Any:
-        # comes with the extra `dask`
-        import distributed
-
-        make: Any = distributed.LocalCluster
-        return make(
-            n_workers=workers,
-            threads_per_worker=1,
-            processes=True,
-            host="127.0.0.1",
-            dashboard_address="127.0.0.1:0",
-            memory_limit=0,
-            silence_logs=SILENT,
-            env={"OMP_NUM_THREADS": "1"},
-            **more,
-        )
-
-    return Site(f"{workers} workers on this machine", start=start)
-
-
 class DaskPool:
-    """See `pool.Pool`. Close it."""
+    """See `Pool`. Close it."""
 
-    def __init__(self, place: Site) -> None:
-        self.where, self.link = place.where, ""
-        self._place = place
-        self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
-        self._calls: dict[int, asyncio.Task[None]] = {}
-        self._known: set[str] = set()
+    def __init__(self, site: Site) -> None:
+        self.where, self.link = site.where, ""
+        self.ended: SimpleQueue[Future[Any]] = SimpleQueue()
+        self._site = site
         self._client: Any = None
         self._cluster: Any = None
-        self._watch: asyncio.Task[None] | None = None
-        self._loop = asyncio.new_event_loop()
-        self._thread = threading.Thread(target=self._run, name="cluster", daemon=True)
-        self._thread.start()
+        self._connection: Any = None
+        self._there: Collection[str] = ()
+        self._calls: set[Future[Any]] = set()
         try:
-            self._done(self._open(CONNECT))
+            self._open(CONNECT)
         except BaseException:
             self.close()
             raise
 
-    # ---- what the coordinator calls ---------------------------------------------------------------------------------
-
-    def submit(self, ticket: int, worker: str, function: Callable[..., Any], *args: Any) -> None:
-
-        def begin() -> None:
-            self._calls[ticket] = self._loop.create_task(self._call(ticket, worker, function, args))
-
-        self._loop.call_soon_threadsafe(begin)
-
-    def forget(self, ticket: int) -> None:
-
-        def cancel() -> None:
-            if (call := self._calls.pop(ticket, None)) is not None:
-                call.cancel()
-
-        self._loop.call_soon_threadsafe(cancel)
-
-    def restart(self, worker: str) -> None:
-        """See `Pool.restart`; a worker without a nanny is only told to close."""
-        self._begin(self._restart(worker))
-
-    def events(self, seconds: float) -> list[Event]:
-        found: list[Event] = []
-        try:
-            found.append(self._events.get(timeout=seconds))
-            while True:
-                found.append(self._events.get_nowait())
-        except queue.Empty:
-            return found
-
-    def reconnect(self) -> None:
-        self._done(self._leave())
-        self._done(self._open(RECONNECT))
-
-    def close(self) -> None:
-        if self._loop.is_closed():
-            return
-        try:
-            self._done(self._leave(), RESTART)
-        except Exception:  # it was going anyway
-            pass
-        self._loop.call_soon_threadsafe(self._loop.stop)
-        self._thread.join(RESTART)
-        if not self._thread.is_alive():
-            self._loop.close()
-
-    # ---- in the loop ------------------------------------------------------------------------------------------------
-
-    def _run(self) -> None:
-        """Run the loop; processes that it starts inherit that Ctrl-C, which a terminal sends to all, is ours alone."""
-        resource_tracker.ensure_running()  # else it begins later, and lets the signal through again
-        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-        self._loop.run_forever()
-
-    def _begin(self, work: Any) -> Future[None]:
-        return asyncio.run_coroutine_threadsafe(work, self._loop)
-
-    def _done(self, work: Any, seconds: float | None = None) -> None:
-        self._begin(work).result(seconds)
-
-    async def _open(self, seconds: float) -> None:
+    def _open(self, seconds: float) -> None:
         # comes with the extra `dask`
         import dask
         import distributed
 
         made: Any = distributed
-        security = made.Security(**self._place.security) if self._place.security else None
+        security = made.Security(**self._site.security) if self._site.security else None
         deadline = time.monotonic() + seconds
         dask.config.set(CONFIG)
         logging.getLogger("distributed").setLevel(SILENT)
         while True:
             try:
-                if self._place.start is not None and self._cluster is None:
-                    named = {} if security is None else {"security": security}
-                    self._cluster = await self._place.start(asynchronous=True, **named)
-                    if self._place.count is not None:
-                        self._cluster.scale(self._place.count)
-                self._client = await made.Client(
-                    self._cluster or self._place.address,
-                    asynchronous=True,
+                if self._site.start is not None and self._cluster is None:
+                    self._cluster = self._site.start(**({} if security is None else {"security": security}))
+                    if self._site.count is not None:
+                        self._cluster.scale(self._site.count)
+                self._client = made.Client(
+                    self._cluster or self._site.address,
                     security=security,
                     timeout=max(1.0, min(CONNECT, deadline - time.monotonic())),
                     set_as_default=False,
                 )
-                self._known = set()
-                self._client.subscribe_topic("all", self._told)
-                await self._look_around()
                 break
             except (OSError, TimeoutError, asyncio.TimeoutError, RuntimeError, ValueError) as error:
                 if time.monotonic() >= deadline:
@@ -213,48 +111,31 @@ class DaskPool:
                         f"{self.where}: there is no scheduler that answers ({error or type(error).__name__}); start "
                         "one with dask scheduler, check address and certificates, and go on with advsearch resume"
                     ) from error
-                client, self._client = self._client, None
-                await _close(client)
-                for worker in self._known:  # that it was told of already
-                    self._events.put(Left(worker, told=True))
-                await asyncio.sleep(LOOK)
+                time.sleep(LOOK)
+        self._connection, self._there = self._client.scheduler_comm, ()
         drawn = importlib.util.find_spec("bokeh") is not None  # what Dask draws its pages with
         self.link = str(self._client.dashboard_link or "") if drawn else ""
-        self._watch = self._loop.create_task(self._watching(self._client))
 
-    async def _leave(self) -> None:
-        """Let go of calls, client and cluster."""
-        for call in (self._watch, *self._calls.values()):
-            if call is not None:
-                call.cancel()
-        self._calls.clear()
-        self._watch = None
-        client, cluster, self._client, self._cluster = self._client, self._cluster, None, None
-        if client is not None and client.status == "running":
-            client.unsubscribe_topic("all")  # or the scheduler tells it of its own leaving
-        await _close(client)
-        await _close(cluster)
+    def workers(self) -> Collection[str]:
+        client = self._client
+        # A client that connects again does so by a connection of its own. What was under way is lost all the same.
+        if client.status != "running" or client.scheduler_comm is not self._connection:
+            raise SchedulerGoneError
+        with suppress(OSError, TimeoutError, asyncio.TimeoutError):  # slow, or going; the next look will tell
+            self._there = client.sync(client.scheduler.ncores, callback_timeout=RESTART).keys()
+        return self._there
 
-    async def _call(self, ticket: int, worker: str, function: Callable[..., Any], args: tuple[Any, ...]) -> None:
-        """Have a worker call a function, again where its answer was lost on the way, and tell what came of it."""
-        client, event = self._client, None
-        while event is None and client.status == "running":  # else all workers are gone, which `_watching` says
-            future = client.submit(
-                function, *args, workers=[worker], allow_other_workers=False, pure=False, retries=0, priority=-ticket
-            )
-            try:
-                event = await self._outcome(ticket, future)
-            finally:
-                if client.status == "running":
-                    future.release()
-            if event is None:
-                await asyncio.sleep(LOOK)
-        self._calls.pop(ticket, None)
-        if event is not None:
-            self._events.put(event)
+    def submit(self, worker: str, function: Callable[..., Any], *args: Any) -> Future[Any]:
+        future = self._begin(self._call(self._client, worker, function, args))
+        self._calls.add(future)
+        future.add_done_callback(self._calls.discard)
+        return future
 
-    async def _outcome(self, ticket: int, future: Any) -> Event | None:
-        """Return what came of a call, or None where that was lost on the way.
+    def _begin(self, work: Any) -> Future[Any]:
+        return asyncio.run_coroutine_threadsafe(work, self._client.loop.asyncio_loop)
+
+    async def _call(self, client: Any, worker: str, function: Callable[..., Any], args: tuple[Any, ...]) -> Any:
+        """Have a worker call a function, again where its answer was lost on the way, and return what it answered.
 
         No type of an error tells the work from the way to it, but Dask's state does: a call that ended with an error
         has the state "error", by word of the scheduler. Whatever else is raised comes from fetching the answer, or from
@@ -263,86 +144,49 @@ class DaskPool:
         # comes with the extra `dask`
         from distributed import KilledWorker
 
-        try:
-            return Ended(ticket, await future)
-        except asyncio.CancelledError:
-            if ticket not in self._calls:  # `forget` or `_leave`
-                raise
-            return None
-        except KilledWorker as error:
-            return Dropped(ticket, str(error))
-        except Exception as error:
-            its_own = future.status == "error" and type(error).__name__ not in NO_WORKER
-            return Ended(ticket, _failure(error)) if its_own else None
+        while client.status == "running":
+            future = client.submit(function, *args, workers=[worker], allow_other_workers=False, pure=False, retries=0)
+            try:
+                return await future
+            except asyncio.CancelledError:
+                if future.status != "cancelled":  # it is this call that nobody wants any more
+                    raise
+            except KilledWorker as error:
+                raise WorkerDiedError(str(error)) from None
+            except Exception as error:
+                if future.status == "error" and type(error).__name__ not in NO_WORKER:
+                    return _failure(error)
+            finally:
+                if client.status == "running":
+                    future.release()
+            await asyncio.sleep(LOOK)
+        raise asyncio.CancelledError  # all workers are gone, which `workers` says
 
-    async def _restart(self, worker: str) -> None:
-        client = self._client
+    def restart(self, worker: str) -> None:
+        """See `Pool.restart`; a worker without a nanny is only told to close."""
+        self._begin(self._restart(self._client, worker))
+
+    async def _restart(self, client: Any, worker: str) -> None:
         try:
             await asyncio.wait_for(
                 client.restart_workers([worker], timeout=RESTART, raise_for_error=False), RESTART + LOOK
             )
         except Exception:  # it has no nanny, or that does not answer either
-            try:
+            with suppress(Exception):
                 await asyncio.wait_for(client.retire_workers([worker], close_workers=True), RESTART)
-            except Exception:
-                logging.getLogger(__name__).debug("%s could not be ended", worker, exc_info=True)
 
-    def _told(self, event: tuple[float, Any]) -> None:
-        _, message = event
-        action = message.get("action") if isinstance(message, Mapping) else None
-        if action == "add-worker":
-            self._there(message["worker"])
-        elif action == "remove-worker":
-            self._known.discard(message["worker"])
-            self._events.put(Left(message["worker"], told=bool(message.get("expected"))))
+    def reconnect(self) -> None:
+        self.close()
+        self._open(RECONNECT)
 
-    def _there(self, worker: str) -> None:
-        if worker not in self._known:
-            self._known.add(worker)
-            self._events.put(Joined(worker))
-
-    async def _look_around(self) -> None:
-        info = await self._client.scheduler.identity(n_workers=-1)
-        there = set(info["workers"])
-        for worker in self._known - there:
-            self._events.put(Left(worker))
-        self._known &= there
-        for worker in there:
-            self._there(worker)
-
-    async def _watching(self, client: Any) -> None:
-        looking = self._loop.create_task(self._looking_around())
-        try:
-            await scheduler_gone(client)
-        finally:
-            looking.cancel()
-        self._events.put(Disconnected())
-
-    async def _looking_around(self) -> None:
-        while True:
-            await asyncio.sleep(RESYNC)
-            with suppress(Exception):  # slow; the next look will tell
-                await asyncio.wait_for(self._look_around(), RESYNC)
-
-
-async def _close(one: Any) -> None:
-    """Close a client or a cluster, where there is one, whether or not its other end is there."""
-    if one is None:
-        return
-    try:
-        await asyncio.wait_for(one.close(), RESTART)
-    except Exception:
-        logging.getLogger(__name__).debug("closing %r failed", one, exc_info=True)
-
-
-async def scheduler_gone(client: Any) -> None:
-    """Wait until a client of Dask has lost its scheduler, also where it has found it again between two looks.
-
-    A client that connects again does so by a connection of its own. What was under way is lost all the same.
-    """
-    connection = client.scheduler_comm
-    while client.status == "running" and client.scheduler_comm is connection:
-        await asyncio.sleep(LOOK)
+    def close(self) -> None:
+        for call in list(self._calls):
+            call.cancel()
+        client, cluster, self._client, self._cluster = self._client, self._cluster, None, None
+        for one in (client, cluster):
+            if one is not None:
+                with suppress(Exception):  # whether or not its other end is there
+                    one.close(timeout=RESTART)
 
 
 def _failure(error: Exception) -> Failure:
@@ -373,20 +217,22 @@ CLASSES = {
 def executor_of(
     work: Work, *, workers: int | None, cluster: str | None, tell: Callable[[str], None]
 ) -> Iterator[Executor | None]:
-    """Open an executor of a work for the block, on a cluster by its scheduler's address, "local", or a YAML file; None
-    where everything is done in this process."""
+    """Open an executor of a work for the block: on processes of this machine, by default one a core, or on a cluster by
+    its scheduler's address or a YAML file; None where everything is done in this process."""
     if workers is None and cluster is None:
         yield None
         return
-    try:
-        import distributed  # noqa: F401
-    except ImportError:
-        raise InputError("workers: needs Dask; pip install 'advsearch[dask]', or leave `workers` out") from None
-    files = read_files(work)
-    said = [work.function, work.settings, work.threads, sorted(files.named.items())]
-    key = hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()[:32]
-    place = place_of(workers, cluster)
-    pool = DaskPool(place)
+    pool: Pool
+    if cluster in (None, LOCAL):
+        key, files, pool = "here", Files({}, {}), LocalPool(workers or threads.cores())
+    else:
+        site = site_of(workers, str(cluster))
+        if importlib.util.find_spec("distributed") is None:
+            raise InputError("cluster: needs Dask; pip install 'advsearch[dask]', or leave `cluster` out")
+        files = read_files(work)
+        asked = [work.function, work.settings, work.threads, sorted(files.named.items())]
+        key = hashlib.sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()[:32]
+        pool = DaskPool(site)
     try:
         if pool.link:
             tell(f"Dask shows its workers at {pool.link}")
@@ -395,50 +241,21 @@ def executor_of(
         pool.close()
 
 
-def check_main() -> None:
-    """Check that workers on this machine can import the script that runs: each does, as `multiprocessing` has it, and
-    would ask again what is asked outside of `if __name__ == "__main__":`."""
-    main, name = sys.modules["__main__"], '`if __name__ == "__main__":`'
-    spec, file = getattr(main, "__spec__", None), getattr(main, "__file__", None)
-    frame = sys._current_frames().get(threading.main_thread().ident or 0)
-    while frame is not None and not (frame.f_code.co_name == "<module>" and frame.f_globals is vars(main)):
-        frame = frame.f_back
-    if file is None or frame is None or (spec is not None and spec.name.endswith("__main__")):
-        return
-    try:
-        tree = ast.parse(Path(file).read_text(encoding="utf-8"))
-    except OSError:
-        raise InputError(f"workers: expected a script that they can import, got {file}; put it into a file") from None
-    except (ValueError, SyntaxError):
-        return
-    line, guards = frame.f_lineno, ("__name__", "parent_process", "current_process")
-    for one in (node for node in ast.walk(tree) if isinstance(node, ast.If) and node.lineno <= line):
-        leaves = any(isinstance(part, ast.NotEq) for part in ast.walk(one.test))  # where it is imported
-        if (leaves or line <= (one.end_lineno or 0)) and any(guard in ast.unparse(one.test) for guard in guards):
-            return
-    raise InputError(
-        f"workers: expected {file} to ask under {name}, got a call outside of it, in line {line}; put it there: "
-        "every worker imports the script and would ask again"
-    )
-
-
-def place_of(workers: int | None, cluster: str | None) -> Site:
-    """Return where so many workers are: of a scheduler's address, "local", or a YAML file; by default on this machine,
-    one a core."""
-    if cluster is None or cluster == LOCAL:
-        check_main()
-        return local(workers or threads.cores())
-    if cluster.startswith(SCHEMES):
-        if workers is not None:
-            raise InputError("workers: the scheduler of `cluster` says how many there are; leave one of the two out")
-        return Site(cluster, address=cluster)
+def site_of(workers: int | None, cluster: str) -> Site:
+    """Return where workers are, of a scheduler's address or a YAML file, and how many of them are wanted."""
     path = Path(cluster)
-    if path.suffix not in (".yaml", ".yml"):
+    if cluster.startswith(SCHEMES):
+        found = Site(cluster, address=cluster)
+    elif path.suffix in (".yaml", ".yml"):
+        found = _from_file(path, workers)
+    else:
         raise InputError(
             f"cluster: expected the address of a scheduler such as tcp://10.0.0.1:8786, local, or a .yaml file, got "
             f"{cluster!r}"
         )
-    return _from_file(path, workers)
+    if found.address and workers is not None:
+        raise InputError("workers: the scheduler of `cluster` says how many there are; leave one of the two out")
+    return found
 
 
 def _from_file(path: Path, workers: int | None) -> Site:
@@ -459,8 +276,8 @@ def _from_file(path: Path, workers: int | None) -> Site:
     if "address" in said:
         if not str(said["address"]).startswith(SCHEMES):
             raise FileFormatError(f"{path}: address: expected tcp://HOST:PORT or tls://HOST:PORT")
-        if count is not None:
-            raise InputError("workers: the scheduler of `cluster` says how many there are; leave one of the two out")
+        if "workers" in said:
+            raise FileFormatError(f"{path}: workers: the scheduler says how many there are; leave it out")
         return Site(str(said["address"]), address=str(said["address"]), security=security or None)
     name = str(said["class"])
     if name not in CLASSES:

@@ -8,6 +8,7 @@ import hashlib
 import importlib
 import json
 import os
+import pickle
 import platform
 import re
 import stat
@@ -15,12 +16,12 @@ import tempfile
 import threading
 import time
 import traceback
-from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, lru_cache
 from importlib import metadata
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any
 
 from advsearch import threads  # before torch: it sets how OpenMP waits
@@ -191,7 +192,6 @@ MOST_LOADED = 2
 KERNELS, INPUTS = "kernels", "inputs"
 """Folders below the machine's own: Dr.Jit's kernels, and files that were sent."""
 
-_loaded: OrderedDict[str, Call] = OrderedDict()
 _known: dict[str, Work] = {}
 _one_at_a_time = threading.Lock()
 
@@ -231,14 +231,15 @@ def prepare(key: str, work: Work, files: Files, asked: str) -> Ready | Failure:
         return Failure(f"it has advsearch {version()}, and {asked} asks; install the same on both", unfit=True)
     try:
         with _one_at_a_time:
-            if key not in _loaded:
+            if key not in _known:
                 own = own_folder()
                 if "DRJIT_CACHE_DIR" not in os.environ:
                     (own / KERNELS).mkdir(exist_ok=True)
                     os.environ["DRJIT_CACHE_DIR"] = str(own / KERNELS)
                 this_machine()
                 allow_code(*work.code)
-                _load(key, write_files(work, files, own / INPUTS))
+                _known[key] = write_files(work, files, own / INPUTS)
+            _call_of(key)
             machine = this_machine()
     except MissingError as error:
         return Failure(f"it lacks {error}", missing=True)
@@ -254,7 +255,7 @@ def carry_out_batch(key: str, items: Sequence[Any]) -> Carried | Failure:
         with _one_at_a_time:
             if key not in _known:
                 return Failure("it is not ready", forgotten=True)
-            value = _load(key, _known[key])(items)
+            value = _call_of(key)(items)
     except Exception as error:
         return _failure(error, unfit=isinstance(error, (OSError, StorageError)))
     return Carried(value, time.perf_counter() - begun)
@@ -269,20 +270,43 @@ def own_folder() -> Path:
     return folder if mine else Path(tempfile.mkdtemp(prefix="advsearch-"))
 
 
-def _load(key: str, work: Work) -> Call:
-    """Return what carries out a work, loaded if it is not; where several runs share a worker, each has its turn."""
-    if key not in _loaded:
-        threads.configure(work.threads)
-        module, _, name = work.function.partition(":")
-        make: Callable[[Any], Call] = getattr(importlib.import_module(module), name)
-        _loaded[key], _known[key] = make(work.settings), work
-        while len(_loaded) > MOST_LOADED:
-            _loaded.popitem(last=False)
-    _loaded.move_to_end(key)
-    return _loaded[key]
+@lru_cache(MOST_LOADED)
+def _call_of(key: str) -> Call:
+    """Return what carries out a work, loaded if it is not."""
+    work = _known[key]
+    threads.configure(work.threads)
+    module, _, name = work.function.partition(":")
+    make: Callable[[Any], Call] = getattr(importlib.import_module(module), name)
+    return make(work.settings)
 
 
 def _failure(error: Exception, *, unfit: bool) -> Failure:
     ours = isinstance(error, AdvsearchError) or unfit
     text = str(error) if isinstance(error, AdvsearchError) else f"{type(error).__name__}: {error}"
     return Failure(text, unfit, trace="" if ours else traceback.format_exc())
+
+
+SERVING = "ADVSEARCH_WORKER"
+"""Environment variable of a process that `serve`s."""
+
+
+def serve() -> None:
+    """Answer the calls that the process writes which has started this one, a pickled pair (function, arguments) each,
+    until it goes."""
+    calls, answers = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
+    os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
+    os.dup2(2, 1)  # what code of others prints is no answer
+    asked: SimpleQueue[tuple[Callable[..., Any], tuple[Any, ...]]] = SimpleQueue()
+
+    def listen() -> None:
+        try:
+            while True:
+                asked.put(pickle.load(calls))
+        except (EOFError, OSError):
+            os._exit(0)  # also in the middle of a batch: nobody waits for it any more
+
+    threading.Thread(target=listen, name="calls", daemon=True).start()
+    while True:
+        function, args = asked.get()
+        pickle.dump(function(*args), answers)
+        answers.flush()

@@ -7,27 +7,36 @@ that this package stays light.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
+
 from advsearch import rooms
 from advsearch.config.attack import FEWEST_TRIALS, TRIALS, TRIALS_OVER, AttackConfig
 from advsearch.config.scene import CLOSE_LOOKS, RenderConfig, SceneConfig
 from advsearch.config.sweep import SweepConfig
 from advsearch.settings import Config
 
-CONFIGS: dict[str, type[Config]]
-"""What the settings of each command are, in the order in which the docs show them; those of questions that are rooms
-are read when somebody first asks, since they are made of the kinds here."""
 
-_OWN: tuple[type[Config], ...] = (AttackConfig, RenderConfig, SweepConfig)
+class _Configs(Mapping[str, type[Config]]):
+    def __init__(self) -> None:
+        self._own = {one.command: one for one in (AttackConfig, RenderConfig, SweepConfig)}
+
+    def __iter__(self) -> Iterator[str]:
+        asked = (name for name in rooms.rooms() if name not in self._own and rooms.Room(name).config is not None)
+        return iter((*self._own, *asked))
+
+    def __len__(self) -> int:
+        return len(list(iter(self)))
+
+    def __getitem__(self, name: str) -> type[Config]:
+        found = self._own.get(name) or getattr(rooms.room(name), "config", None)
+        if found is None:
+            raise KeyError(name)
+        return found
 
 
-def __getattr__(name: str) -> object:
-    """`CONFIGS`, when it is first asked for (PEP 562)."""
-    if name != "CONFIGS":
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    found = {one.command: one for one in (*_OWN, *rooms.in_rooms("settings", "CONFIG"))}
-    globals()[name] = found
-    return found
-
+CONFIGS: Mapping[str, type[Config]] = _Configs()
+"""What the settings of each command are, in the order in which the docs show them; those of a question are read when
+somebody first asks for them, since they are made of the kinds here."""
 
 __all__ = [
     "CLOSE_LOOKS", "CONFIGS", "FEWEST_TRIALS", "TRIALS", "TRIALS_OVER", "AttackConfig", "RenderConfig",

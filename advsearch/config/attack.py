@@ -130,7 +130,6 @@ class AttackConfig(DerivativeConfig):
 
     free: ClassVar[tuple[str, ...]] = (*DerivativeConfig.free, "log", "workers", "cluster")
     # fmt: off
-    now_options: ClassVar[Mapping[str, str]] = {"step_size": "policy"}
     clashes: ClassVar[tuple[Clash, ...]] = (
         *DerivativeConfig.clashes,
         Clash(

@@ -260,12 +260,10 @@ def judged_alone(config: AttackConfig) -> AttackConfig:
     return config.model_copy(update=change)
 
 
-def executor_for(
-    config: SceneConfig, function: str, progress: Progress, *, ahead: bool = True
-) -> AbstractContextManager[Executor | None]:
+def executor_for(config: SceneConfig, function: str, progress: Progress) -> AbstractContextManager[Executor | None]:
     """Return what carries out a function of a configuration, as its workers and cluster say; None for this process."""
     settings = config.to_repeat().model_copy(update={"workers": None, "cluster": None}).plain()
-    work = Work(function, settings, FILES, config.used_threads or 1, ahead=ahead)
+    work = Work(function, settings, FILES, config.used_threads or 1)
     workers, cluster = (getattr(config, name, None) for name in ("workers", "cluster"))
     return executor_of(work, workers=workers, cluster=cluster, tell=progress.message)
 

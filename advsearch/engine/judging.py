@@ -41,7 +41,7 @@ tensor without axes."""
 Metrics = Mapping[str, Metric]
 
 MAIN = "__main__"
-"""The script that runs, which workers on this machine import too."""
+"""The script that runs, which has another name in every other process."""
 
 
 def metrics_as_settings(metrics: Mapping[str, str | Metric]) -> dict[str, str]:
@@ -73,13 +73,11 @@ def only_here(settings: Mapping[str, str]) -> list[str]:
 
 def check_shared(settings: Mapping[str, str]) -> None:
     """Refuse metrics that workers could not import."""
-    notebook = not hasattr(sys.modules[MAIN], "__file__")
-    for name, text in settings.items():
-        if ":" not in text or (notebook and text.startswith(f"{MAIN}:")):
-            raise InputError(
-                f"metrics: {name}: workers import a metric by its name, and {text.rpartition(':')[2]} has none that "
-                "they could; write it as a function of a module, or leave `workers` and `cluster` out"
-            )
+    for name in only_here(settings):
+        raise InputError(
+            f"metrics: {name}: workers import a metric by its name, and {settings[name].rpartition(':')[2]} has none "
+            "that they could; write it as a function of a module, or leave `workers` and `cluster` out"
+        )
 
 
 def load_metrics(settings: Mapping[str, str], given: Mapping[str, str | Metric] | None = None) -> Metrics:

@@ -178,14 +178,10 @@ def _number(value: float | None) -> float | None:
 
 
 def judgement_of(row: Row) -> Judgement:
-    """Return what was said of a trial from its row: nothing where it has no label, for the answer was not a number.
-
-    In an old row, only the score says whether it was right.
-    """
+    """Return what was said of a trial from its row: nothing where it has no label, for the answer was not a number."""
     score, margin = (math.nan if one is None else one for one in (row.score, row.margin))
-    right = score <= 0.0 if row.correct is None else row.correct
     answer = Answer(row.label or NOT_A_NUMBER, row.label_index, row.probability)
-    return Judgement(score, margin, right, answer, row.payload, row.objective, row.metrics or None)
+    return Judgement(score, margin, bool(row.correct), answer, row.payload, row.objective, row.metrics or None)
 
 
 def verified_rate(checked: Verification) -> VerifiedRate:

@@ -11,13 +11,15 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from advsearch.errors import InputError
 from advsearch.report.figures import BLUE, GREY, RED, Figures, drawn, new_axes
 from advsearch.report.shown import AnswerPart, ShownAnswer, shown
+from advsearch.runs.export import table_to_pandas
 from advsearch.runs.images import png_bytes
 from advsearch.runs.results.base import Result
 
@@ -67,7 +69,10 @@ WIDTH = 6.2
 
 
 class InNotebook:
-    """What a notebook shows of a result: what its question says of it, as HTML and as a figure."""
+    """What a notebook shows of a result: what its question says of it, as HTML and as a figure; and its table."""
+
+    tabular: ClassVar[str] = "table"
+    """The field that is its table."""
 
     def plot(self, axes: Any = None) -> Any:
         """Draw the figure of the answer and return the matplotlib axes; nothing is drawn where it has none.
@@ -79,6 +84,17 @@ class InNotebook:
         if part := drawn_part(_shown(self)):
             part.draw(axes)  # type: ignore[misc]
         return axes
+
+    def to_pandas(self) -> Any:
+        """Return the rows of its table as a `pandas.DataFrame`; columns are called as in `summary.json`.
+
+        Raises:
+            InputError: it has no table, or pandas is not installed.
+        """
+        rows = getattr(self, self.tabular, None)
+        if rows is None:
+            raise InputError(f"to_pandas: the result of {getattr(self, 'command', '')} has no table")
+        return table_to_pandas([row.to_dict() for row in rows])
 
     def _repr_html_(self) -> str:
         return answer_html(_shown(self))

@@ -110,8 +110,8 @@ class ShownAnswer:
 
 def shown(result: Result) -> ShownAnswer:
     """Return what a person is shown of the result of any question."""
-    own = rooms.in_room(result.command, "answer", "shown")
-    made: ShownAnswer = own(result) if own else fields_shown(result)
+    room = rooms.room(result.command)
+    made: ShownAnswer = room.shown(result) if room and room.shown else fields_shown(result)
     return made
 
 

@@ -34,11 +34,7 @@ DRIVE_HEADS = ("", "mean", "95 % interval", "worst drive")
 
 def over_drives(summary: SweepSummary) -> str:
     """Return what the interval of a sweep over drives is over; nothing where there are none."""
-    if not summary.drives:
-        return ""
-    if summary.units is None and any(one.frames > 1 for one in summary.drives):  # of an earlier version
-        return ", too narrow: it takes frames of a drive as independent; `explain` has it over drives"
-    return ", over drives"
+    return ", over drives" if summary.drives else ""
 
 
 def drive_title(one: DriveRates) -> str:

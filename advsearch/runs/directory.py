@@ -44,9 +44,6 @@ OBJECT_FILE = f"{ARTIFACTS}/object.glb"
 AOV_FOLDER = "aov"
 """Of a sweep: the ground truth of each picture, by its number."""
 
-OLD_LOG = "replay.bin"
-"""What a search needed to go on, of an older advsearch; now it is in the store."""
-
 PARTS = "parts"
 """Runs that a study consists of."""
 
@@ -62,7 +59,6 @@ CONTENTS = (
     f"{store.NAME}-wal",
     f"{store.NAME}-shm",
     f"{store.NAME}-journal",
-    OLD_LOG,
     summary.NAME,
     REPORT,
     COLUMNS,
@@ -166,8 +162,6 @@ class RunDirectory:
         try:
             if config is not None:
                 opened._check_same(config)
-                if (path / OLD_LOG).exists():  # it kept what searches were told elsewhere
-                    raise InputError(f"{path}: cannot go on: it was begun by an older advsearch; {opened.again}")
                 opened._note_sitting(config)
         except BaseException:
             opened.close()
@@ -183,7 +177,7 @@ class RunDirectory:
 
     def _check_same(self, config: Config) -> None:
         """Refuse settings that decide other numbers than those that are stored: the rest would not fit to them."""
-        before, now = config.of_this_version(self._begun_with()), config.deciding()
+        before, now = self._begun_with(), config.deciding()
         changed = [
             f"{name} was {value!r} and is {now[name]!r}"
             for name, value in before.items()

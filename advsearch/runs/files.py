@@ -1,6 +1,6 @@
 """The files of a run: written whole or not at all, also in a kill (a power cut may empty what can be made again), held
-by one process through a lock that the kernel drops when it ends; and `results.sqlite`: its tables, how it is opened,
-and how an older one is brought up to date."""
+by one process through a lock that the kernel drops when it ends; and `results.sqlite`: its tables, and how it is
+opened."""
 
 from __future__ import annotations
 
@@ -210,9 +210,11 @@ LARGEST = 64 << 30
 APPLICATION_ID = 0x41445653
 """In the header of every results.sqlite that is ours: "ADVS"."""
 
-MIGRATIONS = (
-    """
-    -- How this file came to be; times are UTC. PRAGMA user_version is the number of migrations it has been through.
+VERSION = 8
+"""Of the tables; in the header of the file. Files of another version are read by the advsearch that wrote them."""
+
+SCHEMA = f"""
+    -- How this file came to be; times are UTC.
     CREATE TABLE meta (
         key   TEXT PRIMARY KEY,
         value TEXT NOT NULL
@@ -221,55 +223,30 @@ MIGRATIONS = (
 
     -- One row for each evaluated configuration, in the order in which they were evaluated.
     CREATE TABLE evaluations (
-        id          INTEGER PRIMARY KEY, -- grows by one
-        kind        TEXT    NOT NULL,    -- what it was for: search, baseline, verification, control, ...
-        step        INTEGER NOT NULL,    -- step or trial within its kind, from 0
-        seed        INTEGER,             -- of the render
-        spp         INTEGER,             -- samples per pixel of the render
-        objective   REAL,                -- what was maximised; NULL when it was not a number
-        success     INTEGER,             -- 1 when the model was wrong, 0 when right, NULL when not judged
-        label       TEXT,                -- the class that the model answered
-        label_index INTEGER,             -- its number
-        probability REAL,                -- the model's probability for it, in [0, 1]
-        values_json TEXT    NOT NULL,    -- {"camera.azimuth": {"value": 130.0, "unit": "degrees"}, ...}
-        seconds     REAL,                -- that the evaluation took
-        time        REAL    NOT NULL     -- when the row was written, seconds since 1970 (UTC)
+        id           INTEGER PRIMARY KEY, -- grows by one
+        kind         TEXT    NOT NULL,    -- what it was for: search, baseline, verification, control, ...
+        step         INTEGER NOT NULL,    -- step or trial within its kind, from 0
+        seed         INTEGER,             -- of the render
+        spp          INTEGER,             -- samples per pixel of the render
+        objective    REAL,                -- what was maximised; NULL when it was not a number, or nothing is maximised
+        score        REAL,                -- what the task says of the answer, over 0 where it is what is sought
+        success      INTEGER,             -- 1 when the answer is what is sought, 0 when not, NULL in a sweep
+        correct      INTEGER,             -- 1 when the answer was a right one, else 0
+        margin       REAL,                -- largest logit of a wrong class minus largest of a right one
+        label        TEXT,                -- the class that the model answered
+        label_index  INTEGER,             -- its number
+        probability  REAL,                -- the model's probability for it, in [0, 1]
+        payload_json TEXT,                -- what a task keeps of an answer beside its words: boxes, masks
+        values_json  TEXT    NOT NULL,    -- {{"camera.azimuth": {{"value": 130.0, "unit": "degrees"}}, ...}}
+        seconds      REAL,                -- that the evaluation took
+        renders      INTEGER,             -- pictures that it took; more than one where derivatives are differences
+        phase        TEXT,                -- of a search: search, or ranking where a candidate was rendered again
+        metrics_json TEXT,                -- {{"feature": 0.31, ...}}: numbers that the run's metrics say of the picture
+        machine      TEXT,                -- by its name in the note "machines"; NULL for the one that wrote the row
+        time         REAL    NOT NULL     -- when the row was written, seconds since 1970 (UTC)
     );
-    CREATE INDEX evaluations_kind ON evaluations (kind, step);
-    """,
-    """
-    -- Pictures that the evaluation took: more than one where derivatives came from differences, or it was rendered
-    -- with a multiple of the samples. NULL in rows of version 1.
-    ALTER TABLE evaluations ADD COLUMN renders INTEGER;
-    """,
-    """
-    -- What the model said, whatever a search was after. NULL in older rows, but those of a sweep, where `success` said
-    -- that the model was wrong; now a sweep's rows have no success: nothing is sought there.
-    ALTER TABLE evaluations ADD COLUMN correct INTEGER; -- 1 when the answer was a right one, else 0
-    ALTER TABLE evaluations ADD COLUMN margin REAL;     -- largest logit of a wrong class minus largest of a right one
-    UPDATE evaluations SET correct = coalesce(success = 0, 0), margin = objective, success = NULL WHERE kind = 'sweep';
-    """,
-    """
-    -- What a task keeps of an answer beside its words, as JSON (boxes, masks). NULL where it keeps nothing, and in
-    -- older rows.
-    ALTER TABLE evaluations ADD COLUMN payload_json TEXT;
-    """,
-    """
-    -- A step of a kind is there once, whoever writes it how often.
-    DELETE FROM evaluations WHERE id NOT IN (SELECT min(id) FROM evaluations GROUP BY kind, step);
-    DROP INDEX evaluations_kind;
-    CREATE UNIQUE INDEX evaluations_step ON evaluations (kind, step);
-    -- What the row was evaluated on, by its name in the note "machines". NULL for the machine that wrote the row.
-    ALTER TABLE evaluations ADD COLUMN machine TEXT;
-    """,
-    """
-    -- What a task says of an answer, over 0 where it is what is sought. Before, `objective` held it in all rows but
-    -- those of searches, of which it is not known (NULL).
-    ALTER TABLE evaluations ADD COLUMN score REAL;
-    UPDATE evaluations SET score = objective, objective = NULL
-        WHERE kind <> 'baseline' AND substr(kind, 1, 6) <> 'search';
-    """,
-    """
+    CREATE UNIQUE INDEX evaluations_step ON evaluations (kind, step); -- whoever writes a step how often
+
     -- What an evaluation told its search beside its row: only until the run is done.
     CREATE TABLE told (
         row         INTEGER PRIMARY KEY REFERENCES evaluations (id),
@@ -281,15 +258,8 @@ MIGRATIONS = (
         picture     BLOB,             -- levels of 8 bits, where it is kept for the animation
         height      INTEGER           -- of that, in pixels
     );
-    """,
-    """
-    -- Of rows of a search: search, or ranking where a candidate was rendered again at its end. NULL in older rows.
-    ALTER TABLE evaluations ADD COLUMN phase TEXT;
-    -- {"feature": 0.31, ...}: numbers that the run's metrics say of the picture. NULL where there are none.
-    ALTER TABLE evaluations ADD COLUMN metrics_json TEXT;
-    """,
-)
-"""What turns a file of version n into one of version n + 1. Never change one that was released; add another."""
+    PRAGMA user_version = {VERSION};
+"""
 
 
 _JOURNAL = bytes.fromhex("d9d505f920a163d7")
@@ -325,7 +295,7 @@ def readable(path: Path) -> Iterator[None]:
 
 
 def check_schema(db: sqlite3.Connection, path: Path) -> None:
-    """Check that the file has what `MIGRATIONS` make and no more: a view or a trigger is code, and may never end."""
+    """Check that the file has what `SCHEMA` makes and no more: a view or a trigger is code, and may never end."""
     if _schema(db) != _own_schema():
         db.close()
         raise FileFormatError(f"{path}: expected the tables of a run, got others; {DAMAGED}")
@@ -334,7 +304,7 @@ def check_schema(db: sqlite3.Connection, path: Path) -> None:
 @cache
 def _own_schema() -> frozenset[Any]:
     with closing(sqlite3.connect(":memory:")) as db:
-        _migrate(db)
+        db.executescript(SCHEMA)
         return _schema(db)
 
 
@@ -346,7 +316,7 @@ def _schema(db: sqlite3.Connection) -> frozenset[Any]:
 
 
 def connect_to_write(path: Path) -> sqlite3.Connection:
-    """Open or make the file and bring it up to date."""
+    """Open or make the file."""
     if os.path.islink(path):
         raise FileFormatError(f"{path}: expected a file of this run, got a link to another; {DAMAGED}")
     if path.exists():
@@ -358,7 +328,7 @@ def connect_to_write(path: Path) -> sqlite3.Connection:
             db.execute("PRAGMA synchronous = OFF")
             db.execute(f"PRAGMA application_id = {APPLICATION_ID}")  # before the log, so that the file itself has it
             db.execute("PRAGMA journal_mode = WAL")
-        _migrate(db)
+            db.executescript(f"BEGIN; {SCHEMA} COMMIT;")
     return db
 
 
@@ -383,20 +353,7 @@ def connect_to_read(path: Path) -> sqlite3.Connection:
     except sqlite3.OperationalError:
         db.close()
         db = sqlite3.connect(f"{address}?immutable=1", uri=True)
-    return _migrated_copy(db) if 0 < _version(db) < len(MIGRATIONS) else db
-
-
-def _migrated_copy(db: sqlite3.Connection) -> sqlite3.Connection:
-    copy = sqlite3.connect(":memory:")
-    db.backup(copy)
-    db.close()
-    _migrate(copy)
-    return copy
-
-
-def _migrate(db: sqlite3.Connection) -> None:
-    for number, script in enumerate(MIGRATIONS[_version(db) :], start=_version(db) + 1):
-        db.executescript(f"BEGIN; {script} PRAGMA user_version = {number}; COMMIT;")
+    return db
 
 
 def _version(db: sqlite3.Connection) -> int:
@@ -404,8 +361,14 @@ def _version(db: sqlite3.Connection) -> int:
 
 
 def check_version(db: sqlite3.Connection, path: Path) -> None:
-    version = _version(db)
-    if version != len(MIGRATIONS):
-        db.close()
-        advice = "use a newer advsearch" if version > len(MIGRATIONS) else "it is not a finished results.sqlite"
-        raise FileFormatError(f"{path}: expected version {len(MIGRATIONS)} of the results, got {version}; {advice}")
+    """Refuse, by a FileFormatError, a file of another version, and say which advsearch reads it."""
+    version, day = _version(db), ""
+    if version == VERSION:
+        return
+    if version:
+        with suppress(sqlite3.Error):
+            found = db.execute("SELECT value FROM meta WHERE key = 'created'").fetchone()
+            day = f", that of {str(found[0])[:10]}" if found else ""
+    db.close()
+    advice = f"read it with the advsearch that wrote it{day}" if version else "it is not a finished results.sqlite"
+    raise FileFormatError(f"{path}: expected version {VERSION} of the results, got {version}; {advice}")

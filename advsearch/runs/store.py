@@ -55,7 +55,7 @@ class Row:
         score: what the run's task says of the answer: over 0 where it is what is sought; stored as None when it is not
             a number.
         success: whether the answer is what the attack is after; None where nothing is sought, as in a sweep.
-        correct: whether the answer is right; None in rows of older runs.
+        correct: whether the answer is right.
         margin: how wrong it is, by the run's task, over 0 where it is not right; in classification the largest logit of
             a wrong class minus the largest of a right one; stored as None when it is not a number.
         label: what the model answered, in words.
@@ -66,7 +66,7 @@ class Row:
         seconds: that the evaluation took.
         renders: pictures that it took; 0 where they were predicted, None where that was not counted.
         phase: of a search: ``"search"``, or ``"ranking"`` where a candidate was rendered again at the end; None of
-            trials, and in rows of older runs.
+            trials.
         metrics: numbers that the run's metrics say of the picture, by name; None where one is not a number.
         machine: what it was evaluated on, by its name in the note "machines"; None for the machine that wrote the row.
         time: when it was written, seconds since 1970; set by the store.

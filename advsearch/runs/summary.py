@@ -106,10 +106,7 @@ def read_answer(run: Path) -> NDArray[np.float32]:
     try:
         data = read_bytes(path, "the answer of a run", LARGEST_ANSWER)
     except FileNotFoundError:
-        raise FileFormatError(
-            f"{path}: expected the answer of a run, got no such file; did the run end? One of an older version has "
-            "none: do it again with advsearch run"
-        ) from None
+        raise FileFormatError(f"{path}: expected the answer of a run, got no such file; did the run end?") from None
     except OSError as error:
         raise FileFormatError(f"{path}: expected the answer of a run, got {str(error)[:120]}") from None
     if not data.startswith(MAGIC) or b"\n" not in data[: len(MAGIC) + MOST]:

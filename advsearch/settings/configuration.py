@@ -242,9 +242,6 @@ class Config(BaseModel):
     without: ClassVar[tuple[str, ...]] = ()
     """Settings of a class above that the command does not have."""
     clashes: ClassVar[tuple[Clash, ...]] = ()
-    now_options: ClassVar[Mapping[str, str]] = {}
-    """Settings of older versions that are options of another setting now: ``{"step_size": "policy"}``. In a file that
-    has one it becomes such an option; one that is null goes."""
     free: ClassVar[tuple[str, ...]] = (*PLACE, "threads")
     """Settings that decide no number, so that they may be changed before a run goes on."""
 
@@ -308,7 +305,6 @@ class Config(BaseModel):
             InputError: as for the class; the message names the file.
         """
         data = {name: value for name, value in written.read_yaml(path).items() if name not in ("schema", "command")}
-        data = cls.of_this_version(data)
         for name, value in (overrides or {}).items():
             written.put(data, name, value)
         try:
@@ -347,16 +343,6 @@ class Config(BaseModel):
         """Refuse, by an InputError, settings with power over more than the run: `where` is a file that has them."""
         for one in self.powers:
             raise InputError(f"{where}: {one.name}: {one.does}, which such a file can't ask for; leave it out")
-
-    @classmethod
-    def of_this_version(cls, given: Mapping[str, Any]) -> dict[str, Any]:
-        """Return settings that an older version may have written as this one has them (`now_options`)."""
-        data = dict(given)
-        for name, owner in cls.now_options.items():
-            value, named = data.pop(name, None), data.get(owner) or cls.model_fields[owner].default
-            if value is not None:
-                data[owner] = {**(named if isinstance(named, Mapping) else {"name": named}), name: value}
-        return data
 
     @classmethod
     def shared(cls, other: Config) -> dict[str, object]:

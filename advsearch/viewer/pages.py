@@ -89,8 +89,8 @@ def page_of(run: Path, result: Result) -> str:
     results of the run are damaged."""
     if isinstance(result, SweepSummary):
         return whole_page(run, result, read_columns(run))
-    own = rooms.in_room(result.command, "page", "page")
-    made = own(run, result) if own else None
+    room = rooms.room(result.command)
+    made: str | None = room.page(run, result) if room and room.page else None
     return made or shown_page(run, result, shown(result))
 
 

@@ -29,7 +29,7 @@ from advsearch.engine.naming import given_to
 from advsearch.engine.sweeps.summary import SweepResult
 from advsearch.errors import FileFormatError, InputError, ModelError, UnknownNameError
 from advsearch.progress import BarProgress, LineProgress, NotebookProgress, NullProgress, watched
-from advsearch.questions.gap.answer import GapResult
+from advsearch.questions.gap import GapResult
 from advsearch.questions.region.answer import RegionResult
 from advsearch.runs.results.base import Result
 

@@ -24,7 +24,7 @@ from advsearch.errors import InputError
 from advsearch.questions.attack.answer import MatrixResult
 from advsearch.questions.attack.carry_out import attack_from_config
 from advsearch.questions.attack.several import models_answering
-from advsearch.questions.gap.settings import GapConfig
+from advsearch.questions.gap import GapConfig
 from advsearch.runs.store import Store
 from advsearch.runs.summary import read_result
 from advsearch.tasks import Classification

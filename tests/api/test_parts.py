@@ -14,9 +14,8 @@ from advsearch.api.studies import chains_of
 from advsearch.cluster import Done, Work, Workforce
 from advsearch.config import AttackConfig
 from advsearch.errors import ClusterError
-from advsearch.questions.attack.several import curve_from_config
-from advsearch.questions.gap.carry_out import gap_from_config
-from advsearch.questions.gap.settings import GapConfig
+from advsearch.questions.attack.carry_out import attack_from_config
+from advsearch.questions.gap import GapConfig, gap
 from advsearch.runs.store import NAME, Store
 from advsearch.runs.summary import read_answer
 
@@ -43,7 +42,7 @@ class Backwards:
 
     def __init__(self, work: Work, lost: str) -> None:
         self.call, self.lost = parts.attacks_of(work.settings), lost
-        assert work.function == "advsearch.api.studies:attacks_of" and not work.ahead
+        assert work.function == "advsearch.api.studies:attacks_of"
 
     def results(self, ranges: Iterable[range]) -> Iterator[Done]:
         for one in reversed(list(ranges)):
@@ -65,9 +64,9 @@ def rows(path: Path) -> list[Any]:
 
 
 def test_a_shared_gap_is_the_one_that_was_made_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    alone = gap_from_config(SMALL.model_copy(update={"run": str(tmp_path / "alone")}))
+    alone = gap.from_config(SMALL.model_copy(update={"run": str(tmp_path / "alone")}))
     elsewhere(monkeypatch)
-    shared = gap_from_config(SMALL.model_copy(update={"run": str(tmp_path / "shared"), "workers": 2}))
+    shared = gap.from_config(SMALL.model_copy(update={"run": str(tmp_path / "shared"), "workers": 2}))
     assert [(one.control, one.ending, one.margin) for one in shared.table] == [
         (one.control, one.ending, one.margin) for one in alone.table
     ]
@@ -84,7 +83,7 @@ def test_an_attack_of_which_every_worker_dies_ends_the_study_by_its_name(
 ) -> None:
     elsewhere(monkeypatch, lost="no answer: 3 workers died of it")
     with pytest.raises(ClusterError, match=r"mug with camera.azimuth: no answer: 3 workers died of it; leave it out"):
-        gap_from_config(SMALL.model_copy(update={"run": str(tmp_path / "run"), "workers": 2}))
+        gap.from_config(SMALL.model_copy(update={"run": str(tmp_path / "run"), "workers": 2}))
 
 
 def test_a_gap_is_every_object_with_every_control() -> None:
@@ -103,9 +102,9 @@ def test_a_shared_curve_tries_no_epsilon_more_than_one_that_was_made_here(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     small = AttackConfig.of(SMALL, controls={"texture": {"resolution": 2}}, epsilon="0.02,0.01", average=0)
-    alone = curve_from_config(small.model_copy(update={"run": str(tmp_path / "alone")}))
+    alone = attack_from_config(small.model_copy(update={"run": str(tmp_path / "alone")}))
     elsewhere(monkeypatch)
-    shared = curve_from_config(small.model_copy(update={"run": str(tmp_path / "shared"), "workers": 2}))
+    shared = attack_from_config(small.model_copy(update={"run": str(tmp_path / "shared"), "workers": 2}))
     assert shared.parts == alone.parts and shared.curve == alone.curve
     for name in alone.parts:
         assert rows(tmp_path / "shared" / "parts" / name) == rows(tmp_path / "alone" / "parts" / name)

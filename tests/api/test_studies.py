@@ -23,9 +23,8 @@ from advsearch.config import AttackConfig
 from advsearch.engine.transport import CleanMatrix
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.questions.attack import carry_out as attacking
-from advsearch.questions.attack.several import curve_from_config
-from advsearch.questions.gap.carry_out import gap_from_config
-from advsearch.questions.gap.settings import GapConfig
+from advsearch.questions.attack.carry_out import attack_from_config
+from advsearch.questions.gap import GapConfig, gap
 from advsearch.questions.region import carry_out as mapping
 from advsearch.questions.region.settings import RegionConfig
 from advsearch.runs.directory import RunDirectory
@@ -71,7 +70,7 @@ def summary_of(config: AttackConfig, run: str) -> AttackSummary:
 
 def test_a_curve_counts_robust_objects_at_each_epsilon(asked: list[AttackConfig]) -> None:
     config = AttackConfig(object="mug,bowl,vase,pan", epsilon="0.1,0.01,0.05", run="study")
-    summary = curve_from_config(config)
+    summary = attack_from_config(config)
     told = [(one.epsilon, one.robust, one.found, one.already_wrong) for one in summary.curve]
     assert told == [(0.01, 3, 0, 1), (0.05, 2, 1, 1), (0.1, 1, 2, 1)]
     low, high = summary.curve[1].interval
@@ -88,7 +87,7 @@ def test_a_curve_counts_robust_objects_at_each_epsilon(asked: list[AttackConfig]
 
 
 def test_a_label_for_several_objects_says_whose_own_it_is_not(asked: list[AttackConfig]) -> None:
-    summary = curve_from_config(AttackConfig(object="mug,bowl", label="mug", run="curve"))
+    summary = attack_from_config(AttackConfig(object="mug,bowl", label="mug", run="curve"))
     assert any("also for bowl (its own is 'bowl')" in text for text in summary.warnings)
 
 
@@ -98,13 +97,13 @@ def test_an_attack_on_several_objects_or_epsilons_is_a_curve(
 ) -> None:
     run = str(tmp_path / "it")
     monkeypatch.setattr(
-        "advsearch.questions.attack.carry_out.curve_from_config", lambda config, **more: samples.curve(run=config.run)
+        "advsearch.questions.attack.carry_out.curve", lambda asked: samples.curve(run=str(asked.run.path))
     )
     assert carry_out(AttackConfig(**several, run=run)) == samples.curve(run=run)
 
 
 def test_several_objects_and_one_budget_make_one_row_each(asked: list[AttackConfig]) -> None:
-    summary = curve_from_config(AttackConfig(object="mug,pan", run="study"))
+    summary = attack_from_config(AttackConfig(object="mug,pan", run="study"))
     assert [row.ending for row in summary.table] == ["found", "budget spent"]
     assert [one.robust for one in summary.curve] == [1] and len(asked) == 2
 
@@ -122,10 +121,10 @@ def test_a_study_goes_on_with_the_part_at_which_it_was_stopped(
 
     monkeypatch.setattr(attacking, "attack_once", stopped)
     with pytest.raises(KeyboardInterrupt):
-        gap_from_config(config)
+        gap.from_config(config)
     assert Path("runs/study/parts/00-00-mug-texture/summary.json").is_file()
     monkeypatch.setattr(attacking, "attack_once", carry_out)
-    summary = gap_from_config(config, resumed=Path("runs/study"))
+    summary = gap.from_config(config, resumed=Path("runs/study"))
     assert [(row.object, row.control) for row in summary.table] == [
         ("mug", "texture"), ("mug", "geometry"), ("bowl", "texture"), ("bowl", "geometry"),
     ]  # fmt: skip
@@ -135,12 +134,12 @@ def test_a_study_goes_on_with_the_part_at_which_it_was_stopped(
 
 def test_a_gap_gives_each_control_its_own_budget(asked: list[AttackConfig]) -> None:
     config = GapConfig(object="mug", controls="texture,pose", epsilon="texture=0.05", run="study", average=7)
-    gap_from_config(config)
+    gap.from_config(config)
     assert [(one.epsilon, one.average, list(one.controls)) for one in asked] == [
         ({"texture": 0.05}, 7, ["texture"]), (None, 7, ["pose"]),
     ]  # fmt: skip
     with pytest.raises(InputError, match="epsilon: several make a curve"):
-        gap_from_config(GapConfig(object="mug", epsilon="0.1,0.2", run="other"))
+        gap.from_config(GapConfig(object="mug", epsilon="0.1,0.2", run="other"))
 
 
 # ---- rendered -------------------------------------------------------------------------------------------------------

@@ -36,7 +36,7 @@ from advsearch.controls.base import Choice
 from advsearch.described import Value
 from advsearch.errors import InputError, StorageError
 from advsearch.progress import BarProgress, LineProgress, NullProgress, Progress
-from advsearch.questions.gap.settings import GapConfig
+from advsearch.questions.gap import GapConfig
 from advsearch.questions.region.settings import RegionConfig
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row

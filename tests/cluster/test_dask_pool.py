@@ -1,10 +1,9 @@
-"""Real workers of Dask: processes on this machine, and a scheduler and workers that were started by themselves."""
+"""Real workers: processes of this machine, and a scheduler and workers of Dask that were started by themselves."""
 
 from __future__ import annotations
 
 import asyncio
 import os
-import queue
 import signal
 import socket
 import subprocess
@@ -19,10 +18,10 @@ from typing import Any
 
 import pytest
 from conftest import ROOT
-from covering import only
 
-from advsearch.cluster import Dropped, Ended, Event, Executor, Work
-from advsearch.cluster.dask_pool import CLASSES, DaskPool, executor_of, place_of, scheduler_gone
+from advsearch.cluster import Executor, SchedulerGoneError, Work, WorkerDiedError
+from advsearch.cluster.dask_pool import CLASSES, DaskPool, executor_of, site_of
+from advsearch.cluster.local_pool import LocalPool
 from advsearch.errors import ClusterError, FileFormatError, InputError
 
 psutil: Any = import_module("psutil")  # which Dask brings along
@@ -45,63 +44,61 @@ def check(executor: Executor | None, count: int, added: int = 0) -> None:
     assert found == {number: number * number + added for number in range(count)}
 
 
-def test_processes_of_this_machine_are_killed_and_nothing_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nothing listens beyond loopback; a number of which a worker dies each time is said. The scheduler goes once as
-    it is found, too."""
-    told: list[str] = []
-    look, failing = DaskPool._look_around, [distributed.comm.CommClosedError("in identity: Stream is closed")]
+def own_workers() -> list[Any]:
+    """The processes of workers that this one has started."""
+    return [one for one in psutil.Process().children() if "serve()" in " ".join(one.cmdline())]
 
-    async def fails_once(self: DaskPool) -> None:
-        if failing:
-            raise failing.pop()
-        await look(self)
 
-    monkeypatch.setattr(DaskPool, "_look_around", fails_once)
-    work = Work("cluster_work:squares", {"seconds": 0.01, "deadly": [301]})
-    with executor_of(work, workers=2, cluster=None, tell=told.append) as executor:
+def test_processes_of_this_machine_are_killed_and_nothing_is_lost(capfd: pytest.CaptureFixture[str]) -> None:
+    """They listen nowhere, Ctrl-C in a terminal passes by them, and a number of which each dies is said."""
+    work = Work("cluster_work:squares", {"seconds": 0.01, "deadly": [301], "prints": True})
+    with executor_of(work, workers=2, cluster=None, tell=print) as executor:
         assert executor is not None
-        results = executor.results(pieces(400))
         seen: dict[int, Any] = {}
         lost: dict[int, str] = {}
-        for count, done in enumerate(results):
+        for count, done in enumerate(executor.results(pieces(400))):
             seen |= dict.fromkeys(done.items, done.value)
             lost |= {done.items[0]: done.lost} if done.lost else {}
-            mine = psutil.Process().children(recursive=True)
-            if count == 1:
-                listening = [one for process in (psutil.Process(), *mine) for one in process.net_connections("tcp")]
-                addresses = {one.laddr.ip for one in listening if one.status == "LISTEN"}
-                assert addresses == {"127.0.0.1"}
             if count == 20:
-                workers = [one for one in mine if "spawn_main" in " ".join(one.cmdline())]
-                assert len(workers) >= 2, "they are spawned, never forked"
-                for one in workers:  # Ctrl-C, which a terminal sends to all, is for the main process
-                    blocked = Path(f"/proc/{one.pid}/status").read_text().partition("SigBlk:")[2].split()[0]
-                    assert int(blocked, 16) >> (signal.SIGINT - 1) & 1
+                workers = own_workers()
+                assert len(workers) == 2 and not [c for one in workers for c in one.net_connections()]
+                assert all(os.getsid(one.pid) == one.pid for one in workers)
                 workers[0].kill()
         assert len(seen) == 400 and list(lost) == [301]
         facts = executor.facts
         assert facts is not None and facts.lost >= 4 and facts.most == 2
+    assert not own_workers() and "printed" not in capfd.readouterr().out
 
 
-@pytest.mark.slow
-def test_a_worker_that_takes_long_to_start_again_is_waited_for(tmp_path: Path) -> None:
-    """The only one dies, and needs more than the 15 seconds after which Dask gives up by itself."""
-    begun, late = tmp_path / "begun", tmp_path / "late.py"
-    late.write_text(
-        f"import pathlib, time\nbegun = pathlib.Path({str(begun)!r})\n"
-        "time.sleep(17.0) if begun.exists() else begun.touch()\n"
-    )
-    work = Work("cluster_work:squares", {"seconds": 0.01})
-    with dask.config.set({"distributed.worker.preload": [str(late)]}):
-        with executor_of(work, workers=1, cluster=None, tell=lambda text: None) as executor:
-            assert executor is not None
-            seen: set[int] = set()
-            for done in executor.results(pieces(100)):
-                if not seen:
-                    mine = psutil.Process().children(recursive=True)
-                    next(one for one in mine if "spawn_main" in " ".join(one.cmdline())).kill()
-                seen |= set(done.items)
-            assert seen == set(range(100)) and executor.facts is not None and executor.facts.lost == 1
+def test_workers_end_with_the_process_that_started_them() -> None:
+    """In the middle of a batch, though it was killed."""
+    script = """
+from advsearch.cluster import Work
+from advsearch.cluster.dask_pool import executor_of
+with executor_of(Work("cluster_work:squares", {"seconds": 600.0}), workers=1, cluster=None, tell=print) as executor:
+    executor.facts.most = -1
+    def batches():
+        print("begun", flush=True)
+        yield range(1)
+    list(executor.results(batches()))
+"""
+    environ = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "tests")])}
+    with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, env=environ) as asking:
+        assert asking.stdout is not None and asking.stdout.readline() == b"begun\n"
+        (worker,) = psutil.Process(asking.pid).children()
+        asking.kill()
+    assert worker.wait(60.0) in (0, None)
+
+
+def test_a_worker_has_no_workers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A module that asks as it is imported, here by a worker, is told what to do."""
+    monkeypatch.syspath_prepend(str(tmp_path))
+    asks = "from advsearch.cluster.local_pool import LocalPool\nLocalPool(2)\n"
+    (tmp_path / "asking.py").write_text(asks)
+    with executor_of(Work("asking:work", {}), workers=1, cluster=None, tell=print) as executor:
+        assert executor is not None
+        with pytest.raises(ClusterError, match="a module that a worker imports asks for workers itself"):
+            list(executor.results(pieces(4)))
 
 
 @contextmanager
@@ -163,19 +160,20 @@ def test_a_scheduler_and_workers_of_their_own(tmp_path: Path, monkeypatch: pytes
             assert any("the scheduler has gone" in text for text in told)
 
 
-def test_a_scheduler_that_went_and_came_back_between_two_looks_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_scheduler_that_went_and_came_back_between_two_looks_is_noticed() -> None:
     """Its client runs at both, over another connection: what was under way is lost all the same."""
-    monkeypatch.setattr("advsearch.cluster.dask_pool.LOOK", 0.01)
-    client = SimpleNamespace(status="running", scheduler_comm=object())
-
-    async def look() -> None:
-        gone = asyncio.create_task(scheduler_gone(client))
-        await asyncio.sleep(0.05)
-        assert not gone.done()
-        client.scheduler_comm = object()
-        await asyncio.wait_for(gone, 60.0)
-
-    asyncio.run(look())
+    connection, pool = object(), object.__new__(DaskPool)
+    client = SimpleNamespace(
+        status="running",
+        scheduler_comm=connection,
+        scheduler=SimpleNamespace(ncores=None),
+        sync=lambda *_, **__: {"a": 1},
+    )
+    vars(pool).update(_client=client, _connection=connection)
+    assert list(pool.workers()) == ["a"]
+    client.scheduler_comm = object()
+    with pytest.raises(SchedulerGoneError):
+        pool.workers()
 
 
 class Answer:
@@ -196,15 +194,14 @@ class Answer:
         self.released = True
 
 
-def called(monkeypatch: pytest.MonkeyPatch, *answers: Answer) -> list[Event]:
-    """What is told of a call whose answers come so, one for each time that it is asked."""
+def called(monkeypatch: pytest.MonkeyPatch, *answers: Answer) -> Any:
+    """What comes of a call whose answers come so, one for each time that it is asked."""
     monkeypatch.setattr("advsearch.cluster.dask_pool.LOOK", 0.0)
     left, pool = iter(answers), object.__new__(DaskPool)
     client = SimpleNamespace(status="running", submit=lambda *args, **named: next(left))
-    vars(pool).update(_client=client, _calls={5: None}, _events=queue.SimpleQueue())
-    asyncio.run(pool._call(5, "tcp://here", len, ("abc",)))
-    assert all(one.released for one in answers) and not list(left) and not pool._calls
-    return pool.events(0.0)
+    value = asyncio.run(pool._call(client, "tcp://here", len, ("abc",)))
+    assert all(one.released for one in answers) and not list(left)
+    return value
 
 
 ON_THE_WAY = [
@@ -225,7 +222,7 @@ def test_what_is_lost_on_the_way_is_asked_again(
     monkeypatch: pytest.MonkeyPatch, status: str, error: BaseException
 ) -> None:
     told = called(monkeypatch, Answer(status, error), Answer(status, error), Answer("finished", "value"))
-    assert told == [Ended(5, "value")]
+    assert told == "value"
 
 
 def test_what_a_worker_cannot_begin_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -236,11 +233,11 @@ def test_what_a_worker_cannot_begin_is_told(monkeypatch: pytest.MonkeyPatch) -> 
         (ImportError("no advsearch"), True),
         (ValueError("a bug"), False),
     ):
-        (told,) = called(monkeypatch, Answer("error", error))
-        assert isinstance(told, Ended) and told.value.unfit is unfit and str(error) in told.value.text
+        told = called(monkeypatch, Answer("error", error))
+        assert told.unfit is unfit and str(error) in told.text
     killed = distributed.KilledWorker("a", SimpleNamespace(address="tcp://here"), 0)
-    (told,) = called(monkeypatch, Answer("error", killed))
-    assert isinstance(told, Dropped)
+    with pytest.raises(WorkerDiedError):
+        called(monkeypatch, Answer("error", killed))
 
 
 def test_a_scheduler_that_is_not_there_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -270,61 +267,27 @@ def test_a_file_of_a_cluster_says_what_is_wrong_and_runs_nothing(tmp_path: Path,
     path = tmp_path / "cluster.yaml"
     path.write_text(text)
     with pytest.raises((InputError, FileFormatError), match=message):
-        place_of(None, str(path))
+        site_of(None, str(path))
 
 
 def test_a_cluster_is_an_address_a_file_or_this_machine(tmp_path: Path) -> None:
     path = tmp_path / "cluster.yaml"
     path.write_text("address: tls://10.0.0.1:8786\nsecurity: {tls_ca_file: ca.pem, require_encryption: true}")
-    place = place_of(None, str(path))
+    place = site_of(None, str(path))
     assert place.address == "tls://10.0.0.1:8786"
     assert place.security == {"tls_ca_file": str(tmp_path / "ca.pem"), "require_encryption": True}
-    assert place_of(3, None).where == "3 workers on this machine"
+    assert LocalPool(3).where == "3 workers on this machine"
     for workers, cluster, message in (
         (2, "tcp://a:1", "leave one of the two out"),
         (None, "a", "expected the address"),
     ):
         with pytest.raises(InputError, match=message):
-            place_of(workers, cluster)
+            site_of(workers, cluster)
     assert set(CLASSES.values()) == {"dask_jobqueue", "dask_kubernetes.operator"}
 
 
-ASKING = {
-    "ask()": False,
-    "with open(__file__):\n    ask()": False,
-    "def main():\n    ask()\nmain()": False,
-    "import threading\none = threading.Thread(target=ask)\none.start()\none.join()": False,
-    "if __name__ == '__main__':\n    ask()": True,
-    "def main():\n    ask()\nif '__main__' == __name__:\n    main()": True,
-    "if __name__ != '__main__':\n    raise SystemExit\nask()": True,
-}
-
-
-FEW = [one for one in ASKING if one.startswith(("import", "def main():\n    ask()\nmain", "if __name__ =="))]
-
-
-@pytest.mark.parametrize("text", only(FEW, ASKING))
-def test_a_script_that_every_worker_would_run_again_is_told_what_to_do(tmp_path: Path, text: str) -> None:
-    script = tmp_path / "script.py"
-    begin = "from advsearch.cluster.dask_pool import place_of\ndef ask():\n    place_of(2, None)\n"
-    script.write_text(begin + text, encoding="utf-8")
-    environ = {**os.environ, "PYTHONPATH": str(ROOT)}
-    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, env=environ, check=False)
-    last = done.stderr.strip().rpartition("\n")[2]
-    wanted = f'workers: expected {script} to ask under `if __name__ == "__main__":`, got a call outside of it, in line'
-    assert (wanted in last) is not ASKING[text], done.stderr
-    assert ASKING[text] or done.stderr.count("\n") < 20
-
-
-def test_a_script_that_comes_through_a_pipe_has_no_workers() -> None:
-    script = "from advsearch.cluster.dask_pool import place_of; place_of(2, None)"
-    environ = {**os.environ, "PYTHONPATH": str(ROOT)}
-    done = subprocess.run([sys.executable], input=script, capture_output=True, text=True, env=environ, check=False)
-    assert "expected a script that they can import, got <stdin>; put it into a file" in done.stderr
-
-
 def test_without_dask_the_message_is_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "distributed", None)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(InputError, match=r"needs Dask; pip install 'advsearch\[dask\]'"):
-        with executor_of(Work("a:b", {}), workers=2, cluster=None, tell=lambda text: None):
+        with executor_of(Work("a:b", {}), workers=None, cluster="tcp://a:1", tell=lambda text: None):
             pass

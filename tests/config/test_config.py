@@ -23,7 +23,7 @@ from advsearch.config.attack import TRIALS, TRIALS_OVER
 from advsearch.config.scene import SceneConfig
 from advsearch.errors import FileFormatError, InputError, UnknownNameError
 from advsearch.questions.check.settings import CheckConfig
-from advsearch.questions.gap.settings import GapConfig
+from advsearch.questions.gap import GapConfig
 from advsearch.questions.precision.settings import QUANTITIES, PrecisionConfig
 from advsearch.questions.region.settings import RegionConfig
 from advsearch.questions.stability.settings import StabilityConfig

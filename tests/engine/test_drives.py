@@ -133,7 +133,6 @@ def test_the_worst_of_several_drives_is_the_one_that_is_kept(tmp_path: Path, mon
     shares = ([5, 2, 4, 4], [5] * 4)
     assert result.summary.interval == pytest.approx(share_interval(*shares)), "over drives, not over 20 frames"
     assert result.summary.units == 4 and told_over(result.summary) == ", over drives"
-    assert "too narrow" in told_over(result.summary.model_copy(update={"units": None})), "a run of an earlier version"
     times = [row for row in result.summary.axes if row.axis == "path.time"]
     assert times[0].interval == clopper_pearson(times[0].correct, 4), "at one time each drive has one frame"
     (yaw, *_) = [row for row in result.summary.axes if row.axis == "pose.yaw"]

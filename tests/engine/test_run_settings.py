@@ -20,8 +20,7 @@ from advsearch.engine.attack_parts import with_derivatives
 from advsearch.engine.naming import RUN_SETTINGS, check_run_settings, given_to
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.questions.attack import carry_out as attacking
-from advsearch.questions.gap.carry_out import gap_from_config
-from advsearch.questions.gap.settings import GapConfig
+from advsearch.questions.gap import GapConfig, gap
 from advsearch.questions.sweep.carry_out import job_of
 
 ALL: dict[str, Any] = {"epsilon": 0.07, "norm": "l2", "texture_resolution": 16}
@@ -118,7 +117,7 @@ def test_a_gap_gives_each_control_what_it_takes(monkeypatch: pytest.MonkeyPatch,
 
     monkeypatch.setattr("advsearch.api.studies.StudyRun.attack", lambda self, one: _seen(one.config, seen))
     config = GapConfig(object="mug", controls="texture,pose,geometry", run=str(tmp_path / "gap"), **ALL)
-    gap_from_config(config)
+    gap.from_config(config)
     assert seen == [(0.07, "l2", 16), (None, None, None), (0.07, None, None)]
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -10,6 +12,7 @@ from pathlib import Path
 
 import advsearch
 from advsearch import rooms
+from advsearch.settings import HEADER
 
 GONE = ("recipe", "harden", "stability")
 
@@ -45,7 +48,41 @@ def test_without_the_folders_of_three_questions_the_tool_works(tmp_path: Path) -
 
 def test_every_room_has_what_finds_it() -> None:
     for name in rooms.rooms():
-        if rooms.in_room(name, "settings", "CONFIG") is not None:
-            assert rooms.in_room(name, "settings", "CONFIG").command == name
-            assert rooms.in_room(name, "carry_out", f"{name}_from_config") is not None
-            assert rooms.in_room(name, "answer", "RESULT").command == name
+        room = rooms.Room(name)
+        if room.config is not None:
+            assert room.config.command == name and room.result.command == name
+            assert room.from_config is not None
+
+
+def test_the_question_of_the_docs_is_one_file(tmp_path: Path) -> None:
+    """No other place is edited, and command, file, page and Python know it."""
+    design = (Path(__file__).parents[2] / "docs" / "design.md").read_text()
+    (written,) = [block for block in re.findall(r"```python\n(.*?)```", design, re.DOTALL) if "@question" in block]
+    shutil.copytree(
+        Path(advsearch.__file__).parent, tmp_path / "advsearch", ignore=shutil.ignore_patterns("__pycache__")
+    )
+    (tmp_path / "advsearch" / "questions" / "count.py").write_text(written)
+    for name in ("first", "second"):
+        (tmp_path / "runs" / name).mkdir(parents=True)
+        (tmp_path / "runs" / name / "run.yaml").write_text(HEADER)
+
+    def told(*words: str) -> str:
+        environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
+        done = subprocess.run(
+            [sys.executable, *words], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    assert "  count       count the files that runs have" in told("-m", "advsearch", "--help")
+    helped = told("-m", "advsearch", "count", "--help")
+    assert "Count the files that runs have." in helped and "advsearch count --runs mug-texture-001" in helped
+    asked = told("-m", "advsearch", "count", "--runs", "first,second", "--json", "--run", "kept")
+    assert json.loads(asked)["files"] == {"first": 1, "second": 1}
+    assert "There are 2 files." in told("-m", "advsearch", "show", "kept")
+    assert "There are 2 files." in (tmp_path / "runs" / "kept" / "report.html").read_text()
+    again = told("-m", "advsearch", "run", "runs/kept/run.yaml", "runs=first", "--json", "--run", "again")
+    assert json.loads(again)["files"] == {"first": 1}
+    called = "import advsearch, inspect; print(inspect.signature(advsearch.count)); "
+    python = told("-c", f"{called} print(advsearch.count('first', run='third'), advsearch.load_run('third'))")
+    assert "(runs: 'str | Path'" in python and python.count("files={'first': 1}") == 2

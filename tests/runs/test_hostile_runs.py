@@ -17,9 +17,8 @@ from covering import once_each
 from samples import GAP, REGION, SWEEP, attack, rated
 
 from advsearch.cli.main import main
-from advsearch.config import AttackConfig
 from advsearch.described import Value
-from advsearch.errors import AdvsearchError, FileFormatError, InputError
+from advsearch.errors import AdvsearchError, FileFormatError
 from advsearch.runs import summary
 from advsearch.runs.directory import RunDirectory, find_run
 from advsearch.runs.files import write_text
@@ -170,7 +169,7 @@ def test_damaged_configurations_are_refused(
     assert main(["runs"]) == 0
 
 
-@pytest.mark.parametrize("name", ["run.yaml", "results.sqlite", "summary.json", ".lock", "replay.bin"])
+@pytest.mark.parametrize("name", ["run.yaml", "results.sqlite", "summary.json", ".lock"])
 def test_pipes_in_a_run_do_not_block(name: str, run: Path) -> None:
     (run / name).unlink(missing_ok=True)
     os.mkfifo(run / name)
@@ -180,7 +179,7 @@ def test_pipes_in_a_run_do_not_block(name: str, run: Path) -> None:
 
 
 KEPT = (
-    *("run.yaml", "summary.json", "results.sqlite", "results.sqlite-wal", "report.html", "columns.bin", "replay.bin"),
+    *("run.yaml", "summary.json", "results.sqlite", "results.sqlite-wal", "report.html", "columns.bin"),
     *("images", "images/clean.png", "images/rows", "images/rows/0000", "images/photos", "images/photos/3-0000.jpg"),
     *("artifacts", "artifacts/answer.npy", "artifacts/object.glb", "aov", "aov/000001.exr", "parts", "parts/a"),
     *("parts/a/report.html", "parts/a/images/rows", ".lock"),
@@ -353,7 +352,7 @@ def test_a_run_is_listed_anew_only_where_it_has_changed(run: Path, monkeypatch: 
     assert (listed_run(run).rows, listed_run(run).fault) == (3, "")
 
 
-@pytest.mark.parametrize("name", ["results.sqlite", "replay.bin", ".lock", "images", "artifacts"])
+@pytest.mark.parametrize("name", ["results.sqlite", ".lock", "images", "artifacts"])
 def test_a_run_that_links_elsewhere_changes_nothing_there(name: str, run: Path, tmp_path: Path) -> None:
     outside = tmp_path / "outside"
     if (run / name).exists():
@@ -386,9 +385,3 @@ def test_what_a_search_was_told_is_checked(change: str, tmp_path: Path) -> None:
         db.execute(f"UPDATE told SET {change}")
     with Store(path) as store, pytest.raises(FileFormatError, match="expected what a search was told, got"):
         store.told("search", 0)
-
-
-def test_a_search_that_an_older_advsearch_has_begun_is_refused(run: Path) -> None:
-    (run / "replay.bin").write_bytes(b"")
-    with pytest.raises(InputError, match=r"cannot go on: it was begun by an older advsearch; start again with"):
-        RunDirectory.resume("it", AttackConfig(object="mug", controls="pose"))

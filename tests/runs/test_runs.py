@@ -34,7 +34,7 @@ from advsearch.files import open_regular
 from advsearch.runs import directory, images, summary
 from advsearch.runs.directory import RunDirectory, default_name, find_run, run_path
 from advsearch.runs.export import FORMATS, write_rows
-from advsearch.runs.files import MIGRATIONS, PART, RunLock, replacing, write_bytes, write_text
+from advsearch.runs.files import PART, VERSION, RunLock, replacing, write_bytes, write_text
 from advsearch.runs.listing import finished, listed_runs
 from advsearch.runs.results.base import Result, plain
 from advsearch.runs.store import Row, Store
@@ -134,7 +134,7 @@ def test_the_store_is_readable_beside_the_writer(run: RunDirectory) -> None:
 
 def test_the_file_is_versioned_commented_and_in_wal_mode(run: RunDirectory) -> None:
     with sqlite3.connect(run.path / "results.sqlite") as db:
-        assert db.execute("PRAGMA user_version").fetchone() == (len(MIGRATIONS),)
+        assert db.execute("PRAGMA user_version").fetchone() == (VERSION,)
         assert db.execute("PRAGMA journal_mode").fetchone() == ("wal",)
         (schema,) = db.execute("SELECT sql FROM sqlite_master WHERE name = 'evaluations'").fetchone()
         meta = dict(db.execute("SELECT key, value FROM meta"))
@@ -152,74 +152,6 @@ def test_a_closed_run_is_one_file_and_opens_again(tmp_path: Path) -> None:
         assert store.count() == 2
 
 
-def test_a_file_of_version_1_is_brought_up_to_date(tmp_path: Path) -> None:
-    path = tmp_path / "results.sqlite"
-    db = sqlite3.connect(path)
-    db.executescript(f"BEGIN; {MIGRATIONS[0]} PRAGMA user_version = 1; COMMIT;")
-    with db:
-        columns = (
-            "kind, step, seed, spp, objective, success, label, label_index, probability, values_json, seconds, time"
-        )
-        given = (
-            "search",
-            3,
-            7,
-            8,
-            -0.25,
-            1,
-            "bowl",
-            2,
-            0.5,
-            '{"a.b": {"value": 1.5, "unit": "degrees"}}',
-            0.125,
-            1.7e9,
-        )
-        db.execute(f"INSERT INTO evaluations ({columns}) VALUES ({', '.join('?' * len(given))})", given)
-    db.close()
-    before = path.read_bytes()
-    with Store(path, read_only=True) as store:
-        assert [(row.step, row.renders, row.payload) for row in store.rows()] == [(3, None, None)]
-    assert path.read_bytes() == before, "reading changes nothing"
-    with Store(path) as store:
-        store.append([Row("search", 4, renders=13)])
-        old, new = store.rows()
-        assert (old.step, old.seed, old.objective, old.success, old.label, old.time) == (
-            3,
-            7,
-            -0.25,
-            True,
-            "bowl",
-            1.7e9,
-        )
-        assert old.values == {"a.b": {"value": 1.5, "unit": "degrees"}} and old.seconds == 0.125
-        assert (old.renders, new.renders) == (None, 13)  # nobody counted then
-        assert store.note("created") is not None
-    with sqlite3.connect(path) as db:
-        assert db.execute("PRAGMA user_version").fetchone() == (len(MIGRATIONS),)
-    db.close()
-    with Store(path) as store:  # and not again
-        assert [row.renders for row in store.rows()] == [None, 13]
-
-
-def test_a_sweep_of_version_2_says_what_was_correct_and_an_attack_keeps_its_success(tmp_path: Path) -> None:
-    path = tmp_path / "results.sqlite"
-    db = sqlite3.connect(path)
-    db.executescript(f"BEGIN; {MIGRATIONS[0]} {MIGRATIONS[1]} PRAGMA user_version = 2; COMMIT;")
-    given = [("sweep", 0, 1.5, 1), ("sweep", 1, -0.5, 0), ("sweep", 2, None, None), ("verification", 0, 2.0, 1)]
-    given += [("baseline verification", 0, 3.0, 1), ("search 1", 0, 4.0, 1), ("baseline", 0, 5.0, 1)]
-    with db:
-        columns = "kind, step, objective, success, values_json, time"
-        db.executemany(f"INSERT INTO evaluations ({columns}) VALUES (?, ?, ?, ?, '{{}}', 0)", given)
-    db.close()
-    expected = [(None, False, 1.5), (None, True, -0.5), (None, False, None), *[(True, None, None)] * 4]
-    for read_only in (True, False):
-        with Store(path, read_only=read_only) as store:
-            rows = list(store.rows())
-        assert [(row.success, row.correct, row.margin) for row in rows] == expected
-    assert [row.score for row in rows] == [1.5, -0.5, None, 2.0, 3.0, None, None]
-    assert [row.objective for row in rows] == [None, None, None, None, None, 4.0, 5.0], "only searches maximised it"
-
-
 def test_a_step_is_there_once_however_often_it_is_written(tmp_path: Path) -> None:
     with Store(tmp_path / "results.sqlite") as store:
         store.append([Row("sweep", 4, label="first", id=5), Row("sweep", 1, id=2)])
@@ -235,19 +167,6 @@ def test_a_step_is_there_once_however_often_it_is_written(tmp_path: Path) -> Non
         assert list(store.missing("sweep", 5)) == [range(2, 4)] and list(store.missing("none", 2)) == [range(2)]
 
 
-def test_a_file_of_version_4_with_a_step_twice_keeps_the_first(tmp_path: Path) -> None:
-    path = tmp_path / "results.sqlite"
-    db = sqlite3.connect(path)
-    db.executescript(f"BEGIN; {' '.join(MIGRATIONS[:4])} PRAGMA user_version = 4; COMMIT;")
-    with db:
-        columns = "kind, step, label, values_json, time"
-        given = [("sweep", 0, "a"), ("sweep", 1, "b"), ("sweep", 1, "c"), ("control", 1, "d")]
-        db.executemany(f"INSERT INTO evaluations ({columns}) VALUES (?, ?, ?, '{{}}', 0)", given)
-    db.close()
-    with Store(path) as store:
-        assert [(row.label, row.machine) for row in store.rows()] == [("a", None), ("b", None), ("d", None)]
-
-
 def test_results_of_another_advsearch_or_none_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "results.sqlite"
     with pytest.raises(FileFormatError, match=r"expected the results of a run, got no such file; check the name"):
@@ -260,11 +179,15 @@ def test_results_of_another_advsearch_or_none_are_refused(tmp_path: Path) -> Non
             Store(path, read_only=read_only)
     path.unlink()
     Store(path).close()
-    with sqlite3.connect(path) as db:
-        db.execute("PRAGMA user_version = 99")
-    db.close()
-    with pytest.raises(FileFormatError, match=r"expected version 8 of the results, got 99; use a newer advsearch"):
-        Store(path)
+    for version in (5, 99):
+        with sqlite3.connect(path) as db:
+            db.execute(f"PRAGMA user_version = {version}")
+            db.execute("UPDATE meta SET value = '2026-11-24T10:00:00Z'")
+        db.close()
+        said = rf"expected version 8 of the results, got {version}; read it with .* that wrote it, that of 2026-11-24"
+        for read_only in (True, False):
+            with pytest.raises(FileFormatError, match=said):
+                Store(path, read_only=read_only)
 
 
 PLAIN = st.none() | st.booleans() | st.integers(-(2**53), 2**53) | st.floats(-1e300, 1e300) | st.text()

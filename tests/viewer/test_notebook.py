@@ -19,7 +19,7 @@ from PIL import Image
 from samples import CURVE, GAP, sweep
 
 from advsearch.questions.attack.answer import CurveResult
-from advsearch.questions.gap.answer import GapResult
+from advsearch.questions.gap import GapResult
 from advsearch.report.figures import search_axes, sweep_axes
 from advsearch.report.markup import side_by_side
 

@@ -29,7 +29,6 @@ from advsearch.report.shown import (
     share_text,
 )
 from advsearch.report.wording import count, interval_text, number_text, short_name
-from advsearch.runs.export import table_to_pandas
 from advsearch.runs.results.attack import (
     AttackSummary,
     ControlGroup,
@@ -76,18 +75,11 @@ class CurveResult(InNotebook, StudyResult):
     """Robust accuracy against epsilon, over objects."""
 
     command: ClassVar[str] = "attack"
+    tabular: ClassVar[str] = "curve"
 
     epsilons: list[float | None] = Field(description="those that were tried; null: the own of each control")
     table: list[ObjectRow]
     curve: list[CurvePoint]
-
-    def to_pandas(self) -> Any:
-        """Return a row for each epsilon as a `pandas.DataFrame`; columns are called as in `summary.json`.
-
-        Raises:
-            InputError: pandas is not installed.
-        """
-        return table_to_pandas([point.to_dict() for point in self.curve])
 
 
 class MatrixModel(Fields):

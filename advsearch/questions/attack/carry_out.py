@@ -56,8 +56,9 @@ from advsearch.files import JsonObject
 from advsearch.models import Model
 from advsearch.options import as_setting, told
 from advsearch.progress import NullProgress, Progress, Watched, watcher
+from advsearch.question import Asked, answered
 from advsearch.questions.attack.answer import CurveResult, MatrixResult
-from advsearch.questions.attack.several import curve_from_config, matrix_from_config
+from advsearch.questions.attack.several import curve, matrix
 from advsearch.report.wording import count
 from advsearch.runs.directory import RunDirectory, begun, check_free, is_run, run_path
 from advsearch.tasks import AnyTask, OwnTask, Task, function_of, make_task
@@ -169,9 +170,9 @@ def attack_from_config(
 ) -> AttackResult | CurveResult | MatrixResult:
     """Do what a configuration describes: one attack, a curve or a matrix of several; see `attack`."""
     if config.is_matrix:
-        return matrix_from_config(config, progress=progress, resumed=resumed)
+        return answered(matrix, Asked(config, progress, resumed))
     if config.is_curve:
-        return curve_from_config(config, progress=progress, resumed=resumed)
+        return answered(curve, Asked(config, progress, resumed))
     return attack_once(config, progress=progress, resumed=resumed)
 
 

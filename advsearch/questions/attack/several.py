@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from advsearch import seeds
-from advsearch.api.studies import SETTLED, StudyRun, carry_out_study
+from advsearch.api.studies import SETTLED, StudyRun
 from advsearch.attacks import clopper_pearson
 from advsearch.attacks.verification import WORST_CASE
 from advsearch.cluster import Call
@@ -24,8 +24,7 @@ from advsearch.engine.record import control_group, verified_rate
 from advsearch.engine.transport import CleanMatrix
 from advsearch.engine.verifier import RetrialCondition, Retrials
 from advsearch.files import JsonObject
-from advsearch.interrupts import interruptible
-from advsearch.progress import NullProgress, Progress
+from advsearch.question import Asked
 from advsearch.questions.attack.answer import (
     CurvePoint,
     CurveResult,
@@ -36,29 +35,17 @@ from advsearch.questions.attack.answer import (
     ObjectRow,
 )
 from advsearch.runs.results.attack import AttackSummary
-from advsearch.runs.results.base import StudyResult
 from advsearch.runs.summary import read_answer
 
 
-def curve_from_config(
-    config: AttackConfig, *, progress: Progress | None = None, resumed: Path | None = None
-) -> CurveResult:
+def curve(asked: Asked[AttackConfig]) -> CurveResult:
     """Robust accuracy against epsilon, over objects.
 
     The epsilons are tried from the smallest. An object that flips at one of them flips at every larger one, whose ball
     has the same configuration in it, so it is not attacked again. An object that is wrong as it is counts as not robust
     at any epsilon, and is told apart from those that were found.
     """
-    epsilons: Sequence[float | None] = sorted(config.epsilons) or [None]
-
-    def result(rows: list[ObjectRow], common: StudyResult) -> CurveResult:
-        curve = [_accuracy(rows, epsilon) for epsilon in epsilons]
-        return CurveResult(**vars(common), epsilons=list(epsilons), table=rows, curve=curve)
-
-    return carry_out_study(config, _curve, result, progress, resumed)
-
-
-def _curve(study: StudyRun) -> list[ObjectRow]:
+    study = StudyRun(asked)
     rows = []
     for chain in study.chains:
         row, clean = ObjectRow(object=chain[0].of, clean=None, flips_at=None), CleanMatrix()
@@ -72,7 +59,15 @@ def _curve(study: StudyRun) -> list[ObjectRow]:
             if row.ending in SETTLED:
                 break
         rows.append(row)
-    return rows
+    epsilons: Sequence[float | None] = sorted(asked.config.epsilons) or [None]
+    return asked.result(
+        CurveResult,
+        epsilons=list(epsilons),
+        table=rows,
+        curve=[_accuracy(rows, epsilon) for epsilon in epsilons],
+        parts=study.names,
+        warnings=study.warnings,
+    )
 
 
 def _seen(name: str, summary: AttackSummary, tried: float | None) -> ObjectRow:
@@ -126,28 +121,19 @@ LEAST_SPP = 64
 """Samples a pixel of the trials, where none of the attacks needed more and nothing was asked for."""
 
 
-def matrix_from_config(
-    config: AttackConfig, *, progress: Progress | None = None, resumed: Path | None = None
-) -> MatrixResult:
+def matrix(asked: Asked[AttackConfig]) -> MatrixResult:
     """Attack several models, and try every answer on each of them in pictures that are the same for all.
 
     Trial k has the same seed for every answer and every model, and none that a search or its verification has used.
     Models of one input size are shown the same picture; for another size the same configuration is rendered anew. A
     success needs the model to be right on the clean scene with the same seed, as everywhere.
     """
-    names, progress = different(config.models, "model"), progress or NullProgress()
-    progress.stage(LOADING)
+    config, names = asked.config, different(asked.config.models, "model")
+    asked.progress.stage(LOADING)
     for name in names:
         check_from_config(_alone(config, name))
 
-    def result(rows: tuple[list[MatrixModel], list[MatrixRow]], common: StudyResult) -> MatrixResult:
-        return MatrixResult(**vars(common), models=list(names), ensemble=config.ensemble, tested=rows[0], table=rows[1])
-
-    return carry_out_study(config, lambda study: _matrix(config, names, study), result, progress, resumed)
-
-
-def _matrix(config: AttackConfig, names: Sequence[str], study: StudyRun) -> tuple[list[MatrixModel], list[MatrixRow]]:
-    """Attack, then try every answer on every model."""
+    study = StudyRun(asked)
     attacked: list[tuple[str, AttackSummary]] = []
     for (one,) in study.chains:
         summary = study.attack(one)
@@ -158,36 +144,39 @@ def _matrix(config: AttackConfig, names: Sequence[str], study: StudyRun) -> tupl
     answers = {name: u for name, summary in attacked if (u := _answer(summary)) is not None}
     if answers and not study.interrupted:
         spp = config.verify_spp or max([LEAST_SPP, *(s.sample_count.spp for _, s in attacked if s.sample_count)])
-        try:
-            with interruptible():
-                study.progress.stage("loading the models to try the answers on")
-                problems = {name: problem_from_config(_alone(config, name))[0] for name in names}
-                seed, trials = seeds.stream(config.seed, "matrix"), config.trial_count
-                with executor_for(
-                    config, "advsearch.questions.attack.several:models_answering", study.progress
-                ) as executor:
-                    conditions = [RetrialCondition(name, one, spp, _size(one)) for name, one in problems.items()]
-                    retrials = Retrials(
-                        conditions, study.run, study.progress, trials=trials, seed=seed, executor=executor
-                    )
-                    each = trials * len(names)
-                    hint = f"{each} answers; `trials` or `verify_spp` shorten it"
-                    study.progress.stage("trying the clean scene on every model", each, hint=hint)
-                    models = [_model(one, retrials) for one in conditions]
-                    for name, u in answers.items():
-                        study.progress.stage(f"trying the answer to {name} on every model", each, hint=hint)
-                        checked = [(one.name, retrials.answer(name, u, one)) for one in conditions]
-                        cells[name] = [
-                            MatrixCell(model=model, ending=one.ending.value, verified=verified_rate(one))
-                            for model, one in checked
-                        ]
-        except KeyboardInterrupt:
-            study.interrupted = True
+        with asked.until_interrupted():
+            study.progress.stage("loading the models to try the answers on")
+            problems = {name: problem_from_config(_alone(config, name))[0] for name in names}
+            seed, trials = seeds.stream(config.seed, "matrix"), config.trial_count
+            with executor_for(
+                config, "advsearch.questions.attack.several:models_answering", study.progress
+            ) as executor:
+                conditions = [RetrialCondition(name, one, spp, _size(one)) for name, one in problems.items()]
+                retrials = Retrials(conditions, study.run, study.progress, trials=trials, seed=seed, executor=executor)
+                each = trials * len(names)
+                hint = f"{each} answers; `trials` or `verify_spp` shorten it"
+                study.progress.stage("trying the clean scene on every model", each, hint=hint)
+                models = [_model(one, retrials) for one in conditions]
+                for name, u in answers.items():
+                    study.progress.stage(f"trying the answer to {name} on every model", each, hint=hint)
+                    checked = [(one.name, retrials.answer(name, u, one)) for one in conditions]
+                    cells[name] = [
+                        MatrixCell(model=model, ending=one.ending.value, verified=verified_rate(one))
+                        for model, one in checked
+                    ]
     rows = [
         MatrixRow(attacked=name, ending=one.ending, run=one.run, renders=one.renders, tested=cells.get(name, []))
         for name, one in attacked
     ]
-    return models, rows
+    return asked.result(
+        MatrixResult,
+        models=list(names),
+        ensemble=config.ensemble,
+        tested=models,
+        table=rows,
+        parts=study.names,
+        warnings=study.warnings,
+    )
 
 
 def models_answering(settings: JsonObject) -> Call:

@@ -127,9 +127,7 @@ def _measured(config: PrecisionConfig, run: RunDirectory | None, progress: Progr
         raise InputError(
             f"`controls` {','.join(config.controls)}: has no derivative; leave gradient out of `quantities`"
         )
-    with executor_for(
-        config, "advsearch.questions.precision.carry_out:references_of", progress, ahead=False
-    ) as executor:
+    with executor_for(config, "advsearch.questions.precision.carry_out:references_of", progress) as executor:
         if executor is not None:
             progress.stage("workers load the scene and the model")
             for _ in executor.results([[None]]):

@@ -44,8 +44,9 @@ def claims_of(result: Result) -> list[Claim]:
     if result.goes_on:
         told = f"; so far: {result.brief}" if result.brief else ""
         return [nothing_claimed(f"the run was stopped before its end{told}")]
-    if own := rooms.in_room(result.command, "answer", "claims"):
-        return list(own(result)) or [nothing_claimed("nothing in this run came to its end")]
+    room = rooms.room(result.command)
+    if room and room.claims:
+        return list(room.claims(result)) or [nothing_claimed("nothing in this run came to its end")]
     return [nothing_claimed(f"the command {result.command} measures something else than how often a model is right")]
 
 

@@ -1,0 +1,178 @@
+"""A question from a function: of its types come settings and result, and of both its command and its Python function.
+
+    @question("gap --object mug --control pose", place=("object", "model"))
+    def gap(asked: Asked[GapConfig]) -> GapResult: ...
+
+`advsearch.rooms` finds it by its name. The first line of its file says what it does, as `advsearch --help` shows it.
+The file imports nothing that renders but inside the function: who reads settings or a result reads it too.
+"""
+
+from __future__ import annotations
+
+import inspect
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from functools import cached_property, partial
+from importlib import import_module
+from pathlib import Path
+from typing import Any, Generic, TypeVar, get_args, get_type_hints
+
+from advsearch.interrupts import interruptible
+from advsearch.progress import NullProgress, Progress, watcher
+from advsearch.report.markup import figure_of_answer
+from advsearch.report.shown import shown
+from advsearch.runs.directory import RunDirectory
+from advsearch.runs.files import write_bytes
+from advsearch.runs.results.base import INTERRUPTED, Result
+from advsearch.settings import Config
+from advsearch.viewer.pages import keep_answer
+
+Settings = TypeVar("Settings", bound=Config, covariant=True)
+Answer = TypeVar("Answer", bound=Result)
+Made = TypeVar("Made", bound=Result)
+
+SAID = {
+    "object": "object", "objects": "objects", "environment": "lit_by", "controls": "controls", "model": "model",
+    "task": "task_name", "policy": "policy_name", "seed": "seed",
+}  # fmt: skip
+"""Fields of a result that settings say, by the attribute of these."""
+
+TYPES = {"object": "Scene | str | Path", "model": "AnyModel"}
+"""What Python may give for a setting in place of its text."""
+
+
+class Asked(Generic[Settings]):
+    """What a question is asked: its settings, who watches, and the folder of a run that goes on."""
+
+    def __init__(self, config: Settings, progress: Progress | None = None, resumed: Path | None = None) -> None:
+        self.config, self.progress, self.resumed = config, progress or NullProgress(), resumed
+        self.ending = "done"
+        self._begun, self._open = time.perf_counter(), ExitStack()
+
+    def __enter__(self) -> Asked[Settings]:
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        self._open.__exit__(*error)
+
+    @cached_property
+    def run(self) -> RunDirectory:
+        """The run, made where it is first asked for: whatever may be wrong is looked for before."""
+        return self._open.enter_context(RunDirectory.of(self.config, self.resumed))
+
+    @contextmanager
+    def until_interrupted(self) -> Iterator[None]:
+        """Do what can be interrupted; the question goes on behind it, and its run ends as that."""
+        try:
+            with interruptible():
+                yield
+        except KeyboardInterrupt:
+            self.ending = INTERRUPTED
+
+    def result(self, kind: type[Made], **fields: Any) -> Made:
+        """Return a result with these fields, and with those that all results have: what the settings say of object,
+        model and so on, the run, how it ended and how long it took."""
+        said = {name: getattr(self.config, of) for name, of in SAID.items() if hasattr(self.config, of)}
+        said |= {name: list(said[name]) for name in ("objects", "controls") if name in said}
+        seconds = {"total": time.perf_counter() - self._begun}
+        said |= {"run": str(self.run.path), "ending": self.ending, "seconds": seconds}
+        return kind(**{**said, "command_line": self.config.command_line(), **fields})
+
+
+def answered(answer: Callable[[Asked[Settings]], Answer], asked: Asked[Settings]) -> Answer:
+    """Return what a function answers, which is kept in its run with its page and its figure."""
+    with asked:
+        result = answer(asked)
+        for suffix, data in figure_of_answer(shown(result)).items():
+            write_bytes(asked.run.path / "images" / f"{asked.config.command}.{suffix}", data)
+        return keep_answer(asked.run, result)
+
+
+@dataclass(frozen=True)
+class Question(Generic[Answer]):
+    """A question. Attributes as for `question`; `config` and `result` are the classes of settings and result."""
+
+    answer: Callable[..., Answer]
+    config: type[Config]
+    result: type[Answer]
+    examples: tuple[str, ...]
+    place: tuple[str, ...]
+    about: str
+    expected: tuple[str, str] | None
+    brought: Callable[[Path, Mapping[str, Any]], dict[str, Any]] | None
+    called: str
+
+    def from_config(
+        self, config: Any, *, progress: Progress | None = None, resumed: Path | None = None, **more: Any
+    ) -> Answer:
+        """Do what a configuration describes, and keep it in its run; `more` is for the function alone."""
+        return answered(partial(self.answer, **more), Asked(config, progress, resumed))
+
+    def __call__(self, *args: Any, **settings: Any) -> Answer:
+        """Ask it from Python."""
+        answer: Answer = self.python(*args, **settings)
+        return answer
+
+    @cached_property
+    def python(self) -> Callable[..., Any]:
+        """What Python calls, with every setting as a keyword."""
+        if self.called:
+            module, _, name = self.called.partition(":")
+            made: Callable[..., Any] = getattr(import_module(module), name)
+            return made
+        from advsearch.api.keywords import asks, configured  # imports torch
+
+        def function(*args: Any, progress: Any = None, **settings: Any) -> Answer:
+            given = dict(zip(self.place, args, strict=False))
+            return self.from_config(configured(self.config, **given, **settings), progress=watcher(progress))
+
+        fields = self.config.model_fields
+        parameters = [
+            inspect.Parameter(
+                name,
+                inspect.Parameter.POSITIONAL_OR_KEYWORD,
+                default=inspect.Parameter.empty if fields[name].is_required() else fields[name].default,
+                annotation=TYPES.get(name, "str | Path"),
+            )
+            for name in self.place
+        ]
+        parameters += [
+            inspect.Parameter("progress", inspect.Parameter.KEYWORD_ONLY, default=None, annotation="Watched"),
+            inspect.Parameter("settings", inspect.Parameter.VAR_KEYWORD),
+        ]
+        function.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
+            parameters, return_annotation=self.result.__name__
+        )
+        function.__name__, function.__doc__ = self.config.command, self.answer.__doc__
+        function.__qualname__, function.__module__ = function.__name__, self.answer.__module__
+        return asks(self.config)(function)
+
+
+def question(
+    *examples: str,
+    place: tuple[str, ...] = (),
+    about: str = "",
+    expected: tuple[str, str] | None = None,
+    brought: Callable[[Path, Mapping[str, Any]], dict[str, Any]] | None = None,
+    called: str = "",
+) -> Callable[[Callable[..., Answer]], Question[Answer]]:
+    """Make a question of a function ``(asked: Asked[NameConfig]) -> NameResult``, called as its command.
+
+    Args:
+        examples: lines of a shell, for its help.
+        place: settings that Python takes by position.
+        about: the setting that names a run or a file which it is about.
+        expected: where that is given without its flag, what stands for it in the help, and what an error says it is.
+        brought: returns settings that the `run.yaml` of that run brings, by what was typed.
+        called: ``module:function`` that Python calls, where more can be given there than settings.
+    """
+
+    def decorate(answer: Callable[..., Answer]) -> Question[Answer]:
+        hints = get_type_hints(answer)
+        first, result = next(iter(inspect.signature(answer).parameters)), hints["return"]
+        (config,) = get_args(hints[first])
+        return Question(answer, config, result, examples, place, about, expected, brought, called)
+
+    return decorate
