@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import OpenEXR
@@ -240,7 +241,11 @@ def write_xml(path: Path, scene: Plugin, meshes: Mapping[str, Any], note: str) -
         text = mi.parser.write_string(mi.parser.parse_dict(mi.parser.ParserConfig(VARIANT), whole))
     except (RuntimeError, TypeError) as error:
         raise InputError(f"out: XML of Mitsuba cannot say the scene: {error}; export another run") from error
-    path.write_text(f"<!-- {note.replace('--', '- -')} -->\n{text}", "utf-8")
+    root = ElementTree.fromstring(text)
+    for one in root:  # ids are what Mitsuba calls their parameters by; its writer has them of what is referred to only
+        one.set("id", one.attrib.pop("name"))
+    text = ElementTree.tostring(root, encoding="unicode")
+    path.write_text(f"<!-- {note.replace('--', '- -')} -->\n{text}\n", "utf-8")
 
 
 def _write_picture(path: Path, values: np.ndarray) -> None:

@@ -227,16 +227,16 @@ def _value(where: str, kind: Any, value: Any) -> object:
         made = numbers = list(value)
     elif kind == kinds.Transform:
         made = numbers = np.array(value.matrix, np.float64)
-        if not np.isfinite(numbers).all() or not abs(np.linalg.det(numbers[:3, :3])) > 0.0:
-            raise FileFormatError(f"{where}: expected a transform that can be undone, of finite numbers; correct it")
-        if not np.array_equal(numbers[3], (0.0, 0.0, 0.0, 1.0)):
-            raise FileFormatError(f"{where}: expected an affine transform, whose last row is 0 0 0 1; correct it")
     elif kind == kinds.Spectrum:
         pairs = list(zip(value.wavelengths, value.values, strict=False))
         numbers = pairs or value.values
         made = {"type": "spectrum", "value": pairs or value.values[0]}
     if not (np.abs(np.asarray(numbers, np.float64)) < 1e30).all():
-        raise FileFormatError(f"{where}: expected a finite number, got {shown(str(value))}; correct it")
+        raise FileFormatError(f"{where}: expected a finite number, got {shown(str(np.asarray(numbers)))}; correct it")
+    if kind == kinds.Transform and not abs(np.linalg.det(numbers[:3, :3])) > 0.0:
+        raise FileFormatError(f"{where}: expected a transform that can be undone, got one that squashes; correct it")
+    if kind == kinds.Transform and not np.array_equal(numbers[3], (0.0, 0.0, 0.0, 1.0)):
+        raise FileFormatError(f"{where}: expected an affine transform, whose last row is 0 0 0 1; correct it")
     return made
 
 
