@@ -26,7 +26,6 @@ import numpy as np
 import torch
 from numpy.polynomial import polynomial
 from torch import Tensor
-from torch.func import jvp
 
 from advsearch.errors import InputError
 
@@ -163,8 +162,8 @@ class CameraModel:
         low, most = torch.zeros_like(wanted), torch.full_like(wanted, bound)
         found = torch.minimum(wanted, most)
         for _ in range(STEPS):
-            there, slope = jvp(self._radial, (found,), (torch.ones_like(found),))
-            error = there - wanted
+            there, (slope,) = _with_slopes(lambda radius: self._radial(radius)[..., None], found)
+            error = there[..., 0] - wanted
             if bool(((error.abs() <= TOLERANCE) | (most - low <= TOLERANCE)).all()):
                 break
             most, low = torch.where(error > 0.0, found, most), torch.where(error > 0.0, low, found)
@@ -177,10 +176,8 @@ class CameraModel:
         """Solve bent(found) = bent in two dimensions from (N, 2); and which are solved, before the lens folds."""
         converged = torch.zeros_like(flat[..., 0], dtype=torch.bool)
         for _ in range(STEPS // 3):
-            across, down = torch.tensor([[1.0, 0.0], [0.0, 1.0]]).to(flat).expand(len(flat), 2, 2).unbind(dim=1)
-            there, by_x = jvp(self._bent, (flat,), (across,))
-            by_y = jvp(self._bent, (flat,), (down,))[1]
-            error, (a, c), (b, d) = there - bent, by_x.unbind(dim=-1), by_y.unbind(dim=-1)
+            there, rows = _with_slopes(self._bent, flat)
+            error, ((a, b), (c, d)) = there - bent, (row.unbind(dim=-1) for row in rows)
             determinant = a * d - b * c
             inside = (determinant > 0.0) & (flat.norm(dim=-1) < high)
             converged = inside & (error.norm(dim=-1) <= TOLERANCE * (1.0 + bent.norm(dim=-1)))
@@ -360,6 +357,15 @@ def _evaluated(coefficients: np.ndarray, at: Tensor) -> Tensor:
     for one in coefficients[-2::-1]:
         found = found * at + float(one)
     return found
+
+
+def _with_slopes(function: Field, at: Tensor) -> tuple[Tensor, list[Tensor]]:
+    """Values (N, k) of a function of each of N places alone, and the derivatives of each of the k by the place."""
+    with torch.enable_grad():
+        places = at.detach().requires_grad_()
+        values = function(places)
+        slopes = [torch.autograd.grad(one.sum(), places, retain_graph=True)[0] for one in values.unbind(dim=-1)]
+    return values.detach(), slopes
 
 
 def _inside(margin: Tensor, converged: Tensor) -> Tensor:

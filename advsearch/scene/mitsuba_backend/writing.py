@@ -242,7 +242,7 @@ def write_xml(path: Path, scene: Plugin, meshes: Mapping[str, Any], note: str) -
     except (RuntimeError, TypeError) as error:
         raise InputError(f"out: XML of Mitsuba cannot say the scene: {error}; export another run") from error
     root = ElementTree.fromstring(text)
-    for one in root:  # ids are what Mitsuba calls their parameters by; its writer has them of what is referred to only
+    for one in root.findall("*[@type]"):  # Mitsuba calls parameters by ids, and writes those that are referred to only
         one.set("id", one.attrib.pop("name"))
     text = ElementTree.tostring(root, encoding="unicode")
     path.write_text(f"<!-- {note.replace('--', '- -')} -->\n{text}\n", "utf-8")
