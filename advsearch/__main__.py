@@ -12,7 +12,8 @@ def start() -> int:
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends the process, without a traceback, until `main` begins
 
     # first the handling of signals above
-    from advsearch.cli.main import INTERRUPTED, main
+    from advsearch.cli.main import main
+    from advsearch.cli.output import INTERRUPTED
 
     status = main()
     if status == INTERRUPTED:  # one that struck inside Dr.Jit has left it so that the interpreter aborts at its end

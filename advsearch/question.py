@@ -82,9 +82,12 @@ class Asked(Generic[Settings]):
 
 
 def answered(answer: Callable[[Asked[Settings]], Answer], asked: Asked[Settings]) -> Answer:
-    """Return what a function answers, which is kept in its run with its page and its figure."""
+    """Return what a function answers, which is kept in its run with its page and its figure, unless the function has
+    kept it itself."""
     with asked:
         result = answer(asked)
+        if "run" not in vars(asked):
+            return result
         for suffix, data in figure_of_answer(shown(result)).items():
             write_bytes(asked.run.path / "images" / f"{asked.config.command}.{suffix}", data)
         return keep_answer(asked.run, result)
@@ -172,6 +175,7 @@ def question(
     def decorate(answer: Callable[..., Answer]) -> Question[Answer]:
         hints = get_type_hints(answer)
         first, result = next(iter(inspect.signature(answer).parameters)), hints["return"]
+        result = (*get_args(result), result)[0]  # the first of several kinds
         (config,) = get_args(hints[first])
         return Question(answer, config, result, examples, place, about, expected, brought, called)
 

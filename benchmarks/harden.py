@@ -19,7 +19,7 @@ from advsearch import threads
 
 threads.configure()
 
-from advsearch.cli.output import watch_progress  # noqa: E402
+from advsearch.progress import watched  # noqa: E402
 from advsearch.questions.harden.answer import HEADS, HardenResult, Share, hardened_rows  # noqa: E402  # noqa: E402
 from advsearch.questions.harden.carry_out import harden_from_config  # noqa: E402
 from advsearch.questions.harden.settings import HardenConfig  # noqa: E402
@@ -43,7 +43,7 @@ def main() -> int:
     else:
         first = {} if "controls" in changes else SETTINGS
         config = HardenConfig(**{**first, **changes, "run": str(args.run)})
-    with watch_progress() as progress:
+    with watched(True) as progress:
         result = harden_from_config(config, progress=progress, resumed=args.run if there else None)
     print(" | ".join(HEADS))
     for row in hardened_rows(result):

@@ -208,7 +208,7 @@ def measured(pair: tuple[str, str, str], size: int, spp: int, repeats: int) -> d
 def predicted(size: int, spp: int, repeats: int) -> str:
     """What a picture takes, and how far it is off, where light on surfaces leaves the tracing out; as a row."""
     renderer = problem_of(PAIRS[0], size, "camera").renderer
-    light = SurfaceRenderer(renderer, renderer.start, seed=0)
+    light = SurfaceRenderer(renderer, renderer.start, seed=0).renderer
     seconds: tuple[list[float], list[float]] = ([], [])
     squares: tuple[list[float], list[float]] = ([], [])
     with torch.no_grad():

@@ -102,7 +102,7 @@ class Turn:
         self.right = sum(one for one, _ in pairs)
         both = zip(each.judgements, again.judgements, strict=True)
         self.again = sum(one.right == other.right for one, other in both)
-        told = next(iter(predicting.light.values())).summary()
+        told = next(iter(predicting.predicted.values())).summary()
         assert told is not None and told.used and told.error is not None, told
         self.error = f"off by at most {told.error.levels:.2f} levels, {told.error.logits:+.2f} logits"
 
@@ -128,11 +128,12 @@ class Looks:
         def judged(*given):  # type: ignore[no-untyped-def]
             nonlocal model
             before = time.perf_counter()
-            found = SweptScene._judged(view, *given)
+            found = judge(*given)
             model += time.perf_counter() - before
             return found
 
-        with mock.patch.object(view, "_judged", judged):
+        judge = view.problems[0].judge_several
+        with mock.patch.object(view.problems[0], "judge_several", judged):
             for first in range(0, len(rows), BATCH):
                 part = rows[first : first + BATCH]
                 asked = view.job.queries(range(part[0], part[0] + len(part)))

@@ -128,12 +128,11 @@ def row(name: str, renderer: Renderer, model: Model, label: str | None, args: ar
     wholes = views(renderer, args.views)
     inputs = [renderer.scene.assembly(renderer.space.inputs(one)) for one in wholes]
     others = [milliseconds(lambda one=one: light.light(one)) for one in inputs]  # type: ignore[misc]
-    color = light.color(inputs[0])
     taken: tuple[list[float], list[float]] = ([], [])
     for number in range(args.repeats + 1):
         which = number % len(wholes)
         turns: tuple[Callable[[], object], ...] = (
-            lambda which=which: light.pictures([inputs[which]], color, [wholes[which]]),  # type: ignore[misc]
+            lambda which=which: light(wholes[which]),  # type: ignore[misc]
             lambda which=which: renderer(wholes[which], seed=which, spp=SPP),  # type: ignore[misc]
         )
         for kept, turn in zip(taken, turns, strict=True):
@@ -223,9 +222,12 @@ def compare(
 ) -> list[ComparedView]:
     """One view, predicted and with each mistake planted; all beside the same traced pictures."""
     inputs = renderer.scene.assembly(renderer.space.inputs(whole))
-    color, lit = light.color(inputs), light.light(inputs)
+    lit = light.light(inputs)
     brighter = [replace(lit, on_object=lit.on_object * factor) for factor in (1.0, 1.1, 1.25)]
-    pictures = [light.shown(light.looks([inputs], one), [inputs], color, [whole])[0] for one in brighter]
+    pictures = []
+    for light.fixed in brighter:
+        pictures.append(light(whole))
+    light.fixed = None
     pictures += [pictures[0].roll(1, dims=1), pictures[0]]
     once: Any = Once(renderer)
     found = [view_of(once, one, whole, search, SPP, lambda at, _: -margin(model, at, label)) for one in pictures]

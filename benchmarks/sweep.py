@@ -42,6 +42,7 @@ from advsearch.models import load_model  # noqa: E402
 from advsearch.progress import NullProgress  # noqa: E402
 from advsearch.runs.directory import RunDirectory  # noqa: E402
 from advsearch.scene.formation import EVERYTHING, ImageFormation  # noqa: E402
+from advsearch.scene.gradients import GradientPlan  # noqa: E402
 from advsearch.scene.mitsuba_backend.denoise import denoise  # noqa: E402
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene  # noqa: E402
 from advsearch.tasks import Classification  # noqa: E402
@@ -73,6 +74,7 @@ class ConstantRenderer:
     """A grey picture whatever is asked for."""
 
     non_finite = 0
+    plan = GradientPlan(())
 
     def __init__(self, space: Space, size: tuple[int, int]) -> None:
         self.space, self.start, self.scene = space, space.start, SimpleNamespace(assembly=dict)

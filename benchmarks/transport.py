@@ -71,7 +71,7 @@ def times(renderer: Renderer, loss: Callable[[Tensor], Tensor], repeats: int) ->
 
     turns: dict[str, Callable[[], object]] = {
         "model": alone,
-        "matrix": lambda: linear.gradient(loss, u, 0, SPP),
+        "matrix": lambda: linear.renderer.gradient(loss, u, 0, SPP),
         "rendered": lambda: renderer.gradient(loss, u, 0, SPP),
         "making": lambda: LinearRenderer(renderer, renderer.start, seed=2),
     }

@@ -167,9 +167,9 @@ RECIPE: dict[str, Any] = {
     "quick": True, "objects": ["mug"], "model": "reference",
     "parts": [{"name": "views-00", "part": "views", "command": "sweep", "object": "mug", "ending": "finished",
                "renders": 8}],
-    "figures": [{"figure": "bars", "title": "Accuracy by environment", "text": ["All have the same share."],
-                 "by": "environment",
-                 "bars": [{"name": "studio", "configurations": 8, "correct": 6, **ACCURACY}]}],
+    "figures": [{"figure": "rates", "title": "Accuracy by environment", "text": ["All have the same share."],
+                 "columns": ["environment", "right", "of", "share", "low", "high"],
+                 "rows": [["studio", 6, 8, 0.75, 0.35, 0.97]]}],
 }  # fmt: skip
 STABILITY: dict[str, Any] = {
     "run": "", "ending": "done", "not_run": [], "seconds": {"total": 9.0}, "command_line": "advsearch stability",

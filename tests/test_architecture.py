@@ -514,3 +514,9 @@ def test_imports_inside_functions_are_few_and_say_why() -> None:
     bare = sorted(place for place, why in found.items() if not why)
     assert not bare, "each takes a comment, beside it or above it, with the reason why it stands inside"
     assert len(found) <= 214, "see whether this one can stand at the top: `advsearch --help` has to answer at once"
+
+
+def test_no_modules_import_each_other_in_a_circle() -> None:
+    """Late imports counted; what is for the type checker only is not imported."""
+    concepts = runpy.run_path(str(ROOT / "tools" / "concepts.py"))
+    assert concepts["circles"](concepts["modules_of"](ROOT)) == []

@@ -18,13 +18,13 @@ from advsearch.attacks.trials import choose_spp, most_samples
 from advsearch.cli.flags import with_flags
 from advsearch.cli.output import shown_text as plan_text
 from advsearch.config import AttackConfig, SweepConfig
+from advsearch.engine.problem import Problem
 from advsearch.engine.record import Findings, Stages
-from advsearch.engine.sweeps.swept_scene import OneModel
 from advsearch.questions.plan.carry_out import plan_from_config
 from advsearch.questions.plan.settings import PlanConfig
 from advsearch.questions.precision.settings import PrecisionConfig
-from advsearch.questions.region import carry_out as region
-from advsearch.questions.region.settings import RegionConfig
+from advsearch.questions.region import growing as region
+from advsearch.questions.region.answer import RegionConfig
 from advsearch.questions.sweep.carry_out import sweep_from_config
 from advsearch.runs.directory import RunDirectory
 from advsearch.settings import Config
@@ -248,7 +248,7 @@ def test_a_resumed_sweep_takes_the_probes_of_its_worst_configuration_from_the_st
     config = SweepConfig(**SMALL, grid={"pose.yaw": "0,90"}, trials=14, run=str(tmp_path / "whole"))
     whole = sweep_from_config(config)
     rendered, stop = 0, 5
-    once = OneModel.evaluate
+    once = Problem.evaluate
 
     def trial(self: Any, *given: Any) -> Any:
         nonlocal rendered
@@ -257,7 +257,7 @@ def test_a_resumed_sweep_takes_the_probes_of_its_worst_configuration_from_the_st
             raise KeyboardInterrupt
         return once(self, *given)
 
-    monkeypatch.setattr(OneModel, "evaluate", trial)
+    monkeypatch.setattr(Problem, "evaluate", trial)
     cut = sweep_from_config(config.model_copy(update={"run": str(tmp_path / "run")}))
     assert cut.summary.ending == "interrupted"
     stop, rendered = 0, 0

@@ -26,7 +26,7 @@ from advsearch.attacks import POLICIES, candidates, clopper_pearson, planned_ren
 from advsearch.attacks.objectives import OBJECTIVE_KINDS
 from advsearch.attacks.policies import pgd
 from advsearch.attacks.verification import WORST_CASE
-from advsearch.cli.main import COMMANDS
+from advsearch.cli.commands import COMMANDS
 from advsearch.cli.names import REGISTRIES
 from advsearch.config import TRIALS, TRIALS_OVER, AttackConfig
 from advsearch.config.attack import FEWEST_TRIALS
@@ -37,15 +37,15 @@ from advsearch.models import loading, reference
 from advsearch.models.loading import SOURCES as SOURCES_OF_MODELS
 from advsearch.questions.attack.answer import CurveResult, MatrixResult
 from advsearch.questions.gap import GapResult
-from advsearch.questions.region import carry_out as mapping
-from advsearch.questions.region.settings import RegionConfig
+from advsearch.questions.region import growing as mapping
+from advsearch.questions.region.answer import RegionConfig
 from advsearch.questions.test import counterexamples as tested
 from advsearch.runs import directory, export, store
 from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.results.base import RenderResult, Result
 from advsearch.runs.results.sweep import SweepSummary
 from advsearch.scene import environments, exposure, library
-from advsearch.scene.description import FRAME_FILL
+from advsearch.scene.geometry import FRAME_FILL
 from advsearch.scene.importing.pictures import TEXTURE_LIMIT
 from advsearch.scene.mitsuba_backend import scene as mitsuba_scene
 from advsearch.scene.settings import SETTINGS

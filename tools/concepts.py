@@ -1,9 +1,9 @@
 """Counts what a stranger has to learn: python tools/concepts.py [CHECKOUT] [--names] [--inner]
 
 Lines of the package and its modules; lines with an untyped answer (`dict[str, Any]`, `Mapping[str, Any]`); class names
-and file names that occur several times; imports that go in a circle; modules that take a run's settings (a parameter
-or a field annotated with a `...Config`); and the classes of ours that a new control has to import or subclass, from
-the worked example of docs/controls/writing.md.
+and file names that occur several times; imports that go in a circle, those inside functions included; modules that take
+a run's settings (a parameter or a field annotated with a `...Config`); and the classes of ours that a new control has
+to import or subclass, from the worked example of docs/controls/writing.md.
 
 `--names` prints the public names with several meanings: classes, functions and type aliases that several modules
 define, and names of modules that are a class's, a function's or an alias's elsewhere. One meaning are aliases of the
@@ -43,8 +43,8 @@ def modules_of(root: Path) -> Modules:
 
 
 def imports_of(name: str, path: Path, modules: Modules) -> Iterator[str]:
-    """Yield the modules of the package that one imports when it is imported itself."""
-    for node in at_import(ast.parse(path.read_text("utf-8"))):
+    """Yield the modules of the package that one imports, late imports included."""
+    for node in but_for_types(ast.parse(path.read_text("utf-8"))):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names if alias.name in modules)
         elif isinstance(node, ast.ImportFrom) and node.module in modules:
@@ -52,15 +52,12 @@ def imports_of(name: str, path: Path, modules: Modules) -> Iterator[str]:
             yield from (one if one in modules else str(node.module) for one in inner)
 
 
-def at_import(node: ast.AST) -> Iterator[ast.AST]:
-    """Yield what runs when a module is imported: not the bodies of functions, not what is for the type checker only."""
+def but_for_types(node: ast.AST) -> Iterator[ast.AST]:
+    """Yield everything in a module but what is for the type checker only."""
     for child in ast.iter_child_nodes(node):
-        if isinstance(child, (ast.FunctionDef, ast.AsyncFunctionDef)):
-            continue
-        if isinstance(child, ast.If) and "TYPE_CHECKING" in ast.unparse(child.test):
-            continue
-        yield child
-        yield from at_import(child)
+        if not (isinstance(child, ast.If) and "TYPE_CHECKING" in ast.unparse(child.test)):
+            yield child
+            yield from but_for_types(child)
 
 
 def inner_imports(text: str) -> dict[int, str]:

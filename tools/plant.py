@@ -319,9 +319,9 @@ FAULTS = (
     ),
     Fault(
         "recipes: right and wrong are mixed up",
-        "advsearch/questions/recipe/given.py",
-        "right_wrong=counts[True, False],",
-        "right_wrong=counts[False, True],",
+        "advsearch/questions/recipe/of_runs.py",
+        "for a in (True, False) for b in (True, False)]",
+        "for b in (True, False) for a in (True, False)]",
         ("tests/questions/test_recipe.py",),
     ),
     Fault(

@@ -13,9 +13,9 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from advsearch.bundled.changed_light import varied
 from advsearch.bundled.objects import HOUSEHOLD
 from advsearch.controls import Space
-from advsearch.questions.harden.scenes import varied
 from advsearch.scene import library
 from advsearch.scene.assets import Floats, ObjectAsset
 from advsearch.scene.description import SceneDescription

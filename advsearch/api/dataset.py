@@ -194,7 +194,7 @@ def _swept(folder: Path, categories: Categories, every: bool, progress: Progress
         picture = view.pictures([query])[0]
         things = categories.things(job.tasks[0], facts, view.renderers[size], query.u)
         first = next((row.correct for row in some if row.step % len(job.models) == 0), None)
-        same = first in (None, view.judge(0, query.u, picture).right)
+        same = first in (None, view.problems[0].judge(picture, query.u).right)
         yield Shown(f"{number:06d}", picture, things, some, some[0].values, same)
         progress.advance(1)
 

@@ -32,7 +32,6 @@ from advsearch.scene.mitsuba_backend import llvm
 OK, WARNING, MISSING, BROKEN = "ok", "warning", "missing", "broken"
 """The states of a part. A warning does not keep anything from running."""
 
-FELL_SHORT = 3
 GIB = 2**30
 DISK_WANTED, MEMORY_WANTED = 1 * GIB, 3 * GIB
 """Below these a warning: a run's pictures and the kernel cache; the peak of a search (2.5 GiB) and what else runs."""
@@ -77,7 +76,7 @@ def told(as_json: bool = False) -> int:
         print(json.dumps(answer, indent=2))
     else:
         _print_table(parts, good)
-    return 0 if good else FELL_SHORT
+    return 0 if good else output.FELL_SHORT
 
 
 def diagnose() -> list[Component]:

@@ -7,41 +7,22 @@ missing at the end names the part that ended the process. Run by `advsearch.cli.
 from __future__ import annotations
 
 import contextlib
+import importlib
 import io
 import json
-import os
 import sys
-import tempfile
 from collections.abc import Callable
-
-from advsearch import threads
+from functools import partial
 
 PIXELS = 8
 NOISE = 0.08
 """Four standard deviations of the brightness of those pixels at 4 samples; the slope's are twice as large."""
 
 
-def numpy() -> str:
-    """Solve a small system."""
-    import numpy as np  # what is probed
-
-    if not np.allclose(np.linalg.solve(np.diag([2.0, 4.0]), [2.0, 4.0]), 1.0):
-        raise ArithmeticError("a system of two equations came out wrong")
-    return ""
-
-
-def torch() -> str:
-    """A convolution and its gradient; say which build it is and how many threads it uses."""
-    threads.configure()
-    import torch  # what is probed
-
-    image = torch.ones(1, 3, PIXELS, PIXELS, requires_grad=True)
-    torch.nn.functional.conv2d(image, torch.ones(1, 3, 3, 3)).sum().backward()
-    if image.grad is None or float(image.grad.max()) != 9.0:
-        raise ArithmeticError("the gradient of a convolution came out wrong")
-    count = torch.get_num_threads()
-    build = f"CUDA {torch.version.cuda}" if torch.version.cuda else "CPU build"
-    return f"{build}, {count} thread{'s' * (count > 1)}"
+def imported(name: str) -> str:
+    """Import a package, with the native code that it loads."""
+    importlib.import_module(name)
+    return "imported"
 
 
 def probe_renderer() -> str:
@@ -83,86 +64,13 @@ def probe_denoiser() -> str:
     return ""
 
 
-def openexr() -> str:
-    """Write a linear picture to a file and read it back."""
-    # what is probed
-    import numpy as np
-    import OpenEXR
+MODULES = {"imageio": "imageio.v3", "matplotlib": "matplotlib.figure", "pyarrow": "pyarrow.parquet"}
+"""What is imported of a package, where it is not of its name."""
 
-    pixels = np.full((2, 2, 3), 2.5, np.float32)
-    with tempfile.TemporaryDirectory() as folder:
-        path = os.path.join(folder, "pixel.exr")
-        OpenEXR.File({"type": OpenEXR.scanlineimage}, {"RGB": pixels}).write(path)
-        with OpenEXR.File(path) as file:
-            if not np.array_equal(file.channels()["RGB"].pixels, pixels):
-                raise ArithmeticError("a picture read back is not the one written")
-    return ""
-
-
-def imageio() -> str:
-    """Encode a picture as PNG and decode it."""
-    # what is probed
-    import imageio.v3 as iio
-    import numpy as np
-
-    pixels = np.arange(48, dtype=np.uint8).reshape(4, 4, 3)
-    if not np.array_equal(iio.imread(iio.imwrite("<bytes>", pixels, extension=".png")), pixels):
-        raise ArithmeticError("a PNG decoded is not the picture encoded")
-    return ""
-
-
-def pyarrow() -> str:
-    """Write a Parquet table and read it back."""
-    # what is probed
-    import pyarrow
-    import pyarrow.parquet
-
-    stream = io.BytesIO()
-    pyarrow.parquet.write_table(pyarrow.table({"x": [1.5]}), stream)
-    found = pyarrow.parquet.read_table(io.BytesIO(stream.getvalue())).to_pylist()
-    if found != [{"x": 1.5}]:
-        raise RuntimeError(f"expected the table that was written, got {found}")
-    return "writes and reads a table"
-
-
-def matplotlib() -> str:
-    """Draw an empty figure."""
-    from matplotlib.figure import Figure  # what is probed
-
-    stream = io.BytesIO()
-    Figure(figsize=(1, 1)).savefig(stream, format="png")
-    return f"drew {len(stream.getvalue())} bytes"
-
-
-def cma() -> str:
-    """Import the library of evolution strategies."""
-    import cma as library  # what is probed
-
-    return f"pycma {library.__version__.split()[0]}"
-
-
-def xatlas() -> str:
-    """Unwrap a triangle."""
-    # what is probed
-    import numpy as np
-    import xatlas
-
-    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32)
-    _, faces, uvs = xatlas.parametrize(corners, np.array([[0, 1, 2]], np.uint32))
-    if faces.shape != (1, 3) or uvs.shape != (3, 2):
-        raise ArithmeticError("a triangle was not unwrapped")
-    return ""
-
+PACKAGES = ("numpy", "torch", "OpenEXR", "imageio", "matplotlib", "cma", "pyarrow", "xatlas")
 
 TRIALS: dict[str, Callable[[], str]] = {
-    "numpy": numpy,
-    "torch": torch,
-    "OpenEXR": openexr,
-    "imageio": imageio,
-    "matplotlib": matplotlib,
-    "cma": cma,
-    "pyarrow": pyarrow,
-    "xatlas": xatlas,
+    **{name: partial(imported, MODULES.get(name, name)) for name in PACKAGES},
     "render": probe_renderer,
     "mitsuba-oidn": probe_denoiser,
 }

@@ -1,4 +1,4 @@
-"""Flags made from the settings of a command, and a configuration made from flags.
+"""Flags made from the settings of a command, and a configuration made from flags or from a file.
 
 Values stay text until the configuration reads them, so that a wrong one is reported in one way wherever it came from.
 """
@@ -7,15 +7,15 @@ from __future__ import annotations
 
 import argparse
 import re
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
 from advsearch.config import CONFIGS, AttackConfig
-from advsearch.errors import InputError
+from advsearch.errors import InputError, UnknownNameError
 from advsearch.registry import allow_named
-from advsearch.settings import Config, Setting, check_once, parse_assignment, settings, shown, split_names
+from advsearch.settings import Config, Setting, check_once, parse_assignment, read_yaml, settings, shown, split_names
 
 _NO_SETTINGS = {"code": "--code", "sheets": "--sheets", "paper": "--paper", "size": "--size"}
 """Flags which messages name too and which are no setting of a configuration."""
@@ -24,6 +24,9 @@ SCENE = (
     "a .glb or .gltf file, or a Mitsuba .xml file: the object is one of its nodes or shapes by name, and the rest its "
     "surroundings (the same as --object FILE#NAME)"
 )
+
+IN_A_FILE = tuple(name for name in CONFIGS if name != "render")
+"""What the `command` of a file may say."""
 
 MOST_NAMES = 50
 """Names of what is in a scene that one message lists."""
@@ -71,6 +74,19 @@ def config_from(args: argparse.Namespace, config: type[AnyConfig], **otherwise: 
     if "scene" in args and isinstance(data.get("object"), str):
         data["object"] = ",".join(f"{args.scene}#{name}" for name in split_names(data["object"]))
     return config(**data)
+
+
+def command_in(file: str | Path) -> str:
+    """Return the command that a file is for. Raises FileFormatError where it is not a file with settings."""
+    return str(read_yaml(file).get("command", "attack"))
+
+
+def config_of_file(command: str, file: str | Path, changes: Mapping[str, object]) -> Config:
+    """Return the configuration that a file describes; with `changes` put over it. Raises
+    UnknownNameError where there is no such command."""
+    if command not in IN_A_FILE:
+        raise UnknownNameError("command", command, IN_A_FILE, f"It stands in {file}.")
+    return CONFIGS[command].from_yaml(file, changes)
 
 
 def _inside(scene: str) -> str:

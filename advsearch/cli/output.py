@@ -21,11 +21,15 @@ from typing import IO, TYPE_CHECKING, Any, TextIO, cast
 
 from advsearch.errors import AdvsearchError, StorageError
 from advsearch.interrupts import INTERRUPTS
-from advsearch.progress import NullProgress, Progress, bars, lines
+from advsearch.progress import Progress, watched
 
 if TYPE_CHECKING:
     from advsearch.runs.results.base import Result
 
+
+OK, BAD_INPUT, FELL_SHORT, INTERRUPTED = 0, 2, 3, 130
+"""Exit statuses of a command that did its work, was given what it cannot take, is a check that fell short, and was
+interrupted."""
 
 LONGEST_WORD = 300
 """Most characters of a name in a message; of a longer one the ends are shown."""
@@ -167,9 +171,6 @@ def print_json(value: Any) -> None:
 def finish(result: Result, answer: Callable[[Any], str], *, as_json: bool) -> int:
     """Print the last word of a command, as JSON or as the text for a person that `answer` makes, and return its exit
     status."""
-    # late: it imports this module
-    from advsearch.cli.main import INTERRUPTED, OK
-
     if as_json:
         print_json(result)
     else:
@@ -197,8 +198,8 @@ def go_on_command(run: str | Path) -> str:
 
 def _code_in(file: Path) -> Sequence[str]:
     """The Python code that a run.yaml names."""
-    # late: it imports this module; and so that --help answers at once
-    from advsearch.cli.run import command_in, config_of_file
+    # late, so that --help answers at once
+    from advsearch.cli.flags import command_in, config_of_file
     from advsearch.config import SceneConfig
     from advsearch.settings import split_names
 
@@ -277,26 +278,13 @@ def _descriptor_redirected(source: int, target: int) -> Iterator[None]:
 @contextmanager
 def at_work(*, as_json: bool, quiet: bool) -> Iterator[Progress]:
     """Watch a command's work; where JSON is to be printed, keep everything else off standard output meanwhile."""
-    with output_kept_clean() if as_json else nullcontext(), watch_progress(quiet=quiet) as watcher:
+    from advsearch.cli.flags import with_flags  # late, so that --help answers at once
+
+    with output_kept_clean() if as_json else nullcontext(), watched(not quiet, with_flags) as watcher:
         progress = LookingProgress(watcher)
         progress.stage("starting: loading PyTorch and Mitsuba")
         yield progress
         INTERRUPTS.look()
-
-
-@contextmanager
-def watch_progress(*, quiet: bool = False) -> Iterator[Progress]:
-    """Yield the progress that suits standard error: none when `quiet`, bars on a terminal, lines elsewhere."""
-    from advsearch.cli.flags import with_flags  # late, so that --help answers at once
-
-    if quiet:
-        yield NullProgress()
-    elif sys.stderr.isatty():
-        with bars(raw(sys.stderr), with_flags) as drawn:
-            yield drawn
-    else:
-        with lines(sys.stderr, with_flags) as told:
-            yield told
 
 
 class LookingProgress:

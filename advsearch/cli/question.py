@@ -15,9 +15,6 @@ from advsearch.errors import InputError
 if TYPE_CHECKING:
     from advsearch.settings import Config
 
-FELL_SHORT = 3
-"""Exit status of a check that fell short."""
-
 
 @dataclass(frozen=True)
 class Command:
@@ -118,10 +115,15 @@ class QuestionCommand:
         # late, so that --help answers at once
         from advsearch.cli.flags import config_from
         from advsearch.config import CONFIGS
+        from advsearch.settings import settings
 
+        config = CONFIGS[self.name]
         if self.brought and (file := self.file(args)):
             over = {**self.brought(file, vars(args)), **over}
-        return config_from(args, CONFIGS[self.name], **over)
+        elif self.brought and (missing := [one for one in settings(config) if one.required and one.field not in args]):
+            command, run = f"advsearch {self.name}", f"--{self.about.replace('_', '-')} RUN"
+            raise InputError(f"{command}: expected {missing[0].flag} NAME, or {run}; see {command} --help")
+        return config_from(args, config, **over)
 
     def carry_out(self, config: Config, *, as_json: bool, quiet: bool, resumed: Path | None = None) -> int:
         """Ask what `config` describes, or go on with it; print the answer and return the exit status."""
@@ -131,4 +133,4 @@ class QuestionCommand:
 
             result = carry_out(config, progress=progress, resumed=resumed)
         status = output.finish(result, self.answer, as_json=as_json)
-        return status or (FELL_SHORT if self.short(result) else 0)
+        return status or (output.FELL_SHORT if self.short(result) else 0)

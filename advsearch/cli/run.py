@@ -8,19 +8,16 @@ import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from advsearch.cli import main, output
+from advsearch.cli import commands, output
+from advsearch.cli.flags import command_in, config_of_file
 from advsearch.cli.question import Command
 from advsearch.cli.show import show_run
-from advsearch.config import CONFIGS
-from advsearch.errors import InputError, UnknownNameError
+from advsearch.errors import InputError
 from advsearch.registry import allow_named
 from advsearch.runs.directory import CONFIG, HOME, find_run, only_here
 from advsearch.runs.listing import finished, listed_runs
-from advsearch.settings import Config, parse_assignment, read_yaml
+from advsearch.settings import parse_assignment
 from advsearch.settings.values import put
-
-COMMANDS = tuple(name for name in CONFIGS if name != "render")
-"""What the `command` of a file may say."""
 
 
 def _run_arguments(parser: argparse.ArgumentParser) -> None:
@@ -52,18 +49,6 @@ def changes_in(words: Sequence[str]) -> dict[str, object]:
     return changes
 
 
-def command_in(file: str | Path) -> str:
-    """Return the command that a file is for. Raises FileFormatError where it is not a file with settings."""
-    return str(read_yaml(file).get("command", "attack"))
-
-
-def config_of_file(command: str, file: str | Path, changes: Mapping[str, object]) -> Config:
-    """Return the configuration that a file describes; arguments and errors as for `run_file`."""
-    if command not in COMMANDS:
-        raise UnknownNameError("command", command, COMMANDS, f"It stands in {file}.")
-    return CONFIGS[command].from_yaml(file, changes)
-
-
 def run_file(
     command: str, file: str | Path, changes: Mapping[str, object], args: argparse.Namespace, resumed: Path | None = None
 ) -> int:
@@ -78,7 +63,7 @@ def run_file(
             raise InputError(f"{file}: {one.name}: {one.does}, which a file can't ask for; type {one.ask}")
         if not args.quiet:
             print(f"advsearch: {one.name} is left out: it {one.does}; type {one.ask}", file=sys.stderr)
-    return int(main.found(command).carry_out(config, as_json=args.json, quiet=args.quiet, resumed=resumed))
+    return int(commands.found(command).carry_out(config, as_json=args.json, quiet=args.quiet, resumed=resumed))
 
 
 RUN = Command(_run_arguments, _run)

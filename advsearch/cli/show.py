@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from advsearch.cli import main, output
+from advsearch.cli import commands, output
 from advsearch.cli.names import first_doc_line
 from advsearch.cli.output import at_work, raw
 from advsearch.cli.question import Command, QuestionCommand
@@ -78,7 +78,7 @@ def show_run(name: str, as_json: bool, *, picture: bool = False) -> int:
     if not (path / NAME).is_file():
         return _show_unfinished(listed_run(path), as_json)
     result = read_result(path)
-    answer = main.found(result.command).answer
+    answer = commands.found(result.command).answer
     photos = photos_of(path)
     if as_json:
         output.print_json({**result.to_dict(), "photos": photos.to_dict()} if photos else result)

@@ -80,6 +80,7 @@ class Coordinator:
         self._here = machine_name(machine)
         self._workers: dict[str, _Worker] = {}
         self._owners: dict[Future[Any], _Worker] = {}
+        self._idle: deque[_Worker] = deque()
         self._avoided: dict[str, str] = {}  # those that are given nothing, as long as they are there: why, or empty
         self._todo: deque[_Batch] = deque()
         self._turn = self._under_way = 0  # calls of `results`, and batches of the last one that workers have
@@ -119,21 +120,21 @@ class Coordinator:
 
     def _give_out(self, source: Iterator[Sequence[Any]]) -> None:
         """Give batches to workers that have nothing to do."""
-        for worker in self._workers.values():
-            if not worker.ready or worker.call is not None:
-                continue
+        while self._idle:
             if not self._todo:
                 items = next(source, None)
                 if items is None:
                     return
                 self._todo.append(_Batch(items, self._turn))
-            worker.batch = batch = self._todo.popleft()
-            self._under_way += 1
-            self._submit(worker, carry_out_batch, self._key, batch.items)
+            worker = self._idle.popleft()
+            if self._workers.get(worker.address) is worker:  # it has not gone meanwhile
+                worker.batch = batch = self._todo.popleft()
+                self._under_way += 1
+                self._submit(worker, carry_out_batch, self._key, batch.items)
 
     def _prepare(self, worker: _Worker, *, send: bool = False) -> None:
         """Have a worker get ready; `send` it the files then, which it may have already."""
-        files = self._files if send else self._files.named_only
+        files = self._files if send else Files(self._files.digests, {})
         self._submit(worker, prepare, self._key, self._work, files, self._version)
 
     def _submit(self, worker: _Worker, function: Callable[..., Any], *args: Any) -> None:
@@ -166,6 +167,8 @@ class Coordinator:
         value, batch = future.result(), worker.batch
         del self._owners[future]
         worker.call = worker.batch = None
+        if worker.ready:
+            self._idle.append(worker)
         wanted = batch is not None and batch.turn == self._turn
         self._under_way -= wanted
         if isinstance(value, Ready):
@@ -209,6 +212,7 @@ class Coordinator:
         self._load_deaths = 0
         self.facts.loading += value.seconds
         worker.ready = True
+        self._idle.append(worker)
         self.facts.workers += 1
         self.facts.most = max(self.facts.most, self.facts.workers)
 
@@ -219,7 +223,7 @@ class Coordinator:
         self._count_time()
         now = self._looked_at = self._clock()
         try:
-            there = self._pool.workers()
+            there = dict.fromkeys(self._pool.workers())
         except SchedulerGoneError:
             self._tell(f"{self._pool.where}: the scheduler has gone; what was under way will be done again")
             for worker in list(self._workers.values()):

@@ -230,7 +230,7 @@ def executor_of(
         if importlib.util.find_spec("distributed") is None:
             raise InputError("cluster: needs Dask; pip install 'advsearch[dask]', or leave `cluster` out")
         files = read_files(work)
-        asked = [work.function, work.settings, work.threads, sorted(files.named.items())]
+        asked = [work.function, work.settings, work.threads, sorted(files.digests.items())]
         key = hashlib.sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()[:32]
         pool = DaskPool(site)
     try:

@@ -1,5 +1,5 @@
 """What runs on a worker: it gets ready for a work once, then carries out batches. Errors go back as values, as they may
-not survive being pickled. Files that a work needs are known by their digest and sent once; with a mesh goes its folder,
+not survive being pickled. Files that a work needs are sent to who has not got them; with a mesh goes its folder,
 files in it and below of the kinds that a scene consists of."""
 
 from __future__ import annotations
@@ -89,20 +89,11 @@ LARGEST = 1 << 30
 
 @dataclass(frozen=True)
 class Files:
-    """The files that a work's settings name: of each path, the digest of its folder's part and its name in it; and of
-    each digest, relative path to content, empty where they are not sent."""
+    """The files that a work's settings name, and those beside them: digests by path, and what is in them, empty where
+    they are not sent."""
 
-    named: Mapping[str, tuple[str, str]]
-    contents: Mapping[str, Mapping[str, bytes]]
-
-    @property
-    def bytes(self) -> int:
-        """Of all contents."""
-        return sum(len(data) for files in self.contents.values() for data in files.values())
-
-    @property
-    def named_only(self) -> Files:
-        return Files(self.named, {})
+    digests: Mapping[str, str]
+    contents: Mapping[str, bytes]
 
 
 class MissingError(Exception):
@@ -111,47 +102,41 @@ class MissingError(Exception):
 
 def read_files(work: Work) -> Files:
     """Read the files that the settings of a work name."""
-    named, contents = {}, {}
-    for path in _paths(work):
-        files = _contents(path)
-        digest = _digest(files)
-        named[str(path)], contents[digest] = (digest, path.name), files
-    found = Files(named, contents)
-    if found.bytes > LARGEST:
+    contents = {str(one): one.read_bytes() for path in _paths(work) for one in _with_others(path)}
+    size = sum(map(len, contents.values()))
+    if size > LARGEST:
         raise InputError(
-            f"cluster: the files of the scene and the model have {found.bytes >> 20} MiB, and {LARGEST >> 20} can be "
+            f"cluster: the files of the scene and the model have {size >> 20} MiB, and {LARGEST >> 20} can be "
             "sent; put them in a folder that all workers see, each under the same path"
         )
-    return found
+    return Files({path: hashlib.sha256(data).hexdigest() for path, data in contents.items()}, contents)
 
 
 def write_files(work: Work, files: Files, folder: Path) -> Work:
-    """Write files that were sent into folders of their digests, and return the work with the paths that hold here."""
-    for digest, contents in files.contents.items():
-        for name, data in contents.items():
-            path = folder / digest / name
-            path.parent.mkdir(parents=True, exist_ok=True)
-            part = path.with_name(f"{path.name}.part-{os.getpid()}")  # no kind of file that goes along with another
-            part.write_bytes(data)
-            part.replace(path)
-    new = {path: _here(path, digest, folder / digest / name) for path, (digest, name) in files.named.items()}
+    """Return the work with the paths that hold here: its own where all its files are here, or else those of copies in
+    a folder of their digests, into which what was sent is written. Raises MissingError."""
+    if all(_is(Path(path), digest) for path, digest in files.digests.items()):
+        return work
+    whole = hashlib.sha256(json.dumps(sorted(files.digests.items())).encode()).hexdigest()[:32]
+    here = {path: folder / whole / Path(path).relative_to(Path(path).anchor) for path in files.digests}
+    for name, data in files.contents.items():
+        here[name].parent.mkdir(parents=True, exist_ok=True)
+        part = here[name].with_name(f"{here[name].name}.part-{os.getpid()}")  # it is whole, or not there
+        part.write_bytes(data)
+        part.replace(here[name])
+    for path, digest in files.digests.items():
+        if not _is(here[path], digest):
+            raise MissingError(path)
     settings = dict(work.settings)
     for name in work.files:
         value = settings.get(name)
         if isinstance(value, str):
-            settings[name] = "".join(new.get(part, part) for part in _split(value))
+            settings[name] = "".join(str(here.get(part, part)) for part in _split(value))
     return replace(work, settings=settings)
 
 
-def _here(path: str, digest: str, sent: Path) -> str:
-    for one in (Path(path), sent):
-        if one.is_file() and _digest(_contents(one)) == digest:
-            return str(one)
-    raise MissingError(path)
-
-
-def _contents(path: Path) -> dict[str, bytes]:
-    return {one.relative_to(path.parent).as_posix(): one.read_bytes() for one in _with_others(path)}
+def _is(path: Path, digest: str) -> bool:
+    return path.is_file() and hashlib.sha256(path.read_bytes()).hexdigest() == digest
 
 
 def _paths(work: Work) -> Iterable[Path]:
@@ -177,13 +162,6 @@ def _with_others(path: Path) -> Sequence[Path]:
     kinds = (*WITH_OTHERS[path.suffix.lower()], *PICTURES)
     beside = (one for one in sorted(path.parent.rglob("*")) if one.suffix.lower() in kinds and one.is_file())
     return list(dict.fromkeys([path, *beside]))
-
-
-def _digest(files: Mapping[str, bytes]) -> str:
-    digest = hashlib.sha256()
-    for name, data in sorted(files.items()):
-        digest.update(f"{name}\0{len(data)}\0".encode() + data)
-    return digest.hexdigest()[:32]
 
 
 MOST_LOADED = 2

@@ -25,7 +25,7 @@ ORDER = (
     *("contents", "background", "haze", "lens", "sensor", "corruption", "mitsuba"),
 )
 """In which lists have controls; one that is not named comes last."""
-SHARED = ("base", "drawn", "numbers", "space", "values", "corruption_filters", "material_patterns")
+SHARED = ("base", "ranges", "numbers", "space", "values", "corruption_filters", "material_patterns")
 """Modules of this folder that are no control."""
 
 

@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from torch import Tensor
 
-from advsearch.controls.values import Fixed, Moved, is_number, is_whole, plain, read
+from advsearch.controls.ranges import is_number
+from advsearch.controls.values import Fixed, Moved, is_whole, plain, read
 from advsearch.copies import copied, hand_copies, is_ours
 from advsearch.described import Value as Value
 from advsearch.distributions import as_setting

@@ -21,9 +21,9 @@ from advsearch.controls.numbers import NumberControl, Values
 from advsearch.controls.values import Fixed
 from advsearch.errors import InputError
 from advsearch.scene.camera_model import COEFFICIENTS, NUMBERS, OF_KIND, CameraModel, pinhole
-from advsearch.scene.description import ORBIT_CAMERA, SceneDescription
+from advsearch.scene.description import SceneDescription
 from advsearch.scene.geometry import affine, camera_to_world, framing_distance, middle
-from advsearch.scene.settings import CAMERA, ORBIT, moving
+from advsearch.scene.settings import CAMERA, ORBIT, ORBIT_CAMERA, moving
 
 SENSOR_WIDTH = 36.0
 """Width in millimetres of the full-frame sensor that a focal length refers to."""

@@ -23,7 +23,8 @@ from torch import Tensor
 
 from advsearch.controls.base import NOTHING, Parameter, Value
 from advsearch.controls.numbers import NumberControl, Values
-from advsearch.controls.values import Fixed, Number, OneOf, Range, Spec
+from advsearch.controls.ranges import Range
+from advsearch.controls.values import Fixed, Number, OneOf, Spec
 from advsearch.errors import InputError
 from advsearch.scene.assets import Floats, Material, Mesh, ObjectAsset
 from advsearch.scene.color import srgb_to_linear

@@ -16,7 +16,8 @@ from torch import Tensor
 
 from advsearch.controls.base import Parameter
 from advsearch.controls.numbers import NumberControl, Values
-from advsearch.controls.values import Number, Range
+from advsearch.controls.ranges import Range
+from advsearch.controls.values import Number
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.geometry import camera_to_world

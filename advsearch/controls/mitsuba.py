@@ -14,7 +14,8 @@ from torch import Tensor
 
 from advsearch.controls.base import Parameter
 from advsearch.controls.numbers import NumberControl, Slot, Values
-from advsearch.controls.values import LARGEST, Fixed, Moved, OneOf
+from advsearch.controls.ranges import LARGEST
+from advsearch.controls.values import Fixed, Moved, OneOf
 from advsearch.errors import InputError
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.mitsuba_backend.keys import plugin_numbers

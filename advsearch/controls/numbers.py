@@ -22,12 +22,12 @@ import torch
 from torch import Tensor
 
 from advsearch.controls.base import NOTHING, WHOLE_RANGE, Budget, Control, Group, Parameter, Value
+from advsearch.controls.ranges import Range
 from advsearch.controls.values import (
     Fixed,
     Moved,
     Number,
     OneOf,
-    Range,
     Spec,
     apart,
     check_start,

@@ -27,8 +27,9 @@ from torch import Tensor
 
 from advsearch.controls.base import NOTHING, WHOLE_RANGE, Budget, Choice, Parameter, Value, change_in_colour
 from advsearch.controls.numbers import NumberControl, Slot, Values
+from advsearch.controls.ranges import Range
 from advsearch.controls.texture import radius, resampled
-from advsearch.controls.values import LARGEST_EPSILON, Fixed, Moved, Number, OneOf, Range, Spec, in_words
+from advsearch.controls.values import LARGEST_EPSILON, Fixed, Moved, Number, OneOf, Spec, in_words
 from advsearch.errors import FileFormatError, InputError
 from advsearch.scene.assets import Doubles, Mesh
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear

@@ -24,9 +24,9 @@ from advsearch.controls.numbers import NumberControl, Values
 from advsearch.errors import FileFormatError, InputError
 from advsearch.files import read_text
 from advsearch.scene.assets import Doubles
-from advsearch.scene.description import ORBIT_CAMERA, SceneDescription
+from advsearch.scene.description import SceneDescription
 from advsearch.scene.geometry import affine, camera_to_world, middle, object_to_world
-from advsearch.scene.settings import GEOMETRIC, ORBIT, moving
+from advsearch.scene.settings import GEOMETRIC, ORBIT, ORBIT_CAMERA, moving
 
 APPROACH, PASS, TURN = "approach", "pass", "orbit"
 PATHS = (APPROACH, PASS, TURN)

@@ -3,7 +3,7 @@
     pose: {yaw: [0, 360], pitch: 10, scale: {choices: [0.8, 1.0, 1.2]}}
 
 Two numbers in a list are a range; three or more, or names, are a choice. `{range: [low, high]}` and `{choices: [...]}`
-say which. Values that are drawn may have weights, or a distribution (`advsearch.controls.drawn`).
+say which. Values that are drawn may have weights, or a distribution (`advsearch.controls.ranges`).
 
 Where a control leaves out a value of the clean scene that was asked for, the two contradict each other, and that is
 refused. Where it leaves out only a default, the clean scene has the nearest value that the control allows, and that is
@@ -22,15 +22,13 @@ from typing import TypeGuard
 import torch
 from torch import Tensor
 
+from advsearch.controls.ranges import DrawnRange, Range, is_number, read_drawn
 from advsearch.distributions import CHOICES, DISTRIBUTION, WEIGHTS, as_setting
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.description import ENVIRONMENT, SceneDescription, check_one_environment
 from advsearch.scene.settings import SETTINGS, Parameter
 
 Number = float | str
-
-LARGEST = 1e30
-"""No quantity of a scene is larger; the square of one that is has no float32."""
 
 LARGEST_EPSILON = 1e6
 """No distance from where a control starts is larger, in whichever norm."""
@@ -41,14 +39,6 @@ class Fixed:
     """One value, not searched."""
 
     value: Number
-
-
-@dataclass(frozen=True)
-class Range:
-    """Every value from `low` to `high`."""
-
-    low: float
-    high: float
 
 
 @dataclass(frozen=True)
@@ -82,8 +72,6 @@ def read(where: str, parameter: Parameter, given: object) -> Spec:
         InputError: not such a form, or a value outside the parameter's range.
     """
     if isinstance(given, Mapping) and DISTRIBUTION in given and not parameter.options:
-        from advsearch.controls.drawn import read_drawn  # which is made of what is here
-
         return read_drawn(where, parameter, given)
     if isinstance(given, Mapping) and set(given) == {"range"} and _is_list(given["range"]) and len(given["range"]) == 2:
         given = given["range"]
@@ -158,7 +146,7 @@ def _weighted(where: str, choice: OneOf, weights: object) -> OneOf:
 
 def by_distribution(spec: Spec) -> bool:
     """Return whether a spec says how likely each value is."""
-    return type(spec) not in (Fixed, Range) and (not isinstance(spec, OneOf) or len({*spec.values}) < len(spec.values))
+    return isinstance(spec, DrawnRange) or (isinstance(spec, OneOf) and len({*spec.values}) < len(spec.values))
 
 
 def _is_list(given: object) -> bool:
@@ -184,11 +172,6 @@ def _value(where: str, parameter: Parameter, given: object) -> Number:
     return float(given)
 
 
-def is_number(given: object) -> TypeGuard[float]:
-    """Return whether it is a number that float32 has: not a truth value, not NaN, and at most `LARGEST`."""
-    return isinstance(given, (int, float)) and not isinstance(given, bool) and abs(given) <= LARGEST
-
-
 def is_whole(given: object, low: int, high: int) -> TypeGuard[float]:
     """Return whether it is a whole number from `low` to `high`."""
     return is_number(given) and low <= given <= high and given == int(given)
@@ -205,8 +188,8 @@ def in_words(spec: Spec) -> str:
 
 def to_value(spec: Range, log: bool, u: Tensor) -> Tensor:
     """Map coordinates in [0, 1] to values of a range; differentiable."""
-    if hasattr(spec, "at"):
-        return spec.at(u)  # type: ignore[no-any-return]
+    if isinstance(spec, DrawnRange):
+        return spec.at(u)
     if log:
         return torch.exp(torch.lerp(torch.full_like(u, math.log(spec.low)), torch.full_like(u, math.log(spec.high)), u))
     return spec.low + (spec.high - spec.low) * u
@@ -214,8 +197,8 @@ def to_value(spec: Range, log: bool, u: Tensor) -> Tensor:
 
 def to_unit(spec: Range, log: bool, value: float) -> float:
     """Map a value to its coordinate, clipped to [0, 1]."""
-    if hasattr(spec, "coordinate"):
-        return spec.coordinate(value)  # type: ignore[no-any-return]
+    if isinstance(spec, DrawnRange):
+        return spec.coordinate(value)
     if log:
         value = max(value, 1e-30)
         share = (math.log(value) - math.log(spec.low)) / (math.log(spec.high) - math.log(spec.low))

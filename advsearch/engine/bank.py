@@ -1,12 +1,10 @@
 """Searches over base colours under conditions that vary by chance, by a matrix of light transport for each of a growing
-bank of them (docs/transport.md). All of it follows from the seed, so that a run that goes on makes the same matrices
-and comparisons again."""
+bank of them (docs/transport.md)."""
 
 from __future__ import annotations
 
 import math
 import statistics
-import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -19,12 +17,13 @@ from advsearch.attacks import Evaluate, Evaluation
 from advsearch.attacks.domain import Domain, centre_of_option
 from advsearch.attacks.draws import Draws
 from advsearch.attacks.evaluation import Query, WhichGradient
-from advsearch.engine.acceptance import ComparedView, Deviation, compared
-from advsearch.engine.problem import Problem
-from advsearch.engine.transport import Conditions, Predictor, Tick
+from advsearch.engine.acceptance import ComparedView
+from advsearch.engine.transport import PredictedSearch
 from advsearch.files import scaled
+from advsearch.runs.results.attack import BankOfConditions
 from advsearch.scene.formation import to_8_bit
-from advsearch.scene.transport.matrix import MOST_BYTES, LinearRenderer
+from advsearch.scene.predictor import MOST_BYTES
+from advsearch.scene.transport.matrix import LinearRenderer, Tick
 
 FIRST = 8
 """Conditions in the bank at first, in what an evaluation draws."""
@@ -68,78 +67,62 @@ class Condition:
 
 
 @dataclass
-class Bank(Predictor):
-    """The matrices of a run whose searches look at conditions that vary by chance: `steps` evaluations each, and what
-    comes after them belongs to the ranking, and is traced. After the comparisons `grown`, by evaluation, the bank went
-    on growing; `gaps` are by how much the objective was larger in it than under unseen conditions."""
+class Bank(PredictedSearch):
+    """The matrices of a run whose searches look at conditions that vary by chance. After the comparisons `grown`, by
+    evaluation, the bank went on growing; `gaps` are by how much the objective was larger in it than under unseen
+    conditions. `answers` makes matrices, by workers where there are some."""
 
-    problem: Problem
-    steps: int
     answers: Evaluate
+    drawn: bool = field(default=True, kw_only=True)
+    renewed: int | None = field(default=None, kw_only=True)
     grown: list[int] = field(default_factory=list)
-    deviations: list[Deviation] = field(default_factory=list)
     gaps: list[float] = field(default_factory=list)
-    seconds: float = 0.0
     _held: list[Condition] = field(default_factory=list)
     _places: dict[int, Tensor] = field(default_factory=dict)
     _there: dict[str, Tensor] = field(default_factory=dict)
     _still: LinearRenderer | None = None
     _coming: Iterator[Evaluation] = field(default_factory=lambda: iter(()))
     _until: int = 0
-    _made: int = 0
     _bytes: int = 0
     _last: int = 0
     _dropped: int = 0
-
-    # ---- what a predictor says --------------------------------------------------------------------------------------
 
     @property
     def samples(self) -> int:
         return self._wanted(0) * SPP
 
-    @property
-    def drawn(self) -> bool:
-        return True
-
-    @property
-    def conditions(self) -> Conditions:
-        gap = self.gaps[-1] if self.gaps else None
-        return Conditions(self._wanted(self._last), self._dropped, len(self.grown), gap)
-
-    @property
-    def traced(self) -> int:
-        return self._made + UNSEEN * len(self.gaps) + sum(one.pictures for one in self.deviations)
-
     def size(self) -> tuple[int, int]:
         return sum(one.renderer.entries for one in self._held), self._bytes
+
+    def conditions(self) -> BankOfConditions:
+        gap = self.gaps[-1] if self.gaps else None
+        made, grown = self._wanted(self._last), len(self.grown)
+        return BankOfConditions(made=made, dropped=self._dropped, grown=grown, gap=gap)
+
+    # ---- evaluations ------------------------------------------------------------------------------------------------
 
     def prepare(self, tick: Tick = lambda samples: None) -> None:
         self._fill(0, tick)
 
     def passed(self, query: Query) -> None:
-        self._come_to(query)
-        if query.keep:
-            self._picture(query.u)
-
-    def evaluate(self, query: Query) -> Evaluation:
-        self._come_to(query)
-        answer = self._evaluated(self._drawn(query.kind, query.number), query.u, query.gradient)
-        return replace(answer, picture=to_8_bit(self._picture(query.u))) if query.keep else answer
-
-    def _evaluated(self, chosen: Sequence[Condition], u: Tensor, gradient: WhichGradient) -> Evaluation:
-        wholes = [torch.cat([u, one.numbers]) for one in chosen]
-        found = self.problem.mean_under(lambda s, at: self._pictures(chosen[s], at), wholes, u, gradient, TOGETHER)
-        return replace(found, predicted=1)
-
-    def _come_to(self, query: Query) -> None:
         """Compare where that is due, and have the matrices that there are by then."""
         if query.kind == "search" and query.phase == "search":
             self._last = query.number
             if query.number and query.number % EVERY == 0:
                 self._compare(query.u, query.number)
         self._fill(self._last)
+        if query.keep:
+            self._picture(query.u)  # its noise is the same whenever it is made
 
-    # ---- evaluations ------------------------------------------------------------------------------------------------
+    def evaluate(self, query: Query) -> Evaluation:
+        self.passed(query)
+        answer = self._evaluated(self._drawn(query.kind, query.number), query.u, query.gradient)
+        return replace(answer, picture=to_8_bit(self._picture(query.u))) if query.keep else answer
+
+    def _evaluated(self, chosen: Sequence[Condition], u: Tensor, gradient: WhichGradient) -> Evaluation:
+        wholes = [torch.cat([u, one.numbers]) for one in chosen]
+        answer = self.problem.mean_under(lambda s, at: self._pictures(chosen[s], at), wholes, u, gradient, TOGETHER)
+        return replace(answer, predicted=1)
 
     def _drawn(self, kind: str, index: int) -> list[Condition]:
         """The conditions that an evaluation looks at: what is new, and a random choice of the rest."""
@@ -165,7 +148,7 @@ class Bank(Predictor):
         if self._still is None:
             seed = seeds.stream(self.problem.seed, "bank still")
             self._still = self.problem.linearised(self.problem.whole(self.problem.domain.start), seed, SPP)
-            self._made += 1
+            self.traced += 1
         with torch.no_grad():
             return self._still(self.problem.whole(u))
 
@@ -177,69 +160,68 @@ class Bank(Predictor):
         steps = sum(min(max(index - begin + 1, 0), EVERY) for begin in (0, *self.grown))
         return FIRST * self.problem.draws + steps * self.problem.draws // GROWTH
 
-    def _place(self, number: int) -> Tensor:
-        """The configuration at which the matrix of a condition is made."""
+    def _query(self, number: int) -> Query:
+        """Asks for the matrix of a condition: near what was searched when the bank last began to grow."""
+        assert self.problem.conditions is not None
         begun = [begin for begin in self.grown if self._wanted(begin - 1) <= number]
-        return self._places[begun[-1]] if begun else self.problem.domain.start
+        u = self._places[begun[-1]] if begun else self.problem.domain.start
+        numbers = stratified(self.problem.conditions, number, seeds.stream(self.problem.seed, "bank"))
+        seed = seeds.stream(self.problem.seed, "bank matrix", number)
+        return Query(torch.cat([u, numbers]), seed, spp=SPP, wanted="light")
 
     def _fill(self, index: int, tick: Tick = lambda samples: None) -> None:
         """Make the matrices that there should be by an evaluation, newest last, as far as memory lasts."""
-        wanted, begun = self._wanted(index), time.perf_counter()
-        first = self._held[-1].number + 1 if self._held else 0
-        if self._until <= first < wanted:  # as far as the next comparison
-            self._until = self._wanted((index // EVERY + 1) * EVERY - 1)
-            self._coming = iter(self.answers([self._query(number) for number in range(first, self._until)]))
-        for number in range(first, wanted):
-            self._held.append(self._condition(number))
-            self._bytes += self._held[-1].renderer.bytes
-            tick(SPP)
-            while len(self._held) > 1 and self._bytes > scaled(MOST_BYTES):
-                self._bytes -= self._held.pop(0).renderer.bytes
-                self._dropped += 1
-        if first < wanted:
-            self.seconds += time.perf_counter() - begun
-
-    def _query(self, number: int) -> Query:
-        assert self.problem.conditions is not None
-        numbers = stratified(self.problem.conditions, number, seeds.stream(self.problem.seed, "bank"))
-        whole = torch.cat([self._place(number), numbers])
-        return Query(whole, seeds.stream(self.problem.seed, "bank matrix", number), spp=SPP, wanted="light")
+        wanted, first = self._wanted(index), self._held[-1].number + 1 if self._held else 0
+        if first >= wanted:
+            return
+        with self.timed():
+            if self._until <= first:  # as far as the next comparison
+                self._until = self._wanted((index // EVERY + 1) * EVERY - 1)
+                self._coming = iter(self.answers([self._query(number) for number in range(first, self._until)]))
+            for number in range(first, wanted):
+                self._held.append(self._condition(number))
+                self._bytes += self._held[-1].renderer.bytes
+                tick(SPP)
+                while len(self._held) > 1 and self._bytes > scaled(MOST_BYTES):
+                    self._bytes -= self._held.pop(0).renderer.bytes
+                    self._dropped += 1
 
     def _condition(self, number: int) -> Condition:
-        problem, u, asked = self.problem, self._place(number), self._query(number)
+        problem, asked = self.problem, self._query(number)
+        u, numbers = asked.u.split([problem.domain.dim, len(asked.u) - problem.domain.dim])
         made = problem.linearised(asked.u, asked.seed, SPP, next(self._coming).light)
-        self._made += 1
+        self.traced += 1
         with torch.no_grad():
-            own = problem.searched_space.inputs(u)
-        alone = all(name in own and torch.equal(own[name], there) for name, there in made.there.items())
-        for name, there in made.there.items():
+            of_searched = problem.searched_space.inputs(u)
+        alone = all(name in of_searched and torch.equal(of_searched[name], there) for name, there in made.there.items())
+        for name, there in made.there.items():  # one tensor for all that are alike
             if name in self._there and torch.equal(self._there[name], there):
                 made.there[name] = self._there[name]
         self._there = dict(made.there)
-        return Condition(number, asked.u[u.numel() :], made, alone)
+        return Condition(number, numbers, made, alone)
 
     def _compare(self, u: Tensor, index: int) -> None:
         """Look at unseen conditions and at the bank's own, and let the bank grow while the first are clearly better for
         the model, or predictions of the second are too far off."""
-        problem, begun = self.problem, time.perf_counter()
-        noise = seeds.stream(problem.seed, "bank check", index)
-        draws = [seeds.stream(noise, "draw", number) for number in range(UNSEEN)]
-        unseen = [problem.evaluated(Query(u, draw), problem.whole(u, draw), draw)[0].objective for draw in draws]
-        generator = torch.Generator().manual_seed(noise)
-        order = torch.randperm(len(self._held), generator=generator).tolist()[:UNSEEN]
-        chosen = [self._held[number] for number in order]
-        wholes = [torch.cat([u, one.numbers]) for one in chosen]
-        found, _ = problem.judged(partial(self._pictures, chosen), wholes, u, False)
-        seen = [one.objective for one, _ in found]
-        self.gaps.append(statistics.fmean(seen) - statistics.fmean(unseen))
-        error = math.sqrt(sum(statistics.pvariance(some) / len(some) for some in (seen, unseen)))
+        problem = self.problem
+        with self.timed():
+            noise = seeds.stream(problem.seed, "bank check", index)
+            draws = [seeds.stream(noise, "draw", number) for number in range(UNSEEN)]
+            unseen = [problem.evaluated(Query(u, draw), problem.whole(u, draw), draw)[0].objective for draw in draws]
+            generator = torch.Generator().manual_seed(noise)
+            order = torch.randperm(len(self._held), generator=generator).tolist()[:UNSEEN]
+            chosen = [self._held[number] for number in order]
+            wholes = [torch.cat([u, one.numbers]) for one in chosen]
+            judged, _ = problem.judged(partial(self._pictures, chosen), wholes, u, False)
+            seen = [evaluation.objective for evaluation, _ in judged]
+            self.gaps.append(statistics.fmean(seen) - statistics.fmean(unseen))
+            self.traced += UNSEEN
+            error = math.sqrt(sum(statistics.pvariance(some) / len(some) for some in (seen, unseen)))
 
         def view(number: int) -> ComparedView:
             which = number % len(chosen)
             return problem.view(chosen[which].renderer, wholes[which], seeds.stream(noise, "view", number), SPP)
 
-        self.deviations.append(compared(view))
-        if self.gaps[-1] > SURE * error or not self.deviations[-1].good:
+        if not self.compare(view).good or self.gaps[-1] > SURE * error:
             self._places[index] = u.detach().clone()
             self.grown.append(index)
-        self.seconds += time.perf_counter() - begun

@@ -51,11 +51,17 @@ class Answering(Protocol):
 @dataclass
 class Shared:
     """Answers queries of a problem: several at once by an executor of `answering`, where there is one, and all others
-    here. Its `name` tells it from others that workers hold."""
+    here. Its `name` tells it from others that workers hold. A sweep asks scenes, and has none."""
 
-    problem: Problem
+    own: Problem | None
     executor: Executor | None = None
     name: str = ""
+
+    @property
+    def problem(self) -> Problem:
+        if self.own is None:
+            raise RuntimeError("a sweep has a problem for each scene and model, and none of its own")
+        return self.own
 
     def __call__(self, queries: Sequence[Query]) -> Iterable[Evaluation]:
         if self.executor is None or len(queries) < 2:
@@ -270,8 +276,11 @@ class Journal:
     _counts: dict[str, int] = field(default_factory=dict)
     _trials: dict[str, dict[int, Evaluation]] = field(default_factory=dict)
 
+    @property
+    def problem(self) -> Problem:
+        return self.traced.problem
+
     def __post_init__(self) -> None:
-        self.problem: Problem = self.traced.problem
         if self.run is not None and self.machines.run is None:  # not that of another problem of the same run
             self.machines = Machines(self.run)
             self._counts |= self.run.store.counts()

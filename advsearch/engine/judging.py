@@ -277,16 +277,22 @@ class KnownTruths:
     facts: Callable[[Described, Looked], Facts]
     _kept: dict[bytes, Truth] = field(default_factory=dict)
 
-    def at(self, whole: Tensor) -> Truth:
-        """Return what is true at (d,) of the whole space. What the camera sees first has nothing to do with base
-        colours, so that a truth is remembered where the rest is a few numbers, unless the task asks for numbers."""
+    def at(self, whole: Tensor, listed: Mapping[str, Value] | None = None) -> Truth:
+        """Return what is true at (d,) of the whole space. Values that are `listed` count as they are there, not as what
+        single precision makes of them."""
+        # what the camera sees first has nothing to do with base colours, so that a truth is remembered where the rest
+        # is a few numbers, unless the task asks for numbers
         rest = whole.detach()[self._rest]
         key = rest.numpy().tobytes()
-        if key in self._kept:
+        if not listed and key in self._kept:
             return self._kept[key]
-        facts = self.facts(lambda: self.space.describe(whole), lambda: self.renderer.surfaces(whole))
+
+        def values() -> dict[str, Value]:
+            return {name: (listed or {}).get(name, value) for name, value in self.space.describe(whole).items()}
+
+        facts = self.facts(values, lambda: self.renderer.surfaces(whole))
         truth = self.task.truth(facts)
-        if len(rest) <= MOST_NUMBERS and "numbers" not in vars(facts):
+        if not listed and len(rest) <= MOST_NUMBERS and "numbers" not in vars(facts):
             while len(self._kept) >= MOST:
                 del self._kept[next(iter(self._kept))]
             self._kept[key] = truth

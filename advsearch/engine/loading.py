@@ -28,7 +28,6 @@ from advsearch.scene.camera_model import bundled
 from advsearch.scene.description import (
     ENVIRONMENT,
     NO_MAP,
-    ORBIT_CAMERA,
     SceneDescription,
     check_ground,
     check_meshes,
@@ -40,7 +39,7 @@ from advsearch.scene.grounds import on_its_ground
 from advsearch.scene.importing.pictures import read_picture
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.renderer import Renderer
-from advsearch.scene.settings import Given
+from advsearch.scene.settings import ORBIT_CAMERA, Given
 from advsearch.settings import as_python
 
 Controls = str | Control | Sequence[str | Control] | Mapping[str, object]

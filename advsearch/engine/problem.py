@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -57,7 +57,7 @@ class Problem:
         space: the controls behind the whole of u: those that are searched, then those that vary by chance.
         task: judges the model's output; says what counts as success.
         facts: what the scene gives it to judge by, from what describes the configuration and what looks at it.
-        objective: what is maximised.
+        objective: what is maximised; None of a sweep.
         spp: samples a pixel while searching.
         searched: how many of the controls are searched; None for all. The others are the conditions: drawn anew from
             their whole range for every picture.
@@ -76,7 +76,7 @@ class Problem:
     model: Model
     task: Task
     facts: Callable[[Described, Looked], Facts]
-    objective: Objective
+    objective: Objective | None
     spp: int
     seed: int
     searched: int | None = None
@@ -91,7 +91,6 @@ class Problem:
     def __post_init__(self) -> None:
         self.plan = self.renderer.plan
         self._truths = KnownTruths(self.task, self.space, self.renderer, self.facts)
-        self._start_truth = self._truths.at(self.whole(self.domain.start))
 
     @property
     def plan(self) -> GradientPlan:
@@ -161,11 +160,26 @@ class Problem:
     def judge(self, picture: Tensor, whole: Tensor) -> Judgement:
         """Return what task and objective say of the model's output for a picture (H, W, 3), of the whole space at
         `whole`."""
+        if self.objective is None:
+            return self.judge_several(picture[None], [whole], [{}])[0]
         with torch.no_grad():
             output, truth = self.model(picture), self.truth(whole)
             objective = float(self.objective(output, picture[None], truth, self.asked(whole))[0])
             (said,) = judgements(self.task, output, picture[None], [truth], self.metrics)
             return replace(said, objective=objective)
+
+    def judge_several(
+        self, pictures: Tensor, wholes: Sequence[Tensor], listed: Sequence[Mapping[str, Value]]
+    ) -> list[Judgement]:
+        """Return what the task says of pictures (N, H, W, 3) that the model sees at once, without an objective; values
+        of each configuration as they were `listed`, as for `truth`. A margin that is not finite becomes NaN."""
+        with torch.no_grad():
+            output = self.model(pictures)
+            truths = [self.truth()] if not self.task.varies else list(map(self.truth, wholes, listed))
+            said = judgements(self.task, output, pictures, truths, self.metrics)
+        return [
+            replace(Judgement.of(one.score, one.margin, one.answer, one.payload), metrics=one.metrics) for one in said
+        ]
 
     def view(
         self, predict: Callable[[Tensor], Tensor], whole: Tensor, seed: int, spp: int, *, drawn: Tensor | None = None
@@ -191,9 +205,19 @@ class Problem:
             output, truth = self.model(picture), self.truth(whole)
             return self.task.judge(output, truth)[0].right, self.task.marks(output, truth)[0]
 
-    def truth(self, whole: Tensor | None = None) -> Truth:
-        """Return what is true of the scene at a configuration of the whole space; None for the start."""
-        return self._start_truth if whole is None or not self.task.varies else self._truths.at(whole)
+    def truth(self, whole: Tensor | None = None, listed: Mapping[str, Value] | None = None) -> Truth:
+        """Return what is true of the scene at a configuration of the whole space; None for the start. Values that are
+        `listed` count as they are there, not as what single precision makes of them."""
+        if whole is None or not self.task.varies:
+            return self._start_truth
+        return self._truths.at(whole, listed)
+
+    @cached_property
+    def _start_truth(self) -> Truth:
+        start = self.whole(self.domain.start)
+        if self.task.varies:
+            return self._truths.at(start)
+        return self.task.truth(self.facts(lambda: self.space.describe(start), lambda: self.renderer.surfaces(start)))
 
     def asked(self, *wholes: Tensor) -> Asked:
         """Return what gives the objective more than pictures, at configurations of the whole space."""
@@ -243,6 +267,12 @@ class Problem:
         lost = self.renderer.non_finite - before
         return replace(answer, non_finite=lost) if lost else answer
 
+    def _values(self, outputs: Output, pictures: Tensor, truth: Truth, asked: Asked) -> Tensor:
+        """The objective of pictures (N, H, W, 3), (N,)."""
+        if self.objective is None:
+            raise RuntimeError("a sweep has no objective")
+        return self.objective(outputs, pictures, truth, asked)
+
     def _answer(self, query: Query) -> Evaluation:
         u, seed = query.u, query.seed
         if query.wanted == "light":
@@ -287,7 +317,7 @@ class Problem:
             nonlocal slope
             output = self.model(image)
             seen.append((image.detach(), output))
-            value = self.objective(output, image[None], truth, asked)[0]
+            value = self._values(output, image[None], truth, asked)[0]
             if asked.used and len(seen) == 1 and value.requires_grad:  # exact, whatever the plan does with the picture
                 (found,) = torch.autograd.grad(value, at, retain_graph=True, allow_unused=True)
                 slope = slope if found is None else found
@@ -330,9 +360,9 @@ class Problem:
             places = [torch.cat([at, whole[len(at) :]]) for whole in wholes]
             if self.task.varies:
                 of_each = zip(each, pictures.split(1), truths, map(self.asked, places), strict=True)
-                values = torch.cat([self.objective(*one) for one in of_each])
+                values = torch.cat([self._values(*one) for one in of_each])
             else:
-                values = self.objective(outputs, pictures, truths[0], self.asked(*places))
+                values = self._values(outputs, pictures, truths[0], self.asked(*places))
             derivative = None
             if values.requires_grad:
                 derivative = torch.autograd.grad((values * hard_first(values)).sum(), at)[0]
@@ -394,7 +424,7 @@ class Problem:
     def loss(self, image: Tensor) -> Tensor:
         """The objective of a picture (H, W, 3) sRGB near the start, as a number with a graph."""
         start = self.asked(self.whole(self.domain.start))
-        return self.objective(self.model(image), image[None], self.truth(), start)[0]
+        return self._values(self.model(image), image[None], self.truth(), start)[0]
 
 
 def hard_first(values: Tensor) -> Tensor:

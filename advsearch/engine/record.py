@@ -16,7 +16,7 @@ from torch import Tensor
 from advsearch.attacks import SampleCount, SearchResult, Trials, Verification, count_right
 from advsearch.attacks.candidates import Bracket
 from advsearch.described import NOT_A_NUMBER, Value
-from advsearch.engine.transport import Predictor
+from advsearch.engine.transport import PredictedSearch
 from advsearch.interrupts import interruptible
 from advsearch.progress import Progress
 from advsearch.report.wording import count
@@ -77,7 +77,7 @@ class Findings:
     pictures: dict[tuple[str, int], Tensor] = field(default_factory=dict)
     frames: list[Any] = field(default_factory=list)
     interrupted: bool = False
-    transport: Predictor | None = None
+    transport: PredictedSearch | None = None
     rendered_because: str = ""
     surface_refused: str = ""
     verification_renders: int = 0

@@ -27,8 +27,9 @@ from advsearch.report.phrases import seen_text
 from advsearch.runs.files import placed_by
 from advsearch.runs.images import png_bytes, write_exr, write_layers, write_png
 from advsearch.runs.results.base import Formation, MeshUp, RenderResult, ViewAnswers
-from advsearch.scene.description import OBJECT, ORBIT_CAMERA, SceneDescription
+from advsearch.scene.description import OBJECT, SceneDescription
 from advsearch.scene.formation import SAMPLER, ImageFormation, to_8_bit
+from advsearch.scene.settings import ORBIT_CAMERA
 from advsearch.scene.surfaces import Surfaces
 from advsearch.settings import as_python
 from advsearch.tasks import Answer, AnyTask, Facts, Mark, Sight, make_task

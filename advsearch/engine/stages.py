@@ -38,7 +38,7 @@ from advsearch.engine.objective import penalised
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Findings, Stages
 from advsearch.engine.surface_light import SurfaceLight
-from advsearch.engine.transport import CleanMatrix, Predictor, Transport, reason_against, remark
+from advsearch.engine.transport import CleanMatrix, PredictedSearch, Transport, reason_against, remark
 from advsearch.engine.verifier import Verifier, check_failures, ladder_of
 from advsearch.interrupts import interruptible
 from advsearch.report.wording import count
@@ -298,7 +298,7 @@ class Attack:
         """Why light on surfaces does not predict the search, in words; None if it may."""
         return surface_light.reason_against(self.problem, self.problem.steps, self.policy, self.config.specialise)
 
-    def _prepare(self, predictor: Predictor, title: str) -> None:
+    def _prepare(self, predictor: PredictedSearch, title: str) -> None:
         """Make what predicts pictures; where its matrix would be too large, pictures are rendered."""
         hint = "from here on the search renders nothing (counted in samples a pixel); `specialise=false` leaves it out"
         self.stages.begin("transport", title, predictor.samples, hint=hint)

@@ -1,6 +1,6 @@
-"""Searches over base colours and light by light transport, and how far its pictures are from traced ones. Every `EVERY`
-evaluations predictions are compared with traced pictures: where they are too far off (`engine.acceptance`), the matrix
-is made anew. The ranking and all trials trace paths."""
+"""Searches whose pictures are predicted; here: by a matrix of light transport, where nothing varies by chance. Every
+`EVERY` evaluations predictions are compared with traced pictures: where they are too far off (`engine.acceptance`), the
+matrix is made anew. The ranking and all trials trace paths."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import statistics
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
@@ -18,19 +19,13 @@ from torch import Tensor
 from advsearch import seeds
 from advsearch.attacks import Evaluate, Evaluation
 from advsearch.attacks.evaluation import Query
-from advsearch.engine.acceptance import Deviation, compared
+from advsearch.engine.acceptance import ComparedView, Deviation, compared
 from advsearch.engine.problem import Problem
+from advsearch.runs.results.attack import BankOfConditions, LinearTransport, PredictionError
 from advsearch.scene.formation import to_8_bit
-from advsearch.scene.transport.lights import (
-    HAZE,
-    NOISE,
-    BasisRenderer,
-    lights_to_collect,
-    predicting,
-    samples_to_collect,
-    why_not,
-)
-from advsearch.scene.transport.matrix import TOO_LARGE, PredictingRenderer
+from advsearch.scene.predictor import NOISE, Predictor
+from advsearch.scene.transport.lights import HAZE, lights_to_collect, predicting, samples_to_collect, why_not
+from advsearch.scene.transport.matrix import TOO_LARGE, Tick
 
 WORTH = 16
 """Evaluations from which a search pays for the matrix, which costs as much as some 6 rendered ones with gradients
@@ -48,29 +43,16 @@ AVOIDABLE = {
     TOO_LARGE: "take a lower `resolution` or texture resolution, or set ADVSEARCH_LIMITS=2 where memory allows it",
 }
 """Reasons to render that cost much, and what a user can do instead."""
-Tick = Callable[[int], None]
-Judged = float | Tensor
-
-
-@dataclass(frozen=True)
-class Conditions:
-    """The conditions that matrices were made for: how many, how many of them were dropped for newer ones, comparisons
-    after which there had to be more, and by how much the objective was larger under them than under unseen ones, at the
-    last."""
-
-    made: int
-    dropped: int
-    grown: int
-    gap: float | None
 
 
 def reason_against(problem: Problem, steps: int, specialise: bool) -> str | None:
-    """Why a search renders instead of predicting, in words; None if it predicts."""
+    """Why a search renders instead of predicting by matrices, in words; None if it predicts."""
     if not specialise:
         return "nothing is left out"
     if steps < WORTH:
         return f"a matrix pays from {WORTH} evaluations on"
-    reason = why_not(problem.renderer, varying(problem))
+    by_chance = problem.space.controls[problem.searched :] if problem.conditions is not None else ()
+    reason = why_not(problem.renderer, [control.name for control in by_chance])
     if reason is None and problem.conditions is None:
         worth = WORTH_A_LIGHT * lights_to_collect(problem.renderer)
         return f"basis pictures pay from {worth} evaluations on" if steps < worth else None
@@ -84,26 +66,36 @@ def remark(reason: str) -> str:
     return f"{costs}: {reason}; {instead}." if instead else ""
 
 
-def varying(problem: Problem) -> list[str]:
-    """The controls that vary by chance."""
-    return [] if problem.conditions is None else [one.name for one in problem.space.controls[problem.searched :]]
+@dataclass
+class PredictedSearch(ABC):
+    """What predicts the pictures of a run's searches. All of it follows from the seed, so that a run that goes on makes
+    the same again.
 
-
-class Predictor(ABC):
-    """What predicts the pictures of a run's searches, in what way; its `deviations` from traced pictures, in order, and
-    the seconds spent on making matrices and comparing."""
+    Attributes:
+        way: how, in words.
+        exact: whether equal configurations have equal objectives.
+        drawn: whether the search climbs under conditions that each evaluation draws anew; see `Domain.drawn`.
+        steps: evaluations of a search; what comes after them belongs to the ranking, and is traced.
+        deviations: of predicted pictures from traced ones, in order.
+        traced: pictures that were traced for what predicts, and to be compared.
+        seconds: spent on both.
+        renewed: how often what predicts was made anew; None where it never is.
+        ends: by kind of search, the evaluation from which on pictures are traced, as predicted ones were too far off;
+            `given_up` says so.
+    """
 
     way: ClassVar[str] = "matrix"
-    deviations: list[Deviation]
-    seconds: float
-
     exact: ClassVar[bool] = False
-    """Whether equal configurations have equal objectives."""
 
-    @property
-    def drawn(self) -> bool:
-        """Whether the search climbs under conditions that each evaluation draws anew; see `Domain.drawn`."""
-        return False
+    problem: Problem
+    steps: int
+    drawn: bool = field(default=False, kw_only=True)
+    deviations: list[Deviation] = field(default_factory=list, kw_only=True)
+    traced: int = field(default=0, kw_only=True)
+    seconds: float = field(default=0.0, kw_only=True)
+    renewed: int | None = field(default=0, kw_only=True)
+    ends: dict[str, int] = field(default_factory=dict, kw_only=True)
+    given_up: str | None = field(default=None, kw_only=True)
 
     @property
     @abstractmethod
@@ -112,11 +104,11 @@ class Predictor(ABC):
 
     @abstractmethod
     def prepare(self, tick: Tick = lambda samples: None) -> None:
-        """Make the matrices at the start of the search; told of samples a pixel as they are traced."""
+        """Make what predicts at the start of the search; told of samples a pixel as they are traced."""
 
     @abstractmethod
     def passed(self, query: Query) -> None:
-        """Remember a query that was read back."""
+        """Remember a query that was read back: compare, and make anew, what an answer would have."""
 
     @abstractmethod
     def evaluate(self, query: Query) -> Evaluation:
@@ -130,129 +122,121 @@ class Predictor(ABC):
     def size(self) -> tuple[int, int]:
         """Entries of the matrices, for one colour channel, and bytes."""
 
-    @property
-    @abstractmethod
-    def traced(self) -> int:
-        """Pictures that were traced for matrices and comparisons."""
-
-    @property
-    def renewed(self) -> int | None:
-        """How often the matrix was made anew; None where none is."""
+    def conditions(self) -> BankOfConditions | None:
+        """What there is to say of conditions; None where nothing varies."""
         return None
 
     def predicted(self, kind: str, evaluations: int) -> int:
         """How many of the first evaluations of a search were predicted."""
-        return evaluations
+        return min(evaluations, self.ends.get(kind, evaluations))
 
-    @property
-    def given_up(self) -> str | None:
-        """Why pictures were rendered from some evaluation on, in words; None if they were not."""
-        return None
+    def compare(self, view: Callable[[int], ComparedView]) -> Deviation:
+        """Compare predictions with traced pictures, and keep what was found; see `compared`."""
+        with self.timed():
+            self.deviations.append(compared(view))
+        self.traced += self.deviations[-1].pictures
+        return self.deviations[-1]
 
-    @property
-    def conditions(self) -> Conditions | None:
-        """What there is to say of conditions; None where nothing varies."""
-        return None
+    def give_up(self, kind: str, number: int, where: str = "") -> None:
+        """Have pictures traced from an evaluation of a kind of search on."""
+        self.ends[kind] = number
+        why = f"pictures are rendered from evaluation {number}{where} on: predicted ones were too far off"
+        self.given_up = self.given_up or why
 
+    @contextmanager
+    def timed(self) -> Iterator[None]:
+        """Count the time of a block."""
+        begun = time.perf_counter()
+        yield
+        self.seconds += time.perf_counter() - begun
 
-@dataclass(frozen=True, eq=False)
-class ExpansionPoint:
-    """Where a picture was linearised, and the matrix that was made there."""
-
-    u: Tensor
-    renderer: PredictingRenderer
+    def summary(self) -> LinearTransport:
+        """What a result holds of it."""
+        entries, size = self.size()
+        return LinearTransport(
+            used=True,
+            way=self.way,
+            reason=self.given_up,
+            conditions=self.conditions(),
+            entries=entries,
+            bytes=size,
+            seconds=self.seconds,
+            renewed=self.renewed,
+            error=PredictionError.of(self.deviations[-1]) if self.deviations else None,
+        )
 
 
 @dataclass
 class CleanMatrix:
     """The matrix of the clean configuration, for attacks that differ in nothing but their budget of change."""
 
-    made: ExpansionPoint | None = None
+    made: Predictor | None = None
 
 
 @dataclass
-class Transport(Predictor):
-    """The matrices of a run's searches where nothing varies by chance. What comes after `steps` evaluations of a search
-    belongs to the ranking, and is traced. `renewals` are, by kind of search, the evaluations at which the matrix was
-    made anew, or, where there is none that could be, from which on pictures are traced. Every search begins at `clean`.
-    """
+class Transport(PredictedSearch):
+    """The matrices of a run's searches where nothing varies by chance; every search begins with the `clean` one."""
 
     exact: ClassVar[bool] = True
-    problem: Problem
-    steps: int
-    renewals: dict[str, list[int]] = field(default_factory=dict)
     clean: CleanMatrix = field(default_factory=CleanMatrix)
-    deviations: list[Deviation] = field(default_factory=list)
-    seconds: float = 0.0
     _optimism: float = 0.0
-    _start: ExpansionPoint | None = None
-    _collected: int = 0
-    _present: dict[str, ExpansionPoint] = field(default_factory=dict)
+    _present: dict[str, Predictor] = field(default_factory=dict)
 
     @property
     def samples(self) -> int:
         return samples_to_collect(self.problem.renderer)
 
-    def size(self) -> tuple[int, int]:
-        return self.start.entries, self.start.bytes
-
-    @property
-    def renewed(self) -> int:
-        return sum(len(found) for found in self.renewals.values()) if self._renewable else 0
-
-    @property
-    def _renewable(self) -> bool:
-        """Whether there is something to linearise again: basis pictures of lights stay what they are."""
-        return self.start.entries > 0
-
-    def predicted(self, kind: str, evaluations: int) -> int:
-        return min(evaluations, self._end(kind))
-
-    def _end(self, kind: str) -> int:
-        """The evaluation from which on pictures are traced."""
-        found = self.renewals.get(kind)
-        return self.steps if self._renewable or not found else min(found[0], self.steps)
-
-    @property
-    def given_up(self) -> str | None:
-        found = [f"{at} of the {kind}" for kind, (at, *_) in self.renewals.items() if not self._renewable]
-        return (
-            f"pictures are rendered from evaluation {found[0]} on: predicted ones were too far off" if found else None
-        )
-
-    @property
-    def traced(self) -> int:
-        return (self._collected + self.renewed) * self._pictures + sum(one.pictures for one in self.deviations)
-
     def prepare(self, tick: Tick = lambda samples: None) -> None:
         if self.clean.made is None:
             self.clean.made = self._made(self.problem.domain.start, "start", 0, tick)
-            self._collected = 1
-        self._start = self.clean.made
 
     @property
-    def _pictures(self) -> int:
-        return self.start.lights if isinstance(self.start, BasisRenderer) else 1
+    def start(self) -> Predictor:
+        self.prepare()
+        assert self.clean.made is not None
+        return self.clean.made
 
-    @property
-    def start(self) -> PredictingRenderer:
-        return self._begin.renderer
+    def size(self) -> tuple[int, int]:
+        return self.start.entries, self.start.bytes
 
-    @property
-    def _begin(self) -> ExpansionPoint:
-        if self._start is None:
-            self.prepare()
-        assert self._start is not None
-        return self._start
+    def _made(self, u: Tensor, kind: str, number: int, tick: Tick = lambda samples: None) -> Predictor:
+        with self.timed():
+            seed = seeds.stream(self.problem.seed, f"transport {kind}", number)
+            made = predicting(self.problem.renderer, u, seed, tick)
+        self.traced += made.lights
+        return made
 
     def passed(self, query: Query) -> None:
-        self._compared(query)
+        self._at(query)
 
     def evaluate(self, query: Query) -> Evaluation:
-        renderer = self._compared(query)
-        if renderer is None:
+        present = self._at(query)
+        if present is None:
             return self.problem.evaluate(query)
-        return replace(self.problem.evaluated(query, query.u, query.seed, renderer)[0], predicted=1)
+        return replace(self.problem.evaluated(query, query.u, query.seed, present.renderer)[0], predicted=1)
+
+    def _at(self, query: Query) -> Predictor | None:
+        """What predicts an evaluation, compared and made anew where that is due; None where it is traced."""
+        kind, number = query.kind, query.number
+        if query.phase != "search" or number >= self.predicted(kind, self.steps):
+            return None
+        present = self._present.setdefault(kind, self.start)
+        if number == 0 or number % EVERY or not kind.startswith("search"):
+            return present
+        seed = seeds.stream(self.problem.seed, "transport check", number)
+        deviation = self.compare(
+            lambda view: self.problem.view(present, query.u, seeds.stream(seed, "view", view), self.problem.spp)
+        )
+        if deviation.good:
+            return present
+        if self.start.entries == 0:  # basis pictures of lights stay what they are: there is nothing to linearise again
+            self.give_up(kind, number, f" of the {kind}")
+            return None
+        self._present[kind] = self._made(query.u, kind, number)
+        self.renewed = (self.renewed or 0) + 1
+        return self._present[kind]
+
+    # ---- the smallest change ----------------------------------------------------------------------------------------
 
     def likely(self, u: Tensor) -> bool:
         """Whether the picture that is predicted from the start would pass its trials, as far as those of the last
@@ -269,35 +253,3 @@ class Transport(Predictor):
         """That of the picture that is predicted from the start, rounded to 8 bits."""
         with torch.no_grad():
             return self.problem.judge(to_8_bit(self.start(u)), u).score
-
-    def _compared(self, query: Query) -> PredictingRenderer | None:
-        """The matrix to predict an evaluation with, compared and made anew where that is due; None gives up."""
-        kind, number = query.kind, query.number
-        if query.phase != "search" or number >= self._end(kind):
-            return None
-        place = self._present.setdefault(kind, self._begin)
-        if number and number % EVERY == 0 and kind.startswith("search"):
-            found = self.deviation(place.renderer, query.u, number)
-            self.deviations.append(found)
-            if not found.good:
-                self.renewals.setdefault(kind, []).append(number)
-                if not self._renewable:
-                    return None
-                place = self._present[kind] = self._made(query.u, kind, number)
-        return place.renderer
-
-    def _made(self, u: Tensor, kind: str, number: int, tick: Tick = lambda samples: None) -> ExpansionPoint:
-        begun = time.perf_counter()
-        seed = seeds.stream(self.problem.seed, f"transport {kind}", number)
-        made = predicting(self.problem.renderer, u, seed, tick)
-        self.seconds += time.perf_counter() - begun
-        return ExpansionPoint(u.detach().clone(), made)
-
-    def deviation(self, linear: PredictingRenderer, u: Tensor, index: int) -> Deviation:
-        """Compare what a matrix predicts with traced pictures of several seeds."""
-        begun = time.perf_counter()
-        seed = seeds.stream(self.problem.seed, "transport check", index)
-        problem = self.problem
-        found = compared(lambda number: problem.view(linear, u, seeds.stream(seed, "view", number), problem.spp))
-        self.seconds += time.perf_counter() - begun
-        return found

@@ -33,7 +33,7 @@ from advsearch.engine.attack_result import save_trial
 from advsearch.engine.journal import Journal, Shared
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import KEPT, Findings, Stages, verified_rate
-from advsearch.engine.transport import Predictor
+from advsearch.engine.transport import PredictedSearch
 from advsearch.errors import InputError
 from advsearch.progress import Progress
 from advsearch.report.wording import count as plural
@@ -59,13 +59,15 @@ def ladder_of(config: SceneConfig) -> Sequence[int]:
 class Verifier:
     """Makes the trials of one run: sample count (of a ladder; a single one is taken as it is), control group, answers,
     and configurations one at a time. Each group has as many trials as the last of `looks`; after those before, the
-    verdict may stand. What comes of them, pictures and the count of renders are in `findings`."""
+    verdict may stand. What comes of them, pictures and the count of renders are in `findings`. Rows say of a success
+    where some answer is `sought`."""
 
     journal: Journal
     ladder: Sequence[int]
     stages: Stages
     findings: Findings = field(default_factory=Findings)
     looks: tuple[int, ...] = (0,)
+    sought: bool = True
     _clean_spp: int = 0
     _clean_kind: str = "control"
     _asked: set[tuple[str, int]] = field(default_factory=set)
@@ -78,11 +80,12 @@ class Verifier:
         return self.looks[-1]
 
     def answers(
-        self, queries: Sequence[Query], *, in_samples: bool = False, predictor: Predictor | None = None
+        self, queries: Sequence[Query], *, in_samples: bool = False, predictor: PredictedSearch | None = None
     ) -> Iterator[Evaluation]:
         """Answer trials, keep their pictures, and count each once; the bar counts them, or their samples a pixel. A
         `predictor` answers what it can in place of renders, which alone are counted."""
         made = None if predictor is None else partial(predictor.answered, traced=self.journal.traced)
+        queries = queries if self.sought else [replace(query, sought=False) for query in queries]
         for query, answer in zip(queries, self.journal.answers(queries, made), strict=True):
             if answer.picture is not None:
                 self.findings.pictures[query.kind, query.number] = answer.picture
@@ -179,7 +182,7 @@ class Verifier:
         configurations: Mapping[int, Tensor],
         *,
         sought: bool = True,
-        predictor: Predictor | None = None,
+        predictor: PredictedSearch | None = None,
     ) -> Iterator[Judgement]:
         """Try configurations once each, every one with a seed of its own, by their numbers among those of a kind; a
         `predictor` as for `answers`."""

@@ -22,20 +22,19 @@ from advsearch.scene import environments, library, settings
 from advsearch.scene.assets import Doubles, EnvironmentAsset, Material, ObjectAsset
 from advsearch.scene.camera_files import read_camera
 from advsearch.scene.camera_model import CameraModel, bundled
+from advsearch.scene.exposure import metered_gain
+from advsearch.scene.geometry import moved_part, object_to_world
 from advsearch.scene.grounds import Photograph, on_its_ground, photograph_of
 from advsearch.scene.importing.objects import import_object
 from advsearch.scene.importing.scenes import MITSUBA_FILE, ImportedScene, import_scene, split_node
 from advsearch.scene.parts import Lamp, MeshPart, PlacedCamera, PluginPart, ScenePart, mesh_part, plugins_in
+from advsearch.scene.settings import ORBIT_CAMERA
 
 DEFAULT_ENVIRONMENT = "studio"
 OBJECT = "object"
 """The name of the mesh under test."""
 ENVIRONMENT = "environment"
 """What stands for the environment among the settings that were asked for."""
-FRAME_FILL = 0.86
-"""Share of the picture's half-width that the object's outline may reach when the distance is worked out."""
-ORBIT_CAMERA = "orbit"
-"""The camera that the settings `camera.*` describe: on a sphere around the object, looking at it."""
 ENVIRONMENTS = ("constant", "envmap", "sunsky", "timed_sunsky")
 """Mitsuba's lights from everywhere, of which a scene can have one."""
 NO_MAP = "none"
@@ -140,8 +139,6 @@ class SceneDescription:
     @cached_property
     def meshes(self) -> Mapping[str, MeshPart]:
         """Every mesh by name, as the settings have it; the one under test is `OBJECT`."""
-        from advsearch.scene.geometry import moved_part, object_to_world  # a circle: it takes descriptions
-
         under_test = mesh_part(OBJECT, self.object, object_to_world(self), self.material)
         return {OBJECT: under_test, **{name: moved_part(one, self.values) for name, one in self.around.items()}}
 
@@ -225,8 +222,6 @@ class SceneDescription:
     @property
     def base_vertices(self) -> Doubles:
         """(V, 3) the object's vertices in world space, in its base pose."""
-        from advsearch.scene.geometry import object_to_world  # a circle: it takes descriptions
-
         matrix = object_to_world(self)
         return np.asarray(self.object.mesh.vertices.astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3])
 
@@ -280,8 +275,6 @@ class SceneDescription:
     @property
     def gain(self) -> float:
         """Factor from scene radiance to display-linear values: the metered exposure times `camera.exposure`."""
-        from advsearch.scene.exposure import metered_gain  # a circle: it takes descriptions
-
         return (metered_gain(self) if self.metered else 1.0) * math.pow(2.0, self.number("camera.exposure"))
 
 

@@ -16,18 +16,21 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from advsearch.scene.assets import Doubles, EnvironmentAsset, Floats, Ints
 from advsearch.scene.color import srgb_to_linear
-from advsearch.scene.description import OBJECT, ORBIT_CAMERA, SceneDescription
 from advsearch.scene.geometry import camera_to_world, object_to_world
 from advsearch.scene.grounds import paved
 from advsearch.scene.parts import MeshPart
 from advsearch.scene.raster import looked_up, pixels_in
-from advsearch.scene.settings import resolve
+from advsearch.scene.settings import ORBIT_CAMERA, resolve
 from advsearch.scene.silhouettes import NEAREST, Frame
+
+if TYPE_CHECKING:
+    from advsearch.scene.description import SceneDescription
 
 RASTER = 32
 """Pixels along the longer side of the picture in which the surface is looked at."""
@@ -92,8 +95,8 @@ def irradiance(scene: SceneDescription, normals: Doubles) -> Doubles:
         if faced.any():  # the lamps of controls are dark as they come
             length = max(float(np.linalg.norm(way)), 1e-12)
             found = found + np.maximum(normals @ (way / length), 0.0)[:, None] * faced
-    for name, part in scene.meshes.items():
-        if part.emission is not None and name != OBJECT:  # what the object emits belongs to what it is made of
+    for part in (scene.meshes[name] for name in scene.around):  # what the object emits belongs to what it is made of
+        if part.emission is not None:
             ways, faced = _emitted(part, part.emission, middle)
             facing = np.maximum(np.einsum("nk,fk->nf", normals, ways), 0.0)
             found = found + np.einsum("nf,fc->nc", facing, faced)

@@ -19,16 +19,21 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from advsearch.scene.assets import Doubles
-from advsearch.scene.description import FRAME_FILL, ORBIT_CAMERA, SceneDescription
 from advsearch.scene.parts import MeshPart
-from advsearch.scene.settings import POSE, SETTINGS
+from advsearch.scene.settings import ORBIT_CAMERA, POSE, SETTINGS
 
+if TYPE_CHECKING:
+    from advsearch.scene.description import SceneDescription
+
+FRAME_FILL = 0.86
+"""Share of the picture's half-width that the object's outline may reach when the distance is worked out."""
 CLEARANCE = 0.02
 """Smallest distance, in object sizes, to the sphere around the object."""
 DEFAULT_VIEW = ("camera.azimuth", "camera.elevation", "camera.roll")

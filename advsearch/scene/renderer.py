@@ -42,6 +42,10 @@ Configuration = Tensor | npt.NDArray[np.floating[Any]] | Sequence[float]
 Source = Callable[[Mapping[str, Tensor], int, int], Tensor]
 """From scene inputs, seed and samples a pixel to linear radiance (H, W, 3)."""
 
+Predict = Callable[[Mapping[str, Tensor]], Tensor]
+"""From scene inputs to linear radiance (H, W, 3), or (H, W, 4) with coverage where there is a backdrop; differentiable.
+"""
+
 
 class InputSpace(Protocol):
     """What the renderer and a loop of one's own ask of a space: its start, its groups, what a configuration does."""
@@ -92,9 +96,6 @@ class Renderer:
         estimators: estimators forced by "control.parameter", "control" or "*".
     """
 
-    _predicts = False
-    """Whether every derivative runs back through scene inputs, whatever the plan says."""
-
     def __init__(
         self,
         scene: MitsubaScene,
@@ -111,6 +112,7 @@ class Renderer:
         self.root_seed = root_seed
         self._shape = space.start.shape
         self._source: Source | None = None
+        self._predict: Predict | None = None
         self.renders = 0
         self.gradients = 0
         self.non_finite = 0
@@ -152,6 +154,13 @@ class Renderer:
         other._source = source
         return other
 
+    def predicted_by(self, predict: Predict) -> Renderer:
+        """Return a renderer of the same space whose radiance is predicted (`scene.predictor`): seed and samples of a
+        call mean nothing to it, and every derivative runs back through scene inputs, whatever the plan says."""
+        other = self.like()
+        other._predict = predict
+        return other
+
     def __call__(self, u: Configuration, seed: int = 0, spp: int = 16) -> Tensor:
         """Render a configuration as the model would see it, or several.
 
@@ -188,7 +197,7 @@ class Renderer:
         """
         _, through = self._given(u, spp)
         with torch.inference_mode(False) if torch.is_inference_mode_enabled() else nullcontext():
-            return self._picture(through, seed, spp, shown=False)
+            return self._picture(through, seed, spp, display=False)
 
     def halves(self, u: Tensor, seed: int, spp: int) -> tuple[Tensor, Tensor, Tensor]:
         """Trace two pictures (H, W, 3) of a configuration with independent noise, which are not denoised; and return
@@ -203,12 +212,12 @@ class Renderer:
             traced = {name: value for name, value in inputs.items() if name not in ON_PICTURE}
             undenoised = self.like(denoiser="none")
             numbers = [seeds.stream(seed, "traced", half) for half in range(2)]
-            one, other = (undenoised._rendered(traced, number, spp, hide) for number in numbers)
+            one, other = (undenoised.rendered(traced, number, spp, hide) for number in numbers)
             both = (one + other) / 2.0
             noise = seeds.stream(self.root_seed, "guides", numbers[0])
             clean = denoise(both[..., :3].contiguous(), *self.scene.guides(traced, noise, spp))
             both = torch.cat([clean, both[..., 3:]], dim=-1)
-            *noisy, clean = (self._shown(picture, inputs, u, shown=False) for picture in (one, other, both))
+            *noisy, clean = (self.finished(picture, inputs, u, display=False) for picture in (one, other, both))
             there = self.formation.display(clean)
             moved = (self.formation.display(torch.lerp(clean, one, SMALL_PART)) for one in noisy)
             first, second = (self.space.picture(u, there + (one - there) / SMALL_PART) for one in moved)
@@ -291,22 +300,20 @@ class Renderer:
             )
         with torch.inference_mode(False) if torch.is_inference_mode_enabled() else nullcontext():
             u = u.clone() if u.is_inference() else u
-            if self._predicts or not u.requires_grad or bool((mask := self.plan.through).all()):
+            if self._predict is not None or not u.requires_grad or bool((mask := self.plan.through).all()):
                 return u, u
             return u, u.detach() + mask * (u - u.detach())
 
-    def _picture(
-        self, u: Tensor, seed: int, spp: int, given: dict[str, Tensor] | None = None, *, shown: bool = True
-    ) -> Tensor:
-        """The picture of u, or with scene inputs in the place of its own; or else the radiance that is to be shown."""
-        inputs = self.scene.assembly(self.space.inputs(u)) if given is None else given
+    def _picture(self, u: Tensor, seed: int, spp: int, *, display: bool = True) -> Tensor:
+        """The picture of u, or else the radiance that is to be displayed."""
+        inputs = self.scene.assembly(self.space.inputs(u))
         hide = "backdrop.color" in inputs
         traced = {name: value for name, value in inputs.items() if name not in ON_PICTURE}
-        return self._shown(self._rendered(traced, seed, spp, hide), inputs, u, shown=shown)
+        return self.finished(self.rendered(traced, seed, spp, hide), inputs, u, display=display)
 
-    def _shown(self, rendered: Tensor, inputs: Mapping[str, Tensor], u: Tensor, *, shown: bool = True) -> Tensor:
-        """The picture of rendered radiance, or the radiance that is to be shown: exposure and backdrop of scene inputs,
-        and what controls do to the finished picture at u."""
+    def finished(self, rendered: Tensor, inputs: Mapping[str, Tensor], u: Tensor, *, display: bool = True) -> Tensor:
+        """Return the picture of rendered radiance, or the radiance that is to be displayed: exposure and backdrop of
+        scene inputs are added, and what controls do to the finished picture at u."""
         exposure, backdrop = inputs.get("camera.exposure"), inputs.get("backdrop.color")
         radiance = rendered[..., :3]
         if exposure is not None:
@@ -314,14 +321,17 @@ class Renderer:
         if backdrop is not None:
             uncovered = (1.0 - rendered[..., 3:]).clamp(0.0, 1.0)
             radiance = radiance + uncovered * (backdrop / self.formation.gain)
-        return self.space.picture(u, self.formation.display(radiance)) if shown else radiance
+        return self.space.picture(u, self.formation.display(radiance)) if display else radiance
 
-    def _rendered(self, inputs: Mapping[str, Tensor], seed: int, spp: int, hide: bool) -> Tensor:
-        """Radiance of scene inputs, with a graph, and with coverage if hidden; counted in `renders`."""
+    def rendered(self, inputs: Mapping[str, Tensor], seed: int, spp: int, hide: bool) -> Tensor:
+        """Return linear radiance of scene inputs, (H, W, 3), or (H, W, 4) with coverage if the environment is to `hide`
+        behind a backdrop; with a graph. What is traced counts in `renders`."""
+        if self._predict is not None:
+            return self._predict(inputs)
         found: Tensor = _Radiance.apply(self, tuple(inputs), seed, spp, hide, *inputs.values())  # type: ignore[no-untyped-call]
         return found
 
-    def _finite(self, values: Tensor) -> Tensor:
+    def finite(self, values: Tensor) -> Tensor:
         """Replace NaN and infinite entries by zero and count them."""
         if bool(torch.isfinite(values.sum())):
             return values
@@ -349,7 +359,7 @@ class Renderer:
 
         for group in self._differenced():
             central(value, group, u, found)
-        return self._finite(found)
+        return self.finite(found)
 
     # ---- set-up -----------------------------------------------------------------------------------------------------
 
@@ -419,7 +429,7 @@ class _Radiance(torch.autograd.Function):
             rendered, *guides = renderer.scene.pictures(inputs, wanted, spp)
         else:
             rendered, guides = renderer._source(inputs, noise, spp), []
-        rendered = renderer._finite(rendered)
+        rendered = renderer.finite(rendered)
         for guide in guides:
             noisy, quick = rendered[..., :3].contiguous(), renderer.formation.quick
             clean = denoise(noisy, guide[..., :3], guide[..., 3:], quick=quick)
@@ -437,7 +447,7 @@ class _Radiance(torch.autograd.Function):
         renderer: Renderer = ctx.renderer
         inputs = dict(zip(ctx.names, ctx.saved_tensors, strict=True))
         noise = seeds.stream(renderer.root_seed, "gradient", ctx.seed)
-        cotangent = renderer._finite(cotangent[..., :3])
+        cotangent = renderer.finite(cotangent[..., :3])
         found, left = dict[str, Tensor](), list(inputs)
         for estimator in ("material", "adjoint"):  # what two reach goes to the more general one
             groups = [group for group in renderer.plan.groups if group.estimator == estimator]
@@ -456,7 +466,7 @@ class _Radiance(torch.autograd.Function):
                 gradients = renderer.scene.adjoint(inputs, cotangent, noise, ctx.spp, wrt=wrt, method=method)
             renderer.gradients += 1
             for name, gradient in gradients.items():
-                found[name] = renderer._finite(gradient)
+                found[name] = renderer.finite(gradient)
         return None, None, None, None, None, *(found.get(name) for name in ctx.names)
 
 

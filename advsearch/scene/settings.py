@@ -109,6 +109,9 @@ POSE = (
     _pose("z", "object sizes", -1e4, 1e4, 0.0, "Height of the lowest point above the ground."),
     _pose("scale", "1", 0.01, 100.0, 1.0, "Size relative to the default.", (0.8, 1.25), log=True),
 )
+ORBIT_CAMERA = "orbit"
+"""The camera that the settings `camera.*` describe: on a sphere around the object, looking at it."""
+
 CAMERA = (
     _camera(
         "azimuth",

@@ -34,7 +34,7 @@ from advsearch.errors import AdvsearchError, InputError
 from advsearch.models import ModelWarning
 from advsearch.progress import NullProgress
 from advsearch.questions.attack import carry_out as attacking
-from advsearch.questions.region.settings import RegionConfig
+from advsearch.questions.region.answer import RegionConfig
 from advsearch.report.wording import objective_text
 from advsearch.runs.directory import is_run
 from advsearch.runs.store import Store

@@ -20,8 +20,9 @@ from stored_sweeps import make_sweep
 import advsearch
 from advsearch import testing
 from advsearch.api.studies import attacks_of
+from advsearch.cli.commands import COMMANDS
 from advsearch.cli.dashboard import _LoadedLater as TakenLater
-from advsearch.cli.main import COMMANDS, main
+from advsearch.cli.main import main
 from advsearch.cluster import Work
 from advsearch.cluster.worker import Failure, Files, prepare, version
 from advsearch.config import AttackConfig

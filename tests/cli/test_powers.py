@@ -12,8 +12,8 @@ from stored_sweeps import make_sweep
 import advsearch
 from advsearch import registry
 from advsearch.api import studies
+from advsearch.cli.flags import IN_A_FILE as COMMANDS
 from advsearch.cli.main import main
-from advsearch.cli.run import COMMANDS
 from advsearch.config import CONFIGS, AttackConfig, SweepConfig
 from advsearch.errors import InputError
 from advsearch.progress import NullProgress

@@ -204,7 +204,7 @@ def test_files_are_sent_only_to_a_worker_that_lacks_them() -> None:
 
     pool = Sending()
     pool.add(2)
-    files = Files({"/a/mug.obj": ("d", "mug.obj")}, {"d": {"mug.obj": b"v"}})
+    files = Files({"/a/mug.obj": "d"}, {"/a/mug.obj": b"v"})
     shared = Coordinator(pool, Work("a:b", {}), "key", files, "1", {"processor": "here"}, clock=pool.clock)
     assert len(list(shared.results(ranges()))) == COUNT // SIZE
     assert sorted(sent) == [False, False, True]
@@ -260,8 +260,8 @@ def test_files_of_lists_nodes_and_two_paths_are_read_here_and_found_there(tmp_pa
     }
     work = Work("a:b", given, ("object", "path"))
     files = read_files(work)
-    assert {Path(path).name for path in files.named} == {path.name for path in here.iterdir()}
-    assert write_files(work, files, there).settings == {**given, "object": given["object"].replace(", ", ",")}
+    assert {Path(path).name for path in files.digests} == {path.name for path in here.iterdir()}
+    assert write_files(work, files, there).settings == given and not there.exists()
     here.rename(tmp_path / "gone")
     moved: Any = write_files(work, files, there).settings
     found = [*moved["object"].split(","), *moved["path"].split("csv+")]

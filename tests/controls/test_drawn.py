@@ -17,8 +17,8 @@ from torch.distributions import Laplace as TorchLaplace
 from advsearch.attacks.draws import Draws
 from advsearch.config import AttackConfig
 from advsearch.controls import CameraControl, EnvironmentControl, PatchControl
-from advsearch.controls.drawn import DrawnRange
 from advsearch.controls.numbers import NumberControl
+from advsearch.controls.ranges import DrawnRange
 from advsearch.distributions import as_setting
 from advsearch.engine.attack_parts import controls_given
 from advsearch.engine.loading import as_controls, load_scene, only_here, settings_of

@@ -17,7 +17,7 @@ from advsearch.engine import bank
 from advsearch.engine.attack_parts import problem_of
 from advsearch.engine.bank import Bank
 from advsearch.engine.problem import Problem
-from advsearch.engine.transport import Predictor, Transport
+from advsearch.engine.transport import PredictedSearch, Transport
 from advsearch.errors import InputError, UnknownNameError
 
 SMALL: dict[str, Any] = {
@@ -75,7 +75,7 @@ def test_it_is_the_same_for_rendered_and_for_predicted_pictures(
     monkeypatch.setattr(bank, "FIRST", 2)
     settings = {"over": over, "draws": 2} if over else {}
     made = problem(scene, pinker, controls=TEXTURE, **settings)
-    predicted: Predictor = Bank(made, 16, partial(map, made.evaluate)) if over else Transport(made, 16)
+    predicted: PredictedSearch = Bank(made, 16, partial(map, made.evaluate)) if over else Transport(made, 16)
     at = made.domain.begin.clone().requires_grad_()
     value = pinker(at, at, at, made.searched_space.printed(at)["texture"][None])
     value.sum().backward()

@@ -18,6 +18,7 @@ from typing import Any, Literal
 
 import numpy as np
 import pytest
+import small_models
 import torch
 from conftest import ROOT
 from covering import once_each
@@ -53,6 +54,7 @@ from advsearch.runs.results.sweep import SweepSummary
 from advsearch.runs.store import Row
 from advsearch.runs.summary import write_answer
 from advsearch.scene.formation import ImageFormation
+from advsearch.scene.gradients import GradientPlan
 from advsearch.settings import settings
 from advsearch.viewer.columns import read_columns
 
@@ -84,7 +86,7 @@ class FakeRenderer:
     ) -> None:
         self.space, self.size, self.non_finite = space, size, 0
         self.start, self.scene = space.start, SimpleNamespace(assembly=dict)  # nothing of it is light
-        self.formation = ImageFormation(denoiser=denoise, resolution=size)
+        self.formation, self.plan = ImageFormation(denoiser=denoise, resolution=size), GradientPlan(())
         self.seen: list[tuple[Tensor, int, int]] = []
         FakeRenderer.made.append(self)
 
@@ -422,6 +424,13 @@ def test_what_a_row_says_of_an_occluder_is_true_of_its_own_camera() -> None:
     rows = {row.step: row for row in found.rows()}
     assert (worst := found.summary.worst) is not None
     assert plain(worst.values) == rows[worst.configuration].values
+
+
+def test_a_model_that_comes_with_the_name_of_another_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two functions, each of which gives a model of one name."""
+    monkeypatch.setattr(small_models, "hard", small_models.easy)
+    with pytest.raises(InputError, match="model: expected models with different names, got easy, easy"):
+        advsearch.sweep("mug", "small_models:easy,small_models:hard", {"pose.yaw": [0, 90]}, trials=0)
 
 
 def test_what_a_row_says_is_true_of_the_picture_that_its_model_was_shown() -> None:

@@ -12,7 +12,7 @@ import advsearch
 from advsearch.attacks.draws import Product
 from advsearch.engine import acceptance
 from advsearch.engine.acceptance import Deviation
-from advsearch.engine.sweeps import predicting, swept_scene
+from advsearch.engine.sweeps import predicting
 from advsearch.engine.sweeps.predicting import Groups, combined
 from advsearch.engine.sweeps.swept_scene import SweptScene
 from advsearch.runs.results.attack import LinearTransport, PredictionError
@@ -24,7 +24,7 @@ GRID = {"camera.exposure": [-10, -1, 6], "light.power": "0:6:8"}
 @pytest.fixture(autouse=True)
 def _paying(monkeypatch: pytest.MonkeyPatch) -> None:
     """A few dozen pictures are enough here, and the first two views of a comparison decide."""
-    monkeypatch.setattr(swept_scene, "PAYS", 0.2)
+    monkeypatch.setattr(predicting, "PAYS", 0.2)
     for name in ("BOUND", "MARGIN"):
         monkeypatch.setattr(acceptance, name, 50.0)
 

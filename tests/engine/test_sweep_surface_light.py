@@ -76,7 +76,7 @@ def test_pictures_are_those_that_are_rendered() -> None:
     )
     queries = [query for _, _, query in scene.job.queries(range(8))]
     predicted = scene.pictures(queries)
-    traced = torch.stack([scene.picture(0, query.u, seed=9, spp=64) for query in queries])
+    traced = torch.stack([scene.problems[0].picture(query.u, seed=9, spp=64) for query in queries])
     apart = 255.0 * ((predicted[:, None] - traced[None]) ** 2).mean(dim=(2, 3, 4)).sqrt()
     assert apart.argmin(dim=1).tolist() == list(range(8))
     assert float(apart.diagonal().mean()) < 9.0

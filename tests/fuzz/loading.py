@@ -76,7 +76,7 @@ def load_labels(path: Path) -> None:
 
 def load_settings(path: Path) -> None:
     """Read a YAML file as `advsearch run` does."""
-    from advsearch.cli.run import command_in, config_of_file
+    from advsearch.cli.flags import command_in, config_of_file
 
     config_of_file(command_in(path), path, {})
 

@@ -108,9 +108,9 @@ def test_what_is_rendered_is_searched_together_and_in_further_scenes_too(attacks
     with RunDirectory.create_for(config) as run:
         course = Course(Trainable(torch.nn.Linear(2, 3), load()), load(), config)
         work = work_of(config, run, course)
-        found = work._drawn("scenes", TRAINING, range(1), 1)
-        held_back = work._drawn("scenes", VALIDATION, range(1), 2)
-        assert work._counts[FURTHER] == 2 * work._counts[TRAINING]
+        found = work.drawn("scenes", TRAINING, range(1), 1)
+        held_back = work.drawn("scenes", VALIDATION, range(1), 2)
+        assert work.counts[FURTHER] == 2 * work.counts[TRAINING]
     assert [type(one) for one in held_back] == [TextureLesson] * 2 + [Lesson] + [RenderedLesson] * 2
     rendered = [RenderedLesson, Lesson, RenderedLesson, RenderedLesson]  # one scene as it is, too
     assert [type(one) for one in found] == [TextureLesson, Lesson, *rendered]
@@ -127,7 +127,7 @@ def test_in_half_of_the_scenes_with_a_texture_what_is_rendered_varies_too(
         course = Course(Trainable(torch.nn.Linear(2, 3), load()), load(), config)
         work = work_of(config, run, course)
         assert work.scenes.beside == ("pose",)  # no matrix says what haze does
-        drawn = [work._chance("texture", number) for number in range(400)]
+        drawn = [work.chance("texture", number) for number in range(400)]
         for share, which in ((hardening.SHARED, 0), (hardening.MOVED, 1)):
             for part in (drawn[::2], drawn[1::2]):  # objects take turns, and each has as many
                 assert abs(sum(one[which] for one in part) / 200 - share) < 0.08
@@ -199,12 +199,12 @@ def test_a_round_ends_with_the_part_of_the_way_that_is_best(
     monkeypatch.setattr("advsearch.questions.harden.training.score", judged)
     with RunDirectory.create_for(config) as run:
         work = work_of(config, run, Course(student, load(), config))
-        work.rounds._keep(0, [], Score(1.0, 0.5), 0, 0.0)
+        work.rounds.keep(0, [], Score(1.0, 0.5), 0, 0.0)
         for loss, expected, looked_at in ((0.05, 0.4, 6), (0.2, 1.0, 2), (0.001, 0.25, 6)):
             judged_at.clear()
             net.load_state_dict({name: one + 1.0 for name, one in given.items()})
             work.course.config = config.model_copy(update={"clean_loss": loss})
-            found, part = work.rounds._mixed([])
+            found, part = work.rounds.mixed([])
             assert part == expected and found.robust == pytest.approx(0.5 + 0.2 * part)
             assert len(judged_at) == looked_at, "less than the best part is looked at once"
             torch.testing.assert_close(net.bias.detach(), given["bias"] + part)

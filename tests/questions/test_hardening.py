@@ -20,6 +20,7 @@ from torch import Tensor, nn
 
 from advsearch import threads
 from advsearch.attacks import Block, Domain
+from advsearch.bundled.changed_light import white_light_changed
 from advsearch.config import AttackConfig
 from advsearch.engine.attack_parts import problem_of
 from advsearch.engine.loading import load_scene
@@ -47,7 +48,6 @@ from advsearch.questions.harden.scenes import (
     check_disjoint,
     check_unmeasured,
     fingerprint,
-    white_light_changed,
 )
 from advsearch.questions.harden.settings import HardenConfig
 from advsearch.questions.harden.training import Course, Gradients, Score, TrainingRounds, score

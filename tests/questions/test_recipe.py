@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,25 +19,14 @@ from advsearch.config import AttackConfig, SweepConfig
 from advsearch.engine.attack_parts import parts_of, problem_of_parts
 from advsearch.engine.surface_light import reason_against
 from advsearch.errors import AdvsearchError, FileFormatError, InputError, UnknownNameError
-from advsearch.explanations import Answered
-from advsearch.questions.recipe import accuracy
 from advsearch.questions.recipe import carry_out as carrying_out
-from advsearch.questions.recipe.answer import BarsFigure, HeatMapFigure, RecipeResult, told_once
-from advsearch.questions.recipe.description import (
-    FIGURES,
-    Recipe,
-    check_figures,
-    compute,
-    draw_figure,
-    planned,
-    read_options,
-    read_recipe,
-    recipe_names,
-    titles,
-)
-from advsearch.questions.recipe.given import fitting
+from advsearch.questions.recipe.answer import RecipeFigure, RecipeResult, told_once
+from advsearch.questions.recipe.description import Recipe, planned, read_recipe, recipe_names, titles
+from advsearch.questions.recipe.figures import FIGURES, check_figures, files_of, make, read_options
+from advsearch.questions.recipe.given import CuesOptions, fitting, predicted
 from advsearch.questions.recipe.settings import RecipeConfig
-from advsearch.questions.recipe.table import Table, count_of
+from advsearch.questions.recipe.table import MadeFigure, Table, Tally
+from advsearch.questions.recipe.ternary import all_triangles, triangle_of
 from advsearch.runs.images import write_png
 from advsearch.runs.results.attack import AnswerDistribution, FoundValue
 from advsearch.runs.results.sweep import SurfaceMap
@@ -53,9 +42,34 @@ parts:
     command: sweep
     settings: {controls: {camera: {}}, samples: 2, sampler: random, trials: 0}
 figures:
-  - {figure: heat map, rows: object, columns: environment}
-  - {figure: bars, by: environment}
+  - {figure: rates, form: map, by: object, series: environment}
+  - {figure: rates, by: environment}
 """
+
+
+@dataclass(frozen=True)
+class Answered:
+    """A row: what it shows, with units, and what was said of it."""
+
+    part: str
+    values: dict[str, Any]
+    units: dict[str, str]
+    answer: str
+    correct: bool
+    time: float | None = None
+    margin: float | None = None
+    unit: str | None = None
+
+
+def tabled(given: Sequence[Answered], groups: dict[str, list[str]] | None = None, **more: Any) -> Table:
+    """Rows as the table of a recipe."""
+    said = ("part", "answer", "correct", "time", "margin")
+    listed = [
+        {"model": "m", **one.values, **{name: getattr(one, name) for name in said}, "unit": one.unit or f"row {n}"}
+        for n, one in enumerate(given)
+    ]
+    units = {name: unit for one in given for name, unit in one.units.items()}
+    return Table.of(listed, groups or {}, units=units, **more)
 
 
 def rows(counts: dict[str, tuple[int, int]], **more: float | str) -> list[Answered]:
@@ -74,10 +88,37 @@ def answered(values: dict[str, float | str], right: bool) -> Answered:
 
 def figure(
     described: dict[str, object], answered: Sequence[Answered], groups: dict[str, list[str]] | None = None
-) -> Any:
-    """The numbers of the only figure of these rows."""
-    (made,) = compute(Table(answered, groups or {}), *read_options(described, "here"))
+) -> MadeFigure:
+    """The only figure of these rows."""
+    (made,) = make(tabled(answered, groups), *read_options(described, "here"))
     return made
+
+
+def answer(described: dict[str, object], answered: Sequence[Answered]) -> RecipeFigure:
+    """The only figure of these rows, as a result has it."""
+    made = figure(described, answered)
+    return RecipeFigure(figure="rates", title=made.title, text=list(made.text), columns=[], rows=[])
+
+
+def counts(made: MadeFigure) -> dict[Any, tuple[Any, Any]]:
+    """What is counted, of how many, by the names before it."""
+    names = made.columns.index("of") - 1
+    return {row[0] if names == 1 else tuple(row[:names]): (row[names], row[names + 1]) for row in made.rows}
+
+
+EXAMPLES: dict[str, dict[str, object]] = {
+    "bars": {"figure": "rates", "by": "group"},
+    "bars side by side": {"figure": "rates", "by": "object", "series": "environment", "names": {"noon": "at noon"}},
+    "lines": {"figure": "rates", "form": "lines", "by": "yaw", "series": "environment", "bins": 3},
+    "map": {"figure": "rates", "form": "map", "by": "object", "series": "environment"},
+    "errors": {"figure": "rates", "by": "environment", "series": "model", "wrong": True},
+    "answers": {"figure": "answers", "by": "environment"},
+    "cues": {"figure": "cues", "texture": "environment", "classes": {"noon": ["cup"]}},
+    "ternary": {"figure": "ternary", "shares": ["water", "milk", "coffee"], "normalised": True},
+    "surface": {"figure": "surface"},
+    "scaling": {"figure": "scaling"},
+    "agreement": {"figure": "agreement", "of": ["renderings", "again"], "names": {"again": "through a sensor"}},
+}
 
 
 # ---- what a file may say --------------------------------------------------------------------------------------------
@@ -145,11 +186,11 @@ def test_what_no_command_takes_is_refused_before_anything_is_done(
     ("described", "kind", "message"),
     [
         ({"figure": "pie"}, UnknownNameError, "unknown figure 'pie'"),
-        ({"figure": "bars"}, FileFormatError, "figures: bars: by: Field required"),
+        ({"figure": "rates"}, FileFormatError, "figures: rates: by: Field required"),
         (
-            {"figure": "bars", "by": "weather"},
+            {"figure": "rates", "by": "weather"},
             InputError,
-            "figures: expected one of environment, object, answer, part, got",
+            "figures: expected one of model, environment, object, part, answer, got",
         ),
     ],
 )
@@ -190,11 +231,11 @@ def test_a_later_object_is_checked_before_anything_is_rendered(
     ("figure", "message"),
     [
         (
-            "{figure: curve, along: camera.elevatoin}",
+            "{figure: rates, by: camera.elevatoin}",
             "unknown column 'camera.elevatoin'. Did you mean 'camera.elevation'",
         ),
-        ("{figure: points, by: object, series: trial}", "unknown column 'trial'"),
-        ("{figure: bars, by: object, of: [vievs]}", "unknown part 'vievs'. Did you mean 'views'?"),
+        ("{figure: rates, by: object, series: trial}", "unknown column 'trial'"),
+        ("{figure: rates, by: object, of: [vievs]}", "unknown part 'vievs'. Did you mean 'views'?"),
     ],
 )
 def test_a_figure_of_what_no_row_will_have_is_refused_before_anything_is_rendered(
@@ -211,7 +252,7 @@ def test_a_figure_of_what_no_row_will_have_is_refused_before_anything_is_rendere
 @pytest.mark.parametrize("name", recipe_names())
 def test_the_figures_of_every_bundled_recipe_name_columns_that_there_are(name: str) -> None:
     described, config = read_recipe(name), RecipeConfig(recipe=name, quick=True, object="mug")
-    check_figures(described, carrying_out._check_runs(planned(described, config)), name)
+    check_figures(described, carrying_out.check_runs(planned(described, config)), name)
 
 
 @pytest.mark.parametrize("name", recipe_names())
@@ -219,7 +260,7 @@ def test_every_bundled_recipe_takes_an_environment_of_ones_own(tmp_path: Path, n
     room = tmp_path / "room.exr"
     room.write_bytes((SCENES / "loft.exr").read_bytes())
     runs = planned(read_recipe(name), RecipeConfig(recipe=name, quick=True, object="mug", environment=str(room)))
-    assert runs and carrying_out._check_runs(runs).keys() == {one.part for one in runs}
+    assert runs and carrying_out.check_runs(runs).keys() == {one.part for one in runs}
 
 
 @pytest.mark.parametrize("name", recipe_names())
@@ -229,10 +270,10 @@ def test_every_bundled_recipe_takes_a_detector_or_says_why_not(name: str) -> Non
     runs = planned(described, config)
     assert runs and all(one.config.task == {"name": "detection", "overlap": 0.4} for one in runs)
     if name != "texture-shape":
-        carrying_out._check(described, config)
+        carrying_out.check_described(described, config)
         return
     with pytest.raises(InputError, match="task: texture-shape asks whether answers are classes of the texture"):
-        carrying_out._check(described, config)
+        carrying_out.check_described(described, config)
 
 
 def test_the_recipe_for_viewpoints_searches_predicted_pictures_and_counts_rendered_ones() -> None:
@@ -298,16 +339,36 @@ def test_a_recipe_is_carried_out_and_goes_on_where_it_was_stopped(
     assert done == ["mug", "bowl", "bowl"]
     assert result.to_dict() == read_result(run).to_dict() and isinstance(read_result(run), RecipeResult)
     assert [one.renders for one in result.parts] == [4, 4] and result.ending == "done"
-    heat, bars = result.figures
-    assert isinstance(heat, HeatMapFigure) and isinstance(bars, BarsFigure)
-    assert heat.configurations == [[2, 2], [2, 2]] and sum(one.configurations for one in bars.bars) == 8
+    pairs, bars = result.figures
+    assert [row[3] for row in pairs.rows] == [2, 2, 2, 2, 4, 4] and pairs.columns[:4] == [
+        "object", "environment", "right", "of",
+    ]  # fmt: skip
+    assert sum(row[2] for row in bars.rows) == 8
     page = (run / "report.html").read_text()
-    assert all(text in page.replace("&nbsp;", " ") for text in (result.title, *heat.text, *bars.text))
+    assert all(text in page.replace("&nbsp;", " ") for text in (result.title, *pairs.text, *bars.text))
     assert page.count("data:image/png") == 2 and {"figure-1.png", "figure-2.svg"} <= {
         one.name for one in (run / "images").iterdir()
     }
     assert main(["show", str(run), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["figures"][1]["by"] == "environment"
+    assert json.loads(capsys.readouterr().out)["figures"][1]["columns"][0] == "environment"
+
+
+def test_frames_of_a_drive_count_as_one_draw(tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text("""
+title: Is the mug seen on the way?
+settings: {object: mug, resolution: 16, spp: 1}
+parts:
+  drives:
+    command: sweep
+    settings: {path: approach, fps: 1, controls: {light: {}}, samples: 3, sampler: random, trials: 0}
+figures: [{figure: rates, by: object}]
+""")
+    result = advsearch.recipe(path, run=tmp_path / "run")
+    ((name, right, of, _, low, high),) = result.figures[0].rows
+    assert name == "mug" and of > 3 and of % 3 == 0
+    alone = clopper_pearson(int(right), int(of))
+    assert high - low > alone[1] - alone[0]
 
 
 def test_photographs_come_from_a_folder_and_their_figure_is_made_anew(
@@ -337,9 +398,12 @@ figures: [{{figure: agreement, of: [renderings, finer]}}]
     for _ in range(2):  # those that it has are not taken again
         assert main(["resume", str(run), f"photographs={folder}", "--json"]) == 0
         printed = json.loads(capsys.readouterr().out)
-        ((photographs, finer),) = (one["series"] for one in printed["figures"])
-        assert (photographs["total"]["agreeing"]["configurations"], photographs["alone"]) == (2, 1)
-        assert finer["total"]["agreeing"]["configurations"] == 2
+        (agreement,) = (RecipeFigure.of(one) for one in printed["figures"])
+        of = agreement.columns.index("of")
+        assert {(row[0], row[1]): row[of] for row in agreement.rows} == {
+            (part, name): 2 for part in ("photographs", "finer") for name in ("all objects", "mug")
+        }
+        assert "1 of the photographs belongs to no rendering and so to no pair." in agreement.text
     write_png(folder / "mug" / "rendering-9.png", np.full((20, 30, 3), 0.5))
     assert main(["resume", str(run), f"photographs={folder}"]) == 2
     assert "rendering-9.png: rendering: " in capsys.readouterr().err
@@ -354,7 +418,7 @@ def test_what_is_drawn_has_the_mean_and_the_deviation_that_a_search_answers_with
     }
     found = AnswerDistribution.of({"mean": searched, "deviation": [0.1, 0.05, 2.0, 0.1]})
     ranges = {name: FoundValue.of(value) for name, value in searched.items()}
-    drawn = carrying_out._around(SweepConfig(object="mug"), found, ranges)
+    drawn = carrying_out.around(SweepConfig(object="mug"), found, ranges)
     assert isinstance(drawn, SweepConfig) and drawn.sampler == "random"
     camera: Any = drawn.controls["camera"]
     low, high = camera["elevation"]
@@ -368,33 +432,28 @@ def test_what_is_drawn_has_the_mean_and_the_deviation_that_a_search_answers_with
 # ---- what figures say -----------------------------------------------------------------------------------------------
 
 
-def test_of_few_answers_it_is_not_said_that_none_is_right() -> None:
-    def told(counts: dict[str, tuple[int, int]]) -> list[str]:
-        cells = [count_of(name, *one) for name, one in counts.items()]
-        return accuracy._said_pairs(cells, "objects", "environments")
-
-    few = told({"mug with noon": (0, 4), "bowl with noon": (3, 4)})
-    assert few[-1] == "1 of the pairs without a right answer has under 20 configurations: too few to say."
-    assert not any("No answer is right" in one for one in few)
-    many = told({"mug with noon": (0, 40), "bowl with noon": (0, 4), "bowl with loft": (30, 40)})
-    assert (
-        many[-2] == "No answer is right in 1 of 3 pairs: mug with noon (right in 0 of 40 (0 %, 95 % interval 0-9 %))."
-    )
-    assert not any("never" in one for one in many)
+def test_intervals_are_over_drives_where_frames_of_one_share_a_draw() -> None:
+    frames = [replace(row, unit=f"drive {n // 10}") for n, row in enumerate(rows({"noon": (40, 100)}))]
+    alone, together = (Tally.over("noon", tabled(some).rows) for some in (rows({"noon": (40, 100)}), frames))
+    own, others = alone.interval(), together.interval()
+    assert own is not None and others is not None and alone.cells[:3] == together.cells[:3] == [40, 100, 0.4]
+    assert own == clopper_pearson(40, 100) and others[0] < own[0] and others[1] > own[1]
+    (row,) = figure({"figure": "rates", "by": "environment"}, frames).rows
+    assert row == ["noon", *together.cells]
 
 
 def test_a_difference_is_claimed_where_intervals_are_apart_and_not_where_they_overlap() -> None:
     shown = figure(
-        {"figure": "bars", "by": "environment"}, rows({"noon": (5, 50), "studio": (45, 50), "loft": (30, 50)})
+        {"figure": "rates", "by": "environment"}, rows({"noon": (5, 50), "studio": (45, 50), "loft": (30, 50)})
     )
     assert shown.text[0].startswith(
-        "Hardest is noon: right in 5 of 50 (10 %, 95 % interval 3.3-22 %); easiest is studio"
+        "Lowest is noon: right in 5 of 50 (10 %, 95 % interval 3.3-22 %); highest is studio"
     )
     assert shown.text[1].startswith("The difference is shown")
-    assert [one.name for one in shown.bars] == ["studio", "loft", "noon"]
-    hidden = figure({"figure": "bars", "by": "environment"}, rows({"noon": (8, 20), "studio": (12, 20)}))
+    assert list(counts(shown)) == ["studio", "loft", "noon"]
+    hidden = figure({"figure": "rates", "by": "environment"}, rows({"noon": (8, 20), "studio": (12, 20)}))
     assert hidden.text[1].startswith("No difference between the environments is shown")
-    same = figure({"figure": "bars", "by": "environment"}, rows({"noon": (8, 20), "studio": (8, 20)}))
+    same = figure({"figure": "rates", "by": "environment"}, rows({"noon": (8, 20), "studio": (8, 20)}))
     assert same.text == ["All 2 environments have the same share, 40 %: no difference is shown."]
 
 
@@ -409,19 +468,20 @@ def test_sentences_call_values_what_they_are() -> None:
             ("thick", 2.0, False),
         ]
     ]
-    pairs = figure({"figure": "heat map", "rows": "fog.which", "columns": "fog.severity"}, fogs)
+    pairs = figure({"figure": "rates", "form": "map", "by": "fog.which", "series": "fog.severity"}, fogs)
     assert pairs.text[0].startswith("The lowest pair is thick with severity 2: right in 0 of 1")
     assert pairs.text[1].startswith("No difference between the pairs of fogs and values of fog.severity is shown")
     names = {"thin": "the object as it is", "thick": "the object in fog"}
-    curve = figure({"figure": "curve", "along": "yaw", "by": "trial", "bins": 2, "names": names}, fogs)
-    assert curve.text[1].startswith("For the object in fog, accuracy is lowest")
-    assert "No difference between the kinds of trials is shown" in curve.text[-1]
+    asked = {"figure": "rates", "form": "lines", "by": "yaw", "series": "trial", "bins": 2, "names": names}
+    lines = figure(asked, fogs)
+    assert lines.text[1].startswith("For the object in fog, lowest where yaw is")
+    assert any("No difference between the kinds of trials is shown" in text for text in lines.text)
 
 
 def test_two_of_many_have_to_be_further_apart_than_two_of_two() -> None:
     two = {"noon": (6, 20), "studio": (18, 20)}
     many = {**two, **{f"room {number}": (14, 20) for number in range(18)}}
-    pair, several = (figure({"figure": "bars", "by": "environment"}, rows(one)).text[1] for one in (two, many))
+    pair, several = (figure({"figure": "rates", "by": "environment"}, rows(one)).text[1] for one in (two, many))
     assert pair.startswith("The difference is shown") and several.startswith("No difference")
 
 
@@ -440,7 +500,7 @@ def test_shape_and_texture_are_told_apart() -> None:
         ]
         made = figure({"figure": "cues", "classes": {"zebra": ["zebra"]}}, answered)
         assert any(text in one for one in made.text)
-        assert any(row.textured for row in made.rows) == (answers[0] == "zebra")
+        assert any(row[-1] for row in made.rows) == (answers[0] == "zebra")
 
 
 def told_by(answer: Any, shapes: int, textures: int, seed: int) -> str:
@@ -453,8 +513,7 @@ def told_by(answer: Any, shapes: int, textures: int, seed: int) -> str:
         for _ in range(8)
     ]
     made = figure({"figure": "cues"}, answered)
-    assert made.difference_interval[0] <= made.difference <= made.difference_interval[1]
-    assert sum(one.configurations for one in made.predicted) == 2 * len(answered)
+    assert sum(given for given, _, _ in predicted(tabled(answered), CuesOptions())) == len(answered)
     (text,) = [one for one in made.text if "most frequent answer about the same object" in one]
     return next(
         kind for kind in ("by shape than by texture", "by texture than by shape", "no difference") if kind in text
@@ -478,10 +537,20 @@ def test_many_textures_of_few_objects_favour_neither_cue(shapes: int, textures: 
 def test_one_object_does_not_tell_shape_from_texture() -> None:
     answered = [Answered("a", {"object": "mug", "material.which": t}, {}, "mug", True) for t in ("own", "zebra")]
     made = figure({"figure": "cues"}, answered)
-    assert made.difference is None and any("takes at least two objects and two textures" in one for one in made.text)
+    assert any("takes at least two objects and two textures" in one for one in made.text)
 
 
-def test_a_mixture_is_counted_in_the_triangle_that_it_lies_in() -> None:
+def test_a_mixture_lies_in_its_triangle() -> None:
+    for side in (1, 3, 5):
+        corners = all_triangles(side)
+        assert len(corners) == side * side
+        for mixture in [*np.random.default_rng(0).dirichlet((1.0, 1.0, 1.0), 200), *np.eye(3)]:
+            three = np.array(corners[triangle_of(mixture, side)])
+            weights = np.linalg.solve(three.T, mixture)
+            assert weights.min() > -1e-9 and weights.sum() == pytest.approx(1.0)
+
+
+def test_an_answer_is_counted_by_what_most_of_a_mixture_is() -> None:
     """An answer that is given where most is milk, and nowhere else."""
     shares = [(a / 9, b / 9, (9 - a - b) / 9) for a in range(10) for b in range(10 - a)]
     answered = [
@@ -489,12 +558,9 @@ def test_a_mixture_is_counted_in_the_triangle_that_it_lies_in() -> None:
         for w, m, c in shares
     ]
     made = figure({"figure": "ternary", "shares": ["w", "m", "c"], "side": 3}, answered)
-    bowl = next(one for one in made.answers if one.answer == "bowl")
-    assert sum(cell.configurations for cell in bowl.cells) == len(shares) and len(bowl.cells) == 9
-    assert sum(cell.given for cell in bowl.cells) == bowl.given == 15
-    assert all(corner[1] >= 1 / 3 for cell in bowl.cells if cell.given for corner in cell.corners)
-    assert made.leads == [] and not any("things" in text for text in made.text)
-    assert [one.accuracy for one in bowl.by_most] == [0.0, pytest.approx(15 / bowl.by_most[1].configurations), 0.0]
+    counted = {one[1]: one[2] for one in made.rows if one[0] == "bowl"}
+    assert counted == {"w": 0, "m": 15, "c": 0} and sum(int(one[3] or 0) for one in made.rows) == 2 * len(shares)
+    assert not any("things" in text for text in made.text)
 
 
 def test_where_a_mixture_has_one_answer_it_is_shown_how_far_that_leads() -> None:
@@ -507,17 +573,15 @@ def test_where_a_mixture_has_one_answer_it_is_shown_how_far_that_leads() -> None
         for w, m, c in shares
     ]
     made = figure({"figure": "ternary", "shares": ["w", "m", "c"], "side": 4}, answered)
-    assert [one.name for one in made.leads] == ["w", "m", "c"] and made.leads[1].mean < 2.5 < 4.0 < made.leads[0].mean
+    leads = {name: mean for name, _, mean, _ in made.rows}
+    assert list(leads) == ["w", "m", "c"] and leads["m"] < 2.5 < 4.0 < leads["w"]  # type: ignore[operator]
     assert (
         made.text[0].startswith("The answer is mug in every picture, so that shares")
         and "most of the mixture is m: 2." in made.text[1]
     )
     assert "The difference is shown" in made.text[1]
-    cells = made.answers[0].cells
-    empty = sum(cell.lead is None for cell in cells)
-    assert empty == sum(not cell.configurations for cell in cells) == 1
     assert made.text[2] == "No picture was drawn in 1 of 16 parts of the diagram, which are hatched."
-    assert draw_figure(made, Path())["png"] and made.table()[1][1][0] == "m"
+    assert files_of(made)["png"]
     same = figure({"figure": "ternary", "shares": ["w", "m", "c"]}, [replace(one, margin=-3.0) for one in answered])
     assert "No difference is shown" in same.text[1]
     unknown = figure({"figure": "ternary", "shares": ["w", "m", "c"]}, [replace(one, margin=None) for one in answered])
@@ -527,7 +591,7 @@ def test_where_a_mixture_has_one_answer_it_is_shown_how_far_that_leads() -> None
 
 
 def test_two_figures_that_say_the_same_say_it_once() -> None:
-    one, two = (figure({"figure": "bars", "by": "environment"}, rows({"noon": (at, 20)})) for at in (8, 9))
+    one, two = (answer({"figure": "rates", "by": "environment"}, rows({"noon": (at, 20)})) for at in (8, 9))
     same = ["It says the same as the figure before it."]
     before = ["It says what figures before it say."]
     assert told_once([one, one, two, one]) == [one.text, same, two.text, before] and told_once([]) == []
@@ -539,50 +603,51 @@ def test_curves_along_two_parameters_say_once_what_holds_for_both() -> None:
         for n in range(70)
     ]
     one, two = (
-        figure({"figure": "curve", "along": along, "by": "object", "bins": 2}, answered_) for along in ("yaw", "zoom")
+        answer({"figure": "rates", "form": "lines", "by": by, "series": "object", "bins": 2}, answered_)
+        for by in ("yaw", "zoom")
     )
-    assert one.text[-1] == two.text[-1] and one.text[-1].startswith("Over the whole range, the lowest accuracy is that")
-    assert one.text[-1] in told_once([one, two])[0] and one.text[-1] not in told_once([one, two])[1]
+    (both,) = [text for text in one.text if text.startswith("Over all, the lowest share is that of")]
+    assert both in two.text and both in told_once([one, two])[0] and both not in told_once([one, two])[1]
 
 
-def test_a_fall_is_told_of_the_group_that_has_one() -> None:
+def test_values_that_come_round_are_counted_by_the_shorter_way() -> None:
     """Mugs are right near 0 and wrong behind, balls as often everywhere; 350 degrees are near 0."""
-    made = figure(
-        {"figure": "curve", "along": "yaw", "by": "group", "range": (0, 360), "away_from": 0, "turn": 360},
-        [
-            answered({"object": name, "yaw": yaw}, (yaw < 90 or yaw > 270) if name == "mug" else n % 2 == 0)
-            for name in ("mug", "ball")
-            for yaw in (10.0, 60.0, 120.0, 200.0, 300.0, 350.0)
-            for n in range(20)
-        ],
-        {"round objects": ["ball"]},
-    )
-    mug, ball, both = made.text[-3:]
-    assert mug.startswith("other objects: right in 80 of 80") and mug.endswith("it falls.")
-    assert "where yaw is within 90 of 0, right in 0 of 40" in mug and "accuracy falls by 100 points" in mug
-    assert ball.endswith("accuracy falls by 0 points (95 % interval -20 to 20): no fall is shown.")
-    assert both.startswith("Accuracy falls by 100 points") and both.endswith(
-        "more for other objects than for round objects: the difference is shown."
+    asked = {"figure": "rates", "by": "yaw", "series": "group", "away_from": 0, "turn": 360, "bins": 2}
+    answered_ = [
+        answered({"object": name, "yaw": yaw}, (yaw < 90 or yaw > 270) if name == "mug" else n % 2 == 0)
+        for name in ("mug", "ball")
+        for yaw in (10.0, 60.0, 120.0, 200.0, 300.0, 350.0)
+        for n in range(20)
+    ]
+    made = figure({**asked, "range": (0, 180)}, answered_, {"round objects": ["ball"]})
+    assert counts(made) == {
+        ("0 to 90", "other objects"): (80, 80), ("90 to 180", "other objects"): (0, 40),
+        ("0 to 90", "round objects"): (40, 80), ("90 to 180", "round objects"): (20, 40),
+        ("all", "other objects"): (80, 120), ("all", "round objects"): (60, 120),
+    }  # fmt: skip
+    mug, shown, ball, _ = made.text
+    assert mug.startswith("For other objects, lowest where the distance of yaw from 0 is 90 to 180: right in 0 ")
+    assert shown.startswith("The difference is shown") and ball.endswith(
+        "the same share, 50 %: no difference is shown."
     )
 
 
 def test_photographs_agree_with_the_renderings_whose_configurations_they_show() -> None:
     made = figure(EXAMPLES["agreement"], PICTURED)
-    photographs, again = made.series
-    total = photographs.total
-    assert (total.right_right, total.right_wrong, total.wrong_right, total.wrong_wrong) == (5, 1, 0, 2)
-    assert (photographs.alone, total.same_answer, again.total.agreeing.correct) == (1, 7, 10)
-    assert total.agreeing.interval == clopper_pearson(7, 8)
+    of_all = {row[0]: row[2:] for row in made.rows if row[1] == "all objects"}
+    assert of_all["photographs"][:7] == [5, 1, 0, 2, 7, 7, 8] and of_all["through a sensor"][5] == 10
+    assert of_all["photographs"][8:] == [*clopper_pearson(7, 8)]
     assert "right about both or wrong about both in 7 of 8 (88 %, 95 % interval 47-99.7 %)" in made.text[0]
     assert "it is right in 5 of 6" in made.text[0] and "wrong in 2 of 2" in made.text[0]
     assert made.text[2].startswith("1 of the photographs belongs to no rendering")
 
 
 def test_the_rate_of_workers_is_that_after_the_first_quarter_and_their_gain_is_over_the_same_object() -> None:
-    one, two = figure(EXAMPLES["scaling"], TIMED).points
-    assert one.rates == pytest.approx([4.0, 8.0]) and two.rates == pytest.approx([8.0, 16.0])
-    assert two.gains == pytest.approx([2.0, 2.0])
-    said = figure(EXAMPLES["scaling"], TIMED).text
+    made = figure(EXAMPLES["scaling"], TIMED)
+    expected = [[1, "mug", 4.0, 1.0], [1, "bowl", 8.0, 1.0], [2, "mug", 8.0, 2.0], [2, "bowl", 16.0, 2.0]]
+    assert [row[:2] for row in made.rows] == [row[:2] for row in expected]
+    assert [row[2:] for row in made.rows] == [pytest.approx(row[2:]) for row in expected]
+    said = made.text
     assert "2 workers: 12 (8 to 16) pictures a second, 2 (2 to 2) times as many as 1 worker (100 % of linear)." in said
     assert "with a confidence of 50 %" in said[2]
     at_once = [replace(row, time=1.0) for row in TIMED]
@@ -606,8 +671,8 @@ def test_without_photographs_nothing_is_said_of_reality_and_they_are_in_no_figur
     assert (
         made.text[0].startswith("There are no photographs yet: nothing is said about reality") and len(made.text) == 2
     )
-    bars: dict[str, object] = {"figure": "bars", "by": "object"}
-    assert figure(bars, PICTURED) == figure(bars, rendered)
+    bars: dict[str, object] = {"figure": "rates", "by": "object"}
+    assert figure(bars, PICTURED).rows == figure(bars, rendered).rows
     with pytest.raises(InputError, match="expected again to have the configurations of renderings"):
         figure(EXAMPLES["agreement"], rendered[1:])
 
@@ -620,41 +685,50 @@ def test_the_mean_corruption_error_is_relative_to_the_first_model() -> None:
         for which, wrong in wrongs.items()
         for number in range(10)
     ]
-    one, two = figure({"figure": "corruption error"}, answered).models
-    assert one.relative is None and two.relative == pytest.approx((8 / 4 + 1 / 2) / 2 * 100)
-    assert (one.error.correct, one.error.configurations) == (6, 20)
+    clean = [Answered("clean", {"object": "mug", "model": model}, {}, "mug", True) for model in errors] * 9
+    asked = {"figure": "rates", "by": "corruption.which", "series": "model", "wrong": True, "beside": "clean"}
+    made = figure(asked, [*answered, *clean])
+    assert counts(made) == {
+        ("clean", "one"): (0, 9), ("clean", "two"): (0, 9), ("jpeg", "one"): (2, 10), ("jpeg", "two"): (1, 10),
+        ("fog", "one"): (4, 10), ("fog", "two"): (8, 10), ("all", "one"): (6, 20), ("all", "two"): (9, 20),
+    }  # fmt: skip
+    relative = (8 / 4 + 1 / 2) / 2 * 100
+    assert f"Relative to one, in AlexNet's place, the mCE of two is {relative:.0f} %." in made.text
+    assert any(text.startswith("two, clean: wrong in 0 of 9") and text.endswith("is not shown.") for text in made.text)
 
 
 def test_each_model_has_a_figure_unless_it_tells_them_apart() -> None:
     answered = [*rows({"noon": (2, 6)}, model="one"), *rows({"noon": (5, 6)}, model="two")]
-    described = {"figure": "bars", "by": "environment", "title": "Hard"}
-    found = compute(Table(answered, {}), *read_options(described, "here"))
+    described = {"figure": "rates", "by": "environment", "title": "Hard"}
+    found = list(make(tabled(answered), *read_options(described, "here")))
     assert [made.title for made in found] == ["Hard: one", "Hard: two"]
     assert [made.text[0][:29] for made in found] == ["noon: right in 2 of 6 (33 %, ", "noon: right in 5 of 6 (83 %, "]
-    for told in ({"figure": "bars", "by": "model"}, {"figure": "points", "by": "environment", "series": "model"}):
-        assert len(compute(Table(answered, {}), *read_options(told, "here"))) == 1
+    for told in ({"figure": "rates", "by": "model"}, {"figure": "rates", "by": "environment", "series": "model"}):
+        assert len(list(make(tabled(answered), *read_options(told, "here")))) == 1
 
 
 def test_a_curve_puts_each_value_in_its_part_of_the_range() -> None:
     answered = [
         Answered("a", {"object": "mug", "yaw": float(yaw)}, {"yaw": "degrees"}, "mug", yaw < 180) for yaw in range(361)
     ]
-    made = figure({"figure": "curve", "along": "yaw", "bins": 4, "range": [0, 360]}, answered)
-    (line,) = made.lines
-    assert [(one.correct, one.configurations) for one in line.bins] == [(90, 90), (90, 90), (0, 90), (0, 91)]
-    assert made.text[0].startswith("Accuracy is lowest where yaw is 180 to 270 degrees (as 1 other): right in 0 of 90")
+    made = figure({"figure": "rates", "by": "yaw", "bins": 4, "range": [0, 360]}, answered)
+    assert list(counts(made).values()) == [(90, 90), (90, 90), (0, 90), (0, 91)]
+    assert made.text[0].startswith("Lowest where yaw is 180 to 270 degrees (as 1 other): right in 0 of 90")
 
 
-@pytest.mark.parametrize("kind", FIGURES)
-def test_every_figure_is_drawn_and_is_a_table(kind: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_every_figure_is_drawn_and_is_a_table(name: str, tmp_path: Path) -> None:
     write_png(tmp_path / "parts" / "views-00-mug" / "images" / "surface.png", np.zeros((8, 8, 3)))
     own = {"agreement": PICTURED, "scaling": TIMED}
-    table = Table(own.get(kind, EXAMPLE_ROWS), {"round": ["mug"]}, {"views-00-mug": SURFACE})
-    made: Any = compute(table, *read_options(EXAMPLES[kind], "here"))[0]
-    assert made.figure == kind and made.title and made.text and all(one.endswith(".") for one in made.text)
-    heads, lines = made.table()
-    assert lines and all(len(one) == len(heads) for one in lines)
-    assert draw_figure(made, tmp_path)["png"].startswith(b"\x89PNG")
+    table = tabled(own.get(name, EXAMPLE_ROWS), {"round": ["mug"]}, surfaces={"views-00-mug": SURFACE}, folder=tmp_path)
+    (made,) = make(table, *read_options(EXAMPLES[name], "here"))
+    assert made.title and made.text and all(one.endswith(".") for one in made.text)
+    assert made.rows and all(len(row) == len(made.columns) for row in made.rows)
+    assert files_of(made)["png"].startswith(b"\x89PNG")
+
+
+def test_every_kind_of_figure_has_an_example() -> None:
+    assert {one["figure"] for one in EXAMPLES.values()} == FIGURES.keys()
 
 
 EXAMPLE_ROWS = [
@@ -688,7 +762,6 @@ TIMED = [
 ]
 """Five rows at once, then some at an even rate, in runs of two objects: two workers are twice as fast as one."""
 
-MIXTURE = ("water", "milk", "coffee")
 PICTURED = [
     Answered(part, {"object": "mug", "model": "m", **values}, {}, "mug" if right else "cup", right)
     for part, values, right in [
@@ -699,20 +772,6 @@ PICTURED = [
     ]
 ]
 """Ten renderings, the same ones through a sensor, photographs of eight of them, and one of none."""
-
-EXAMPLES: dict[str, dict[str, object]] = {
-    "curve": {"figure": "curve", "along": "yaw", "by": "environment", "bins": 3},
-    "points": {"figure": "points", "by": "object", "series": "environment", "names": {"noon": "at noon"}},
-    "answers": {"figure": "answers", "by": "environment"},
-    "cues": {"figure": "cues", "texture": "environment", "classes": {"noon": ["cup"]}},
-    "ternary": {"figure": "ternary", "shares": list(MIXTURE), "normalised": True},
-    "surface": {"figure": "surface"},
-    "scaling": {"figure": "scaling"},
-    "corruption error": {"figure": "corruption error", "which": "environment"},
-    "bars": {"figure": "bars", "by": "group"},
-    "heat map": {"figure": "heat map", "rows": "object", "columns": "environment"},
-    "agreement": {"figure": "agreement", "of": ["renderings", "again"], "names": {"again": "through a sensor"}},
-}
 
 
 @pytest.mark.parametrize(

@@ -301,7 +301,7 @@ def test_outside_the_circle_all_is_black_in_pictures_guides_and_predictions(thro
     u, corner = through_fisheye.start, (slice(0, 4), slice(0, 4))
     with torch.no_grad():
         traced = through_fisheye.radiance(u, 1, 16)
-        predicted = LinearRenderer(through_fisheye, u, seed=1).radiance(u)
+        predicted = LinearRenderer(through_fisheye, u, seed=1).renderer.radiance(u)
     albedo, normal = through_fisheye.scene.guides({}, 0, 4)
     for picture in (through_fisheye.scene.radiance({}, 1, 4), albedo, normal):
         assert float(picture[corner].abs().max()) == 0.0

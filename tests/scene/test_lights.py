@@ -41,7 +41,7 @@ def predicted(renderer: Renderer) -> BasisRenderer:
     return BasisRenderer(renderer, renderer.start, seed=1)
 
 
-def off(renderer: Renderer, predicted: Renderer, u: Tensor) -> tuple[float, float]:
+def off(renderer: Renderer, predicted: BasisRenderer, u: Tensor) -> tuple[float, float]:
     """How far a predicted picture is from traced ones, and how far two of these lie apart."""
     with torch.no_grad():
         one, other = (renderer(u, seed=seed, spp=256) for seed in (11, 12))
@@ -86,7 +86,7 @@ def test_a_sum_of_basis_pictures_is_the_traced_picture(
 
 
 def test_radiance_is_linear_in_power(predicted: BasisRenderer) -> None:
-    none, half, whole = (predicted.radiance(torch.tensor([0.5, power, 0.5])) for power in (0.0, 0.5, 1.0))
+    none, half, whole = (predicted.renderer.radiance(torch.tensor([0.5, power, 0.5])) for power in (0.0, 0.5, 1.0))
     assert torch.allclose(whole - none, 2.0 * (half - none), atol=1e-5 * float(whole.max()))
     assert predicted.lights == 2 and predicted.entries == 0
 
@@ -97,7 +97,7 @@ def test_its_derivative_is_that_of_its_pictures(predicted: BasisRenderer) -> Non
     def loss(picture: Tensor) -> Tensor:
         return picture.square().mean()
 
-    _, slope = predicted.gradient(loss, u, seed=0, spp=1)
+    _, slope = predicted.renderer.gradient(loss, u, seed=0, spp=1)
     for number in range(3):
         ends = []
         for side in (-step, step):

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.scene.description import FRAME_FILL, SceneDescription, describe
-from advsearch.scene.geometry import camera_to_world, middle, object_to_world, rotation
+from advsearch.scene.description import SceneDescription, describe
+from advsearch.scene.geometry import FRAME_FILL, camera_to_world, middle, object_to_world, rotation
 from advsearch.scene.settings import SETTINGS, resolve
 
 

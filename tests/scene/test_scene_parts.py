@@ -9,10 +9,11 @@ import torch
 
 from advsearch.engine.loading import Scene, load_scene
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.scene.description import ORBIT_CAMERA, describe
+from advsearch.scene.description import describe
 from advsearch.scene.geometry import camera_to_world
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.parts import BallLamp, PlacedCamera, PointLamp
+from advsearch.scene.settings import ORBIT_CAMERA
 
 
 def picture(scene: Scene, controls: str | dict[str, dict[str, object]] = "pose") -> torch.Tensor:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from torch import Tensor
 import advsearch
 from advsearch.controls.geometry import _Solve
 from advsearch.scene.mitsuba_backend.transport import Vertices
-from advsearch.scene.surface.arrangement import SparseProduct
+from advsearch.scene.surface.arrangement import product
 from advsearch.scene.transport.matrix import COARSE, TextureTransport
 
 ONCE = {"_Radiance", "_Differences", "_Once"}
@@ -33,7 +34,7 @@ def solved() -> Callable[[Tensor], Tensor]:
 
 def sparse() -> Callable[[Tensor], Tensor]:
     matrix = scipy.sparse.random(7, 5, 0.5, "csr", random_state=0)
-    return lambda x: SparseProduct.apply(matrix, x.reshape(5, 2))  # type: ignore[no-untyped-call]
+    return lambda x: product(matrix, x.reshape(5, 2))
 
 
 def transport() -> Callable[[Tensor], Tensor]:
@@ -47,13 +48,13 @@ def transport() -> Callable[[Tensor], Tensor]:
     return lambda x: made(torch.einsum("n,nhwc->hwc", x.float(), spread)).double()
 
 
-OPERATIONS = {"_Solve": solved, "SparseProduct": sparse, "_Product": transport}
+OPERATIONS = {"_Solve": [solved], "LinearMap": [sparse, transport]}
 
 
-@pytest.mark.parametrize("name", OPERATIONS)
-def test_an_exact_operation_is_differentiated_any_number_of_times(name: str) -> None:
+@pytest.mark.parametrize("made", [one for several in OPERATIONS.values() for one in several])
+def test_an_exact_operation_is_differentiated_any_number_of_times(made: Any) -> None:
     """As the dense matrix of the same numbers is: of the sum of cubes, three times."""
-    operation = OPERATIONS[name]()
+    operation = made()
     dense = torch.stack([operation(one).detach().flatten() for one in torch.eye(10, dtype=torch.float64)], dim=1)
     x = torch.from_numpy(np.random.default_rng(0).normal(size=10)).requires_grad_()
     found = []

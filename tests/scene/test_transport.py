@@ -90,11 +90,11 @@ def test_its_derivative_is_that_of_the_adjoint(renderer: Renderer, predicted: li
         return (picture * picture).mean()
 
     u = changed(renderer, 0.05, "signs")
-    _, exact = predicted.gradient(loss, u, seed=3, spp=1)
+    _, exact = predicted.renderer.gradient(loss, u, seed=3, spp=1)
     sampled = torch.stack([renderer.gradient(loss, u, seed=seed, spp=64)[1] for seed in range(4)]).mean(dim=0)
     assert float(torch.nn.functional.cosine_similarity(exact, sampled, dim=0)) > 0.97
     assert 0.9 < float(exact.norm() / sampled.norm()) < 1.1
-    assert torch.equal(exact, predicted.gradient(loss, u, seed=4, spp=8)[1]), "nothing of it is by chance"
+    assert torch.equal(exact, predicted.renderer.gradient(loss, u, seed=4, spp=8)[1]), "nothing of it is by chance"
 
 
 def vertices(rows: Sequence[tuple[int, float, float, float]], sharp: bool = True) -> Vertices:

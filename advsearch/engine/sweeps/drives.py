@@ -127,7 +127,7 @@ def picture_of(scenes: Scenes, number: int) -> npt.NDArray[np.float32]:
     sent = scenes.job.queries(range(number, number + 1))
     view, query = scenes.named(sent[0][0]), sent[0][2]
     picture = view.pictures([query])[0]
-    return np.asarray(marked(picture.numpy(), view.marks(0, query.u, picture)), dtype=np.float32)
+    return np.asarray(marked(picture.numpy(), view.problems[0].marks(picture, query.u)), dtype=np.float32)
 
 
 def longest(flags: npt.NDArray[np.bool_]) -> int:

@@ -9,7 +9,6 @@ import json
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
-from typing import Any
 
 from advsearch.attacks import Evaluation, Query
 from advsearch.attacks.draws import batches
@@ -85,8 +84,7 @@ class Sweep:
         self.samples = job.spp
         self._scenes = Scenes(job)
         self._executor = InProcess(answering(self._scenes.named)) if executor is None else executor
-        scenes: Any = self._scenes
-        self.journal = Journal(run, Shared(scenes, executor))
+        self.journal = Journal(run, Shared(None, executor))
         self._rendered = self._traced = self._predicted = self._lost = 0
         self._transport: dict[tuple[str, int], list[LinearTransport | None]] = {}
         self._not_finite = run is not None and run.store.note(NOT_FINITE) is not None
@@ -285,7 +283,7 @@ class Sweep:
         query, model = self._query(index)
         task, scene = self.job.tasks[model], index // self.models // self.per_scene
         if task.varies:
-            truth = self._scenes.open(scene).truth(model, query.u, query.values)
+            truth = self._scenes.open(scene).problems[model].truth(query.u, query.values)
         else:
             truth = self.job.truth(self.job.places[scene], model, query.values)
         return WorstConfiguration(
@@ -300,15 +298,15 @@ class Sweep:
     def _verified(self, worst: WorstConfiguration) -> dict[str, object]:
         """What fresh renders say of it, and what the model says of the picture that is kept."""
         query, model = self._query(worst.configuration)
-        view, u = self._scenes.open(worst.configuration // self.models // self.per_scene), query.u
-        checked = check_worst(view, self.job, model, u, self.run, self.stages)
+        problem = self._scenes.open(worst.configuration // self.models // self.per_scene).problems[model]
+        checked = check_worst(problem, self.job.config, query.u, self.run, self.stages)
         if self.run is None:
             return {"verified": checked}
         spp = max(PICTURE_SPP, checked.spp if checked else 0)
-        picture = view.picture(model, u, worst.seed, spp)
+        picture = problem.picture(query.u, worst.seed, spp)
         self.run.save_image("worst", picture)
-        save_marked(self.run, "worst", picture, view.marks(model, u, picture))
-        return {"verified": checked, "pictured": _claim_of(view.judge(model, u, picture))}
+        save_marked(self.run, "worst", picture, problem.marks(picture, query.u))
+        return {"verified": checked, "pictured": _claim_of(problem.judge(picture, query.u))}
 
     def _query(self, index: int) -> tuple[Query, int]:
         number, model = divmod(index, self.models)
@@ -329,7 +327,7 @@ class Sweep:
     def _finish(self, tally: Tally, ending: str, worst: WorstConfiguration | None) -> SweepResult:
         job, seconds = self.job, self.stages.seconds
         view, checked = self._scenes.scene, worst.verified if worst else None
-        predicting = self._transport.values() or [[one.summary() for one in (view.light.values() if view else ())]]
+        predicting = self._transport.values() or [[one.summary() for one in (view.predicted.values() if view else ())]]
         swept = seconds.get("sweep", 0.0)
         formation = Formation.of(next(iter(view.renderers.values())).formation) if view else None
         gains = self._gains() if formation else {}

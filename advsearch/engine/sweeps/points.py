@@ -19,7 +19,8 @@ from advsearch.attacks import Block, Domain
 from advsearch.attacks.draws import Draws, Product
 from advsearch.controls import Control, NumberControl, Parameter, Space
 from advsearch.controls.base import Value
-from advsearch.controls.values import Fixed, OneOf, Range, to_value
+from advsearch.controls.ranges import Range
+from advsearch.controls.values import Fixed, OneOf, to_value
 from advsearch.engine.sweeps.axes import Axis
 from advsearch.runs.results.base import VariedValue
 from advsearch.runs.units import Units

@@ -248,7 +248,8 @@ def map_surface(
             for size in dict.fromkeys(job.sizes):
                 asked = [model for model in range(models) if job.sizes[model] == size]
                 picks = view.points[size].picks(some.start, len(some), scene * per_scene)
-                seen = view.surfaces(picks, size, ceil(RAYS / min(size)))
+                us, fineness = view.points[size].configurations(picks), ceil(RAYS / min(size))
+                seen = (view.renderers[size].surfaces(u, fineness) for u in us)
                 for said, shown in zip(answers[some.start : some.stop], seen, strict=True):
                     mine.add(shown, {model: bool(said[model]) for model in asked if said[model] != UNKNOWN})
             progress.advance(len(some) * models)

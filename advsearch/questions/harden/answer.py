@@ -106,13 +106,11 @@ TRAINED = (
 
 HEADS = ("on held-out scenes", "before", "95 % interval", "after", "95 % interval")
 
-LINES = (("before", RED), ("after", BLUE))
-
 
 def shown(result: HardenResult) -> ShownAnswer:
     """Return how robust the model was and is, what it was trained on, and what never was."""
     rounds: Mapping[str, Column] = {
-        "round": lambda one: str(one[0]),
+        "round": "{0[0]}",
         "views trained on": "{0[1].lessons}",
         "part of the way": lambda one: percent(one[1].part),
         "plain pictures right": lambda one: percent(one[1].clean),
@@ -134,18 +132,21 @@ def shown(result: HardenResult) -> ShownAnswer:
         "weights": result.weights or "",
         "pictures": result.pictures or "",
     }
-    return ShownAnswer(
-        hardened_text(result),
-        [
-            AnswerPart(
-                "Before and after", heads=HEADS, rows=hardened_rows(result), note=ROBUST, figure="images/harden.png"
-            ),
-            AnswerPart.table(enumerate(result.rounds), rounds, title="The training", note=TRAINED, only="page"),
-            AnswerPart.table(result.split.items(), split, title="What it was trained and measured on", only="page"),
-        ],
-        facts,
-        about=[",".join(result.objects), ", ".join(result.controls)],
-    )
+    before, after, clean, left = result.before, result.after, result.clean_before, result.clean_after
+    said = "Stopped before the hardened model was measured."
+    if before is not None and after is not None and clean is not None and left is not None:
+        said = (
+            f"Of {after.count} held-out scenes the searches leave {after.right} right, before {before.right}; "
+            f"of {left.count} plain pictures {left.right} are right, before {clean.right}."
+        )
+    sections = [
+        AnswerPart(
+            "Before and after", heads=HEADS, rows=hardened_rows(result), note=ROBUST, figure="images/harden.png"
+        ),
+        AnswerPart.table(enumerate(result.rounds), rounds, title="The training", note=TRAINED, only="page"),
+        AnswerPart.table(result.split.items(), split, title="What it was trained and measured on", only="page"),
+    ]
+    return ShownAnswer(said, sections, facts, about=[",".join(result.objects), ", ".join(result.controls)])
 
 
 def claims(result: HardenResult) -> Iterator[Claim]:
@@ -157,34 +158,27 @@ def claims(result: HardenResult) -> Iterator[Claim]:
             yield claim("measured", f"{text} scenes. {NO_PROOF}", extent)
 
 
-def hardened_text(result: HardenResult) -> str:
-    """Return what came out, in a sentence."""
-    before, after, clean, left = result.before, result.after, result.clean_before, result.clean_after
-    if before is None or after is None or clean is None or left is None:
-        return "Stopped before the hardened model was measured."
-    return (
-        f"Of {after.count} held-out scenes the searches leave {after.right} right, before {before.right}; "
-        f"of {left.count} plain pictures {left.right} are right, before {clean.right}."
-    )
-
-
 def hardened_rows(result: HardenResult) -> list[list[str]]:
     """Return two rows for each control, one of each search; one for all of them where there are several; and one for
     plain pictures."""
-    return [[name, *_cells(before), *_cells(after)] for name, before, after in _shares(result)]
+
+    def cells(share: Share | None) -> tuple[str, str]:
+        return ("", "") if share is None else (percent(share.accuracy), wording.interval_text(share.interval))
+
+    return [[name, *cells(before), *cells(after)] for name, before, after in _shares(result)]
 
 
 def _shares(result: HardenResult) -> list[tuple[str, Share | None, Share | None]]:
     """What was measured, before and after."""
-    found = list[tuple[str, Share | None, Share | None]]()
+    shares = list[tuple[str, Share | None, Share | None]]()
     for row in result.table:
-        found.append((f"robust to {row.control}", row.before, row.after))
-        found.append((f"robust to {row.control}, stronger search", row.stronger_before, row.stronger))
+        shares.append((f"robust to {row.control}", row.before, row.after))
+        shares.append((f"robust to {row.control}, stronger search", row.stronger_before, row.stronger))
     if len(result.table) > 1:
-        found.append(("robust to each", result.before, result.after))
+        shares.append(("robust to each", result.before, result.after))
     if result.clean_after is not None:
-        found.append(("plain pictures right", result.clean_before, result.clean_after))
-    return found
+        shares.append(("plain pictures right", result.clean_before, result.clean_after))
+    return shares
 
 
 def hardened_figure(result: HardenResult) -> Figures:
@@ -196,19 +190,17 @@ def hardened_figure(result: HardenResult) -> Figures:
     def draw(figure: Any) -> None:
         axes = figure.subplots()
         for place, (_, *of_each) in enumerate(shares):
-            for (label, color), share, up in zip(LINES, of_each, (place - 0.14, place + 0.14), strict=True):
+            for label, colour, share, shift in zip(
+                ("before", "after"), (RED, BLUE), of_each, (-0.14, 0.14), strict=True
+            ):
                 if share is not None:
-                    axes.plot(share.interval, [up, up], color=color, alpha=0.35, linewidth=5)
-                    axes.plot(share.accuracy, up, "o", color=color, ms=4, label=label if place == 0 else None)
+                    axes.plot(share.interval, [place + shift] * 2, color=colour, alpha=0.35, linewidth=5)
+                    axes.plot(share.accuracy, place + shift, "o", color=colour, ms=4, label=None if place else label)
         axes.set_yticks(range(len(shares)), [name for name, *_ in shares])
         axes.invert_yaxis()
         axes.set(xlabel="share that is right, with 95 % interval", xlim=(-0.03, 1.03))
         axes.set_title(f"Held-out scenes: {wording.short_name(result.model)}")
         axes.grid(True, axis="x")
-        figure.legend(loc="outside lower center", ncols=len(LINES))
+        figure.legend(loc="outside lower center", ncols=2)
 
     return drawn(draw, (6.4, 1.4 + 0.45 * len(shares)))
-
-
-def _cells(share: Share | None) -> tuple[str, str]:
-    return ("", "") if share is None else (percent(share.accuracy), wording.interval_text(share.interval))

@@ -6,22 +6,20 @@ from __future__ import annotations
 import gc
 import json
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
-from typing_extensions import Unpack
 
 from advsearch import seeds
-from advsearch.api.keywords import Named, Names, RenderedKeywords, RunKeywords, asks, configured
+from advsearch.api.keywords import asks, configured
 from advsearch.attacks import clopper_pearson
 from advsearch.cluster import Executor, InProcess
 from advsearch.engine.attack_parts import LOADING, executor_for
 from advsearch.engine.journal import check_made_of
-from advsearch.engine.loading import Controls
 from advsearch.engine.naming import AnyModel, check_not_spread, check_run_settings, load_models, model_name
 from advsearch.errors import ClusterError, InputError, ModelError
 from advsearch.interrupts import interruptible
@@ -65,34 +63,6 @@ from advsearch.runs.store import Row
 from advsearch.tasks import make_task
 from advsearch.viewer.pages import keep_answer
 
-
-class HardenKeywords(RenderedKeywords, RunKeywords, total=False):
-    controls: Controls
-    spp: int | Literal["auto"] | None
-    epsilon: float | Mapping[str, float] | None
-    norm: Literal["linf", "l2"] | None
-    specialise: bool
-    object: Names
-    held_out: Names | None
-    held_out_environment: Names | None
-    objective: str | None
-    policy: Named
-    steps: int
-    verify_spp: int | None
-    trials: int | None
-    layers: Literal["all", "last"]
-    rounds: int
-    scenes: int
-    views: int
-    epochs: int
-    rate: float
-    clean_loss: float
-    measured: int
-    workers: int | None
-    cluster: str | None
-    quick: bool
-
-
 MEASURED, MEANS = "measured", "means"
 """Notes under which the store keeps what is done."""
 MEASUREMENTS = ("before", "stronger_before", "after", "stronger")
@@ -101,7 +71,7 @@ SHARED, MOVED = 0.25, 0.5
 """Shares of the scenes with a texture in which all views have the same, and in which rendered controls vary too."""
 
 
-@asks(HardenConfig, HardenKeywords)
+@asks(HardenConfig)
 def harden(
     model: AnyModel = "reference",
     *,
@@ -109,7 +79,7 @@ def harden(
     beside: Examples | None = None,
     resume: bool = False,
     progress: Watched = None,
-    **settings: Unpack[HardenKeywords],
+    **settings: Any,
 ) -> HardenResult:
     """Train a copy of a model on its worst cases, and prove what it is better at (docs/harden.md).
 
@@ -187,25 +157,28 @@ def _same_means(run: RunDirectory, given: dict[str, bool]) -> None:
             )
 
 
-@dataclass
 class Hardening:
     """One run of `harden`: a course that trains a copy of the model, and scenes, with what was asked and the model as
     it was given."""
 
-    run: RunDirectory
-    course: Course
-    scenes: SceneWork
-    progress: Progress
-    seconds: dict[str, float] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        self.config = self.scenes.config
-        self.rounds = TrainingRounds(self.run, self.course, self._drawn, self.progress)
-        self.measured: dict[str, str] = json.loads(self.run.store.note(MEASURED) or "{}")
+    def __init__(self, run: RunDirectory, course: Course, scenes: SceneWork, progress: Progress) -> None:
+        self.run, self.course, self.scenes, self.progress = run, course, scenes, progress
+        self.config, self.seconds = scenes.config, dict[str, float]()
+        self.rounds = TrainingRounds(run, course, self.drawn, progress)
+        self.measured: dict[str, str] = json.loads(run.store.note(MEASURED) or "{}")
         self.clean: dict[str, Share] = {}
-        self._executor: Executor = InProcess(self.scenes)
+        self._executor: Executor = InProcess(scenes)
 
-    # ---- the parts --------------------------------------------------------------------------------------------------
+    @cached_property
+    def further(self) -> int:
+        """Scenes that come with each one of the training."""
+        return RENDERED_SCENES if self.scenes.rendered else PLAIN_SCENES
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Scenes of each split, by its name; of those that are held out a part is attacked."""
+        searched, held = self.config.scenes * self.config.rounds, CLEAN_SCENES * self.config.measured
+        return {TRAINING: searched, FURTHER: self.further * searched, VALIDATION: self.rounds.judged, HELD_OUT: held}
 
     def carry_out(self, executor: Executor) -> None:
         """Measure, train, and measure again; the executor does what there is to do with scenes."""
@@ -222,7 +195,11 @@ class Hardening:
                 weights = (self.run.path / ARTIFACTS / WEIGHTS).read_bytes()
                 self._measure("after", "attacking the hardened model", weights)
                 self._measure("stronger", "attacking it with a stronger search", weights, known="after")
-                self._look()
+                wanted = [Looking(number) for number in range(self.counts[HELD_OUT])]
+                self.progress.stage("looking at plain pictures of held-out scenes", len(wanted))
+                seen = [one for _, some in self._each(wanted) for one in some]
+                for which, model in (("before", self.scenes.model), ("after", self.course.student.model)):
+                    self.clean[which] = _share(round(right_share(model, seen, "plain") * len(seen)), len(seen))
         finally:
             gc.unfreeze()
 
@@ -233,19 +210,6 @@ class Hardening:
             yield
         finally:
             self.seconds[part] = self.seconds.get(part, 0.0) + time.perf_counter() - begun
-
-    @property
-    def _further(self) -> int:
-        """Scenes that come with each one of the training."""
-        return RENDERED_SCENES if self.scenes.rendered else PLAIN_SCENES
-
-    @property
-    def _counts(self) -> dict[str, int]:
-        """Scenes of each split, by its name; of those that are held out a part is attacked."""
-        config = self.config
-        held, searched = CLEAN_SCENES * config.measured, config.scenes * config.rounds
-        counts = {TRAINING: searched, FURTHER: self._further * searched}
-        return {**counts, VALIDATION: self.rounds.judged, HELD_OUT: held}
 
     def _each(self, wanted: Sequence[Wanted]) -> Iterator[tuple[int, Any]]:
         """Have done what is wanted of scenes; yield the place of each and what came of it, in any order."""
@@ -258,10 +222,8 @@ class Hardening:
             self.progress.advance(1, **({} if facts is None else facts.told))
             yield places[id(one)], done.value[0]
 
-    # ---- lessons ----------------------------------------------------------------------------------------------------
-
-    def _drawn(self, title: str, split: str, places: Sequence[int], views: int) -> list[Lesson]:
-        """Lessons of scenes: for each control whose pictures a matrix says, and for all others together.
+    def drawn(self, title: str, split: str, places: Sequence[int], views: int) -> list[Lesson]:
+        """Return lessons of scenes: for each control whose pictures a matrix says, and for all others together.
 
         In the training a fourth of the scenes have one texture for all views, in half of them the controls that are
         rendered vary by chance, and further scenes come on top: of what is rendered new scenes teach more than further
@@ -271,9 +233,9 @@ class Hardening:
         wanted = list[Drawing]()
         for one in linear:
             for number in places:
-                shared, moved = self._chance(one, number) if training else (False, False)
+                shared, moved = self.chance(one, number) if training else (False, False)
                 wanted.append(Drawing(split, number, (one,), views, 1, shared, self.scenes.beside if moved else ()))
-        more = [self._further * place + one for place in places for one in range(self._further)] if training else []
+        more = [self.further * place + one for place in places for one in range(self.further)] if training else []
         if rendered:
             harder, plain = (1, 1) if training else (views, 0)
             wanted += [Drawing(split, number, rendered, harder, plain) for number in places]
@@ -284,13 +246,11 @@ class Hardening:
         found = dict(self._each(wanted))
         return [one for place in range(len(wanted)) for one in found[place]]
 
-    def _chance(self, control: str, number: int) -> tuple[bool, bool]:
-        """Whether all views of a scene have one texture, and whether other controls vary beside it. Not by turns, as
-        the objects take turns."""
+    def chance(self, control: str, number: int) -> tuple[bool, bool]:
+        """Return whether all views of a scene have one texture, and whether other controls vary beside it. Not by
+        turns, as the objects take turns."""
         shared, moved = np.random.default_rng(seeds.stream(self.config.seed, f"views of {control}", number)).random(2)
         return bool(shared < SHARED), bool(moved < MOVED)
-
-    # ---- measurement ------------------------------------------------------------------------------------------------
 
     def _measure(self, which: str, title: str, weights: bytes | None = None, *, known: str | None = None) -> None:
         """Attack the model, as it was given or with other weights, on every held-out scene over each control; what is
@@ -317,15 +277,6 @@ class Hardening:
         wrong = ending != ROBUST
         self.run.record(Row(f"{which} {control}", number, seed=seed, spp=self.config.verify_spp, success=wrong))
 
-    def _look(self) -> None:
-        wanted = [Looking(number) for number in range(self._counts[HELD_OUT])]
-        self.progress.stage("looking at plain pictures of held-out scenes", len(wanted))
-        seen = [one for _, some in self._each(wanted) for one in some]
-        for which, model in (("before", self.scenes.model), ("after", self.course.student.model)):
-            self.clean[which] = _share(round(right_share(model, seen, "plain") * len(seen)), len(seen))
-
-    # ---- what came out ----------------------------------------------------------------------------------------------
-
     def _robust(self, which: str, controls: Sequence[str]) -> Share | None:
         """Scenes that are robust to the searches over all of some controls; None where some are not known."""
         scenes = range(self.config.measured)
@@ -349,7 +300,7 @@ class Hardening:
         ]
         weights = self.run.path / ARTIFACTS / WEIGHTS
         views = {TRAINING: config.views, FURTHER: 1, VALIDATION: VALIDATION_VIEWS, HELD_OUT: CLEAN_VIEWS}
-        names, facts = list(config.controls), self._executor.facts
+        names, facts, (name, _) = list(config.controls), self._executor.facts, split_weights(config.model)
         return HardenResult(
             run=str(self.run.path),
             environment=",".join(self.scenes.splits[TRAINING].environments),
@@ -366,16 +317,16 @@ class Hardening:
             search=f"{config.policy_name}, {config.steps} steps",
             stronger_search=f"portfolio of pgd with restarts, cmaes and random, {TIMES * config.steps} steps",
             split={
-                name: SplitSide(
+                side: SplitSide(
                     objects=list(one.objects),
                     environments=list(one.environments),
-                    scenes=self._counts[name],
-                    views=views[name],
+                    scenes=self.counts[side],
+                    views=views[side],
                 )
-                for name, one in self.scenes.splits.items()
+                for side, one in self.scenes.splits.items()
             },
             rounds=rounds,
-            hardened=_loads(config.model, weights) if done else None,
+            hardened=f"{name}@{weights}" if done and (name == "reference" or ":" in name) else None,  # or code makes it
             weights=str(weights) if done else None,
             pictures=str(self.run.path / ARTIFACTS / FOLDER) if done else None,
             shared=SharedWork.of_facts(facts, facts.machines if facts else {}),
@@ -388,9 +339,3 @@ class Hardening:
 
 def _share(right: int, count: int) -> Share:
     return Share(accuracy=right / count, interval=clopper_pearson(right, count), right=right, count=count)
-
-
-def _loads(model: str, weights: Path) -> str | None:
-    """What `model` takes to load hardened weights into the network of a name; None where code has to make it."""
-    name, _ = split_weights(model)
-    return f"{name}@{weights}" if name == "reference" or ":" in name else None

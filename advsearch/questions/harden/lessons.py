@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import io
 import json
-import math
 import re
 import tarfile
 from collections.abc import Callable, Sequence
@@ -23,7 +22,7 @@ from pathlib import Path
 
 import torch
 import torch.nn.functional as F
-from torch import Generator, Tensor
+from torch import Tensor
 
 from advsearch import seeds
 from advsearch.attacks import Domain
@@ -50,12 +49,8 @@ TOGETHER = 32
 
 @dataclass(eq=False)
 class Lesson:
-    """One scene under conditions that were drawn for it. Pictures are kept as an 8-bit file has them: there are many.
-
-    Attributes:
-        right: indices of the right classes.
-        levels: (H, W, 3) uint8, its picture as it is; of a scene that is rendered twice, that with one control moved.
-    """
+    """One scene under conditions that were drawn for it: indices of its right classes, and its picture as it is, (H, W,
+    3) uint8, as there are many; of a scene that is rendered twice, that with one control moved."""
 
     right: tuple[int, ...]
     levels: Tensor
@@ -80,15 +75,8 @@ class Disguise:
 
 @dataclass(eq=False)
 class TextureLesson(Lesson):
-    """A lesson whose pictures a matrix says.
-
-    Attributes:
-        space: that the texture belongs to.
-        domain: where it may be.
-        linear: says the pictures; the scene is let go of, as there are many lessons.
-        numbers: conditions that it was made for.
-        texture: the adversarial one.
-    """
+    """A lesson whose pictures `linear` says, the scene being let go of: the space and the domain of its texture, the
+    numbers of the conditions that it was made for, and the adversarial texture."""
 
     space: Space
     domain: Domain
@@ -213,29 +201,19 @@ def with_worst(some: Sequence[Lesson]) -> list[TextureLesson | RenderedLesson]:
     return [one for one in some if isinstance(one, (TextureLesson, RenderedLesson))]
 
 
-def unchanged(images: Tensor) -> Tensor:
-    """Return images as they are."""
-    return images
-
-
 def harder(chosen: Sequence[Lesson], model: Model, steps: int = 1) -> None:
     """Make the worst pictures of lessons worse for a model: further steps of their textures, and a look at what was
     rendered in several configurations."""
     for begin in range(0, len(chosen), TOGETHER):
         part = chosen[begin : begin + TOGETHER]
         ascend(part, partial(slopes, model=model), steps)
-        _look([one for one in part if isinstance(one, RenderedLesson) and len(one.pictures) > 1], model)
-
-
-@torch.no_grad()
-def _look(chosen: Sequence[RenderedLesson], model: Model) -> None:
-    """Have a model look at all pictures of lessons, so that the worst of each is known."""
-    if not chosen:
-        return
-    pictures = torch.cat([one.pictures for one in chosen]) / 255.0
-    loss = surprise(model(pictures), [one.right for one in chosen for _ in one.pictures])
-    for one, own in zip(chosen, loss.split([len(one.pictures) for one in chosen]), strict=True):
-        one.losses = own.clone()
+        several = [one for one in part if isinstance(one, RenderedLesson) and len(one.pictures) > 1]
+        if several:
+            with torch.no_grad():
+                pictures = torch.cat([one.pictures for one in several]) / 255.0
+                loss = surprise(model(pictures), [one.right for one in several for _ in one.pictures])
+            for one, own in zip(several, loss.split([len(one.pictures) for one in several]), strict=True):
+                one.losses = own.clone()
 
 
 def ascend(
@@ -257,7 +235,9 @@ def ascend(
 
 
 def slopes(
-    chosen: Sequence[TextureLesson], model: Callable[[Tensor], Tensor], change: Callable[[Tensor], Tensor] = unchanged
+    chosen: Sequence[TextureLesson],
+    model: Callable[[Tensor], Tensor],
+    change: Callable[[Tensor], Tensor] = lambda images: images,
 ) -> Sequence[Tensor]:
     """Return the derivative (d,) of the loss of each lesson with respect to its texture; `change` is what happens to
     the pictures (N, H, W, 3) before the model sees them."""
@@ -266,112 +246,14 @@ def slopes(
     return torch.autograd.grad(surprise(model(change(pictures)), [one.right for one in chosen]).sum(), leaves)
 
 
-@dataclass(frozen=True)
-class Augmentation:
-    """What may happen to a training image, in this order; every amount is drawn anew for every image.
-
-    Args:
-        flip: probability of a horizontal mirror image.
-        smallest_crop, largest_crop: ends of the uniform side of the square crop, as parts of the image's side; its
-            place is uniform inside the image or, where it is larger, around it; there the border goes on. 1 and 1
-            switch cropping off.
-        turn: half width of the uniform angle that the crop is turned by, in degrees.
-        brightness: half width of the uniform shift, display-referred.
-        contrast: half width of the uniform factor around 1 that scales deviations from the image's mean.
-        colour: half width of the uniform factor around 1, per channel.
-        blur: probability of a 3 x 3 binomial blur.
-        noise: upper end of the uniform standard deviation of gaussian noise, display-referred.
-        noisy: probability that noise is added at all.
-        cutout: probability that a grey square hides a part.
-        largest_cutout: upper end of the square's side, as a part of the image's.
-    """
-
-    flip: float = 0.5
-    smallest_crop: float = 0.8
-    largest_crop: float = 1.0
-    turn: float = 0.0
-    brightness: float = 0.1
-    contrast: float = 0.25
-    colour: float = 0.08
-    blur: float = 0.15
-    noise: float = 0.04
-    noisy: float = 0.3
-    cutout: float = 0.2
-    largest_cutout: float = 0.3
-
-    def __call__(self, images: Tensor, generator: Generator) -> Tensor:
-        """Return changed images (N, 3, H, W), float32 in [0, 1], from images of the same kind."""
-        x = self._crop_and_flip(images, generator)
-        x = self._jitter(x, generator)
-        x = self._blur(x, generator)
-        x = self._add_noise(x, generator)
-        return self._hide(x.clamp_(0.0, 1.0), generator)
-
-    def _crop_and_flip(self, x: Tensor, generator: Generator) -> Tensor:
-        count = len(x)
-        scale = _uniform(count, self.smallest_crop, self.largest_crop, generator)
-        shift = _uniform(2 * count, -1.0, 1.0, generator).view(2, count) * (1.0 - scale).abs()
-        mirror = 1.0 - 2.0 * _chosen(count, self.flip, generator).float()
-        angle = _uniform(count, -self.turn, self.turn, generator) * (math.pi / 180.0)
-        along, across = scale * angle.cos(), scale * angle.sin()
-        rows = (torch.stack([along * mirror, -across, shift[0]], 1), torch.stack([across * mirror, along, shift[1]], 1))
-        grid = F.affine_grid(torch.stack(rows, 1), list(x.shape), align_corners=False)
-        return F.grid_sample(x, grid, mode="bilinear", padding_mode="border", align_corners=False)
-
-    def _jitter(self, x: Tensor, generator: Generator) -> Tensor:
-        count = len(x)
-        gain = 1.0 + _uniform(count, -self.contrast, self.contrast, generator).view(count, 1, 1, 1)
-        colour = 1.0 + _uniform(3 * count, -self.colour, self.colour, generator).view(count, 3, 1, 1)
-        shift = _uniform(count, -self.brightness, self.brightness, generator).view(count, 1, 1, 1)
-        mean = x.mean(dim=(1, 2, 3), keepdim=True)
-        # ((x - mean) gain + mean + shift) colour, as one affine map
-        return torch.addcmul((mean * (1.0 - gain) + shift) * colour, x, gain * colour)
-
-    def _blur(self, x: Tensor, generator: Generator) -> Tensor:
-        chosen = _chosen(len(x), self.blur, generator)
-        if bool(chosen.any()):
-            taps = x.new_tensor([0.25, 0.5, 0.25])
-            kernel = (taps[:, None] * taps[None, :]).expand(3, 1, 3, 3)
-            x[chosen] = F.conv2d(F.pad(x[chosen], (1, 1, 1, 1), mode="replicate"), kernel, groups=3)
-        return x
-
-    def _add_noise(self, x: Tensor, generator: Generator) -> Tensor:
-        chosen = _chosen(len(x), self.noisy, generator)
-        count = int(chosen.sum())
-        if count:
-            deviation = _uniform(count, 0.0, self.noise, generator).view(count, 1, 1, 1)
-            x[chosen] += deviation * torch.randn((count, *x.shape[1:]), generator=generator)
-        return x
-
-    def _hide(self, x: Tensor, generator: Generator) -> Tensor:
-        chosen = _chosen(len(x), self.cutout, generator).tolist()
-        height, width = x.shape[2:]
-        draws = torch.rand((len(x), 4), generator=generator).tolist()
-        for index, (size, top, left, grey) in enumerate(draws):
-            if chosen[index]:
-                side = max(1, int((0.3 + 0.7 * size) * self.largest_cutout * min(height, width)))
-                row, column = int(top * (height - side)), int(left * (width - side))
-                x[index, :, row : row + side, column : column + side] = grey
-        return x
-
-
-def _uniform(count: int, low: float, high: float, generator: Generator) -> Tensor:
-    return low + (high - low) * torch.rand(count, generator=generator)
-
-
-def _chosen(count: int, probability: float, generator: Generator) -> Tensor:
-    return torch.rand(count, generator=generator) < probability
-
-
 FOLDER, ARCHIVE = "pictures", "pictures.tar"
-KINDS = ("plain", "worst")
 
 
 def save_pictures(folder: Path, number: int, chosen: Sequence[Lesson], labels: Sequence[str]) -> None:
     """Write the pictures of a round's lessons: ``CLASS/ROUND-LESSON-plain.png`` and ``...-worst.png``."""
     for place, one in enumerate(chosen):
         name = re.sub(r"[^a-z0-9]+", "-", labels[one.right[0]].lower()).strip("-")
-        for kind in KINDS if isinstance(one, (TextureLesson, RenderedLesson)) else KINDS[:1]:
+        for kind in ("plain", "worst") if with_worst([one]) else ("plain",):
             path = folder / f"{one.right[0]:04d}-{name}" / f"{number:03d}-{place:05d}-{kind}.png"
             path.parent.mkdir(parents=True, exist_ok=True)
             write_png(path, getattr(one, kind))
@@ -389,11 +271,8 @@ def write_archive(folder: Path, archive: Path) -> int:
             index, kind = int(path.parent.name[:4]), path.stem.rpartition("-")[2]
             facts: JsonObject = {"class": index, "kind": kind}
             key = f"{path.parent.name}-{path.stem}"
-            for suffix, data in (
-                ("png", path.read_bytes()),
-                ("cls", str(index).encode()),
-                ("json", json.dumps(facts).encode()),
-            ):
+            files = {"png": path.read_bytes(), "cls": str(index).encode(), "json": json.dumps(facts).encode()}
+            for suffix, data in files.items():
                 member = tarfile.TarInfo(f"{key}.{suffix}")
                 member.size = len(data)
                 tar.addfile(member, io.BytesIO(data))

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import gc
 import hashlib
-import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -16,6 +15,7 @@ from safetensors import torch as safetensors
 
 from advsearch import seeds
 from advsearch.attacks.verification import WORST_CASE
+from advsearch.bundled.changed_light import varied, white_light_changed
 from advsearch.bundled.objects import OBJECTS
 from advsearch.cluster import Call
 from advsearch.config import AttackConfig
@@ -31,7 +31,7 @@ from advsearch.questions.attack.carry_out import attack_on
 from advsearch.questions.harden.lessons import Lesson, has_matrix, lessons, plain_lessons
 from advsearch.questions.harden.settings import ALL, HardenConfig
 from advsearch.runs.results.base import INTERRUPTED
-from advsearch.scene.assets import EnvironmentAsset, Floats, ObjectAsset
+from advsearch.scene.assets import ObjectAsset
 from advsearch.scene.formation import levels_of
 from advsearch.scene.library import list_environments
 from advsearch.scene.settings import Given
@@ -60,16 +60,8 @@ TIMES = 3
 
 @dataclass(frozen=True)
 class Drawing:
-    """Lessons that are wanted of a scene.
-
-    Attributes:
-        side: name of the split.
-        controls: that make them harder together; none for plain ones alone.
-        views: that are made harder.
-        plain: views of the scene as it is.
-        shared: whether all views share one adversarial texture.
-        beside: controls that vary by chance from view to view.
-    """
+    """Lessons that are wanted of a scene of the split `side`: `views` that its controls make harder together, in which
+    those `beside` vary by chance and which may share one adversarial texture, and `plain` views of it as it is."""
 
     side: str
     number: int
@@ -116,11 +108,9 @@ def splits_of(config: HardenConfig, model: Model) -> dict[str, Split]:
     training = split_names(config.environment) if config.environment else list_environments("train")
     asked = config.held_out_environment
     measured = split_names(asked) if asked else list_environments("heldout")
-    taught = [
-        Split(name, known, training, seeds.stream(config.seed, name), True) for name in (TRAINING, FURTHER, VALIDATION)
-    ]
-    measured_on = Split(HELD_OUT, held, measured, seeds.stream(config.seed, HELD_OUT))
-    return {one.name: one for one in (*taught, measured_on)}
+    sides = {name: (known, training, True) for name in (TRAINING, FURTHER, VALIDATION)}
+    sides[HELD_OUT] = held, measured, False
+    return {name: Split(name, a, b, seeds.stream(config.seed, name), c) for name, (a, b, c) in sides.items()}
 
 
 def _has_class(model: Model, label: str) -> bool:
@@ -149,18 +139,19 @@ class SceneWork:
 
     def __call__(self, wanted: Iterable[Wanted]) -> list[list[Lesson] | str]:
         """Return what came of each: lessons, or how an attack ended."""
-        return [self._done(one) for one in wanted]
-
-    def _done(self, one: Wanted) -> list[Lesson] | str:
-        if isinstance(one, Attacking):
-            return self._attack(one)
-        return self._look(one) if isinstance(one, Looking) else self._draw(one)
+        return [
+            self._attack(one)
+            if isinstance(one, Attacking)
+            else self._look(one)
+            if isinstance(one, Looking)
+            else self._draw(one)
+            for one in wanted
+        ]
 
     @cached_property
     def linear(self) -> tuple[str, ...]:
         """The controls whose pictures a matrix of light transport says; the others are rendered."""
-        side = self.splits[TRAINING]
-        return tuple(one for one in self.config.controls if has_matrix(self._problem(side, 0, (one,))[0]))
+        return tuple(one for one in self.config.controls if self._has_matrix(one))
 
     @cached_property
     def rendered(self) -> tuple[str, ...]:
@@ -170,14 +161,16 @@ class SceneWork:
     @cached_property
     def beside(self) -> tuple[str, ...]:
         """The controls that are rendered which can vary by chance beside every matrix."""
-        return tuple(one for one in self.rendered if self._can_vary(one))
+        return tuple(one for one in self.rendered if all(self._has_matrix(other, one) for other in self.linear))
 
-    def _can_vary(self, control: str) -> bool:
-        side = self.splits[TRAINING]
+    def _has_matrix(self, *controls: str) -> bool:
+        """Whether a matrix says the pictures of the first control, the others varying by chance."""
         try:
-            return all(has_matrix(self._problem(side, 0, (one,), (control,))[0]) for one in self.linear)
+            return has_matrix(self._problem(self.splits[TRAINING], 0, controls[:1], controls[1:])[0])
         except InputError:
-            return False
+            if len(controls) > 1:
+                return False
+            raise
 
     @cached_property
     def _measured(self) -> frozenset[str]:
@@ -199,7 +192,7 @@ class SceneWork:
             student = trainable(model)
             student.net.load_state_dict(safetensors.load(one.weights))
             model = student.model
-        name, scene = self.splits[HELD_OUT].scene(one.number, self._set)
+        name, scene = self.splits[HELD_OUT].scene(one.number, scene_settings(self.config))
         seed = seeds.stream(config.seed, f"measured {one.control}", one.number)
         harder_search = {} if one.times == 1 else {"policy": STRONGER, "steps": one.times * config.steps}
         return attacked(self._of((one.control,), name, seed=seed, **harder_search), scene, model)
@@ -217,7 +210,7 @@ class SceneWork:
         self, side: Split, number: int, controls: Sequence[str], beside: Sequence[str] = ()
     ) -> tuple[Problem, int]:
         """What a scene is searched as, with controls that vary by chance beside, and the root of its lessons' draws."""
-        name, scene = side.scene(number, self._set)
+        name, scene = side.scene(number, scene_settings(self.config))
         if side.name != HELD_OUT:
             check_unmeasured(scene.description.object, self._measured)
         kinds = {control.partition(":")[0].partition(".")[0] for control in (*controls, *beside)}
@@ -225,10 +218,6 @@ class SceneWork:
         over |= {control: self.config.controls[control] for control in beside}
         problem = problem_of(self._of(controls, name, over=over), scene, self.model, differentiated=False)
         return problem, seeds.stream(side.seed, "views", number)
-
-    @property
-    def _set(self) -> Given:
-        return scene_settings(self.config)
 
     def _of(self, controls: Sequence[str], name: str, **changes: object) -> AttackConfig:
         """What some of the controls are searched with, on an object of a name."""
@@ -352,46 +341,3 @@ def check_unmeasured(asset: ObjectAsset, measured: Set[str]) -> None:
     measured."""
     if fingerprint(asset) in measured:
         raise InputError(f"held_out: {asset.name} is an object of the training too; name others")
-
-
-WARM = (1.06, 0.18, -1.25)
-"""Logarithms of what light of 2,700 K has of red, green and blue, beside light of 6,500 K; their mean is about zero."""
-OF_WARM = (-0.24, 1.0)
-"""Ends of the uniform factor of `WARM`: about 10,000 and 2,700 K."""
-WHITE_LIGHT_CHANGES = 0.5
-"""How often the colour of light is changed."""
-
-
-def varied(environment: EnvironmentAsset, rng: np.random.Generator) -> EnvironmentAsset:
-    """Mirror, tint, change the contrast of, and add one soft light to an environment, each by chance."""
-    radiance = environment.radiance[:, ::-1] if rng.random() < 0.5 else environment.radiance
-    radiance = radiance * np.exp(rng.normal(0.0, 0.1, 3)).astype(np.float32)
-    mean = float(radiance.mean()) + 1e-6
-    radiance = mean * (radiance / mean) ** np.float32(rng.uniform(0.8, 1.15))
-    if rng.random() < 0.5:
-        radiance = radiance + mean * _soft_light(radiance.shape[:2], rng)
-    return replace(environment, radiance=np.ascontiguousarray(radiance, dtype=np.float32))
-
-
-def white_light_changed(environment: EnvironmentAsset, rng: np.random.Generator) -> EnvironmentAsset:
-    """Change the colour temperature of all light of an environment, by chance, in one of two cases.
-
-    Relative to daylight (D65), what a black body of 2,700 K (an incandescent lamp) gives in linear sRGB is about
-    exp(`WARM`), and one of 10,000 K (a clear sky in the shade) about exp(-0.24 `WARM`); the amount is uniform between.
-    """
-    if rng.random() >= WHITE_LIGHT_CHANGES:
-        return environment
-    factors = np.exp(rng.uniform(*OF_WARM) * np.asarray(WARM)).astype(np.float32)
-    return replace(environment, radiance=np.ascontiguousarray(environment.radiance * factors))
-
-
-def _soft_light(shape: tuple[int, ...], rng: np.random.Generator) -> Floats:
-    """A broad lobe from a random direction above the horizon, in units of the map's mean; (H, W, 1)."""
-    height, width = shape
-    theta = (np.arange(height) + 0.5)[:, None] * math.pi / height
-    phi = (np.arange(width) + 0.5)[None, :] * 2.0 * math.pi / width
-    tilt, turn = rng.uniform(0.1, 1.3), rng.uniform(0.0, 2.0 * math.pi)
-    cosine = np.cos(theta) * math.cos(tilt) + np.sin(theta) * math.sin(tilt) * np.cos(phi - turn)
-    sharpness = rng.uniform(20.0, 150.0)
-    lobe = rng.uniform(2.0, 12.0) * np.exp(sharpness * (cosine - 1.0))
-    return np.asarray(lobe[..., None], dtype=np.float32)

@@ -1,5 +1,3 @@
-"""What `harden` needs to know."""
-
 from __future__ import annotations
 
 from typing import Any, ClassVar, Literal
@@ -28,77 +26,46 @@ QUICK: dict[str, int] = {"rounds": 1, "scenes": 14, "views": 2, "epochs": 6, "me
 class HardenConfig(AttackConfig):
     """Everything that decides what `harden` does: training on worst cases, and the measurement before and after."""
 
+    # fmt: off
     command: ClassVar[str] = "harden"
     several: ClassVar[tuple[str, ...]] = ("object", "environment")
     without: ClassVar[tuple[str, ...]] = (
-        "smallest",
-        "ensemble",
-        "printable",
-        "aov",
-        "metrics",
-        "log",
-        "target",
-        "minimise",
-        "over",
-        "draws",
-        "path",
-        "average",
-        "baseline",
-        "seconds",
-        "camera",
-        "up",
-        "label",
-        "task",
-        "measure",
-        "estimators",
+        "smallest", "ensemble", "printable", "aov", "metrics", "log", "target", "minimise", "over", "draws", "path",
+        "average", "baseline", "seconds", "camera", "up", "label", "task", "measure", "estimators",
     )
 
     object: str = setting_as_in(
-        AttackConfig,
-        "object",
-        default=ALL,
+        AttackConfig, "object", default=ALL,
         description="objects to train on, separated by commas; all: every bundled one that the model has a class for; "
         "a file is called as its class: coffee-mug.glb",
     )
     environment: str | None = setting_as_in(
-        AttackConfig,
-        "environment",
+        AttackConfig, "environment",
         description="what lights the training; several, separated by commas, take turns",
         otherwise="the bundled environments that the reference model was trained in",
     )
     held_out: str | None = setting(
-        None,
-        "scene",
-        "objects that training never sees, which are measured, separated by commas",
-        "names of objects or files",
-        otherwise="other instances of the bundled objects",
-        min_length=1,
+        None, "scene", "objects that training never sees, which are measured, separated by commas",
+        "names of objects or files", otherwise="other instances of the bundled objects", min_length=1,
     )
     held_out_environment: str | None = setting(
-        None,
-        "scene",
-        "what lights the measurement, and never the training",
+        None, "scene", "what lights the measurement, and never the training",
         "names of environments or files, separated by commas",
-        otherwise="the bundled environments that the reference model was not trained in",
-        min_length=1,
+        otherwise="the bundled environments that the reference model was not trained in", min_length=1,
     )
     layers: Literal["all", "last"] = setting("all", "training", "layers that are trained")
     rounds: int = setting(2, "training", "rounds of search and training", ge=1, le=1000)
     scenes: int = setting(
-        336,
-        "training",
+        336, "training",
         f"new scenes a round for each control; of what is rendered {RENDERED_SCENES + 1} times as many",
-        ge=1,
-        le=100_000,
+        ge=1, le=100_000,
     )
     views: int = setting(2, "training", "views of each scene, unless it is rendered", ge=1, le=1000)
     epochs: int = setting(
-        3,
-        "training",
+        3, "training",
         "how often a round looks at each view; where a texture is searched, as many times as often as makes "
         f"{TEXTURE_LOOKS} for a scene, at most, over its views",
-        ge=1,
-        le=10_000,
+        ge=1, le=10_000,
     )
     rate: float = setting(1e-3, "training", "the highest learning rate", gt=0.0, le=1.0)
     clean_loss: float = setting(
@@ -112,6 +79,7 @@ class HardenConfig(AttackConfig):
         AttackConfig, "workers", description="worker processes that share the scenes that are drawn and attacked"
     )
     quick: bool = setting(False, "training", "minutes instead of an hour: fewer rounds, scenes and steps")
+    # fmt: on
 
     @model_validator(mode="before")
     @classmethod

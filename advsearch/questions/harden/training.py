@@ -19,6 +19,7 @@ from torch import Tensor, nn
 
 from advsearch import seeds, threads
 from advsearch.models import Model
+from advsearch.models.augmentation import Augmentation
 from advsearch.models.reference import Trainable
 from advsearch.progress import Progress
 from advsearch.questions.harden.answer import TrainingRound
@@ -26,7 +27,6 @@ from advsearch.questions.harden.lessons import (
     ARCHIVE,
     FOLDER,
     TOGETHER,
-    Augmentation,
     Lesson,
     RenderedLesson,
     TextureLesson,
@@ -107,7 +107,10 @@ class Course:
                 order = rng.permutation(places)
                 for begin in range(0, len(order), BATCH):
                     batch = [chosen[place] for place in order[begin : begin + BATCH]]
-                    self._step(batch, gradients, optimiser, int(rng.integers(2**62)))
+                    optimiser.zero_grad(set_to_none=True)
+                    gradients.take(batch, self._next(), int(rng.integers(2**62)))
+                    nn.utils.clip_grad_norm_(parameters, LARGEST_GRADIENT_NORM)
+                    optimiser.step()
                     rates.step()
                     done += 1
                     decay = min(AVERAGE, done / (done + 5))
@@ -127,19 +130,15 @@ class Course:
         often = [self.config.texture_looks if isinstance(one, TextureLesson) else 1 for one in chosen]
         return [place for place, times in enumerate(often) for _ in range(times)]
 
-    def _step(self, batch: Sequence[Lesson], gradients: Gradients, optimiser: torch.optim.Optimizer, seed: int) -> None:
-        optimiser.zero_grad(set_to_none=True)
-        gradients.take(batch, None if self.beside is None else self._next(), seed)
-        nn.utils.clip_grad_norm_(self.student.parameters(), LARGEST_GRADIENT_NORM)
-        optimiser.step()
-
-    def _next(self) -> tuple[Tensor, Tensor]:
-        assert self.beside is not None
-        found = next(self._further, None)
-        if found is None:
+    def _next(self) -> tuple[Tensor, Tensor] | None:
+        """A batch of further examples, if there are any."""
+        if self.beside is None:
+            return None
+        batch = next(self._further, None)
+        if batch is None:
             self._further = iter(self.beside)
-            found = next(self._further)
-        return found
+            batch = next(self._further)
+        return batch
 
 
 def score(model: Model, held_back: Sequence[Lesson]) -> Score:
@@ -175,19 +174,12 @@ Draw = Callable[[str, str, Sequence[int], int], list[Lesson]]
 """From what to tell the progress, the name of a split, numbers of its scenes and the views of each to lessons."""
 
 
-@dataclass
 class TrainingRounds:
     """The rounds of a run; `done` is what each came to, of which the first is the model as it was."""
 
-    run: RunDirectory
-    course: Course
-    draw: Draw
-    progress: Progress
-    done: list[TrainingRound] = field(init=False)
-
-    def __post_init__(self) -> None:
-        noted = json.loads(self.run.store.note(ROUNDS) or "[]")
-        self.done = [TrainingRound.of(one) for one in noted]
+    def __init__(self, run: RunDirectory, course: Course, draw: Draw, progress: Progress) -> None:
+        self.run, self.course, self.draw, self.progress = run, course, draw, progress
+        self.done = [TrainingRound.of(one) for one in json.loads(run.store.note(ROUNDS) or "[]")]
 
     @property
     def judged(self) -> int:
@@ -205,35 +197,31 @@ class TrainingRounds:
 
     def carry_out(self) -> None:
         """Do what is left of the rounds; the student has the best weights afterwards, which the run keeps."""
-        if len(self.done) <= self.course.config.rounds:
-            self._train()
-        student = self.course.student
+        student, config, folder = self.course.student, self.course.config, self.run.path / ARTIFACTS
+        if len(self.done) <= config.rounds:
+            pool, begun, title = list[Lesson](), 0, "drawing scenes to choose weights by"
+            held_back = self.draw(title, VALIDATION, range(self.judged), VALIDATION_VIEWS)
+            if not self.done:
+                self.keep(0, [], score(student.model, held_back), 0, 0.0)
+            for number in range(1, config.rounds + 1):
+                places = range((number - 1) * config.scenes, number * config.scenes)
+                new = self.draw(f"round {number}: drawing scenes", TRAINING, places, config.views)
+                pool += new
+                if number < len(self.done):
+                    continue  # done before this run was stopped
+                student.net.load_state_dict(self._weights(number - 1))
+                self.progress.stage(f"round {number}: training", self.course.steps(pool))
+                with threads.all_for_torch():
+                    harder(pool[begun:], student.model, FIRST_STEPS)  # others are as hard as their training left them
+                    self.course.round(number, pool, lambda: self.progress.advance(1))
+                    judged, part = self.mixed(held_back)
+                begun = len(pool)
+                self.keep(number, new, judged, len(pool), part)
         student.net.load_state_dict(self._weights(self.best))
         self._save(WEIGHTS)
-        folder = self.run.path / ARTIFACTS
         write_archive(folder / FOLDER, folder / ARCHIVE)
 
-    def _train(self) -> None:
-        student, config, pool, begun = self.course.student, self.course.config, list[Lesson](), 0
-        held_back = self.draw("drawing scenes to choose weights by", VALIDATION, range(self.judged), VALIDATION_VIEWS)
-        if not self.done:
-            self._keep(0, [], score(student.model, held_back), 0, 0.0)
-        for number in range(1, config.rounds + 1):
-            places = range((number - 1) * config.scenes, number * config.scenes)
-            new = self.draw(f"round {number}: drawing scenes", TRAINING, places, config.views)
-            pool += new
-            if number < len(self.done):
-                continue  # done before this run was stopped
-            student.net.load_state_dict(self._weights(number - 1))
-            self.progress.stage(f"round {number}: training", self.course.steps(pool))
-            with threads.all_for_torch():
-                harder(pool[begun:], student.model, FIRST_STEPS)  # the others are as hard as their training left them
-                self.course.round(number, pool, lambda: self.progress.advance(1))
-                found, part = self._mixed(held_back)
-            begun = len(pool)
-            self._keep(number, new, found, len(pool), part)
-
-    def _mixed(self, held_back: Sequence[Lesson]) -> tuple[Score, float]:
+    def mixed(self, held_back: Sequence[Lesson]) -> tuple[Score, float]:
         """Leave the student with the best part of the way from the weights that were given; return its score and it.
 
         The best one is right most often on the worst pictures among those that lose no more on plain ones than they
@@ -260,14 +248,14 @@ class TrainingRounds:
         take(best)
         return found[best], best
 
-    def _keep(self, number: int, new: Sequence[Lesson], found: Score, trained: int, part: float) -> None:
-        model = self.course.student.model
+    def keep(self, number: int, new: Sequence[Lesson], judged: Score, trained: int, part: float) -> None:
+        """Keep the weights of a round, with its new pictures and what it came to."""
         self._save(_file(number))
-        save_pictures(self.run.path / ARTIFACTS / FOLDER, number, new, model.labels)
-        done = TrainingRound(lessons=trained, part=part, clean=found.clean, robust=found.robust, kept=False)
+        save_pictures(self.run.path / ARTIFACTS / FOLDER, number, new, self.course.student.model.labels)
+        done = TrainingRound(lessons=trained, part=part, clean=judged.clean, robust=judged.robust, kept=False)
         self.done.append(done)
         self.run.store.set_note(ROUNDS, json.dumps([one.model_dump() for one in self.done]))
-        clean, worst = percent(found.clean), percent(found.robust)
+        clean, worst = percent(judged.clean), percent(judged.robust)
         self.progress.message(f"round {number}: {clean} of plain pictures right, {worst} of the worst")
 
     def _save(self, name: str) -> None:
@@ -306,8 +294,12 @@ class Gradients:
     def take(self, batch: Sequence[Lesson], beside: tuple[Tensor, Tensor] | None, seed: int) -> None:
         """Make the worst pictures of lessons worse, and leave the gradient of their loss with the parameters. Further
         images (N, H, W, 3) and class indices (N,) count too."""
-        batch = sorted(batch, key=lambda one: not isinstance(one, TextureLesson))  # parts are those of `_slopes`
-        ascend(batch, lambda chosen: self._slopes(chosen, seed))
+        batch = sorted(batch, key=lambda one: not isinstance(one, TextureLesson))  # so that `climb` has the same parts
+
+        def climb(number: int, twin: Trainable, part: Sequence[TextureLesson]) -> Sequence[Tensor]:
+            return slopes(part, twin.quickly, lambda images: _changed(images, seed + number))
+
+        ascend(batch, lambda chosen: [one for some in self._each(climb, chosen) for one in some])
         plain, worst = 1.0 / len(batch), 1.0 / max(1, len(with_worst(batch)))
 
         def descend(number: int, twin: Trainable, part: Sequence[Lesson]) -> list[Tensor | None]:
@@ -332,13 +324,6 @@ class Gradients:
         while len(self._twins) < len(parts):
             self._twins.append(self._student.twin())
         return list(self._pool.map(do, itertools.count(), self._twins, parts))
-
-    def _slopes(self, chosen: Sequence[TextureLesson], seed: int) -> list[Tensor]:
-
-        def climb(number: int, twin: Trainable, part: Sequence[TextureLesson]) -> Sequence[Tensor]:
-            return slopes(part, twin.quickly, lambda images: _changed(images, seed + number))
-
-        return [one for some in self._each(climb, chosen) for one in some]
 
     def _loss(self, student: Trainable, part: Sequence[Lesson], plain: float, worst: float, seed: int) -> Tensor:
         """What is descended, of a part of a batch, textures first: so much of each plain picture and each worst one.
@@ -366,21 +351,16 @@ class Gradients:
         if mixed:
             of_others = surprise(logits[mixed], [right[place] for place in others])
             found[mixed] = torch.lerp(found[mixed], of_others, share)
-        as_given = [place for place, one in enumerate(part) if not isinstance(one, RenderedLesson)]
         loss = plain * found[: len(part)].sum() + worst * found[len(part) :].sum()
+        as_given = [place for place, one in enumerate(part) if not isinstance(one, RenderedLesson)]
         if as_given:
-            kept = self._forgotten(images[as_given], logits[as_given], [right[place] for place in as_given])
-            loss = loss + plain * KEEP * kept
+            with torch.no_grad():
+                wanted = self._given(images[as_given])
+            # only where the given model is right: the Kullback-Leibler divergence of what it says
+            known = [said in right[at] for said, at in zip(wanted.argmax(dim=1).tolist(), as_given, strict=True)]
+            own, target = (F.log_softmax(one[known], dim=1) for one in (logits[as_given], wanted))
+            loss = loss + plain * KEEP * F.kl_div(own, target, reduction="sum", log_target=True)
         return loss
-
-    def _forgotten(self, plain: Tensor, logits: Tensor, right: Sequence[tuple[int, ...]]) -> Tensor:
-        """The Kullback-Leibler divergence of what the given model says of plain pictures (N, H, W, 3), where it is
-        right, to what logits (N, C) say; a sum over all."""
-        with torch.no_grad():
-            wanted = self._given(plain)
-        known = [said in own for said, own in zip(wanted.argmax(dim=1).tolist(), right, strict=True)]
-        target = F.log_softmax(wanted[known], dim=1)
-        return F.kl_div(F.log_softmax(logits[known], dim=1), target, reduction="sum", log_target=True)
 
 
 def _changed(images: Tensor, seed: int) -> Tensor:

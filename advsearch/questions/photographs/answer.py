@@ -30,13 +30,12 @@ from advsearch.report.markup import Html, element, join_html
 from advsearch.report.phrases import percent
 from advsearch.runs.directory import IMAGES
 from advsearch.runs.results.base import Fields, Interval
-from advsearch.viewer.document import data_script, document, in_address
+from advsearch.viewer.document import data_script, document, in_address, study_table
 from advsearch.viewer.server import Refused
 from advsearch.viewer.thumbnails import kept_file, kept_pictures
 
 PHOTO, LOOSE_PHOTO = "photo", "loose photo"
 """Kinds of rows in a run's store: photographs that were aligned with a rendering, and ones that were with none."""
-
 
 FOLDER = "photos"
 """Where photographs are, in `images/` of the run."""
@@ -84,9 +83,8 @@ SIDE = 1024
 QUALITY = 95
 """Of its JPEG file, from 1 to 95."""
 
-_NUMBER = re.compile(r"[0-9]{1,12}")
-_NAME = re.compile(r"clean|adversarial|verification-[0-9]{2}")
-_PHOTO = re.compile(r"(?:[0-9]{1,12}|clean|adversarial|verification-[0-9]{2})-[0-9]{4,9}\.jpg")
+_NAME = re.compile(r"[0-9]{1,12}|clean|adversarial|verification-[0-9]{2}")
+_PHOTO = re.compile(rf"(?:{_NAME.pattern})-[0-9]{{4,9}}\.jpg")
 
 
 def rendering_file(run: Path, name: str) -> Path:
@@ -96,10 +94,8 @@ def rendering_file(run: Path, name: str) -> Path:
         InputError: the run has none of that name.
     """
     file = None
-    if _NUMBER.fullmatch(name):
-        file = kept_file(run, int(name))
-    elif _NAME.fullmatch(name):
-        file = run / IMAGES / f"{name}.png"
+    if _NAME.fullmatch(name):
+        file = kept_file(run, int(name)) if name.isdigit() else run / IMAGES / f"{name}.png"
     if file is None or not file.is_file():
         raise InputError(f"rendering: {run.name} has none called {name[:40]!r}; open its page for those that it has")
     return file
@@ -110,9 +106,8 @@ def rendering_names(run: Path) -> tuple[str, ...]:
     kept = kept_pictures(run)
     if kept is not None:
         return tuple(map(str, kept.numbers))
-    files = sorted((run / IMAGES).glob("*.png"))
-    found = [file.stem for file in files if _NAME.fullmatch(file.stem)]
-    return tuple(sorted(found, key=lambda name: (name != "adversarial", name)))
+    names = [file.stem for file in (run / IMAGES).glob("*.png") if _NAME.fullmatch(file.stem)]
+    return tuple(sorted(names, key=lambda name: (name != "adversarial", name)))
 
 
 def photo_file(run: Path, name: str) -> Path:
@@ -125,11 +120,6 @@ def photo_file(run: Path, name: str) -> Path:
     if not _PHOTO.fullmatch(name) or not file.is_file():
         raise InputError("photo: there is none of that name")
     return file
-
-
-def photo_name(rendering: str, number: int) -> str:
-    """Return what the file of a run's photograph `number` is called."""
-    return f"{rendering}-{number:04d}.jpg"
 
 
 def sound_photo(data: bytes, shape: tuple[int, int]) -> bytes:
@@ -172,86 +162,67 @@ NO_QR = "pip install segno"
 def align_page(run: str, renderings: Sequence[str], table: PhotoAgreement, key: str, elsewhere: str | None) -> str:
     """Return the page of a run as HTML: the first of its renderings is shown, `key` is what the server wants to see
     with a photograph, and `elsewhere` the address by which another device opens the page, if one can."""
-    facts = {"key": key, "names": list(renderings[:1])}
-    align = element("div", _hint(renderings), id="align") if renderings else _without()
+    named = ", ".join(renderings[:8]) + (f", ... {renderings[-1]}" if len(renderings) > 8 else "")
+    align = join_html(
+        element("p", "Lay a rendering over what the camera sees, move the real object until both agree, and take a "
+                "photograph."),
+        element("p", f"Renderings of this run ({len(renderings)}): {named}.", class_="soft", id="renderings"),
+        element("noscript", element("p", "The camera needs JavaScript, which is switched off.")),
+    )  # fmt: skip
+    without = element(
+        "p", "This run kept no pictures to align with. An attack keeps them when it ends; a sweep with ",
+        element("code", "keep_pictures=all"), ".",
+    )  # fmt: skip
+    code = None
+    if elsewhere is not None:
+        made = _code(elsewhere)
+        svg = made and Html(made.svg_inline(omitsize=True, light="#fff", title="QR code of the address below"))
+        code = element(
+            "details", element("summary", "Open this page on a phone"),
+            element("div", svg or element("p", f"A code to point the phone at would stand here: {NO_QR}"), class_="qr"),
+            element("pre", elsewhere, class_="wrap", tabindex="0"),
+        )  # fmt: skip
     main = element(
         "main",
-        align,
+        element("div", align, id="align") if renderings else without,
         element("h2", "Renderings and reality"),
         element("div", table_html(table), id="agreement"),
-        _code(elsewhere),
+        code,
     )
     header = element("header", element("p", "Photographs", class_="eyebrow"), element("h1", f"{run}, photographed"))
-    data = [data_script(facts, "photographing")] if renderings else []
+    data = [data_script({"key": key, "names": list(renderings[:1])}, "photographing")] if renderings else []
     scripts = ("make.js", "align.js") if renderings else ()
     return document(f"{run}, photographs", header, main, data=data, scripts=scripts, connects=True)
 
 
-def _hint(names: Sequence[str]) -> Html:
-    shown = ", ".join(names[:8]) + (f", ... {names[-1]}" if len(names) > 8 else "")
-    first = "Lay a rendering over what the camera sees, move the real object until both agree, and take a photograph."
-    return join_html(
-        element("p", first),
-        element("p", f"Renderings of this run ({len(names)}): {shown}.", class_="soft", id="renderings"),
-        element("noscript", element("p", "The camera needs JavaScript, which is switched off.")),
-    )
-
-
-def _without() -> Html:
-    return element(
-        "p",
-        "This run kept no pictures to align with. An attack keeps them when it ends; a sweep with ",
-        element("code", "keep_pictures=all"),
-        ".",
-    )
-
-
-def _code(address: str | None) -> Html | None:
-    if address is None:
-        return None
-    code = qr_svg(address)
-    drawn = Html(code) if code else element("p", f"A code to point the phone at would stand here: {NO_QR}")
-    return element(
-        "details", element("summary", "Open this page on a phone"), element("div", drawn, class_="qr"),
-        element("pre", address, class_="wrap", tabindex="0"),
-    )  # fmt: skip
-
-
-def qr_svg(address: str) -> str | None:
-    """Return an address as a QR code, an SVG for a page; None where segno is not installed."""
-    made = _made(address)
-    return (
-        None
-        if made is None
-        else str(made.svg_inline(omitsize=True, light="#fff", title="QR code of the address below"))
-    )
-
-
 def qr_text(address: str) -> str | None:
     """Return an address as a QR code for a terminal; None where segno is not installed."""
-    made, text = _made(address), io.StringIO()
+    made, text = _code(address), io.StringIO()
     if made is None:
         return None
     made.terminal(out=text, compact=True)
     return text.getvalue()
 
 
-def _made(address: str) -> Any:
+def _code(address: str) -> Any:
+    """A QR code of an address; None where segno is not installed."""
     try:
         return importlib.import_module("segno").make(address, error="m", micro=False)
     except ImportError:
         return None
 
 
+COUNTED = ("photographs", "right in the photograph", "wrong in the photograph")
+"""Heads of the table of agreement."""
+
+
 def table_html(table: PhotoAgreement) -> Html:
     """Return the counts of right and wrong answers in rendering and photograph, in all and by rendering."""
     if not table.photos or table.interval is None:
         return element("p", "No photographs yet.", class_="soft")
-    heads = ("photographs", "right in the photograph", "wrong in the photograph")
-    head = element("tr", *(element("th", text, scope="col") for text in heads))
-    rows = [
-        _row("right in the rendering", str(table.right_right), str(table.right_wrong)),
-        _row("wrong in the rendering", str(table.wrong_right), str(table.wrong_wrong)),
+    counts = [
+        ["right in the rendering", str(table.right_right), str(table.right_wrong)],
+        ["wrong in the rendering", str(table.wrong_right), str(table.wrong_wrong)],
     ]
     agreeing = table.right_right + table.wrong_wrong
     text = (
@@ -259,38 +230,28 @@ def table_html(table: PhotoAgreement) -> Html:
         f"interval {wording.interval_text(table.interval)}."
     )
     several = len({one.model for one in table.renderings}) > 1
-    names = ["rendering", *(["model"] if several else []), "in the rendering", "in photographs", "agree", "interval"]
-    each = element(
-        "table",
-        element("thead", element("tr", *(element("th", text, scope="col") for text in names))),
-        element("tbody", *(_rendering(one, several) for one in table.renderings)),
-    )
-    counts = element("table", element("thead", head), element("tbody", *rows), class_="agreement")
+    rows = []
+    for one in table.renderings:
+        photos = [
+            join_html(element("a", label or "nothing", href=f"photos/{in_address(file)}"), " ")
+            for label, file in zip(one.labels, one.files, strict=True)
+        ]
+        rows.append(
+            [
+                one.rendering,
+                *([one.model] if several else []),
+                f"{'right' if one.rendering_right else 'wrong'}: {one.label}",
+                join_html(f"{one.photos_right} of {one.photos} right: ", *photos),
+                f"{one.agreeing} of {one.photos}",
+                wording.interval_text(one.interval),
+            ]
+        )
+    heads = ["rendering", *(["model"] if several else []), "in the rendering", "in photographs", "agree", "interval"]
+    each = study_table(heads, rows, [f"renderings/{in_address(one.rendering)}" for one in table.renderings])
     return join_html(
-        counts,
+        element("div", study_table(COUNTED, counts), class_="agreement"),
         element("p", text),
         element("div", each, class_="scroll", tabindex="0", role="region", aria_label="by rendering"),
-    )
-
-
-def _row(name: str, *cells: str) -> Html:
-    return element("tr", element("th", name, scope="row"), *(element("td", one, class_="number") for one in cells))
-
-
-def _rendering(one: PhotographedRendering, several: bool) -> Html:
-    photos = [
-        join_html(element("a", label or "nothing", href=f"photos/{in_address(file)}"), " ")
-        for label, file in zip(one.labels, one.files, strict=True)
-    ]
-    name = element("a", one.rendering, href=f"renderings/{in_address(one.rendering)}")
-    return element(
-        "tr",
-        element("th", name, scope="row"),
-        element("td", one.model) if several else None,
-        element("td", f"{'right' if one.rendering_right else 'wrong'}: {one.label}"),
-        element("td", f"{one.photos_right} of {one.photos} right: ", *photos),
-        element("td", f"{one.agreeing} of {one.photos}", class_="number"),
-        element("td", wording.interval_text(one.interval), class_="number"),
     )
 
 

@@ -362,7 +362,7 @@ def _predicted(
     """The picture and the gradient that light transport predicts, and the seconds of a gradient with its share of the
     making."""
     begun = time.perf_counter()
-    made = predicting(renderer, u, seed)
+    made = predicting(renderer, u, seed).renderer
     with torch.no_grad():
         picture = made(u, seed, spp)
     ready = time.perf_counter()

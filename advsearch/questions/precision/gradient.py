@@ -35,7 +35,7 @@ from advsearch.scene.gradients import BY_ADJOINT, Group, compared
 from advsearch.scene.mitsuba_backend.surface import RAYS
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.surface.renderer import SurfaceRenderer, why_not_kept
-from advsearch.scene.transport.matrix import LinearRenderer, PredictingRenderer, linear_inputs
+from advsearch.scene.transport.matrix import LinearRenderer, linear_inputs
 
 COUNTS = (4, 8, 16, 32, 64, 128, 256)
 BY_COORDINATE = 32
@@ -119,9 +119,11 @@ def ways_to_predict(renderer: Renderer) -> list[str]:
     return [MATRIX] * by_matrix + [SURFACE_LIGHT] * (why_not_kept(clean) is None)
 
 
-def predicting(way: str, renderer: Renderer, u: Tensor, seed: int, spp: int) -> PredictingRenderer:
-    """Return what predicts pictures in a way, made at u."""
-    return SurfaceRenderer(renderer, u, seed) if way == SURFACE_LIGHT else LinearRenderer(renderer, u, seed, spp=spp)
+def predicting(way: str, renderer: Renderer, u: Tensor, seed: int, spp: int) -> Renderer:
+    """Return a renderer of what is predicted in a way, made at u."""
+    if way == SURFACE_LIGHT:
+        return SurfaceRenderer(renderer, u, seed).renderer
+    return LinearRenderer(renderer, u, seed, spp=spp).renderer
 
 
 def theory_of(estimator: str, sampler: str) -> Theory:

@@ -6,8 +6,8 @@ A part is carried out once for each object, as a run of its command; figures are
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from importlib import resources
 from itertools import product
 from pathlib import Path
@@ -19,15 +19,8 @@ from advsearch import seeds
 from advsearch.config import CONFIGS
 from advsearch.config.scene import DEFAULT_ENVIRONMENT, SceneConfig
 from advsearch.errors import FileFormatError, InputError, UnknownNameError
-from advsearch.explanations import ANSWER, GROUP, PART, PHOTOGRAPHS
-from advsearch.questions.recipe.accuracy import BARS, CORRUPTION_ERROR, HEAT_MAP, POINTS, SURFACE
-from advsearch.questions.recipe.along import CURVE, SCALING
-from advsearch.questions.recipe.answer import RecipeFigure
-from advsearch.questions.recipe.given import AGREEMENT, ANSWERS, CUES
+from advsearch.questions.recipe.answer import PHOTOGRAPHS
 from advsearch.questions.recipe.settings import RecipeConfig
-from advsearch.questions.recipe.table import FigureKind, Options, Table
-from advsearch.questions.recipe.ternary import TERNARY
-from advsearch.report.figures import Figures, drawn
 from advsearch.runs.directory import default_name
 from advsearch.settings import read_yaml, split_names
 from advsearch.settings.configuration import PLACE, SettingsError
@@ -39,7 +32,9 @@ COMMANDS = ("attack", "sweep")
 OWN = (*PLACE, "object", "seed", "threads", "deterministic", "label")
 """Settings that a part has from the recipe's command and may not say itself."""
 
-MOST_PARTS, MOST_FIGURES = 64, 32
+MOST_PARTS, MOST_FIGURES, MOST_RUNS = 64, 32, 1000
+
+BUNDLED = resources.files("advsearch.questions.recipe")
 
 Settings = dict[str, object]
 
@@ -95,7 +90,7 @@ class Recipe(_Described):
         about: what is done for an answer, and whose experiment it is.
         settings: of all parts; what the command line says of objects, environments and models goes over them.
         parts: by name, in the order in which they are carried out.
-        figures: each with a `figure`, its kind, and options (`advsearch.questions.recipe.description`).
+        figures: each with a `figure`, its kind, and options (`advsearch.questions.recipe.figures`).
         groups: names of groups, each with the names of objects in it.
         quick: what is different when it should be quick.
     """
@@ -144,9 +139,7 @@ class Recipe(_Described):
 
 def recipe_names() -> tuple[str, ...]:
     """Return the names of the bundled recipes."""
-    return tuple(
-        sorted(path.name.removesuffix(".yaml") for path in _bundled().iterdir() if path.name.endswith(".yaml"))
-    )
+    return tuple(sorted(path.name[:-5] for path in BUNDLED.iterdir() if path.name.endswith(".yaml")))
 
 
 def titles() -> dict[str, str]:
@@ -158,7 +151,7 @@ def recipe_yaml(name: str) -> str:
     """Return the YAML of a bundled recipe."""
     if name not in recipe_names():
         raise UnknownNameError("recipe", name, recipe_names(), "A recipe of your own is a YAML file: give its path.")
-    return str((_bundled() / f"{name}.yaml").read_text(encoding="utf-8"))
+    return str((BUNDLED / f"{name}.yaml").read_text(encoding="utf-8"))
 
 
 def read_recipe(name: str) -> Recipe:
@@ -171,7 +164,7 @@ def read_recipe(name: str) -> Recipe:
     if is_file_name(name):
         return recipe_of(read_yaml(name), name)
     recipe_yaml(name)
-    with resources.as_file(_bundled() / f"{name}.yaml") as path:
+    with resources.as_file(BUNDLED / f"{name}.yaml") as path:
         return recipe_of(read_yaml(path), name)
 
 
@@ -196,61 +189,6 @@ def recipe_of(data: Mapping[str, object], where: str) -> Recipe:
         raise FileFormatError(f"{where}: {what}: {text}; advsearch show recipe backgrounds prints one") from None
     except (RecursionError, TypeError) as error:
         raise FileFormatError(f"{where}: expected a recipe, got {type(error).__name__}") from None
-
-
-def _bundled() -> Any:
-    return resources.files("advsearch.questions.recipe")
-
-
-OUTER = ("object", "environment", "model", ANSWER, PART)
-"""Columns of every recipe."""
-
-WHICH = "which"
-"""The option that names a column which clean pictures do not have."""
-
-NAMING = ("by", "series", "rows", "columns", "along", "texture", "shape", "shares", WHICH)
-"""Options of figures that name columns."""
-
-ANY = "*"
-"""Stands for the parameters of a control that does not say beforehand which it has."""
-
-
-def check_figures(recipe: Recipe, columns: Mapping[str, Collection[str]], where: str) -> None:
-    """Refuse a figure of a part or of a column that there is not. `columns` are the parameters that the rows of each
-    part will have, and `where` is the recipe.
-
-    Raises:
-        UnknownNameError: a figure names one; the message says which figure.
-        InputError: a part that it shows has not the column that others have.
-    """
-    for number, described in enumerate(recipe.figures, start=1):
-        kind, options = read_options(described, where)
-        place = f"It stands in {where}, figure {number} ({kind})"
-        for part in options.of:
-            if part not in (*recipe.parts, PHOTOGRAPHS):
-                raise UnknownNameError("part", part, [*recipe.parts, PHOTOGRAPHS], f"{place}, as `of`.")
-        shown = {part: own for part, own in columns.items() if part in options.of or not options.of}
-        known = {*OUTER, *([GROUP] if recipe.groups else [])}
-        for option, column in _named(options):
-            without = [part for part, own in shown.items() if column not in known and not _has(own, column)]
-            if shown and len(without) == len(shown):
-                others = {name for own in shown.values() for name in own if not name.endswith(ANY)}
-                raise UnknownNameError("column", column, known | others, f"{place}, as `{option}`.")
-            if without and option != WHICH:
-                raise InputError(f"{place}: {without[0]} has no {column}; name the parts that have it as `of`")
-
-
-def _named(options: Options) -> list[tuple[str, str]]:
-    """The columns that a figure names, each behind the option that names it."""
-    found = [(name, value) for name, value in vars(options).items() if name in NAMING and value is not None]
-    return [(name, one) for name, value in found for one in ([value] if isinstance(value, str) else value)]
-
-
-def _has(columns: Collection[str], column: str) -> bool:
-    return column in columns or f"{column.partition('.')[0]}.{ANY}" in columns
-
-
-MOST_RUNS = 1000
 
 
 @dataclass(frozen=True)
@@ -312,84 +250,23 @@ def _runs(recipe: Recipe, name: str, config: RecipeConfig) -> Iterator[PlannedRu
         for axis, default in (("object", ""), ("environment", DEFAULT_ENVIRONMENT), ("model", "reference"))
         if axis not in several or axis == "object"
     }
+    where = f"{config.recipe}: parts: {name}"
     for number, values in enumerate(product(*axes.values())):
-        one = dict(zip(axes, values, strict=True))
-        words = [value for axis, value in one.items() if axis == "object" or len(axes[axis]) > 1]
-        where, stream = f"{config.recipe}: parts: {name}", f"{part.drawn_as or name} {number}"
-        made = _config(part, {**settings, **one}, where, config, stream)
-        yield PlannedRun(_folder(name, number, words), name, made, part.around and _folder(part.around, number, words))
-
-
-def _config(part: Part, settings: Settings, where: str, config: RecipeConfig, stream: str) -> SceneConfig:
-    """The configuration of one run; its seed is its own, so that no two runs draw the same."""
-    label = config.label_of(str(settings["object"]))
-    own: Settings = {"seed": seeds.stream(config.seed, f"recipe {stream}")}
-    own |= {"threads": config.threads} if not config.deterministic else {"deterministic": True}
-    own |= {} if label is None else {"label": label}
-    try:
-        made = CONFIGS[part.command](**{**settings, **own})
-    except SettingsError as error:
-        raise SettingsError(error.problems, where) from None
-    except UnknownNameError:
-        raise
-    except InputError as error:
-        raise InputError(f"{where}: {error}") from None
-    assert isinstance(made, SceneConfig)
-    return made
-
-
-def _folder(part: str, number: int, words: Sequence[str]) -> str:
-    return f"{part}-{number:02d}-{default_name(words[0], [default_name(word, []) for word in words[1:]])}"
-
-
-MODEL = "model"
-"""The column that says which model answered."""
-
-FIGURES: dict[str, FigureKind[Any, Any]] = {
-    "bars": BARS,
-    "heat map": HEAT_MAP,
-    "curve": CURVE,
-    "points": POINTS,
-    "answers": ANSWERS,
-    "cues": CUES,
-    "ternary": TERNARY,
-    "corruption error": CORRUPTION_ERROR,
-    "agreement": AGREEMENT,
-    "scaling": SCALING,
-    "surface": SURFACE,
-}
-
-
-def read_options(described: Mapping[str, object], where: str) -> tuple[str, Options]:
-    """Return the kind of a figure and its options, as they stand in the recipe `where`, with its kind as `figure`; an
-    UnknownNameError or a FileFormatError where there is none of that kind, or such an option."""
-    given = dict(described)
-    kind = str(given.pop("figure", ""))
-    if kind not in FIGURES:
-        raise UnknownNameError("figure", kind, FIGURES, f"It stands in {where}.")
-    try:
-        return kind, FIGURES[kind].options(**given)
-    except ValidationError as error:
-        first = error.errors(include_url=False, include_input=False)[0]
-        what = ".".join(str(one) for one in first["loc"])[:80]
-        raise FileFormatError(f"{where}: figures: {kind}: {what}: {first['msg'][:200]}; see docs/recipes.md") from None
-
-
-def compute(table: Table, kind: str, options: Options) -> list[RecipeFigure]:
-    """Return the numbers of a figure, and what they say; where it does not tell several models apart, of each model. An
-    InputError where it needs what the answers do not have."""
-    shown = table.of(options.parts)
-    together = FIGURES[kind].tells_models or MODEL in vars(options).values()
-    if together or len({row.values.get(MODEL) for row in shown.rows}) < 2:
-        return [FIGURES[kind].compute(shown, options)]
-    found = []
-    for name, rows in shown.by(MODEL).items():
-        made: RecipeFigure = FIGURES[kind].compute(replace(shown, rows=rows), options)
-        found.append(made.model_copy(update={"title": f"{made.title}: {name}"}))
-    return found
-
-
-def draw_figure(made: RecipeFigure, run: Path) -> Figures:
-    """Return a figure as files; `run` is the recipe's folder."""
-    kind = FIGURES[made.figure]
-    return drawn(lambda figure: kind.draw(made, figure, run), kind.size(made))
+        own: Settings = dict(zip(axes, values, strict=True))
+        words = [value for axis, value in zip(axes, values, strict=True) if axis == "object" or len(axes[axis]) > 1]
+        # a seed of its own, so that no two runs draw the same
+        own["seed"] = seeds.stream(config.seed, f"recipe {part.drawn_as or name} {number}")
+        own |= {"deterministic": True} if config.deterministic else {"threads": config.threads}
+        if (label := config.label_of(str(own["object"]))) is not None:
+            own["label"] = label
+        try:
+            made = kind(**{**settings, **own})
+        except SettingsError as error:
+            raise SettingsError(error.problems, where) from None
+        except UnknownNameError:
+            raise
+        except InputError as error:
+            raise InputError(f"{where}: {error}") from None
+        assert isinstance(made, SceneConfig)
+        folder = f"{number:02d}-{default_name(words[0], [default_name(word, []) for word in words[1:]])}"
+        yield PlannedRun(f"{name}-{folder}", name, made, part.around and f"{part.around}-{folder}")

@@ -4,42 +4,25 @@ from __future__ import annotations
 
 import random
 from collections import Counter
-from collections.abc import Hashable, Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Any
 
+import pandas as pd
 from pydantic import Field
 
-from advsearch.errors import InputError
-from advsearch.explanations import PHOTOGRAPHS, Answered
-from advsearch.questions.recipe.along import COLOURS, MARKS
-from advsearch.questions.recipe.answer import (
-    AgreementCount,
-    AgreementFigure,
-    AgreementSeries,
-    AnswersFigure,
-    AnswersRow,
-    CuesFigure,
-    CuesRow,
-    GivenAnswer,
-    NamedCount,
-)
 from advsearch.questions.recipe.table import (
-    FigureKind,
+    ANSWER,
+    COUNT,
+    MadeFigure,
     Options,
     Table,
-    count_of,
-    counted,
+    Tally,
     extremes,
     most_frequent,
     plural,
-    rate_with_interval,
 )
 from advsearch.report.figures import BLUE, GREY, RED
 from advsearch.report.phrases import percent
-from advsearch.report.wording import interval_text
-from advsearch.runs.results.base import Interval
 
 LETTERS = 85
 """Letters that a bar of the whole width has room for."""
@@ -54,37 +37,41 @@ class AnswersOptions(Options):
     most: int = Field(default=4, ge=1, le=10)
 
 
-def _compute_given(table: Table, options: AnswersOptions) -> AnswersFigure:
-    rows = [_row_given(name, inside, options.most) for name, inside in table.by(options.by).items()]
-    return AnswersFigure(
-        figure="answers",
-        title=options.title or f"Most frequent answers by {options.by}",
-        text=_said(rows, plural(options.by)),
-        by=options.by,
-        rows=rows,
-    )
-
-
-def _row_given(name: str, rows: list[Answered], most: int) -> AnswersRow:
-    answers = [
-        GivenAnswer(
-            **count_of(answer, number, len(rows)).model_dump(),
-            right=sum(row.correct for row in rows if row.answer == answer),
-        )
-        for answer, number in most_frequent(rows)[:most]
+def answers(table: Table, options: AnswersOptions) -> MadeFigure:
+    """Count the most frequent answers for each value of something."""
+    groups: dict[str, list[tuple[Tally, int]]] = {}  # how often each was given, and how often it was a right one
+    for value, rows in table.by(options.by).items():
+        most = most_frequent(rows)[: options.most]
+        given = {answer: rows[ANSWER] == answer for answer, _ in most}
+        groups[value] = [
+            (Tally.over(answer, rows, flags), int(rows["correct"][flags].sum())) for answer, flags in given.items()
+        ]
+    wrong = {value: each[0] for value, each in groups.items() if 2 * each[0][1] < each[0][0].times}
+    known, thing = len(groups) - len(wrong), plural(options.by)
+    text = [f"For {known} of {len(groups)} {thing} the most frequent answer is mostly a right one."]
+    text += [
+        f"For {value} it is {one.name}, {one.told('given')} and right in {right} of these."
+        for value, (one, right) in wrong.items()
     ]
-    return AnswersRow(**counted(name, rows).model_dump(), answers=answers)
+    title = options.title or f"Most frequent answers by {options.by}"
 
+    def draw(figure: Any) -> None:
+        axes = figure.subplots()
+        for place, given in enumerate(groups.values()):
+            left = 0.0
+            for one, right in given:
+                share, colour = one.share or 0.0, BLUE if 2 * right >= one.times else RED
+                axes.barh(place, share, left=left, color=colour, alpha=0.5, height=0.72, edgecolor="white")
+                axes.text(left + share / 2, place, fitting(one.name, share), ha="center", va="center", fontsize=7)
+                left += share
+            axes.barh(place, max(1.0 - left, 0.0), left=left, color=GREY, alpha=0.15, height=0.72)
+        axes.set_yticks(range(len(groups)), list(groups))
+        axes.invert_yaxis()
+        axes.set(xlabel="share of answers; blue: mostly right, red: mostly wrong, grey: others", xlim=(0.0, 1.0))
 
-def _said(rows: list[AnswersRow], thing: str) -> list[str]:
-    wrong = [row for row in rows if row.answers and 2 * row.answers[0].right < row.answers[0].correct]
-    said = [f"For {len(rows) - len(wrong)} of {len(rows)} {thing} the most frequent answer is mostly a right one."]
-    return said + [f"For {row.name} it is {_given(row.answers[0])}." for row in wrong]
-
-
-def _given(one: GivenAnswer) -> str:
-    share = f"{percent(one.accuracy)}, 95 % interval {interval_text(one.interval)}"
-    return f"{one.name}, given in {one.correct} of {one.configurations} ({share}) and right in {one.right} of these"
+    rows = [[value, one.name, *one.cells, right] for value, given in groups.items() for one, right in given]
+    columns = [options.by, "answer", "given in", *COUNT, "right"]
+    return MadeFigure(title, text, columns, rows, draw, (6.4, 1.2 + 0.3 * len(groups)))
 
 
 def fitting(name: str, share: float) -> str:
@@ -94,32 +81,14 @@ def fitting(name: str, share: float) -> str:
     return fits if fits is not None else f"{first[: room - 1].rstrip()}…" if room > FEWEST_LETTERS else ""
 
 
-def _draw_given(made: AnswersFigure, figure: Any, run: Path) -> None:
-    axes = figure.subplots()
-    for place, row in enumerate(reversed(made.rows)):
-        left = 0.0
-        for one in row.answers:
-            share = one.accuracy or 0.0
-            colour = BLUE if 2 * one.right >= one.correct else RED
-            axes.barh(place, share, left=left, color=colour, alpha=0.5, height=0.72, edgecolor="white")
-            axes.text(left + share / 2, place, fitting(one.name, share), ha="center", va="center", fontsize=7)
-            left += share
-        axes.barh(place, max(1.0 - left, 0.0), left=left, color=GREY, alpha=0.15, height=0.72)
-    axes.set_yticks(range(len(made.rows)), [row.name for row in reversed(made.rows)])
-    axes.set(xlabel="share of answers; blue: mostly right, red: mostly wrong, grey: others", xlim=(0.0, 1.0))
-    axes.set_title(made.title)
-
-
-ANSWERS = FigureKind(
-    AnswersOptions, AnswersFigure, _compute_given, _draw_given, lambda made: (6.4, 1.2 + 0.3 * len(made.rows))
-)
-
-
 SEED, RESAMPLES = 0, 2000
 """Of the answers that predict, and of the bootstrap."""
 
-FEWEST_CELLS = 4
+FEWEST_PAIRS = 4
 """Pairs of object and texture: two of each."""
+
+Predicted = tuple[int, int, int]
+"""Of one object with one texture: answers, and how many of these the shape and the texture predict."""
 
 
 class CuesOptions(Options):
@@ -130,36 +99,42 @@ class CuesOptions(Options):
     classes: dict[str, list[str]] = Field(default_factory=dict)
 
 
-def _compute_cues(table: Table, options: CuesOptions) -> CuesFigure:
-    rows = [
-        CuesRow(
-            **counted(name, inside).model_dump(),
-            textured=sum(_names(row.answer, options.classes.get(name, [])) for row in inside),
-        )
-        for name, inside in table.by(options.texture).items()
-    ]
-    cells = _cells(table, options)
-    total = sum(one.answers for one in cells)
-    predicted = [
-        count_of("shape", sum(one.by_shape for one in cells), total),
-        count_of("texture", sum(one.by_texture for one in cells), total),
-    ]
-    difference = _difference(cells)
-    return CuesFigure(
-        figure="cues",
-        title=options.title or "Answers by shape and by texture",
-        text=[
-            *_by_texture(table, options, rows),
-            *_which(predicted, difference),
-            *extremes(rows, "The hardest texture", "the easiest", "textures"),
-        ],
-        shape=options.shape,
-        texture=options.texture,
-        predicted=predicted,
-        difference=None if difference is None else difference[0],
-        difference_interval=None if difference is None else difference[1],
-        rows=rows,
-    )
+def cues(table: Table, options: CuesOptions) -> MadeFigure:
+    """Count how often the answer is the object and how often the texture, and which of both predicts answers better."""
+    textures = table.by(options.texture)
+    shapes = {name: Tally.over(name, rows) for name, rows in textures.items()}
+    naming = {
+        name: rows[ANSWER].map(lambda answer, name=name: _names(answer, options.classes.get(name, [])))
+        for name, rows in textures.items()
+    }
+    named = {name: Tally.over(name, rows, naming[name]) for name, rows in textures.items()}
+    asked = [name for name in textures if options.classes.get(name)]
+    text = [f"The answer is the object, whatever its texture: {Tally.over('', table.rows).told('so')}."]
+    if asked:
+        flags = pd.concat([naming[name] for name in asked])
+        total = Tally.over("", table.rows.loc[flags.index], flags)
+        text.append(f"The answer names the texture ({', '.join(asked)}): {total.told('so')}.")
+        if not total.share:
+            text.append("A model that has no class for a texture cannot name it.")
+    text.append(_which(predicted(table, options)))
+    text += extremes(list(shapes.values()), "The hardest texture", "the easiest", "textures")
+    title = options.title or "Answers by shape and by texture"
+
+    def draw(figure: Any) -> None:
+        axes = figure.subplots()
+        names = sorted(shapes, key=lambda name: shapes[name].share or 0.0)
+        own, other = ([counts[name].share or 0.0 for name in names] for counts in (shapes, named))
+        axes.barh(names, own, color=BLUE, alpha=0.55, height=0.66, label="the object")
+        axes.barh(names, other, left=own, color=RED, alpha=0.55, height=0.66, label="the texture")
+        for place, name in enumerate(names):
+            axes.plot(shapes[name].interval(), [place, place], color="#1c1d20", linewidth=1.2)
+        axes.set(xlabel="share of answers; line: 95 % interval of the object's", xlim=(0.0, 1.0))
+        axes.grid(True, axis="x")
+        figure.legend(loc="outside lower center", ncols=2, title="the answer names")
+
+    rows = [[name, *shapes[name].cells, named[name].times] for name in textures]
+    columns = [options.texture, "the object", *COUNT, "the texture"]
+    return MadeFigure(title, text, columns, rows, draw, (6.0, 1.7 + 0.27 * len(textures)))
 
 
 def _names(answer: str, classes: list[str]) -> bool:
@@ -167,16 +142,7 @@ def _names(answer: str, classes: list[str]) -> bool:
     return any(name.strip() in classes for name in [answer, *answer.split(",")])
 
 
-@dataclass(frozen=True)
-class _Cell:
-    """One object with one texture: how many answers there are, and how many each cue predicts."""
-
-    answers: int
-    by_shape: int
-    by_texture: int
-
-
-def _cells(table: Table, options: CuesOptions) -> list[_Cell]:
+def predicted(table: Table, options: CuesOptions) -> list[Predicted]:
     """Predict the answers about each object with each texture by those about it with others, and with others by it.
 
     Each cue predicts the most frequent one of as many answers: those about the same object with other textures, and
@@ -184,226 +150,43 @@ def _cells(table: Table, options: CuesOptions) -> list[_Cell]:
     answers is among them, so that a model which answers by neither cue is predicted as well by both.
     """
     generator = random.Random(SEED)
-    inside: dict[tuple[float | str, float | str], list[str]] = {}
-    for row in table.rows:
-        key = table.value(row, options.shape), table.value(row, options.texture)
-        inside.setdefault(key, []).append(row.answer)
-    found = []
-    for (shape, texture), answers in inside.items():
-        same_shape = [one for (s, t), more in inside.items() if s == shape and t != texture for one in more]
-        same_texture = [one for (s, t), more in inside.items() if t == texture and s != shape for one in more]
-        count = min(len(same_shape), len(same_texture))
-        if count:
-            drawn = (Counter(generator.sample(one, count)).items() for one in (same_shape, same_texture))
-            first = [min(each, key=lambda one: (-one[1], one[0]))[0] for each in drawn]
-            found.append(_Cell(len(answers), answers.count(first[0]), answers.count(first[1])))
-    return found
+    groups = table.rows.groupby([table.column(options.shape), table.column(options.texture)], sort=False)
+    pairs = {pair: list(rows[ANSWER]) for pair, rows in groups}
+    counts = []
+    for (shape, texture), given in pairs.items():
+        same_shape = [one for (s, t), more in pairs.items() if s == shape and t != texture for one in more]
+        same_texture = [one for (s, t), more in pairs.items() if t == texture and s != shape for one in more]
+        drawn = min(len(same_shape), len(same_texture))
+        if drawn:
+            each = (Counter(generator.sample(one, drawn)).items() for one in (same_shape, same_texture))
+            by_shape, by_texture = (min(one, key=lambda item: (-item[1], item[0]))[0] for one in each)
+            counts.append((len(given), given.count(by_shape), given.count(by_texture)))
+    return counts
 
 
-def _difference(cells: Sequence[_Cell]) -> tuple[float, Interval] | None:
-    """Return by how much more the shape predicts than the texture, and the 95 % interval of that.
-
-    The two are shares of the same answers, and answers about one object with one texture go together: the interval is
-    a percentile bootstrap over pairs of object and texture. None with fewer than `FEWEST_CELLS` of these.
-    """
-    if len(cells) < FEWEST_CELLS:
-        return None
-    generator = random.Random(SEED)
-    drawn = sorted(_mean(generator.choices(cells, k=len(cells))) for _ in range(RESAMPLES))
-    outside = round(RESAMPLES * 0.025)
-    return _mean(cells), (drawn[outside], drawn[-1 - outside])
-
-
-def _mean(cells: Sequence[_Cell]) -> float:
-    return sum(one.by_shape - one.by_texture for one in cells) / sum(one.answers for one in cells)
-
-
-def _by_texture(table: Table, options: CuesOptions, rows: list[CuesRow]) -> list[str]:
-    shape = count_of("by shape", sum(one.correct for one in rows), sum(one.configurations for one in rows))
-    asked = [one for one in rows if options.classes.get(one.name)]
-    said = [f"The answer is the object, whatever its texture: {rate_with_interval(shape, 'so')}."]
-    if asked:
-        named = count_of("by texture", sum(one.textured for one in asked), sum(one.configurations for one in asked))
-        known = ", ".join(one.name for one in asked)
-        said.append(f"The answer names the texture ({known}): {rate_with_interval(named, 'so')}.")
-        if not named.correct:
-            said.append("A model that has no class for a texture cannot name it.")
-    return said
-
-
-def _which(predicted: Sequence[NamedCount], difference: tuple[float, Interval] | None) -> list[str]:
-    shape, texture = predicted
-    if difference is None:
-        return [
+def _which(pairs: Sequence[Predicted]) -> str:
+    """By how much more the shape predicts than the texture, both of the same answers. Answers about one pair go
+    together: the interval is a percentile bootstrap over pairs."""
+    if len(pairs) < FEWEST_PAIRS:
+        return (
             "Whether the answers go more by shape or by texture is not said: that takes at least two objects and two "
-            f"textures, {FEWEST_CELLS} pairs in all."
-        ]
-    mean, (low, high) = difference
-    said = (
-        f"The most frequent answer about the same object with other textures is given in {percent(shape.accuracy)}, "
-        f"and that about the same texture on other objects, of as many answers, in {percent(texture.accuracy)}: "
-        f"{100 * mean:.0f} points more by shape (95 % interval {100 * low:.0f} to {100 * high:.0f}, over pairs of "
-        "object and texture)"
-    )
-    if low > 0.0:
-        return [f"{said}: the model goes more by shape than by texture."]
-    if high < 0.0:
-        return [f"{said}: the model goes more by texture than by shape."]
-    return [f"{said}: no difference is shown."]
-
-
-def _draw_cues(made: CuesFigure, figure: Any, run: Path) -> None:
-    axes = figure.subplots()
-    rows = sorted(made.rows, key=lambda one: one.accuracy or 0.0)
-    for place, one in enumerate(rows):
-        total = max(one.configurations, 1)
-        axes.barh(
-            place, one.correct / total, color=BLUE, alpha=0.55, height=0.66, label="the object" if not place else "_"
+            f"textures, {FEWEST_PAIRS} pairs in all."
         )
-        axes.barh(
-            place, one.textured / total, left=one.correct / total, color=RED, alpha=0.55, height=0.66,
-            label="the texture" if not place else "_",
-        )  # fmt: skip
-        if one.interval:
-            axes.plot(one.interval, [place, place], color="#1c1d20", linewidth=1.2)
-    axes.set_yticks(range(len(rows)), [one.name for one in rows])
-    axes.set(xlabel="share of answers; line: 95 % interval of the object's", xlim=(0.0, 1.0))
-    axes.set_title(made.title)
-    axes.grid(True, axis="x")
-    figure.legend(loc="outside lower center", ncols=2, title="the answer names")
 
+    def ahead(some: Sequence[Predicted]) -> float:
+        return sum(shape - texture for _, shape, texture in some) / sum(given for given, _, _ in some)
 
-CUES = FigureKind(CuesOptions, CuesFigure, _compute_cues, _draw_cues, lambda made: (6.0, 1.7 + 0.27 * len(made.rows)))
-
-
-NO_PHOTOGRAPHS = (
-    "There are no photographs yet: nothing is said about reality here. Take some with advsearch dashboard and the "
-    "runs in parts/, or name a folder of them (photographs=FOLDER), and let advsearch resume go on with this run."
-)
-ALL = "all objects"
-
-AnswerPair = tuple[Answered, Answered]
-
-
-class AgreementOptions(Options):
-    """Options of agreements: the part whose renderings are compared with photographs, and parts that picture the same
-    configurations under other conditions."""
-
-    of: tuple[str, ...] = Field(min_length=1)
-    names: dict[str, str] = Field(default_factory=dict)
-
-    @property
-    def parts(self) -> tuple[str, ...]:
-        """Those, and photographs."""
-        return (*self.of, PHOTOGRAPHS)
-
-
-def _compute_agreement(table: Table, options: AgreementOptions) -> AgreementFigure:
-    shown = [row for row in table.rows if row.part == options.of[0]]
-    if not shown:
-        raise InputError(f"figures: agreement: expected answers of a part {options.of[0]!r}, got none")
-    series = [_series(shown, table.rows, part, options) for part in (PHOTOGRAPHS, *options.of[1:])]
-    known = [one for one in series if one.total.agreeing.configurations or one.alone]
-    said = [] if known and known[0].part == PHOTOGRAPHS else [NO_PHOTOGRAPHS]
-    return AgreementFigure(
-        figure="agreement",
-        title=options.title or "Renderings and other pictures of the same",
-        text=said + [text for one in known for text in _said_of_series(one)],
-        renderings=options.of[0],
-        series=known,
+    generator, outside = random.Random(SEED), round(RESAMPLES * 0.025)
+    drawn = sorted(ahead(generator.choices(pairs, k=len(pairs))) for _ in range(RESAMPLES))
+    interval = drawn[outside], drawn[-1 - outside]
+    total, shape, texture = (sum(one) for one in zip(*pairs, strict=True))
+    verdict = (
+        "the model goes more by shape than by texture" if interval[0] > 0.0
+        else "the model goes more by texture than by shape" if interval[1] < 0.0 else "no difference is shown"
+    )  # fmt: skip
+    return (
+        f"The most frequent answer about the same object with other textures is given in {percent(shape / total)}, "
+        f"and that about the same texture on other objects, of as many answers, in {percent(texture / total)}: "
+        f"{100 * ahead(pairs):.0f} points more by shape (95 % interval {100 * interval[0]:.0f} to "
+        f"{100 * interval[1]:.0f}, over pairs of object and texture): {verdict}."
     )
-
-
-def _series(
-    shown: Sequence[Answered], rows: Sequence[Answered], part: str, options: AgreementOptions
-) -> AgreementSeries:
-    """Pair the pictures of a part with the renderings whose values they have."""
-    names = list(shown[0].values)
-    by_values = {_key(row, names): row for row in shown}
-    others = [row for row in rows if row.part == part]
-    pairs = [(found, row) for row in others if (found := by_values.get(_key(row, names))) is not None]
-    if part != PHOTOGRAPHS and len(pairs) < len(others):
-        raise InputError(f"figures: agreement: expected {part} to have the configurations of {options.of[0]}")
-    objects = list(dict.fromkeys(str(row.values["object"]) for row in shown))
-    by_object = {name: [pair for pair in pairs if pair[0].values["object"] == name] for name in objects}
-    return AgreementSeries(
-        part=part,
-        name=options.names.get(part, part),
-        alone=len(others) - len(pairs),
-        total=_count(ALL, pairs),
-        rows=[_count(name, inside) for name, inside in by_object.items()],
-    )
-
-
-def _key(row: Answered, names: Sequence[str]) -> Hashable:
-    """The values that renderings have; other pictures may have more."""
-    return tuple(row.values.get(name) for name in names)
-
-
-def _count(name: str, pairs: Sequence[AnswerPair]) -> AgreementCount:
-    counts = {
-        (a, b): sum((x.correct, y.correct) == (a, b) for x, y in pairs) for a in (True, False) for b in (True, False)
-    }
-    return AgreementCount(
-        name=name,
-        right_right=counts[True, True],
-        right_wrong=counts[True, False],
-        wrong_right=counts[False, True],
-        wrong_wrong=counts[False, False],
-        same_answer=sum(x.answer == y.answer for x, y in pairs),
-        agreeing=count_of(name, counts[True, True] + counts[False, False], len(pairs)),
-    )
-
-
-def _said_of_series(one: AgreementSeries) -> list[str]:
-    total, said = one.total, []
-    if total.agreeing.configurations:
-        said.append(
-            f"Renderings and {one.name}: {rate_with_interval(total.agreeing, 'right about both or wrong about both')}. "
-            f"{_share('right', total.right_right, total.right_wrong)} "
-            f"{_share('wrong', total.wrong_wrong, total.wrong_right)} The answer is the same in "
-            f"{total.same_answer} of {total.agreeing.configurations} "
-            f"({percent(total.same_answer / total.agreeing.configurations)})."
-        )
-    if one.part == PHOTOGRAPHS and total.agreeing.configurations:
-        said.append("The intervals take photographs as independent.")
-    if one.alone:
-        belong = "belongs" if one.alone == 1 else "belong"
-        said.append(f"{one.alone} of the photographs {belong} to no rendering and so to no pair.")
-    return said
-
-
-def _share(verb: str, same: int, other: int) -> str:
-    if not same + other:
-        return f"It is {verb} about none of the renderings."
-    counted = rate_with_interval(count_of("", same, same + other), verb)
-    return f"Where it is {verb} about the rendering, it is {counted} about the other."
-
-
-def _draw_agreement(made: AgreementFigure, figure: Any, run: Path) -> None:
-    axes = figure.subplots()
-    names = [ALL, *[row.name for row in made.series[0].rows][::-1]] if made.series else []
-    for number, one in enumerate(made.series):
-        shift = (number - (len(made.series) - 1) / 2) * 0.22
-        colour, label = COLOURS[number % len(COLOURS)], one.name
-        for row in [one.total, *one.rows]:
-            share, place = row.agreeing, names.index(row.name) - shift
-            if share.interval:
-                axes.plot(share.interval, [place] * 2, color=colour, alpha=0.45, linewidth=3)
-                axes.plot(share.accuracy, place, MARKS[number % len(MARKS)], color=colour, ms=5, label=label)
-                label = "_"
-    axes.set_yticks(range(len(names)), names)
-    axes.set(xlabel="share that agrees, with 95 % interval", xlim=(-0.03, 1.03), ylim=(-0.6, max(len(names), 1) - 0.4))
-    axes.set_title(made.title)
-    axes.grid(True, axis="x")
-    figure.legend(loc="outside lower center", ncols=1)
-
-
-AGREEMENT = FigureKind(
-    AgreementOptions,
-    AgreementFigure,
-    _compute_agreement,
-    _draw_agreement,
-    lambda made: (6.0, 1.7 + 0.2 * len(made.series) + 0.34 * len(made.series[0].rows if made.series else [])),
-    tells_models=True,
-)

@@ -1,5 +1,3 @@
-"""What `recipe` needs to know."""
-
 from __future__ import annotations
 
 from pathlib import Path
@@ -14,6 +12,8 @@ from advsearch.settings import Clash, Config, setting, setting_as_in, split_name
 ALL_OBJECTS = "*"
 """Under this a label stands that is right for every object without one of its own."""
 
+NAMED = "what the recipe names"
+
 
 class RecipeConfig(Config):
     """Everything that decides what `recipe` does: which recipe, and on what objects, environments and models."""
@@ -22,45 +22,33 @@ class RecipeConfig(Config):
     free: ClassVar[tuple[str, ...]] = (*Config.free, "photographs")
     clashes: ClassVar[tuple[Clash, ...]] = SceneConfig.clashes
 
+    # fmt: off
     recipe: str = setting(
-        ...,
-        "recipe",
-        "the experiment to run",
+        ..., "recipe", "the experiment to run",
         "the name of a recipe, which advsearch recipe list shows, or a YAML file",
     )
     quick: bool = setting(False, "recipe", "few and small pictures, for a first look")
     photographs: str | None = setting(
-        None,
-        "recipe",
-        "photographs to compare with renderings, of each object in a folder of its name",
-        "a folder",
+        None, "recipe", "photographs to compare with renderings, of each object in a folder of its name", "a folder",
         otherwise="those taken with advsearch dashboard",
     )
     object: str | None = setting_as_in(
-        SceneConfig,
-        "object",
-        default=None,
+        SceneConfig, "object", default=None, otherwise=NAMED,
         description="the object that the model should recognise; several, separated by commas",
         expects=f"names of objects or {either(MESHES)} files",
-        otherwise="what the recipe names",
     )
     environment: str | None = setting_as_in(
-        SceneConfig,
-        "environment",
+        SceneConfig, "environment", otherwise=NAMED,
         description="the environment map that lights the scene; several, separated by commas",
         expects="names of environments or .hdr or .exr files",
-        otherwise="what the recipe names",
     )
     up: Literal["y", "z"] | None = setting_as_in(SceneConfig, "up")
     resolution: tuple[int, int] | None = setting_as_in(
         SceneConfig, "resolution", otherwise="what the recipe says, or what the model takes"
     )
     model: str | None = setting_as_in(
-        SceneConfig,
-        "model",
-        default=None,
+        SceneConfig, "model", default=None, otherwise=NAMED,
         description="the network under test; several separated by commas",
-        otherwise="what the recipe names",
     )
     labels: str | None = setting_as_in(SceneConfig, "labels")
     prompt: str | None = setting_as_in(SceneConfig, "prompt")
@@ -68,19 +56,17 @@ class RecipeConfig(Config):
         SceneConfig, "task", default=None, otherwise="what the recipe says, or classification"
     )
     label: dict[str, str] = setting(
-        dict,
-        "model",
+        dict, "model",
         "the right answers, separated by commas, for all objects or one (OBJECT=LABELS); may be repeated",
         'names of classes, such as "coffee mug,cup" or mug="coffee mug,cup"',
-        form="choices",
-        metavar="LABELS",
-        otherwise="each object's own",
+        form="choices", metavar="LABELS", otherwise="each object's own",
     )
     seed: int = setting_as_in(SceneConfig, "seed")
     threads: int | None = setting_as_in(SceneConfig, "threads")
     deterministic: bool = setting_as_in(SceneConfig, "deterministic")
     run: str | None = setting_as_in(SceneConfig, "run", otherwise="runs/RECIPE-NNN")
     overwrite: bool = setting_as_in(SceneConfig, "overwrite")
+    # fmt: on
 
     _named = field_validator(
         "recipe", "photographs", "object", "environment", "model", "labels", "task", "run", mode="before"
@@ -88,11 +74,7 @@ class RecipeConfig(Config):
     _prompts = field_validator("prompt", mode="before")(lambda value: SceneConfig._prompts_as_text(value))
     _sized = field_validator("resolution", mode="before")(lambda value: SceneConfig._resolution_from_text(value))
     _in_range = field_validator("resolution")(lambda value: SceneConfig._resolution_in_range(value))
-
-    @field_validator("task", mode="before")
-    @classmethod
-    def _task_with_options(cls, value: Any) -> Any:
-        return read_joined(value, "task", "classification")
+    _task = field_validator("task", mode="before")(lambda value: read_joined(value, "task", "classification"))
 
     @field_validator("photographs")
     @classmethod

@@ -44,7 +44,7 @@ def predicted(renderer: Renderer, epsilon: float = 0.1, off: float = OFF) -> Out
     with torch.no_grad():
         before, after = (renderer(one, seed=5, spp=TRACED) for one in (renderer.start, u))
         change = linear(u) - linear(renderer.start)
-    value, slope = linear.gradient(lambda picture: picture.square().mean(), u, 0, 1)
+    value, slope = linear.renderer.gradient(lambda picture: picture.square().mean(), u, 0, 1)
     finite = bool(torch.isfinite(change).all() and torch.isfinite(slope).all()) and linear.non_finite == 0
     size = float((after - before).square().mean().sqrt())
     error = float((change - (after - before)).square().mean().sqrt()) / size if size else float(change.abs().max())
@@ -129,7 +129,7 @@ def light_out() -> Outcome:
     with torch.no_grad():
         before, after = (beside(one, seed=5, spp=TRACED) for one in (lit, out))
         change, black = basis(out) - basis(lit), dark(out)
-    _, slope = dark.gradient(lambda picture: picture.square().mean(), out, 0, 1)
+    _, slope = dark.renderer.gradient(lambda picture: picture.square().mean(), out, 0, 1)
     error = float((change - (after - before)).norm() / (after - before).norm())
     finite = bool(torch.isfinite(change).all() and torch.isfinite(black).all() and torch.isfinite(slope).all())
     checks = [
@@ -184,9 +184,9 @@ def lit_derivatives(renderer: Renderer, light: SurfaceRenderer, u: Tensor, step:
     """The derivative of a smooth linear loss of the raw picture as texels go inwards that raise it so, predicted and by
     traced one-sided differences of second order: a texel at a bound has no other side."""
     linear = renderer.like(transfer="linear")
-    light.formation = linear.formation
+    light.traced = linear
     loss = smooth_loss(linear.formation.resolution)
-    slope = light.gradient(loss, u, 0, 1)[1]
+    slope = light.renderer.gradient(loss, u, 0, 1)[1]
     inwards = torch.where(u > 0.5, -1.0, 1.0) * (slope * (0.5 - u) > 0.0) * textured(renderer)
     with torch.no_grad():
         near, middle, far = (float(loss(linear(u + k * step * inwards, 5, 4 * REFERENCE_SPP))) for k in range(3))
@@ -228,7 +228,7 @@ def lit_unseen() -> Outcome:
     """Texels that the view does not meet have a derivative of exactly 0, and no change of them is predicted."""
     renderer = small("mug", PAINTED)
     light, u = lit(renderer), renderer.start
-    slope = light.gradient(lambda picture: picture.square().mean(), u, 0, 1)[1]
+    slope = light.renderer.gradient(lambda picture: picture.square().mean(), u, 0, 1)[1]
     hidden = textured(renderer) * (slope == 0.0)
     other = u * (1.0 - hidden)
     with torch.no_grad():
@@ -262,7 +262,7 @@ def black_map() -> Outcome:
     """The picture is black, the derivative 0."""
     renderer = small("mug", PAINTED, environment=grey_map(0.0))
     light = lit(renderer)
-    value, slope = light.gradient(lambda picture: picture.sum(), renderer.start, 0, 1)
+    value, slope = light.renderer.gradient(lambda picture: picture.sum(), renderer.start, 0, 1)
     checks = (
         Check("sum of the picture", float(value), 0.0, 1e-6),
         Check("largest derivative", float((slope * textured(renderer)).abs().max()), 0.0, 0.0),
@@ -283,7 +283,7 @@ def lit_out_of_sight() -> Outcome:
     light = lit(renderer)
     with torch.no_grad():
         (off,) = levels_off(renderer, [light(renderer.start)], renderer.start, 3, TRACED)
-    slope = light.gradient(lambda picture: picture.sum(), renderer.start, 0, 1)[1] * textured(renderer)
+    slope = light.renderer.gradient(lambda picture: picture.sum(), renderer.start, 0, 1)[1] * textured(renderer)
     checks = (
         Check("levels of 255 off", off, most=LEVELS),
         Check("largest derivative", float(slope.abs().max()), 0.0, 0.0),

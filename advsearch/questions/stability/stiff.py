@@ -15,7 +15,8 @@ from torch import Tensor
 
 from advsearch.attacks import PGD, Domain, Policy, SearchResult, make_policy, search
 from advsearch.controls.base import Parameter
-from advsearch.controls.values import Range, read, to_unit, to_value
+from advsearch.controls.ranges import Range
+from advsearch.controls.values import read, to_unit, to_value
 from advsearch.engine.gradients import smooth_loss
 from advsearch.questions.stability.scene import (
     SHARPNESS,

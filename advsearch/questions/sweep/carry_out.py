@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from typing_extensions import Unpack
 
-from advsearch.api.keywords import SweepKeywords, asks
+from advsearch.api.keywords import asks
 from advsearch.cluster import Call
 from advsearch.config import AttackConfig, SweepConfig
 from advsearch.controls import Control
@@ -73,7 +72,7 @@ CLEAN = "clean"
 AnyScene = Scene | str | Path
 
 
-@asks(SweepConfig, SweepKeywords)
+@asks(SweepConfig)
 def sweep(
     scene: AnyScene | Sequence[AnyScene] | None = None,
     model: AnyModel | Sequence[AnyModel] | None = None,
@@ -86,7 +85,7 @@ def sweep(
     metrics: Mapping[str, str | Metric] | None = None,
     run: str | Path | None = None,
     progress: Watched = None,
-    **settings: Unpack[SweepKeywords],
+    **settings: Any,
 ) -> SweepResult:
     """Render every configuration of a grid, and draws by chance, and say how often the model is right.
 
@@ -322,13 +321,18 @@ def _places(config: SweepConfig) -> tuple[NamedScene, ...]:
 
 def _models(models: Sequence[AnyModel], config: SweepConfig, task: Task) -> tuple[tuple[Model, ...], list[str]]:
     """Load the models; their warnings become sentences of the run."""
-    names = [model_name(one) for one in models]
+    _check_different([model_name(one) for one in models])
+    loaded, warnings = load_models(models, task, config)
+    _check_different([one.name for one in loaded])  # what a file or a function gives may have the name of another
+    return loaded, warnings
+
+
+def _check_different(names: Sequence[str]) -> None:
     if len(set(names)) < len(names):
         raise InputError(
             f"model: expected models with different names, got {', '.join(names)}; from Python, "
             "load_model(..., name=...) gives one"
         )
-    return load_models(models, task, config)
 
 
 def _stopped(config: SweepConfig) -> Path | None:

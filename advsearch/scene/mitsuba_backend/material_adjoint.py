@@ -244,22 +244,26 @@ def _attached(camera: Camera, si: Any, place: Any, facet: Any, bent: Any) -> Any
 def _reflected(view: FilmView, at: Any, si: Any, sampler: Any) -> Any:
     """One sample of the light reflected towards the camera, from directions fixed in the world."""
     context, bsdf = mi.BSDFContext(), si.bsdf()
-    with dr.suspend_grad():
+    with dr.suspend_grad():  # both directions are drawn where the surface is, and stay
         active = mi.Bool(view.max_depth > 1)
-        lit = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-        ds, light = view.scene.sample_emitter_direction(si, sampler.next_2d(), True, lit)
-        lit &= ds.pdf != 0.0
-        picked, through = bsdf.sample(context, si, sampler.next_1d(), sampler.next_2d(), active)
-        active &= dr.any(through != 0.0)
-        direction = si.to_world(picked.wo)
-        smooth = ~mi.has_flag(picked.sampled_type, mi.BSDFFlags.Delta)
-        arriving = through * _arriving(view, si, direction, picked.pdf, smooth, sampler, active)
-    ds, light = _attached_light(view, at, ds, light, lit)
-    value, pdf = bsdf.eval_pdf(context, at, at.to_local(ds.d), lit)
-    mis = dr.select(ds.delta, 1.0, _mis(ds.pdf, dr.detach(pdf)))
-    total = dr.select(lit, value * light * mis, 0.0)
-    value = bsdf.eval(context, at, at.to_local(direction), active & smooth)
-    relative = mi.Color3f(*(_relative(dr.select(smooth, channel, 1.0)) for channel in value))
+        active_em = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+        ds, em_weight = view.scene.sample_emitter_direction(si, sampler.next_2d(), True, active_em)
+        active_em &= ds.pdf != 0.0
+        bsdf_sample, bsdf_weight = bsdf.sample(context, si, sampler.next_1d(), sampler.next_2d(), active)
+        active &= dr.any(bsdf_weight != 0.0)
+        wo = si.to_world(bsdf_sample.wo)
+        smooth = ~mi.has_flag(bsdf_sample.sampled_type, mi.BSDFFlags.Delta)
+        arriving = bsdf_weight * _arriving(view, si, wo, bsdf_sample.pdf, smooth, sampler, active)
+
+    # ---- light that was sampled, from the moving point: its distance and the BSDF change
+    ds, em_weight = _attached_light(view, at, ds, em_weight, active_em)
+    bsdf_value_em, bsdf_pdf_em = bsdf.eval_pdf(context, at, at.to_local(ds.d), active_em)
+    mis = dr.select(ds.delta, 1.0, _mis(ds.pdf, dr.detach(bsdf_pdf_em)))
+    total = dr.select(active_em, bsdf_value_em * em_weight * mis, 0.0)
+
+    # ---- light along the sampled direction: a constant, of which the BSDF passes more or less; a mirror's stays
+    bsdf_value = bsdf.eval(context, at, at.to_local(wo), active & smooth)
+    relative = mi.Color3f(*(_relative(dr.select(smooth, channel, 1.0)) for channel in bsdf_value))
     return total + dr.select(active, arriving * relative, 0.0)
 
 
@@ -278,11 +282,11 @@ def _attached_light(view: FilmView, at: Any, ds: Any, light: Any, lit: Any) -> t
 def _arriving(view: FilmView, si: Any, direction: Any, pdf: Any, smooth: Any, sampler: Any, active: Any) -> Any:
     """Radiance from a sampled direction; what shines there itself is weighted against light sampling."""
     ray = si.spawn_ray(direction)
-    everything = view.radiance(ray, sampler, view.max_depth - 1, active)
-    there = view.scene.ray_intersect(ray, active)
-    ds = mi.DirectionSample3f(view.scene, si=there, ref=si)
-    other = view.scene.pdf_emitter_direction(si, ds, active & smooth)
-    return everything - (1.0 - _mis(pdf, other)) * ds.emitter.eval(there, active & smooth)
+    L = view.radiance(ray, sampler, view.max_depth - 1, active)  # with all of what the next surface emits
+    si_next = view.scene.ray_intersect(ray, active)
+    ds = mi.DirectionSample3f(view.scene, si=si_next, ref=si)
+    em_pdf = view.scene.pdf_emitter_direction(si, ds, active & smooth)
+    return L - (1.0 - _mis(pdf, em_pdf)) * ds.emitter.eval(si_next, active & smooth)
 
 
 def _mis(own: Any, other: Any) -> Any:

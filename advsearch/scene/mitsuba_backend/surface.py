@@ -174,110 +174,117 @@ class Views:
         height, width = self._scene.resolution
         pixel, number = lane // RAYS, lane % RAYS
         view, pixel = pixel // (height * width), pixel % (height * width)
-        across, down = (_chosen(number, [one[axis] for one in PATTERN]) for axis in (0, 1))
-        entry = [dr.gather(mi.Float, cameras, view * CAMERA + k) for k in range(CAMERA)]
+        across, down = mi.Float(PATTERN[0][0]), mi.Float(PATTERN[0][1])
+        for index, place in enumerate(PATTERN[1:], 1):
+            across, down = (dr.select(number == index, a, b) for a, b in zip(place, (across, down), strict=True))
+        camera = [dr.gather(mi.Float, cameras, view * CAMERA + k) for k in range(CAMERA)]
         if self._lens is None:
-            x = (entry[14] - 2.0 * (mi.Float(pixel % width) + across) / width) * entry[12]
-            y = (entry[15] - 2.0 * (mi.Float(pixel // width) + down) / height) * entry[13]
-            z, inside = mi.Float(1.0), mi.Bool(True)
+            x = (camera[14] - 2.0 * (mi.Float(pixel % width) + across) / width) * camera[12]
+            y = (camera[15] - 2.0 * (mi.Float(pixel // width) + down) / height) * camera[13]
+            z, active = mi.Float(1.0), mi.Bool(True)
         else:
             x, y, z, within = (dr.gather(mi.Float, lens, 4 * (pixel * RAYS + number) + k) for k in range(4))
-            inside = within > 0.0
-        way = dr.normalize(mi.Vector3f(*(entry[k] * x + entry[3 + k] * y + entry[6 + k] * z for k in range(3))))
-        ray, wanted = mi.Ray3f(mi.Point3f(*entry[9:12]), way), mi.RayFlags.UV | mi.RayFlags.ShadingFrame
-        layers, found = layers_of(self._scene), []
-        radiance, covered, share = mi.Color3f(0.0), mi.Float(0.0), mi.Float(1.0)
-        active: Any = inside
-        for layer in range(layers + 1):
-            hit = held.ray_intersect(ray, wanted, layer == 0, active)
-            stops = active & hit.is_valid()
-            part = share * (1.0 - passed(hit, stops)) if layer < layers else share
-            shown, diffuse, side = self._shaded(held, hit, stops, way, tables, lit)
-            radiance += dr.select(stops, part * shown, 0.0)
-            radiance += dr.select(active & ~hit.is_valid(), share * _sky(lit, way, to_map(self._scene)), 0.0)
-            covered += dr.select(stops, part / RAYS, 0.0)
-            found += [hit.uv.x, hit.uv.y, side * part * diffuse / (math.pi * RAYS)]
-            share, active = share - part, stops & (share - part > LEAST)
-            ray = hit.spawn_ray(way)
-        radiance /= RAYS
-        dr.eval(radiance, covered, found)  # a sum of its own kernel each would send all rays again
-        return [*(dr.block_sum(one, RAYS) for one in (*radiance, covered)), *found]
+            active = within > 0.0
+        d = dr.normalize(mi.Vector3f(*(camera[k] * x + camera[3 + k] * y + camera[6 + k] * z for k in range(3))))
+        ray, wanted = mi.Ray3f(mi.Point3f(*camera[9:12]), d), mi.RayFlags.UV | mi.RayFlags.ShadingFrame
 
-    def _shaded(self, held: Any, hit: Any, valid: Any, way: Any, tables: Any, lit: Lit) -> tuple[Any, Any, Any]:
-        """What was hit: its radiance, but for what the searched texture reflects diffusely; its diffuse share; and 1 on
-        the front of the searched texture, -1 on its back, 0 elsewhere."""
+        # Through cut-outs, layer by layer; of each, what light passes is left for those behind it
+        layers, texture = layers_of(self._scene), []
+        radiance, covered, left = mi.Color3f(0.0), mi.Float(0.0), mi.Float(1.0)
+        for layer in range(layers + 1):
+            si = held.ray_intersect(ray, wanted, layer == 0, active)
+            valid = active & si.is_valid()
+            share = left * (1.0 - passed(si, valid)) if layer < layers else left
+            shown, diffuse, side = self._shaded(held, si, valid, d, tables, lit)
+            radiance += dr.select(valid, share * shown, 0.0)
+            radiance += dr.select(active & ~si.is_valid(), left * _sky(lit, d, to_map(self._scene)), 0.0)
+            covered += dr.select(valid, share / RAYS, 0.0)
+            texture += [si.uv.x, si.uv.y, side * share * diffuse / (math.pi * RAYS)]
+            left, active = left - share, valid & (left - share > LEAST)
+            ray = si.spawn_ray(d)
+        radiance /= RAYS
+        dr.eval(radiance, covered, texture)  # a sum of its own kernel each would send all rays again
+        return [*(dr.block_sum(channel, RAYS) for channel in (*radiance, covered)), *texture]
+
+    def _shaded(self, held: Any, si: Any, valid: Any, d: Any, tables: Any, lit: Lit) -> tuple[Any, Any, Any]:
+        """What a ray in direction d hit: its radiance, but for what the searched texture reflects diffusely; its
+        diffuse share; and 1 on the front of the searched texture, -1 on its back, 0 elsewhere."""
         to_local, layers = to_map(self._scene), layers_of(self._scene)
-        ons = [on & valid for on in on_grids(held, self._grids, hit, way)]
-        normal = dr.select(dr.dot(hit.sh_frame.n, way) > 0.0, -hit.sh_frame.n, hit.sh_frame.n)
-        cosine = -dr.dot(normal, way)
+        on = [at & valid for at in on_grids(held, self._grids, si, d)]
+        n = dr.select(dr.dot(si.sh_frame.n, d) > 0.0, -si.sh_frame.n, si.sh_frame.n)  # towards the viewer
+        cosine = -dr.dot(n, d)
+
+        # The tables of the surface, between their two entries next to the angle
         table = mi.UInt32(0)
-        for number_of, on in enumerate(ons):
-            table = dr.select(on, mi.UInt32(number_of * len(TABLES) * ANGLES), table)
-        diffuse, gloss, up, along, core, tail = self._measured(tables, table, cosine)
-        shown = self._shown(hit, ons, lit, to_local)
+        for number, at in enumerate(on):
+            table = dr.select(at, mi.UInt32(number * len(TABLES) * ANGLES), table)
+        place = dr.clip(cosine * ANGLES - 0.5, 0.0, ANGLES - 1.0)
+        low = dr.minimum(mi.UInt32(place), ANGLES - 2)
+        between, entries = place - mi.Float(low), []
+        for number in range(len(TABLES)):
+            first, second = (dr.gather(mi.Float, tables, table + (number * ANGLES + k) + low) for k in (0, 1))
+            entries.append(first + between * (second - first))
+        diffuse, gloss, up, along, core, tail = entries
+
+        # Diffuse light; that of the searched texture is left to the matrix
+        shown = self._shown(si, on, lit, to_local)
         side = mi.Float(0.0)
-        for grid, on in zip(self._grids, ons, strict=True):
-            side = dr.select(on, -1.0 if grid.side < 0 else 1.0, side) if grid.warp is None else side
+        for grid, at in zip(self._grids, on, strict=True):
+            side = dr.select(at, -1.0 if grid.side < 0 else 1.0, side) if grid.warp is None else side
         radiance = dr.select(side != 0.0, 0.0, shown * dr.select(valid, diffuse, 1.0))
-        # the gloss: a ray in the mean direction of the lobe says what is there, the blurred map how bright it is
+
+        # The gloss: a ray in the mean direction of the lobe says what is there, the blurred map how bright it is
         glossy = valid & (gloss > 1e-4)
-        beside = dr.normalize(way + normal * cosine + 1e-8)
-        mirrored = dr.normalize(normal * up + beside * along)
-        second = stopped(held, mi.Ray3f(hit.p + normal * SHIFT, mirrored), layers, active=glossy)
-        seconds = on_grids(held, self._grids, second, mirrored)
-        shown_at = self._from_middle(hit.p, mirrored)
-        blurred = 0.5 * sum(_blurred(lit, shown_at, to_local, spread, self._widths) for spread in (core, tail))
-        texel = self._texel(second, seconds, lit)
+        beside = dr.normalize(d + n * cosine + 1e-8)
+        wo = dr.normalize(n * up + beside * along)
+        si_wo = stopped(held, mi.Ray3f(si.p + n * SHIFT, wo), layers, active=glossy)
+        on_wo = on_grids(held, self._grids, si_wo, wo)
+        seen_in = self._from_middle(si.p, wo)
+        blurred = 0.5 * sum(_blurred(lit, seen_in, to_local, spread, self._widths) for spread in (core, tail))
+        texel = self._texel(si_wo, on_wo, lit)
+
+        # On the ground one ray meets a single place: the wider the lobe, the more counts what surrounds the object,
+        # which is darker where the ground is darker there than far off
         shade = texel / _gathered(lit.texels, mi.UInt32(self._grids[-1].first + self._grids[-1].count))
         level = mi.Bool(False)
-        for grid, on in zip(self._grids, seconds, strict=True):
-            level |= on & (grid.warp is not None)
+        for grid, at in zip(self._grids, on_wo, strict=True):
+            level |= at & (grid.warp is not None)
         wide = dr.clip((dr.sqrt(0.5 * (core * core + tail * tail)) - SHARP) / (WIDE - SHARP), 0.0, 1.0)
-        traced = self._shown(second, seconds, lit, to_local)
+        traced = self._shown(si_wo, on_wo, lit, to_local)
         ground = traced + wide * (blurred * shade - traced)
-        reflected = dr.select(second.is_valid(), dr.select(level, ground, texel), blurred)
+        reflected = dr.select(si_wo.is_valid(), dr.select(level, ground, texel), blurred)
         radiance += dr.select(glossy, gloss * reflected, 0.0)
         return radiance, diffuse, side
 
-    def _measured(self, tables: Any, first: Any, cosine: Any) -> list[Any]:
-        """The entries of the tables at a cosine."""
-        place = dr.clip(cosine * ANGLES - 0.5, 0.0, ANGLES - 1.0)
-        low = dr.minimum(mi.UInt32(place), ANGLES - 2)
-        share = place - mi.Float(low)
-        found = []
-        for number in range(len(TABLES)):
-            one, other = (dr.gather(mi.Float, tables, first + (number * ANGLES + k) + low) for k in (0, 1))
-            found.append(one + share * (other - one))
-        return found
-
-    def _from_middle(self, place: Any, way: Any) -> Any:
+    def _from_middle(self, place: Any, d: Any) -> Any:
         """The direction in which the middle of the object sees the ground that a place sees in a direction."""
         if all(grid.warp is None for grid in self._grids):
-            return way
-        far = place.z / dr.maximum(-way.z, 1e-3)
-        return dr.select(way.z < -1e-3, dr.normalize(place + way * far - mi.Point3f(*self._middle)), way)
+            return d
+        far = place.z / dr.maximum(-d.z, 1e-3)
+        return dr.select(d.z < -1e-3, dr.normalize(place + d * far - mi.Point3f(*self._middle)), d)
 
-    def _shown(self, hit: Any, ons: Sequence[Any], lit: Lit, to_local: Any) -> Any:
-        """Diffuse radiance of what was hit."""
-        found = self._texel(hit, ons, lit)
+    def _shown(self, si: Any, on: Sequence[Any], lit: Lit, to_local: Any) -> Any:
+        """Diffuse radiance of what was hit: that of a photographed ground is a share of its photograph."""
+        radiance = self._texel(si, on, lit)
         if self._photographed is not None:
-            below = dr.normalize(hit.p - mi.Point3f(0.0, 0.0, self._photographed))
-            for grid, on in zip(self._grids, ons, strict=True):
-                found = dr.select(on, found * _sky(lit, below, to_local), found) if grid.warp is not None else found
-        return found
+            below = dr.normalize(si.p - mi.Point3f(0.0, 0.0, self._photographed))
+            for grid, at in zip(self._grids, on, strict=True):
+                if grid.warp is not None:
+                    radiance = dr.select(at, radiance * _sky(lit, below, to_local), radiance)
+        return radiance
 
-    def _texel(self, hit: Any, ons: Sequence[Any], lit: Lit) -> Any:
+    def _texel(self, si: Any, on: Sequence[Any], lit: Lit) -> Any:
         """What the texels say of what was hit; 0 where it has none."""
         first, rows, columns = mi.UInt32(0), mi.UInt32(1), mi.UInt32(1)
         y, x, known = mi.Float(0.0), mi.Float(0.0), mi.Bool(False)
-        for grid, on in zip(self._grids, ons, strict=True):
-            down, across = grid_place(grid, hit.p, hit.uv)
-            y, x, known = dr.select(on, down, y), dr.select(on, across, x), known | on
-            first = dr.select(on, mi.UInt32(grid.first), first)
-            rows = dr.select(on, mi.UInt32(grid.shape[0]), rows)
-            columns = dr.select(on, mi.UInt32(grid.shape[1]), columns)
-        found = _bilinear(lit.texels, first, rows, columns, y * mi.Float(rows) - 0.5, x * mi.Float(columns) - 0.5)
-        return dr.select(known, found, 0.0)
+        for grid, at in zip(self._grids, on, strict=True):
+            down, across = grid_place(grid, si.p, si.uv)
+            y, x, known = dr.select(at, down, y), dr.select(at, across, x), known | at
+            first = dr.select(at, mi.UInt32(grid.first), first)
+            rows = dr.select(at, mi.UInt32(grid.shape[0]), rows)
+            columns = dr.select(at, mi.UInt32(grid.shape[1]), columns)
+        radiance = _bilinear(lit.texels, first, rows, columns, y * mi.Float(rows) - 0.5, x * mi.Float(columns) - 0.5)
+        return dr.select(known, radiance, 0.0)
 
 
 # ---- look-ups -------------------------------------------------------------------------------------------------------
@@ -324,14 +331,6 @@ def _seen(found: Sequence[Any], size: tuple[int, int, int]) -> Seen:
             weight=torch.from_numpy(np.abs(weight[met])),
             back=torch.from_numpy(weight[met] < 0.0),
         )
-
-
-def _chosen(number: Any, values: Sequence[float]) -> Any:
-    """The value with a number."""
-    found = mi.Float(values[0])
-    for index, value in enumerate(values[1:], 1):
-        found = dr.select(number == index, value, found)
-    return found
 
 
 def _bilinear(values: Any, first: Any, rows: Any, columns: Any, y: Any, x: Any, *, wraps: bool = False) -> Any:

@@ -89,20 +89,24 @@ def gather(
         some = slice(begin, min(count, begin + max(1, PASS // rays)))
         lane = dr.arange(mi.UInt32, (some.stop - begin) * rays)
         texel, number = lane // rays, lane % rays
+
+        # The same points for every texel, each shifted around the square by chance; over the cosine
         shift = dr.gather(mi.Point2f, _points(mi.Point2f, shifts[some]), texel)
         square = dr.gather(mi.Point2f, points, number) + shift
         square -= dr.floor(square)
         normal = dr.gather(mi.Normal3f, _points(mi.Normal3f, normals[some]), texel)
         place = dr.gather(mi.Point3f, _points(mi.Point3f, places[some]), texel)
         way = mi.Frame3f(normal).to_world(mi.warp.square_to_cosine_hemisphere(square))
-        hit = stopped(held, mi.Ray3f(place + normal * SHIFT, way), layers, _chance(layers, len(lane), (seed, begin)))
+        si = stopped(held, mi.Ray3f(place + normal * SHIFT, way), layers, _chance(layers, len(lane), (seed, begin)))
+
+        # What escapes sees a cell of the environment; what stops sees a texel, or a shape that has no light
         column, row = map_place(way, to_local)
         across, down = mi.UInt32(column * cells[1]) % cells[1], mi.UInt32(dr.minimum(row * cells[0], cells[0] - 1))
-        seen = dr.select(hit.is_valid(), mi.Int32(-1), mi.Int32(texels + down * cells[1] + across))
-        for grid, on in zip(grids, on_grids(held, grids, hit, way), strict=True):
+        seen = dr.select(si.is_valid(), mi.Int32(-1), mi.Int32(texels + down * cells[1] + across))
+        for grid, on in zip(grids, on_grids(held, grids, si, way), strict=True):
             if grid.warp is None and grid.side == 0:
-                on &= dr.dot(hit.n, way) < 0.0
-            y, x = grid_place(grid, hit.p, hit.uv)
+                on &= dr.dot(si.n, way) < 0.0
+            y, x = grid_place(grid, si.p, si.uv)
             nearest = mi.Int32(grid.first + _cell(y, grid.shape[0]) * grid.shape[1] + _cell(x, grid.shape[1]))
             seen = dr.select(on, nearest, seen)
         found[some] = seen.numpy().reshape(-1, rays)
@@ -151,9 +155,9 @@ def seen_from_behind(scene: MitsubaScene, name: str, places: Floats) -> bool:
     way = _points(mi.Vector3f, (-ways).astype(np.float32))
     ray = mi.Ray3f(_points(mi.Point3f, (targets + reach * ways).astype(np.float32)), way)
     layers = layers_of(scene)
-    hit = stopped(scene._scene, ray, layers, _chance(layers, len(ways), (0,)))
-    (on,) = on_grids(scene._scene, [TexelGrid(name, 0, (1, 1))], hit, way)
-    behind = np.asarray((on & (dr.dot(hit.n, way) > 0.0)).numpy())
+    si = stopped(scene._scene, ray, layers, _chance(layers, len(ways), (0,)))
+    (on,) = on_grids(scene._scene, [TexelGrid(name, 0, (1, 1))], si, way)
+    behind = np.asarray((on & (dr.dot(si.n, way) > 0.0)).numpy())
     return bool(behind.sum() > FROM_BEHIND * np.asarray(on.numpy()).sum())
 
 
@@ -175,30 +179,30 @@ def stopped(held: Any, ray: Any, layers: int, chance: Any = 0.5, active: Any = T
         chance: in [0, 1]; a ray goes on as long as the share of light that passes all it has met is larger.
         active: which lanes count.
     """
-    hit = held.ray_intersect(ray, mi.RayFlags.UV, False, active)
+    si = held.ray_intersect(ray, mi.RayFlags.UV, False, active)
     share = mi.Float(1.0)
     for _ in range(layers):
-        share *= passed(hit, active)
-        active = active & hit.is_valid() & (share > chance)
-        following = held.ray_intersect(hit.spawn_ray(ray.d), mi.RayFlags.UV, False, active)
-        hit = dr.select(active, following, hit)
-    return hit
+        share *= passed(si, active)
+        active = active & si.is_valid() & (share > chance)
+        following = held.ray_intersect(si.spawn_ray(ray.d), mi.RayFlags.UV, False, active)
+        si = dr.select(active, following, si)
+    return si
 
 
-def passed(hit: Any, active: Any) -> Any:
+def passed(si: Any, active: Any) -> Any:
     """The share of light that passes what was hit."""
-    return dr.mean(hit.bsdf().eval_null_transmission(hit, active & hit.is_valid()))
+    return dr.mean(si.bsdf().eval_null_transmission(si, active & si.is_valid()))
 
 
 def _passing(held: Any, ray: Any, layers: int, active: Any) -> Any:
     """The share of light that passes all that is in the way of rays."""
     share = mi.Float(1.0)
     for _ in range(layers):
-        hit = held.ray_intersect(ray, mi.RayFlags.UV, False, active)
-        active = active & hit.is_valid()
-        share = dr.select(active, share * passed(hit, active), share)
+        si = held.ray_intersect(ray, mi.RayFlags.UV, False, active)
+        active = active & si.is_valid()
+        share = dr.select(active, share * passed(si, active), share)
         active = active & (share > 0.0)
-        ray = hit.spawn_ray(ray.d)
+        ray = si.spawn_ray(ray.d)
     return dr.select(held.ray_test(ray, active), 0.0, share)
 
 
@@ -212,12 +216,12 @@ def _chance(layers: int, count: int, seed: tuple[int, ...]) -> Any:
 # ---- places ---------------------------------------------------------------------------------------------------------
 
 
-def on_grids(held: Any, grids: Sequence[TexelGrid], hit: Any, way: Any) -> list[Any]:
+def on_grids(held: Any, grids: Sequence[TexelGrid], si: Any, way: Any) -> list[Any]:
     """Whether hits of rays in a direction lie on each grid."""
-    front, shapes = dr.dot(hit.n, way) < 0.0, {one.id(): one for one in held.shapes()}
+    front, shapes = dr.dot(si.n, way) < 0.0, {one.id(): one for one in held.shapes()}
     found = []
     for grid in grids:
-        on = hit.is_valid() & (hit.shape == mi.ShapePtr(shapes[grid.name]))
+        on = si.is_valid() & (si.shape == mi.ShapePtr(shapes[grid.name]))
         found.append(on & (front if grid.side > 0 else ~front) if grid.side else on)
     return found
 
@@ -314,18 +318,18 @@ def measured(
             held = scene.held({**inputs, **changed})
             start = mi.Point3f([float(x) for x in place + 1e-3 * normal])
             ray = mi.Ray3f(start, mi.Vector3f([float(-x) for x in normal]))
-            hit = held.ray_intersect(dr.gather(mi.Ray3f, ray, dr.zeros(mi.UInt32, ANGLES * LOBE_SAMPLES)))
-            bsdf = hit.bsdf()
-            hit.wi = towards
-            opaque = dr.maximum(1.0 - passed(hit, True), 1e-3)  # of cut-outs, what stops light
-            value = bsdf.eval(mi.BSDFContext(), hit, even) / opaque
+            si = held.ray_intersect(dr.gather(mi.Ray3f, ray, dr.zeros(mi.UInt32, ANGLES * LOBE_SAMPLES)))
+            bsdf = si.bsdf()
+            si.wi = towards
+            opaque = dr.maximum(1.0 - passed(si, True), 1e-3)  # of cut-outs, what stops light
+            value = bsdf.eval(mi.BSDFContext(), si, even) / opaque
             if level:
                 found.append(dr.mean(value))
                 continue
-            sampled, weight = bsdf.sample(mi.BSDFContext(), hit, one, two)
-            back = dr.select((sampled.pdf > 0.0) & (sampled.wo.z > 0.0), dr.mean(weight) / opaque, 0.0)
+            bsdf_sample, bsdf_weight = bsdf.sample(mi.BSDFContext(), si, one, two)
+            back = dr.select((bsdf_sample.pdf > 0.0) & (bsdf_sample.wo.z > 0.0), dr.mean(bsdf_weight) / opaque, 0.0)
             back = dr.select(dr.isfinite(back), back, 0.0)
-            found += [dr.mean(value), back, sampled.wo.x, sampled.wo.z]
+            found += [dr.mean(value), back, bsdf_sample.wo.x, bsdf_sample.wo.z]
     lit, dark = (_rows(one.numpy()) / _rows(even.z.numpy() / math.pi) for one in found[:2])
     weight, x, z = (_rows(one.numpy()) for one in found[2:])
     share = weight.mean(axis=1)

@@ -104,29 +104,42 @@ def collect(scene: Any, parameters: Any, key: str, noise: Any, size: tuple[int, 
     place = (corner + noise.next_2d()) / mi.Point2f(width, height)
     aperture = noise.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
     ray, weight = sensor.sample_ray(0.0, 0.5, place, aperture)
-    first, steps = _walk(scene, ray, weight, noise, depth)
-    there = mi.TensorXf(parameters[key])
+    first, bounces = _traced(scene, ray, weight, noise, depth)
+
+    # The same BSDFs once more, now that the base colour is larger by `STEP`: their differences are the derivatives
+    base_color = mi.TensorXf(parameters[key])
     try:
-        parameters[key] = there + STEP
+        parameters[key] = base_color + STEP
         parameters.update()
-        for one in steps:
-            one.slopes()
+        slopes = [bounce.slopes() for bounce in bounces]
     finally:
-        parameters[key] = there
+        parameters[key] = base_color
         parameters.update()
-    radiance, vertices = _gathered(steps)
-    pictures = [*(radiance + first.shown), *first.others]
-    all_of_them = dr.full(mi.Bool, True, height * width * spp)
-    taking_part = [all_of_them & dr.any(one != 0.0) & dr.all(dr.isfinite(one)) for _, one, _ in vertices]
-    dr.eval(pictures, vertices, taking_part)
-    means = [dr.block_sum(channel, spp) / spp for channel in pictures]
+
+    # From the last vertex back to the camera: what leaves each towards the one before it, and what of that is a
+    # base colour's
+    L = mi.Spectrum(0.0)
+    vertices = list[tuple[Any, Any, Any]]()
+    for bounce, (slope_em, slope_bsdf) in zip(reversed(bounces), reversed(slopes), strict=True):
+        incoming = bounce.emitted_next + L
+        weight = bounce.throughput * (slope_em * bounce.em_weight + slope_bsdf * incoming)
+        vertices.append((mi.Point2f(bounce.si.uv), weight, bounce.sharp))
+        L = bounce.bsdf_value_em * bounce.em_weight + bounce.bsdf_weight * incoming
+    vertices.reverse()
+    L = dr.select(dr.isfinite(L), L, 0.0)
+
+    every = dr.full(mi.Bool, True, height * width * spp)
+    channels = [*(L + first.emitted), first.coverage, *first.background, *first.albedo, *first.normal]
+    taking_part = [every & dr.any(weight != 0.0) & dr.all(dr.isfinite(weight)) for _, weight, _ in vertices]
+    dr.eval(channels, vertices, taking_part)  # one kernel for the whole path
+    means = [dr.block_sum(channel, spp) / spp for channel in channels]
     dr.eval(means)
     picture = torch.stack([one.torch() for one in means], dim=1).reshape(*size, -1)
     radiance, coverage, background, albedo, normal = (
         one.contiguous() for one in torch.split(picture, [3, 1, 3, 3, 3], dim=-1)
     )
-    found = [_kept(*vertex, taken, spp) for vertex, taken in zip(vertices, taking_part, strict=True)]
-    return Paths(radiance, coverage, background, albedo, normal, found)
+    kept = [_kept(*vertex, taken, spp) for vertex, taken in zip(vertices, taking_part, strict=True)]
+    return Paths(radiance, coverage, background, albedo, normal, kept)
 
 
 def _kept(uv: Any, weight: Any, sharp: Any, taking_part: Any, spp: int) -> Vertices:
@@ -145,170 +158,160 @@ def _kept(uv: Any, weight: Any, sharp: Any, taking_part: Any, spp: int) -> Verti
 
 
 @dataclass
-class _First:
-    """What the camera sees.
+class FirstHit:
+    """What the camera sees: light that it sees directly (`emitted`), and by sample the pictures of `Paths`."""
 
-    Attributes:
-        shown: light that it sees directly.
-        covered, behind: the channels of `Paths.coverage` and `Paths.background`.
-        albedo, normal: those of the first hit that light does not pass.
-    """
-
-    shown: Any
-    covered: Any
-    behind: Any
+    emitted: Any
+    coverage: Any
+    background: Any
     albedo: Any
     normal: Any
 
-    def stops(self, hit: Any, bsdf: Any, where: Any) -> None:
-        """Take reflectance and normal of a hit for those of the picture."""
-        self.albedo = dr.select(where, bsdf.eval_diffuse_reflectance(hit, where), self.albedo)
-        self.normal = dr.select(where, hit.sh_frame.n, self.normal)
-
-    @property
-    def others(self) -> list[Any]:
-        """The other pictures of `Paths` by channel."""
-        return [self.covered, *self.behind, *self.albedo, *self.normal]
+    def stops(self, si: Any, bsdf: Any, where: Any) -> None:
+        """Take reflectance and normal of a hit that light does not pass for those of the picture."""
+        self.albedo = dr.select(where, bsdf.eval_diffuse_reflectance(si, where), self.albedo)
+        self.normal = dr.select(where, si.sh_frame.n, self.normal)
 
 
 @dataclass
-class _Step:
+class Bounce:
     """One vertex of all paths.
 
     Attributes:
-        through: throughput before it.
+        si, bsdf: surface interaction, and its BSDF.
+        throughput: of the path before it.
         sharp: no vertex before it scatters light.
-        to_light, on: directions to the light that was sampled and of the path; with which of them count.
-        arriving: radiance that arrives from the light over the density, weighted.
-        value, value_on: the BSDF times the cosine for both.
-        factor: throughput of the vertex.
-        hit: radiance that the path's next vertex emits, weighted.
+        wo_em, active_em: direction to the light that was sampled, and in which lanes there is one.
+        em_weight: radiance from there over the density, with its weight beside BSDF sampling.
+        wo, active_bsdf, pdf: direction of the path, in which lanes it has a density, and which.
+        bsdf_value_em, bsdf_value: the BSDF times the cosine for both directions.
+        bsdf_weight: the latter over its density: the throughput of the vertex.
+        emitted_next: radiance that the next vertex of the path emits, weighted.
     """
 
+    si: Any
     bsdf: Any
-    at: Any
-    through: Any
+    throughput: Any
     sharp: Any
-    to_light: Any
-    lit: Any
-    arriving: Any
-    value: Any
-    on: Any
-    going_on: Any
+    wo_em: Any
+    active_em: Any
+    em_weight: Any
+    bsdf_value_em: Any
+    wo: Any
+    active_bsdf: Any
     pdf: Any
-    value_on: Any
-    factor: Any
-    hit: Any
-    slope: Any = None
-    slope_on: Any = None
+    bsdf_value: Any
+    bsdf_weight: Any
+    emitted_next: Any
 
-    def slopes(self) -> None:
-        """Find the derivatives of the BSDF, now that the base colour is larger by `STEP`."""
+    def slopes(self) -> tuple[Any, Any]:
+        """The derivatives of both values by the base colour, which is larger by `STEP` now; the second over the
+        density."""
         context = mi.BSDFContext()
-        value = self.bsdf.eval(context, self.at, self.to_light, self.lit)
-        self.slope = _difference(value, self.value, self.lit)
-        value = self.bsdf.eval(context, self.at, self.on, self.going_on)
-        self.slope_on = _difference(value, self.value_on, self.going_on) / dr.select(self.going_on, self.pdf, 1.0)
+        value = self.bsdf.eval(context, self.si, self.wo_em, self.active_em)
+        slope_em = _slope(value, self.bsdf_value_em, self.active_em)
+        value = self.bsdf.eval(context, self.si, self.wo, self.active_bsdf)
+        slope = _slope(value, self.bsdf_value, self.active_bsdf)
+        return slope_em, slope / dr.select(self.active_bsdf, self.pdf, 1.0)
 
 
-def _walk(scene: Any, ray: Any, weight: Any, noise: Any, depth: int) -> tuple[_First, list[_Step]]:
+def _traced(scene: Any, ray: Any, weight: Any, noise: Any, depth: int) -> tuple[FirstHit, list[Bounce]]:
     """Trace paths; return what the camera sees, and the vertices, the first one first. Rays of weight 0 see nothing."""
-    context = mi.BSDFContext()
-    through = mi.Spectrum(1.0)
-    active, sharp = (
-        dr.any(weight > 0.0) & dr.full(mi.Bool, True, dr.width(ray.o)),
-        dr.full(mi.Bool, True, dr.width(ray.o)),
-    )
-    cut_out = any(mi.has_flag(one.bsdf().flags(), mi.BSDFFlags.Null) for one in scene.shapes() if one.bsdf())
-    passed = mi.Bool(cut_out)
-    last, last_pdf, last_delta = dr.zeros(mi.SurfaceInteraction3f), mi.Float(1.0), mi.Bool(True)
-    steps: list[_Step] = []
-    first: _First | None = None
+    context, count = mi.BSDFContext(), dr.width(ray.o)
+    active = dr.any(weight > 0.0) & dr.full(mi.Bool, True, count)
+    sharp = dr.full(mi.Bool, True, count)  # no vertex so far scatters light
+    throughput = mi.Spectrum(1.0)
+    cut_outs = any(mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Null) for shape in scene.shapes() if shape.bsdf())
+    straight = mi.Bool(cut_outs)  # the path has gone through cut-outs alone
+
+    # Of the vertex before: the camera counts as one that reflects in one direction alone
+    prev_si, prev_pdf, prev_delta = dr.zeros(mi.SurfaceInteraction3f), mi.Float(1.0), mi.Bool(True)
+    first: FirstHit | None = None
+    bounces: list[Bounce] = []
     for segment in range(depth):
-        hit = scene.ray_intersect(ray, active)
-        emitter = hit.emitter(scene, active)
-        towards = mi.DirectionSample3f(scene, hit, last)
-        by_light = scene.pdf_emitter_direction(last, towards, active & ~last_delta)
-        shown = dr.select(last_delta, 1.0, _balance(last_pdf, by_light)) * emitter.eval(hit, active)
-        shown = dr.select(active, shown, 0.0)
-        if steps:
-            steps[-1].hit = shown
-        bsdf = hit.bsdf(ray)
+        si = scene.ray_intersect(ray, active)
+
+        # ---- emission of what was hit: the vertex before may have sampled the same light, so the two share it
+        ds = mi.DirectionSample3f(scene, si, prev_si)
+        em_pdf = scene.pdf_emitter_direction(prev_si, ds, active & ~prev_delta)
+        mis = dr.select(prev_delta, 1.0, _mis_weight(prev_pdf, em_pdf))
+        emitted = dr.select(active, mis * si.emitter(scene, active).eval(si, active), 0.0)
+        if bounces:
+            bounces[-1].emitted_next = emitted
+
+        # ---- what the camera sees first; through cut-outs it sees what is behind them
+        bsdf = si.bsdf(ray)
         if first is None:
-            first = _seen(hit, shown)
-            if not cut_out:
-                first.stops(hit, bsdf, hit.is_valid())
-        active &= hit.is_valid() & mi.Bool(segment + 1 < depth)
-        if segment + 1 == depth:
+            covered, black = si.is_valid(), dr.zeros(mi.Color3f, count)
+            first = FirstHit(
+                emitted=emitted,
+                coverage=dr.select(covered, mi.Float(1.0), 0.0),
+                background=dr.select(covered, 0.0, emitted),
+                albedo=black,
+                normal=mi.Normal3f(black),
+            )
+            if not cut_outs:
+                first.stops(si, bsdf, covered)
+        active &= si.is_valid() & mi.Bool(segment + 1 < depth)
+        if segment + 1 == depth:  # the last vertex takes light along, and reflects none
             break
-        light, arriving = scene.sample_emitter_direction(hit, noise.next_2d(active), True, active)
-        lit = active & (light.pdf > 0.0)
-        to_light = hit.to_local(light.d)
-        value, pdf = bsdf.eval_pdf(context, hit, to_light, lit)
-        arriving = dr.select(lit, arriving * dr.select(light.delta, 1.0, _balance(light.pdf, pdf)), 0.0)
-        sampled, factor = bsdf.sample(context, hit, noise.next_1d(active), noise.next_2d(active), active)
-        going = active & (sampled.pdf > 0.0)
-        delta = mi.has_flag(sampled.sampled_type, mi.BSDFFlags.Delta)
-        if cut_out:
-            through_it = going & mi.has_flag(sampled.sampled_type, mi.BSDFFlags.Null)
-            first.stops(hit, bsdf, passed & active & ~through_it)
-            passed &= through_it
-        factor = dr.select(going, factor, 0.0)
-        made = _Step(
-            bsdf=bsdf,
-            at=hit,
-            through=through,
-            sharp=sharp,
-            to_light=to_light,
-            lit=lit,
-            arriving=arriving,
-            value=value,
-            on=sampled.wo,
-            going_on=going & ~delta,
-            pdf=sampled.pdf,
-            value_on=factor * sampled.pdf,
-            factor=factor,
-            hit=mi.Spectrum(0.0),
+
+        # ---- light that is sampled directly: one that a BSDF sample can't meet (a point) has all of the weight
+        ds, em_weight = scene.sample_emitter_direction(si, noise.next_2d(active), True, active)
+        active_em = active & (ds.pdf > 0.0)
+        wo_em = si.to_local(ds.d)
+        bsdf_value_em, bsdf_pdf_em = bsdf.eval_pdf(context, si, wo_em, active_em)
+        mis = dr.select(ds.delta, 1.0, _mis_weight(ds.pdf, bsdf_pdf_em))
+        em_weight = dr.select(active_em, em_weight * mis, 0.0)
+
+        # ---- the direction in which the path goes on
+        bsdf_sample, bsdf_weight = bsdf.sample(context, si, noise.next_1d(active), noise.next_2d(active), active)
+        active_next = active & (bsdf_sample.pdf > 0.0)
+        delta = mi.has_flag(bsdf_sample.sampled_type, mi.BSDFFlags.Delta)
+        if cut_outs:
+            through = active_next & mi.has_flag(bsdf_sample.sampled_type, mi.BSDFFlags.Null)
+            first.stops(si, bsdf, straight & active & ~through)
+            straight &= through
+        bsdf_weight = dr.select(active_next, bsdf_weight, 0.0)
+        bounces.append(
+            Bounce(
+                si=si,
+                bsdf=bsdf,
+                throughput=throughput,
+                sharp=sharp,
+                wo_em=wo_em,
+                active_em=active_em,
+                em_weight=em_weight,
+                bsdf_value_em=bsdf_value_em,
+                wo=bsdf_sample.wo,
+                active_bsdf=active_next & ~delta,  # a mirror's value has no derivative that could be evaluated
+                pdf=bsdf_sample.pdf,
+                bsdf_value=bsdf_weight * bsdf_sample.pdf,
+                bsdf_weight=bsdf_weight,
+                emitted_next=mi.Spectrum(0.0),
+            )
         )
-        steps.append(made)
-        through = through * factor
-        active &= going
+
+        # ---- on to the next vertex
+        throughput = throughput * bsdf_weight
+        active &= active_next
         sharp = sharp & delta
-        last, last_pdf, last_delta = hit, sampled.pdf, delta
-        ray = hit.spawn_ray(hit.to_world(sampled.wo))
+        prev_si, prev_pdf, prev_delta = si, bsdf_sample.pdf, delta
+        ray = si.spawn_ray(si.to_world(bsdf_sample.wo))
     assert first is not None
-    return first, steps
+    return first, bounces
 
 
-def _seen(hit: Any, shown: Any) -> _First:
-    """What the camera sees at the first vertices, and the radiance that these emit."""
-    covered, none = hit.is_valid(), dr.zeros(mi.Color3f, dr.width(hit.p))
-    behind = dr.select(covered, 0.0, shown)
-    return _First(shown, dr.select(covered, mi.Float(1.0), 0.0), behind, none, mi.Normal3f(none))
-
-
-def _gathered(steps: list[_Step]) -> tuple[Any, list[tuple[Any, Any, Any]]]:
-    """Return the radiance that leaves the first vertices, and texture coordinates, weights and sharpness of all."""
-    beyond = mi.Spectrum(0.0)
-    found: list[tuple[Any, Any, Any]] = []
-    for one in reversed(steps):
-        incoming = one.hit + beyond
-        weight = one.through * (one.slope * one.arriving + one.slope_on * incoming)
-        found.append((mi.Point2f(one.at.uv), weight, one.sharp))
-        beyond = one.value * one.arriving + one.factor * incoming
-    return dr.select(dr.isfinite(beyond), beyond, 0.0), found[::-1]
-
-
-def _difference(after: Any, before: Any, active: Any) -> Any:
+def _slope(after: Any, before: Any, active: Any) -> Any:
     """The derivative of a BSDF from two values; zero where they differ by rounding alone, as on other surfaces."""
     change = after - before
     return dr.select(active & (dr.max(dr.abs(change)) > ROUNDING * dr.max(dr.abs(before))), change / STEP, 0.0)
 
 
-def _balance(one: Any, other: Any) -> Any:
-    """The power heuristic's weight of a strategy with this density beside another one."""
-    total = one * one + other * other
-    return dr.select(total > 0.0, one * one / total, 0.0)
+def _mis_weight(pdf_a: Any, pdf_b: Any) -> Any:
+    """The power heuristic's weight of a strategy with the first density beside one with the second."""
+    total = pdf_a * pdf_a + pdf_b * pdf_b
+    return dr.select(total > 0.0, pdf_a * pdf_a / total, 0.0)
 
 
 def first_hits(scene: Any, sensor: Any, resolution: tuple[int, int]) -> Surfaces:
@@ -336,22 +339,25 @@ def first_hits(scene: Any, sensor: Any, resolution: tuple[int, int]) -> Surfaces
     normal, uv = dr.zeros(mi.Normal3f, count), dr.zeros(mi.Point2f, count)
     shapes = scene.shapes()
     while dr.any(active):
-        hit = scene.ray_intersect(ray, active)
-        active &= hit.is_valid()
-        shining = dr.max(hit.emitter(scene, active).eval(hit, active)) > 0.0
-        flags = hit.bsdf().flags()
-        clear = dr.max(hit.bsdf().eval_null_transmission(hit, active)) > 0.5
-        passes = active & mi.has_flag(flags, mi.BSDFFlags.Null) & (clear | ~mi.has_flag(flags, mi.BSDFFlags.Smooth))
-        passes &= ~shining
+        si = scene.ray_intersect(ray, active)
+        active &= si.is_valid()
+        bsdf = si.bsdf()
+
+        # Most of the light passes, as through a hole in a leaf, and nothing shines: the ray goes on behind it
+        shining = dr.max(si.emitter(scene, active).eval(si, active)) > 0.0
+        clear = dr.max(bsdf.eval_null_transmission(si, active)) > 0.5
+        alone = ~mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)  # nothing is there but what lets light pass
+        passes = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) & (clear | alone) & ~shining
+
         seen = active & ~passes
         for place_of, shape in enumerate(shapes, 1):
-            number[seen & (hit.shape == mi.ShapePtr(shape))] = mi.UInt32(place_of)
-        face[seen] = hit.prim_index
-        depth[seen] = dr.norm(hit.p - eye)
-        z_depth[seen] = dr.dot(hit.p - eye, ahead)
-        normal[seen] = mi.Normal3f(hit.sh_frame.n)
-        uv[seen] = mi.Point2f(hit.uv.x, 1.0 - hit.uv.y)  # Mitsuba's rows of a texture begin at the top
-        ray, active = hit.spawn_ray(ray.d), passes
+            number[seen & (si.shape == mi.ShapePtr(shape))] = mi.UInt32(place_of)
+        face[seen] = si.prim_index
+        depth[seen] = dr.norm(si.p - eye)
+        z_depth[seen] = dr.dot(si.p - eye, ahead)
+        normal[seen] = mi.Normal3f(si.sh_frame.n)
+        uv[seen] = mi.Point2f(si.uv.x, 1.0 - si.uv.y)  # Mitsuba's rows of a texture begin at the top
+        ray, active = si.spawn_ray(ray.d), passes
     size = (height, width)
     return Surfaces(
         names=tuple(shape.id() for shape in shapes),

@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from functools import partial
 
 import numpy as np
 import scipy.sparse
@@ -28,6 +28,7 @@ from advsearch.scene.description import OBJECT
 from advsearch.scene.grounds import irradiance as unshadowed
 from advsearch.scene.mitsuba_backend.surface import RAYS, Lit, Seen, Views, lit_arrays
 from advsearch.scene.mitsuba_backend.texel_rays import Ints, Lobes, gather, measured, seen_from_behind, to_map, towards
+from advsearch.scene.predictor import LinearMap
 from advsearch.scene.raster import rasterised
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.surface.texels import (
@@ -78,21 +79,17 @@ class SurfaceView:
 
     def radiance(self, reflected: Tensor) -> Tensor:
         """Return (H, W, 3) for what the fine grid reflects (sides x cells, 3); differentiable in it."""
-        found: Tensor = SparseProduct.apply(self.matrix, reflected)  # type: ignore[no-untyped-call]
-        return self.rest + found.reshape(self.rest.shape)
+        return self.rest + product(self.matrix, reflected).reshape(self.rest.shape)
 
 
-class SparseProduct(torch.autograd.Function):
-    """A sparse matrix times columns, with its transpose as the derivative, any number of times."""
+def product(matrix: scipy.sparse.csr_matrix, columns: Tensor) -> Tensor:
+    """Return a sparse matrix times columns (k, 3); differentiable in these."""
 
-    @staticmethod
-    def forward(ctx: Any, matrix: scipy.sparse.csr_matrix, values: Tensor) -> Tensor:
-        ctx.matrix = matrix
-        return torch.from_numpy(matrix @ values.detach().numpy())
+    def times(of: scipy.sparse.csr_matrix, values: Tensor) -> Tensor:
+        return torch.from_numpy(of @ values.numpy())
 
-    @staticmethod
-    def backward(ctx: Any, cotangent: Tensor) -> tuple[None, Tensor]:
-        return None, SparseProduct.apply(ctx.matrix.T, cotangent)  # type: ignore[no-untyped-call]
+    found: Tensor = LinearMap.apply(partial(times, matrix), partial(times, matrix.T), columns)  # type: ignore[no-untyped-call]
+    return found
 
 
 GATHERED = 256
@@ -259,10 +256,7 @@ class Arrangement:
     def finer(self, color: Tensor) -> Tensor:
         """Return a base colour (h, w, 3) on the fine grid, (cells, 3); differentiable."""
         flat = color.reshape(-1, 3)
-        if self._finer is None:
-            return flat
-        found: Tensor = SparseProduct.apply(self._finer, flat)  # type: ignore[no-untyped-call]
-        return found
+        return flat if self._finer is None else product(self._finer, flat)
 
     def light(self, padded: Tensor, color: Tensor) -> Light:
         """Return the light of an environment (H, W + 2, 3) where the object has a base colour (h, w, 3)."""

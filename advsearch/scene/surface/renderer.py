@@ -1,4 +1,4 @@
-"""A renderer of pictures from many cameras and under many environments: light is kept on surfaces.
+"""Pictures from many cameras and under many environments: light is kept on surfaces.
 
 `why_not` says which scenes and spaces have pictures that it may predict.
 """
@@ -16,10 +16,9 @@ from torch import Tensor
 from advsearch.files import scaled
 from advsearch.scene.description import OBJECT
 from advsearch.scene.mitsuba_backend.surface import RAYS
+from advsearch.scene.predictor import MOST_BYTES, NOISE, Predictor, differs
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.surface.arrangement import CAMERAS, COLOR, FREE, MAP, Arrangement, Light, SurfaceView
-from advsearch.scene.transport.lights import NOISE
-from advsearch.scene.transport.matrix import MOST_BYTES, PredictingRenderer
 
 MOST_RAYS = 1 << 21
 """Rays of cameras of one launch."""
@@ -57,53 +56,68 @@ class Sketch:
         return torch.where(self.mean > 0.0, other.mean / self.mean, 1.0)
 
 
-class SurfaceRenderer(PredictingRenderer):
-    """A renderer whose pictures come from light on surfaces; for spaces that `why_not` says nothing against.
+class SurfaceRenderer(Predictor):
+    """Predicts pictures by light on surfaces, in spaces that `why_not` says nothing against.
 
     A picture is linear in the base colour of the object. Light that goes from the object to itself, or to the ground
     and back, is that of the base colour `there`.
 
     Args:
-        renderer: the one that traces paths.
+        traced: the renderer that traces paths.
         u: everything but cameras, environment and base colour stays as it is there.
         seed: number of the noise of the rays that say what texels see.
 
     Attributes:
         arrangement: object and surroundings.
         there: (h, w, 3) the base colour whose light between surfaces is kept; see `renew`.
-        lights: those that are kept, the oldest first.
+        lights_kept: by what tells their maps apart, the oldest first.
         dropped: lights that made room for others.
+        fixed: the light of all pictures; None for that of their own environment. See `under`.
     """
 
-    def __init__(self, renderer: Renderer, u: Tensor, seed: int) -> None:
-        vars(self).update(vars(copy.copy(renderer)))
-        self.products = self.dropped = 0
-        self.lights: dict[Sketch, Light] = {}
-        self._base = {name: self.scene.base(name) for name in (*CAMERAS, MAP, COLOR) if name in self.scene.names}
+    fixed: Light | None = None
+
+    def __init__(self, traced: Renderer, u: Tensor, seed: int) -> None:
+        super().__init__(traced)
+        self.dropped = 0
+        self.lights_kept: dict[Sketch, Light] = {}
+        self._base = {name: traced.scene.base(name) for name in (*CAMERAS, MAP, COLOR) if name in traced.scene.names}
+        inputs = self.inputs(u)
+        self.there = self.color(inputs)
+        standing = {name: inputs[name] for name in inputs if name not in FREE}
         with torch.no_grad():
-            inputs = self.scene.assembly(self.space.inputs(u))
-            self.there = self.color(inputs)
-            standing = {name: inputs[name] for name in inputs if name not in FREE}
-            texture = self.there.shape[0], self.there.shape[1]
-            self.arrangement = Arrangement(renderer, standing, texture, seed)
+            self.arrangement = Arrangement(traced, standing, (self.there.shape[0], self.there.shape[1]), seed)
+
+    def inputs(self, u: Tensor) -> dict[str, Tensor]:
+        """Return the scene inputs of a configuration (d,), without a graph."""
+        with torch.no_grad():
+            return self.traced.scene.assembly(self.traced.space.inputs(u))
+
+    def color(self, inputs: Mapping[str, Tensor]) -> Tensor:
+        """Return the base colour (h, w, 3) of scene inputs."""
+        return inputs.get(COLOR, self._base[COLOR])
 
     def stands(self, inputs: Mapping[str, Tensor]) -> bool:
         """Whether everything but cameras and environment is the same in scene inputs."""
-        own, others = self.arrangement.inputs, {name: inputs[name] for name in inputs if name not in FREE}
-        if own.keys() != others.keys() or not _same(self.there, self.color(inputs)):
-            return False
-        return all(_same(own[name], others[name]) for name in own)
+        standing = {**self.arrangement.inputs, COLOR: self.there}
+        others = {name: inputs[name] for name in inputs if name not in FREE} | {COLOR: self.color(inputs)}
+        return standing.keys() == others.keys() and not any(differs(standing[name], others[name]) for name in standing)
 
     def renew(self, u: Tensor) -> None:
         """Take the light between surfaces from the base colour at u from now on."""
-        with torch.no_grad():
-            self.there = self.color(self.scene.assembly(self.space.inputs(u)))
-        self.lights.clear()
+        self.there = self.color(self.inputs(u))
+        self.lights_kept.clear()
+
+    def under(self, inputs: Mapping[str, Tensor]) -> SurfaceRenderer:
+        """Return what predicts pictures that are all under the environment of some scene inputs."""
+        other = copy.copy(self)
+        other.fixed, other.lights_kept = self.light(inputs), {}
+        return other
 
     @property
     def at_once(self) -> int:
         """Cameras of one launch, at most."""
-        height, width = self.formation.resolution
+        height, width = self.traced.formation.resolution
         return max(1, MOST_RAYS // (height * width * RAYS))
 
     @property
@@ -112,7 +126,13 @@ class SurfaceRenderer(PredictingRenderer):
 
     @property
     def bytes(self) -> int:
-        return self.arrangement.bytes + sum(one.bytes for one in self.lights.values())
+        if self.fixed is not None:  # of its own: the rest is shared
+            return self.fixed.bytes
+        return self.arrangement.bytes + sum(one.bytes for one in self.lights_kept.values())
+
+    @property
+    def lights(self) -> int:
+        return 0
 
     def light(self, inputs: Mapping[str, Tensor]) -> Light:
         """Make the light under the environment of scene inputs."""
@@ -122,39 +142,25 @@ class SurfaceRenderer(PredictingRenderer):
         """Return the light under the environment of scene inputs, and a factor (3,) on it: exposures and tints of one
         map have one light. It is made on first use, and `MOST_BYTES` of them are kept."""
         sketch = Sketch.of(inputs.get(MAP, self._base[MAP]).detach())
-        for one, light in self.lights.items():
-            factor = one.times(sketch)
+        for known, light in self.lights_kept.items():
+            factor = known.times(sketch)
             if factor is not None:
                 return light, factor
-        self.lights[sketch] = light = self.light(inputs)
-        while len(self.lights) > 1 and self.bytes > scaled(MOST_BYTES):
-            self.lights.pop(next(iter(self.lights)))
+        self.lights_kept[sketch] = light = self.light(inputs)
+        while len(self.lights_kept) > 1 and self.bytes > scaled(MOST_BYTES):
+            self.lights_kept.pop(next(iter(self.lights_kept)))
             self.dropped += 1
         return light, torch.ones(3)
 
-    def pictures(self, inputs: Sequence[Mapping[str, Tensor]], color: Tensor, wholes: Sequence[Tensor]) -> Tensor:
-        """Return the pictures (n, H, W, 3) sRGB of a base colour for several cameras and environments; those under one
-        environment in one launch. Differentiable in the base colour.
-
-        Args:
-            inputs: of the scene, for each; their base colour does not count.
-            color: (h, w, 3) base colour.
-            wholes: (d,) configurations of the space, for what controls do to the finished picture.
-        """
-        return self.shown(self.looks(inputs), inputs, color, wholes)
-
-    def looks(self, inputs: Sequence[Mapping[str, Tensor]], light: Light | None = None) -> Iterator[Look]:
-        """Look through cameras; those under one environment in one launch, while the last launch's are made use of.
-
-        Args:
-            inputs: of the scene, for each.
-            light: in place of theirs.
-        """
-        lights = [self.kept_light(one) if light is None else (light, 1.0) for one in inputs]
+    def looks(self, inputs: Sequence[Mapping[str, Tensor]]) -> Iterator[Look]:
+        """Look through the cameras of scene inputs; those under one environment in one launch, while the last launch's
+        are made use of."""
+        lights = [self.kept_light(one) if self.fixed is None else (self.fixed, 1.0) for one in inputs]
         groups: dict[Light, list[int]] = {}
         for number, (one, _) in enumerate(lights):
             groups.setdefault(one, []).append(number)
-        looks = (self.arrangement.look([self._camera(inputs[n]) for n in some], lit) for lit, some in groups.items())
+        cameras = [{name: one.get(name, self._base[name]) for name in CAMERAS if name in self._base} for one in inputs]
+        looks = (self.arrangement.look([cameras[number] for number in some], lit) for lit, some in groups.items())
         begun = next(looks)
         for lit, numbers in groups.items():
             seen = begun()
@@ -165,31 +171,35 @@ class SurfaceRenderer(PredictingRenderer):
     def shown(
         self, looks: Iterable[Look], inputs: Sequence[Mapping[str, Tensor]], color: Tensor, wholes: Sequence[Tensor]
     ) -> Tensor:
-        """Return the pictures of what cameras see; arguments as of `pictures`."""
-        fine, reflected, found = self.arrangement.finer(color), dict[Light, Tensor](), dict[int, Tensor]()
+        """Return the pictures (n, H, W, 3) sRGB of what cameras see; differentiable in the base colour.
+
+        Args:
+            looks: see `looks`.
+            inputs: of the scene, for each; their base colour does not count.
+            color: (h, w, 3) base colour.
+            wholes: (d,) configurations of the space, for what controls do to the finished picture.
+        """
+        fine, reflected, pictures = self.arrangement.finer(color), dict[Light, Tensor](), dict[int, Tensor]()
         for look in looks:
             if look.light not in reflected:
                 reflected[look.light] = look.light.reflected(fine)
             radiance = look.view.radiance(reflected[look.light]) * look.factor
-            found[look.number] = self._shown(radiance, inputs[look.number], wholes[look.number])
-        self.products += len(found)
-        return torch.stack([found[number] for number in range(len(inputs))])
+            pictures[look.number] = self.traced.finished(radiance, inputs[look.number], wholes[look.number])
+        return torch.stack([pictures[number] for number in range(len(inputs))])
 
-    def _rendered(self, inputs: Mapping[str, Tensor], seed: int, spp: int, hide: bool) -> Tensor:
+    def pictures(self, us: Sequence[Tensor]) -> list[Tensor]:
+        """Return pictures of configurations that differ in camera and environment alone, many in one launch."""
+        found = list[Tensor]()
+        with torch.no_grad():
+            for begin in range(0, len(us), self.at_once):
+                some = us[begin : begin + self.at_once]
+                inputs = [self.inputs(u) for u in some]
+                found += self.shown(self.looks(inputs), inputs, self.there, some)
+        return found
+
+    def radiance(self, inputs: Mapping[str, Tensor]) -> Tensor:
         (look,) = self.looks([inputs])
-        self.products += 1
         return look.view.radiance(look.light.reflected(self.arrangement.finer(self.color(inputs)))) * look.factor
-
-    def _camera(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        return {name: inputs.get(name, self._base[name]) for name in CAMERAS if name in self._base}
-
-    def color(self, inputs: Mapping[str, Tensor]) -> Tensor:
-        """The base colour (h, w, 3) of scene inputs."""
-        return inputs.get(COLOR, self._base[COLOR])
-
-
-def _same(one: Tensor, other: Tensor) -> bool:
-    return one.shape == other.shape and torch.equal(one, other)
 
 
 PLACES = (0.02, 0.29, 0.61, 0.97)
@@ -208,11 +218,9 @@ def why_not(renderer: Renderer, varying: Collection[str]) -> str | None:
     if reason is not None:
         return reason
     for group in renderer.plan.groups:
-        if group.control in varying or group.estimator == "image":
-            continue
-        reached = renderer.routes.get(group.name, frozenset())
-        if reached != {COLOR}:
-            return f"{group.name} changes more than the object's base colour"
+        if group.control not in varying and group.estimator != "image":
+            if renderer.routes.get(group.name, frozenset()) != {COLOR}:
+                return f"{group.name} changes more than the object's base colour"
     changed = varied(renderer, varying)
     if not changed <= FREE:
         return f"{', '.join(sorted(changed - FREE))} varies, and light on surfaces is kept for one arrangement"
@@ -229,30 +237,19 @@ def why_not_kept(renderer: Renderer) -> str | None:
         return "there is more in the scene than the object, its ground and an environment"
     if renderer.scene.volumetric or description.thin_lens or description.backdrop:
         return "there is haze, a lens with an aperture, or a plain background"
-    if renderer.formation.denoiser != "oidn":
-        return NOISE
-    return None
+    return None if renderer.formation.denoiser == "oidn" else NOISE
 
 
 def varied(renderer: Renderer, varying: Collection[str]) -> frozenset[str]:
     """The scene inputs that some controls, or groups of coordinates, change; by their names."""
+    found: set[str] = set()
     with torch.no_grad():
         start = renderer.scene.assembly(renderer.space.inputs(renderer.start))
-        found: set[str] = set()
-        for place in _places(renderer, varying):
-            there = renderer.scene.assembly(renderer.space.inputs(place))
-            found |= {name for name in start.keys() | there.keys() if _differs(start.get(name), there.get(name))}
+        for value in PLACES:
+            u = renderer.start.clone()
+            for group in renderer.space.groups:
+                if group.control in varying or group.name in varying:
+                    u[group.coordinates] = value
+            there = renderer.scene.assembly(renderer.space.inputs(u))
+            found |= {name for name in start.keys() | there.keys() if differs(start.get(name), there.get(name))}
     return frozenset(found)
-
-
-def _places(renderer: Renderer, varying: Collection[str]) -> Iterator[Tensor]:
-    for value in PLACES:
-        place = renderer.start.clone()
-        for group in renderer.space.groups:
-            if group.control in varying or group.name in varying:
-                place[group.coordinates] = value
-        yield place
-
-
-def _differs(one: Tensor | None, other: Tensor | None) -> bool:
-    return one is None or other is None or one.shape != other.shape or not torch.equal(one, other)

@@ -12,8 +12,7 @@ off below zero is why they need not meet it.
 
 from __future__ import annotations
 
-import copy
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -25,8 +24,9 @@ from advsearch.scene.assembly import ON_PICTURE
 from advsearch.scene.geometry import real_harmonics
 from advsearch.scene.gradients import Group
 from advsearch.scene.parts import PluginPart
+from advsearch.scene.predictor import NOISE, Predictor, differs
 from advsearch.scene.renderer import Renderer
-from advsearch.scene.transport.matrix import SPP, LinearRenderer, PredictingRenderer, linear_inputs, passes
+from advsearch.scene.transport.matrix import SPP, LinearRenderer, Tick, linear_inputs, passes
 
 ENVIRONMENT = "environment.padded"
 LAMPS = (".intensity", ".radiance")
@@ -96,68 +96,59 @@ def lighting(renderer: Renderer) -> Lighting:
     with torch.no_grad():
         here = renderer.scene.assembly(renderer.space.inputs(middle))
         for group in renderer.space.groups:
-            found: set[str] = set()
+            changed: set[str] = set()
             most, brightest = -1.0, middle
             for place in _places(group, middle):
                 there = renderer.scene.assembly(renderer.space.inputs(place))
-                changes = _changes(here, there, group.size)
-                if None in changes.values():
+                ways = {name: _change(name, here.get(name), there.get(name), group.size) for name in here | there}
+                if None in ways.values():
                     break
                 if ENVIRONMENT in there and float(there[ENVIRONMENT].sum()) > most:
                     most, brightest = float(there[ENVIRONMENT].sum()), place
-                found |= changes.keys()
-                if changes.get(ENVIRONMENT) == "harmonics":
+                changed |= {name for name, way in ways.items() if way}
+                if ways.get(ENVIRONMENT) == "harmonics":
                     harmonic.add(group.name)
             else:
-                if not found <= ON_PICTURE and fixed_lights(renderer):
+                if not changed <= ON_PICTURE and fixed_lights(renderer):
                     continue
-                groups[group.name] = frozenset(found)
-                if ENVIRONMENT in found and group.name not in harmonic:
+                groups[group.name] = frozenset(changed)
+                if ENVIRONMENT in changed and group.name not in harmonic:
                     bright.append((group.coordinates, brightest[group.coordinates]))
     return Lighting(groups, frozenset(harmonic & groups.keys()), tuple(bright))
 
 
 def _places(group: Group, middle: Tensor) -> Iterator[Tensor]:
     """Configurations that differ in one group."""
+    values = list(BETWEEN)
     if group.options:
-        step = -(-group.options // PROBED)
-        values = [(number + 0.5) / group.options for number in range(0, group.options, step)]
-    else:
-        values = list(BETWEEN)
+        values = [(number + 0.5) / group.options for number in range(0, group.options, -(-group.options // PROBED))]
     numbers = [torch.full((group.size,), value) for value in values]
     if group.size > 1:
         numbers.append(torch.rand(group.size, generator=torch.Generator().manual_seed(0)))
-    for one in numbers:
+    for chosen in numbers:
         place = middle.clone()
-        place[group.coordinates] = one
+        place[group.coordinates] = chosen
         yield place
 
 
-def _changes(here: Inputs, there: Inputs, numbers: int) -> dict[str, str | None]:
-    """The inputs that differ by so many numbers, with how, in words; None of one that is more than light."""
-    found: dict[str, str | None] = {name: None for name in here.keys() ^ there.keys()}
-    for name in here.keys() & there.keys():
-        one, other = here[name], there[name]
-        if one.shape == other.shape and torch.equal(one, other):
-            continue
-        if name in ON_PICTURE or name.endswith(LAMPS):
-            found[name] = "power"
-        else:
-            found[name] = _change_of_map(one, other, numbers) if name == ENVIRONMENT else None
-    return found
-
-
-def _change_of_map(one: Tensor, other: Tensor, numbers: int) -> str | None:
-    """How a map (H, W, 3) differs from another one: times a colour, or plus spherical harmonics; None if neither."""
-    if one.shape != other.shape:
+def _change(name: str, here: Tensor | None, there: Tensor | None, numbers: int) -> str | None:
+    """How so many numbers change an input: in power and colour, by spherical harmonics, or not at all (empty); None if
+    in more than light."""
+    if here is None or there is None:
         return None
-    if _explained(one[None], other):
+    if not differs(here, there):
+        return ""
+    if name in ON_PICTURE or name.endswith(LAMPS):
+        return "power"
+    if name != ENVIRONMENT or here.shape != there.shape:
+        return None
+    if _explained(here[None], there):
         return "power"
     if numbers == 1:  # one number adds no harmonics of a choice
         return None
-    basis = torch.cat([one[None], _harmonic_maps(one)])
-    some = basis[:, ::FEW, ::FEW], other[::FEW, ::FEW]  # tells most others apart in a tenth of the time
-    return "harmonics" if _explained(*some) and _explained(basis, other) else None
+    basis = torch.cat([here[None], _harmonic_maps(here)])
+    some = basis[:, ::FEW, ::FEW], there[::FEW, ::FEW]  # tells most others apart in a tenth of the time
+    return "harmonics" if _explained(*some) and _explained(basis, there) else None
 
 
 def _explained(basis: Tensor, lit: Tensor) -> bool:
@@ -240,9 +231,16 @@ class Lights:
         self._still = bool(still) or not (self._lamps or lit)
         self.alone: list[Inputs] = [{**dark, **still}] if self._still else []
         self.alone += [{**dark, name: torch.ones(3)} for name in self._lamps]
-        self._span = Span(_basis_maps(renderer, own[ENVIRONMENT], bool(lighting.harmonic))) if lit else None
-        if self._span is not None:
-            self.alone += [{**dark, ENVIRONMENT: one} for one in self._span.maps]
+        self._span: Span | None = None
+        if lit:
+            there = own[ENVIRONMENT]
+            maps = there[None]
+            if lighting.harmonic:  # added where the environment is not cut off
+                start = renderer.scene.assembly(renderer.space.inputs(renderer.start))[ENVIRONMENT]
+                whole = (there > 0.0) | (start <= 0.0 if start.shape == there.shape else torch.zeros_like(there).bool())
+                maps = torch.cat([maps, _harmonic_maps(there) * whole.to(torch.float32)])
+            self._span = Span(maps)
+            self.alone += [{**dark, ENVIRONMENT: one} for one in maps]
 
     def weights(self, inputs: Inputs) -> Tensor:
         """Return how much of each light there is in a configuration, (lights, 3); differentiable."""
@@ -253,23 +251,14 @@ class Lights:
         return torch.cat(found)
 
 
-def _basis_maps(renderer: Renderer, there: Tensor, harmonic: bool) -> Tensor:
-    """The basis maps (k, H, W, 3) of an environment: itself, and spherical harmonics where it is not cut off."""
-    if not harmonic:
-        return there[None]
-    start = renderer.scene.assembly(renderer.space.inputs(renderer.start))[ENVIRONMENT]
-    whole = (there > 0.0) | (start <= 0.0 if start.shape == there.shape else torch.zeros_like(there).bool())
-    return torch.cat([there[None], _harmonic_maps(there) * whole.to(torch.float32)])
-
-
-class BasisRenderer(PredictingRenderer):
-    """A renderer whose pictures are put together from one basis picture a light.
+class BasisRenderer(Predictor):
+    """Puts pictures together from one basis picture a light.
 
     Where base colours are searched too, each light has matrices of its own, so that radiance is bilinear in both: to
     first order in the base colours, under any light.
 
     Args:
-        renderer: the one that traces paths.
+        traced: the renderer that traces paths.
         u: where base colours are linearised; what does not move is as it is there.
         seed: number of the noise.
         tick: told of samples a pixel as they are traced, `samples_to_collect` in all.
@@ -278,24 +267,23 @@ class BasisRenderer(PredictingRenderer):
 
     def __init__(
         self,
-        renderer: Renderer,
+        traced: Renderer,
         u: Tensor,
         seed: int,
-        tick: Callable[[int], None] = lambda samples: None,
+        tick: Tick = lambda samples: None,
         *,
         moving: Lighting | None = None,
     ) -> None:
-        vars(self).update(vars(copy.copy(renderer)))
-        self.products = 0
+        super().__init__(traced)
         with torch.no_grad():
-            moving = moving or lighting(renderer)
-            inputs = self.scene.assembly(self.space.inputs(moving.at_its_brightest(u)))
-            self._lights = Lights(renderer, moving, inputs)
+            moving = moving or lighting(traced)
+            brightest = traced.scene.assembly(traced.space.inputs(moving.at_its_brightest(u)))
+            self._lights = Lights(traced, moving, brightest)
             self._of_each = [
-                LinearRenderer(renderer, u, seeds.stream(seed, "light", number), tick, light=alone)
+                LinearRenderer(traced, u, seeds.stream(seed, "light", number), tick, light=alone)
                 for number, alone in enumerate(self._lights.alone)
             ]
-        self.non_finite += sum(one.non_finite - renderer.non_finite for one in self._of_each)
+        self.non_finite = sum(one.non_finite for one in self._of_each)
 
     @property
     def lights(self) -> int:
@@ -310,16 +298,14 @@ class BasisRenderer(PredictingRenderer):
     def bytes(self) -> int:
         return sum(one.bytes for one in self._of_each)
 
-    def _rendered(self, inputs: Mapping[str, Tensor], seed: int, spp: int, hide: bool) -> Tensor:
-        pictures = [one._rendered(inputs, seed, spp, hide) for one in self._of_each]
+    def radiance(self, inputs: Inputs) -> Tensor:
+        pictures = [one.radiance(inputs) for one in self._of_each]
         radiance = torch.einsum("lc,lhwc->hwc", self._lights.weights(inputs), torch.stack(pictures)[..., :3])
-        self.products += 1
-        return torch.cat([radiance, pictures[0][..., 3:]], dim=-1) if hide else radiance
+        return torch.cat([radiance, pictures[0][..., 3:]], dim=-1)
 
 
 HAZE = "there is haze"
-NOISE = "noise is part of the picture without the denoiser"
-"""Reasons that stand alone: without haze, or with the denoiser, pictures of the same space could be predicted."""
+"""A reason that stands alone: without haze, pictures of the same space could be predicted."""
 
 
 def why_not(renderer: Renderer, varying: Collection[str] = ()) -> str | None:
@@ -332,14 +318,17 @@ def why_not(renderer: Renderer, varying: Collection[str] = ()) -> str | None:
     plan, linear = renderer.plan, linear_inputs(renderer)
     searched = [group for group in plan.groups if group.control not in varying]
     lit = {} if varying else lighting(renderer).groups
+    hazes = tuple(f"{part.name}." for part in renderer.scene.made[0].parts if part.volumetric)
     for group in searched:
         if "forced" in group.reason and group.estimator not in ("none", "image"):
             return f"the estimator of {group.name} is forced"
-        if group.estimator == "image" or group.name in lit or _of_haze(renderer, group.name):
+        reached = renderer.routes.get(group.name, frozenset())
+        of_haze = bool(reached) and all(name.startswith(hazes) for name in reached)
+        if group.estimator == "image" or group.name in lit or of_haze:
             continue
-        if renderer.routes.get(group.name, frozenset()) & light_inputs(renderer) and fixed_lights(renderer):
+        if reached & light_inputs(renderer) and fixed_lights(renderer):
             return f"{group.name} changes light, and the scene has other lights of its own"
-        if group.estimator != "adjoint" or not renderer.routes.get(group.name, frozenset()) <= linear:
+        if group.estimator != "adjoint" or not reached <= linear:
             return f"{group.name} changes more than base colours{'' if varying else ' and light'}"
     if not any(renderer.routes.get(group.name) or lit.get(group.name) for group in searched):
         return "nothing that is searched needs a render to be differentiated"
@@ -348,16 +337,7 @@ def why_not(renderer: Renderer, varying: Collection[str] = ()) -> str | None:
     return None if renderer.formation.denoiser == "oidn" else NOISE
 
 
-def _of_haze(renderer: Renderer, group: str) -> bool:
-    """Whether a group of coordinates changes haze alone."""
-    hazes = tuple(f"{part.name}." for part in renderer.scene.made[0].parts if part.volumetric)
-    inputs = renderer.routes.get(group, frozenset())
-    return bool(inputs) and all(name.startswith(hazes) for name in inputs)
-
-
-def predicting(
-    renderer: Renderer, u: Tensor, seed: int, tick: Callable[[int], None] = lambda samples: None
-) -> PredictingRenderer:
+def predicting(renderer: Renderer, u: Tensor, seed: int, tick: Tick = lambda samples: None) -> Predictor:
     """Return what predicts the pictures of a renderer's space, made at u; arguments as for `LinearRenderer`."""
     moving = lighting(renderer)
     if moving.moved:

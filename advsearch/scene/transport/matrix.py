@@ -13,9 +13,7 @@ in 32, by rows and by columns, so that a product with it is one call.
 
 from __future__ import annotations
 
-import copy
 import warnings
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
@@ -34,6 +32,7 @@ from advsearch.scene.assembly import ON_PICTURE
 from advsearch.scene.assets import Floats, Ints
 from advsearch.scene.mitsuba_backend.denoise import denoise
 from advsearch.scene.mitsuba_backend.transport import Paths, Vertices, mean_of
+from advsearch.scene.predictor import MOST_BYTES, LinearMap, Predictor
 from advsearch.scene.renderer import InputSpace, Renderer
 
 Smooth = Callable[[Tensor], Tensor]
@@ -126,23 +125,20 @@ class ColouredRows:
         self._kept_colours = Halves(colours if smooth is None else smooth(colours))
         self._colours = np.zeros((0, 3), dtype=np.float32)
 
-    def times(self, values: Floats) -> Floats:
+    def times(self, values: Tensor) -> Tensor:
         """Return the matrix times (columns, 3): (rows, 3)."""
         if self._both_ways is not None:
-            found: Floats = (self._both_ways[0] @ torch.from_numpy(values)).numpy()
+            product = self._both_ways[0] @ values
         else:
-            found = self._shares() @ values
-        found = found * self._kept_colours().reshape(-1, 3).numpy()
-        return found
+            product = torch.from_numpy(self._shares() @ values.numpy())
+        return product * self._kept_colours().reshape(-1, 3)
 
-    def transposed_times(self, values: Floats) -> Floats:
+    def transposed_times(self, values: Tensor) -> Tensor:
         """Return the transpose times (rows, 3): (columns, 3)."""
-        coloured = values * self._kept_colours().reshape(-1, 3).numpy()
+        coloured = values * self._kept_colours().reshape(-1, 3)
         if self._both_ways is not None:
-            found: Floats = (self._both_ways[1] @ torch.from_numpy(coloured)).numpy()
-        else:
-            found = self._shares().T @ coloured
-        return found
+            return self._both_ways[1] @ coloured
+        return torch.from_numpy(self._shares().T @ coloured.numpy())
 
     def _shares(self) -> scipy.sparse.csr_matrix:
         assert self._kept is not None, "finish it first"
@@ -162,7 +158,11 @@ class TextureTransport:
     def __init__(self, picture: tuple[int, int], texture: tuple[int, int], *, small: bool = False) -> None:
         self._picture, self._texture = picture, texture
         self._cells = (-(-texture[0] // COARSE), -(-texture[1] // COARSE))
-        tall, wide = (_lengths(texels, cells) for texels, cells in zip(texture, self._cells, strict=True))
+        # texels of each cell along one side, of which the last one may have fewer
+        tall, wide = (
+            (texels - COARSE * torch.arange(cells)).clamp(max=COARSE).to(torch.float32)
+            for texels, cells in zip(texture, self._cells, strict=True)
+        )
         self._in_cell = (tall[:, None] * wide[None, :])[:, :, None]
         pixels = picture[0] * picture[1]
         self._first = ColouredRows(pixels, texture[0] * texture[1], small)
@@ -178,9 +178,18 @@ class TextureTransport:
 
     def add(self, vertices: Sequence[Vertices], share: float) -> None:
         """Add a pass of paths, vertices by their place in the path; it counts as this share of the samples."""
-        for one in vertices:
-            self._first.add(*_bilinear(one.only(one.sharp), self._texture, share))
-            self._later.add(*_nearest(one.only(~one.sharp), self._cells, share))
+        for vertex in vertices:
+            seen = vertex.only(vertex.sharp)
+            texels, shares = bilinear(seen.uv.numpy(), self._texture)
+            weights = seen.weight.numpy() * np.float32(share)
+            self._first.add(seen.pixel.numpy(), texels.astype(np.int64), shares, weights)
+            scattered = vertex.only(~vertex.sharp)
+            uv, (rows, columns) = scattered.uv.numpy() % 1.0, self._cells
+            column = np.floor(uv[:, 0] * columns).astype(np.int64).clip(0, columns - 1)
+            row = np.floor(uv[:, 1] * rows).astype(np.int64).clip(0, rows - 1)
+            cell = (row * columns + column)[:, None]
+            weights = scattered.weight.numpy() * np.float32(share)
+            self._later.add(scattered.pixel.numpy(), cell, np.ones_like(cell, dtype=np.float32), weights)
 
     def finish(self, smooth: Smooth | None = None) -> None:
         """End the collecting.
@@ -194,43 +203,26 @@ class TextureTransport:
 
     def __call__(self, change: Tensor) -> Tensor:
         """Return the change of radiance (H, W, 3) for a change of the base colour (h, w, 3); differentiable."""
-        found: Tensor = _Product.apply(self, change)  # type: ignore[no-untyped-call]
+        found: Tensor = LinearMap.apply(self.times, self.transposed_times, change)  # type: ignore[no-untyped-call]
         return found
 
     def times(self, change: Tensor) -> Tensor:
         """Return J times (h, w, 3), as (H, W, 3)."""
-        near = self._first.times(change.reshape(-1, 3).numpy())
-        far = self._later.times(self._pooled(change).reshape(-1, 3).numpy())
-        return torch.from_numpy(near + far).reshape(*self._picture, 3)
+        rows, columns = self._cells
+        below, right = (COARSE * cells - texels for cells, texels in zip(self._cells, self._texture, strict=True))
+        whole = functional.pad(change, (0, 0, 0, right, 0, below)) if right or below else change
+        across = whole.reshape(rows * COARSE, columns, COARSE, 3).sum(dim=2)
+        pooled = across.reshape(rows, COARSE, columns, 3).sum(dim=1) / self._in_cell
+        radiance = self._first.times(change.reshape(-1, 3)) + self._later.times(pooled.reshape(-1, 3))
+        return radiance.reshape(*self._picture, 3)
 
     def transposed_times(self, cotangent: Tensor) -> Tensor:
         """Return the transpose of J times (H, W, 3), as (h, w, 3)."""
-        flat = cotangent.reshape(-1, 3).numpy()
-        near = torch.from_numpy(self._first.transposed_times(flat)).reshape(*self._texture, 3)
-        far = torch.from_numpy(self._later.transposed_times(flat)).reshape(*self._cells, 3) / self._in_cell
+        flat = cotangent.reshape(-1, 3)
+        near = self._first.transposed_times(flat).reshape(*self._texture, 3)
+        far = self._later.transposed_times(flat).reshape(*self._cells, 3) / self._in_cell
         spread = far[:, None, :, None].expand(-1, COARSE, -1, COARSE, -1)
         return near + spread.reshape(self._cells[0] * COARSE, -1, 3)[: self._texture[0], : self._texture[1]]
-
-    def _pooled(self, texture: Tensor) -> Tensor:
-        """The mean of each cell, (ceil(h / COARSE), ceil(w / COARSE), 3)."""
-        below, right = (COARSE * cells - texels for cells, texels in zip(self._cells, self._texture, strict=True))
-        whole = functional.pad(texture, (0, 0, 0, right, 0, below)) if right or below else texture
-        across = whole.reshape(self._cells[0] * COARSE, self._cells[1], COARSE, 3).sum(dim=2)
-        return across.reshape(self._cells[0], COARSE, self._cells[1], 3).sum(dim=1) / self._in_cell
-
-
-class _Product(torch.autograd.Function):
-    """J times a change, or its transpose, with the other as the derivative, any number of times."""
-
-    @staticmethod
-    def forward(ctx: Any, transport: TextureTransport, change: Tensor, transposed: bool = False) -> Tensor:
-        ctx.transport, ctx.transposed = transport, transposed
-        return transport.transposed_times(change) if transposed else transport.times(change)
-
-    @staticmethod
-    def backward(ctx: Any, cotangent: Tensor) -> tuple[None, Tensor, None]:
-        back = _Product.apply(ctx.transport, cotangent.contiguous(), not ctx.transposed)  # type: ignore[no-untyped-call]
-        return None, back, None
 
 
 def by_rows(matrix: scipy.sparse.csr_matrix) -> Tensor:
@@ -239,11 +231,6 @@ def by_rows(matrix: scipy.sparse.csr_matrix) -> Tensor:
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Sparse CSR tensor support is in beta")
         return torch.sparse_csr_tensor(parts[0], parts[1], parts[2], matrix.shape, check_invariants=False)
-
-
-def _lengths(texels: int, cells: int) -> Tensor:
-    """How many texels each cell has along one side, (cells,) float32; the last one may have fewer."""
-    return (texels - COARSE * torch.arange(cells)).clamp(max=COARSE).to(torch.float32)
 
 
 def bilinear(uv: Floats, texture: tuple[int, int]) -> tuple[npt.NDArray[np.int32], Floats]:
@@ -261,23 +248,6 @@ def bilinear(uv: Floats, texture: tuple[int, int]) -> tuple[npt.NDArray[np.int32
     return columns, shares
 
 
-def _bilinear(vertices: Vertices, texture: tuple[int, int], share: float) -> tuple[Ints, Ints, Floats, Floats]:
-    """The texels of the bilinear lookup of each vertex, and their shares."""
-    columns, shares = bilinear(vertices.uv.numpy(), texture)
-    weights = vertices.weight.numpy() * np.float32(share)
-    return vertices.pixel.numpy(), columns.astype(np.int64), shares, weights
-
-
-def _nearest(vertices: Vertices, cells: tuple[int, int], share: float) -> tuple[Ints, Ints, Floats, Floats]:
-    """The cell that each vertex lies in, which has all of it."""
-    uv = vertices.uv.numpy() % 1.0
-    column = np.floor(uv[:, 0] * cells[1]).astype(np.int64).clip(0, cells[1] - 1)
-    row = np.floor(uv[:, 1] * cells[0]).astype(np.int64).clip(0, cells[0] - 1)
-    columns = (row * cells[1] + column)[:, None]
-    shares: Floats = np.ones_like(columns, dtype=np.float32)
-    return vertices.pixel.numpy(), columns, shares, vertices.weight.numpy() * np.float32(share)
-
-
 SPP = 128
 """Samples a pixel of the paths whose vertices become the matrix and which make the base picture; what noise the
 denoiser leaves in it is in all predicted pictures."""
@@ -285,38 +255,16 @@ PASS = 2**20
 """Samples of all pixels in one pass; its vertices are held in memory."""
 MOST = 4.0
 """Factor by which the noise of the base picture corrects a row at most."""
-MOST_BYTES = 2**30
-"""Memory of the matrix of one input, times `ADVSEARCH_LIMITS`."""
 TOO_LARGE = "the matrix would take more than"
 LINEAR = ".base_color"
 """What the names of inputs end in to which radiance is linear, but for light that meets them twice."""
 
+Tick = Callable[[int], None]
+"""Told of samples a pixel as they are traced."""
+
 
 class TransportTooLargeError(Exception):
     """A matrix that takes more memory than it may."""
-
-
-class PredictingRenderer(Renderer, ABC):
-    """A renderer of the same space that traces no paths for its pictures; differentiable, without noise.
-
-    The seed and the samples of a call mean nothing to it.
-
-    Attributes:
-        products: pictures it has made.
-    """
-
-    products: int
-    _predicts = True
-
-    @property
-    @abstractmethod
-    def entries(self) -> int:
-        """Entries of all matrices, for one colour channel."""
-
-    @property
-    @abstractmethod
-    def bytes(self) -> int:
-        """Memory of all matrices and pictures, 16 bits a number."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -327,20 +275,22 @@ class Linearised:
         transports: by input, finished.
         there: the inputs where it was linearised.
         applied: the inputs that belong to the picture, not to the scene.
-        base: the picture there, linear radiance.
+        base: the picture there, linear radiance, and coverage where there is a backdrop.
+        non_finite: values that were not finite and were set to zero.
     """
 
     transports: Mapping[str, TextureTransport]
     there: dict[str, Tensor]
     applied: Mapping[str, Tensor]
     base: Halves
+    non_finite: int = 0
 
 
-class LinearRenderer(PredictingRenderer):
-    """A renderer whose pictures come from a matrix.
+class LinearRenderer(Predictor):
+    """Predicts pictures by a matrix for each base colour.
 
     Args:
-        renderer: the one that traces paths.
+        traced: the renderer that traces paths.
         u: where the picture is linearised.
         seed: number of the noise.
         tick: told of samples a pixel as they are traced, `samples_to_collect` in all.
@@ -352,24 +302,16 @@ class LinearRenderer(PredictingRenderer):
         light: inputs in the place of those of u.
         collected: what was collected elsewhere with the same arguments; nothing is traced then.
 
-    Attributes:
-        transports: by input.
-        there: the inputs where it was linearised.
-
     Raises:
         TransportTooLargeError: a matrix would take more than `MOST_BYTES`.
     """
 
-    transports: Mapping[str, TextureTransport]
-    there: dict[str, Tensor]
-    _applied: Mapping[str, Tensor]
-
     def __init__(
         self,
-        renderer: Renderer,
+        traced: Renderer,
         u: Tensor,
         seed: int,
-        tick: Callable[[int], None] = lambda samples: None,
+        tick: Tick = lambda samples: None,
         *,
         spp: int = SPP,
         quick: bool = False,
@@ -377,99 +319,97 @@ class LinearRenderer(PredictingRenderer):
         light: Mapping[str, Tensor] = MappingProxyType({}),
         collected: Linearised | None = None,
     ) -> None:
-        vars(self).update(vars(copy.copy(renderer)))
-        self.products = 0
-        if collected is not None:
-            self.transports, self.there = collected.transports, collected.there
-            self._applied, self._base = collected.applied, collected.base
-            return
-        with torch.no_grad():
-            inputs = self.scene.assembly(self.space.inputs(u))
-            self._applied = {name: value for name, value in inputs.items() if name in ON_PICTURE}
-            traced = {name: value for name, value in inputs.items() if name not in ON_PICTURE} | dict(light)
-            linear = [name for name in traced if name in (linear_inputs(renderer) if names is None else names)]
-            self.there = {name: traced[name].clone() for name in linear}
-            self.transports = {
-                name: TextureTransport(self.formation.resolution, (value.shape[0], value.shape[1]), small=quick)
-                for name, value in self.there.items()
-            }
-            if self.transports:
-                base = self._finished(self._traced(traced, seed, tick, spp), quick)
-            else:
-                base = super()._rendered(traced, seed, spp, self._hide)
-                tick(spp)
-            self._base = Halves(base)
-
-    def let_go(self, space: InputSpace) -> None:
-        """Let go of the scene, which only tracing takes; the pictures stay, and `space` is the same without a scene."""
-        del self.scene
-        self.space = space
+        super().__init__(traced)
+        if collected is None:
+            with torch.no_grad():
+                collected = _collected(traced.like(), u, seed, tick, spp, quick, names, light)
+        self.collected, self.non_finite = collected, collected.non_finite
 
     @property
-    def collected(self) -> Linearised:
-        """What was collected."""
-        return Linearised(self.transports, self.there, self._applied, self._base)
+    def there(self) -> dict[str, Tensor]:
+        """The inputs where it was linearised."""
+        return self.collected.there
 
     @property
     def entries(self) -> int:
-        return sum(one.entries for one in self.transports.values())
+        return sum(one.entries for one in self.collected.transports.values())
 
     @property
     def bytes(self) -> int:
-        height, width = self.formation.resolution
-        return sum(one.bytes for one in self.transports.values()) + 8 * height * width
+        height, width = self.traced.formation.resolution
+        return sum(one.bytes for one in self.collected.transports.values()) + 8 * height * width
 
-    @property
-    def _hide(self) -> bool:
-        return "backdrop.color" in self._applied
+    def let_go(self, space: InputSpace) -> None:
+        """Let go of the scene, which only tracing takes; the pictures stay, and `space` is the same without a scene."""
+        self.traced = self.traced.like()
+        del self.traced.scene
+        self.traced.space = space
 
-    def _traced(self, inputs: Mapping[str, Tensor], seed: int, tick: Callable[[int], None], spp: int) -> Paths:
-        """Trace paths, fill the matrices with their vertices, and return the mean of their pictures.
+    def radiance(self, inputs: Mapping[str, Tensor]) -> Tensor:
+        base = self.collected.base()
+        radiance = base[..., :3]
+        for name, transport in self.collected.transports.items():
+            radiance = radiance + transport(inputs[name] - self.there[name])
+        return torch.cat([radiance, base[..., 3:]], dim=-1)
 
-        Raises:
-            TransportTooLargeError: a matrix would take more than `MOST_BYTES`.
-        """
-        samples, count = passes(self, spp)
-        found: list[Paths] = []
-        for name, transport in self.transports.items():
-            for number in range(count):
-                noise = seeds.stream(seed, f"transport {name}", number)
-                paths = self.scene.transport(inputs, name, noise, samples)
-                transport.add(paths.vertices, 1.0 / count)
-                if self.bytes > scaled(MOST_BYTES):
-                    raise TransportTooLargeError(f"{TOO_LARGE} {scaled(MOST_BYTES) / 2**30:g} GiB")
-                found.append(replace(paths, vertices=[]))
-                tick(samples)
-        return mean_of(found)
+    def shown(self, inputs: Mapping[str, Tensor], u: Tensor) -> Tensor:
+        """The picture (H, W, 3) sRGB of scene inputs, of which only those to which radiance is linear count; what
+        controls do to the finished picture comes from `u`."""
+        return self.traced.finished(self.radiance(inputs), self.collected.applied, u)
 
-    def _finished(self, seen: Paths, quick: bool) -> Tensor:
-        """Take the noise out of the matrices and the base picture, and return that, with coverage if hidden."""
-        radiance = self._finite(seen.radiance - seen.background if self._hide else seen.radiance)
-        clean = radiance
-        if self.formation.denoiser == "oidn":
-            clean = denoise(radiance, seen.albedo.clamp(0.0, 1.0), seen.normal)
+
+def _collected(
+    renderer: Renderer,
+    u: Tensor,
+    seed: int,
+    tick: Tick,
+    spp: int,
+    quick: bool,
+    names: Collection[str] | None,
+    light: Mapping[str, Tensor],
+) -> Linearised:
+    """Trace the base picture and the matrices. Arguments as of `LinearRenderer`; nobody else has this renderer."""
+    before, (height, width) = renderer.non_finite, renderer.formation.resolution
+    inputs = renderer.scene.assembly(renderer.space.inputs(u))
+    applied = {name: value for name, value in inputs.items() if name in ON_PICTURE}
+    traced = {name: value for name, value in inputs.items() if name not in ON_PICTURE} | dict(light)
+    linear = [name for name in traced if name in (linear_inputs(renderer) if names is None else names)]
+    there = {name: traced[name].clone() for name in linear}
+    transports = {
+        name: TextureTransport((height, width), (value.shape[0], value.shape[1]), small=quick)
+        for name, value in there.items()
+    }
+    hide = "backdrop.color" in applied
+    if not transports:
+        base = renderer.rendered(traced, seed, spp, hide)
+        tick(spp)
+        return Linearised(transports, there, applied, Halves(base), renderer.non_finite - before)
+    samples, count = passes(renderer, spp)
+    traces: list[Paths] = []
+    for name, transport in transports.items():
+        for number in range(count):
+            noise = seeds.stream(seed, f"transport {name}", number)
+            paths = renderer.scene.transport(traced, name, noise, samples)
+            transport.add(paths.vertices, 1.0 / count)
+            if sum(one.bytes for one in transports.values()) + 8 * height * width > scaled(MOST_BYTES):
+                raise TransportTooLargeError(f"{TOO_LARGE} {scaled(MOST_BYTES) / 2**30:g} GiB")
+            traces.append(replace(paths, vertices=[]))
+            tick(samples)
+    seen = mean_of(traces)
+    radiance = clean = renderer.finite(seen.radiance - seen.background if hide else seen.radiance)
+    smooth: Smooth | None = None
+    if renderer.formation.denoiser == "oidn":
+        clean = denoise(radiance, seen.albedo.clamp(0.0, 1.0), seen.normal)
         ratio = (clean / radiance.clamp_min(1e-12)).clamp(1.0 / MOST, MOST)
         even = (seen.albedo.sum(dim=-1, keepdim=True) > 0.0).to(torch.float32).expand(-1, -1, 3).contiguous()
 
         def smooth(picture: Tensor) -> Tensor:
             return picture * ratio if quick else denoise(picture.contiguous(), even, seen.normal)
 
-        for transport in self.transports.values():
-            transport.finish(smooth if self.formation.denoiser == "oidn" else None)
-        return torch.cat([clean, seen.coverage], dim=-1) if self._hide else clean
-
-    def _rendered(self, inputs: Mapping[str, Tensor], seed: int, spp: int, hide: bool) -> Tensor:
-        base = self._base()
-        radiance = base[..., :3]
-        for name, transport in self.transports.items():
-            radiance = radiance + transport(inputs[name] - self.there[name])
-        self.products += 1
-        return torch.cat([radiance, base[..., 3:]], dim=-1) if hide else radiance
-
-    def shown(self, inputs: Mapping[str, Tensor], u: Tensor) -> Tensor:
-        """The picture (H, W, 3) sRGB of scene inputs, of which only those to which radiance is linear count; what
-        controls do to the finished picture comes from `u`."""
-        return self._picture(u, 0, 1, {**inputs, **self._applied})
+    for transport in transports.values():
+        transport.finish(smooth)
+    base = torch.cat([clean, seen.coverage], dim=-1) if hide else clean
+    return Linearised(transports, there, applied, Halves(base), renderer.non_finite - before)
 
 
 def linear_inputs(renderer: Renderer) -> frozenset[str]:

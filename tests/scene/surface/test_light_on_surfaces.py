@@ -103,15 +103,16 @@ def test_pictures_through_a_lens_are_those_that_are_traced(camera: str | None, f
 
 def test_pictures_of_several_cameras_at_once_are_those_of_each(light: SurfaceRenderer) -> None:
     """Two of them under one light, one under another."""
-    first, second = drawn(light, 0), drawn(light, 1)
+    renderer = light.traced
+    first, second = drawn(renderer, 0), drawn(renderer, 1)
     third = second.clone()
-    for group in light.space.groups:
+    for group in renderer.space.groups:
         if group.control == "environment":
             third[group.coordinates] = first[group.coordinates]
     wholes = [first, second, third]
     with torch.no_grad():
-        inputs = [light.scene.assembly(light.space.inputs(one)) for one in wholes]
-        together = light.pictures(inputs, light.color(inputs[0]), wholes)
+        inputs = [light.inputs(one) for one in wholes]
+        together = light.shown(light.looks(inputs), inputs, light.color(inputs[0]), wholes)
         assert torch.equal(together, torch.stack([light(one) for one in wholes]))
 
 
@@ -195,7 +196,8 @@ def test_an_object_out_of_sight_has_no_derivative() -> None:
     matrix = inputs.get("camera.to_world", of.scene.base("camera.to_world")).clone()
     matrix[:3, 0], matrix[:3, 2] = -matrix[:3, 0], -matrix[:3, 2]
     color = torch.full((16, 16, 3), 0.5, requires_grad=True)
-    picture = made.pictures([{**inputs, "camera.to_world": matrix}], color, [of.start])
+    turned = [{**inputs, "camera.to_world": matrix}]
+    picture = made.shown(made.looks(turned), turned, color, [of.start])
     (found,) = torch.autograd.grad(picture.sum(), color)
     assert not bool(found.any()) and float(picture.detach().mean()) > 0.0
 

@@ -1,20 +1,23 @@
-"""A range whose values are drawn by a distribution: u is the share of its probability, so that whatever draws u evenly
-(nets of points, banks of light transport) draws values as the distribution has them."""
+"""Ranges of numbers, and those whose values are drawn by a distribution: u is the share of its probability, so that
+whatever draws u evenly (nets of points, banks of light transport) draws values as the distribution has them."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import TypeGuard
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from advsearch.controls.values import Range, is_number
 from advsearch.distributions import DISTRIBUTION, FROM_PYTHON, OwnQuantiles
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.settings import Parameter
+
+LARGEST = 1e30
+"""No quantity of a scene is larger; the square of one that is has no float32."""
 
 Quantiles = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
@@ -32,6 +35,19 @@ CHECKED = 257
 
 NEAR = 1e-4
 """Half of the step over which the slope of a quantile is taken."""
+
+
+def is_number(given: object) -> TypeGuard[float]:
+    """Return whether it is a number that float32 has: not a truth value, not NaN, and at most `LARGEST`."""
+    return isinstance(given, (int, float)) and not isinstance(given, bool) and abs(given) <= LARGEST
+
+
+@dataclass(frozen=True)
+class Range:
+    """Every value from `low` to `high`."""
+
+    low: float
+    high: float
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,86 @@
+"""What predicts pictures of a scene, so that no paths have to be traced for them."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from advsearch.scene.renderer import Renderer
+
+NOISE = "noise is part of the picture without the denoiser"
+"""A reason against predictions that stands alone: with the denoiser, the same pictures could be predicted."""
+MOST_BYTES = 2**30
+"""Memory of what one predictor keeps, times `ADVSEARCH_LIMITS`."""
+
+
+class Predictor(ABC):
+    """Predicts the pictures of a renderer's space, without noise; differentiable.
+
+    Args:
+        traced: the renderer of the space, which traces paths.
+
+    Attributes:
+        non_finite: values that were not finite while it was made, and were set to zero.
+    """
+
+    non_finite: int = 0
+
+    def __init__(self, traced: Renderer) -> None:
+        self.traced = traced
+
+    @property
+    def renderer(self) -> Renderer:
+        """A renderer of the same space whose pictures are the predicted ones."""
+        # made each time: two objects that hold each other are freed late, and matrices are large
+        return self.traced.predicted_by(self.radiance)
+
+    def __call__(self, u: Tensor) -> Tensor:
+        """Return the picture (H, W, 3) sRGB of a configuration (d,); differentiable."""
+        return self.renderer(u)
+
+    def pictures(self, us: Sequence[Tensor]) -> Sequence[Tensor]:
+        """Return the pictures of several configurations."""
+        return [self(u) for u in us]
+
+    @abstractmethod
+    def radiance(self, inputs: Mapping[str, Tensor]) -> Tensor:
+        """Return the linear radiance of scene inputs; see `advsearch.scene.renderer.Predict`."""
+
+    @property
+    @abstractmethod
+    def entries(self) -> int:
+        """Entries of all matrices, for one colour channel."""
+
+    @property
+    @abstractmethod
+    def bytes(self) -> int:
+        """Memory of all that is kept."""
+
+    @property
+    def lights(self) -> int:
+        """Pictures that were traced for it."""
+        return 1
+
+
+def differs(one: Tensor | None, other: Tensor | None) -> bool:
+    """Whether two inputs of a scene are not the same, bit for bit."""
+    return one is None or other is None or one.shape != other.shape or not torch.equal(one, other)
+
+
+class LinearMap(torch.autograd.Function):
+    """A linear map as a torch operation: `times`, with its transpose as the derivative, any number of times."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, times: Callable[[Tensor], Tensor], transposed_times: Callable[[Tensor], Tensor], values: Tensor
+    ) -> Tensor:
+        ctx.back = transposed_times, times
+        return times(values.detach())
+
+    @staticmethod
+    def backward(ctx: Any, cotangent: Tensor) -> tuple[None, None, Tensor]:
+        return None, None, LinearMap.apply(*ctx.back, cotangent.contiguous())  # type: ignore[no-untyped-call]
