@@ -17,7 +17,6 @@ from torch import Tensor
 
 from advsearch import seeds
 from advsearch.attacks import Ending, SearchResult
-from advsearch.controls.numbers import BoundNumbers
 from advsearch.controls.path import PathControl
 from advsearch.engine.attack_parts import AttackParts
 from advsearch.engine.loading import Scene, load_scene
@@ -385,12 +384,12 @@ def answer_along(problem: Problem, u: Tensor | None, spp: int, run: RunDirectory
     )
 
 
-def _path_of(problem: Problem) -> tuple[BoundNumbers, int] | None:
+def _path_of(problem: Problem) -> tuple[PathControl, int] | None:
     """The path among what varies by chance, and the coordinate of the whole space that is its time."""
     begin = 0
     for number, bound in enumerate(problem.space.controls):
         chance = problem.searched is not None and number >= problem.searched
-        if chance and isinstance(bound, BoundNumbers) and isinstance(bound.control, PathControl) and bound.groups:
+        if chance and isinstance(bound, PathControl) and bound.groups:
             return bound, begin
         begin += len(bound.start)
     return None

@@ -280,7 +280,7 @@ class Faded(NumberControl):
         Parameter("amount", (), "1", 0.0, 1.0, 0.0, "1 is black.", search=(0.0, 1.0), estimators=("adjoint",)),
     )
 
-    def scene_inputs(self, scene: Any, values: Any, so_far: Any) -> dict[str, Tensor]:
+    def scene_inputs(self, values: Any, so_far: Any) -> dict[str, Tensor]:
         return {"object.roughness": 0.5 + 0.5 * values["amount"]}
 
 

@@ -17,9 +17,8 @@ from torch import Tensor
 
 from advsearch.attacks import Block, Domain
 from advsearch.attacks.draws import Draws, Product
-from advsearch.controls import NumberControl, Parameter, Space
-from advsearch.controls.base import BoundControl, Value
-from advsearch.controls.numbers import BoundNumbers
+from advsearch.controls import Control, NumberControl, Parameter, Space
+from advsearch.controls.base import Value
 from advsearch.controls.ranges import Range
 from advsearch.controls.values import Fixed, OneOf, to_value
 from advsearch.engine.sweeps.axes import Axis
@@ -154,11 +153,11 @@ class Points:
             first = into[-1][2].stop if into else 0
             columns = slice(first, first + block.size + (block.norm == "l2"))
             into.append((block, part, columns))
-            if block.size <= MOST_BINNED and block.norm != "l2" and isinstance(control, BoundNumbers):
+            if block.size <= MOST_BINNED and block.norm != "l2" and isinstance(control, NumberControl):
                 shown += self._shown(control, group.parameter, block, part, first)
         return tuple(shown)
 
-    def _shown(self, control: BoundNumbers, name: str, block: Block, part: slice, first: int) -> list[Drawn]:
+    def _shown(self, control: NumberControl, name: str, block: Block, part: slice, first: int) -> list[Drawn]:
         parameter, spec = _spec(control, name)
         full = f"{control.name}.{name}"
         if isinstance(spec, OneOf):
@@ -272,23 +271,28 @@ def _unit(parameter: Parameter) -> str:
     return "name" if parameter.options else parameter.unit
 
 
-def _spec(bound: BoundNumbers, name: str) -> tuple[Parameter, Range | OneOf]:
+def _spec(bound: NumberControl, name: str) -> tuple[Parameter, Range | OneOf]:
     """A parameter that is not fixed, and what it is set to."""
     slot = next(one for one in bound.slots if one.parameter.name == name)
     assert not isinstance(slot.spec, Fixed)
     return slot.parameter, slot.spec
 
 
-def _teller(space: Space, control: BoundControl, part: slice, axes: Sequence[tuple[int, Axis]]) -> Tell:
+def _teller(space: Space, control: Control, part: slice, axes: Sequence[tuple[int, Axis]]) -> Tell:
     """Return what says the values of one control for many configurations."""
-    if type(control) is BoundNumbers and type(control.control).measured is NumberControl.measured:
+    if isinstance(control, NumberControl) and _says_its_numbers(type(control)):
         return _by_column(control, part, axes)
     if control.refines:
         return _by_description(lambda u: space.describe(u, (control,)), axes, keep=False)
     return _by_description(lambda u: control.describe(u[part]), axes, keep=len(axes) == len(control.groups))
 
 
-def _by_column(control: BoundNumbers, part: slice, axes: Sequence[tuple[int, Axis]]) -> Tell:
+def _says_its_numbers(kind: type[NumberControl]) -> bool:
+    """Whether what a control says of a configuration is its parameters' values and nothing else."""
+    return (kind.describe, kind.measured) == (NumberControl.describe, NumberControl.measured)
+
+
+def _by_column(control: NumberControl, part: slice, axes: Sequence[tuple[int, Axis]]) -> Tell:
     """Values of all configurations at once, parameter by parameter; the same numbers as `describe`."""
     number_of = {axis.parameter.name: (number, axis) for number, axis in axes}
     columns: list[Callable[[Tensor, Picks], list[tuple[str, Value]]]] = []
@@ -316,7 +320,7 @@ def _listed(name: str, listed: list[Value], number: int) -> Callable[[Tensor, Pi
 
 
 def _drawn(
-    control: BoundNumbers, parameter_name: str, name: str, begin: int, size: int
+    control: NumberControl, parameter_name: str, name: str, begin: int, size: int
 ) -> list[Callable[[Tensor, Picks], list[tuple[str, Value]]]]:
     parameter, spec = _spec(control, parameter_name)
     unit = _unit(parameter)
