@@ -182,13 +182,16 @@ class Dashboard(HTTPServer):
         super().server_close()
 
 
+OTHERS = served_policy(own=False)
+
+
 class Served(NamedTuple):
     """What is answered: its media type and bytes, and under which policy. Whatever comes out of a run's folder may be
     somebody else's, so that policy is the usual one."""
 
     kind: str
     data: bytes
-    policy: str = served_policy(own=False)
+    policy: str = OTHERS
 
 
 class _Handler(BaseHTTPRequestHandler):

@@ -102,9 +102,9 @@ def test_a_shared_curve_tries_no_epsilon_more_than_one_that_was_made_here(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     small = AttackConfig.of(SMALL, controls={"texture": {"resolution": 2}}, epsilon="0.02,0.01", average=0)
-    alone = attack_from_config(small.model_copy(update={"run": str(tmp_path / "alone")}))
+    alone: Any = attack_from_config(small.model_copy(update={"run": str(tmp_path / "alone")}))
     elsewhere(monkeypatch)
-    shared = attack_from_config(small.model_copy(update={"run": str(tmp_path / "shared"), "workers": 2}))
+    shared: Any = attack_from_config(small.model_copy(update={"run": str(tmp_path / "shared"), "workers": 2}))
     assert shared.parts == alone.parts and shared.curve == alone.curve
     for name in alone.parts:
         assert rows(tmp_path / "shared" / "parts" / name) == rows(tmp_path / "alone" / "parts" / name)

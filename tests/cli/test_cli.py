@@ -202,7 +202,7 @@ def test_a_message_names_the_argument_in_python_and_the_flag_on_the_command_line
     assert main(["attack", "--object", "mug", "--up", "z"]) == 2
     assert "error: --up: bundled objects stand upright already; leave --up out" in capsys.readouterr().err
     with pytest.raises(InputError, match=r"^smallest: finds one epsilon by itself; give one `epsilon` as the largest"):
-        advsearch.attack("mug", smallest=True, epsilon=(0.1, 0.2))  # type: ignore[arg-type]
+        advsearch.attack("mug", smallest=True, epsilon=(0.1, 0.2))
     assert main(["attack", "--object", "mug", "--smallest", "--epsilon", "0.1,0.2"]) == 2
     assert "error: --smallest: finds one epsilon by itself; give one --epsilon as" in capsys.readouterr().err
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from typing import Any
 
 import numpy as np
 import pytest
@@ -27,7 +28,7 @@ def scene() -> SceneDescription:
     return describe("mug")
 
 
-def bound(scene: SceneDescription, **settings: object) -> GeometryControl:
+def bound(scene: SceneDescription, **settings: Any) -> GeometryControl:
     return GeometryControl(**settings).bind(scene)
 
 

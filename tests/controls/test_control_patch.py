@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -37,7 +38,7 @@ def surface(scene: SceneDescription) -> tuple[Floats, Floats, Floats]:
     return positions, normals, texel_area(scene.object.mesh, SIDE)
 
 
-def bound(scene: SceneDescription, **settings: object) -> PatchControl:
+def bound(scene: SceneDescription, **settings: Any) -> PatchControl:
     return PatchControl(**settings).bind(scene)
 
 

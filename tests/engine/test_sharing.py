@@ -29,7 +29,7 @@ def test_answers_come_in_the_order_of_the_queries_whoever_gives_them() -> None:
     here, there = StandInProblem(), StandInProblem()
     here.prepared, here.renderer = None, RendererCount()  # type: ignore[attr-defined]
     problem: Any = here
-    workers: Any = StandInWorkers(InProcess(answering(lambda name: there)))  # type: ignore[arg-type,return-value]
+    workers: Any = StandInWorkers(InProcess(answering(lambda name: there)))
     alone, shared = (list(Shared(problem, executor)(queries(5))) for executor in (None, workers))
     assert [one.said for one in alone] == [one.said for one in shared] and len(workers.given) == 5
     assert [one.machine for one in shared] == [*["ab12"] * 4, None], "the last was answered first"

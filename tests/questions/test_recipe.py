@@ -340,10 +340,11 @@ def test_a_recipe_is_carried_out_and_goes_on_where_it_was_stopped(
     assert result.to_dict() == read_result(run).to_dict() and isinstance(read_result(run), RecipeResult)
     assert [one.renders for one in result.parts] == [4, 4] and result.ending == "done"
     pairs, bars = result.figures
+    counts: Any = bars.rows
     assert [row[3] for row in pairs.rows] == [2, 2, 2, 2, 4, 4] and pairs.columns[:4] == [
         "object", "environment", "right", "of",
     ]  # fmt: skip
-    assert sum(row[2] for row in bars.rows) == 8
+    assert sum(row[2] for row in counts) == 8
     page = (run / "report.html").read_text()
     assert all(text in page.replace("&nbsp;", " ") for text in (result.title, *pairs.text, *bars.text))
     assert page.count("data:image/png") == 2 and {"figure-1.png", "figure-2.svg"} <= {
@@ -365,7 +366,8 @@ parts:
 figures: [{figure: rates, by: object}]
 """)
     result = advsearch.recipe(path, run=tmp_path / "run")
-    ((name, right, of, _, low, high),) = result.figures[0].rows
+    rows: Any = result.figures[0].rows
+    ((name, right, of, _, low, high),) = rows
     assert name == "mug" and of > 3 and of % 3 == 0
     alone = clopper_pearson(int(right), int(of))
     assert high - low > alone[1] - alone[0]

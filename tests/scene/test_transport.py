@@ -217,7 +217,7 @@ def test_a_curve_over_epsilon_is_searched_with_one_matrix(monkeypatch: pytest.Mo
     monkeypatch.setattr(searching, "predicting", counted)
     settings: Any = {**SMALL, "baseline": False, "average": 0, "resolution": (SIZE, SIZE)}
     config = AttackConfig(object="mug", epsilon="0.002,0.004", run=str(tmp_path / "curve"), **settings)
-    found = attack_from_config(config)
+    found: Any = attack_from_config(config)
     assert made == 1 and [one.robust for one in found.curve] == [1, 1]
     alone = advsearch.attack("mug", epsilon=0.004, run=tmp_path / "alone", **settings)
     shared = attack_of(tmp_path / "curve" / "parts" / found.parts[1])
