@@ -4,45 +4,16 @@
     model = advsearch.load_model("reference")
     result = advsearch.attack(scene, model, controls=["texture"])
 
-Nothing heavy is imported until one of these is used.
+Nothing heavy is imported until one of these is used. Editors and type checkers read `__init__.pyi`, which
+`tools/stubs.py` makes.
 """
 
 from __future__ import annotations
 
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from advsearch.rooms import made_question, made_questions
-
-if TYPE_CHECKING:
-    from advsearch import losses as losses
-    from advsearch import testing as testing
-    from advsearch.api.render import Rendering as Rendering
-    from advsearch.api.render import load_model as load_model
-    from advsearch.api.render import load_run as load_run
-    from advsearch.api.render import render as render
-    from advsearch.attacks import Policy as Policy
-    from advsearch.controls.base import Control as Control
-    from advsearch.engine.attack_result import AttackResult as AttackResult
-    from advsearch.engine.loading import Scene as Scene
-    from advsearch.engine.loading import load_scene as load_scene
-    from advsearch.engine.sweeps.summary import SweepResult as SweepResult
-    from advsearch.models import Model as Model
-    from advsearch.questions.attack.carry_out import attack as attack
-    from advsearch.questions.check.carry_out import check as check
-    from advsearch.questions.compare.carry_out import compare as compare
-    from advsearch.questions.explain.carry_out import explain as explain
-    from advsearch.questions.gap import gap as gap
-    from advsearch.questions.harden.carry_out import harden as harden
-    from advsearch.questions.photographs.carry_out import photo_agreement as photo_agreement
-    from advsearch.questions.precision.carry_out import precision as precision
-    from advsearch.questions.recipe.carry_out import recipe as recipe
-    from advsearch.questions.region.carry_out import region as region
-    from advsearch.questions.replay.carry_out import replay as replay
-    from advsearch.questions.stability.carry_out import stability as stability
-    from advsearch.questions.sweep.carry_out import sweep as sweep
-    from advsearch.registry import allow_code as allow_code
-    from advsearch.tasks import Task as Task
 
 __version__ = "0.1.0"
 
@@ -56,10 +27,7 @@ _HOMES = {
     "SweepResult": "advsearch.engine.sweeps.summary",
     "Task": "advsearch.tasks",
     "allow_code": "advsearch.registry",
-    "attack": "advsearch.questions.attack.carry_out",
     "check": "advsearch.questions.check.carry_out",
-    "compare": "advsearch.questions.compare.carry_out",
-    "explain": "advsearch.questions.explain.carry_out",
     "harden": "advsearch.questions.harden.carry_out",
     "load_model": "advsearch.api.render",
     "load_run": "advsearch.api.render",
@@ -67,11 +35,8 @@ _HOMES = {
     "photo_agreement": "advsearch.questions.photographs.carry_out",
     "precision": "advsearch.questions.precision.carry_out",
     "recipe": "advsearch.questions.recipe.carry_out",
-    "region": "advsearch.questions.region.carry_out",
     "render": "advsearch.api.render",
-    "replay": "advsearch.questions.replay.carry_out",
     "stability": "advsearch.questions.stability.carry_out",
-    "sweep": "advsearch.questions.sweep.carry_out",
 }
 """The public names, and the module of each; besides, every question that
 `advsearch.question` makes."""

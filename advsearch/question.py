@@ -39,7 +39,10 @@ SAID = {
 }  # fmt: skip
 """Fields of a result that settings say, by the attribute of these."""
 
-TYPES = {"object": "Scene | str | Path", "model": "AnyModel"}
+TYPES = {
+    "object": "Scene | str | Path", "model": "AnyModel", "compared": "str | Path | Sequence[str | Path]",
+    "sweeps": "str | Path | Sequence[str | Path]",
+}  # fmt: skip
 """What Python may give for a setting in place of its text."""
 
 
@@ -82,9 +85,12 @@ class Asked(Generic[Settings]):
 
 
 def answered(answer: Callable[[Asked[Settings]], Answer], asked: Asked[Settings]) -> Answer:
-    """Return what a function answers, which is kept in its run with its page and its figure."""
+    """Return what a function answers, which is kept in its run with its page and its figure, unless the function has
+    kept it itself."""
     with asked:
         result = answer(asked)
+        if "run" not in vars(asked):
+            return result
         for suffix, data in figure_of_answer(shown(result)).items():
             write_bytes(asked.run.path / "images" / f"{asked.config.command}.{suffix}", data)
         return keep_answer(asked.run, result)
@@ -100,7 +106,7 @@ class Question(Generic[Answer]):
     examples: tuple[str, ...]
     place: tuple[str, ...]
     about: str
-    expected: tuple[str, str] | None
+    expected: tuple[Any, ...] | None
     brought: Callable[[Path, Mapping[str, Any]], dict[str, Any]] | None
     called: str
 
@@ -154,7 +160,7 @@ def question(
     *examples: str,
     place: tuple[str, ...] = (),
     about: str = "",
-    expected: tuple[str, str] | None = None,
+    expected: tuple[Any, ...] | None = None,
     brought: Callable[[Path, Mapping[str, Any]], dict[str, Any]] | None = None,
     called: str = "",
 ) -> Callable[[Callable[..., Answer]], Question[Answer]]:
@@ -164,7 +170,8 @@ def question(
         examples: lines of a shell, for its help.
         place: settings that Python takes by position.
         about: the setting that names a run or a file which it is about.
-        expected: where that is given without its flag, what stands for it in the help, and what an error says it is.
+        expected: where that is given without its flag, what stands for it in the help, and what an error says it is;
+            as further fields of `cli.question.Positional`, what the help adds, and whether there may be several.
         brought: returns settings that the `run.yaml` of that run brings, by what was typed.
         called: ``module:function`` that Python calls, where more can be given there than settings.
     """
@@ -172,6 +179,7 @@ def question(
     def decorate(answer: Callable[..., Answer]) -> Question[Answer]:
         hints = get_type_hints(answer)
         first, result = next(iter(inspect.signature(answer).parameters)), hints["return"]
+        result = (*get_args(result), result)[0]  # the first of several kinds
         (config,) = get_args(hints[first])
         return Question(answer, config, result, examples, place, about, expected, brought, called)
 

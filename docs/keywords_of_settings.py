@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-import importlib
 import inspect
 from typing import Any
 
 import griffe
 
+import advsearch
+
 
 class KeywordsOfSettings(griffe.Extension):  # type: ignore[misc]
-    """Takes signature and docstring of what `advsearch.api.keywords.asks` decorates from the function itself."""
+    """Takes signature and docstring of the functions that `advsearch/__init__.pyi` declares from these themselves."""
 
     def on_function(self, *, func: griffe.Function, **rest: Any) -> None:
-        """Replace both, where a function is decorated so."""
-        decorated = any(str(one.value).startswith("asks(") for one in func.decorators)
-        if not decorated or func.parent is None or func.docstring is None:
+        """Replace both, where a function is declared there."""
+        if func.parent is None or func.parent.path != "advsearch" or func.name.startswith("_"):
             return
-        function = getattr(importlib.import_module(func.parent.path), func.name)
+        function = getattr(advsearch, func.name)
         parameters = inspect.signature(function).parameters.values()
         func.parameters = griffe.Parameters(
             *(
@@ -30,4 +30,4 @@ class KeywordsOfSettings(griffe.Extension):  # type: ignore[misc]
                 for one in parameters
             )
         )
-        func.docstring.value = inspect.getdoc(function) or ""
+        func.docstring = griffe.Docstring(inspect.getdoc(function) or "", parent=func)

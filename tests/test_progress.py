@@ -23,8 +23,8 @@ from advsearch.engine.record import Findings, Stages
 from advsearch.questions.check.carry_out import check_from_config
 from advsearch.questions.check.settings import CheckConfig
 from advsearch.questions.precision.settings import PrecisionConfig
-from advsearch.questions.region import carry_out as region
-from advsearch.questions.region.settings import RegionConfig
+from advsearch.questions.region import growing as region
+from advsearch.questions.region.answer import RegionConfig
 from advsearch.questions.sweep.carry_out import sweep_from_config
 from advsearch.runs.directory import RunDirectory
 from advsearch.settings import Config

@@ -37,8 +37,8 @@ from advsearch.models import loading, reference
 from advsearch.models.loading import SOURCES as SOURCES_OF_MODELS
 from advsearch.questions.attack.answer import CurveResult, MatrixResult
 from advsearch.questions.gap import GapResult
-from advsearch.questions.region import carry_out as mapping
-from advsearch.questions.region.settings import RegionConfig
+from advsearch.questions.region import growing as mapping
+from advsearch.questions.region.answer import RegionConfig
 from advsearch.questions.test import counterexamples as tested
 from advsearch.runs import directory, export, store
 from advsearch.runs.results.attack import AttackSummary

@@ -85,35 +85,6 @@ class DerivativeKeywords(PictureKeywords, total=False):
     specialise: bool
 
 
-class SearchKeywords(DerivativeKeywords, total=False):
-    """Of every search."""
-
-    measure: Literal["no", "quick", "full"]
-    steps: int | None
-    seconds: float | None
-    target: int | Names | None
-    minimise: bool
-    path: str | None
-    draws: int | None
-    average: int
-    baseline: bool
-    verify_spp: int | None
-    trials: int | None
-
-
-class AttackKeywords(SearchKeywords, total=False):
-    """Of `attack`."""
-
-    smallest: bool
-    printable: bool
-    aov: str | None
-    log: Literal["mlflow", "tensorboard", "wandb"] | None
-    ensemble: Literal["mean", "worst"] | None
-    workers: int | None
-    cluster: str | None
-    overwrite: bool
-
-
 class SampledKeywords(PictureKeywords, total=False):
     """Of what sweeps."""
 
@@ -125,18 +96,6 @@ class SampledKeywords(PictureKeywords, total=False):
     workers: int | None
     cluster: str | None
     overwrite: bool
-
-
-class SweepKeywords(SampledKeywords, total=False):
-    """Of `sweep`."""
-
-    aov: str | None
-    surface: bool
-    log: Literal["mlflow", "tensorboard", "wandb"] | None
-    trials: int
-    verify_spp: int | None
-    path: str | None
-    fps: float | None
 
 
 LOADED = (loading.Scene, Model, nn.Module)
@@ -259,9 +218,9 @@ WRITTEN = {
 def hint_of(field: str, kind: Any) -> str:
     """Return what Python callers may write for a setting that is declared as `kind`: for a text also a path, and for
     what may be several names a list."""
-    if field in WRITTEN:
-        return WRITTEN[field]
     text = inspect.formatannotation(kind).replace("typing.", "").replace("NoneType", "None")
+    if field in WRITTEN and not (field == "label" and "dict" in text):  # a recipe's may be one of each object
+        return WRITTEN[field]
     match = re.fullmatch(r"Optional\[(.*)\]", text)
     parts = [match[1], "None"] if match else re.split(r" \| (?![^\[]*\])", text)
     wider = {"str": "Path | Names" if field in (*SEVERAL, "prompt", "vary", "ways") else "str | Path"}

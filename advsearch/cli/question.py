@@ -115,10 +115,15 @@ class QuestionCommand:
         # late, so that --help answers at once
         from advsearch.cli.flags import config_from
         from advsearch.config import CONFIGS
+        from advsearch.settings import settings
 
+        config = CONFIGS[self.name]
         if self.brought and (file := self.file(args)):
             over = {**self.brought(file, vars(args)), **over}
-        return config_from(args, CONFIGS[self.name], **over)
+        elif self.brought and (missing := [one for one in settings(config) if one.required and one.field not in args]):
+            command, run = f"advsearch {self.name}", f"--{self.about.replace('_', '-')} RUN"
+            raise InputError(f"{command}: expected {missing[0].flag} NAME, or {run}; see {command} --help")
+        return config_from(args, config, **over)
 
     def carry_out(self, config: Config, *, as_json: bool, quiet: bool, resumed: Path | None = None) -> int:
         """Ask what `config` describes, or go on with it; print the answer and return the exit status."""

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from advsearch.attacks import Ending, SearchResult, Verification, count_right
 from advsearch.attacks.candidates import Bracket
-from advsearch.attacks.domain import Distribution
 from advsearch.attacks.rate_samples import MOST_TIMES, MOVED, OVER_LADDER
 from advsearch.config import AttackConfig
 from advsearch.engine.attack_result import (
@@ -114,6 +113,15 @@ def _summary(
     budgets = {bound.name: bound.budget for bound in controls}
     depth = problem.renderer.scene.max_depth
     count = findings.sample_count
+    ending = Ending.INTERRUPTED
+    if not findings.interrupted and findings.verification is not None:
+        ending = findings.verification.ending
+    elif not findings.interrupted and findings.clean:
+        if problem.rule.already_wrong(count_right(findings.clean, findings.spp)):
+            ending = Ending.ALREADY_WRONG
+    distribution = search.distribution if search else None
+    if distribution is not None and distribution.mean.numel() > MOST_NUMBERS:
+        distribution = None
     return AttackSummary(
         run=None,
         object=config.object,
@@ -130,7 +138,7 @@ def _summary(
         target=list(task.target_names) or None,
         over=[bound.name for bound in problem.space.controls[len(controls) :]],
         conditions=_conditions(problem),
-        ending=_ending(findings, problem).value,
+        ending=ending.value,
         image_formation=Formation.of(problem.renderer.formation),
         gradient_plan=problem.plan_summary(problem.plan),
         light_path_segments=results.PathSegments(search=problem.search_depth or depth, verification=depth),
@@ -158,7 +166,11 @@ def _summary(
         average=_average(findings) if findings.average else None,
         smallest=None if findings.smallest is None else _smallest(findings.smallest, problem),
         printability=_printability(problem, findings) if config.printable else None,
-        distribution=_distribution(search.distribution, problem) if search and search.distribution else None,
+        distribution=None
+        if distribution is None
+        else results.AnswerDistribution(
+            mean=_described(problem, distribution.mean), deviation=distribution.deviation.tolist()
+        ),
         failures=described_failures(problem, findings),
         transport=transport_of(findings),
         sample_count=None if count is None else results.VerificationSamples(spp=count.spp, converged=count.converged),
@@ -192,27 +204,22 @@ def _objective_over(trials: Sequence[Judgement]) -> results.ObjectiveValues | No
 
 
 def _printability(problem: Problem, findings: Findings) -> results.Printability:
-    space, domain, search = problem.searched_space, problem.domain, findings.search
-    answer = None if search is None else print_terms(space, domain.project(search.best_u))
-    return results.Printability(
-        clean=print_terms(space, domain.start), answer=answer, cost=_print_cost(problem, findings)
-    )
-
-
-def _print_cost(problem: Problem, findings: Findings) -> results.PrintCost | None:
-    """The margin of the answer beside that of the search without terms; None where either was not verified."""
-    verified, other, search = findings.verification, findings.unprinted_verification, findings.unprinted
-    if verified is None or other is None or search is None:
-        return None
-    ours, theirs = (verified_rate(one) for one in (verified, other))
-    return results.PrintCost(
-        steps=len(search.history),
-        margin_with=ours.margin,
-        margin_without=theirs.margin,
-        cost=theirs.margin - ours.margin,
-        verified=theirs,
-        terms=print_terms(problem.searched_space, problem.domain.project(search.best_u)),
-    )
+    """The print terms, and the margin of the answer beside that of the search without them, if both were verified."""
+    space, domain = problem.searched_space, problem.domain
+    terms, cost = (lambda found: print_terms(space, domain.project(found.best_u))), None
+    verified, other, unprinted = findings.verification, findings.unprinted_verification, findings.unprinted
+    if verified is not None and other is not None and unprinted is not None:
+        ours, theirs = (verified_rate(one) for one in (verified, other))
+        cost = results.PrintCost(
+            steps=len(unprinted.history),
+            margin_with=ours.margin,
+            margin_without=theirs.margin,
+            cost=theirs.margin - ours.margin,
+            verified=theirs,
+            terms=terms(unprinted),
+        )
+    answer = None if findings.search is None else terms(findings.search)
+    return results.Printability(clean=print_terms(space, domain.start), answer=answer, cost=cost)
 
 
 def _alone(values: dict[str, T]) -> T | dict[str, T]:
@@ -284,25 +291,23 @@ def transport_of(findings: Findings) -> results.LinearTransport:
 
 def _renders(findings: Findings, problem: Problem) -> dict[str, int]:
     """How many pictures each part took, and how many were predicted instead."""
-    search, baseline, transport = findings.search, findings.baseline, findings.transport
-    unprinted = findings.unprinted
-    kinds = {"search": search, "baseline": baseline, UNPRINTED: unprinted}
-    products = [
-        transport.predicted(kind, len(one.history)) * problem.draws if one and transport else 0
-        for kind, one in kinds.items()
-    ]
-    traced = transport.traced if transport else 0
+    transport, searches = findings.transport, {"search": findings.search, "baseline": findings.baseline}
+    searches[UNPRINTED] = findings.unprinted
+    predicted = {
+        kind: transport.predicted(kind, len(one.history)) * problem.draws if one and transport else 0
+        for kind, one in searches.items()
+    }
+    rendered = {kind: one.renders * problem.draws - predicted[kind] if one else 0 for kind, one in searches.items()}
+    gradients = {kind: max(0, one.gradients - predicted[kind]) if one else 0 for kind, one in searches.items()}
+    unprinted = {} if findings.unprinted is None else {"unprinted": rendered[UNPRINTED] + gradients[UNPRINTED]}
     return {
-        "search": (search.renders * problem.draws if search else 0) - products[0] + traced,
-        "gradient": max(0, search.gradients - products[0]) if search else 0,
-        "baseline": (baseline.renders * problem.draws if baseline else 0) - products[1],
+        "search": rendered["search"] + (transport.traced if transport else 0),
+        "gradient": gradients["search"],
+        "baseline": rendered["baseline"],
         "verification": findings.verification_renders + len(findings.first_look),
-        "products": sum(products),
-    } | ({} if unprinted is None else {"unprinted": _without_terms(unprinted, problem, products[2])})
-
-
-def _without_terms(search: SearchResult, problem: Problem, predicted: int) -> int:
-    return search.renders * problem.draws - predicted + max(0, search.gradients - predicted)
+        "products": sum(predicted.values()),
+        **unprinted,
+    }
 
 
 def _gradients(search: SearchResult) -> results.SearchGradients:
@@ -340,24 +345,6 @@ def _smallest(bracket: Bracket, problem: Problem) -> results.SmallestEpsilon:
         searches=bracket.searches,
         checks=bracket.checks,
     )
-
-
-def _distribution(distribution: Distribution, problem: Problem) -> results.AnswerDistribution | None:
-    if distribution.mean.numel() > MOST_NUMBERS:
-        return None
-    return results.AnswerDistribution(
-        mean=_described(problem, distribution.mean), deviation=distribution.deviation.tolist()
-    )
-
-
-def _ending(findings: Findings, problem: Problem) -> Ending:
-    if findings.interrupted:
-        return Ending.INTERRUPTED
-    if findings.verification is not None:
-        return findings.verification.ending
-    if findings.clean and problem.rule.already_wrong(count_right(findings.clean, findings.spp)):
-        return Ending.ALREADY_WRONG
-    return Ending.INTERRUPTED
 
 
 def _verified(verification: Verification | None) -> VerifiedRate | None:

@@ -11,7 +11,7 @@ import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import accumulate, cycle
+from itertools import cycle
 from math import ceil
 from typing import TYPE_CHECKING, Any
 
@@ -105,21 +105,31 @@ def sweep_axes(answer: SweepSummary, axes: Any) -> None:
         _along(axes, answer, _only_axis(answer))
 
 
-def search_axes(objectives: Mapping[str, Sequence[float | None]], meaning: str, axes: Any) -> None:
+def search_axes(
+    objectives: Mapping[str, Sequence[float | None]], meaning: str, axes: Any, zero_means: str = ""
+) -> None:
     """Draw searches on matplotlib axes: the best objective so far over the evaluations, and each single one.
 
     Args:
         objectives: name of a search to its objectives in order; None where one was not a number.
         meaning: label of the vertical axis.
         axes: of matplotlib.
+        zero_means: what stands at the zero line, which is not drawn where it is empty.
     """
-    for (name, values), colour in zip(objectives.items(), cycle((BLUE, RED, GREY))):
-        single = [math.nan if one is None else one for one in values]
-        best = list(accumulate((-math.inf if math.isnan(one) else one for one in single), max))
-        at = range(1, len(single) + 1)
-        axes.plot(at, single, ".", color=colour, alpha=0.35)
-        axes.plot(at, [math.nan if math.isinf(one) else one for one in best], color=colour, label=name)
-    axes.set(xlabel="evaluations", ylabel=meaning)
+    styles = cycle(((BLUE, "-"), (RED, (0.0, (4.0, 1.5))), (GREY, "-")))
+    for (name, values), (colour, dashes) in zip(objectives.items(), styles, strict=False):
+        each = np.array([math.nan if one is None else one for one in values], dtype=float)
+        best = np.fmax.accumulate(each) if len(each) else each
+        shown = np.unique(np.linspace(0, len(each) - 1, min(len(each), MOST_POINTS)).round().astype(int))
+        # a dot is a line without a length: all of them are one path, and a page stays small
+        at, dots = (np.stack([one, one, one * np.nan], 1).ravel() for one in (shown + 1.0, each[shown]))
+        axes.plot(at, dots, solid_capstyle="round", linewidth=4, alpha=0.35, color=colour)
+        axes.plot(shown + 1, best[shown], linestyle=dashes, linewidth=2, color=colour, label=name)
+    if zero_means:
+        axes.axhline(0.0, color=GREY, linewidth=1, linestyle=(0.0, (5.0, 4.0)))
+        axes.annotate(zero_means, (1.0, 0.0), (-4, 4), axes.get_yaxis_transform(), "offset points", ha="right")
+    axes.set(xlabel="evaluations", ylabel=meaning, xlim=(1, max(2, *map(len, objectives.values()))))
+    axes.locator_params("x", integer=True)
     axes.grid(True, axis="y")
     axes.legend()
 

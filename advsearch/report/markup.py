@@ -9,7 +9,6 @@ from __future__ import annotations
 import base64
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from html import escape
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -19,7 +18,6 @@ from numpy.typing import ArrayLike
 from advsearch.errors import InputError
 from advsearch.report.figures import BLUE, GREY, RED, Figures, drawn, new_axes
 from advsearch.report.shown import AnswerPart, ShownAnswer, shown
-from advsearch.runs.export import table_to_pandas
 from advsearch.runs.images import png_bytes
 from advsearch.runs.results.base import Result
 
@@ -89,12 +87,14 @@ class InNotebook:
         """Return the rows of its table as a `pandas.DataFrame`; columns are called as in `summary.json`.
 
         Raises:
-            InputError: it has no table, or pandas is not installed.
+            InputError: it has no table.
         """
         rows = getattr(self, self.tabular, None)
         if rows is None:
             raise InputError(f"to_pandas: the result of {getattr(self, 'command', '')} has no table")
-        return table_to_pandas([row.to_dict() for row in rows])
+        from pandas import json_normalize  # takes half a second
+
+        return json_normalize([row.to_dict() for row in rows])
 
     def _repr_html_(self) -> str:
         return answer_html(_shown(self))
@@ -165,9 +165,6 @@ WIDE, NARROW = 720, 350
 one until nobody can read them. The style sheet shows one of them.
 """
 
-MOST_POINTS = 400
-"""Points of a curve that are drawn; of more, evenly spread ones."""
-
 COLORS = {"search": "#010101", "baseline": "#020202", "soft": "#030303", "line": "#040404"}
 """Variables of the style sheet, and what stands for them while matplotlib draws."""
 OF_FIGURES = {"search": BLUE, "baseline": RED, "soft": GREY}
@@ -197,45 +194,6 @@ STYLE: dict[Any, Any] = {
     "savefig.facecolor": "none",
     "path.simplify": False,
 }
-
-
-@dataclass(frozen=True)
-class Curve:
-    """The objective of one policy, evaluation by evaluation; None where it was not a number. The name is for the
-    legend; `search` or `baseline` is also the variable of the style sheet that has its colour."""
-
-    name: str
-    kind: str
-    values: Sequence[float | None]
-
-
-def objective_chart(curves: Sequence[Curve], objective: str, zero_means: str = "", width: int = WIDE) -> Html:
-    """Return the best objective so far (lines) and each single one (dots) over the number of evaluations; each curve
-    has a finite value. `zero_means` stands at the zero line, which is not there when it is empty; the width is in CSS
-    pixels."""
-    values = [np.array(curve.values, dtype=float) for curve in curves]
-    best = [np.fmax.accumulate(one) for one in values]
-    ends = [(one[np.isfinite(one)][0], one[-1]) for one in best]
-    told = "; ".join(f"{curve.name}: from {a:.3g} to {b:.3g}" for curve, (a, b) in zip(curves, ends, strict=True))
-
-    def draw(figure: Figure) -> None:
-        axes = figure.subplots()
-        for curve, each, so_far in zip(curves, values, best, strict=True):
-            shown = np.unique(np.linspace(0, len(each) - 1, min(len(each), MOST_POINTS)).round().astype(int))
-            color = COLORS[curve.kind]
-            # a dot is a line without a length: all of them are one path, and the page stays small
-            at, dots = (np.stack([one, one, one * np.nan], 1).ravel() for one in (shown + 1.0, each[shown]))
-            axes.plot(at, dots, solid_capstyle="round", linewidth=4, alpha=0.35, color=color)
-            dashes = {"search": "-", "baseline": (0.0, (4.0, 1.5))}[curve.kind]
-            axes.plot(shown + 1, so_far[shown], linestyle=dashes, linewidth=2, label=curve.name, color=color)
-        if zero_means:
-            axes.axhline(0.0, color=COLORS["soft"], linewidth=1, linestyle=(0.0, (5.0, 4.0)))
-            axes.annotate(zero_means, (1.0, 0.0), (-4, 4), axes.get_yaxis_transform(), "offset points", ha="right")
-        axes.set(xlabel="evaluations", ylabel=objective, xlim=(1, max(2, *map(len, values))))
-        axes.locator_params("x", integer=True)
-        figure.legend(loc="outside upper left", ncols=2)
-
-    return _chart(draw, width, HEIGHT, f"{objective} over evaluations. {told}")
 
 
 def study_chart(draw: Callable[[Axes], object], words: str, width: int = WIDE, height: int = HEIGHT) -> Html:

@@ -41,10 +41,11 @@ Column = str | Callable[[Any], str]
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture in the folder of the run, and what is said of it."""
+    """A picture in the folder of the run, and what is said of it, behind a name if it has one."""
 
     file: str
     caption: str
+    name: str = ""
 
 
 @dataclass(frozen=True)
@@ -64,6 +65,9 @@ class AnswerPart:
         size: of the figure that is kept of it, width and height in inches; None: as high as the chart.
         parts: the run among the parts that each row is of.
         shares: in [0, 1], by row and column: the larger, the stronger the colour of the cell.
+        bars: drawn beside each row on a page, decoration: from, to and a mark, in [0, 1]; None for no bar.
+        layout: of the pictures on a page: `pair`, `small`, `large`, `rows`, or as many as they are.
+        live: name of what a script of the page fills; without the script the part is hidden.
         folded: whether a page shows it only when asked to.
         only: `page`, `text` or `notebook`, where nobody else is shown it.
     """
@@ -80,6 +84,9 @@ class AnswerPart:
     size: tuple[float, float] | None = None
     parts: Sequence[str | None] = ()
     shares: Mapping[tuple[int, int], float] = field(default_factory=dict)
+    bars: Sequence[tuple[float, float, float] | None] = ()
+    layout: str = ""
+    live: str = ""
     folded: bool = False
     only: str = ""
 
@@ -92,7 +99,7 @@ class AnswerPart:
     @property
     def empty(self) -> bool:
         """Whether there is nothing to show."""
-        return not (any(self.text) or self.rows or self.pictures or self.draw)
+        return not (any(self.text) or self.rows or self.pictures or self.draw or self.live)
 
 
 @dataclass(frozen=True)

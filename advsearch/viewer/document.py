@@ -10,6 +10,7 @@ import hashlib
 import json
 import os
 import re
+import shlex
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from importlib import resources
@@ -20,7 +21,8 @@ from advsearch import __version__
 from advsearch.files import MESHES
 from advsearch.report import wording
 from advsearch.report.markup import Html, element, join_html
-from advsearch.runs.directory import PARTS, REPORT
+from advsearch.report.phrases import is_command
+from advsearch.runs.directory import CONFIG, PARTS, REPORT
 
 MOST_NOTES = 3
 """Notes on files that are not folded."""
@@ -207,18 +209,32 @@ def study_table(
     rows: Sequence[Sequence[str]],
     links: Sequence[str] = (),
     shares: Mapping[tuple[int, int], float] | None = None,
+    bars: Sequence[tuple[float, float, float] | None] = (),
 ) -> Html:
     """Return a table whose rows begin with their name. Links, of the names, lead nowhere where they are empty or
-    missing. Shares in [0, 1], by row and column: the larger, the stronger the colour of the cell."""
+    missing. Shares and bars as those of `AnswerPart`."""
     lines = []
     for number, (first, *cells) in enumerate(rows):
         link = links[number] if number < len(links) else ""
         name = element("a", first, href=link) if link else first
         shown = [_cell(text, (shares or {}).get((number, at))) for at, text in enumerate(cells, 1)]
-        lines.append(element("tr", element("th", name, scope="row"), *shown))
-    head = element("tr", *(element("th", text, scope="col") for text in heads))
+        drawn = [element("td", _bar(bars[number]), class_="hide-small")] if bars else []
+        lines.append(element("tr", element("th", name, scope="row"), *shown, *drawn))
+    beside = element("td", class_="hide-small") if bars else None
+    head = element("tr", *(element("th", text, scope="col") for text in heads), beside)
     made = element("table", element("thead", head), element("tbody", *lines))
     return scrolled(made)
+
+
+def _bar(bar: tuple[float, float, float] | None) -> Html | None:
+    if bar is None:
+        return None
+    low, high, mark = bar
+    spans = (
+        element("span", style=f"left: {low:.1%}; width: {high - low:.1%}", class_="range"),
+        element("span", style=f"left: {mark:.1%}", class_="mark"),
+    )
+    return element("div", *spans, class_="interval", aria_hidden="true")
 
 
 def _cell(text: str, share: float | None) -> Html:
@@ -237,6 +253,20 @@ def part_links(run: Path, parts: Sequence[str | None]) -> list[str]:
     return found
 
 
-def again(command_line: str) -> Html:
-    """Return the command that asks the same again."""
-    return join_html(element("h2", "Do it again"), element("pre", command_line, class_="wrap"))
+def again(run: Path, command_line: str, *, goes_on: bool) -> Html:
+    """Return the commands that ask the same again, all settings, and the command that goes on with what was stopped."""
+    recipe, on = run / CONFIG, []
+    commands = [shlex.join(["advsearch", "run", str(recipe)])] if recipe.is_file() and is_command(command_line) else []
+    commands += [command_line] if command_line else []
+    if goes_on:
+        resume = shlex.join(["advsearch", "resume", str(run)])
+        on = [element("h2", "Go on"), element("pre", resume, class_="wrap")]
+    settings = recipe.read_text(encoding="utf-8", errors="replace") if recipe.is_file() else ""
+    return join_html(
+        *on,
+        element("h2", "Do it again"),
+        *(element("pre", one, class_="wrap") for one in commands),
+        element("details", element("summary", "All settings"), element("pre", settings, class_="wrap"))
+        if settings
+        else None,
+    )

@@ -9,43 +9,42 @@ from __future__ import annotations
 import base64
 import gzip
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from advsearch.errors import AdvsearchError
 from advsearch.files import JsonObject, JsonValue
 from advsearch.report import sweeps, wording
-from advsearch.report.markup import NARROW, WIDE, Html, element, join_html, study_chart
-from advsearch.report.phrases import answer_text, beside_text, is_command, percent
+from advsearch.report.markup import Html, element, join_html
+from advsearch.report.phrases import answer_text, beside_text, percent
+from advsearch.report.shown import shown
 from advsearch.runs import directory
 from advsearch.runs.files import write_bytes, write_text
-from advsearch.runs.results.sweep import AxisRow, SurfaceTable, SweepSummary
+from advsearch.runs.results.sweep import SweepSummary
 from advsearch.runs.summary import read_result
 from advsearch.settings import read_yaml
-from advsearch.viewer.columns import Columns, read_columns
+from advsearch.viewer.columns import packed, read_columns
 from advsearch.viewer.document import (
     data_script,
     data_url,
     document,
-    facts_table,
     remarks_html,
-    scrolled,
-    study_table,
     subject_html,
 )
+from advsearch.viewer.parts import end_html, part_html
 from advsearch.viewer.thumbnails import Kept, kept_pictures
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 MOST_EMBEDDED = 3_000_000
 """Bytes of pictures that a page which needs no other file takes along; the worst answers first."""
 
 MOST_ROWS = 200_000
 """Rows that such a page takes along; more are for `advsearch dashboard`."""
-
-MOST_LISTED = 96
-"""Values of an axis that are listed as a table; of more, none."""
 
 
 @dataclass(frozen=True)
@@ -62,10 +61,14 @@ class SweepSource:
     """
 
     name: str
-    rows: Columns | str | None
+    rows: pd.DataFrame | str | None
     parts: bool = False
     pictures: Kept | None = None
     folder: str | None = None
+
+    @property
+    def embedded(self) -> bool:
+        return self.rows is not None and not isinstance(self.rows, str)
 
 
 def write_sweep_page(run: Path, summary: SweepSummary) -> Path:
@@ -76,13 +79,13 @@ def write_sweep_page(run: Path, summary: SweepSummary) -> Path:
         StorageError: it cannot be written.
     """
     columns = read_columns(run)
-    write_bytes(run / directory.COLUMNS, columns.packed(), durable=False)
+    write_bytes(run / directory.COLUMNS, packed(columns), durable=False)
     return write_text(run / directory.REPORT, whole_page(run, summary, columns), durable=False)
 
 
-def whole_page(run: Path, summary: SweepSummary, columns: Columns) -> str:
+def whole_page(run: Path, summary: SweepSummary, columns: pd.DataFrame) -> str:
     """Return the page of a sweep that needs no other file, with its rows unless they are too many."""
-    rows = columns if len(columns.step) <= MOST_ROWS else None
+    rows = columns if len(columns) <= MOST_ROWS else None
     return sweep_page_html([(run, summary)], [SweepSource(run.name, rows, pictures=kept_pictures(run))])
 
 
@@ -96,19 +99,16 @@ def sweep_page_html(runs: Sequence[tuple[Path, SweepSummary | None]], sources: S
     shown = [(one, *run) for one, run in zip(sources, runs, strict=True) if one.rows is not None]
     for number, (source, path, summary) in enumerate(shown):
         described.append(_described(source, number) | (_going_on(path) if summary is None else _judged(summary)))
-        if isinstance(source.rows, Columns):
-            packed = base64.b64encode(gzip.compress(source.rows.packed(), 6, mtime=0)).decode()
-            data.append(element("script", Html(packed), type="application/octet-stream", id=f"rows-{number}"))
+        if source.embedded:
+            zipped = base64.b64encode(gzip.compress(packed(source.rows), 6, mtime=0)).decode()
+            data.append(element("script", Html(zipped), type="application/octet-stream", id=f"rows-{number}"))
             left_out.append(_left_out(described[-1], source))
     main = element(
         "main",
         element("div", id="explorer", hidden="hidden") if shown else _too_many(runs),
         *left_out,
         *(_still(path, summary) for path, summary in summaries),
-        *(_distance(summary) for _, summary in summaries),
-        *(_drives(path, summary) for path, summary in summaries),
-        *(_surface(path, summary) for path, summary in summaries),
-        *(join_html(_axes(summary), _cost(path, summary)) for path, summary in summaries),
+        *(join_html(*_parts(path, summary)) for path, summary in summaries),
     )
     return document(
         title,
@@ -122,16 +122,14 @@ def sweep_page_html(runs: Sequence[tuple[Path, SweepSummary | None]], sources: S
 
 def _described(source: SweepSource, number: int) -> JsonObject:
     described: JsonObject = {"name": source.name, "parts": source.parts}
-    described["embedded" if isinstance(source.rows, Columns) else "rows"] = (
-        f"rows-{number}" if isinstance(source.rows, Columns) else source.rows
-    )
+    described |= {"embedded": f"rows-{number}"} if source.embedded else {"rows": source.rows}
     kept = source.pictures
     if kept is None:
         return described
     pictures: JsonObject = {"models": kept.models}
     if source.folder is not None:
         pictures |= {"folder": source.folder, "suffix": kept.suffix, "kept": list(kept.numbers) if kept.some else None}
-    elif isinstance(source.rows, Columns):
+    elif source.embedded:
         pictures["embedded"] = dict(kept.embedded(source.rows, MOST_EMBEDDED))
     return {**described, "pictures": pictures}
 
@@ -217,64 +215,11 @@ def _still(path: Path, summary: SweepSummary) -> Html:
     )
 
 
-def _drives(path: Path, summary: SweepSummary) -> Html:
-    """What is said of whole drives, where frames of a path were swept, with frames of the worst one."""
-    if not summary.drives:
-        return Html("")
-    said = f"Frames of the worst drive, {sweeps.drive_title(summary.drives[0])}, from the first to the last"
-    figure = _figure(path / "images" / "drive.png", said, wide=True)
-    return join_html(
-        element("h2", "Whole drives"),
-        element("div", figure, class_="pictures") if figure else None,
-        *(
-            join_html(element("p", sweeps.drive_title(one)), study_table(sweeps.DRIVE_HEADS, sweeps.drive_rows(one)))
-            for one in summary.drives
-        ),
-    )
-
-
-def _distance(summary: SweepSummary) -> Html:
-    """How far away the object is seen, where the sweep of a detector tells."""
-    found = sweeps.distance_of(summary)
-    if found is None:
-        return Html("")
-    said = sweeps.distance_sentence(found)
-    charts = [study_chart(partial(sweeps.distance_axes, found), said, width) for width in (WIDE, NARROW)]
-    return join_html(element("h2", "How far away it is seen"), element("p", said), *charts)
-
-
-def _surface(path: Path, summary: SweepSummary) -> Html:
-    """Which parts of the surface go with wrong answers, where that was asked for."""
-    if summary.surface is None:
-        return Html("")
-    said = sweeps.surface_sentences(summary.surface)
-    figure = _figure(path / "images" / "surface.png", " ".join(said), wide=True)
-    tables = [_parts(one) for one in summary.surface.tables if one.strongest]
-    return join_html(
-        element("h2", "The surface that was seen"),
-        element("div", figure, class_="pictures") if figure else element("p", " ".join(said)),
-        *tables,
-    )
-
-
-def _parts(told: SurfaceTable) -> Html:
-    """The parts of one map that are told most clearly."""
-    heads = ("middle (u, v)", "place (x, y, z)", "face", "wrong where seen", "wrong where not", "difference", "p")
-    cells = [
-        (
-            f"{one.u:.3f}, {one.v:.3f}",
-            ", ".join(f"{x:.3g}" for x in one.place),
-            str(one.face),
-            sweeps.wrong_text(one.seen),
-            sweeps.wrong_text(one.hidden),
-            sweeps.difference_text(one),
-            f"{one.p:.2g}",
-        )
-        for one in told.strongest
-    ]
-    who = f"{wording.short_name(told.object)}, {wording.short_name(told.model)}"
-    what = f"{who}: the {told.part}s that are told most clearly"
-    return element("details", element("summary", what), study_table(heads, cells))
+def _parts(path: Path, summary: SweepSummary) -> Iterator[Html]:
+    """What is shown of a sweep on a page alone, and how it came about."""
+    given = shown(summary)
+    yield from (part_html(path, one, given.said) for one in given.sections if one.only == "page" and not one.empty)
+    yield end_html(path, summary, given)
 
 
 def _worst_text(summary: SweepSummary) -> str:
@@ -289,48 +234,11 @@ def _worst_text(summary: SweepSummary) -> str:
     return f"{told}; {wording.tally('wrong', rate.successes, rate.trials, rate.not_a_number)} fresh renders."
 
 
-def _figure(file: Path, caption: str, *, wide: bool = False) -> Html | None:
+def _figure(file: Path, caption: str) -> Html | None:
     if not file.is_file():
         return None
     image = element("img", src=data_url(file.read_bytes(), "image/png"), alt=caption)
-    return element("figure", scrolled(image, "wide") if wide else image, element("figcaption", caption))
-
-
-def _axes(summary: SweepSummary) -> Html:
-    """The accuracy of each value of each axis, as tables."""
-    tables = []
-    for name in dict.fromkeys(row.axis for row in summary.axes):
-        mine = [row for row in summary.axes if row.axis == name]
-        if len(mine) <= MOST_LISTED:
-            heads = ("value", "configurations", "right", "accuracy", "95 % interval")
-            table = study_table(heads, [_cells(row) for row in mine])
-            tables.append(element("details", element("summary", f"Accuracy by {name}"), table))
-    return join_html(element("h2", "In numbers"), *tables) if tables else Html("")
-
-
-def _cells(row: AxisRow) -> list[str]:
-    """What a table says of a value of an axis: value, configurations, right, accuracy, interval."""
-    ends = row.value if isinstance(row.value, (list, tuple)) else [row.value]
-    value = " to ".join(f"{end:g}" if isinstance(end, float) else str(end) for end in ends)
-    unit = f" {row.unit}" if row.unit not in ("", "name") else ""
-    counts = [str(row.configurations), str(row.correct)]
-    return [value + unit, *counts, percent(row.accuracy), wording.interval_text(row.interval)]
-
-
-def _cost(path: Path, summary: SweepSummary) -> Html:
-    formed = summary.image_formation
-    facts = {
-        "Ending": summary.ending,
-        "Time": wording.seconds_text(summary.seconds["total"]),
-        "Samples a pixel": str(summary.spp),
-        "Image formation": wording.formation_text(formed, summary.gains) if formed else "",
-        "Seed": str(summary.seed),
-        "Again": shlex.join(["advsearch", "run", f"{summary.run or path}/{directory.CONFIG}"])
-        if is_command(summary.command_line)
-        else "",
-        "Command": summary.command_line,
-    }
-    return join_html(element("h2", "Cost and conditions"), facts_table(facts))
+    return element("figure", image, element("figcaption", caption))
 
 
 def result_of(run: Path) -> SweepSummary | None:

@@ -35,7 +35,7 @@ from advsearch.errors import AdvsearchError, InputError
 from advsearch.models import ModelWarning
 from advsearch.progress import NullProgress
 from advsearch.questions.attack import carry_out as attacking
-from advsearch.questions.region.settings import RegionConfig
+from advsearch.questions.region.answer import RegionConfig
 from advsearch.report.wording import objective_text
 from advsearch.runs.directory import is_run
 from advsearch.runs.store import Store
@@ -280,7 +280,7 @@ class Faded(NumberControl):
         Parameter("amount", (), "1", 0.0, 1.0, 0.0, "1 is black.", search=(0.0, 1.0), estimators=("adjoint",)),
     )
 
-    def scene_inputs(self, scene: Any, values: Any, so_far: Any) -> dict[str, Tensor]:
+    def scene_inputs(self, values: Any, so_far: Any) -> dict[str, Tensor]:
         return {"object.roughness": 0.5 + 0.5 * values["amount"]}
 
 

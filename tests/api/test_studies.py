@@ -25,8 +25,8 @@ from advsearch.errors import InputError, UnknownNameError
 from advsearch.questions.attack import carry_out as attacking
 from advsearch.questions.attack.carry_out import attack_from_config
 from advsearch.questions.gap import GapConfig, gap
-from advsearch.questions.region import carry_out as mapping
-from advsearch.questions.region.settings import RegionConfig
+from advsearch.questions.region import growing, region
+from advsearch.questions.region.answer import RegionConfig
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.listing import finished, listed_runs
 from advsearch.runs.results.attack import AttackSummary
@@ -148,13 +148,13 @@ SMALL: dict[str, Any] = {"object": "mug", "resolution": 16, "denoise": "none"}
 
 
 def test_a_region_is_told_in_the_units_of_its_parameters(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("advsearch.questions.region.carry_out.MOST_PROBED", 20)
+    monkeypatch.setattr("advsearch.questions.region.growing.MOST_PROBED", 20)
     config = RegionConfig(
         **SMALL, controls={"pose": {"yaw": [10, 50], "pitch": 0, "roll": 0, "x": 0, "z": 0}, "camera.elevation": {}},
         vary="pose.yaw,camera.elevation", samples=8, map=2, verify_spp=2, run=str(tmp_path / "run"),
     )  # fmt: skip
     try:
-        result = mapping.region_from_config(config)
+        result = region.from_config(config)
     except InputError as error:  # sixteen pixels may leave the verdict to the noise, which is said
         assert "depends on the noise" in str(error)
         return
@@ -174,9 +174,9 @@ def test_a_region_that_is_interrupted_says_how_to_go_on(
     def stopped(*_: Any, **__: Any) -> Any:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(mapping, "grow", stopped)
+    monkeypatch.setattr(growing, "grow", stopped)
     monkeypatch.setattr(
-        mapping, "_verdict", lambda verifier, centre: next(verifier.trials("centre", {0: centre})).success
+        growing, "_verdict", lambda verifier, centre: next(verifier.trials("centre", {0: centre})).success
     )
     folder = tmp_path / "run"
     flags = (
@@ -200,7 +200,7 @@ def test_a_region_that_is_interrupted_says_how_to_go_on(
 )
 def test_a_region_refuses_what_does_not_fit(more: dict[str, Any], error: Any, message: str, tmp_path: Path) -> None:
     with pytest.raises(error, match=message):
-        mapping.region_from_config(RegionConfig(**{**SMALL, "controls": "pose", **more, "run": str(tmp_path / "run")}))
+        region.from_config(RegionConfig(**{**SMALL, "controls": "pose", **more, "run": str(tmp_path / "run")}))
     assert not (tmp_path / "run").exists()
 
 

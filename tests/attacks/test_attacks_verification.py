@@ -41,8 +41,8 @@ from advsearch.attacks.verification import (
 )
 from advsearch.config import FEWEST_TRIALS
 from advsearch.errors import InputError
-from advsearch.questions.region.carry_out import GrownBox
-from advsearch.questions.region.settings import FEWEST_SAMPLES
+from advsearch.questions.region.answer import FEWEST_SAMPLES
+from advsearch.questions.region.growing import GrownBox
 from advsearch.seeds import stream
 from advsearch.tasks import Answer, Judgement
 

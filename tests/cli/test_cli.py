@@ -35,7 +35,7 @@ from advsearch.described import Value
 from advsearch.errors import InputError, StorageError
 from advsearch.progress import BarProgress, LineProgress, NullProgress, Progress, watched
 from advsearch.questions.gap import GapConfig
-from advsearch.questions.region.settings import RegionConfig
+from advsearch.questions.region.answer import RegionConfig
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row
 from advsearch.scene.settings import Parameter

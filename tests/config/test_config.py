@@ -25,7 +25,7 @@ from advsearch.errors import FileFormatError, InputError, UnknownNameError
 from advsearch.questions.check.settings import CheckConfig
 from advsearch.questions.gap import GapConfig
 from advsearch.questions.precision.settings import QUANTITIES, PrecisionConfig
-from advsearch.questions.region.settings import RegionConfig
+from advsearch.questions.region.answer import RegionConfig
 from advsearch.questions.stability.settings import StabilityConfig
 from advsearch.questions.test.settings import SuiteConfig
 from advsearch.settings import Config, Setting, all_finite, parse_assignment, read_yaml, settings

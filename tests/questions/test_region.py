@@ -10,9 +10,8 @@ import pytest
 from stand_ins import Impatient, rows
 
 from advsearch.engine import acceptance
-from advsearch.questions.region import carry_out
-from advsearch.questions.region.answer import RegionResult
-from advsearch.questions.region.settings import RegionConfig
+from advsearch.questions.region import growing, region
+from advsearch.questions.region.answer import RegionConfig, RegionResult
 from advsearch.runs.store import NAME as STORE
 from advsearch.runs.store import Store
 from advsearch.scene.surface import arrangement, texels
@@ -30,8 +29,8 @@ def coarse() -> Iterator[None]:
         patched.setattr(texels, "GROUND", 32)
         for module, name, value in (
             (arrangement, "SIDE", 48), (arrangement, "GATHERED", 64), (acceptance, "CHECK_SPP", 4),
-            (acceptance, "BOUND", 50.0), (acceptance, "MARGIN", 50.0), (carry_out, "MOST_PROBED", 20),
-            (carry_out, "pays_from", lambda *_: 1),
+            (acceptance, "BOUND", 50.0), (acceptance, "MARGIN", 50.0), (growing, "MOST_PROBED", 20),
+            (growing, "pays_from", lambda *_: 1),
         ):  # fmt: skip
             patched.setattr(module, name, value)
         yield
@@ -41,7 +40,7 @@ def coarse() -> Iterator[None]:
 def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, RegionResult]:
     """A run that nobody disturbed, and its result."""
     run = tmp_path_factory.mktemp("region") / "run"
-    return run, carry_out.region_from_config(RegionConfig(**SMALL, run=str(run)))
+    return run, region.from_config(RegionConfig(**SMALL, run=str(run)))
 
 
 def test_viewpoints_are_predicted_and_fresh_samples_are_rendered(whole: tuple[Path, RegionResult]) -> None:
@@ -55,7 +54,7 @@ def test_viewpoints_are_predicted_and_fresh_samples_are_rendered(whole: tuple[Pa
     assert predicted and found.count(("map", True, 4)) == 9 and len(found) == predicted + checked + 9
     assert result.renders["products"] == predicted + 9
     compared = 3 * acceptance.FIRST
-    assert result.renders["verification"] == carry_out.AT_CENTRE + checked + compared
+    assert result.renders["verification"] == growing.AT_CENTRE + checked + compared
 
 
 class Stopping(Impatient):
@@ -68,8 +67,8 @@ class Stopping(Impatient):
 def test_a_region_that_goes_on_ends_with_the_same_rows(whole: tuple[Path, RegionResult], tmp_path: Path) -> None:
     """Light is found again; pictures that were predicted are counted as such."""
     config = RegionConfig(**SMALL, run=str(tmp_path / "run"))
-    assert carry_out.region_from_config(config, progress=Stopping(9)).ending == "interrupted"
-    result = carry_out.region_from_config(config, resumed=tmp_path / "run")
+    assert region.from_config(config, progress=Stopping(9)).ending == "interrupted"
+    result = region.from_config(config, resumed=tmp_path / "run")
     assert rows(tmp_path / "run") == rows(whole[0]) and result.renders == whole[1].renders
 
 
@@ -85,8 +84,8 @@ def test_what_is_rendered_says_why(
     more: dict[str, Any], reason: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Nothing is said where that was asked for, or where more moves than a camera."""
-    monkeypatch.setattr(carry_out, "pays_from", lambda *_: 999)
+    monkeypatch.setattr(growing, "pays_from", lambda *_: 999)
     config = RegionConfig(**{**SMALL, "map": 0, "verify_spp": 2, **more}, run=str(tmp_path / "run"))
-    result = carry_out.region_from_config(config)
+    result = region.from_config(config)
     assert "products" not in result.renders
     assert (result.transport and result.transport.reason) == reason

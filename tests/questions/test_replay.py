@@ -19,8 +19,8 @@ from advsearch.engine.verifier import RetrialCondition, Retrials
 from advsearch.errors import FileFormatError, InputError
 from advsearch.progress import NullProgress
 from advsearch.questions.attack.carry_out import attack_once
-from advsearch.questions.replay import carry_out as replaying
-from advsearch.questions.replay.settings import ReplayConfig
+from advsearch.questions.replay import replay
+from advsearch.questions.replay.answer import ReplayConfig
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Store
 from advsearch.runs.summary import read_answer, read_result, write_answer
@@ -85,9 +85,9 @@ def test_a_replay_goes_on_where_it_was_stopped(attacked: Path, tmp_path: Path, m
         return real(*given)
 
     monkeypatch.setattr(Problem, "judge", stopped)
-    first = replaying.replay_from_config(config)
+    first = replay.from_config(config)
     assert first.goes_on and len(first.table) == 1
-    again = replaying.replay_from_config(config, resumed=tmp_path / "run")
+    again = replay.from_config(config, resumed=tmp_path / "run")
     assert again.ending == "done" and len(again.table) == 4 and done == 32 + 4 * 12 - 31
     assert again.table[0] == first.table[0]
 

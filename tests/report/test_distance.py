@@ -86,5 +86,5 @@ def test_the_page_of_a_sweep_has_the_curve(tmp_path: Any) -> None:
     run = make_sweep(tmp_path / "s")
     told = sweep(task="detection", axes=rows([20, 20, 15, 5, 0]))
     page = sweep_page_html([(run, told)], [SweepSource("s", None)])
-    assert re.search(r"<h2>How far away it is seen</h2>\s*<p>Seen from 28.3 m", page)
+    assert re.search(r"<h2>How far away it is seen</h2>.*<p class=\"soft\">Seen from 28.3 m", page, re.DOTALL)
     assert page.count("<svg") >= 2

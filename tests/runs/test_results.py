@@ -12,7 +12,7 @@ from pydantic import Field, computed_field
 from samples import attack
 
 from advsearch.cli.output import shown_text as check_text
-from advsearch.questions.attack.page import RunData, attack_page_html
+from advsearch.questions.attack.page import page as attack_page
 from advsearch.report.shown import facts_of, fields_shown
 from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.results.base import Fields, Interval, JsonFloat, Result, as_fact
@@ -60,10 +60,10 @@ def test_a_field_that_is_declared_as_a_fact_is_in_terminal_page_and_json(tmp_pat
     assert "picture_bytes" not in old.to_dict() and new.to_dict()["picture_bytes"] == 768
     assert old.to_dict()["renders_a_second"] == Timed.of(old.to_dict()).renders_a_second == 101 / 14.6
     assert AttackSummary.of(new.to_dict()) == attack()
-    page = attack_page_html(RunData(tmp_path, new, "", {}, {}))
+    page = attack_page(tmp_path, new)
     for name, text in (("picture bytes", "768"), ("renders a second", "6.92")):
         assert re.search(rf"^  {name} +{text}$", check_text(new), re.M)
-        assert re.search(rf"<th[^>]*>{name.capitalize()}</th><td[^>]*>{text}</td>", page)
+        assert re.search(rf"<th[^>]*>{name.capitalize()}</th><td[^>]*>{text}</td>", str(page))
     assert "picture bytes" not in check_text(old)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+from functools import partial
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -31,15 +32,16 @@ from samples import (
 from advsearch.attacks import clopper_pearson
 from advsearch.attacks.objectives import OBJECTIVE_KINDS
 from advsearch.errors import FileFormatError
-from advsearch.questions.attack.page import LARGE_PICTURE, SMALLER_SIDE
 from advsearch.report import wording
-from advsearch.report.markup import NARROW, WIDE, Curve, Html, element, figure_of_answer, join_html, objective_chart
+from advsearch.report.figures import search_axes
+from advsearch.report.markup import NARROW, WIDE, Html, element, figure_of_answer, join_html, study_chart
 from advsearch.report.phrases import objective_label, percent
 from advsearch.report.shown import shown
 from advsearch.runs.directory import OBJECT_FILE
 from advsearch.runs.images import read_png
 from advsearch.viewer.document import asset
-from advsearch.viewer.pages import LARGEST, object_section, read_object
+from advsearch.viewer.pages import LARGEST, object_part, read_object
+from advsearch.viewer.parts import LARGE_PICTURE, SMALLER_SIDE
 
 VOID = {"meta", "img", "br", "hr", "link"}
 
@@ -97,9 +99,9 @@ def test_the_page_says_it_all(tmp_path: Path) -> None:
         "Adversarial : vase, 91 %",
         "5 times magnified, grey where nothing changed",
         "trial 00",
-        "Clean scene (control group) right 20 of 20 83-100 %",
-        "Adversarial wrong 20 of 20 83-100 %",
-        "Random search wrong 1 of 20 0.1-25 %",
+        "clean right in 20 of 20 83-100 % mug 98 %",
+        "adversarial wrong in 20 of 20 83-100 % vase 91 %",
+        "random search wrong in 1 of 20 0.1-25 % 40 pictures",
         "64 samples per pixel",
         "margin [logits]",
         "pgd, 40 steps",
@@ -107,7 +109,7 @@ def test_the_page_says_it_all(tmp_path: Path) -> None:
         "40 of the search, 40 gradients, 21 of the verification",
         "14.6 s (setup 3.1 s, search 9.0 s, verification 2.2 s)",
         "128 x 128 pixels, box filter, denoised (oidn), exposure 0 stops",
-        "advsearch run runs/mug-texture-001/run.yaml",
+        f"advsearch run {tmp_path}/run/run.yaml",
         "advsearch attack",
         "texture_resolution: null",
     ):
@@ -126,12 +128,12 @@ def test_the_page_says_what_was_asked_beside_the_worst_case(tmp_path: Path) -> N
     page = page_of(make_run(tmp_path / "run", summary))
     for text in (
         "in 20 of 20 fresh renders (95 % interval 83-100 %), each with another camera and environment.",
-        "Adversarial target 20 of 20 83-100 %",
-        "Random search target 1 of 20 0.1-25 %",
-        "Average case (random configurations) right 150 of 200 68-81 %",
-        "Goal the model should answer vase",
+        "adversarial target in 20 of 20 83-100 % vase 91 %",
+        "random search target in 1 of 20 0.1-25 % 40 pictures",
+        "average case right in 150 of 200 68-81 % 200 configurations",
+        "Wanted the model should answer vase",
         "Over camera and environment, drawn anew for every picture",
-        "Smallest epsilon 0.0123; no search found one at 0.0118",
+        "Smallest 0.0123; no search found one at 0.0118",
     ):
         assert text in page.text, text
     assert "above: target" in [part.strip() for part in page.words]
@@ -141,7 +143,7 @@ def test_the_page_says_what_was_asked_beside_the_worst_case(tmp_path: Path) -> N
 
 def test_the_page_does_not_say_what_was_not_asked(tmp_path: Path) -> None:
     text = page_of(make_run(tmp_path / "run", attack(**ANY))).text
-    assert not re.search(r"Goal|Over |Smallest epsilon|Average case", text)
+    assert not re.search(r"Wanted|Over |Smallest|average case", text)
 
 
 def test_the_page_needs_nothing_from_elsewhere(tmp_path: Path) -> None:
@@ -260,13 +262,16 @@ def test_text_is_escaped_and_markup_is_not() -> None:
     assert join_html("<", element("br")) == "&lt;<br>"
 
 
+def searches(objectives: dict[str, list[float | None]], zero: str = "", width: int = WIDE) -> Html:
+    return study_chart(partial(search_axes, objectives, "margin", zero_means=zero), "the search", width)
+
+
 @pytest.mark.parametrize("width", [WIDE, NARROW])
 @pytest.mark.parametrize(
     "values", [[1.0], [2.0, 2.0, 2.0], [None, 1.0, None], [1e-12, 2e-12], [-1e9, 1e9], [float(i) for i in range(5000)]]
 )
 def test_a_chart_of_any_values_is_drawn_inside_its_frame(values: list[float | None], width: int) -> None:
-    curves = [Curve("a", "search", values), Curve("random", "baseline", values)]
-    page = Page(objective_chart(curves, "margin", "wrong", width))
+    page = Page(searches({"a": values, "random": values}, "wrong", width))
     lines = [path for path in page.all("path") if re.search(r"stroke-width: 2\b", str(path["style"]))]
     assert [re.findall(r"var\(--(\w+)\)", str(line["style"])) for line in lines] == [["search"], ["baseline"]] * 2, (
         "the legend draws them again"
@@ -281,14 +286,14 @@ def test_a_chart_of_any_values_is_drawn_inside_its_frame(values: list[float | No
 
 
 def test_the_numbers_at_an_axis_are_whole() -> None:
-    assert {"1.00", "1.25", "1.50"} <= set(Page(objective_chart([Curve("a", "search", [1.0, 3.0])], "m")).text.split())
-    texts = Page(objective_chart([Curve("a", "search", [5.0])], "m")).text.split()
+    assert {"1.00", "1.25", "1.50"} <= set(Page(searches({"a": [1.0, 3.0]})).text.split())
+    texts = Page(searches({"a": [5.0]})).text.split()
     assert texts[texts.index("evaluations", 3) - 2 :][:2] == ["1", "2"], "there is no evaluation 0.5"
 
 
 @pytest.mark.parametrize("name", ["$x$", "<b>&", "\u6a21"])
 def test_any_name_may_stand_in_a_chart(name: str) -> None:
-    page = Page(objective_chart([Curve(name, "search", [0.0, 1.0])], name))
+    page = Page(study_chart(partial(search_axes, {name: [0.0, 1.0]}, name), name))
     assert page.text.count(name) >= 3 and not page.all("b")
 
 
@@ -525,11 +530,11 @@ def test_a_damaged_object_is_left_out(tmp_path: Path) -> None:
     keep_object(tmp_path)
     good = file.read_bytes()
     assert read_object(tmp_path) == good
-    assert "It has fewer faces here." in str(object_section(good))
+    assert "It has fewer faces here." in object_part(good).note
     for data in (b"", b"glTF", b"glTF" + bytes(40), b"GIF89a" * 9, good[:2000], good + bytes(LARGEST)):
         file.write_bytes(data)
         assert read_object(tmp_path) == b""
-    assert object_section(b"") is None
+    assert object_part(b"").empty
 
 
 METHOD: dict[str, Any] = {

@@ -127,8 +127,6 @@ class MatrixResult(InNotebook, StudyResult):
         return f"{sum(cell.ending == 'found' for cell in others)} of {len(others)} transfer" if others else ""
 
 
-RESULT = AttackSummary
-
 BY_FIELD: dict[str, type[Result]] = {"models": MatrixResult, "curve": CurveResult}
 """Other results of the command, by a field that they alone have."""
 

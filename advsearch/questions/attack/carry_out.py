@@ -9,10 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from torch import Tensor
-from typing_extensions import Unpack
 
 from advsearch import losses
-from advsearch.api.keywords import AttackKeywords, asks
+from advsearch.api.keywords import asks
 from advsearch.attacks import Policy, make_policy
 from advsearch.attacks.objectives import OBJECTIVE_KINDS
 from advsearch.cluster import Call
@@ -67,7 +66,7 @@ PREPARING = "preparing the scene for rendering"
 """What a person who waits is told before the first picture."""
 
 
-@asks(AttackConfig, AttackKeywords)
+@asks(AttackConfig)
 def attack(
     scene: Scene | str | Path | Mapping[str, object],
     model: AnyModel | Sequence[AnyModel] = "reference",
@@ -82,7 +81,7 @@ def attack(
     run: str | Path | None = None,
     resume: bool = False,
     progress: Watched = None,
-    **settings: Unpack[AttackKeywords],
+    **settings: Any,
 ) -> AttackResult:
     """Search for the worst configuration of a scene, verify it, and return everything that is known about it.
 
@@ -215,7 +214,7 @@ def _policy_of(setting: str | Mapping[str, Any]) -> Policy[Any]:
     return make_policy(config.policy_name, **config.policy_options)
 
 
-def _scene(scene: Scene | str | Path | Mapping[str, Any], object: str | None, settings: AttackKeywords) -> Scene:
+def _scene(scene: Scene | str | Path | Mapping[str, Any], object: str | None, settings: Mapping[str, Any]) -> Scene:
     """The scene as it was given, or the one that a name and the settings describe."""
     if isinstance(scene, Scene):
         check_not_of_scene({**settings, "object": object})

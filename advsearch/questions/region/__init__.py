@@ -1,39 +1,32 @@
-"""`advsearch region`: how far one can go from a configuration before the model's verdict changes."""
+"""Grow a box around a configuration in which the model's verdict stays the same."""
 
 from __future__ import annotations
 
-import argparse
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
 
-from advsearch.cli.question import QuestionCommand
-from advsearch.errors import InputError
+from advsearch.config.attack import AttackConfig
+from advsearch.question import Asked, question
+from advsearch.questions.region.answer import RegionConfig, RegionResult
+from advsearch.questions.region.answer import claims as claims
+from advsearch.questions.region.answer import shown as shown
 
-if TYPE_CHECKING:
-    from advsearch.settings import Config
 
-HELP = "grow a box around a configuration in which the model's verdict stays the same"
-EXAMPLES = (
+def of_the_run(file: Path, typed: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what the run around whose answer a box grows brings: scene, model and controls."""
+    return RegionConfig.shared(AttackConfig.from_yaml(file))
+
+
+@question(
     "region --object mug --control pose.yaw,camera.elevation --map 24",
     "region --around mug-pose-001 --vary pose.yaw,pose.pitch",
+    place=("object", "model"),
+    about="around",
+    brought=of_the_run,
 )
+def region(asked: Asked[RegionConfig]) -> RegionResult:
+    """Grow the box around a configuration in which the verdict stays what it is (docs/questions.md)."""
+    from advsearch.questions.region.growing import region_around  # imports torch
 
-
-class _Region(QuestionCommand):
-    """The command, which may take scene and controls from the run that it goes around."""
-
-    def config(self, args: argparse.Namespace, **over: Any) -> Config:
-        """Return what the flags describe over the scene and the controls of the run."""
-        file = self.file(args)
-        if file is None:
-            if "object" not in args:
-                raise InputError(
-                    "advsearch region: expected --object NAME, or --around RUN; see advsearch region --help"
-                )
-            return super().config(args, **over)
-        from advsearch.config import AttackConfig  # settings take a third of a second, and help needs none
-        from advsearch.questions.region.settings import RegionConfig
-
-        return super().config(args, **over, **RegionConfig.shared(AttackConfig.from_yaml(file)))
-
-
-COMMAND = _Region("region", about="around")
+    return region_around(asked)

@@ -1,18 +1,65 @@
-"""The result of `region`."""
+"""Settings and result of `region`, and what is shown of it."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Annotated, Any, ClassVar
+from collections.abc import Iterator, Mapping
+from typing import Annotated, ClassVar
 
 from pydantic import Field
 
-from advsearch.report.figures import MARGIN, Figures, axis_title, figure_of, heat
+from advsearch.config.attack import AttackConfig, DerivativeConfig
+from advsearch.config.scene import SceneConfig
 from advsearch.report.markup import InNotebook
 from advsearch.report.phrases import percent
 from advsearch.report.shown import AnswerPart, Claim, Column, Extent, ShownAnswer, claim, share_text
 from advsearch.runs.results.attack import LinearTransport
 from advsearch.runs.results.base import CleanScene, Fields, Formation, Interval, JsonFloat, SceneResult, having
+from advsearch.settings import setting, setting_as_in
+
+FEWEST_SAMPLES = 8
+"""With fewer, not even a box without exceptions has one verdict in more than half of it, at the confidence of
+`questions.region.growing.GrownBox.interval`."""
+
+
+class RegionConfig(SceneConfig):
+    """Everything that decides what `region` does: the box around a configuration in which the verdict stays."""
+
+    command: ClassVar[str] = "region"
+    without: ClassVar[tuple[str, ...]] = ("spp",)
+
+    around: str | None = setting(
+        None,
+        "region",
+        "a run whose answer is the centre; it brings scene, model and controls with it",
+        "the name or the folder of a run",
+        otherwise="the scene as it is",
+    )
+    vary: str | None = setting(
+        None,
+        "region",
+        "the parameters in which the box grows, separated by commas",
+        "names such as pose.yaw,camera.elevation",
+        otherwise="all that the controls search, up to eight",
+    )
+    samples: int = setting(
+        200, "region", "fresh samples that check the box", unit="renders", ge=FEWEST_SAMPLES, le=1_000_000
+    )
+    map: int = setting(
+        0,
+        "region",
+        "side of the map of the margin, where there are two parameters; 0 for none",
+        unit="points",
+        ge=0,
+        le=512,
+    )
+    specialise: bool = setting_as_in(
+        DerivativeConfig,
+        "specialise",
+        group="region",
+        description="predict pictures from new viewpoints while the box grows, and those of the map",
+        switched="render every picture",
+    )
+    verify_spp: int | None = setting_as_in(AttackConfig, "verify_spp", group="region", description="samples per pixel")
 
 
 class AxisRange(Fields):
@@ -74,9 +121,6 @@ class RegionResult(InNotebook, GrownRegion, SceneResult):
         return f"{self.verdict} in {self.same} of {self.samples} samples of the box" if self.samples else ""
 
 
-RESULT = RegionResult
-
-
 def shown(result: RegionResult) -> ShownAnswer:
     """Return the box and what is known of it."""
     if result.box is None or result.interval is None:
@@ -108,22 +152,3 @@ def claims(result: RegionResult) -> Iterator[Claim]:
         f"Inside {box or 'the box'} the model is {result.verdict} in {share_text(extent)} samples drawn evenly from it."
     )
     yield claim("measured", f"{text} Certified by sampling: single points of it may differ.", extent)
-
-
-def map_figure(drawn: MarginMap, box: Sequence[BoxSide]) -> Figures:
-    """Draw a map of the margin over two parameters, with the line at which the verdict changes, and the box."""
-
-    def draw(axes: Any) -> None:
-        (first, second), margins = drawn.axes, drawn.margins
-        extent = (first.low, first.high, second.low, second.high)
-        heat(axes, margins, extent, MARGIN, axis_title(first.name, first.unit), axis_title(second.name, second.unit))
-        if min(map(min, margins)) < 0.0 < max(map(max, margins)):
-            axes.contour(margins, levels=[0.0], extent=extent, colors="black", linewidths=1.0)
-        across, up = box
-        corners_x = [across.low, across.high, across.high, across.low, across.low]
-        corners_y = [up.low, up.low, up.high, up.high, up.low]
-        axes.plot(corners_x, corners_y, color="black", linestyle="--", label="region")
-        axes.plot(across.centre, up.centre, "k+", label="centre")
-        axes.legend(loc="upper right", frameon=True)
-
-    return figure_of(draw, (6.0, 4.6))

@@ -1,9 +1,22 @@
-"""`advsearch replay`: the answer of a run under other conditions, in one table."""
+"""Render the answer of a run again under other conditions, beside the clean scene."""
 
-from advsearch.cli.question import Positional, QuestionCommand
+from __future__ import annotations
 
-HELP = "render the answer of a run again under other conditions, beside the clean scene"
-EXAMPLES = ("replay mug-texture-001", "replay mug-texture-001 --ways jpeg,sensor --model torchvision:resnet18 --json")
+from advsearch.question import Asked, question
+from advsearch.questions.replay.answer import ReplayConfig, ReplayResult
+from advsearch.questions.replay.answer import claims as claims
+from advsearch.questions.replay.answer import shown as shown
 
 
-COMMAND = QuestionCommand("replay", about="answer", place=Positional("RUN", "a run"))
+@question(
+    "replay mug-texture-001",
+    "replay mug-texture-001 --ways jpeg,sensor --model torchvision:resnet18 --json",
+    about="answer",
+    expected=("RUN", "a run"),
+    called="advsearch.questions.replay.conditions:replay",
+)
+def replay(asked: Asked[ReplayConfig]) -> ReplayResult:
+    """Render the answer of a run under other conditions, each beside the clean scene."""
+    from advsearch.questions.replay.conditions import rendered_again  # imports torch
+
+    return rendered_again(asked)

@@ -10,7 +10,7 @@ from advsearch.report.markup import Html, element, join_html
 from advsearch.report.shown import Claim
 from advsearch.report.wording import interval_text
 from advsearch.runs.results.base import Fields, Result
-from advsearch.viewer.document import again, document, facts_table, heading, study_table
+from advsearch.viewer.document import document, facts_table, heading, study_table
 
 
 class EvidenceRun(Fields):
@@ -118,5 +118,7 @@ def _run_html(one: EvidenceRun) -> Html:
         element("h2", f"{one.run} ({one.command})"),
         study_table(CLAIM_HEADS, rows),
         beside,
-        again(one.command_line) if one.command_line else None,
+        join_html(element("h2", "Do it again"), element("pre", one.command_line, class_="wrap"))
+        if one.command_line
+        else None,
     )

@@ -3,26 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from functools import partial
 
 from advsearch.report import wording
 from advsearch.report.figures import figure_size, sweep_axes
 from advsearch.report.phrases import answer_text, beside_text, margin_text, percent
-from advsearch.report.shown import AnswerPart, Claim, Extent, ShownAnswer, claim, extent_of, share_text
+from advsearch.report.shown import AnswerPart, Claim, Column, Extent, ShownAnswer, claim, extent_of, share_text
 from advsearch.report.sweeps import (
     DRIVE_HEADS,
+    difference_text,
+    distance_axes,
     distance_of,
     distance_sentence,
     drive_rows,
     drive_title,
     over_drives,
     surface_sentences,
+    wrong_text,
 )
 from advsearch.runs.results.base import INTERRUPTED
 from advsearch.runs.results.sweep import AxisRow, PairedRates, SweepSummary, WorstConfiguration
 from advsearch.settings import split_names
-
-RESULT = SweepSummary
-
 
 READING = "How often it is right at each value, over all others, with the 95 % interval:"
 
@@ -31,6 +33,27 @@ BAR = 20
 
 MOST_ROWS = 24
 """Values of an axis that are all shown; of more, half as many: those where the model does worst."""
+
+
+MOST_LISTED = 96
+"""Values of an axis that a page lists as a table; of more, none."""
+
+AXIS_COLUMNS: dict[str, Column] = {
+    "value": lambda row: wording.value_text(row.value) + (f" {row.unit}" if row.unit not in ("", "name") else ""),
+    "configurations": "{0.configurations}",
+    "right": "{0.correct}",
+    "accuracy": lambda row: percent(row.accuracy),
+    "95 % interval": lambda row: wording.interval_text(row.interval),
+}
+SURFACE_COLUMNS: dict[str, Column] = {
+    "middle (u, v)": "{0.u:.3f}, {0.v:.3f}",
+    "place (x, y, z)": lambda one: ", ".join(f"{x:.3g}" for x in one.place),
+    "face": "{0.face}",
+    "wrong where seen": lambda one: wrong_text(one.seen),
+    "wrong where not": lambda one: wrong_text(one.hidden),
+    "difference": difference_text,
+    "p": "{0.p:.2g}",
+}
 
 
 def shown(summary: SweepSummary) -> ShownAnswer:
@@ -45,7 +68,29 @@ def shown(summary: SweepSummary) -> ShownAnswer:
     size = figure_size(summary)
     if size is not None:
         sections.append(AnswerPart(draw=lambda axes: sweep_axes(summary, axes), size=size, only="notebook"))
+    sections += (replace(part, only="page") for part in _page_parts(summary))
     return ShownAnswer(_verdict(summary), sections, _facts(summary))
+
+
+def _page_parts(summary: SweepSummary) -> Iterator[AnswerPart]:
+    """What a page shows beside its explorer: from how far away, whole drives, the surface, and each axis in numbers."""
+    if far := distance_of(summary):
+        said = distance_sentence(far)
+        yield AnswerPart("How far away it is seen", [said], draw=partial(distance_axes, far), note=said)
+    for number, one in enumerate(summary.drives or ()):
+        title, figure = ("Whole drives", "images/drive.png") if number == 0 else ("", "")
+        yield AnswerPart(title, [drive_title(one)], heads=DRIVE_HEADS, rows=drive_rows(one), figure=figure)
+    if summary.surface is not None:
+        text = [" ".join(surface_sentences(summary.surface))]
+        yield AnswerPart("The surface that was seen", text, figure="images/surface.png")
+        for table in (one for one in summary.surface.tables if one.strongest):
+            who = f"{wording.short_name(table.object)}, {wording.short_name(table.model)}"
+            title = f"{who}: the {table.part}s that are told most clearly"
+            yield AnswerPart.table(table.strongest, SURFACE_COLUMNS, title=title, folded=True)
+    for name in dict.fromkeys(row.axis for row in summary.axes):
+        rows = [row for row in summary.axes if row.axis == name]
+        if len(rows) <= MOST_LISTED:
+            yield AnswerPart.table(rows, AXIS_COLUMNS, title=f"Accuracy by {name}", folded=True)
 
 
 def _verdict(summary: SweepSummary) -> str:

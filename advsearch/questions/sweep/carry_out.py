@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from typing_extensions import Unpack
 
-from advsearch.api.keywords import SweepKeywords, asks
+from advsearch.api.keywords import asks
 from advsearch.cluster import Call
 from advsearch.config import AttackConfig, SweepConfig
 from advsearch.controls import Control
@@ -73,7 +72,7 @@ CLEAN = "clean"
 AnyScene = Scene | str | Path
 
 
-@asks(SweepConfig, SweepKeywords)
+@asks(SweepConfig)
 def sweep(
     scene: AnyScene | Sequence[AnyScene] | None = None,
     model: AnyModel | Sequence[AnyModel] | None = None,
@@ -86,7 +85,7 @@ def sweep(
     metrics: Mapping[str, str | Metric] | None = None,
     run: str | Path | None = None,
     progress: Watched = None,
-    **settings: Unpack[SweepKeywords],
+    **settings: Any,
 ) -> SweepResult:
     """Render every configuration of a grid, and draws by chance, and say how often the model is right.
 

@@ -16,7 +16,7 @@
     const input = make("input", { type: "range", min: 0, max: 100, value: 50, "aria-label": "where the clean picture ends and the adversarial one begins", oninput: (event) => slide(event.target.value) });
     slide(50);
     place.append(stage, make("label", { class: "ends" }, make("span", {}, "clean"), input, make("span", {}, "adversarial")));
-    place.hidden = false;
+    place.closest("[hidden]").hidden = false;
   }
 
   function frames(place) {

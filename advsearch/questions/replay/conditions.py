@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -11,10 +10,9 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from typing_extensions import Unpack
 
 from advsearch import seeds
-from advsearch.api.keywords import Names, RunKeywords, asks, configured
+from advsearch.api.keywords import asks, configured
 from advsearch.controls.corruption import coded
 from advsearch.controls.sensor import SensorControl, through_sensor
 from advsearch.engine.attack_parts import LOADING, SEARCHED_WITH, AttackParts, parts_in, problem_of_parts
@@ -24,18 +22,15 @@ from advsearch.engine.problem import Problem
 from advsearch.engine.record import control_group, verified_rate
 from advsearch.engine.verifier import RetrialCondition, Retrials, kept_answer, unchanged
 from advsearch.errors import InputError
-from advsearch.interrupts import interruptible
-from advsearch.progress import NullProgress, Progress, Watched, watcher
-from advsearch.questions.replay.answer import NOT_DONE, ReplayResult, ReplayRow
-from advsearch.questions.replay.settings import ReplayConfig
+from advsearch.progress import Progress, Watched, watcher
+from advsearch.question import Asked, answered
+from advsearch.questions.replay.answer import NOT_DONE, ReplayConfig, ReplayResult, ReplayRow
 from advsearch.runs.directory import RunDirectory, find_run, only_here
 from advsearch.runs.results.attack import AttackSummary
-from advsearch.runs.results.base import INTERRUPTED
 from advsearch.runs.store import NAME, Store
 from advsearch.runs.summary import MADE_WITH, attack_of, changed_file
 from advsearch.scene.cycles import BlenderError, Cycles
 from advsearch.scene.renderer import MAX_SPP
-from advsearch.viewer.pages import keep_answer
 
 OWN = "as verified"
 """The way in which nothing is changed."""
@@ -157,40 +152,25 @@ def _sensor(values: dict[str, float]) -> Callable[[Tensor, int], Tensor]:
     return lambda picture, seed: through_sensor(picture, full, seed)
 
 
-class ReplayKeywords(RunKeywords, total=False):
-    ways: Names | None
-    model: Names | None
-    trials: int
-    threads: int | None
-
-
-@asks(ReplayConfig, ReplayKeywords)
-def replay(
-    answer: str | Path | AttackResult, *, progress: Watched = None, **settings: Unpack[ReplayKeywords]
-) -> ReplayResult:
+@asks(ReplayConfig)
+def replay(answer: str | Path | AttackResult, *, progress: Watched = None, **settings: Any) -> ReplayResult:
     """Render the answer of a run under other conditions, each beside the clean scene (docs/questions.md).
 
     Args:
         answer: of an attack that was kept and has ended: its result, or name or folder of its run.
     """
-    if not isinstance(answer, AttackResult):
-        return replay_from_config(configured(ReplayConfig, answer=answer, **settings), progress=watcher(progress))
-    if answer.run is None:
-        raise InputError("answer: expected an attack that was kept, got one that was not; give it a `run`")
-    needed = [one for one in only_here(answer.run) if not one.startswith(SEARCHED_WITH)]
-    config = configured(ReplayConfig, answer=answer.run, **settings).with_only_here(needed)
-    return replay_from_config(
-        config, progress=watcher(progress), parts=None if answer.parts is None else answer.parts()
-    )
+    parts, only_now = None, list[str]()
+    if isinstance(answer, AttackResult):
+        if answer.run is None:
+            raise InputError("answer: expected an attack that was kept, got one that was not; give it a `run`")
+        only_now = [one for one in only_here(answer.run) if not one.startswith(SEARCHED_WITH)]
+        parts = None if answer.parts is None else answer.parts()
+    config = configured(ReplayConfig, answer=answer.run if isinstance(answer, AttackResult) else answer, **settings)
+    asked = Asked(config.with_only_here(only_now) if only_now else config, watcher(progress))
+    return answered(partial(rendered_again, parts=parts), asked)
 
 
-def replay_from_config(
-    config: ReplayConfig,
-    *,
-    progress: Progress | None = None,
-    resumed: Path | None = None,
-    parts: AttackParts | None = None,
-) -> ReplayResult:
+def rendered_again(asked: Asked[ReplayConfig], parts: AttackParts | None = None) -> ReplayResult:
     """Render an answer again as a configuration describes; every trial is stored at once, and a run goes on with the
     next.
 
@@ -200,8 +180,8 @@ def replay_from_config(
         InputError: the run has no answer, or its scene is another one now.
         FileFormatError: it did not end, or is of another command.
     """
-    begun, progress = time.perf_counter(), progress or NullProgress()
-    progress.stage(LOADING)
+    config = asked.config
+    asked.progress.stage(LOADING)
     folder = find_run(config.answer)
     summary = attack_of(folder)
     if summary.adversarial is None:
@@ -213,35 +193,27 @@ def replay_from_config(
     problem, warnings = again()
     warnings += _changed(folder, parts)
     u = kept_answer(folder, problem)
-    ways = [*_ways(config, again, problem, summary), *_models(config, again, problem, summary)]
-    ending, seed = "done", seeds.stream(parts.config.seed, "replay")
-    with RunDirectory.of(config, resumed) as run:
-        table = _Table(ways, u, config.trials, seed, run, progress)
-        try:
-            with interruptible():
-                table.fill([number for number, way in enumerate(ways) if way.shares])
-                for number in (number for number, way in enumerate(ways) if not way.shares):
-                    table.fill([number])
-        except KeyboardInterrupt:
-            ending = INTERRUPTED
-        result = ReplayResult(
-            run=str(run.path),
-            answer=str(folder),
-            answered=summary.ending,
-            object=summary.object,
-            model=summary.model,
-            task=summary.task,
-            environment=summary.environment,
-            controls=summary.controls,
-            ending=ending,
-            table=[row for _, row in sorted(table.rows.items())],
-            renders=table.renders,
-            warnings=warnings,
-            seconds={"total": time.perf_counter() - begun},
-            seed=parts.config.seed,
-            command_line=config.command_line(),
-        )
-        return keep_answer(run, result)
+    own, *others = ways_of(problem, _spp(summary), lambda size: again(resolution=size)[0])
+    ways = [own, *(way for way in others if way.name in config.chosen), *_models(config, again, problem, summary)]
+    table = _Table(ways, u, config.trials, seeds.stream(parts.config.seed, "replay"), asked.run, asked.progress)
+    with asked.until_interrupted():
+        table.fill([number for number, way in enumerate(ways) if way.shares])
+        for number in (number for number, way in enumerate(ways) if not way.shares):
+            table.fill([number])
+    return asked.result(
+        ReplayResult,
+        answer=str(folder),
+        answered=summary.ending,
+        object=summary.object,
+        model=summary.model,
+        task=summary.task,
+        environment=summary.environment,
+        controls=summary.controls,
+        table=[row for _, row in sorted(table.rows.items())],
+        renders=table.renders,
+        warnings=warnings,
+        seed=parts.config.seed,
+    )
 
 
 @dataclass
@@ -312,17 +284,6 @@ OWN_MODEL = "the run's own"
 
 def _spp(summary: AttackSummary) -> int:
     return summary.sample_count.spp if summary.sample_count else summary.verified.spp if summary.verified else 64
-
-
-def _ways(config: ReplayConfig, again: Again, problem: Problem, summary: AttackSummary) -> Iterator[Way]:
-    """The run's own condition, and those that are asked for."""
-
-    def sized(size: tuple[int, int]) -> Problem:
-        return again(resolution=size)[0]
-
-    own, *others = ways_of(problem, _spp(summary), sized)
-    yield own
-    yield from (way for way in others if way.name in config.chosen)
 
 
 def _models(config: ReplayConfig, again: Again, problem: Problem, summary: AttackSummary) -> Iterator[Way]:

@@ -4,23 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
-from typing_extensions import Unpack
 
 from advsearch import seeds
-from advsearch.api.keywords import NamedKeywords, Names, PictureKeywords, asks, configured
 from advsearch.attacks.draws import batches
 from advsearch.attacks.evaluation import most_at_once
 from advsearch.attacks.trials import clopper_pearson
 from advsearch.config import AttackConfig
 from advsearch.engine.attack_parts import LOADING, problem_from_config
 from advsearch.engine.journal import Journal, Shared
-from advsearch.engine.loading import Scene
-from advsearch.engine.naming import AnyModel
 from advsearch.engine.outcome import transport_of
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Stages
@@ -28,29 +23,17 @@ from advsearch.engine.surface_light import LIGHTS, SurfaceLight
 from advsearch.engine.sweeps.predicting import pays_from
 from advsearch.engine.verifier import Verifier, ladder_of
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.interrupts import interruptible
-from advsearch.progress import NullProgress, Progress, Watched, watcher
-from advsearch.questions.region.answer import AxisRange, BoxSide, GrownRegion, MarginMap, RegionResult, map_figure
-from advsearch.questions.region.settings import RegionConfig
+from advsearch.question import Asked
+from advsearch.questions.region.answer import AxisRange, BoxSide, GrownRegion, MarginMap, RegionConfig, RegionResult
+from advsearch.report.figures import MARGIN, Figures, axis_title, figure_of, heat
 from advsearch.runs.directory import CONFIG, RunDirectory, find_run
 from advsearch.runs.files import write_bytes
-from advsearch.runs.results.base import INTERRUPTED, CleanScene, Formation, MovedValue
+from advsearch.runs.results.base import CleanScene, Formation, MovedValue
 from advsearch.runs.summary import read_answer
 from advsearch.scene.surface import renderer as surface_renderer
 from advsearch.scene.surface.arrangement import CAMERAS, FREE
 from advsearch.seeds import stream
 from advsearch.settings import split_names
-from advsearch.viewer.pages import keep_answer
-
-
-class RegionKeywords(PictureKeywords, NamedKeywords, total=False):
-    around: str | None
-    vary: Names | None
-    samples: int
-    map: int
-    specialise: bool
-    verify_spp: int | None
-
 
 MOST = 8
 """A box is grown in at most so many parameters."""
@@ -69,24 +52,9 @@ class Varied:
     groups: frozenset[str]
 
 
-@asks(RegionConfig, RegionKeywords)
-def region(
-    object: Scene | str | Path,
-    model: AnyModel = "reference",
-    *,
-    progress: Watched = None,
-    **settings: Unpack[RegionKeywords],
-) -> RegionResult:
-    """Grow the box around a configuration in which the verdict stays what it is (docs/questions.md)."""
-    config = configured(RegionConfig, object=object, model=model, **settings)
-    return region_from_config(config, progress=watcher(progress))
-
-
-def region_from_config(
-    config: RegionConfig, *, progress: Progress | None = None, resumed: Path | None = None
-) -> RegionResult:
-    """Grow the region that a configuration describes and keep it in a run directory."""
-    stages = Stages(progress or NullProgress())
+def region_around(asked: Asked[RegionConfig]) -> RegionResult:
+    """Grow the region that a configuration describes."""
+    config, stages = asked.config, Stages(asked.progress)
     stages.begin("setup", LOADING)
     budget: dict[str, object] = {}
     if config.around is not None:  # its answer has to lie within
@@ -97,41 +65,30 @@ def region_from_config(
         stages.progress.message(text)
     varied = _varied(problem, config)
     centre = _centre(problem, config)
-    with RunDirectory.of(config, resumed) as run:
-        verifier = Verifier(Journal(run, Shared(problem)), ladder_of(config), stages)
-        findings = verifier.findings
-        try:
-            with interruptible():
-                answer, ending = _answer(verifier, config, varied, centre, run), "done"
-        except KeyboardInterrupt:
-            answer, ending = GrownRegion(), INTERRUPTED
-        stages.end()
-        result = RegionResult(
-            run=str(run.path),
-            object=config.object,
-            environment=problem.environment,
-            model=problem.model.name,
-            task=problem.task.title,
-            controls=[bound.name for bound in problem.space.controls],
-            ending=ending,
-            **vars(answer),
-            image_formation=Formation.of(problem.renderer.formation),
-            clean=CleanScene(moved=[MovedValue.of(one) for one in problem.space.moved]),
-            warnings=warnings,
-            transport=transport_of(findings) if findings.transport or findings.rendered_because else None,
-            renders={
-                "verification": findings.verification_renders
-                + (findings.transport.traced if findings.transport else 0),
-                **({"products": findings.predicted_trials} if findings.predicted_trials else {}),
-            },
-            seconds={**stages.seconds, "total": stages.total},
-            seed=config.seed,
-            command_line=config.command_line(),
-        )
-        return keep_answer(run, result)
+    verifier = Verifier(Journal(asked.run, Shared(problem)), ladder_of(config), stages)
+    findings, grown = verifier.findings, GrownRegion()
+    with asked.until_interrupted():
+        grown = _grown(verifier, config, varied, centre, asked.run)
+    stages.end()
+    traced = findings.verification_renders + (findings.transport.traced if findings.transport else 0)
+    return asked.result(
+        RegionResult,
+        **vars(grown),
+        environment=problem.environment,
+        model=problem.model.name,
+        task=problem.task.title,
+        controls=[bound.name for bound in problem.space.controls],
+        image_formation=Formation.of(problem.renderer.formation),
+        clean=CleanScene(moved=[MovedValue.of(one) for one in problem.space.moved]),
+        warnings=warnings,
+        transport=transport_of(findings) if findings.transport or findings.rendered_because else None,
+        renders={"verification": traced}
+        | ({"products": findings.predicted_trials} if findings.predicted_trials else {}),
+        seconds={**stages.seconds, "total": stages.total},
+    )
 
 
-def _answer(verifier: Verifier, config: RegionConfig, varied: Varied, centre: Tensor, run: RunDirectory) -> GrownRegion:
+def _grown(verifier: Verifier, config: RegionConfig, varied: Varied, centre: Tensor, run: RunDirectory) -> GrownRegion:
     """Look at the centre, grow the box, check it, and draw the map if one was asked for."""
     problem, stages = verifier.problem, verifier.stages
     verifier.choose_spp({"centre": centre})
@@ -297,6 +254,25 @@ def _map(
     for suffix, data in map_figure(drawn, box).items():
         write_bytes(run.path / "images" / f"map.{suffix}", data)
     return drawn
+
+
+def map_figure(drawn: MarginMap, box: Sequence[BoxSide]) -> Figures:
+    """Draw a map of the margin over two parameters, with the line at which the verdict changes, and the box."""
+
+    def draw(axes: Any) -> None:
+        (first, second), margins = drawn.axes, drawn.margins
+        extent = (first.low, first.high, second.low, second.high)
+        heat(axes, margins, extent, MARGIN, axis_title(first.name, first.unit), axis_title(second.name, second.unit))
+        if min(map(min, margins)) < 0.0 < max(map(max, margins)):
+            axes.contour(margins, levels=[0.0], extent=extent, colors="black", linewidths=1.0)
+        across, up = box
+        corners_x = [across.low, across.high, across.high, across.low, across.low]
+        corners_y = [up.low, up.low, up.high, up.high, up.low]
+        axes.plot(corners_x, corners_y, color="black", linestyle="--", label="region")
+        axes.plot(across.centre, up.centre, "k+", label="centre")
+        axes.legend(loc="upper right", frameon=True)
+
+    return figure_of(draw, (6.0, 4.6))
 
 
 Same = Callable[[Tensor, int], bool]
