@@ -229,7 +229,7 @@ def test_every_setting_of_every_command_says_what_it_is(config: type[Config]) ->
             object="mug", controls="pose", vary="pose.yaw,pose.pitch", map=24, samples=50, around="mug-pose-001"
         ),
         SweepConfig(object="mug", grid={"pose.yaw": "0:360:24", "camera.elevation": [5, 50]}, samples=3, batch=2),
-        PrecisionConfig(object="mug", controls="pose", quantities="image", seconds=9.0, depths="2,3"),
+        PrecisionConfig(object="mug", controls="pose", quantities="image", seconds=9.0, samplers="independent"),
         StabilityConfig(case=["ties", "saturated"], group="stiff", seconds=9.0, run="x", overwrite=True),
     ],
     ids=lambda config: config.command,
@@ -356,11 +356,9 @@ CLASHES: tuple[tuple[type[Config], dict[str, Any], str], ...] = (
     *(
         (PrecisionConfig, {name: value, "quantities": ",".join({*QUANTITIES} - {left})}, f"{name}: is of the {left}, ")
         for name, value, left in (
-            ("samplers", "independent", "image"), ("depths", "2,3", "image"), ("loss", "model", "gradient"),
-            ("policies", "random", "objective"), ("steps", 9, "objective"), ("repeats", 2, "objective"),
+            ("samplers", "independent", "image"), ("loss", "model", "gradient"),
         )
     ),
-    (PrecisionConfig, {"out": "x", "run": "y"}, "out: is instead of a run"),
     (SuiteConfig, {"suite": "a.yaml", "fresh": True, "seed": 1}, "fresh: draws a seed, and `seed` says one"),
     (SuiteConfig, {"suite": "a.yaml", "update": True, "add": "run"}, "update: renews what claims are expected to say"),
     (SuiteConfig, {"suite": "a.yaml", "only": "a", "add": "run"}, "only: names claims, and `add` tries the new"),

@@ -1,4 +1,4 @@
-"""`advsearch stability`: extreme scenes, objectives and arithmetic, and whether each of them holds."""
+"""`advsearch stability`: stiff and extreme scenes, and whether each of them holds."""
 
 from __future__ import annotations
 

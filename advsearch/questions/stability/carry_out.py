@@ -1,4 +1,4 @@
-"""`stability`: extreme scenes, objectives and arithmetic, and whether each of them holds."""
+"""`stability`: stiff and extreme scenes, and whether each of them holds."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class StabilityKeywords(RunKeywords, total=False):
 
 @asks(StabilityConfig, StabilityKeywords)
 def stability(*, progress: Watched = None, **settings: Unpack[StabilityKeywords]) -> StabilityResult:
-    """Try extreme scenes, objectives and arithmetic, and say whether each of them holds (docs/stability.md)."""
+    """Try stiff and extreme scenes, and say whether each of them holds (docs/stability.md)."""
     return stability_from_config(configured(StabilityConfig, **settings), progress=watcher(progress))
 
 
@@ -46,7 +46,7 @@ def stability_from_config(
 
         def rows() -> Iterator[CaseRow]:
             hint = "`case` and `group` pick some, `seconds` stops before the next one"
-            progress.stage("trying extreme scenes, objectives and arithmetic", len(cases), hint=hint)
+            progress.stage("trying stiff and extreme scenes", len(cases), hint=hint)
             for case in cases:
                 known = results.stored(case.name) is not None
                 row = results.row(case.name, CaseRow, case.run)
