@@ -111,8 +111,7 @@ def compare(asked: Asked[CompareConfig]) -> CompareResult:
     """
     # these import torch and pandas
     from advsearch.api.studies import carry_out_part
-    from advsearch.questions.compare.pairs import compared, differing, read_sides
-    from advsearch.questions.compare.pictures import Pictures
+    from advsearch.questions.compare.pairs import Pictures, compared, differing, read_sides
     from advsearch.rules import interval_of
 
     config, progress, renders = asked.config, asked.progress, 0
