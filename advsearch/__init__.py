@@ -28,14 +28,11 @@ _HOMES = {
     "Task": "advsearch.tasks",
     "allow_code": "advsearch.registry",
     "check": "advsearch.questions.check.carry_out",
-    "compare": "advsearch.questions.compare.carry_out",
-    "explain": "advsearch.questions.explain.carry_out",
     "harden": "advsearch.questions.harden.carry_out",
     "load_model": "advsearch.api.render",
     "load_run": "advsearch.api.render",
     "load_scene": "advsearch.engine.loading",
     "photo_agreement": "advsearch.questions.photographs.carry_out",
-    "plan": "advsearch.questions.plan.carry_out",
     "precision": "advsearch.questions.precision.carry_out",
     "recipe": "advsearch.questions.recipe.carry_out",
     "render": "advsearch.api.render",
@@ -57,6 +54,8 @@ def __getattr__(name: str) -> Any:
         if name in made_questions():
             return made_question(name).python
         return import_module(f"advsearch.{name}") if name in _MODULES else getattr(import_module(_HOMES[name]), name)
+    if name == "plan":
+        raise AttributeError("`plan` is a part of `check` now: use advsearch.check(..., loss='model')")
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 

@@ -26,7 +26,6 @@ from advsearch.questions.harden.answer import HardenResult
 from advsearch.questions.harden.training import Examples
 from advsearch.questions.harden.training import MakeOptimiser
 from advsearch.questions.photographs.carry_out import photo_agreement as photo_agreement
-from advsearch.questions.plan.answer import PlanResult
 from advsearch.questions.precision.answer import PrecisionResult
 from advsearch.questions.recipe.answer import RecipeResult
 from advsearch.questions.region.answer import RegionResult
@@ -143,16 +142,16 @@ def compare(
     compared: str | Path | Sequence[str | Path],
     *,
     progress: Watched = ...,
-    object: Names = ...,
+    object: Path | Names = ...,
     environment: Path | Names | None = ...,
     up: Literal['y', 'z'] | None = ...,
-    camera: str | None = ...,
+    camera: str | Path | None = ...,
     set: Mapping[str, float | str | Sequence[float]] | None = ...,
-    exposure: float | None = ...,
+    exposure: float = ...,
     resolution: int | str | tuple[int, int] | None = ...,
     labels: Path | Names | None = ...,
-    prompt: Names | None = ...,
-    task: Named = ...,
+    prompt: Path | Names | None = ...,
+    task: str | Path | Mapping[str, Any] = ...,
     label: int | np.integer[Any] | Names | None = ...,
     controls: Controls = ...,
     texture_resolution: int | None = ...,
@@ -164,14 +163,14 @@ def compare(
     deterministic: bool = ...,
     run: str | Path | None = ...,
     overwrite: bool = ...,
-    grid: dict[str, object] = ...,
+    grid: Mapping[str, Any] = ...,
     samples: int | None = ...,
     sampler: Literal['sobol', 'random'] = ...,
     batch: int = ...,
     keep_pictures: Literal['all', 'wrong', 'none'] = ...,
     specialise: bool = ...,
     workers: int | None = ...,
-    cluster: str | None = ...,
+    cluster: str | Path | None = ...,
     pictures: int = ...,
 ) -> CompareResult: ...
 
@@ -283,39 +282,6 @@ def harden(
     quick: bool = ...,
 ) -> HardenResult: ...
 
-def plan(
-    object: Scene | str | Path = ...,
-    model: AnyModel = ...,
-    *,
-    progress: Watched = ...,
-    environment: Path | Names | None = ...,
-    up: Literal['y', 'z'] | None = ...,
-    camera: str | None = ...,
-    set: Mapping[str, float | str | Sequence[float]] | None = ...,
-    exposure: float | None = ...,
-    resolution: int | str | tuple[int, int] | None = ...,
-    labels: Path | Names | None = ...,
-    prompt: Names | None = ...,
-    task: Named = ...,
-    label: int | np.integer[Any] | Names | None = ...,
-    controls: Controls = ...,
-    texture_resolution: int | None = ...,
-    spp: int | Literal['auto'] | None = ...,
-    denoise: Literal['oidn', 'none'] = ...,
-    pixel_sampler: Literal['independent', 'multijitter'] = ...,
-    seed: int = ...,
-    threads: int | None = ...,
-    deterministic: bool = ...,
-    run: str | Path | None = ...,
-    overwrite: bool = ...,
-    epsilon: float | Mapping[str, float] | None = ...,
-    norm: Literal['linf', 'l2'] | None = ...,
-    estimators: str | Mapping[str, str] = ...,
-    objective: str | None = ...,
-    specialise: bool = ...,
-    seconds: float | None = ...,
-) -> PlanResult: ...
-
 def precision(
     object: Scene | str | Path = ...,
     model: AnyModel = ...,
@@ -351,14 +317,7 @@ def precision(
     error: float = ...,
     rounds: int = ...,
     samplers: Names = ...,
-    depths: str | Sequence[int] = ...,
     loss: Literal['linear', 'model'] = ...,
-    policies: Names = ...,
-    steps: int = ...,
-    repeats: int = ...,
-    workers: int | None = ...,
-    cluster: str | None = ...,
-    out: str | Path | None = ...,
 ) -> PrecisionResult: ...
 
 def recipe(

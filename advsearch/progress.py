@@ -230,7 +230,7 @@ class BarProgress:
 
     def advance(self, n: int = 1, **info: float | str) -> None:
         for task in self.bars.tasks[-1:]:
-            self.bars.update(task.id, advance=n, **({"info": _escaped(info_text(info))} if info else {}))
+            self.bars.update(task.id, advance=n, info=_escaped(info_text(info)) if info else task.fields["info"])
 
     def message(self, text: str) -> None:
         self._print(self._written(text))

@@ -39,7 +39,10 @@ SAID = {
 }  # fmt: skip
 """Fields of a result that settings say, by the attribute of these."""
 
-TYPES = {"object": "Scene | str | Path", "model": "AnyModel"}
+TYPES = {
+    "object": "Scene | str | Path", "model": "AnyModel", "compared": "str | Path | Sequence[str | Path]",
+    "sweeps": "str | Path | Sequence[str | Path]",
+}  # fmt: skip
 """What Python may give for a setting in place of its text."""
 
 
@@ -103,7 +106,7 @@ class Question(Generic[Answer]):
     examples: tuple[str, ...]
     place: tuple[str, ...]
     about: str
-    expected: tuple[str, str] | None
+    expected: tuple[Any, ...] | None
     brought: Callable[[Path, Mapping[str, Any]], dict[str, Any]] | None
     called: str
 
@@ -157,7 +160,7 @@ def question(
     *examples: str,
     place: tuple[str, ...] = (),
     about: str = "",
-    expected: tuple[str, str] | None = None,
+    expected: tuple[Any, ...] | None = None,
     brought: Callable[[Path, Mapping[str, Any]], dict[str, Any]] | None = None,
     called: str = "",
 ) -> Callable[[Callable[..., Answer]], Question[Answer]]:
@@ -167,7 +170,8 @@ def question(
         examples: lines of a shell, for its help.
         place: settings that Python takes by position.
         about: the setting that names a run or a file which it is about.
-        expected: where that is given without its flag, what stands for it in the help, and what an error says it is.
+        expected: where that is given without its flag, what stands for it in the help, and what an error says it is;
+            as further fields of `cli.question.Positional`, what the help adds, and whether there may be several.
         brought: returns settings that the `run.yaml` of that run brings, by what was typed.
         called: ``module:function`` that Python calls, where more can be given there than settings.
     """

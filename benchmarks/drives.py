@@ -26,10 +26,11 @@ from collections.abc import Callable
 
 import numpy as np
 import numpy.typing as npt
+import pandas as pd
 
 from advsearch.attacks.units import fewer_by_chance, mean_interval, paired_by_unit, share_interval
-from advsearch.explanations import Factor, Observations, find_rules
 from advsearch.questions.explain.findings import find_importance
+from advsearch.rules import find_rules, halves
 
 Floats = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
@@ -144,16 +145,15 @@ def rules(runs: int) -> int:
     return bad
 
 
-FACTORS = (Factor("pose.yaw"), Factor("camera.elevation"), Factor("path.time"))
-
-
-def observed(rng: Random, right: Flags) -> Observations:
+def observed(rng: Random, right: Flags) -> pd.DataFrame:
     """Answers (drives, frames) with two numbers that a drive has, and the time."""
     drives = len(right)
-    own = np.repeat(rng.random((drives, 2)), FRAMES, axis=0)
-    times = np.tile(np.linspace(0.0, 1.0, FRAMES), drives)[:, None]
-    units = np.repeat(np.arange(drives), FRAMES)
-    return Observations(FACTORS, np.concatenate([own, times], axis=1), right.ravel(), units)
+    yaw, elevation = np.repeat(rng.random((drives, 2)), FRAMES, axis=0).T
+    times = np.tile(np.linspace(0.0, 1.0, FRAMES), drives)
+    table = pd.DataFrame({"pose.yaw": yaw, "camera.elevation": elevation, "path.time": times, "correct": right.ravel()})
+    table["unit"] = np.repeat(np.arange(drives), FRAMES)
+    table.attrs["units"] = dict.fromkeys(("pose.yaw", "camera.elevation", "path.time"), "")
+    return table
 
 
 def explained(runs: int) -> int:
@@ -165,24 +165,24 @@ def explained(runs: int) -> int:
             for seed in range(runs):
                 rng = np.random.default_rng(seed)
                 found = observed(rng, answer(rng, drives, 0.7))
-                told += bool(find_rules(*found.halves(seed), seed=seed).told)
-                weights = {one.places: one.interval[0] > 0.0 for one in find_importance(found)}
-                decides += [weights.get((0,), False), weights.get((2,), False)]
+                told += bool(find_rules(*halves(found, seed), seed=seed).told)
+                weights = {one.factors: one.interval[0] > 0.0 for one in find_importance(found)}
+                decides += [weights.get(("pose.yaw",), False), weights.get(("path.time",), False)]
             bad += too_many(told, runs, 0.01) + sum(too_many(int(one), runs, 0.025) for one in decides)
             shares = ", ".join(f"{100 * one / runs:.1f}" for one in decides)
             print(f"| {name} | {drives} | {100 * told / runs:.1f} | {shares} |", flush=True)
     print("\n| explain, something decides | drives | interval has the truth, % |\n| --- | --- | --- |")
-    for place, name in ((0, "yaw: 40 or 90 %"), (2, "time: 40 or 90 %")):
+    for factor, name in (("pose.yaw", "yaw: 40 or 90 %"), ("path.time", "time: 40 or 90 %")):
         for drives in (60, 200):
             covered, true, asked = 0, 0.25**2 / (0.65 * 0.35), 2 * runs
             for seed in range(asked):
                 rng = np.random.default_rng(seed)
                 found = observed(rng, np.zeros((drives, FRAMES), bool))
-                over = (found.values[:, place] > 0.5).reshape(drives, FRAMES)
+                over = (found[factor] > 0.5).to_numpy().reshape(drives, FRAMES)
                 low, high = (ANSWERS["shares of their own"](rng, drives, p) for p in (0.4, 0.9))
-                same = Observations(
-                    FACTORS[:1], over.reshape(-1, 1).astype(np.float64), np.where(over, high, low).ravel(), found.units
-                )
+                same = pd.DataFrame({factor: over.ravel().astype(np.float64), "unit": found["unit"]})
+                same["correct"] = np.where(over, high, low).ravel()
+                same.attrs["units"] = {factor: ""}
                 (weight,) = find_importance(same)
                 covered += weight.interval[0] <= true <= weight.interval[1]
             bad += too_many(asked - covered, asked, 0.07)

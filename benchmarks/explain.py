@@ -13,21 +13,20 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
+import pandas as pd
 
-from advsearch.explanations import CountedRule, Factor, Mask, Numbers, Observations, find_rules
 from advsearch.questions.explain.findings import find_importance
+from advsearch.rules import CountedRule, Mask, find_rules, halves, observed
 
-FACTORS = (
-    Factor("camera.elevation", "degrees"),
-    Factor("light.power", "1"),
-    Factor("pose.yaw", "degrees"),
-    Factor("camera.distance", "object sizes"),
-    Factor("colour", "", ("blue", "green", "red")),
-    Factor("environment", "", ("dusk", "noon", "studio")),
-)
+Numbers = npt.NDArray[np.float64]
+
+FACTORS = ("camera.elevation", "light.power", "pose.yaw", "camera.distance", "colour", "environment")
+NAMES = {"colour": ("blue", "green", "red"), "environment": ("dusk", "noon", "studio")}
 LOW, HIGH = np.array([5.0, 0.0, 0.0, 1.0, 0.0, 0.0]), np.array([85.0, 2.0, 360.0, 4.0, 3.0, 3.0])
 LAWS = {
     "over 60 degrees and dim": ({0: 60.0, 1: 0.6}, 1),
@@ -36,6 +35,14 @@ LAWS = {
     "none": ({}, 0),
 }
 """Bounds by the number of the factor, and how many rules there are."""
+
+
+def table(values: Mapping[str, Any], right: Mask) -> pd.DataFrame:
+    """Independent rows as a table for rules."""
+    rows = pd.DataFrame({**values, "correct": right, "unit": np.arange(len(right))})
+    rows = rows.astype({name: "category" for name in NAMES if name in values})
+    rows.attrs["units"] = dict.fromkeys(values, "")
+    return observed(rows, values)
 
 
 def wrong(law: str, values: Numbers) -> Mask:
@@ -56,14 +63,15 @@ def is_told(law: str, rules: list[CountedRule]) -> bool:
     if len(rules) != count:
         return False
     for rule in rules:
-        if {one.place for one in rule.conditions} != set(bounds):
+        if {FACTORS.index(one.factor) for one in rule.conditions} != set(bounds):
             return False
         for one in rule.conditions:
-            at = bounds[one.place]
+            place = FACTORS.index(one.factor)
+            at = bounds[place]
             if one.options is not None:
-                if one.options != frozenset({int(at)}):
+                if one.options != frozenset({NAMES[one.factor][int(at)]}):
                     return False
-            elif min(abs(one.low - at), abs(one.high - at)) > (HIGH - LOW)[one.place] / 20.0:
+            elif min(abs(one.low - at), abs(one.high - at)) > (HIGH - LOW)[place] / 20.0:
                 return False
     return True
 
@@ -97,14 +105,13 @@ def coverage(name: str, rows: int, samples: int) -> str:
     """In how many samples the intervals have the true shares, and how wide they are."""
     accuracy = ACCURACIES[name]
     true, hit, width = true_shares(accuracy, rows), np.zeros(3), np.zeros(3)
-    factors = tuple(Factor(one) for one in ("x", "y", "z"))
     for seed in range(samples):
         generator = np.random.default_rng(seed)
         x = generator.random((rows, 3))
         right = generator.random(rows) < accuracy(x)
-        for one in find_importance(Observations(factors, x, right)):
-            if len(one.places) == 1:
-                (place,), (low, high) = one.places, one.interval
+        for one in find_importance(table(dict(zip("xyz", x.T, strict=True)), right)):
+            if len(one.factors) == 1:
+                place, (low, high) = "xyz".index(one.factors[0]), one.interval
                 hit[place] += low <= true[place] <= high
                 width[place] += high - low
     each = zip(true, hit / samples, 50 * width / samples, strict=True)
@@ -127,7 +134,9 @@ def main() -> None:
             values = generator.uniform(LOW, HIGH, (args.rows, len(FACTORS)))
             values[:, 4:] = values[:, 4:].astype(int)
             right = ~(wrong(law, values) ^ (generator.random(args.rows) < args.noise))
-            found = find_rules(*Observations(FACTORS, values, right).halves(seed), seed=seed).told
+            columns: dict[str, Any] = dict(zip(FACTORS, values.T, strict=True))
+            columns |= {name: np.array(names)[columns[name].astype(int)] for name, names in NAMES.items()}
+            found = find_rules(*halves(table(columns, right), seed), seed=seed).told
             told, rules = told + is_told(law, found), rules + len(found)
         seconds = (time.process_time() - begun) / args.seeds
         print(f"{law:26s} told {told} of {args.seeds}, {rules} rules in all, {seconds:.1f} CPU s each", flush=True)

@@ -145,7 +145,6 @@ def questions() -> dict[str, list[list[str]]]:
     few = ["--rounds", "1", "--scenes", "1", "--views", "1", "--epochs", "1", "--measured", "2"]
     return {
         "check": [["check", "--control", "light.power"]],
-        "plan": [["plan", "--control", "light,pose"]],
         "compare": [["compare", "reference", "golden:colours", "--control", "pose", "--samples", "24"]],
         "explain": [swept, ["explain", "run-0", "--confirm", "0", "--pairs", "2", "--clusters", "8"]],
         "replay": [small, ["replay", "run-0", "--trials", "6", "--ways", "samples,resolution,depth,curve,jpeg,sensor"]],

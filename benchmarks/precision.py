@@ -26,15 +26,9 @@ threads.configure()
 from advsearch.engine.attack_parts import problem_from_config  # noqa: E402
 from advsearch.engine.gradients import inside, smooth_loss  # noqa: E402
 from advsearch.questions.precision.answer import Recommended  # noqa: E402
-from advsearch.questions.precision.benches import (  # noqa: E402
-    REFERENCE_SAMPLER,
-    PictureBench,
-    variants,
-)
+from advsearch.questions.precision.benches import Gradients, Pictures, TimeBudget, gradient_parts  # noqa: E402
 from advsearch.questions.precision.carry_out import precision_from_config  # noqa: E402
-from advsearch.questions.precision.gradient import GradientBench, estimated_parts  # noqa: E402
-from advsearch.questions.precision.points import MeasuredSetting, ReferenceValue, point_of  # noqa: E402
-from advsearch.questions.precision.rounds import TimeBudget  # noqa: E402
+from advsearch.questions.precision.rule import ReferenceValue, Setting, point_of  # noqa: E402
 from advsearch.questions.precision.settings import PrecisionConfig  # noqa: E402
 
 SCENES = ("bowl/kitchen", "bottle/noon", "ball/studio")
@@ -77,11 +71,12 @@ def intervals() -> int:
             covered, all_covered = [], []
             for _ in range(TRIES):
                 samples, true = simulated(noise, repeats, rng)
-                setting = MeasuredSetting("image", noise, 4, 4.0)
+                setting = Setting("picture", noise, 4, 4.0)
                 point = point_of(setting, samples)
-                bare = point_of(setting, [({"error": one["error"]}, seconds) for one, seconds in samples])
+                bare = point_of(setting, [{**numbers, "fourth": math.nan} for numbers in samples])
+                assert bare.interval is not None
                 all_covered.append(bare.interval[0] <= true <= bare.interval[1])
-                if not point.heavy:
+                if not point.heavy_tailed:
                     covered.append(all_covered[-1])
             share = f"{100 * statistics.fmean(covered):.0f} %" if covered else ""
             given, bare_share = 100 * len(covered) / TRIES, 100 * statistics.fmean(all_covered)
@@ -90,7 +85,7 @@ def intervals() -> int:
     return 0 if kept else 3
 
 
-def simulated(noise: str, repeats: int, rng: np.random.Generator) -> tuple[list[tuple[dict[str, float], float]], float]:
+def simulated(noise: str, repeats: int, rng: np.random.Generator) -> tuple[list[dict[str, float]], float]:
     """Return measurements of pictures with a noise, and their true root mean square error. Of fireflies there are so
     many a picture, and they hold as much of the error as all else."""
     kind, _, given = noise.partition(" ")
@@ -106,8 +101,7 @@ def simulated(noise: str, repeats: int, rng: np.random.Generator) -> tuple[list[
         found = found + (rng.random(size) < share) * rng.exponential(1.0, size) * math.sqrt(0.5 / share)
         variance = 2.0
     reference = ReferenceValue(np.zeros(PIXELS), 0.0, 1.0, 2)
-    errors = [reference.relative_errors(one) for one in found]
-    return [({"error": error, "fourth": fourth}, 1.0) for error, fourth in errors], math.sqrt(PIXELS * variance)
+    return [{**reference.beside(picture), "seconds": 1.0} for picture in found], math.sqrt(PIXELS * variance)
 
 
 def one(scene: str, args: argparse.Namespace) -> bool:
@@ -119,16 +113,14 @@ def one(scene: str, args: argparse.Namespace) -> bool:
             environment=environment or "studio",
             controls=args.control,
             resolution=args.resolution,
-            quantities="image,gradient",
-            depths="6",
             seconds=args.seconds,
             error=args.error,
-            out=folder,
+            run=f"{folder}/run",
         )
         report = precision_from_config(config)
     kept = True
     for found in report.recommendations:
-        if found.estimator is None or found.measure == "margin_error" or found.among in ("by path depth", "predicted"):
+        if found.estimator is None or found.quantity == "margin":
             continue
         assert found.error is not None
         error, known = measured(config, found)
@@ -143,7 +135,7 @@ def one(scene: str, args: argparse.Namespace) -> bool:
             flush=True,
         )
     for slope in report.slopes:
-        if slope.estimator == "independent" and slope.measure == "error" and slope.against == "samples":
+        if slope.estimator == "independent" and slope.quantity == "picture":
             good = abs(slope.slope + 0.5) <= SLOPE
             kept = kept and good
             print(f"  {scene:14s}  slope of independent sampling {slope.slope:.2f}{'' if good else '   FALLS SHORT'}")
@@ -155,27 +147,21 @@ def measured(config: PrecisionConfig, found: Recommended) -> tuple[float, bool]:
     problem, _ = problem_from_config(config)
     renderer, budget = problem.renderer, TimeBudget(config.seconds / 3.0)
     assert found.estimator is not None and found.spp is not None
-    setting = MeasuredSetting(found.quantity, found.estimator, found.spp, 1.0, found.control or "")
+    setting = Setting(found.quantity, found.estimator, found.spp, 1.0, found.control, found.family)
     bench: Any
-    if found.quantity == "image":
-        samplers = [name for name in ("independent", "multijitter", "stratified", "orthogonal", "ldsampler")]
-        chosen = [
-            one
-            for one in variants(samplers, (), renderer.scene.max_depth, volumetric=renderer.scene.volumetric)
-            if one.series in (found.estimator, REFERENCE_SAMPLER, f"{REFERENCE_SAMPLER} + oidn")
-        ]
-        bench = PictureBench(renderer, problem.whole(problem.domain.start), lambda picture: 1.0, chosen)
+    if found.quantity == "picture":
+        samplers = dict.fromkeys(("multijitter", found.estimator.partition(" ")[0]))
+        bench = Pictures(renderer, problem.whole(problem.domain.start), lambda picture: 1.0, list(samplers))
     else:
         renderer = renderer.like(denoiser="none", transfer="linear")
-        exact = renderer.like(renderer.scene.like(sampler=REFERENCE_SAMPLER))
-        part = next(one for one in estimated_parts(renderer.plan.groups, linear=True) if one.name == found.control)
+        renderer.plan = renderer.plan.at_a_pixel()
+        part = next(one for one in gradient_parts(renderer.plan.groups, linear=True) if one.name == found.control)
         loss = smooth_loss(renderer.formation.resolution, config.seed)
-        bench = GradientBench(renderer, loss, inside(renderer), part, exact)
+        bench = Gradients(renderer, loss, inside(renderer), part)
     bench.refer(budget, SEED, lambda: None)
-    samples = [bench.measure(setting, SEED + number) for number in range(REPEATS)]
-    point = point_of(setting, samples, floor=bench.floor(setting, "error"))
-    assert statistics.fmean(seconds for _, seconds in samples) > 0.0
-    return point.error, point.known
+    samples = [bench.measure(setting, SEED + number)[found.quantity] for number in range(REPEATS)]
+    point = point_of(setting, samples, floor=bench.floor(setting, found.quantity))
+    return point.rms, point.known
 
 
 if __name__ == "__main__":

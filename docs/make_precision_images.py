@@ -28,9 +28,9 @@ FACTS = FOLDER / "diagrams.json"
 PICTURE = "picture"
 GOALS = (0.2, 0.5)
 """Relative errors of a gradient that the page says how to reach."""
-BESIDE = {PICTURE: ("texture", "image,objective", 4)}
+BESIDE = {PICTURE: ("texture", "image", 4)}
 """Control, quantities and multiple of the time of what is no control."""
-FEW = ("--samplers", "independent,multijitter", "--depths", "2,4")
+FEW = ("--samplers", "independent,multijitter")
 """Of the picture: what leaves time for the rest."""
 
 
@@ -58,13 +58,17 @@ def measured(name: str, seconds: int, resolution: int) -> dict[str, Any]:
     command += ["--quantities", quantities, "--seconds", str(times * seconds), "--resolution", str(resolution)]
     command += ["--error", str(GOALS[0]), "--json", "--quiet", *(FEW if name == PICTURE else ())]
     with tempfile.TemporaryDirectory() as folder:
-        done = subprocess.run([*command, "--out", f"{folder}/out"], capture_output=True, text=True, check=False)
+        done = subprocess.run([*command, "--run", f"{folder}/out"], capture_output=True, text=True, check=False)
         if done.returncode:
             return {"refused": done.stderr.strip().splitlines()[-1]}
-        shutil.copy(Path(folder) / "out" / "precision.svg", FOLDER / f"{name}.svg")
+        shutil.copy(Path(folder) / "out" / "images" / "precision.svg", FOLDER / f"{name}.svg")
     report = json.loads(done.stdout)
-    kept = ("control", "estimator", "spp", "error", "cosine", "seconds", "known")
-    points = [{key: one[key] for key in kept} for one in report["points"] if one["quantity"] == "gradient"]
+    kept = ("control", "estimator", "spp", "error", "cosine", "seconds")
+    points = [
+        {**{key: point.get(key) for key in kept}, "known": point["status"] == "ok"}
+        for point in report["points"]
+        if point["quantity"] == "gradient"
+    ]
     return {"machine": report["machine"], "seconds": times * seconds, "resolution": resolution, "points": points}
 
 
@@ -102,7 +106,7 @@ def page(facts: Mapping[str, Mapping[str, Any]]) -> str:
         longer = "" if fact["seconds"] == usual else f" ({fact['seconds']} s)"
         link = f"[{name}](#{name})" if (FOLDER / f"{name}.svg").exists() else name
         lines.append(f"| {link}{longer} | {' | '.join(cells)} |")
-    lines += ["", "## The picture, the margin and the policies", "", f"![diagrams](images/precision/{PICTURE}.svg)"]
+    lines += ["", "## The picture and the margin", "", f"![diagrams](images/precision/{PICTURE}.svg)"]
     for name in shown:
         if (FOLDER / f"{name}.svg").exists():
             lines += ["", f"## {name}", "", f"![error against seconds: {name}](images/precision/{name}.svg)"]

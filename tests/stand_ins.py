@@ -68,7 +68,7 @@ class StandInProblem:
         value = 0.05 - (u - torch.linspace(0.3, 0.8, 6)).square().sum() + noise[0]
         return torch.stack([-value, value])
 
-    def answers(self, queries: Sequence[Query]) -> Iterator[Evaluation]:
+    def answers(self, queries: Sequence[Query], prepared: Any = None) -> Iterator[Evaluation]:
         return map(self.evaluate, queries)
 
     def evaluate(self, query: Query) -> Evaluation:

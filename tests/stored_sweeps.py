@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import itertools
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from samples import sweep
 
 from advsearch.config import SweepConfig
 from advsearch.described import Value
 from advsearch.files import JsonValue
 from advsearch.questions.photographs.answer import PhotoTaker
+from advsearch.rules import observed
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row
 from advsearch.viewer import thumbnails
@@ -91,3 +93,12 @@ def serving(
         server.shutdown()
         server.server_close()
         thread.join()
+
+
+def seen(values: Mapping[str, Any], right: Any, units: Any = None) -> pd.DataFrame:
+    """Rows that have some numbers and names as a table for rules, each a unit unless said otherwise."""
+    columns = {name: pd.Series(one) for name, one in values.items()}
+    columns = {name: one if one.dtype.kind == "f" else one.astype("category") for name, one in columns.items()}
+    rows = pd.DataFrame({**columns, "correct": right, "unit": np.arange(len(right)) if units is None else units})
+    rows.attrs["units"] = dict.fromkeys(values, "")
+    return observed(rows, values)

@@ -79,11 +79,12 @@ RULES = {
         | {"settings"}
     ),
     "runs": Rule(
-        {"config", "settings"}, {"numpy", "pydantic", "typing_extensions", "imageio", "OpenEXR", "PIL", "pyarrow"}
+        {"config", "settings"},
+        {"numpy", "pydantic", "typing_extensions", "imageio", "OpenEXR", "PIL", "pandas", "pyarrow"},
     ),
-    "report": Rule({"runs", "config", "settings"}, {"numpy", "PIL", "matplotlib", "pydantic"}, HEAVY),
-    "viewer": Rule({"runs", "report", "config", "settings"}, {"numpy", "PIL"}, HEAVY),
-    "explanations": Rule({"attacks", "runs", "report"}, {"numpy", "scipy"}, HEAVY),
+    "report": Rule({"runs", "config", "settings"}, {"numpy", "pandas", "PIL", "matplotlib", "pydantic"}, HEAVY),
+    "viewer": Rule({"runs", "report", "config", "settings"}, {"numpy", "pandas", "PIL"}, HEAVY),
+    "rules": Rule({"attacks", "runs"}, {"numpy", "pandas"}, HEAVY),
     "losses": Rule({"attacks", "engine"}, {"torch"}),
     "question": Rule({"runs", "report", "viewer", "api", "settings"}, {"pydantic"}, HEAVY),
     "questions": Rule(None, None, frozenset(RENDERER)),
@@ -321,7 +322,7 @@ def _imports(statement: ast.stmt, package: str) -> bool:
 
 # -- what is heavy ---------------------------------------------------------------------------------------------------
 
-LATE = ("torch", "mitsuba", "drjit", "scipy", "matplotlib", "pyarrow")
+LATE = ("torch", "mitsuba", "drjit", "scipy", "matplotlib", "pandas", "pyarrow")
 SHOW_HEAVY = f"import sys; print([m for m in {LATE} if m in sys.modules])"
 
 

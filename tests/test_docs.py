@@ -36,8 +36,8 @@ from advsearch.engine.loading import as_controls
 from advsearch.engine.naming import check_run_settings, given_to
 from advsearch.engine.sweeps.axes import read_axes
 from advsearch.files import MESHES
-from advsearch.questions.compare.settings import CompareConfig
-from advsearch.questions.explain.settings import ExplainConfig
+from advsearch.questions.compare import CompareConfig
+from advsearch.questions.explain import ExplainConfig
 from advsearch.questions.harden.settings import ALL, HardenConfig
 from advsearch.questions.recipe.description import planned, read_recipe
 from advsearch.questions.recipe.description import recipe_names as recipes

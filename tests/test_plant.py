@@ -10,7 +10,7 @@ import pytest
 from plant import FAULTS, ROOT, Answer, Fault, found_by, rooms, write
 
 EVERY_ROOM = {
-    *("attacks", "cli", "cluster", "config", "controls", "engine", "explanations", "exporting", "hardening"),
+    *("attacks", "cli", "cluster", "config", "controls", "engine", "explain", "exporting", "hardening"),
     *("importing", "mitsuba_backend", "models", "policies", "recipes", "report", "runs", "scene", "sweeps"),
     *("tasks", "viewer"),
 }

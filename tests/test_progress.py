@@ -16,12 +16,12 @@ from advsearch.api import carry_out as answered
 from advsearch.attacks import Evaluation, Query, make_policy
 from advsearch.attacks.trials import choose_spp, most_samples
 from advsearch.cli.flags import with_flags
-from advsearch.cli.output import shown_text as plan_text
+from advsearch.cli.output import shown_text as check_text
 from advsearch.config import AttackConfig, SweepConfig
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Findings, Stages
-from advsearch.questions.plan.carry_out import plan_from_config
-from advsearch.questions.plan.settings import PlanConfig
+from advsearch.questions.check.carry_out import check_from_config
+from advsearch.questions.check.settings import CheckConfig
 from advsearch.questions.precision.settings import PrecisionConfig
 from advsearch.questions.region import growing as region
 from advsearch.questions.region.answer import RegionConfig
@@ -202,15 +202,13 @@ def test_every_command_says_what_it_does_and_how_far_it_is(tmp_path: Path, confi
 
 
 @pytest.mark.slow
-def test_a_plan_counts_what_it_says(tmp_path: Path) -> None:
+def test_a_check_counts_what_it_says(tmp_path: Path) -> None:
     progress = Recorded()
-    whole = plan_from_config(
-        PlanConfig(**SMALL, controls={"environment.rotation": {}}, run=str(tmp_path / "run")), progress=progress
-    )
+    asked = {"controls": {"environment.rotation": {}}, "loss": "model", "run": str(tmp_path / "run")}
+    whole = check_from_config(CheckConfig(**SMALL, **asked), progress=progress)
     progress.check()
-    assert whole.ending == "done" and whole.not_measured == [] and whole.gains
-    assert sum("cosine" in text for text in progress.messages) == len(whole.cosines)
-    assert "How a search gets the derivative of each parameter" in plan_text(whole)
+    assert whole.ending == "done" and whole.gains and len(progress.messages) == len(whole.rows)
+    assert "How a search gets its derivatives" in check_text(whole)
 
 
 # ---- what is stored is not rendered again ---------------------------------------------------------------------------

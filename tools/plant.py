@@ -215,8 +215,8 @@ FAULTS = (
     Fault(
         "sweeps: a rate of another group",
         "advsearch/engine/sweeps/summary.py",
-        "answer=counted(per_unit(after, units), of),",
-        "answer=counted(per_unit(before, units), of),",
+        "answer=counted(per_unit(after, draws), of),",
+        "answer=counted(per_unit(before, draws), of),",
         ("tests/engine/test_sweep.py",),
     ),
     Fault(
@@ -264,8 +264,8 @@ FAULTS = (
     Fault(
         "viewer: the best pictures come first",
         "advsearch/viewer/thumbnails.py",
-        "np.argsort(-np.nan_to_num(columns.margin, nan=-np.inf)",
-        "np.argsort(np.nan_to_num(columns.margin, nan=-np.inf)",
+        "np.argsort(-np.nan_to_num(margins, nan=-np.inf)",
+        "np.argsort(np.nan_to_num(margins, nan=-np.inf)",
         ("tests/viewer/test_columns.py",),
     ),
     Fault(
@@ -304,18 +304,18 @@ FAULTS = (
         ("tests/config/test_config.py",),
     ),
     Fault(
-        "explanations: a rule is counted on the rows that chose it",
-        "advsearch/explanations/__init__.py",
-        "rule = CountedRule(conditions, counting.where(inside), counting.where(~inside))",
-        "rule = CountedRule(conditions, choosing.where(covered(conditions, choosing)), choosing)",
-        ("tests/questions/test_explanations.py",),
+        "explain: a rule is counted on the rows that chose it",
+        "advsearch/rules.py",
+        "rule = CountedRule(conditions, counting[inside], counting[~inside])",
+        "rule = CountedRule(conditions, choosing[covered(conditions, choosing)], choosing)",
+        ("tests/questions/test_rules.py",),
     ),
     Fault(
-        "explanations: what chance adds is not taken off",
+        "explain: what chance adds is not taken off",
         "advsearch/questions/explain/findings.py",
         "share = 1.0 - (1.0 - counted) * (n - 1) / max(n - k, 1)",
         "share = counted",
-        ("tests/questions/test_explanations.py",),
+        ("tests/questions/test_rules.py",),
     ),
     Fault(
         "recipes: right and wrong are mixed up",

@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from advsearch.bundled.light import varied
+from advsearch.bundled.changed_light import varied
 from advsearch.bundled.objects import HOUSEHOLD
 from advsearch.controls import Space
 from advsearch.scene import library

@@ -43,7 +43,6 @@ GROUPS = {
         "test": "",
         "replay": "",
         "check": "",
-        "plan": "",
         "precision": "",
         "stability": "",
         "doctor": "advsearch.cli.doctor:DOCTOR check every part that a run needs, with versions and how to mend it",

@@ -98,6 +98,8 @@ def _run_and_tell(given: list[str]) -> int:
 
 def _run(given: list[str]) -> int:
     command = given[0] if given and not given[0].startswith("-") else None
+    if command == "plan":
+        raise InputError("`plan` is a part of `check` now: use advsearch check --loss model, with the same flags")
     if command is not None and command not in COMMANDS:
         raise UnknownNameError("command", command, COMMANDS, "See advsearch --help.")
     try:

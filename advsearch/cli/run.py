@@ -103,7 +103,7 @@ RESUME = Command(
     "; what it has evaluated is not rendered again",
     (
         "resume mug-texture-001",
-        "resume mug-plan-001 seconds=600",
+        "resume mug-check-001 seconds=600",
         "resume mug-sweep-001 surface=true",
         "resume realism-001 photographs=my-photographs",
     ),

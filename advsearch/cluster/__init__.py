@@ -113,8 +113,9 @@ class Pool(Protocol):
     link: str
     """Of a page that shows the workers; empty where there is none."""
 
-    ended: SimpleQueue[Future[Any]]
-    """Futures of calls that have ended, put there by who submitted them."""
+    @property
+    def ended(self) -> SimpleQueue[Future[Any]]:
+        """Futures of calls that have ended, put there by who submitted them."""
 
     def workers(self) -> Collection[str]:
         """Return the addresses of the workers that are there. Raises SchedulerGoneError."""

@@ -223,7 +223,7 @@ class Coordinator:
         self._count_time()
         now = self._looked_at = self._clock()
         try:
-            there = self._pool.workers()
+            there = dict.fromkeys(self._pool.workers())
         except SchedulerGoneError:
             self._tell(f"{self._pool.where}: the scheduler has gone; what was under way will be done again")
             for worker in list(self._workers.values()):

@@ -26,9 +26,10 @@ class Process:
 
     def __init__(self) -> None:
         environ = {**os.environ, "OMP_NUM_THREADS": "1", SERVING: "1"}
-        pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
         command = [sys.executable, "-c", BEGIN, *sys.path]
-        self.popen = subprocess.Popen(command, env=environ, start_new_session=True, **pipes)
+        self.popen = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environ, start_new_session=True
+        )
         self.thread = ThreadPoolExecutor(1, "worker")
 
     def call(self, function: Callable[..., Any], *args: Any) -> Any:

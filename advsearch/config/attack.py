@@ -40,7 +40,7 @@ class DerivativeConfig(SceneConfig):
     )
     estimators: dict[str, str] = setting(
         dict, "search", "force a gradient estimator",
-        "NAME for all controls, or CONTROL=NAME or CONTROL.PARAMETER=NAME; `advsearch plan` shows the names",
+        "NAME for all controls, or CONTROL=NAME or CONTROL.PARAMETER=NAME; `advsearch check` shows the names",
         alias="estimator", flag="--estimator", metavar="NAME", form="choices",
     )
     objective: str | None = setting(
@@ -49,7 +49,7 @@ class DerivativeConfig(SceneConfig):
     )
     specialise: bool = setting(
         True, "search", "leave out what the scene and the search don't need", flag="--no-specialise",
-        switched="compute everything, also what this search does not need; `advsearch plan` shows what is left out "
+        switched="compute everything, also what this search does not need; `advsearch check` shows what is left out "
         "otherwise",
     )
     # fmt: on

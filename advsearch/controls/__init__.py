@@ -11,7 +11,7 @@ from importlib import import_module
 from pkgutil import iter_modules
 from typing import Any
 
-from advsearch.controls.base import BoundControl, Budget, Choice, Control, Group, Parameter
+from advsearch.controls.base import Budget, Choice, Control, Group, Parameter
 from advsearch.controls.numbers import NumberControl
 from advsearch.controls.space import Space
 from advsearch.controls.values import Moved, check_prepared
@@ -25,10 +25,7 @@ ORDER = (
     *("contents", "background", "haze", "lens", "sensor", "corruption", "mitsuba"),
 )
 """In which lists have controls; one that is not named comes last."""
-SHARED = (
-    *("base", "ranges", "numbers", "space", "values"),
-    *("corruption_filters", "material_patterns", "patch_sticker"),
-)
+SHARED = ("base", "ranges", "numbers", "space", "values", "corruption_filters", "material_patterns")
 """Modules of this folder that are no control."""
 
 
@@ -64,7 +61,7 @@ def make_control(asked: str, settings: Mapping[str, object] | None = None) -> Co
         UnknownNameError: no such control, or no such setting.
         InputError: a setting is out of range.
     """
-    given = {name: value for name, value in (settings or {}).items() if value is not None}
+    given: dict[str, Any] = {name: value for name, value in (settings or {}).items() if value is not None}
     kind, name, parameter = _read_name(asked, given)
     if kind not in CONTROLS:
         raise UnknownNameError("control", kind, CONTROLS)
@@ -241,6 +238,6 @@ def __getattr__(name: str) -> Any:
 
 
 __all__ = [
-    "CONTROLS", "BoundControl", "Budget", "Choice", "Control", "Group", "NumberControl", "Parameter", "Space",
+    "CONTROLS", "Budget", "Choice", "Control", "Group", "NumberControl", "Parameter", "Space",
     "compose", "gathered", "make_control", "make_space", "names_of", "settings_by_name",
 ]  # fmt: skip

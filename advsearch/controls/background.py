@@ -68,24 +68,24 @@ class BackgroundControl(NumberControl):
                 f"leave the control out"
             )
 
-    def default(self, scene: SceneDescription, parameter: Parameter) -> Number:
+    def default(self, parameter: Parameter) -> Number:
         spec = self.specs.get("what")
         as_ever = parameter.name == "what" and isinstance(spec, OneOf) and "environment" in spec.values
-        return "environment" if as_ever else super().default(scene, parameter)
+        return "environment" if as_ever else super().default(parameter)
 
-    def unchanged(self, scene: SceneDescription, parameter: Parameter) -> Number:
-        return "environment" if parameter.name == "what" else super().unchanged(scene, parameter)
+    def unchanged(self, parameter: Parameter) -> Number:
+        return "environment" if parameter.name == "what" else super().unchanged(parameter)
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         scene = dataclasses.replace(scene, backdrop=True)
         return on_its_ground(scene.with_values(ground__size=0.0)) if self.chosen["ground"] == "hide" else scene
 
-    def scene_inputs(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
         if WHAT[int(values["what"])] == "environment":
             return {}
         return {COLOR: srgb_to_linear(hsv_to_rgb(values["hue"], values["saturation"], values["value"]))}
 
-    def measured(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Value]:
+    def measured(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Value]:
         color = hsv_to_rgb(values["hue"], values["saturation"], values["value"])
         return {name: {"value": float(one), "unit": "sRGB"} for name, one in zip(CHANNELS, color, strict=True)}
 

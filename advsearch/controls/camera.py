@@ -90,39 +90,39 @@ class CameraControl(NumberControl):
                 whose = f"the lens of `camera={model.name}`" if model.name else "a lens with distortion"
                 raise InputError(f"`controls` {self.name}: {name} is not supported with {whose}; leave one of them out")
 
-    def in_scene(self, scene: SceneDescription, parameter: Parameter) -> Parameter:
-        return measured_in(parameter, scene.object.metres is not None)
+    def in_scene(self, parameter: Parameter) -> Parameter:
+        return measured_in(parameter, self.scene.object.metres is not None)
 
-    def default(self, scene: SceneDescription, parameter: Parameter) -> float | str:
-        model = scene.camera_model
+    def default(self, parameter: Parameter) -> float | str:
+        model = self.scene.camera_model
         if parameter.name in COEFFICIENTS and model is not None:
             return model.values[parameter.name]
         if parameter.name == "distance" or parameter.name == "focus":
-            return fitted_distance(self._described(scene)) * scene.metres
+            return fitted_distance(self._described()) * self.scene.metres
         if parameter.name == "focal_length":
-            return SENSOR_WIDTH / 2.0 / math.tan(math.radians(scene.number("camera.fov")) / 2.0)
-        return super().default(scene, parameter)
+            return SENSOR_WIDTH / 2.0 / math.tan(math.radians(self.scene.number("camera.fov")) / 2.0)
+        return super().default(parameter)
 
     def setting(self, parameter: Parameter) -> str:
         return "camera.fov" if parameter.name == "focal_length" else super().setting(parameter)
 
-    def search_range(self, scene: SceneDescription, parameter: Parameter) -> tuple[float, float] | None:
+    def search_range(self, parameter: Parameter) -> tuple[float, float] | None:
         if parameter.name == "distance" and parameter.search is not None:
-            fitted = fitted_distance(self._described(scene)) * scene.metres
+            fitted = fitted_distance(self._described()) * self.scene.metres
             return parameter.search[0] * fitted, parameter.search[1] * fitted
         return parameter.search
 
-    def scene_inputs(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        fov = values["fov"]
+    def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        scene, fov = self.scene, values["fov"]
         if "focal_length" in self.specs:
             fov = _fov_of(values["focal_length"])
         if "distance" in self.specs or not self.asked or "camera.distance" in scene.given:
             distance = values["distance"] / scene.metres
         else:
             distance = framing_distance(scene, fov, scene.aspect).float()
-        inputs = {"camera.to_world": self._orbit(scene, values, distance)}
+        inputs = {"camera.to_world": self._orbit(values, distance)}
         if scene.camera_model is not None:
-            inputs["camera.lens"] = self._numbers(scene.camera_model, scene.aspect, values, fov)
+            inputs["camera.lens"] = self._numbers(scene.camera_model, values, fov)
         else:
             inputs["camera.fov"] = fov.reshape(1)
         if scene.thin_lens and ("aperture" in self.specs or "focus" in self.specs):
@@ -135,33 +135,33 @@ class CameraControl(NumberControl):
             inputs["camera.exposure"] = values["exposure"] - scene.number("camera.exposure")
         return inputs
 
-    def _numbers(self, model: CameraModel, aspect: float, values: Values, fov: Tensor) -> Tensor:
+    def _numbers(self, model: CameraModel, values: Values, fov: Tensor) -> Tensor:
         """The numbers (17,) of the camera's model."""
         found = {name: torch.tensor(value) for name, value in model.values.items()}
         if not model.name:
-            focal = 0.5 / torch.tan(torch.deg2rad(fov) / 2.0)
+            aspect, focal = self.scene.aspect, 0.5 / torch.tan(torch.deg2rad(fov) / 2.0)
             found |= {"fx": focal * max(1.0, 1.0 / aspect), "fy": focal * max(1.0, aspect)}
         found |= {name: values[name] for name in COEFFICIENTS if name in self.specs}
         found |= {"cx": found["cx"] + values["shift_x"], "cy": found["cy"] + values["shift_y"]}
         return torch.stack([found[name].to(fov) for name in NUMBERS])
 
-    def _described(self, scene: SceneDescription) -> SceneDescription:
+    def _described(self) -> SceneDescription:
         """The scene with a fixed lens, for which the distance is worked out as for the same setting."""
-        fov, focal_length = self.specs.get("fov"), self.specs.get("focal_length")
+        scene, fov, focal_length = self.scene, self.specs.get("fov"), self.specs.get("focal_length")
         if isinstance(fov, Fixed):
             return scene.with_values(camera__fov=float(fov.value))
         if isinstance(focal_length, Fixed):
             return scene.with_values(camera__fov=_fov_of(torch.tensor(float(focal_length.value))).item())
         return scene
 
-    def _orbit(self, scene: SceneDescription, values: Values, distance: Tensor) -> Tensor:
+    def _orbit(self, values: Values, distance: Tensor) -> Tensor:
         azimuth, elevation, roll = (torch.deg2rad(values[name]) for name in ("azimuth", "elevation", "roll"))
         zero = torch.zeros_like(azimuth)
         outwards = torch.stack([elevation.cos() * azimuth.cos(), elevation.cos() * azimuth.sin(), elevation.sin()])
         left = torch.stack([azimuth.sin(), -azimuth.cos(), zero])
         up = torch.linalg.cross(-outwards, left)
         left, up = roll.cos() * left + roll.sin() * up, roll.cos() * up - roll.sin() * left
-        place = torch.from_numpy(middle(scene)).to(distance) + distance * outwards
+        place = torch.from_numpy(middle(self.scene)).to(distance) + distance * outwards
         return affine(torch.stack([left, up, -outwards], dim=1), place)
 
 

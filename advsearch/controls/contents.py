@@ -22,7 +22,7 @@ from scipy import ndimage
 from torch import Tensor
 
 from advsearch.controls.base import NOTHING, Parameter, Value
-from advsearch.controls.numbers import BoundNumbers, NumberControl, Values
+from advsearch.controls.numbers import NumberControl, Values
 from advsearch.controls.ranges import Range
 from advsearch.controls.values import Fixed, Number, OneOf, Spec
 from advsearch.errors import InputError
@@ -229,6 +229,7 @@ class ContentsControl(NumberControl):
 
     kind = "contents"
     amount = "level"
+    refines = frozenset({"object.to_world"})  # which is not changed; but it comes after whatever moves the vessel
     summary = "What a vessel is filled with, and how high: water, coffee and milk."
     parameters = (
         moving(
@@ -249,15 +250,23 @@ class ContentsControl(NumberControl):
         color = np.zeros((4, 4, 3), dtype=np.float32)
         return scene.with_part(MeshPart(self.name, mesh, color, SURFACE, to_world=object_to_world(scene)))
 
-    def bind(self, scene: SceneDescription) -> BoundContents:
-        return BoundContents(self, super().bind(scene))
+    def fit(self) -> None:
+        super().fit()
+        cuts = self.cuts({one.name: float(one.default) for one in self.parameters if one.name in INGREDIENTS})
+        for slot in self.slots:
+            if slot.width and slot.parameter.name in cuts:
+                self.start[slot.begin] = cuts[slot.parameter.name]
 
-    def refines(self, scene: SceneDescription) -> frozenset[str]:
-        """Nothing is changed; but it has to come after whatever moves the vessel."""
-        return frozenset({"object.to_world"})
+    def values(self, u: Tensor) -> dict[str, Tensor]:
+        values = super().values(u)  # of ingredients, where the stick is cut
+        return {**values, **self.proportions(values)}
 
-    def scene_inputs(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        vessel = self._vessel(scene)
+    def describe(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Value]:
+        said, values = super().describe(u, so_far), self.values(u.detach())
+        return said | {f"{self.name}.{name}": {"value": float(values[name]), "unit": "1"} for name in INGREDIENTS}
+
+    def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        vessel = self._vessel(self.scene)
         base = _surface(vessel, torch.full_like(values["level"], 0.5))
         inputs = {f"{self.name}.offsets": _surface(vessel, values["level"]) - base}
         if "object.to_world" in so_far:
@@ -299,10 +308,10 @@ class ContentsControl(NumberControl):
                 rest = rest if searched else 0.0
         return bounds
 
-    def _spec(self, scene: SceneDescription, parameter: Parameter, value: Number) -> Spec:
+    def spec(self, parameter: Parameter, value: Number) -> Spec:
         """An ingredient's coordinate is where the stick is cut, from 0 to 1 of what is possible there."""
         if parameter.name not in INGREDIENTS:
-            return super()._spec(scene, parameter, value)
+            return super().spec(parameter, value)
         wide = [name for name in INGREDIENTS if self.bounds[name][1] > self.bounds[name][0]]
         return Range(0.0, 1.0) if parameter.name in wide[:-1] else Fixed(0.0)
 
@@ -351,32 +360,6 @@ class ContentsControl(NumberControl):
                 f"bowl, a glass), got {scene.object.name!r}; choose another object or leave the control out"
             )
         return found
-
-
-class BoundContents(BoundNumbers):
-    """A filled vessel: coordinates are cuts of a stick, values are proportions. `bound` is the control, bound as plain
-    numbers."""
-
-    control: ContentsControl
-
-    def __init__(self, control: ContentsControl, bound: BoundNumbers) -> None:
-        super().__init__(control, bound.scene, bound.slots)
-        wanted = {one.name: float(one.default) for one in control.parameters if one.name in INGREDIENTS}
-        cuts = control.cuts(wanted)
-        for slot in self.slots:
-            if slot.width and slot.parameter.name in cuts:
-                self.start[slot.begin] = cuts[slot.parameter.name]
-
-    def values(self, u: Tensor) -> dict[str, Tensor]:
-        values = super().values(u)
-        return {**values, **self.control.proportions(values)}
-
-    def describe(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Value]:
-        values = self.values(u.detach())
-        said = super().describe(u, so_far)
-        for name in INGREDIENTS:
-            said[f"{self.name}.{name}"] = {"value": float(values[name]), "unit": "1"}
-        return said
 
 
 def _said(low: float, high: float) -> str:

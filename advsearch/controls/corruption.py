@@ -21,7 +21,6 @@ from torch import Tensor
 from advsearch.controls import corruption_filters as filters
 from advsearch.controls.base import Choice, Parameter, Value
 from advsearch.controls.numbers import NumberControl, Values
-from advsearch.scene.description import SceneDescription
 from advsearch.scene.formation import levels_of
 
 BRIGHTNESS = ((0.1,), (0.2,), (0.3,), (0.4,), (0.5,))
@@ -153,15 +152,14 @@ class CorruptionControl(NumberControl):
         # a name without a severity does nothing, and a severity needs a name: what is not given is searched
         self.asked = False
 
-    def estimators(self, scene: SceneDescription, parameter: Parameter) -> tuple[str, ...]:
+    def estimators(self, parameter: Parameter) -> tuple[str, ...]:
         stepped = {*self.allowed("which", *NAMES)} <= {*STEPPED}
-        return () if parameter.name == "severity" and stepped else super().estimators(scene, parameter)
+        return () if parameter.name == "severity" and stepped else super().estimators(parameter)
 
-    def on_picture(self, scene: SceneDescription, values: Values, image: Tensor) -> Tensor:
-        seed = int(self.chosen["seed"])  # type: ignore[call-overload]
-        return corrupted(image, NAMES[int(values["which"])], values["severity"], seed)
+    def on_picture(self, values: Values, image: Tensor) -> Tensor:
+        return corrupted(image, NAMES[int(values["which"])], values["severity"], int(self.chosen["seed"]))
 
-    def measured(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Value]:
+    def measured(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Value]:
         severity = values["severity"]
         applied = nearest(severity) if NAMES[int(values["which"])] in STEPPED else float(severity)
         return {"applied": {"value": float(applied), "unit": "1"}}

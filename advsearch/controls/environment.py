@@ -102,43 +102,43 @@ class EnvironmentControl(NumberControl):
             scene = replace(scene, environment=_loaded(name), environment_spec=name)
         return replace(scene, remarks=(*scene.remarks, *notes)) if notes else scene
 
-    def default(self, scene: SceneDescription, parameter: Parameter) -> Number:
+    def default(self, parameter: Parameter) -> Number:
         """Of `which`, the scene's own environment, by its name where only that is allowed."""
         if parameter.name != "which":
-            return super().default(scene, parameter)
-        return OWN_MAP if OWN_MAP in self.allowed("which", OWN_MAP) else self._own_name(scene) or OWN_MAP
+            return super().default(parameter)
+        return OWN_MAP if OWN_MAP in self.allowed("which", OWN_MAP) else self._own_name(self.scene) or OWN_MAP
 
     def setting(self, parameter: Parameter) -> str:
         return ENVIRONMENT if parameter.name == "which" else super().setting(parameter)
 
-    def unchanged(self, scene: SceneDescription, parameter: Parameter) -> Number:
+    def unchanged(self, parameter: Parameter) -> Number:
         if parameter.name == "which" and OWN_MAP not in self.allowed("which", OWN_MAP):
-            return self._own_name(scene) or scene.environment_spec
-        return super().unchanged(scene, parameter)
+            return self._own_name(self.scene) or self.scene.environment_spec
+        return super().unchanged(parameter)
 
     def _own_name(self, scene: SceneDescription) -> str | None:
         """What the scene's own environment is called among those that can be chosen; None if it is none of them."""
         return next((str(one) for one in self.allowed("which", OWN_MAP) if _is_own(one, scene)), None)
 
-    def budget(self, scene: SceneDescription, parameter: Parameter) -> Budget:
+    def budget_of(self, parameter: Parameter) -> Budget:
         if parameter.name != "harmonics":
             return WHOLE_RANGE
         spec = self.specs["harmonics"]
         width = getattr(spec, "high", 1.0) - getattr(spec, "low", -1.0)
-        return Budget("l2", float(str(self.chosen["epsilon"])) / width)
+        return Budget("l2", float(self.chosen["epsilon"]) / width)
 
-    def scene_inputs(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        base = self._map(scene, int(values["which"])).to(values["rotation"].device)
-        turned = turn(base, values["rotation"] - scene.number("environment.rotation"))
+    def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        base = self._map(int(values["which"])).to(values["rotation"].device)
+        turned = turn(base, values["rotation"] - self.scene.number("environment.rotation"))
         tint = torch.stack([values[f"tint_{color}"] for color in CHANNELS])
-        stops = values["exposure"] - scene.number("environment.exposure")
+        stops = values["exposure"] - self.scene.number("environment.exposure")
         lit = turned * tint * torch.exp2(stops)
         if "harmonics" in self.specs:
             lit = (lit + harmonics(values["harmonics"], base)).clamp_min(0.0)
         return {"environment.data": lit}
 
-    def _map(self, scene: SceneDescription, which: int) -> Tensor:
-        name = self.own[0].options[which]
+    def _map(self, which: int) -> Tensor:
+        name, scene = self.own[0].options[which], self.scene
         return _tensor_of(scene) if name == OWN_MAP or _is_own(name, scene) else _metered(_loaded(name), scene)
 
 

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -28,10 +27,9 @@ from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 from torch import Tensor
 
-from advsearch.controls.base import NOTHING, BoundControl, Choice, Control, Group, Parameter, Value
+from advsearch.controls.base import NOTHING, Choice, Control, Group, Parameter, Value
 from advsearch.scene.assembly import MovingMesh
 from advsearch.scene.assets import Mesh
-from advsearch.scene.description import SceneDescription
 from advsearch.scene.raster import welded
 
 Doubles = npt.NDArray[np.float64]
@@ -321,25 +319,8 @@ of d, so that it is reached without every vertex of the object agreeing."""
 ESTIMATORS = ("material", "differences")
 
 
-@dataclass(frozen=True)
 class GeometryControl(Control):
-    """A smooth change of the object's shape, at most so far.
-
-    Attributes:
-        epsilon: largest displacement of a vertex in object sizes, over 0 to 0.5.
-        modes: number of modes, 1 to 200.
-        form: "modes" or "large-steps"; None takes modes.
-        amplitudes: stands for form "modes" when `geometry.amplitudes` is asked for; its range cannot be set.
-        pushes: likewise, for form "large-steps".
-        name: the instance's name.
-    """
-
-    epsilon: float = DEFAULT_EPSILON
-    modes: int = DEFAULT_MODES
-    form: str | None = None
-    amplitudes: object = None
-    pushes: object = None
-    name: str = "geometry"
+    """A smooth change of the object's shape, at most so far."""
 
     kind = "geometry"
     of_a_mesh = True
@@ -364,34 +345,23 @@ class GeometryControl(Control):
         Choice("form", "modes", "What is searched: modes (a few smooth fields) or large-steps (every vertex)."),
     )  # fmt: skip
 
-    def __post_init__(self) -> None:
-        for choice in self.choices:
-            choice.check(self.name, getattr(self, choice.name))
-        object.__setattr__(self, "form", self.chosen_form(FORMS, self.form))
+    def check_choices(self) -> None:
+        self.form = self.chosen_form(FORMS)
 
-    def bind(self, scene: SceneDescription) -> BoundControl:
-        return BoundGeometry(self, self.mesh_in(scene).mesh)
-
-
-class BoundGeometry(BoundControl):
-    """The shape of one mesh."""
-
-    def __init__(self, control: GeometryControl, mesh: Mesh) -> None:
-        self.name = control.name
-        self._offsets = f"{control.mesh}.offsets"
-        self._mesh, solid = mesh, body(mesh)
+    def fit(self) -> None:
+        self._offsets, self._mesh = f"{self.mesh}.offsets", self.mesh_in(self.scene).mesh
+        solid = body(self._mesh)
         self._index = torch.from_numpy(solid.index)
-        self._limits = Limits(solid, float(control.epsilon))
-        if control.form == "modes":
-            modes = torch.from_numpy(shape_modes(mesh, int(control.modes)))
+        self._limits = Limits(solid, float(self.chosen["epsilon"]))
+        if self.form == "modes":
+            modes = torch.from_numpy(shape_modes(self._mesh, int(self.chosen["modes"])))
             group = Group("amplitudes", modes.shape[2], ESTIMATORS)
             self._field: Callable[[Tensor], Tensor] = lambda a: modes.to(a.device) @ a
         else:
             spread = Preconditioner(solid)
             group = Group("pushes", 3 * len(solid.places), ESTIMATORS)
             self._field = lambda a: PUSH * spread(a.reshape(-1, 3))
-        self.groups = (group,)
-        self.start = torch.full((group.size,), 0.5)
+        self.groups, self.start = (group,), torch.full((group.size,), 0.5)
 
     def inputs(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Tensor]:
         return {self._offsets: self.offsets(u).index_select(0, self._index.to(u.device)).float()}

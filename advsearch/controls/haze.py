@@ -47,18 +47,18 @@ class HazeControl(NumberControl):
         *colors("of the haze: what it scatters and does not absorb.", (0.6, 1.0), low=0.02),
     )  # fmt: skip
 
-    def default(self, scene: SceneDescription, parameter: Parameter) -> Number:
-        if (own := _haze_of(scene)) is not None and own.density:
+    def default(self, parameter: Parameter) -> Number:
+        if (own := _haze_of(self.scene)) is not None and own.density:
             return own.density if parameter.name == "density" else _display(own)[CHANNELS.index(parameter.name)]
         if parameter.name == "density" and self.asked and not self.searches("density"):
             return THIN_HAZE
         return parameter.default
 
-    def unchanged(self, scene: SceneDescription, parameter: Parameter) -> Number:
-        own = _haze_of(scene)
-        return parameter.default if own is None or not own.density else self.default(scene, parameter)
+    def unchanged(self, parameter: Parameter) -> Number:
+        own = _haze_of(self.scene)
+        return parameter.default if own is None or not own.density else self.default(parameter)
 
-    def estimators(self, scene: SceneDescription, parameter: Parameter) -> tuple[str, ...]:
+    def estimators(self, parameter: Parameter) -> tuple[str, ...]:
         if parameter.name != "density":
             return parameter.estimators
         spec = self.specs.get("density")
@@ -71,7 +71,7 @@ class HazeControl(NumberControl):
         away = float(np.linalg.norm(camera_to_world(scene)[:3, 3]))
         return scene.with_part(HazePart(self.name, max(LEAST_RADIUS, BEHIND_CAMERA * away)))
 
-    def scene_inputs(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
         albedo = srgb_to_linear(torch.stack([values[channel] for channel in CHANNELS]))
         return {f"{self.name}.density": values["density"].reshape(1), f"{self.name}.albedo": albedo}
 

@@ -15,9 +15,9 @@ import torch
 from torch import Tensor
 
 from advsearch.controls.base import Choice, Parameter
-from advsearch.controls.numbers import BoundNumbers, NumberControl, Values
+from advsearch.controls.numbers import NumberControl, Values
+from advsearch.controls.values import OneOf
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
-from advsearch.scene.description import SceneDescription
 
 DOTS = 4
 """How many dots there are when nothing is said."""
@@ -70,24 +70,22 @@ class LensControl(NumberControl):
     @property
     def dots(self) -> int:
         """How many dots there are."""
-        return int(self.chosen["dots"])  # type: ignore[call-overload,no-any-return]
+        return int(self.chosen["dots"])
 
     def size(self, parameter: Parameter) -> int:
         return self.dots if parameter.shape else 1
 
-    def bind(self, scene: SceneDescription) -> BoundNumbers:
-        bound = super().bind(scene)
-        begin = 0
-        for group in bound.groups:
-            if group.parameter in PLACES and not group.options:
-                bound.start[begin : begin + group.size] = spread(self.dots)[PLACES.index(group.parameter)]
-            begin += group.size
-        return bound
+    def fit(self) -> None:
+        super().fit()
+        for slot in self.slots:
+            name, width = slot.parameter.name, slot.width
+            if name in PLACES and width and not isinstance(slot.spec, OneOf):
+                self.start[slot.begin : slot.begin + width] = spread(self.dots)[PLACES.index(name)]
 
-    def on_picture(self, scene: SceneDescription, values: Values, image: Tensor) -> Tensor:
+    def on_picture(self, values: Values, image: Tensor) -> Tensor:
         return with_dots(image, self._placed(values))
 
-    def kept_pictures(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    def kept_pictures(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
         square = torch.arange(STICKER_SIDE) // (STICKER_SIDE // 16)
         dark = (square[:, None] + square[None, :]) % 2
         return {self.name: with_dots((0.6 - 0.2 * dark)[..., None].repeat(1, 1, 3), self._placed(values))}

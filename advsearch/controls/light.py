@@ -79,15 +79,15 @@ class LightControl(NumberControl):
                 f"{self.name}.type to area"
             )
 
-    def default(self, scene: SceneDescription, parameter: Parameter) -> Number:
+    def default(self, parameter: Parameter) -> Number:
         if parameter.name == "power" and self.asked and not self.searches("power"):
             return LIT_POWER
         return parameter.default
 
-    def unchanged(self, scene: SceneDescription, parameter: Parameter) -> Number:
+    def unchanged(self, parameter: Parameter) -> Number:
         return parameter.default
 
-    def search_range(self, scene: SceneDescription, parameter: Parameter) -> tuple[float, float] | None:
+    def search_range(self, parameter: Parameter) -> tuple[float, float] | None:
         is_point = self.chosen["type"] == "point"
         return None if is_point and parameter.name == "size" else parameter.search
 
@@ -96,10 +96,10 @@ class LightControl(NumberControl):
         power = self.specs.get("power")
         return scene.with_part(lamp(self.name, dark=isinstance(power, Fixed) and power.value == 0.0))
 
-    def scene_inputs(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
         place = torch.stack([values[axis] for axis in ("x", "y", "z")])
         tint = srgb_to_linear(torch.stack([values[channel] for channel in CHANNELS]))
-        intensity = tint * values["power"] * metered_irradiance(scene)
+        intensity = tint * values["power"] * metered_irradiance(self.scene)
         if self.chosen["type"] == "point":
             return {f"{self.name}.position": place, f"{self.name}.intensity": intensity}
         radius = values["size"] / 2.0

@@ -52,22 +52,23 @@ class MaterialControl(NumberControl):
             )
         return scene
 
-    def default(self, scene: SceneDescription, parameter: Parameter) -> Number:
+    def default(self, parameter: Parameter) -> Number:
         if parameter.name in NUMBERS:
             first = OWN if OWN in self._names else str(self._names[0])  # the fixed or first material
-            return float(getattr(self._own(scene, first), parameter.name))
+            return float(getattr(self._own(first), parameter.name))
         return parameter.default
 
-    def unchanged(self, scene: SceneDescription, parameter: Parameter) -> Number:
-        given = self.setting(parameter) in scene.given
-        return scene.number(self.setting(parameter)) if given else self.default(scene, parameter)
+    def unchanged(self, parameter: Parameter) -> Number:
+        given = self.setting(parameter) in self.scene.given
+        return self.scene.number(self.setting(parameter)) if given else self.default(parameter)
 
-    def refines(self, scene: SceneDescription) -> frozenset[str]:
+    @property
+    def refines(self) -> frozenset[str]:
         return frozenset({self._base_color}) if self._colours() else frozenset()
 
-    def scene_inputs(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
         which = (OWN, *PATTERNS)[int(values["which"])]
-        own = self._own(scene, which)
+        own = self._own(which)
         inputs: dict[str, Tensor] = {}
         for name in NUMBERS:
             if self._varies(name):
@@ -76,13 +77,13 @@ class MaterialControl(NumberControl):
                 inputs[f"{self.mesh}.{name}"] = values["which"].new_tensor([float(getattr(own, name))])
         if self._colours():
             tint = torch.stack([values[name] for name in CHANNELS])
-            inputs[self._base_color] = srgb_to_linear(tint) * self._reflectance(scene, which, so_far).to(tint.device)
+            inputs[self._base_color] = srgb_to_linear(tint) * self._reflectance(which, so_far).to(tint.device)
         return inputs
 
-    def kept_pictures(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    def kept_pictures(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
         if not self._colours():
             return {}
-        return {self.name: linear_to_srgb(self.scene_inputs(scene, values, so_far)[self._base_color])}
+        return {self.name: linear_to_srgb(self.scene_inputs(values, so_far)[self._base_color])}
 
     @property
     def _base_color(self) -> str:
@@ -99,16 +100,16 @@ class MaterialControl(NumberControl):
     def _colours(self) -> bool:
         return self._names != (OWN,) or any(self._varies(name) for name in CHANNELS)
 
-    def _own(self, scene: SceneDescription, which: str) -> Material:
-        return self.mesh_in(scene).material if which == OWN else PATTERNS[which].material
+    def _own(self, which: str) -> Material:
+        return self.mesh_in(self.scene).material if which == OWN else PATTERNS[which].material
 
-    def _reflectance(self, scene: SceneDescription, which: str, so_far: Mapping[str, Tensor]) -> Tensor:
+    def _reflectance(self, which: str, so_far: Mapping[str, Tensor]) -> Tensor:
         """Linear reflectance (h, w, 3) before the tint: what the controls before made of the texture, or a pattern."""
         if which == OWN:
             before = so_far.get(self._base_color)
-            own = self.mesh_in(scene).base_color
+            own = self.mesh_in(self.scene).base_color
             return srgb_to_linear(torch.from_numpy(own.copy())) if before is None else before
-        return _linear_covering(self.mesh_in(scene).mesh, which)
+        return _linear_covering(self.mesh_in(self.scene).mesh, which)
 
 
 @lru_cache(maxsize=len(PATTERNS))

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from advsearch.controls.base import Parameter
-from advsearch.controls.numbers import BoundNumbers, NumberControl, Slot, Values
+from advsearch.controls.numbers import NumberControl, Slot, Values
 from advsearch.controls.ranges import LARGEST
 from advsearch.controls.values import Fixed, Moved, OneOf
 from advsearch.errors import InputError
@@ -42,9 +42,9 @@ class MitsubaControl(NumberControl):
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         return scene.with_part(PluginNumbers(self.name, plugin_numbers(scene, self.name, tuple(self._given))))
 
-    def bind(self, scene: SceneDescription) -> BoundNumbers:
+    def laid_out(self) -> tuple[Slot, ...]:
         slots: list[Slot] = []
-        for one in self._numbers(scene):
+        for one in self._numbers():
             whole = self.specs.get(one.key)
             if isinstance(whole, OneOf) and len(one.values) > 1:
                 raise InputError(
@@ -54,19 +54,18 @@ class MitsubaControl(NumberControl):
             for parameter, value in zip(_channels(one), one.values, strict=True):
                 spec = self.specs.get(parameter.name, whole or Fixed(value))
                 slots.append(Slot(replace(parameter, default=value), spec, 1, sum(slot.width for slot in slots), value))
-        return BoundNumbers(self, scene, tuple(slots))
+        return tuple(slots)
 
-    def scene_inputs(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
         return {
-            one.input: torch.stack([values[parameter.name] for parameter in _channels(one)])
-            for one in self._numbers(scene)
+            one.input: torch.stack([values[parameter.name] for parameter in _channels(one)]) for one in self._numbers()
         }
 
-    def moved(self, scene: SceneDescription, slots: Sequence[Slot]) -> Iterator[Moved]:
-        return super().moved(scene, [slot for slot in slots if slot.width])
+    def left_out(self, slots: Sequence[Slot]) -> Iterator[Moved]:
+        return super().left_out([slot for slot in slots if slot.width])
 
-    def _numbers(self, scene: SceneDescription) -> tuple[PluginNumber, ...]:
-        return next(one.numbers for one in scene.parts if isinstance(one, PluginNumbers) and one.name == self.name)
+    def _numbers(self) -> tuple[PluginNumber, ...]:
+        return next(one.numbers for one in self.scene.parts if isinstance(one, PluginNumbers) and one.name == self.name)
 
 
 def _parameter(key: str, valid: tuple[str, ...] = ("differences",)) -> Parameter:

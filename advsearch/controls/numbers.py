@@ -7,13 +7,13 @@ Subclass `NumberControl`, declare the parameters, and say in `scene_inputs` what
         summary = "How bright the picture is."
         parameters = (Parameter("stops", (), "stops", -10, 10, 0.0, "Over the metered exposure.", search=(-2, 2)),)
 
-        def scene_inputs(self, scene, values, so_far):
+        def scene_inputs(self, values, so_far):
             return {"camera.exposure": values["stops"]}
 """
 
 from __future__ import annotations
 
-from abc import ABC
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -21,7 +21,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from advsearch.controls.base import NOTHING, WHOLE_RANGE, BoundControl, Budget, Choice, Control, Group, Parameter, Value
+from advsearch.controls.base import NOTHING, WHOLE_RANGE, Budget, Control, Group, Parameter, Value
 from advsearch.controls.ranges import Range
 from advsearch.controls.values import (
     Fixed,
@@ -34,184 +34,16 @@ from advsearch.controls.values import (
     in_words,
     nearest,
     option_index,
-    plain,
-    read,
     same,
     to_unit,
     to_value,
 )
-from advsearch.copies import copied, hand_copies, is_ours
-from advsearch.distributions import as_setting
-from advsearch.errors import InputError, UnknownNameError
-from advsearch.scene.description import ENVIRONMENT, SceneDescription
+from advsearch.copies import hand_copies
+from advsearch.errors import InputError
+from advsearch.scene.description import ENVIRONMENT
 
 Values = Mapping[str, Tensor]
 """A configuration: parameter name to a float32 tensor of the parameter's shape; of a discrete choice, its number."""
-
-
-class NumberControl(Control, ABC):
-    """A control made of named numbers and choices.
-
-    Args:
-        name: the instance's name; the kind unless given.
-        **settings: a value for any parameter (fixed, range or list) or choice, by name. Once one parameter is given a
-            range or a list, only those given so are searched; otherwise each parameter is searched over its own
-            `search` range, if it has one.
-
-    Raises:
-        UnknownNameError: no such parameter or choice.
-        InputError: a value is out of range.
-    """
-
-    choices: ClassVar[tuple[Choice, ...]] = ()
-    own: tuple[Parameter, ...]
-    """The parameters of this instance: `declared` of its settings."""
-    amount: ClassVar[str | None] = None
-    """The parameter whose value in the scene as it was described means that the rest of the control does not show: the
-    power of a lamp, say. None where the scene has all parameters of itself."""
-
-    def __init_subclass__(cls, **more: Any) -> None:
-        super().__init_subclass__(**more)
-        asked = ("scene_inputs", "on_picture", "measured", "kept_pictures", "kept_files")
-        hand_copies(cls, **dict.fromkeys(asked, slice(1, None)))
-
-    def __init__(self, name: str | None = None, **settings: object) -> None:
-        self.name = name or self.kind
-        settings = {setting: as_setting(value) for setting, value in settings.items()}
-        own = self.own = self.declared(settings)
-        known = [one.name for one in own] + [one.name for one in self.choices]
-        for setting in settings:
-            if setting not in known:
-                raise UnknownNameError(f"setting of control {self.kind}", setting, known)
-        self._given = {setting: plain(value) for setting, value in settings.items() if value is not None}
-        self.chosen = {choice.name: self._given.get(choice.name, choice.default) for choice in self.choices}
-        for choice in self.choices:
-            choice.check(self.name, self.chosen[choice.name])
-        self.check_choices()
-        self.specs = {
-            one.name: read(f"{self.name}.{one.name}", one, self._given[one.name])
-            for one in own
-            if one.name in self._given
-        }
-        self.asked = any(not isinstance(spec, Fixed) for spec in self.specs.values())
-
-    def settings(self) -> dict[str, object]:
-        return {"kind": self.kind, **self._given} if self.name != self.kind else dict(self._given)
-
-    def allowed(self, parameter: str, *otherwise: Number) -> tuple[Number, ...]:
-        """Return the values, one by one, that a parameter was set to; others where nothing was said of it."""
-        spec = self.specs.get(parameter)
-        return spec.values if isinstance(spec, OneOf) else (spec.value,) if isinstance(spec, Fixed) else otherwise
-
-    def searches(self, parameter: str) -> bool:
-        """Return whether a parameter with a range of its own is among what is searched."""
-        return not isinstance(self.specs[parameter], Fixed) if parameter in self.specs else not self.asked
-
-    # ---- what a subclass says ---------------------------------------------------------------------------------------
-
-    def check_choices(self) -> None:
-        """Check what the choices' own declarations do not say of `self.chosen`; by default nothing.
-
-        Raises:
-            InputError: a choice is out of range.
-        """
-
-    def in_scene(self, scene: SceneDescription, parameter: Parameter) -> Parameter:
-        """Return a parameter as this scene has it, where its unit depends on that."""
-        return parameter
-
-    def default(self, scene: SceneDescription, parameter: Parameter) -> Number:
-        """Return a parameter's value in the unchanged scene: the setting of that name, or else its own default."""
-        value = scene.values.get(self.setting(parameter))
-        return parameter.default if value is None else value
-
-    def unchanged(self, scene: SceneDescription, parameter: Parameter) -> Number:
-        """Return a parameter's value in the scene as it was described: the default, unless that changes the scene."""
-        return self.default(scene, parameter)
-
-    def size(self, parameter: Parameter) -> int:
-        """Return how many numbers a parameter has: by default the product of its shape."""
-        count = 1
-        for side in parameter.shape:
-            count *= side or 1
-        return count
-
-    def scene_inputs(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Return what the values do to the scene; differentiable torch operations."""
-        return {}
-
-    def on_picture(self, scene: SceneDescription, values: Values, image: Tensor) -> Tensor:
-        """Return what the values make of the finished picture (H, W, 3) sRGB; differentiable in both."""
-        return image
-
-    def refines(self, scene: SceneDescription) -> frozenset[str]:
-        """Return the scene inputs that `scene_inputs` and `measured` take from the controls before, and may change."""
-        return frozenset()
-
-    def measured(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Value]:
-        """Return further values worth storing with a configuration, by name without the instance's."""
-        return {}
-
-    def kept_pictures(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Return pictures worth keeping, by file stem: (h, w, 3) sRGB in [0, 1]."""
-        return {}
-
-    def kept_files(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, bytes]:
-        """Return other files worth keeping, by name with ending."""
-        return {}
-
-    def search_range(self, scene: SceneDescription, parameter: Parameter) -> tuple[float, float] | None:
-        """Return the range searched when nothing is said about a parameter, or None to leave it at its default."""
-        return parameter.search
-
-    def budget(self, scene: SceneDescription, parameter: Parameter) -> Budget:
-        """Return how far a searched parameter may go: by default its whole range."""
-        return WHOLE_RANGE
-
-    def estimators(self, scene: SceneDescription, parameter: Parameter) -> tuple[str, ...]:
-        """Return the valid estimators of a parameter in this scene, preferred first."""
-        return parameter.estimators
-
-    # ---- what it makes of it ----------------------------------------------------------------------------------------
-
-    def bind(self, scene: SceneDescription) -> BoundNumbers:
-        scene = scene if is_ours(type(self)) else copied(scene)
-        slots: list[Slot] = []
-        begin = 0
-        for parameter in self.own:
-            value = self.default(scene, parameter)
-            spec, size = self._spec(scene, parameter, value), self.size(parameter)
-            slot = Slot(self.in_scene(scene, parameter), spec, size, begin, value)
-            slots.append(slot)
-            begin += slot.width
-        return BoundNumbers(self, scene, tuple(slots))
-
-    def moved(self, scene: SceneDescription, slots: Sequence[Slot]) -> Iterator[Moved]:
-        """Yield the values of the clean scene that the start has not.
-
-        Raises:
-            InputError: one of them was asked for.
-        """
-        for slot in slots:
-            parameter = slot.parameter
-            if self.amount not in (None, parameter.name):
-                continue
-            wanted, used = self.unchanged(scene, parameter), slot.start_value()
-            if same(used, wanted, turns=slot.turns):
-                continue
-            setting = self.setting(parameter)
-            check_start(self.name, parameter.name, in_words(slot.spec), setting, scene, wanted)
-            if not isinstance(self.specs.get(parameter.name), Fixed):
-                address = setting if setting == ENVIRONMENT else f"{self.name}.{parameter.name}"
-                yield Moved(self.name, address, "name" if parameter.options else parameter.unit, wanted, used)
-
-    def _spec(self, scene: SceneDescription, parameter: Parameter, value: Number) -> Spec:
-        if parameter.name in self.specs:
-            return self.specs[parameter.name]
-        wanted = None if self.asked else self.search_range(scene, parameter)
-        if wanted is None:
-            return Fixed(value)
-        return OneOf(parameter.options) if parameter.options else Range(*wanted)
 
 
 @dataclass(frozen=True)
@@ -261,40 +93,152 @@ class Slot:
         return [to_unit(spec, self.parameter.log, float(value))] * self.size
 
 
-class BoundNumbers(BoundControl):
-    """A `NumberControl` in a scene. `slots` has each parameter with what it is set to, in the order of its
-    coordinates."""
+class NumberControl(Control):
+    """A control made of named numbers and choices.
 
-    def __init__(self, control: NumberControl, scene: SceneDescription, slots: tuple[Slot, ...]) -> None:
-        self.control = control
-        self.scene = scene
-        self.name = control.name
-        self.refines = control.refines(scene)
-        self.slots = slots
-        self._draws = type(control).on_picture is not NumberControl.on_picture
-        self.moved = tuple(control.moved(scene, slots))
-        self.start = torch.tensor([share for slot in slots for share in slot.start()], dtype=torch.float32)
-        self.groups = tuple(self._group(slot) for slot in slots if slot.width)
-        ranges = [
-            (one.spec if isinstance(one.spec, Range) else Range(0.0, 1.0)) for one in slots for _ in range(one.width)
-        ]
-        self._low = torch.tensor([one.low for one in ranges], dtype=torch.float64)
-        self._span = torch.tensor([one.high - one.low for one in ranges], dtype=torch.float64)
+    Once one parameter is given a range or a list, only those given so are searched; otherwise each parameter is
+    searched over its own `search` range, if it has one. Of a picture among the parameters, the numbers are not said one
+    by one.
+
+    Attributes:
+        slots: once bound, each parameter with what it is set to, in the order of its coordinates.
+    """
+
+    slots: tuple[Slot, ...]
+    amount: ClassVar[str | None] = None
+    """The parameter whose value in the scene as it was described means that the rest of the control does not show: the
+    power of a lamp, say. None where the scene has all parameters of itself."""
+
+    def __init_subclass__(cls, **more: Any) -> None:
+        super().__init_subclass__(**more)
+        asked = ("scene_inputs", "on_picture", "measured", "kept_pictures", "kept_files")
+        hand_copies(cls, **dict.fromkeys(asked, slice(None)))
+
+    def allowed(self, parameter: str, *otherwise: Number) -> tuple[Number, ...]:
+        """Return the values, one by one, that a parameter was set to; others where nothing was said of it."""
+        spec = self.specs.get(parameter)
+        return spec.values if isinstance(spec, OneOf) else (spec.value,) if isinstance(spec, Fixed) else otherwise
+
+    def searches(self, parameter: str) -> bool:
+        """Return whether a parameter with a range of its own is among what is searched."""
+        return not isinstance(self.specs[parameter], Fixed) if parameter in self.specs else not self.asked
+
+    # ---- what a subclass says, in `self.scene` ----------------------------------------------------------------------
+
+    def in_scene(self, parameter: Parameter) -> Parameter:
+        """Return a parameter as this scene has it, where its unit depends on that."""
+        return parameter
+
+    def default(self, parameter: Parameter) -> Number:
+        """Return a parameter's value in the unchanged scene: the setting of that name, or else its own default."""
+        value = self.scene.values.get(self.setting(parameter))
+        return parameter.default if value is None else value
+
+    def unchanged(self, parameter: Parameter) -> Number:
+        """Return a parameter's value in the scene as it was described: the default, unless that changes the scene."""
+        return self.default(parameter)
+
+    def size(self, parameter: Parameter) -> int:
+        """Return how many numbers a parameter has: by default the product of its shape."""
+        return math.prod(side or 1 for side in parameter.shape)
+
+    def search_range(self, parameter: Parameter) -> tuple[float, float] | None:
+        """Return the range searched when nothing is said about a parameter, or None to leave it at its default."""
+        return parameter.search
+
+    def budget_of(self, parameter: Parameter) -> Budget:
+        """Return how far a searched parameter may go: by default its whole range."""
+        return WHOLE_RANGE
+
+    def estimators(self, parameter: Parameter) -> tuple[str, ...]:
+        """Return the valid estimators of a parameter in this scene, preferred first."""
+        return parameter.estimators
+
+    def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Return what the values do to the scene; differentiable torch operations."""
+        return {}
+
+    def on_picture(self, values: Values, image: Tensor) -> Tensor:
+        """Return what the values make of the finished picture (H, W, 3) sRGB; differentiable in both."""
+        return image
+
+    def measured(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Value]:
+        """Return further values worth storing with a configuration, by name without the instance's."""
+        return {}
+
+    def kept_pictures(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Return pictures worth keeping, by file stem: (h, w, 3) sRGB in [0, 1]."""
+        return {}
+
+    def kept_files(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, bytes]:
+        """Return other files worth keeping, by name with ending."""
+        return {}
+
+    # ---- what it makes of it ----------------------------------------------------------------------------------------
+
+    def fit(self) -> None:
+        self.slots = self.laid_out()
+        self.moved = tuple(self.left_out(self.slots))
+        self.start = torch.tensor([share for slot in self.slots for share in slot.start()], dtype=torch.float32)
+        self.groups = tuple(self._group(slot) for slot in self.slots if slot.width)
+        ranges = [one.spec if isinstance(one.spec, Range) else Range(0.0, 1.0) for one in self.slots]
+        widths = torch.tensor([one.width for one in self.slots])
+        self._low = torch.tensor([one.low for one in ranges], dtype=torch.float64).repeat_interleave(widths)
+        self._span = torch.tensor([one.high - one.low for one in ranges], dtype=torch.float64).repeat_interleave(widths)
+
+    def laid_out(self) -> tuple[Slot, ...]:
+        """Return the parameters in the order of their coordinates."""
+        slots: list[Slot] = []
+        begin = 0
+        for parameter in self.own:
+            value = self.default(parameter)
+            spec, size = self.spec(parameter, value), self.size(parameter)
+            slots.append(Slot(self.in_scene(parameter), spec, size, begin, value))
+            begin += slots[-1].width
+        return tuple(slots)
+
+    def spec(self, parameter: Parameter, value: Number) -> Spec:
+        """Return what a parameter is set to where its value in the unchanged scene is `value`."""
+        if parameter.name in self.specs:
+            return self.specs[parameter.name]
+        wanted = None if self.asked else self.search_range(parameter)
+        if wanted is None:
+            return Fixed(value)
+        return OneOf(parameter.options) if parameter.options else Range(*wanted)
+
+    def left_out(self, slots: Sequence[Slot]) -> Iterator[Moved]:
+        """Yield the values of the clean scene that the start has not.
+
+        Raises:
+            InputError: one of them was asked for.
+        """
+        for slot in slots:
+            parameter = slot.parameter
+            if self.amount not in (None, parameter.name):
+                continue
+            wanted, used = self.unchanged(parameter), slot.start_value()
+            if same(used, wanted, turns=slot.turns):
+                continue
+            setting = self.setting(parameter)
+            check_start(self.name, parameter.name, in_words(slot.spec), setting, self.scene, wanted)
+            if not isinstance(self.specs.get(parameter.name), Fixed):
+                address = setting if setting == ENVIRONMENT else f"{self.name}.{parameter.name}"
+                yield Moved(self.name, address, "name" if parameter.options else parameter.unit, wanted, used)
 
     def _group(self, slot: Slot) -> Group:
         parameter, spec = slot.parameter, slot.spec
         options = len(spec.values) if isinstance(spec, OneOf) else 0
-        estimators = () if options else self.control.estimators(self.scene, parameter)
-        if type(spec) not in (OneOf, Range) and self.control.budget(self.scene, parameter) != WHOLE_RANGE:
+        budget = WHOLE_RANGE if options else self.budget_of(parameter)
+        if type(spec) not in (OneOf, Range) and budget != WHOLE_RANGE:
             raise InputError(f"{self.name}.{parameter.name}: it has a ball and no distribution; give it a range")
         return Group(
             parameter.name,
             slot.width,
-            estimators,
-            WHOLE_RANGE if options else self.control.budget(self.scene, parameter),
+            () if options else self.estimators(parameter),
+            budget,
             periodic=slot.periodic,
             options=options,
-            setting=self.control.setting(parameter),
+            setting=self.setting(parameter),
         )
 
     def values(self, u: Tensor) -> dict[str, Tensor]:
@@ -317,35 +261,35 @@ class BoundNumbers(BoundControl):
         return found
 
     def numbers(self, u: Tensor) -> Mapping[str, Tensor]:
-        named = {slot.parameter.name for slot in self.slots if slot.parameter.options}
-        return {name: value for name, value in self.values(u).items() if name not in named}
+        values = self.values(u)
+        others = (slot.parameter for slot in self.slots)
+        return {one.name: values[one.name] for one in others if not one.options and len(one.shape) < 2}
 
     def inputs(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Tensor]:
-        return self.control.scene_inputs(self.scene, self.values(u), so_far)
+        return self.scene_inputs(self.values(u), so_far)
 
     def picture(self, u: Tensor, image: Tensor) -> Tensor:
-        return self.control.on_picture(self.scene, self.values(u), image) if self._draws else image
+        # many do nothing to the picture: their values are not worked out again
+        return image if type(self).on_picture is NumberControl.on_picture else self.on_picture(self.values(u), image)
 
     def describe(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Value]:
         values = self.values(u.detach())
         said: dict[str, Value] = {}
         for slot in self.slots:
-            if isinstance(slot.spec, Fixed):
-                continue
             parameter, value = slot.parameter, values[slot.parameter.name]
+            if isinstance(slot.spec, Fixed) or len(parameter.shape) > 1:
+                continue
+            name = f"{self.name}.{parameter.name}"
             if parameter.options:
-                said[f"{self.name}.{parameter.name}"] = {"value": parameter.options[int(value)], "unit": "name"}
+                said[name] = {"value": parameter.options[int(value)], "unit": "name"}
             elif value.ndim == 0:
-                said[f"{self.name}.{parameter.name}"] = {"value": float(value), "unit": parameter.unit}
+                said[name] = {"value": float(value), "unit": parameter.unit}
             else:
-                for number, one in enumerate(value):
-                    said[f"{self.name}.{parameter.name}.{number}"] = {"value": float(one), "unit": parameter.unit}
-        for name, one_value in self.control.measured(self.scene, values, so_far).items():
-            said[f"{self.name}.{name}"] = one_value
-        return said
+                said |= {f"{name}.{k}": {"value": float(one), "unit": parameter.unit} for k, one in enumerate(value)}
+        return said | {f"{self.name}.{name}": one for name, one in self.measured(values, so_far).items()}
 
     def artifacts(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Tensor]:
-        return self.control.kept_pictures(self.scene, self.values(u.detach()), so_far)
+        return self.kept_pictures(self.values(u.detach()), so_far)
 
     def files(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, bytes]:
-        return self.control.kept_files(self.scene, self.values(u.detach()), so_far)
+        return self.kept_files(self.values(u.detach()), so_far)

@@ -127,6 +127,7 @@ class OcclusionControl(NumberControl):
 
     kind = "occlusion"
     amount = "coverage"
+    refines = frozenset(SURROUNDINGS)  # none is changed; but it comes after whatever moves the camera or the object
     summary = "A second object between the camera and the object, hiding a wanted share of it."
     parameters = (
         Parameter(
@@ -177,22 +178,18 @@ class OcclusionControl(NumberControl):
             scene = scene.with_part(MeshPart(self._part(option), asset.mesh, *looks, to_world=away))
         return scene
 
-    def refines(self, scene: SceneDescription) -> frozenset[str]:
-        """Nothing is changed; but it has to come after whatever moves the camera or the object."""
-        return frozenset(SURROUNDINGS)
-
-    def scene_inputs(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
         chosen = self._option(values)
-        camera = so_far.get("camera.to_world", torch.from_numpy(camera_to_world(scene)).to(values["turn"]))
+        camera = so_far.get("camera.to_world", torch.from_numpy(camera_to_world(self.scene)).to(values["turn"]))
         inputs = {f"{self._part(one)}.to_world": _put_away(camera) for one in self._candidates()}
-        placed = self.placement(scene, values, so_far)
+        placed = self.placement(values, so_far)
         if not placed.away:
             inputs[f"{self._part(chosen)}.to_world"] = _matrix(camera, placed, values)
         return inputs
 
-    def measured(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Value]:
+    def measured(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Value]:
         """What is hidden of the object, and what became of the size and the distance that were asked for."""
-        placed = self.placement(scene, values, so_far)
+        placed = self.placement(values, so_far)
         hidden: dict[str, Value] = {"hidden": {"value": placed.hidden, "unit": "1"}}
         if placed.away:
             return hidden
@@ -220,11 +217,11 @@ class OcclusionControl(NumberControl):
     def _asset(self, option: str) -> ObjectAsset:
         return made(option) if option in MADE else loaded(option)
 
-    def placement(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> Placement:
+    def placement(self, values: Values, so_far: Mapping[str, Tensor]) -> Placement:
         """Work out where the occluder goes, with camera and object where other controls put them; without
         derivatives."""
         asked = {name: float(value.detach()) for name, value in values.items()}
-        seen = _Seen.of(scene, so_far)
+        seen = _Seen.of(self.scene, so_far)
         mesh = self._asset(self._option(values)).mesh
         if seen.directions is None or asked["coverage"] <= 0.0:
             return Placement(np.eye(3), 0.0, asked["size"], asked["distance"] * seen.far, 0.0, True)

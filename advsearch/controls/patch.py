@@ -2,54 +2,59 @@
 
 After Brown et al. (2017, "Adversarial Patch", arXiv 1712.09665, section 2): the pixels are free, and what is around
 them stays. There the patch is pasted into pictures; here it lies on the surface, under the scene's light, and bends
-with it (`sticker`). It is part of the base colour, so that no outline moves and the adjoint is right.
+with it. It is part of the base colour, so that no outline moves and the adjoint is right.
+
+    base colour = (1 - m) base colour + m linear(pixels at (a, b)),     m = soft square in (a, b), front of the surface
+
+A place is where a ray from outside towards the middle of the object meets the surface; (a, b) are those in the tangent
+plane, unrolled along the direction in which the surface bends (exact for cylinders and spheres; Schmidt et al. 2006,
+"Interactive Decal Compositing with Discrete Exponential Maps"). Only what is connected and faces that way is painted.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
+import numpy as np
 import torch
 import torch.nn.functional as F
+from scipy import spatial
 from torch import Tensor
 
-from advsearch.controls.base import NOTHING, WHOLE_RANGE, BoundControl, Budget, Choice, Control, Group, Parameter, Value
-from advsearch.controls.numbers import BoundNumbers, NumberControl
-from advsearch.controls.patch_sticker import Sticker, towards_camera
+from advsearch.controls.base import NOTHING, WHOLE_RANGE, Budget, Choice, Parameter, Value, change_in_colour
+from advsearch.controls.numbers import NumberControl, Slot, Values
 from advsearch.controls.ranges import Range
-from advsearch.controls.texture import resampled
-from advsearch.controls.values import LARGEST_EPSILON, Fixed, Moved, Number, OneOf, in_words, read
+from advsearch.controls.texture import radius, resampled
+from advsearch.controls.values import LARGEST_EPSILON, Fixed, Moved, Number, OneOf, Spec, in_words
 from advsearch.errors import FileFormatError, InputError
+from advsearch.scene.assets import Doubles, Mesh
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.description import SceneDescription
+from advsearch.scene.geometry import camera_to_world, object_to_world
 from advsearch.scene.importing.pictures import read_picture
+from advsearch.scene.raster import Charts, MeshSurface, rasterised
 
 BASE_COLOR = "object.base_color"
 NORMS = ("box", "linf", "l2")
-DEFAULT_EPSILON = 0.1
-"""Default radius of an L-infinity ball; the default L2 ball has the same root-mean-square change at its edge."""
 PRINT_SIDE = 512
 """Least side of the picture that is kept for printing, in pixels."""
+BASE_SIDES = (512, 1024)
+"""Smallest and largest side of the base-colour map that is painted into, in texels."""
+REACH = 0.75
+"""Radius around the middle, in sides of the square, within which the surface is painted: its corners are at 0.7071."""
+FACING = (0.1, 0.3)
+"""Cosines between the surface and the square's normal between which it fades in."""
+EDGE_TEXELS = 2.0
+"""Width of the soft edge in texels."""
 
 
-class PatchControl(Control):
-    """A printed square stuck onto the object.
-
-    Args:
-        name: the instance's name.
-        pixels: [low, high] narrows the colours that are searched; a number makes the patch a plain grey.
-        resolution: side of the patch in pixels, 2 to 512.
-        norm: "box", "linf" or "l2"; None takes box, or linf where there is an epsilon.
-        epsilon: radius of the ball that the pixels stay in, for linf and l2; None takes the norm's default.
-        picture: path of a picture to stick on as it is.
-        **numbers: azimuth, height, size and rotation: a number, a range or a list; fixed where not given.
-
-    Raises:
-        UnknownNameError: no such setting.
-        InputError: a value is out of range.
-    """
+class PatchControl(NumberControl):
+    """A printed square stuck onto the object: numbers that are not given are fixed, and pixels are searched unless they
+    are a grey or a picture."""
 
     kind = "patch"
     summary = "A printed square stuck onto the object: its pixels, place, size and turn."
@@ -93,186 +98,106 @@ class PatchControl(Control):
         Choice("picture", None, "A picture file to stick on as it is; then pixels are not searched.", fixes="pixels"),
     )  # fmt: skip
 
-    def __init__(
-        self,
-        name: str | None = None,
-        *,
-        pixels: object = None,
-        resolution: int = 32,
-        norm: str | None = None,
-        epsilon: float | None = None,
-        picture: str | None = None,
-        **numbers: object,
-    ) -> None:
-        self.name = name or self.kind
-        self.resolution, self.epsilon, self.picture = resolution, epsilon, picture
-        self.norm = norm or ("box" if epsilon is None else "linf")
-        for choice in self.choices:
-            choice.check(self.name, getattr(self, choice.name))
-        if self.norm == "box" and self.epsilon is not None:
-            raise InputError(
-                f"{self.name}.epsilon: expected none with norm box, got {self.epsilon:g}; set norm to linf or l2"
-            )
-        self._placement = _Placement(self.name, **numbers)
-        self._pixels_given = pixels
-        self._pixels = self._pixel_spec()
-        ball = "epsilon" if epsilon is not None else "norm" if self.norm != "box" else None
-        if ball and isinstance(self._pixels, Fixed):
+    refines = frozenset({BASE_COLOR})
+    on_top = True
+
+    def __init__(self, name: str | None = None, **settings: object) -> None:
+        super().__init__(name, **settings)
+        pixels, picture = self.specs.get("pixels"), self.chosen["picture"]
+        if pixels is not None and picture is not None:
+            raise InputError(f"{self.name}.pixels: expected none beside {self.name}.picture; leave one of them out")
+        if pixels is not None and not isinstance(pixels, Fixed) and type(pixels) is not Range:
+            got = f"a list of {len(pixels.values)}" if isinstance(pixels, OneOf) else "a distribution"
+            raise InputError(f"{self.name}.pixels: expected [low, high] or one number, got {got}")
+        self._free = picture is None and not isinstance(pixels, Fixed)
+        ball = next((one for one in ("epsilon", "norm") if self.chosen[one] not in (None, "box")), None)
+        if ball and not self._free:
             raise InputError(
                 f"{self.name}.{ball}: is of the ball that searched pixels stay in, and these are fixed; leave it out, "
                 f"or leave out {self.name}.{'picture' if picture is not None else 'pixels'}"
             )
 
-    def settings(self) -> dict[str, object]:
-        given = {one.name: getattr(self, one.name) for one in self.choices if getattr(self, one.name) != one.default}
-        if self._pixels_given is not None:
-            given["pixels"] = self._pixels_given
-        named = {"kind": self.kind} if self.name != self.kind else {}
-        return {**named, **given, **self._placement.given}
+    def check_choices(self) -> None:
+        epsilon = self.chosen["epsilon"]
+        if "norm" not in self._given and epsilon is not None:
+            self.chosen["norm"] = "linf"
+        if self.chosen["norm"] == "box" and epsilon is not None:
+            raise InputError(
+                f"{self.name}.epsilon: expected none with norm box, got {epsilon:g}; set norm to linf or l2"
+            )
 
-    def _pixel_spec(self) -> Range | Fixed:
-        """What the pixels are set to; where there is a picture, that takes their place."""
-        if self._pixels_given is None:
-            return Fixed(0.0) if self.picture is not None else Range(0.0, 1.0)
-        if self.picture is not None:
-            raise InputError(f"{self.name}.pixels: expected none beside {self.name}.picture; leave one of them out")
-        spec = read(f"{self.name}.pixels", self.parameters[0], self._pixels_given)
-        if not isinstance(spec, Fixed) and type(spec) is not Range:
-            got = f"a list of {len(spec.values)}" if isinstance(spec, OneOf) else "a distribution"
-            raise InputError(f"{self.name}.pixels: expected [low, high] or one number, got {got}")
-        return spec
+    # ---- in a scene -------------------------------------------------------------------------------------------------
 
-    def bind(self, scene: SceneDescription) -> BoundControl:
-        spec, placed = self._pixels, self._placement.placed(scene)
-        if isinstance(spec, Fixed) and not self._placement.asked:
+    def size(self, parameter: Parameter) -> int:
+        return 3 * int(self.chosen["resolution"]) ** 2 if parameter.shape else 1
+
+    def default(self, parameter: Parameter) -> Number:
+        if parameter.name in ("azimuth", "height"):
+            return towards_camera(self.scene)[parameter.name == "height"]
+        return 0.0 if parameter.name == "pixels" else parameter.default  # what is underneath takes their place
+
+    def spec(self, parameter: Parameter, value: Number) -> Spec:
+        if parameter.name == "pixels" and "pixels" not in self.specs:
+            return Range(0.0, 1.0) if self._free else Fixed(0.0)
+        return self.specs.get(parameter.name, Fixed(value))
+
+    def budget_of(self, parameter: Parameter) -> Budget:
+        norm = self.chosen["norm"]
+        if parameter.name != "pixels" or norm == "box":
+            return WHOLE_RANGE
+        spec = self.specs.get("pixels", Range(0.0, 1.0))
+        assert isinstance(spec, Range)
+        return Budget(norm, radius(norm, self.chosen["epsilon"], self.size(parameter)) / (spec.high - spec.low))
+
+    def fit(self) -> None:
+        super().fit()
+        if not self.groups:
             raise InputError(
                 f"`controls` {self.name}: the pixels are fixed, so there is nothing to search; give another parameter "
                 f"a range, such as {self.name}={{azimuth: [0, 360]}}"
             )
-        resting = placed.values(placed.start) if isinstance(placed, BoundNumbers) else placed
-        side = int(self.resolution)
-        sticker = Sticker(scene, {one: float(value) for one, value in resting.items()}, side)
-        if isinstance(spec, Fixed):
-            pixels = self._fixed_pixels(float(spec.value))
-            bound = BoundPatch(self.name, sticker, Range(0.0, 1.0), pixels, None, placed)
-            bound.moved = placed.moved if isinstance(placed, BoundNumbers) else ()
-            return bound
-        wanted = (sticker.underneath() - spec.low) / (spec.high - spec.low)
-        start = wanted.clamp(0.0, 1.0)
-        group = Group("pixels", start.numel(), ("adjoint",), self._budget(start.numel(), spec))
-        bound = BoundPatch(self.name, sticker, spec, start, group, placed)
-        if not torch.allclose(start, wanted, atol=1e-5):
-            nearest = f"the nearest {in_words(spec)}"
-            bound.moved = (Moved(self.name, f"{self.name}.pixels", "sRGB", "the texture underneath", nearest),)
-        return bound
+        side, pixels = int(self.chosen["resolution"]), self.slots[0]
+        self._picture = None if self.chosen["picture"] is None else resampled(self._read(), side)
+        resting = {name: float(value) for name, value in self.values(self.start).items() if name != "pixels"}
+        self._sticker = Sticker(self.scene, resting, side)
+        if isinstance(pixels.spec, Range):
+            low, high = pixels.spec.low, pixels.spec.high
+            wanted = (self._sticker.underneath() - low) / (high - low)
+            self.start[: pixels.width] = wanted.clamp(0.0, 1.0).reshape(-1)
+            moved = not torch.allclose(wanted.clamp(0.0, 1.0), wanted, atol=1e-5)
+            nearest = f"the nearest {in_words(pixels.spec)}"
+            self.moved = (Moved(self.name, f"{self.name}.pixels", "sRGB", "the texture underneath", nearest),) * moved
 
-    def _fixed_pixels(self, grey: float) -> Tensor:
-        """The patch (n, n, 3) sRGB that is not searched: the picture, or else one grey."""
-        side = int(self.resolution)
-        if self.picture is None:
-            return torch.full((side, side, 3), grey)
-        path = Path(self.picture)
+    def left_out(self, slots: Sequence[Slot]) -> Iterator[Moved]:
+        return super().left_out(() if self._free else slots[1:])  # at the start searched pixels show no patch
+
+    def _read(self) -> Tensor:
         try:
-            pixels = torch.from_numpy(read_picture(path))
+            return torch.from_numpy(read_picture(Path(self.chosen["picture"])))
         except FileFormatError as error:
             raise FileFormatError(f"{self.name}.picture: {error}") from error
-        return resampled(pixels, side)
 
-    def _budget(self, count: int, spec: Range) -> Budget:
-        if self.norm == "box":
-            return WHOLE_RANGE
-        epsilon = self.epsilon or DEFAULT_EPSILON * (math.sqrt(count) if self.norm == "l2" else 1.0)
-        return Budget(self.norm, epsilon / (spec.high - spec.low))
+    def values(self, u: Tensor) -> dict[str, Tensor]:
+        values, side = super().values(u), int(self.chosen["resolution"])
+        if self._picture is not None:
+            return values | {"pixels": self._picture.to(u.device, copy=True)}
+        return values | {"pixels": values["pixels"].reshape(side, side, 3)}
 
-
-class _Placement(NumberControl):
-    """The numbers of a patch; those not given are fixed."""
-
-    kind = PatchControl.kind
-    summary = "Where a patch is, how large and how turned."
-    parameters = PatchControl.parameters[1:]
-
-    @property
-    def given(self) -> dict[str, object]:
-        """What was said about the numbers."""
-        return self._given
-
-    def default(self, scene: SceneDescription, parameter: Parameter) -> Number:
-        if parameter.name in ("azimuth", "height"):
-            return dict(zip(("azimuth", "height"), towards_camera(scene), strict=True))[parameter.name]
-        return parameter.default
-
-    def placed(self, scene: SceneDescription) -> BoundNumbers | dict[str, Tensor]:
-        """The numbers bound to a scene where any is searched, or else their values."""
-        if self.asked:
-            return self.bind(scene)
-        fixed = {name: spec.value for name, spec in self.specs.items() if isinstance(spec, Fixed)}
-        return {one.name: torch.tensor(float(fixed.get(one.name, self.default(scene, one)))) for one in self.parameters}
-
-
-class BoundPatch(BoundControl):
-    """A patch on one object.
-
-    Args:
-        name: the instance's name.
-        sticker: paints it.
-        spec: range of the pixels.
-        pixels: (n, n, 3) their coordinates in u at the start, or their sRGB values where they are not searched.
-        group: the group of the pixels, if they are searched.
-        numbers: the other parameters, bound or fixed.
-    """
-
-    refines: frozenset[str] = frozenset({BASE_COLOR})
-    on_top = True
-
-    def __init__(
-        self,
-        name: str,
-        sticker: Sticker,
-        spec: Range,
-        pixels: Tensor,
-        group: Group | None,
-        numbers: BoundNumbers | dict[str, Tensor],
-    ) -> None:
-        self.name = name
-        self._sticker, self._spec, self._pixels, self._numbers = sticker, spec, pixels, numbers
-        self._searched = group.size if group else 0
-        further = numbers if isinstance(numbers, BoundNumbers) else None
-        self.start = torch.cat([pixels.reshape(-1)[: self._searched], further.start if further else torch.zeros(0)])
-        self.groups = (*([group] if group else ()), *(further.groups if further else ()))
-
-    def pixels(self, u: Tensor) -> Tensor:
-        """Return the patch (n, n, 3), display-referred sRGB in [0, 1]."""
-        if not self._searched:
-            return self._pixels.to(u.device, copy=True)
-        share = u[: self._searched].reshape(self._pixels.shape)
-        return self._spec.low + (self._spec.high - self._spec.low) * share
-
-    def numbers(self, u: Tensor) -> Mapping[str, Tensor]:
-        """Return place, size and rotation, in their units."""
-        if isinstance(self._numbers, BoundNumbers):
-            return self._numbers.values(u[self._searched :])
-        return {name: number.to(u.device, copy=True) for name, number in self._numbers.items()}
-
-    def inputs(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Tensor]:
-        return {BASE_COLOR: self._sticker.paint(so_far.get(BASE_COLOR), self.pixels(u), self.numbers(u))}
+    def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        return {BASE_COLOR: self._sticker.paint(so_far.get(BASE_COLOR), values["pixels"], values)}
 
     def describe(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Value]:
-        u = u.detach()
-        said: dict[str, Value] = {}
-        if self._searched:
-            change = self.pixels(u) - self.pixels(self.start.to(u.device))
-            said[f"{self.name}.linf"] = {"value": float(change.abs().max()), "unit": "sRGB"}
-            said[f"{self.name}.rms"] = {"value": float(change.square().mean().sqrt()), "unit": "sRGB"}
-        if isinstance(self._numbers, BoundNumbers):
-            said.update(self._numbers.describe(u[self._searched :]))
-        return said
+        said = super().describe(u, so_far)
+        if not self._free:
+            return said
+        here, start = (self.values(at)["pixels"] for at in (u.detach(), self.start.to(u.device)))
+        return {**change_in_colour(self.name, here - start), **said}
 
     def printed(self, u: Tensor) -> Tensor | None:
-        return self.pixels(u) if self._searched else None
+        return self.values(u)["pixels"] if self._free else None
 
-    def artifacts(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Tensor]:
-        pixels = self.pixels(u.detach())
+    def kept_pictures(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        pixels = values["pixels"]
         return {self.name: enlarged(pixels, -(-PRINT_SIDE // len(pixels))), f"{self.name}-pixels": pixels}
 
 
@@ -281,3 +206,203 @@ def enlarged(pixels: Tensor, factor: int) -> Tensor:
     linear = srgb_to_linear(pixels).permute(2, 0, 1)[None]
     larger = F.interpolate(linear, scale_factor=factor, mode="bilinear", align_corners=False)
     return linear_to_srgb(larger[0].permute(1, 2, 0))
+
+
+# ---- on the surface --------------------------------------------------------------------------------------------------
+
+
+def towards_camera(scene: SceneDescription) -> tuple[float, float]:
+    """Return azimuth (degrees) and height (0 to 1) of the place in the middle of the object as the camera sees it."""
+    middle, radius, half = _shape(scene.object.mesh)
+    camera = camera_to_world(scene)[:3, 3]
+    x, y, z = np.linalg.solve(object_to_world(scene), np.append(camera, 1.0))[:3] - middle
+    lift = math.atan2(z * radius, max(math.hypot(x, y), 1e-12) * half)
+    return math.degrees(math.atan2(y, x)) % 360.0, 0.5 + lift / math.pi
+
+
+def _shape(mesh: Mesh) -> tuple[Doubles, float, float]:
+    """Middle (3,) of a mesh, its largest half-width and its half-height."""
+    low, high = mesh.vertices.min(axis=0).astype(np.float64), mesh.vertices.max(axis=0).astype(np.float64)
+    half = np.maximum((high - low) / 2.0, 1e-6)
+    return (low + high) / 2.0, float(half[:2].max()), float(half[2])
+
+
+@dataclass(frozen=True, eq=False)
+class Spot:
+    """A place for a patch: the texels that it may cover and their coordinates around it.
+
+    Attributes:
+        texels: (N,) their numbers, row by row.
+        flat: (N, 2) their coordinates to the right and upwards, object sizes.
+        cover: (N,) in [0, 1]: how much they face the patch.
+        spacing: distance between neighbouring texels on the surface, object sizes.
+    """
+
+    texels: Tensor
+    flat: Tensor
+    cover: Tensor
+    spacing: float
+
+
+class Sticker:
+    """Paints a patch of `side` pixels into the object's base-colour map; the resting numbers are those at the start."""
+
+    def __init__(self, scene: SceneDescription, resting: Mapping[str, float], side: int) -> None:
+        mesh = scene.object.mesh
+        if mesh.repeats:
+            raise InputError(
+                "`controls` patch: the object's texture repeats on it, and so would a patch that is painted into it; "
+                "leave patch out, or search the whole texture"
+            )
+        self._shape = _shape(mesh)
+        self._resting, self._side = resting, side
+        self._surface = MeshSurface(mesh)
+        own = srgb_to_linear(torch.from_numpy(scene.object.base_color.copy()))
+        charts = _fine_enough(mesh, max(own.shape[:2]), resting["size"] / side)
+        self._own = _fitted(own, len(charts.face))
+        mask = charts.touched
+        self._texels, self._faces = np.flatnonzero(mask), charts.face[mask]
+        self._positions, self._normals, self._areas = (
+            array[mask].astype(np.float64) for array in (charts.positions(), charts.normals(), charts.areas())
+        )
+        self._spot = lru_cache(maxsize=4)(self._find_spot)
+
+    def paint(self, base: Tensor | None, pixels: Tensor, numbers: Mapping[str, Tensor]) -> Tensor:
+        """Return the base colour (h, w, 3), linear, with the patch of pixels (n, n, 3) sRGB on it; differentiable
+        except in the place (azimuth, height, size and rotation). The base is what other controls made of it; None takes
+        the object's own."""
+        device = pixels.device
+        base = self._own.to(device) if base is None else _fitted(base, len(self._own))
+        size = numbers["size"]
+        spot = self._spot(*(float(numbers[name].detach()) for name in ("azimuth", "height", "size")))
+        texels = spot.texels.to(device)
+        across = _turned(spot.flat.to(device), numbers["rotation"]) / size
+        edge = (0.5 - across.abs().amax(dim=1)) * size / (EDGE_TEXELS * spot.spacing) + 0.5
+        cover = (spot.cover.to(device) * _smooth(edge))[:, None]
+        grid = (across * across.new_tensor([2.0, -2.0]))[None, None]
+        linear = srgb_to_linear(pixels).permute(2, 0, 1)[None]
+        color = F.grid_sample(linear, grid, mode="bilinear", padding_mode="border", align_corners=False)[0, :, 0].T
+        flat = base.reshape(-1, 3)
+        under = flat.index_select(0, texels)
+        return flat.index_copy(0, texels, under + cover * (color - under)).reshape(base.shape)
+
+    def underneath(self) -> Tensor:
+        """Return what the object's own texture shows where the patch starts, as a patch (n, n, 3) sRGB."""
+        resting, side = self._resting, self._side
+        spot = self._spot(resting["azimuth"], resting["height"], resting["size"])
+        across = _turned(spot.flat, torch.tensor(resting["rotation"])) / resting["size"]
+        inside = (across.abs().amax(dim=1) < 0.5) & (spot.cover > 0.0)
+        if not bool(inside.any()):
+            return torch.full((side, side, 3), 0.5)
+        color = self._own.reshape(-1, 3)[spot.texels[inside]]
+        place = across[inside] * torch.tensor([1.0, -1.0]) + 0.5
+        column, row = (place * side).long().clamp(0, side - 1).T
+        index = row * side + column
+        sums = torch.zeros(side * side, 3).index_add(0, index, color)
+        counts = torch.zeros(side * side).index_add(0, index, torch.ones(len(index)))
+        found = sums / counts.clamp_min(1.0)[:, None]
+        centres = torch.stack(torch.meshgrid(*[torch.arange(side) + 0.5] * 2, indexing="ij"), dim=-1).reshape(-1, 2)
+        nearest = spatial.cKDTree(place.flip(1).numpy()).query(centres.numpy() / side)[1]
+        found = torch.where(counts[:, None] > 0.0, found, color[torch.from_numpy(nearest)])
+        return linear_to_srgb(found).reshape(side, side, 3)
+
+    def _find_spot(self, azimuth: float, height: float, size: float) -> Spot:
+        middle, radius, half = self._shape
+        angle, lift = math.radians(azimuth), (height - 0.5) * math.pi
+        outwards = np.array([math.cos(lift) * radius * math.cos(angle), math.cos(lift) * radius * math.sin(angle), 0.0])
+        outwards[2] = math.sin(lift) * half
+        outwards /= np.linalg.norm(outwards)
+        face, point = self._surface.hit(middle + 4.0 * (radius + half) * outwards, -outwards)
+        side = 1.0 if float(self._surface.normals[face] @ outwards) >= 0.0 else -1.0
+        normal = self._mean_normal(face, point, side)
+        level = math.hypot(outwards[0], outwards[1])
+        upwards = np.array([-outwards[2] * math.cos(angle), -outwards[2] * math.sin(angle), level])
+        return self._around(face, point, _frame(side * normal, upwards), side, REACH * size)
+
+    def _mean_normal(self, face: int, point: Doubles, side: float) -> Doubles:
+        """Unit normal (3,) of the surface around a point: the mean over half of the patch's side at the start."""
+        radius = 0.5 * self._resting["size"]
+        normal = self._surface.normals[face]
+        near = self._surface.region(face, point, normal, radius)[self._faces]
+        fall = np.maximum(1.0 - ((self._positions[near] - point) ** 2).sum(axis=1) / radius**2, 0.0) ** 2
+        total = (self._normals[near] * (fall * self._areas[near])[:, None]).sum(axis=0)
+        length = float(np.linalg.norm(total))
+        return np.asarray(total / length) if length > 1e-12 else normal
+
+    def _around(self, face: int, point: Doubles, frame: Doubles, side: float, radius: float) -> Spot:
+        chosen = np.flatnonzero(self._surface.region(face, point, side * frame[2], radius)[self._faces])
+        offsets = self._positions[chosen] - point
+        close = (offsets**2).sum(axis=1) <= radius**2
+        chosen, offsets = chosen[close], offsets[close]
+        flat, cosine = unrolled(offsets, side * self._normals[chosen], frame)
+        low, high = FACING
+        areas = self._areas[chosen]
+        return Spot(
+            torch.from_numpy(self._texels[chosen]),
+            torch.from_numpy(flat.astype(np.float32)),
+            _smooth(torch.from_numpy(((cosine - low) / (high - low)).astype(np.float32))),
+            math.sqrt(float(np.median(areas[areas > 0.0]))) if (areas > 0.0).any() else 1.0 / len(self._own),
+        )
+
+
+def _fine_enough(mesh: Mesh, own: int, pixel: float) -> Charts:
+    """Rasterise the charts at the side of a base-colour map whose texels are smaller than the square's pixels, whose
+    side is `pixel` object sizes; `own` is the side of the object's own map."""
+    smallest, largest = BASE_SIDES
+    side = max(smallest, own)
+    charts = rasterised(mesh, side)
+    areas = charts.areas()
+    spacing = math.sqrt(float(np.median(areas[areas > 0.0])))
+    wanted = side
+    while 2 * wanted <= largest and spacing * side / wanted > pixel:
+        wanted *= 2
+    return charts if wanted == side else rasterised(mesh, wanted)
+
+
+def _frame(normal: Doubles, upwards: Doubles) -> Doubles:
+    """Rows right, up, normal (3, 3) of a right-handed frame with `up` as near to a direction as the normal lets it."""
+    up = upwards - float(upwards @ normal) * normal
+    if float(np.linalg.norm(up)) < 1e-6:
+        up = np.eye(3)[int(np.abs(normal).argmin())]
+        up = up - float(up @ normal) * normal
+    up = up / np.linalg.norm(up)
+    return np.stack([np.cross(up, normal), up, normal])
+
+
+def unrolled(offsets: Doubles, normals: Doubles, frame: Doubles) -> tuple[Doubles, Doubles]:
+    """Return coordinates (N, 2) of points along a surface, to the right and upwards, and normals' cosines (N,).
+
+    In the tangent plane a point of a circle of radius R lies at `R sin(phi)` where its arc is `R phi`, phi being the
+    angle that the normal has turned. So the component along the direction of turning is stretched by `phi / sin(phi)`.
+    Offsets are (N, 3) from the middle; the rows of `frame` are right, up and normal there.
+    """
+    plane, tilt = offsets @ frame[:2].T, normals @ frame[:2].T
+    cosine = normals @ frame[2]
+    sine = np.linalg.norm(tilt, axis=1)
+    towards = tilt / np.maximum(sine, 1e-9)[:, None]
+    turned = np.arctan2(sine, np.maximum(cosine, 0.1))
+    stretch = np.where(sine > 1e-4, turned / np.maximum(np.sin(turned), 1e-9), 1.0)
+    along = (plane * towards).sum(axis=1)
+    return plane + ((stretch - 1.0) * along)[:, None] * towards, cosine
+
+
+def _turned(flat: Tensor, degrees: Tensor) -> Tensor:
+    """Coordinates (N, 2) on a patch that is turned counter-clockwise."""
+    angle = torch.deg2rad(degrees)
+    cosine, sine = torch.cos(angle), torch.sin(angle)
+    return torch.stack([flat[:, 0] * cosine + flat[:, 1] * sine, flat[:, 1] * cosine - flat[:, 0] * sine], dim=1)
+
+
+def _smooth(share: Tensor) -> Tensor:
+    """The step `3 t^2 - 2 t^3` between 0 and 1."""
+    clipped = share.clamp(0.0, 1.0)
+    return clipped.square() * (3.0 - 2.0 * clipped)
+
+
+def _fitted(base: Tensor, side: int) -> Tensor:
+    """Resize a base colour (h, w, 3) to (side, side, 3); differentiable."""
+    if base.shape[:2] == (side, side):
+        return base
+    planes, smaller = base.permute(2, 0, 1)[None], max(base.shape[:2]) > side
+    resized = F.interpolate(planes, size=(side, side), mode="bilinear", antialias=smaller, align_corners=False)
+    return resized[0].permute(1, 2, 0)

@@ -11,6 +11,7 @@ import csv
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -127,7 +128,6 @@ class PathControl(NumberControl):
             )
         if not alone and "moves" in self._given:
             raise InputError(f"{self.name}: {asked} says what the camera does and what the object; leave moves out")
-        self._kept: tuple[SceneDescription, Start] | None = None
         self._ways: dict[str, Way] = {}
         for mover, name in zip([str(self.chosen["moves"])] if alone else MOVERS, names, strict=True):
             self._ways |= {mover: name} if name in PATHS else read_waypoints(Path(name), mover, alone=alone)
@@ -141,7 +141,7 @@ class PathControl(NumberControl):
     @property
     def seconds(self) -> float:
         """How long the path takes."""
-        return float(str(self.chosen["seconds"]))
+        return float(self.chosen["seconds"])
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         if CAMERA in self._ways and scene.camera != ORBIT_CAMERA:
@@ -150,11 +150,11 @@ class PathControl(NumberControl):
                 f"moves=object, or have it seen by {ORBIT_CAMERA!r}"
             )
         if CAMERA in self._ways:
-            self._check_looks(scene)
+            self.within(scene)._check_looks()
         wide = [note for way in self._ways.values() if isinstance(way, Waypoints) for note in way.notes]
         return replace(scene, remarks=tuple(dict.fromkeys((*scene.remarks, *wide)))) if wide else scene
 
-    def _check_looks(self, scene: SceneDescription) -> None:
+    def _check_looks(self) -> None:
         """Refuse a path on which the camera is at what it looks at, at a waypoint or between two.
 
         Raises:
@@ -162,7 +162,7 @@ class PathControl(NumberControl):
         """
         files = [way.times for way in self._ways.values() if isinstance(way, Waypoints)]
         time = torch.cat([torch.linspace(0.0, self.seconds, LOOKS), *files]).unique()
-        begin = self._start(scene, time)
+        begin = self._start(time)
         place, target = self._camera(begin, time, self._object(begin, time)[0])
         gap = (target - place).expand(len(time), 3).double()
         step = gap[1:] - gap[:-1]
@@ -177,41 +177,38 @@ class PathControl(NumberControl):
                 "look_z)"
             )
 
-    def default(self, scene: SceneDescription, parameter: Parameter) -> float | str:
+    def default(self, parameter: Parameter) -> float | str:
         first, *last = self._ways.values()
         way = last[0] if last and first == TURN else first  # who goes around is back at the end
         return CLEAN_AT.get(way, 0.0) * self.seconds if isinstance(way, str) else 0.0
 
-    def search_range(self, scene: SceneDescription, parameter: Parameter) -> tuple[float, float] | None:
+    def search_range(self, parameter: Parameter) -> tuple[float, float] | None:
         return 0.0, self.seconds
 
-    def estimators(self, scene: SceneDescription, parameter: Parameter) -> tuple[str, ...]:
+    def estimators(self, parameter: Parameter) -> tuple[str, ...]:
         return ORBIT if CAMERA in self._ways else GEOMETRIC
 
-    def scene_inputs(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        time, start = values["time"], self._start(scene, values["time"])
+    def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        time, start = values["time"], self._start(values["time"])
         shift, heading = self._object(start, time)
         inputs = {}
         if CAMERA in self._ways:
             place, target = self._camera(start, time, shift)
-            inputs["camera.to_world"] = looking(place, target, scene.number("camera.roll"))
+            inputs["camera.to_world"] = looking(place, target, self.scene.number("camera.roll"))
         if THING in self._ways:
             inputs["object.to_world"] = turned(start, shift, heading)
         return inputs
 
-    def measured(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Value]:
-        time, start = values["time"], self._start(scene, values["time"])
+    def measured(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Value]:
+        time, start = values["time"], self._start(values["time"])
         shift, _ = self._object(start, time)
         away = self._camera(start, time, shift)[0] - start.middle - shift
-        unit = "object sizes" if scene.object.metres is None else "metres"
-        return {"distance": {"value": float(away.norm()) * scene.metres, "unit": unit}}
+        unit = "object sizes" if self.scene.object.metres is None else "metres"
+        return {"distance": {"value": float(away.norm()) * self.scene.metres, "unit": unit}}
 
-    def _start(self, scene: SceneDescription, time: Tensor) -> Start:
-        """How the scene stands; of the last scene it is kept, as it takes a look at every vertex."""
-        if self._kept is None or self._kept[0] is not scene:
-            found = (camera_to_world(scene), middle(scene), object_to_world(scene))
-            self._kept = scene, Start(*(torch.from_numpy(one).float() for one in found))
-        return Start(*(one.to(time.device) for one in self._kept[1]))
+    def _start(self, time: Tensor) -> Start:
+        """How the scene stands, on the device of a time."""
+        return Start(*(one.to(time.device) for one in _start_of(self.scene)))
 
     def _share(self, time: Tensor) -> Tensor:
         return (time / self.seconds).clamp(0.0, 1.0)
@@ -225,7 +222,7 @@ class PathControl(NumberControl):
         if isinstance(way, Waypoints):
             target = center + (shift if way.targets is None else way.at(time, way.targets))
             return center + way.at(time, way.places), target
-        along, away, reach = own[:3, 2], (start - center).norm(), float(str(self.chosen["reach"]))
+        along, away, reach = own[:3, 2], (start - center).norm(), float(self.chosen["reach"])
         ahead = torch.stack([along[0], along[1], own.new_zeros(())])  # the camera keeps its height, as a car's does
         ahead = ahead / ahead.norm().clamp_min(1e-6)
         share = self._share(time)
@@ -247,7 +244,7 @@ class PathControl(NumberControl):
             return own.new_zeros(3), still
         if isinstance(way, Waypoints):
             return way.at(time, way.places), still if way.headings is None else way.at(time, way.headings)
-        share, reach = self._share(time), float(str(self.chosen["reach"]))
+        share, reach = self._share(time), float(self.chosen["reach"])
         if way == TURN:
             return own.new_zeros(3), 360.0 * share
         away = (own[:3, 3] - begin.middle).norm()
@@ -256,6 +253,12 @@ class PathControl(NumberControl):
         ahead = ahead / ahead.norm().clamp_min(1e-6)
         far = away * (reach - 1.0) * (1.0 - share) if way == APPROACH else away * reach * (1.0 - 2.0 * share)
         return ahead * far[..., None], still
+
+
+@lru_cache(maxsize=4)
+def _start_of(scene: SceneDescription) -> Start:  # which takes a look at every vertex
+    poses = camera_to_world(scene), middle(scene), object_to_world(scene)
+    return Start(*(torch.from_numpy(one).float() for one in poses))
 
 
 def looking(place: Tensor, target: Tensor, roll: float) -> Tensor:

@@ -18,7 +18,6 @@ from torch import Tensor
 from advsearch.controls.base import Choice, Parameter
 from advsearch.controls.numbers import NumberControl, Values
 from advsearch.errors import InputError
-from advsearch.scene.description import SceneDescription
 from advsearch.scene.geometry import affine, standing
 from advsearch.scene.parts import MeshPart
 from advsearch.scene.settings import GEOMETRIC, POSE
@@ -47,9 +46,9 @@ class PoseControl(NumberControl):
         if given not in ("yes", "no", True, False):
             raise InputError(f"{self.name}.on_ground: expected yes or no, got {given!r}")
 
-    def scene_inputs(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        mesh = self.mesh_in(scene)
-        base, vertices, floor = _standing(mesh, scene.around.get(mesh.name))
+    def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        mesh = self.mesh_in(self.scene)
+        base, vertices, floor = _standing(mesh, self.scene.around.get(mesh.name))
         base, vertices = (held.to(values["scale"].device) for held in (base, vertices))
         middle = (vertices.amin(dim=0) + vertices.amax(dim=0)) / 2.0
         turned = rotation_vector(values["rotation"]) @ euler(values["yaw"], values["pitch"], values["roll"])

@@ -28,7 +28,6 @@ from advsearch.controls.corruption import coded
 from advsearch.controls.corruption_filters import picture, planes, warped
 from advsearch.controls.numbers import NumberControl, Values
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
-from advsearch.scene.description import SceneDescription
 
 _DARK = 1e-6
 """Keeps the slope of a square root finite in black."""
@@ -77,8 +76,8 @@ class SensorControl(NumberControl):
     )  # fmt: skip
     choices = (Choice("seed", 0, "Which draw of the noise: a whole number from 0.", whole=(0, 2**32 - 1)),)
 
-    def on_picture(self, scene: SceneDescription, values: Values, image: Tensor) -> Tensor:
-        return through_sensor(image, values, int(self.chosen["seed"]))  # type: ignore[call-overload]
+    def on_picture(self, values: Values, image: Tensor) -> Tensor:
+        return through_sensor(image, values, int(self.chosen["seed"]))
 
 
 def through_sensor(image: Tensor, values: Mapping[str, Tensor], seed: int = 0) -> Tensor:

@@ -183,25 +183,21 @@ class SkyControl(NumberControl):
     )  # fmt: skip
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
-        radiance = self.radiance(scene, self.start_values(scene)).numpy().astype(np.float32)
+        bound = self.bind(scene)
+        radiance = bound.radiance(bound.values(bound.start)).numpy().astype(np.float32)
         sky = EnvironmentAsset("sky", radiance, source="Hosek and Wilkie's sky")
         return replace(scene, environment=sky).with_values(environment__rotation=0.0, environment__exposure=0.0)
 
-    def scene_inputs(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        return {"environment.data": self.radiance(scene, values)}
+    def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        return {"environment.data": self.radiance(values)}
 
-    def start_values(self, scene: SceneDescription) -> Values:
-        """Return the values of the start, fixed ones included."""
-        bound = self.bind(scene)
-        return bound.values(bound.start)
-
-    def radiance(self, scene: SceneDescription, values: Values) -> Tensor:
+    def radiance(self, values: Values) -> Tensor:
         """Return the map (H, W, 3) of linear radiance at some values; differentiable."""
-        ground = scene.ground_color
+        ground = self.scene.ground_color
         numbers = values["azimuth"], values["elevation"], values["turbidity"]
         radiance, metered = sky_over(ground, numbers[0].device)(*numbers)
         if self.chosen["exposure"] == "fixed":
-            start = self.start_values(scene)
+            start = self.values(self.start)
             metered = metered_at(ground, float(start["elevation"]), float(start["turbidity"])).to(radiance.device)
         return radiance * (METERED_IRRADIANCE / metered)
 

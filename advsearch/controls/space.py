@@ -10,7 +10,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from advsearch.controls.base import NOTHING, BoundControl, Group, Value
+from advsearch.controls.base import NOTHING, Control, Group, Value
 from advsearch.controls.values import Moved
 from advsearch.copies import is_ours
 from advsearch.errors import InputError
@@ -32,7 +32,7 @@ class Space:
         InputError: two instances have one name.
     """
 
-    controls: tuple[BoundControl, ...]
+    controls: tuple[Control, ...]
     scene: SceneDescription | None = None
     moved: tuple[Moved, ...] = ()
     environment: str | None = None
@@ -78,7 +78,7 @@ class Space:
         """How many coordinates each control has."""
         return [len(control.start) for control in self.controls]
 
-    def slices(self, u: Tensor) -> list[tuple[BoundControl, Tensor]]:
+    def slices(self, u: Tensor) -> list[tuple[Control, Tensor]]:
         """Return each control with its slice of u."""
         return list(zip(self.controls, u.split(self.sizes), strict=True))
 
@@ -101,7 +101,7 @@ class Space:
         for number in self._turns:
             control = self.controls[number]
             own = control.inputs(parts[number], merged)
-            if not (is_ours(type(control)) and is_ours(type(getattr(control, "control", control)))):
+            if not is_ours(type(control)):
                 _check_inputs(control.name, own)
             for name in own:
                 if name in merged and name not in control.refines:
@@ -112,7 +112,7 @@ class Space:
             merged = {**merged, **own}
         return merged
 
-    def _among_others(self, u: Tensor) -> list[tuple[BoundControl, Tensor, Mapping[str, Tensor]]]:
+    def _among_others(self, u: Tensor) -> list[tuple[Control, Tensor, Mapping[str, Tensor]]]:
         """Each control with its slice of u and the inputs of those before it, if it takes any."""
         parts, so_far, found = u.detach().split(self.sizes), NOTHING, dict[int, Mapping[str, Tensor]]()
         last = max((turn for turn, number in enumerate(self._turns) if self.controls[number].refines), default=0)
@@ -126,11 +126,10 @@ class Space:
     def picture(self, u: Tensor, image: Tensor) -> Tensor:
         """Apply what controls do to the finished picture (H, W, 3) sRGB, in their order; differentiable in both."""
         for control, part in zip(self.controls, u.split(self.sizes), strict=True):
-            if type(control).picture is not BoundControl.picture:
-                image = control.picture(part, image)
+            image = control.picture(part, image)
         return image
 
-    def describe(self, u: Tensor, controls: Sequence[BoundControl] | None = None) -> dict[str, Value]:
+    def describe(self, u: Tensor, controls: Sequence[Control] | None = None) -> dict[str, Value]:
         """Say a configuration in a few named values with units: what some of the controls say of it, or else all."""
         found: dict[str, Value] = {}
         for control, part, so_far in self._among_others(u):
@@ -139,12 +138,12 @@ class Space:
         return found
 
     def printed(self, u: Tensor) -> dict[str, Tensor]:
-        """Return the searched colours that a printer would print, by control; see `BoundControl.printed`."""
+        """Return the searched colours that a printer would print, by control; see `Control.printed`."""
         found = {control.name: control.printed(part) for control, part in self.slices(u)}
         return {name: colors for name, colors in found.items() if colors is not None}
 
     def numbers(self, u: Tensor) -> dict[str, Tensor]:
-        """Return the numbers of a configuration by parameter ("pose.yaw"); see `BoundControl.numbers`."""
+        """Return the numbers of a configuration by parameter ("pose.yaw"); see `Control.numbers`."""
         each = ((control.name, control.numbers(part)) for control, part in self.slices(u))
         return {f"{name}.{one}": value for name, numbers in each for one, value in numbers.items()}
 
@@ -189,13 +188,20 @@ class Space:
         return {file_name(name): data for one in named for name, data in one.items()}
 
 
-class _Held(BoundControl):
-    """A control that stays at one configuration, and takes no coordinates."""
+class _Held(Control):
+    """A bound control that stays at one configuration, and takes no coordinates."""
 
-    def __init__(self, control: BoundControl, at: Tensor) -> None:
+    def __init__(self, control: Control, at: Tensor) -> None:
         self._control, self._at = control, at
-        self.name, self.start, self.groups = control.name, torch.zeros(0), ()
-        self.moved, self.refines, self.on_top = control.moved, control.refines, control.on_top
+        self.name, self.moved, self.on_top = control.name, control.moved, control.on_top
+        self.fit()
+
+    def fit(self) -> None:
+        self.start, self.groups = torch.zeros(0), ()
+
+    @property
+    def refines(self) -> frozenset[str]:
+        return self._control.refines
 
     def inputs(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Tensor]:
         return self._control.inputs(self._at, so_far)

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -22,7 +21,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from advsearch.controls.base import NOTHING, BoundControl, Budget, Choice, Control, Group, Parameter, Value
+from advsearch.controls.base import NOTHING, Budget, Choice, Control, Group, Parameter, Value, change_in_colour
 from advsearch.controls.values import LARGEST_EPSILON
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.assets import Bools, Floats, Mesh
@@ -46,38 +45,8 @@ WAVE_REACH = 3.0
 """Argument of the tanh that the slowest wave alone reaches at its largest amplitude: 0.995 of the ball's radius."""
 
 
-@dataclass(frozen=True)
 class TextureControl(Control):
-    """The base-colour map of one mesh, inside a ball around the original.
-
-    Attributes:
-        epsilon: radius of the ball, display-referred; None takes the norm's default.
-        norm: "linf" or "l2".
-        resolution: side of the searched texture in texels, 2 to 4096; None takes the longer side of the mesh's own
-            texture, but at least 256 and at most 512.
-        form: "texels" (each on its own), "palette" (a few colours) or "waves" (smooth).
-        colors: number of colours of the palette, 1 to 64.
-        waves: number of waves along each side of the texture, 1 to 64.
-        materials: a name or names of materials in the mesh's file: only their texels are searched, and all others stay
-            as they are, bit for bit. Then the texture has the mesh's own size where no resolution is asked for, unless
-            both its sides are under 256. None paints all of the mesh.
-        texels: stands for form "texels" when `texture.texels` is asked for; its range cannot be set.
-        palette: likewise.
-        amplitudes: likewise, for form "waves".
-        name: the instance's name.
-    """
-
-    epsilon: float | None = None
-    norm: str = "linf"
-    resolution: int | None = None
-    form: str | None = None
-    colors: int = 6
-    waves: int = 8
-    materials: str | Sequence[str] | None = None
-    texels: object = None
-    palette: object = None
-    amplitudes: object = None
-    name: str = "texture"
+    """The base-colour map of one mesh, inside a ball around the original."""
 
     kind = "texture"
     of_a_mesh = True
@@ -116,19 +85,17 @@ class TextureControl(Control):
         Choice("materials", None, "Materials of the mesh's file that are painted, by name; by default all of it."),
     )  # fmt: skip
 
-    def __post_init__(self) -> None:
-        for choice in self.choices:
-            if getattr(self, choice.name) is not None:  # None is "what the norm, the form or the object says"
-                choice.check(self.name, getattr(self, choice.name))
-        object.__setattr__(self, "form", self.chosen_form(FORMS, self.form))
-        names = [self.materials] if isinstance(self.materials, str) else self.materials
+    def check_choices(self) -> None:
+        self.form = self.chosen_form(FORMS)
+        names = self.chosen["materials"]
         if names is not None:
+            names = [names] if isinstance(names, str) else names
             if not (isinstance(names, Sequence) and names and all(isinstance(one, str) for one in names)):
                 raise InputError(
-                    f"{self.name}.materials: expected names of materials, got {self.materials!r}; put quotes around a "
+                    f"{self.name}.materials: expected names of materials, got {names!r}; put quotes around a "
                     "name that reads as a number"
                 )
-            object.__setattr__(self, "materials", list(dict.fromkeys(names)))
+            self.chosen["materials"] = list(dict.fromkeys(names))
 
     def mesh_in(self, scene: SceneDescription) -> MeshPart:
         if self._named_material(scene):
@@ -140,10 +107,6 @@ class TextureControl(Control):
             kind = "mesh of the scene" + (" or material of the object" if materials else "")
             raise UnknownNameError(kind, self.mesh, [*scene.meshes, *materials], hint) from None
 
-    def materials_in(self, scene: SceneDescription) -> Sequence[str] | None:
-        """Return the materials that it paints in a scene; None for all of the mesh."""
-        return self._named_material(scene) or (None if self.materials is None else list(self.materials))
-
     def _named_material(self, scene: SceneDescription) -> list[str]:
         """The materials of the object that its name means, as in `texture:paint`, where no mesh is called so."""
         from advsearch.scene.importing.scenes import clean  # takes time, and most do without
@@ -152,16 +115,22 @@ class TextureControl(Control):
             return []
         return [one for one in scene.object.mesh.materials if self.mesh in (one, clean(one))]
 
-    def bind(self, scene: SceneDescription) -> BoundControl:
-        mesh, names = self.mesh_in(scene), self.materials_in(scene)
-        own = torch.from_numpy(mesh.base_color.copy())
-        longer = max(own.shape[:2])
-        if self.resolution or names is None or longer < RESOLUTIONS[0]:
-            own = resampled(own, int(self.resolution or min(max(longer, RESOLUTIONS[0]), RESOLUTIONS[1])))
-        if names is None:
-            return BoundTexture(self.name, mesh.name, own, self._painter(mesh.mesh, own, None))
-        where = self._texels_of(mesh, names, (own.shape[0], own.shape[1]))
-        return BoundTexture(self.name, mesh.name, own, self._painter(mesh.mesh, own, where), where, ", ".join(names))
+    def materials_in(self, scene: SceneDescription) -> list[str] | None:
+        """Return the materials that it paints in a scene; None for all of the mesh."""
+        return self._named_material(scene) or self.chosen["materials"]
+
+    def fit(self) -> None:
+        part, names = self.mesh_in(self.scene), self.materials_in(self.scene)
+        original = torch.from_numpy(part.base_color.copy())
+        longer, side = max(original.shape[:2]), self.chosen["resolution"]
+        if side or names is None or longer < RESOLUTIONS[0]:
+            original = resampled(original, int(side or min(max(longer, RESOLUTIONS[0]), RESOLUTIONS[1])))
+        where = None if names is None else self._texels_of(part, names, (original.shape[0], original.shape[1]))
+        self._on, self._original, self._materials = part.name, original, ", ".join(names or ())
+        self._where = None if where is None else torch.from_numpy(where)
+        self._painter = painter = self._painter_of(part.mesh, original, where)
+        self._unchanged = painter.texels(painter.start)
+        self.start, self.groups = painter.start, (painter.group,)
 
     def _texels_of(self, part: MeshPart, names: Sequence[str], shape: tuple[int, int]) -> Bools:
         """Which texels (h, w) only lookups on some materials read."""
@@ -176,28 +145,57 @@ class TextureControl(Control):
             raise InputError(
                 f"{self.name}.materials: other materials read {100 * (1 - share):.0f} % of the texels of "
                 f"{', '.join(names)} too, so that it cannot be painted alone; give each material texels of its own in "
-                f"the file, {'take a higher resolution, ' if self.resolution else ''}or leave materials out"
+                f"the file, {'take a higher resolution, ' if self.chosen['resolution'] else ''}or leave materials out"
             )
         return where
 
-    def _painter(self, mesh: Mesh, original: Tensor, where: Bools | None) -> Painter:
+    def _painter_of(self, mesh: Mesh, original: Tensor, where: Bools | None) -> Painter:
         shape = original.shape[0], original.shape[1]
         mask = torch.ones(shape, dtype=torch.bool) if where is None else torch.from_numpy(where)
-        texels = original[mask]
+        texels, norm = original[mask], self.chosen["norm"]
+        epsilon = self._given.get("epsilon")
         if self.form == "palette":
             area = np.where(mask.numpy(), texel_area(mesh, shape), 0.0).astype(np.float32)
-            centres = palette(original, area if area.any() else mask.numpy().astype(np.float32), int(self.colors))
-            return recoloured(texels, centres, Budget(self.norm, self._radius(centres.numel())))
+            weight = area if area.any() else mask.numpy().astype(np.float32)
+            centres = palette(original, weight, int(self.chosen["colors"]))
+            return recoloured(texels, centres, ball(norm, epsilon, centres.numel()))
         if self.form == "waves":
-            flat = self._radius(texels.numel()) / (math.sqrt(texels.numel()) if self.norm == "l2" else 1.0)
-            return waved(texels, mask, int(self.waves), flat)
-        return repainted(texels, Budget(self.norm, self._radius(texels.numel())))
+            flat = radius(norm, epsilon, texels.numel()) / (math.sqrt(texels.numel()) if norm == "l2" else 1.0)
+            return waved(texels, mask, int(self.chosen["waves"]), flat)
+        return repainted(texels, ball(norm, epsilon, texels.numel()))
 
-    def _radius(self, count: int) -> float:
-        """Radius of the ball over `count` numbers."""
-        if self.epsilon is not None:
-            return float(self.epsilon)
-        return DEFAULT_EPSILON * (math.sqrt(count) if self.norm == "l2" else 1.0)
+    def inputs(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Tensor]:
+        return {f"{self._on}.base_color": srgb_to_linear(self._texels(u))}
+
+    def _texels(self, u: Tensor) -> Tensor:
+        """All texels (h, w, 3) of a slice of u."""
+        painted, original = self._painter.texels(u), self._original.to(u.device)
+        if self._where is None:
+            return painted.reshape(original.shape)
+        return original.index_put(self._where.to(u.device).nonzero(as_tuple=True), painted)
+
+    def describe(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Value]:
+        change = self._painter.texels(u.detach()) - self._unchanged.to(u.device)
+        named: dict[str, Value] = {f"{self.name}.materials": {"value": self._materials, "unit": "name"}}
+        return (named if self._materials else {}) | change_in_colour(self.name, change)
+
+    def printed(self, u: Tensor) -> Tensor | None:
+        texels = self._texels(u)
+        return texels if self._where is None else torch.cat([texels, self._where.to(texels)[..., None]], dim=-1)
+
+    def artifacts(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Tensor]:
+        return {self.name: self._texels(u.detach()), f"{self.name}-original": self._original}
+
+
+def radius(norm: str, epsilon: float | None, count: int) -> float:
+    """Return the radius of a ball over `count` colours, `DEFAULT_EPSILON` where none is given: in an L2 ball so large
+    that its edge has the same root-mean-square."""
+    return DEFAULT_EPSILON * (math.sqrt(count) if norm == "l2" else 1.0) if epsilon is None else float(epsilon)
+
+
+def ball(norm: str, epsilon: float | None, count: int) -> Budget:
+    """Return that ball."""
+    return Budget(norm, radius(norm, epsilon, count))
 
 
 class Painter(NamedTuple):
@@ -258,50 +256,6 @@ def waved(original: Tensor, where: Tensor, count: int, radius: float) -> Painter
 
     start = torch.full((count * count * 3,), 0.5)
     return Painter(start, Group("amplitudes", len(start), ("adjoint",)), texels)
-
-
-class BoundTexture(BoundControl):
-    """The base-colour map of one mesh: the original (h, w, 3) float32 display-referred sRGB in [0, 1], of which a
-    painter paints the texels where `where` (h, w) says, or all. `on` is the mesh, and `materials` says whose they
-    are."""
-
-    def __init__(
-        self, name: str, on: str, original: Tensor, painter: Painter, where: Bools | None = None, materials: str = ""
-    ) -> None:
-        self.name = name
-        self._on = on
-        self._original = original
-        self._where = None if where is None else torch.from_numpy(where)
-        self._painter = painter
-        self._materials = materials
-        self.start = painter.start
-        self._unchanged = painter.texels(painter.start)
-        self.groups = (painter.group,)
-
-    def inputs(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Tensor]:
-        return {f"{self._on}.base_color": srgb_to_linear(self._texels(u))}
-
-    def _texels(self, u: Tensor) -> Tensor:
-        """All texels (h, w, 3) of a slice of u."""
-        painted, original = self._painter.texels(u), self._original.to(u.device)
-        if self._where is None:
-            return painted.reshape(original.shape)
-        return original.index_put(self._where.to(u.device).nonzero(as_tuple=True), painted)
-
-    def describe(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Value]:
-        change = self._painter.texels(u.detach()) - self._unchanged.to(u.device)
-        named: dict[str, Value] = {f"{self.name}.materials": {"value": self._materials, "unit": "name"}}
-        return (named if self._materials else {}) | {
-            f"{self.name}.linf": {"value": float(change.abs().max()), "unit": "sRGB"},
-            f"{self.name}.rms": {"value": float(change.pow(2).mean().sqrt()), "unit": "sRGB"},
-        }
-
-    def printed(self, u: Tensor) -> Tensor | None:
-        texels = self._texels(u)
-        return texels if self._where is None else torch.cat([texels, self._where.to(texels)[..., None]], dim=-1)
-
-    def artifacts(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Tensor]:
-        return {self.name: self._texels(u.detach()), f"{self.name}-original": self._original}
 
 
 def resampled(image: Tensor, side: int) -> Tensor:

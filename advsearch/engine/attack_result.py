@@ -17,7 +17,6 @@ from torch import Tensor
 
 from advsearch import seeds
 from advsearch.attacks import Ending, SearchResult
-from advsearch.controls.numbers import BoundNumbers
 from advsearch.controls.path import PathControl
 from advsearch.engine.attack_parts import AttackParts
 from advsearch.engine.loading import Scene, load_scene
@@ -34,7 +33,6 @@ from advsearch.report.markup import answer_html, side_by_side
 from advsearch.report.shown import shown
 from advsearch.runs import images, store
 from advsearch.runs.directory import IMAGES, OBJECT_FILE, RunDirectory
-from advsearch.runs.export import to_pandas
 from advsearch.runs.files import write_bytes
 from advsearch.runs.results.attack import AnswerAlongDrive, AttackSummary
 from advsearch.scene.assets import Shape, simpler
@@ -179,11 +177,9 @@ class AttackResult:
             yield from results.rows(kind)
 
     def to_pandas(self, kind: str | None = None) -> Any:
-        """Return these rows as a `pandas.DataFrame`: columns as in an export (docs/runs.md), units in its `attrs`.
+        """Return these rows as a `pandas.DataFrame`: columns as in an export (docs/runs.md), units in its `attrs`."""
+        from advsearch.runs.tables import to_pandas  # pandas takes half a second
 
-        Raises:
-            InputError: pandas is not installed.
-        """
         return to_pandas(self.rows(kind))
 
     def plot(self, axes: Any = None) -> Any:
@@ -388,12 +384,12 @@ def answer_along(problem: Problem, u: Tensor | None, spp: int, run: RunDirectory
     )
 
 
-def _path_of(problem: Problem) -> tuple[BoundNumbers, int] | None:
+def _path_of(problem: Problem) -> tuple[PathControl, int] | None:
     """The path among what varies by chance, and the coordinate of the whole space that is its time."""
     begin = 0
     for number, bound in enumerate(problem.space.controls):
         chance = problem.searched is not None and number >= problem.searched
-        if chance and isinstance(bound, BoundNumbers) and isinstance(bound.control, PathControl) and bound.groups:
+        if chance and isinstance(bound, PathControl) and bound.groups:
             return bound, begin
         begin += len(bound.start)
     return None

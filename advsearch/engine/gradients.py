@@ -7,7 +7,7 @@ import base64
 import math
 import statistics
 import time
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -16,8 +16,8 @@ import torch
 from torch import Tensor
 
 from advsearch import seeds
-from advsearch.runs.results.base import GradientStatus
-from advsearch.scene.gradients import STEP_RANGE, GradientPlan, Group
+from advsearch.runs.results.base import GradientStatus, Measured
+from advsearch.scene.gradients import STEP_RANGE, GradientPlan, Group, compared
 from advsearch.scene.renderer import Renderer
 
 Loss = Callable[[Tensor], Tensor]
@@ -312,32 +312,17 @@ def _difference(renderer: Renderer, loss: Loss, u: Tensor, probe: Probe, step: f
         return (float(loss(renderer(above, seed, spp))) - float(loss(renderer(below, seed, spp)))) / width
 
 
-@dataclass(frozen=True)
-class Agreement:
-    """How good an estimate is beside a reference, see `agreement`, relative to the derivative's size: the `error` of
-    the mean, how much of it noise explains (`doubt`: `CONFIDENCE` standard errors of both), and the `noise` of one
-    estimate."""
-
-    status: GradientStatus
-    error: float
-    doubt: float
-    noise: float
-
-    @property
-    def excess(self) -> float:
-        """What of the error noise does not explain."""
-        return max(0.0, self.error - self.doubt)
-
-
-def agreement(estimate: Estimate, against: Reference, beside: Sequence[Reference] = ()) -> Agreement:
-    """Say how good an estimate is: "reference unusable" where the reference's noise exceeds `LOUD` and doubt covers
-    the error; "biased" where the error exceeds `TOLERANCE` beyond doubt; "noisy" where the noise exceeds `LOUD`;
-    otherwise "ok".
+def agreement(
+    estimate: Estimate, against: Reference, beside: Sequence[Reference] = (), probe: Probe | None = None, spp: int = 0
+) -> Measured:
+    """Say how good an estimate is along a probe, from so many samples a pixel: "reference unusable" where the
+    reference's noise exceeds `LOUD` and doubt (`CONFIDENCE` standard errors of both) covers the error; "biased" where
+    the error of the mean exceeds `TOLERANCE` beyond doubt; "noisy" where the noise exceeds `LOUD`; otherwise "ok".
 
     The size that this is relative to is the reference's, or `SMALL` of the largest of those `beside` it, the others of
     its control: a derivative that happens to be near zero has no size of its own to speak of.
     """
-    size = max([abs(against.value), *(SMALL * abs(one.value) for one in beside)])
+    size = max([abs(against.value), *(SMALL * abs(other.value) for other in beside)])
     difference = abs(estimate.value - against.value)
     doubt = CONFIDENCE * math.hypot(estimate.noise / math.sqrt(max(1, estimate.repeats)), against.noise)
     status: GradientStatus
@@ -347,6 +332,107 @@ def agreement(estimate: Estimate, against: Reference, beside: Sequence[Reference
         status = "biased"
     else:
         status = "noisy" if estimate.noise > LOUD * size else "ok"
-    if size == 0.0:
-        return Agreement(status, math.inf if difference else 0.0, 0.0, math.inf)
-    return Agreement(status, difference / size, doubt / size, estimate.noise / size)
+
+    def relative(value: float) -> float:
+        return value / size if size > 0.0 else math.inf if value else 0.0
+
+    return Measured(
+        quantity="derivative",
+        control=probe.group.control if probe else "",
+        parameter=probe.name.partition(".")[2] if probe else "",
+        estimator=estimate.estimator,
+        factor=estimate.factor,
+        spp=spp,
+        repeats=estimate.repeats,
+        seconds=estimate.seconds,
+        status=status,
+        error=relative(math.hypot(difference, estimate.noise)),
+        bias=relative(difference),
+        doubt=relative(doubt) if size > 0.0 else 0.0,
+        noise=relative(estimate.noise) if size > 0.0 else math.inf,
+        value=estimate.value,
+        reference=against.value,
+        reference_error=relative(against.noise),
+    )
+
+
+def as_planned(group: Group) -> list[tuple[str, float]]:
+    """Return the one way to differentiate a group that its plan has, at its step."""
+    return [(group.estimator, 1.0)]
+
+
+def attempts(group: Group) -> list[tuple[str, float]]:
+    """Return every estimator to measure on a group, with the multiple of the step; then other steps.
+
+    Differences of the loss and of the picture are the same for a linear loss, so that wider steps are tried with one.
+    """
+    forced = "forced" in group.reason
+    tries = [(name, 1.0) for name in ([group.estimator] if forced else compared(group.valid, group.size))]
+    wide = next((name for name in ("differences", "secant") if (name, 1.0) in tries), None)
+    if wide is None:
+        return tries
+    steps = {group.step}
+    for factor in FACTORS[1:]:
+        step = min(factor * group.step, STEP_RANGE[1])
+        if step not in steps:
+            steps.add(step)
+            tries.append((wide, factor))
+    return tries
+
+
+def derivatives(
+    renderer: Renderer,
+    loss: Loss,
+    u: Tensor,
+    *,
+    seed: int,
+    spp: int,
+    reference_spp: int,
+    seeds_of_reference: tuple[int, int],
+    reference_factors: Sequence[float] = (1.0,),
+    tried: Callable[[Group], Sequence[tuple[str, float]]] = as_planned,
+    repeats: tuple[int, int] = (6, 8),
+    value: Callable[[str, Any, Callable[[], Any]], Any] = lambda name, kind, measure: measure(),
+    stage: Callable[[str, int], None] = lambda name, steps: None,
+    tick: Callable[[], None] = lambda: None,
+) -> Iterator[Measured]:
+    """Measure the derivative by each parameter of a renderer's space beside differences of many samples.
+
+    Args:
+        reference_spp, seeds_of_reference, reference_factors: as of `reference`.
+        tried: from a group the estimators to try, with multiples of the step; a wider one on what is not `ok` yet.
+        repeats: gradients by an estimator at first, and by one with another step, which has to be surer.
+        value: is asked for each measurement, by a name and the type of what the last argument measures.
+        stage, tick: are told what begins and of how many steps, and of each step.
+    """
+    along = probes(renderer, loss, u, seed, spp)
+    for control in dict.fromkeys(probe.group.control for probe in along):
+        mine = [probe for probe in along if probe.group.control == control]
+        stage(f"references for {control}", len(mine))
+        references: dict[str, Reference] = {}
+        for probe in mine:
+            # what acts on the picture clips: its mean depends on the noise, so both get the same
+            many = spp if probe.group.estimator == "image" else max(spp, reference_spp)
+            measure = partial(reference, renderer, loss, u, probe, seed=seed, spp=many, repeats=seeds_of_reference)
+            measure = partial(measure, factors=reference_factors)
+            references[probe.name] = value(f"reference {probe.name}", Reference, measure)
+            tick()
+        sets: dict[tuple[tuple[str, ...], str], list[Probe]] = {}  # each is answered by one gradient
+        for probe in mine:
+            sets.setdefault((probe.group.valid, probe.group.estimator), []).append(probe)
+        stage(f"gradients for {control}", sum(len(tried(members[0].group)) for members in sets.values()))
+        for members in sets.values():
+            good: set[str] = set()
+            for estimator, factor in tried(members[0].group):
+                wanted = members if factor == 1.0 else [probe for probe in members if probe.name not in good]
+                if not wanted:
+                    break
+                count = repeats[0] if factor == 1.0 else repeats[1]
+                taken = partial(estimates, renderer, loss, u, estimator, wanted, seed=seed, spp=spp, repeats=count)
+                name = f"{estimator} x {factor:g} {','.join(probe.name for probe in wanted)}"
+                found = value(name, list[Estimate], partial(taken, factor=factor))
+                for probe, estimate in zip(wanted, found, strict=True):
+                    row = agreement(estimate, references[probe.name], list(references.values()), probe, spp)
+                    good |= {probe.name} if row.status == "ok" else set()
+                    yield row
+                tick()

@@ -42,10 +42,8 @@ Sent: TypeAlias = tuple[str, Prepared | None, Query]
 class Answering(Protocol):
     """What answers queries: a `Problem`, or a scene of a sweep."""
 
-    prepared: Any
-
-    def answers(self, queries: Sequence[Query]) -> Iterable[Evaluation]:
-        """See `advsearch.attacks.evaluation.Evaluate`."""
+    def answers(self, queries: Sequence[Query], prepared: Prepared | None = None) -> Iterable[Evaluation]:
+        """See `advsearch.attacks.evaluation.Evaluate`; with what the problem that asks has been prepared with."""
 
 
 @dataclass
@@ -101,9 +99,9 @@ def answering(named: Callable[[str], Answering]) -> Call:
     def call(sent: Sequence[Sent]) -> list[Evaluation]:
         found = list[Evaluation]()
         for name, some in groupby(sent, lambda one: one[0]):
-            listed, asked = list(some), named(name)
-            asked.prepared = listed[0][1]  # the same of all that are sent together
-            found += asked.answers([query for _, _, query in listed])
+            listed = list(some)
+            prepared = listed[0][1]  # the same of all that are sent together
+            found += named(name).answers([query for _, _, query in listed], prepared)
         return found
 
     return call

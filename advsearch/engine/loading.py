@@ -85,7 +85,7 @@ class Scene:
             resolution: side, or (height, width), in pixels.
             denoise: "oidn" or "none".
             seed: root of the noise; the `seed` of each call counts on from it.
-            estimators: how derivatives are obtained, by "control.parameter", "control" or "*"; see `advsearch plan`.
+            estimators: how derivatives are obtained, by "control.parameter", "control" or "*"; see `advsearch check`.
             sampler: "multijitter", or "independent", which has more noise; the first rounds sample counts up to
                 products of two near numbers.
 

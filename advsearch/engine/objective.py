@@ -16,7 +16,7 @@ from torch import Tensor
 from advsearch.attacks import Block, Domain, Evaluation, Objective, get_objective
 from advsearch.attacks.objectives import OBJECTIVE_KINDS, More, nothing_more
 from advsearch.controls import Space
-from advsearch.controls.base import BoundControl
+from advsearch.controls.base import Control
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.models import Model
 from advsearch.models.features import features_of
@@ -26,7 +26,7 @@ from advsearch.tasks import Task
 from advsearch.tasks.together import Ensemble, Outputs, Together, of_each
 
 
-def domain_of(controls: Sequence[BoundControl], start: Tensor | None = None, **more: Any) -> Domain:
+def domain_of(controls: Sequence[Control], start: Tensor | None = None, **more: Any) -> Domain:
     """Return where a search over some controls may look: the budgets of all their groups, in the order of u, from
     `start` (d,) or the controls' own, which leaves the scene as it is; with `more` fields of `Domain`."""
     blocks = tuple(

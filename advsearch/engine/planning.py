@@ -5,6 +5,7 @@ paths of other lengths with one seed are the same, cut off earlier) by measureme
 from __future__ import annotations
 
 import itertools
+import math
 import statistics
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -16,7 +17,7 @@ from torch import Tensor
 from advsearch import seeds
 from advsearch.engine.gradients import Keep, Loss, gradients, measured_now, only
 from advsearch.engine.problem import Problem
-from advsearch.runs.results.base import CosineRow, GradientStatus, PathCut, PathLength
+from advsearch.runs.results.base import GradientStatus, Measured, PathCut, PathLength
 from advsearch.scene.gradients import BY_ADJOINT, BY_DIFFERENCES, GradientPlan, Group, compared
 from advsearch.scene.renderer import Renderer
 
@@ -167,7 +168,7 @@ def cosines(
     controls: Collection[str] | None = None,
     tick: Callable[[int], None] = lambda samples: None,
     keep: Keep = measured_now,
-) -> Iterator[CosineRow]:
+) -> Iterator[Measured]:
     """Measure, control by control, the cosine of working gradients with the converged one at the same step.
 
     Sample counts are tried in their order until one reaches the goal at a step; then the next step follows. With
@@ -189,7 +190,7 @@ def cosines(
             if plan in tried:  # no step can be wider
                 continue
             tried.append(plan)
-            for row in _cosines_at(plan, taken, factor, counts, renderer.formation.denoiser, tick):
+            for row in _cosines_at(plan, taken, factor, counts, tick):
                 reached = reached or row.status == "ok"
                 yield row
 
@@ -199,11 +200,11 @@ def _cosines_at(
     taken: Callable[..., tuple[Tensor, float]],
     factor: float,
     counts: Sequence[int],
-    denoiser: str,
     tick: Callable[[int], None],
-) -> Iterator[CosineRow]:
+) -> Iterator[Measured]:
     """The rows of the one control that a plan differentiates, at its step."""
-    control = next(one.control for one in plan.groups if one.estimator != "none")
+    groups = [group for group in plan.groups if group.estimator != "none"]
+    control, estimators = groups[0].control, ", ".join(dict.fromkeys(group.estimator for group in groups))
     place = f"{control} x {factor:g}"
 
     def converged(spp: int) -> tuple[Tensor, float]:
@@ -222,13 +223,15 @@ def _cosines_at(
             plan, "working", spp=spp, repeats=REPEATS, place=f"{place} {spp}", tick=partial(tick, spp)
         )
         mean = statistics.fmean(_cosine(one, truth) for one in found)
-        yield CosineRow(
-            denoise=denoiser,
+        yield Measured(
+            quantity="gradient",
             control=control,
+            estimator=estimators,
             factor=factor,
             spp=spp,
+            repeats=REPEATS,
             cosine=mean,
-            converged=agreement,
+            reference_cosine=agreement,
             seconds=seconds,
             status=status_of(mean, agreement),
         )
@@ -241,7 +244,7 @@ def _cosine(one: Tensor, other: Tensor) -> float:
     return float(one @ other) / size if size > 0.0 else float("nan")
 
 
-def tuned(plan: GradientPlan, table: Sequence[CosineRow]) -> tuple[GradientPlan, int | None]:
+def tuned(plan: GradientPlan, table: Sequence[Measured]) -> tuple[GradientPlan, int | None]:
     """Return the plan with each control's step chosen from measured cosines, and the sample count that all then need.
 
     Of the settings that reach the goal, the one with the fewest samples wins (all take as many renders), of equal ones
@@ -250,11 +253,15 @@ def tuned(plan: GradientPlan, table: Sequence[CosineRow]) -> tuple[GradientPlan,
     """
     counts = []
     for control in dict.fromkeys(row.control for row in table):
-        rows = [row for row in table if row.control == control and row.cosine == row.cosine]
+        rows = [row for row in table if row.control == control and not math.isnan(_of(row.cosine))]
         if not rows:
             continue
         good = [row for row in rows if row.status == "ok"]
-        chosen = min(good, key=lambda row: (row.spp, -row.cosine)) if good else max(rows, key=lambda row: row.cosine)
+        chosen = (
+            min(good, key=lambda row: (row.spp, -_of(row.cosine)))
+            if good
+            else max(rows, key=lambda row: _of(row.cosine))
+        )
         counts.append(chosen.spp)
         said = f"cosine {chosen.cosine:.2f} with the converged gradient at {chosen.spp} samples"
         said += f" and {chosen.factor:g} x the step" + ("" if good else f": {_shortfall(chosen)}")
@@ -267,9 +274,13 @@ def tuned(plan: GradientPlan, table: Sequence[CosineRow]) -> tuple[GradientPlan,
     return plan, max(counts) if counts else None
 
 
-def _shortfall(chosen: CosineRow) -> str:
-    if chosen.converged < TELLS:
-        return f"which says little, two converged ones have {chosen.converged:.2f}"
+def _of(cosine: float | None) -> float:
+    return math.nan if cosine is None else cosine
+
+
+def _shortfall(chosen: Measured) -> str:
+    if _of(chosen.reference_cosine) < TELLS:
+        return f"which says little, two converged ones have {chosen.reference_cosine:.2f}"
     return f"below {GOAL:g}, the best that was found"
 
 

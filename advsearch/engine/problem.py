@@ -111,14 +111,6 @@ class Problem:
     def prepared(self) -> Prepared:
         return Prepared(self.spp, self.search_depth, self.plan)
 
-    @prepared.setter
-    def prepared(self, found: Prepared | None) -> None:
-        if found is None:
-            return
-        self.spp, self.search_depth = found.spp, found.search_depth
-        if self.plan != found.plan:
-            self.plan = found.plan
-
     @property
     def _over(self) -> bool:
         return self.searched is not None and self.searched < len(self.space.controls)
@@ -256,8 +248,13 @@ class Problem:
 
     # ---- evaluations ------------------------------------------------------------------------------------------------
 
-    def answers(self, queries: Sequence[Query]) -> Iterator[Evaluation]:
-        """Answer queries, each when it is asked for: see `advsearch.attacks.evaluation.Evaluate`."""
+    def answers(self, queries: Sequence[Query], prepared: Prepared | None = None) -> Iterator[Evaluation]:
+        """Answer queries, each when it is asked for (see `advsearch.attacks.evaluation.Evaluate`), as another process
+        has prepared the same problem."""
+        if prepared is not None:
+            self.spp, self.search_depth = prepared.spp, prepared.search_depth
+            if self.plan != prepared.plan:
+                self.plan = prepared.plan
         return map(self.evaluate, queries)
 
     def evaluate(self, query: Query) -> Evaluation:

@@ -155,6 +155,13 @@ def value_text(value: Any) -> str:
     return f"{value:.4g}" if isinstance(value, float) else short_name(value)
 
 
+def figure_value(value: float | str) -> str:
+    """Return a value as figures write it; of a file, its name without folder and suffix."""
+    if isinstance(value, str):
+        return PurePath(value).stem if "/" in value else value
+    return f"{value:.4g}"
+
+
 def short_names(text: str) -> str:
     """Return the last parts of paths, of one or of several separated by commas: ``a.hdr, studio``."""
     return ", ".join(map(short_name, split_names(text)))

@@ -5,7 +5,6 @@ each value, its unit in the name: ``pose.yaw [degrees]``, ``camera.target[0]`` (
 from __future__ import annotations
 
 import csv
-import importlib
 import io
 import itertools
 import json
@@ -67,44 +66,6 @@ def as_record(row: Row) -> JsonObject:
     """Return a row as column to value."""
     own = {one.name: getattr(row, one.name) for one in fields(row) if one.name not in ("values", "metrics")}
     return own | dict(row.metrics) | _values(row.values)
-
-
-def to_pandas(rows: Iterable[Row]) -> Any:
-    """Return rows as a `pandas.DataFrame`, with the columns of an export under plain names.
-
-    A value is called ``pose.yaw``, and ``attrs["units"]["pose.yaw"]`` says its unit: "degrees".
-
-    Raises:
-        InputError: pandas is not installed.
-    """
-    pandas, listed = _pandas(), list(rows)
-    names = {one: one.partition(" [")[0] for one in as_columns(listed)}
-    units = {plain: one.removeprefix(f"{plain} [").removesuffix("]") for one, plain in names.items() if plain != one}
-    records = [{names[name]: value for name, value in as_record(row).items()} for row in listed]
-    frame = pandas.DataFrame(records, columns=list(names.values()))
-    frame.attrs = {"units": units}
-    return frame
-
-
-def table_to_pandas(rows: Sequence[JsonObject]) -> Any:
-    """Return a table of a result as a `pandas.DataFrame`: a column for each value, named ``average.accuracy``."""
-    pandas, flat = _pandas(), [dict(_leaves(row)) for row in rows]
-    return pandas.DataFrame(flat, columns=list(dict.fromkeys(name for row in flat for name in row)))
-
-
-def _leaves(values: JsonObject, before: str = "") -> Iterator[tuple[str, JsonValue]]:
-    for name, value in values.items():
-        if isinstance(value, dict):
-            yield from _leaves(value, f"{before}{name}.")
-        else:
-            yield before + name, value
-
-
-def _pandas() -> Any:
-    try:
-        return importlib.import_module("pandas")
-    except ImportError:
-        raise InputError("to_pandas: needs pandas; pip install pandas, or export the run as csv or parquet") from None
 
 
 def _records(rows: Iterable[Row]) -> Iterator[JsonObject]:
@@ -204,67 +165,44 @@ def write_threedb(rows: Callable[[], Iterable[Row]], out: Path, picture: Callabl
     ``network`` tells what several networks answer apart."""
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"out: {out} is there already and not empty; name another folder")
-    names, classes = dict[str, None](), _Classes()
+    names, classes = dict[str, None](), dict[str, int | None]()
     for row in rows():
         names |= dict.fromkeys(name for name in row.values if name not in _PLACED)
-        classes.add(row)
-    if not classes.seen:
+        classes.setdefault(row.label or NOT_A_NUMBER, row.label_index)
+    if not classes:
         raise InputError("format 3db: needs the rows of a sweep, and this run has none")
+    numbers = {name: number for name, number in classes.items() if number is not None}
+    for name in [one for one in classes if one not in numbers]:  # behind the others
+        numbers[name] = max(numbers.values(), default=-1) + 1
+    called = {number: name for name, number in numbers.items()}
     with placed_by("out"):
         count = 0
         with replacing(out / DETAILS) as part, part.open("w", encoding="utf-8") as file:
             for row in rows():
-                line = _line(row, names, classes.number(row))
+                line = _line(row, names, numbers[row.label or NOT_A_NUMBER])
                 file.write(json.dumps(line, allow_nan=False) + "\n")
                 data = picture(row.step)
                 if data is not None:
                     write_bytes(out / IMAGES / f"{line['id']}_rgb.png", data, durable=False)
                 count += 1
-        write_text(out / CLASSES, json.dumps(classes.names()))
+        listed = [called.get(number, f"class {number}") for number in range(max(called) + 1)]
+        write_text(out / CLASSES, json.dumps(listed))
     return count
 
 
-class _Classes:
-    """The classes that were answered; those without a number get one behind the others."""
-
-    def __init__(self) -> None:
-        self.seen: dict[str, int | None] = {}
-
-    def add(self, row: Row) -> None:
-        self.seen.setdefault(row.label or NOT_A_NUMBER, row.label_index)
-
-    def names(self) -> list[str]:
-        numbers = self._numbers()
-        found = [f"class {number}" for number in range(max(numbers.values()) + 1)]
-        for name, number in numbers.items():
-            found[number] = name
-        return found
-
-    def number(self, row: Row) -> int:
-        return self._numbers()[row.label or NOT_A_NUMBER]
-
-    def _numbers(self) -> dict[str, int]:
-        given = {name: number for name, number in self.seen.items() if number is not None}
-        free = max(given.values(), default=-1) + 1
-        others = [name for name, number in self.seen.items() if number is None]
-        return given | {name: free + place for place, name in enumerate(others)}
-
-
 def _line(row: Row, names: Iterable[str], prediction: int) -> JsonObject:
-    parameters: JsonObject = {}
-    for name in names:
-        value = row.values.get(name)
-        parameters["network" if name == "model" else name] = "none" if value is None else value["value"]
-    own = {name: str(row.values[name]["value"]) if name in row.values else "none" for name in _PLACED}
+    said = {name: one["value"] for name, one in row.values.items()}
+    parameters = {"network" if name == "model" else name: said.get(name, "none") for name in names}
+    environment, model = (str(said.get(name, "none")) for name in _PLACED)
     return {
         "id": f"{row.step}",
-        "environment": own["environment"],
-        "model": own["object"],
+        "environment": environment,
+        "model": model,
         "is_correct": str(bool(row.correct)),
         "loss": row.margin,
         "prediction": [prediction],
         "output_type": "classes",
-        "render_args": parameters,
+        "render_args": parameters,  # type: ignore[dict-item]
     }
 
 

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import json
 import math
-import sqlite3
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
@@ -153,39 +152,40 @@ class Store:
             ended = time.monotonic()
             self._next_sync = ended + max(SYNC_INTERVAL, (ended - began) / SYNC_SHARE)
 
+    def _select(self, what: str, *given: Any) -> Iterator[Any]:
+        """The rows of a query; a FileFormatError where the file is damaged."""
+        with readable(self.path):
+            cursor = self._db.execute(f"SELECT {what}", given)
+            row = cursor.fetchone()
+        while row is not None:
+            yield row
+            with readable(self.path):
+                row = cursor.fetchone()
+
     def rows(self, kind: str | None = None, after: int = 0) -> Iterator[Row]:
         """Yield the rows, or those of one kind, in the order in which they were written, behind the id `after`."""
-        where, given = ("id > ?", (after,)) if kind is None else ("id > ? AND kind = ?", (after, kind))
-        with readable(self.path):
-            cursor = self._db.execute(f"SELECT {', '.join(_COLUMNS)} FROM evaluations WHERE {where} ORDER BY id", given)
-        while (values := self._next(cursor)) is not None:
+        where, given = ("id > ?", [after]) if kind is None else ("id > ? AND kind = ?", [after, kind])
+        for values in self._select(f"{', '.join(_COLUMNS)} FROM evaluations WHERE {where} ORDER BY id", *given):
             yield _decode(values, self.path)
 
     def row(self, kind: str, step: int) -> Row | None:
         """Return the last row of a kind with a step; None where there is none."""
-        with readable(self.path):
-            found = self._db.execute(
-                f"SELECT {', '.join(_COLUMNS)} FROM evaluations WHERE kind = ? AND step = ? ORDER BY id DESC LIMIT 1",
-                (kind, step),
-            ).fetchone()
-        return None if found is None else _decode(found, self.path)
+        what = f"{', '.join(_COLUMNS)} FROM evaluations WHERE kind = ? AND step = ? ORDER BY id DESC LIMIT 1"
+        return next((_decode(values, self.path) for values in self._select(what, kind, step)), None)
 
     def told(self, kind: str, step: int) -> tuple[Row, Told] | None:
         """Return a row of a search with what it told; None where there is none, or the run is done."""
         row = self.row(kind, step)
-        with readable(self.path):
-            found = row and self._db.execute(f"SELECT {_TOLD} FROM told WHERE row = ?", (row.id,)).fetchone()
-        return (row, _told(found, self.path)) if row and found else None
+        found = None if row is None else next(self._select(f"{_TOLD} FROM told WHERE row = ?", row.id), None)
+        return None if row is None or found is None else (row, _told(found, self.path))
 
     def pictures(self, kind: str, after: int, until: int) -> Iterator[tuple[int, NDArray[np.uint8]]]:
         """Yield number and picture of what rows of a kind with ids over `after` have told, while the run goes on."""
-        with readable(self.path):
-            cursor = self._db.execute(
-                "SELECT number, u, non_finite, cost, NULL, picture, height FROM told JOIN evaluations ON row = id "
-                "WHERE kind = ? AND id > ? AND id <= ? AND picture IS NOT NULL ORDER BY id",
-                (kind, after, until),
-            )
-        while (values := self._next(cursor)) is not None:
+        what = (
+            "number, u, non_finite, cost, NULL, picture, height FROM told JOIN evaluations ON row = id "
+            "WHERE kind = ? AND id > ? AND id <= ? AND picture IS NOT NULL ORDER BY id"
+        )
+        for values in self._select(what, kind, after, until):
             one = _told(values, self.path)
             assert one.picture is not None
             yield one.number, one.picture
@@ -193,8 +193,7 @@ class Store:
     @property
     def goes_on(self) -> bool:
         """Whether there is something that searches were told: the run is not done."""
-        with readable(self.path):
-            return bool(self._db.execute("SELECT EXISTS (SELECT * FROM told)").fetchone()[0])
+        return bool(next(self._select("EXISTS (SELECT * FROM told)"))[0])
 
     def forget(self) -> None:
         """Remove what searches were told: the run is done."""
@@ -207,14 +206,11 @@ class Store:
 
     def last_step(self, kind: str) -> int:
         """Return the largest step of a kind; -1 where there is none."""
-        with readable(self.path):
-            found = self._db.execute("SELECT max(step) FROM evaluations WHERE kind = ?", (kind,)).fetchone()[0]
-        return -1 if found is None else int(found)
+        return int(next(self._select("coalesce(max(step), -1) FROM evaluations WHERE kind = ?", kind))[0])
 
     def count(self, kind: str | None = None) -> int:
-        where, given = ("", ()) if kind is None else (" WHERE kind = ?", (kind,))
-        with readable(self.path):
-            return int(self._db.execute(f"SELECT count(*) FROM evaluations{where}", given).fetchone()[0])
+        where, given = ("", []) if kind is None else (" WHERE kind = ?", [kind])
+        return int(next(self._select(f"count(*) FROM evaluations{where}", *given))[0])
 
     def curve(self, kind: str) -> list[tuple[int, float | None]]:
         """Return (step, objective) of every row of one kind, in the order in which they were written."""
@@ -223,28 +219,19 @@ class Store:
     def missing(self, kind: str, count: int) -> Iterator[range]:
         """Yield the steps from 0 to `count` of which there is no row of a kind, neighbours together."""
         expected = 0
-        with readable(self.path):
-            cursor = self._db.execute("SELECT step FROM evaluations WHERE kind = ? ORDER BY step", (kind,))
-        while (found := self._next(cursor)) is not None:
-            if found[0] > expected:
-                yield range(expected, min(found[0], count))
-            expected = found[0] + 1
+        for (step,) in self._select("step FROM evaluations WHERE kind = ? ORDER BY step", kind):
+            if step > expected:
+                yield range(expected, min(step, count))
+            expected = step + 1
         if expected < count:
             yield range(expected, count)
 
-    def _next(self, cursor: sqlite3.Cursor) -> Any:
-        with readable(self.path):
-            return cursor.fetchone()
-
     def counts(self) -> dict[str, int]:
-        with readable(self.path):
-            found = self._db.execute("SELECT kind, count(*) FROM evaluations GROUP BY kind ORDER BY kind").fetchall()
-        return {str(kind): count for kind, count in found}
+        what = "kind, count(*) FROM evaluations GROUP BY kind ORDER BY kind"
+        return {str(kind): count for kind, count in self._select(what)}
 
     def note(self, key: str) -> str | None:
-        with readable(self.path):
-            found = self._db.execute("SELECT value FROM meta WHERE key = ?", (key,)).fetchone()
-        return None if found is None else str(found[0])
+        return next((str(text) for (text,) in self._select("value FROM meta WHERE key = ?", key)), None)
 
     def noted(self, key: str) -> Any:
         """Return the JSON value that was noted under `key`, or None."""

@@ -162,13 +162,12 @@ class CameraModel:
         low, most = torch.zeros_like(wanted), torch.full_like(wanted, bound)
         found = torch.minimum(wanted, most)
         for _ in range(STEPS):
-            square = found * found
-            scale, rise = self._scale(square)
-            error = found * scale - wanted
+            there, (slope,) = _with_slopes(lambda radius: self._radial(radius)[..., None], found)
+            error = there[..., 0] - wanted
             if bool(((error.abs() <= TOLERANCE) | (most - low <= TOLERANCE)).all()):
                 break
             most, low = torch.where(error > 0.0, found, most), torch.where(error > 0.0, low, found)
-            step = found - error / (scale + 2.0 * square * rise)
+            step = found - error / slope
             found = torch.where((step > low) & (step < most), step, (low + most) / 2.0)
         error = (self._radial(found) - wanted).abs()
         return found, error <= 1e3 * TOLERANCE * (1.0 + wanted)
@@ -177,8 +176,8 @@ class CameraModel:
         """Solve bent(found) = bent in two dimensions from (N, 2); and which are solved, before the lens folds."""
         converged = torch.zeros_like(flat[..., 0], dtype=torch.bool)
         for _ in range(STEPS // 3):
-            error = self._bent(flat) - bent
-            (a, b), (c, d) = self._jacobian(flat)
+            there, rows = _with_slopes(self._bent, flat)
+            error, ((a, b), (c, d)) = there - bent, (row.unbind(dim=-1) for row in rows)
             determinant = a * d - b * c
             inside = (determinant > 0.0) & (flat.norm(dim=-1) < high)
             converged = inside & (error.norm(dim=-1) <= TOLERANCE * (1.0 + bent.norm(dim=-1)))
@@ -228,21 +227,18 @@ class CameraModel:
             return min(self.fold, math.radians(self.reach), math.pi)
         return math.tan(self.fold) * (1.0 - 1e-9) if self.fold < math.pi / 2.0 else math.inf
 
-    def _scale(self, square: Tensor) -> tuple[Tensor, Tensor]:
-        """radial(r) / r at r^2, and its derivative with respect to r^2."""
+    def _scale(self, square: Tensor) -> Tensor:
+        """radial(r) / r at r^2."""
         over, under = self._polynomials
-        top, rise = _evaluated(over, square), _evaluated(polynomial.polyder(over), square)
-        if len(under) == 1:
-            return top, rise
-        bottom, fall = _evaluated(under, square), _evaluated(polynomial.polyder(under), square)
-        return top / bottom, (rise * bottom - top * fall) / (bottom * bottom)
+        top = _evaluated(over, square)
+        return top if len(under) == 1 else top / _evaluated(under, square)
 
     def _radial(self, radius: Tensor) -> Tensor:
-        return radius * self._scale(radius * radius)[0]
+        return radius * self._scale(radius * radius)
 
     def _bent(self, flat: Tensor) -> Tensor:
         """Where tangents (N, 2) lie after the distortion."""
-        return flat * self._scale(flat.square().sum(dim=-1))[0][..., None] + self._decentred(flat)
+        return flat * self._scale(flat.square().sum(dim=-1))[..., None] + self._decentred(flat)
 
     def _decentred(self, flat: Tensor) -> Tensor:
         """The part of the distortion that is not radial: of a lens off its centre, and of a thin prism."""
@@ -251,25 +247,6 @@ class CameraModel:
         aside = 2.0 * one["p1"] * x * y + one["p2"] * (square + 2.0 * x * x) + square * (one["s1"] + one["s2"] * square)
         below = one["p1"] * (square + 2.0 * y * y) + 2.0 * one["p2"] * x * y + square * (one["s3"] + one["s4"] * square)
         return torch.stack([aside, below], dim=-1)
-
-    def _jacobian(self, flat: Tensor) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
-        """The derivative of `_bent`, row by row."""
-        one, (x, y) = self.values, flat.unbind(dim=-1)
-        square = x * x + y * y
-        scale, rise = self._scale(square)
-        turn = 2.0 * rise
-        aside, below = (2.0 * one[a] + 4.0 * one[b] * square for a, b in (("s1", "s2"), ("s3", "s4")))
-        p1, p2 = one["p1"], one["p2"]
-        return (
-            (
-                scale + turn * x * x + 2.0 * p1 * y + 6.0 * p2 * x + aside * x,
-                turn * x * y + 2.0 * p1 * x + 2.0 * p2 * y + aside * y,
-            ),
-            (
-                turn * x * y + 2.0 * p1 * x + 2.0 * p2 * y + below * x,
-                scale + turn * y * y + 6.0 * p1 * y + 2.0 * p2 * x + below * y,
-            ),
-        )
 
     # ---- what follows from it ---------------------------------------------------------------------------------------
 
@@ -380,6 +357,15 @@ def _evaluated(coefficients: np.ndarray, at: Tensor) -> Tensor:
     for one in coefficients[-2::-1]:
         found = found * at + float(one)
     return found
+
+
+def _with_slopes(function: Field, at: Tensor) -> tuple[Tensor, list[Tensor]]:
+    """Values (N, k) of a function of each of N places alone, and the derivatives of each of the k by the place."""
+    with torch.enable_grad():
+        places = at.detach().requires_grad_()
+        values = function(places)
+        slopes = [torch.autograd.grad(one.sum(), places, retain_graph=True)[0] for one in values.unbind(dim=-1)]
+    return values.detach(), slopes
 
 
 def _inside(margin: Tensor, converged: Tensor) -> Tensor:

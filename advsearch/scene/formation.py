@@ -126,7 +126,7 @@ ITEMS: Mapping[str, str] = {
 """What a scene inside Mitsuba leaves out because a search doesn't need it, by name; each can be put back.
 
 None of it changes what is computed: pictures and gradients with and without agree to within their noise, and where the
-random numbers are the same ones, to within rounding, which `advsearch plan` shows on the scene at hand. Bounces of
+random numbers are the same ones, to within rounding, which `advsearch check` shows on the scene at hand. Bounces of
 light are another matter (`engine.path_length`): leaving those out has a bias, so only the search does it, within a
 measured bound, and the verification renders all of them."""
 

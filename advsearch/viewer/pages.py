@@ -23,7 +23,7 @@ from advsearch.runs.results.base import Result
 from advsearch.runs.results.sweep import SweepSummary
 from advsearch.runs.summary import read_result
 from advsearch.viewer import document
-from advsearch.viewer.columns import read_columns
+from advsearch.viewer.columns import packed, read_columns
 from advsearch.viewer.parts import end_html, figures_of, links_html, part_html
 from advsearch.viewer.sweep_page import SweepSource, sweep_page_html, whole_page, write_sweep_page
 from advsearch.viewer.thumbnails import kept_pictures, path_of, read_thumbnail
@@ -156,7 +156,7 @@ def write_bundle(runs: Sequence[Path], folder: Path) -> Path:
 def _copied(run: Path, folder: Path, number: int) -> SweepSource:
     """Write rows and thumbnails of a sweep into the folder, and say where they are."""
     rows, pictures = f"rows-{number}.bin", f"pictures-{number}"
-    write_bytes(folder / rows, read_columns(run).packed())
+    write_bytes(folder / rows, packed(read_columns(run)))
     kept = kept_pictures(run)
     for one in kept.numbers if kept else ():
         place = path_of(folder / pictures, one)

@@ -19,7 +19,6 @@ import secrets
 import ssl
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
@@ -33,7 +32,7 @@ from advsearch.report.markup import element, join_html
 from advsearch.runs import files, listing
 from advsearch.runs.directory import COLUMNS, HOME, PARTS, REPORT, check_links, is_run
 from advsearch.viewer.clients import PATIENCE, SLOWEST, TICK, Clients, https_context, is_address, reachable
-from advsearch.viewer.columns import read_columns
+from advsearch.viewer.columns import packed, read_columns
 from advsearch.viewer.dashboard import START, following_page, is_under_way, list_page, progress_json
 from advsearch.viewer.document import has_other_scripts, in_address, served_policy
 from advsearch.viewer.sweep_page import SweepSource, result_of, sweep_page_html
@@ -331,8 +330,8 @@ class _Handler(BaseHTTPRequestHandler):
         part = PART if after else FIRST_PART
         running = files.is_held(run)  # before the rows are read: what comes later is asked for again
         columns = read_columns(run, after, part)
-        more = len(columns.step) == part
-        return Served("application/octet-stream", replace(columns, more=more, running=running).packed())
+        more = len(columns) == part
+        return Served("application/octet-stream", packed(columns, more=more, running=running))
 
     def _progress(self, query: Query, name: str) -> Served:
         return Served("application/json", progress_json(self.server.run(name), _after(query, START)))

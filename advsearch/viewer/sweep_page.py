@@ -13,6 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from advsearch.errors import AdvsearchError
 from advsearch.files import JsonObject, JsonValue
@@ -25,7 +26,7 @@ from advsearch.runs.files import write_bytes, write_text
 from advsearch.runs.results.sweep import SweepSummary
 from advsearch.runs.summary import read_result
 from advsearch.settings import read_yaml
-from advsearch.viewer.columns import Columns, read_columns
+from advsearch.viewer.columns import packed, read_columns
 from advsearch.viewer.document import (
     data_script,
     data_url,
@@ -35,6 +36,9 @@ from advsearch.viewer.document import (
 )
 from advsearch.viewer.parts import end_html, part_html
 from advsearch.viewer.thumbnails import Kept, kept_pictures
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 MOST_EMBEDDED = 3_000_000
 """Bytes of pictures that a page which needs no other file takes along; the worst answers first."""
@@ -57,10 +61,14 @@ class SweepSource:
     """
 
     name: str
-    rows: Columns | str | None
+    rows: pd.DataFrame | str | None
     parts: bool = False
     pictures: Kept | None = None
     folder: str | None = None
+
+    @property
+    def embedded(self) -> bool:
+        return self.rows is not None and not isinstance(self.rows, str)
 
 
 def write_sweep_page(run: Path, summary: SweepSummary) -> Path:
@@ -71,13 +79,13 @@ def write_sweep_page(run: Path, summary: SweepSummary) -> Path:
         StorageError: it cannot be written.
     """
     columns = read_columns(run)
-    write_bytes(run / directory.COLUMNS, columns.packed(), durable=False)
+    write_bytes(run / directory.COLUMNS, packed(columns), durable=False)
     return write_text(run / directory.REPORT, whole_page(run, summary, columns), durable=False)
 
 
-def whole_page(run: Path, summary: SweepSummary, columns: Columns) -> str:
+def whole_page(run: Path, summary: SweepSummary, columns: pd.DataFrame) -> str:
     """Return the page of a sweep that needs no other file, with its rows unless they are too many."""
-    rows = columns if len(columns.step) <= MOST_ROWS else None
+    rows = columns if len(columns) <= MOST_ROWS else None
     return sweep_page_html([(run, summary)], [SweepSource(run.name, rows, pictures=kept_pictures(run))])
 
 
@@ -91,9 +99,9 @@ def sweep_page_html(runs: Sequence[tuple[Path, SweepSummary | None]], sources: S
     shown = [(one, *run) for one, run in zip(sources, runs, strict=True) if one.rows is not None]
     for number, (source, path, summary) in enumerate(shown):
         described.append(_described(source, number) | (_going_on(path) if summary is None else _judged(summary)))
-        if isinstance(source.rows, Columns):
-            packed = base64.b64encode(gzip.compress(source.rows.packed(), 6, mtime=0)).decode()
-            data.append(element("script", Html(packed), type="application/octet-stream", id=f"rows-{number}"))
+        if source.embedded:
+            zipped = base64.b64encode(gzip.compress(packed(source.rows), 6, mtime=0)).decode()
+            data.append(element("script", Html(zipped), type="application/octet-stream", id=f"rows-{number}"))
             left_out.append(_left_out(described[-1], source))
     main = element(
         "main",
@@ -114,16 +122,14 @@ def sweep_page_html(runs: Sequence[tuple[Path, SweepSummary | None]], sources: S
 
 def _described(source: SweepSource, number: int) -> JsonObject:
     described: JsonObject = {"name": source.name, "parts": source.parts}
-    described["embedded" if isinstance(source.rows, Columns) else "rows"] = (
-        f"rows-{number}" if isinstance(source.rows, Columns) else source.rows
-    )
+    described |= {"embedded": f"rows-{number}"} if source.embedded else {"rows": source.rows}
     kept = source.pictures
     if kept is None:
         return described
     pictures: JsonObject = {"models": kept.models}
     if source.folder is not None:
         pictures |= {"folder": source.folder, "suffix": kept.suffix, "kept": list(kept.numbers) if kept.some else None}
-    elif isinstance(source.rows, Columns):
+    elif source.embedded:
         pictures["embedded"] = dict(kept.embedded(source.rows, MOST_EMBEDDED))
     return {**described, "pictures": pictures}
 

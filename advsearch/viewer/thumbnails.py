@@ -21,10 +21,9 @@ from advsearch.runs.directory import CONFIG, IMAGES, SMALL_PICTURES
 from advsearch.runs.files import write_bytes
 from advsearch.runs.images import BAD_PICTURE, Bytes, to_8bit
 from advsearch.settings import read_yaml, split_names
-from advsearch.viewer.columns import Columns
 
 if TYPE_CHECKING:
-    from PIL import Image
+    import pandas as pd
 
 
 A_FOLDER = 1000
@@ -127,11 +126,12 @@ class Kept:
             raise FileFormatError(f"{file}: expected a small picture of the run, got something else") from None
         return stream.getvalue()
 
-    def embedded(self, columns: Columns, most: int) -> Iterator[tuple[str, str]]:
+    def embedded(self, rows: pd.DataFrame, most: int) -> Iterator[tuple[str, str]]:
         """Yield number and data address of thumbnails, of the worst margins first, up to `most` bytes."""
-        order = np.argsort(-np.nan_to_num(columns.margin, nan=-np.inf), kind="stable")
+        steps, margins = rows["step"].to_numpy(), rows["margin"].to_numpy()
+        order = np.argsort(-np.nan_to_num(margins, nan=-np.inf), kind="stable")
         there, spent = set(self.numbers), 0
-        for step in columns.step[order]:
+        for step in steps[order]:
             number = int(step) // self.models
             if number not in there:
                 continue

@@ -58,26 +58,6 @@ class Detector(nn.Module):
         return [{"boxes": box, "scores": image.mean()[None], "labels": torch.tensor([1])} for image in images]
 
 
-class Frame:
-    """What a `pandas.DataFrame` is given."""
-
-    attrs: dict[str, Any]
-
-    def __init__(self, data: list[dict[str, Any]], columns: list[str]) -> None:
-        self.columns = columns
-        self.data = data
-
-    def __getitem__(self, name: str) -> list[Any]:
-        assert name in self.columns
-        return [row[name] for row in self.data]
-
-
-@pytest.fixture
-def pandas(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A table for those who have no pandas."""
-    monkeypatch.setitem(sys.modules, "pandas", types.SimpleNamespace(DataFrame=Frame))
-
-
 def red(image: Tensor, output: Tensor, truth: Any) -> float:
     """A metric that other processes can import."""
     assert image.shape == (SIDE, SIDE, 3) and output.shape == (2,)
@@ -232,7 +212,6 @@ def test_a_found_texture_is_put_on_another_scene(attacked: AttackResult, tmp_pat
 # ---- metrics --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.usefixtures("pandas")
 def test_metrics_are_columns_of_an_attack(attacked: AttackResult) -> None:
     seen = attacked.to_pandas()["red"]
     assert len(seen) > 10 and all(0.0 < one < 1.0 for one in seen) and len(set(seen)) > 4
@@ -240,7 +219,6 @@ def test_metrics_are_columns_of_an_attack(attacked: AttackResult) -> None:
     assert all(row.metrics.keys() == {"red"} for row in attacked.rows())
 
 
-@pytest.mark.usefixtures("pandas")
 def test_metrics_are_columns_of_a_sweep_and_of_one_that_goes_on(
     scene: advsearch.Scene, model: advsearch.Model, tmp_path: Path
 ) -> None:
@@ -255,7 +233,7 @@ def test_metrics_are_columns_of_a_sweep_and_of_one_that_goes_on(
     asked: dict[str, Any] = {**PICTURE, "grid": {"pose.yaw": [0, 90, 180, 270]}, "trials": 0, "batch": 1}
     whole = advsearch.sweep(scene, model, metrics={"both": both}, **asked)
     frame = whole.to_pandas()
-    assert all(0.0 < one < 1.0 for one in frame["both.light"]) and frame["both.none"] == [None] * 4
+    assert all(0.0 < one < 1.0 for one in frame["both.light"]) and frame["both.none"].isna().all()
     run = tmp_path / "run"
     for progress in (Stops(), NullProgress()):
         with suppress(KeyboardInterrupt):
@@ -449,11 +427,10 @@ def test_rows_are_there_without_a_folder(
     assert [row.kind for row in held.rows("control")] == ["control"] * 6
 
 
-@pytest.mark.usefixtures("pandas")
 def test_a_table_says_which_rows_are_steps(attacked: AttackResult) -> None:
     frame, search = attacked.to_pandas("search"), attacked.search
     assert search is not None and (len(search.history), len(search.ranking)) == (4, 8)
-    assert frame["phase"] == ["search"] * 4 + ["ranking"] * 8
+    assert frame["phase"].tolist() == ["search"] * 4 + ["ranking"] * 8
     axes = attacked.plot()
     assert len(axes.lines[0].get_xdata()) == 4
     assert attacked.history == pytest.approx([record.objective for record in search.history])
@@ -467,11 +444,10 @@ def test_names_that_people_guess_are_there(attacked: AttackResult) -> None:
         assert inspect.isabstract(base), base
 
 
-@pytest.mark.usefixtures("pandas")
 def test_columns_have_plain_names_and_units_stand_beside_them(scene: advsearch.Scene, model: advsearch.Model) -> None:
     swept = advsearch.sweep(scene, model, {"pose.yaw": [0, 90], "camera.azimuth": [0, 1]}, trials=0, **PICTURE)
     frame = swept.to_pandas()
-    assert frame["pose.yaw"] == [0.0, 0.0, 90.0, 90.0] and not [one for one in frame.columns if "[" in one]
+    assert frame["pose.yaw"].tolist() == [0.0, 0.0, 90.0, 90.0] and not [one for one in frame.columns if "[" in one]
     assert frame.attrs["units"] == {"pose.yaw": "degrees", "camera.azimuth": "degrees"}
 
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import inspect
 import runpy
-import sys
-import types
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +23,7 @@ def test_dir_lists_the_public_names() -> None:
 
 
 QUESTIONS = (
-    *("attack", "sweep", "gap", "region", "replay", "recipe", "plan", "check", "precision", "stability", "harden"),
+    *("attack", "sweep", "gap", "region", "replay", "recipe", "check", "precision", "stability", "harden"),
     *("explain", "compare"),
 )
 
@@ -104,13 +102,6 @@ def swept(model: advsearch.Model) -> advsearch.SweepResult:
     return advsearch.sweep("mug", model, {"pose.yaw": [0, 90], "camera.elevation": [10, 60]}, spp=1, trials=0)
 
 
-class Frame:
-    """What a `pandas.DataFrame` is given."""
-
-    def __init__(self, data: Any, columns: Any) -> None:
-        self.data, self.columns = data, columns
-
-
 def test_texts_are_short(model: advsearch.Model, attacked: Any, swept: advsearch.SweepResult) -> None:
     scene = advsearch.load_scene("mug", environment="loft", settings={"camera.azimuth": 60.0})
     assert repr(scene) == "Scene('mug', 'loft', camera.azimuth=60.0)"
@@ -128,19 +119,12 @@ def test_a_notebook_shows_verdict_pictures_and_tables(attacked: Any, swept: advs
     assert page.count("<img") == 1 and "<b>pose.yaw, degrees</b>" in page and "<td>90</td>" in page
 
 
-def test_rows_become_a_table_of_pandas(
-    attacked: Any, swept: advsearch.SweepResult, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "pandas", types.SimpleNamespace(DataFrame=Frame))
+def test_rows_become_a_table_of_pandas(attacked: Any, swept: advsearch.SweepResult) -> None:
     table = swept.to_pandas()
-    assert [row["pose.yaw"] for row in table.data] == [0.0, 0.0, 90.0, 90.0]
+    assert table["pose.yaw"].tolist() == [0.0, 0.0, 90.0, 90.0]
     assert {"correct", "margin", "label", "camera.elevation"} <= set(table.columns)
     searched = attacked.to_pandas("search")
-    assert [row["kind"] for row in searched.data] == ["search"] * len(searched.data) and searched.data
-    assert len(attacked.to_pandas().data) > len(searched.data)
-    monkeypatch.setitem(sys.modules, "pandas", None)
-    with pytest.raises(InputError, match="needs pandas; pip install pandas, or export the run as csv or parquet"):
-        swept.to_pandas()
+    assert len(searched) and set(searched["kind"]) == {"search"} and len(attacked.to_pandas()) > len(searched)
 
 
 def test_the_gap_is_asked_for_by_name(tmp_path: Path) -> None:

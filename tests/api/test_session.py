@@ -30,6 +30,7 @@ from advsearch.controls import Control
 from advsearch.controls.numbers import NumberControl
 from advsearch.controls.pose import PoseControl
 from advsearch.controls.texture import TextureControl
+from advsearch.engine.attack_parts import problem_from_config
 from advsearch.errors import AdvsearchError, InputError
 from advsearch.models import ModelWarning
 from advsearch.progress import NullProgress
@@ -279,7 +280,7 @@ class Faded(NumberControl):
         Parameter("amount", (), "1", 0.0, 1.0, 0.0, "1 is black.", search=(0.0, 1.0), estimators=("adjoint",)),
     )
 
-    def scene_inputs(self, scene: Any, values: Any, so_far: Any) -> dict[str, Tensor]:
+    def scene_inputs(self, values: Any, so_far: Any) -> dict[str, Tensor]:
         return {"object.roughness": 0.5 + 0.5 * values["amount"]}
 
 
@@ -305,13 +306,13 @@ def test_instances_and_names_go_together_in_every_question(
     assert [row.control for row in gap.table] == ["faded", "pose.yaw"]
     seen: list[Any] = []
 
-    def planned(problem: Any, *_: Any) -> None:
-        seen.append(problem)
+    def loaded(config: Any, **_: Any) -> None:
+        seen.append(problem_from_config(config)[0])
         raise ZeroDivisionError
 
-    monkeypatch.setattr("advsearch.questions.plan.carry_out._Measurements", planned)
+    monkeypatch.setattr("advsearch.questions.check.carry_out.problem_from_config", loaded)
     with pytest.raises(ZeroDivisionError):
-        advsearch.plan("mug", controls=mixed, run=tmp_path / "plan", **small)
+        advsearch.check("mug", controls=mixed, run=tmp_path / "check", **small)
     assert [bound.name for bound in seen[0].space.controls] == ["faded", "pose"]
     with pytest.raises(InputError, match="workers: expected names of objects, models, controls"):
         advsearch.gap("mug", controls=mixed, workers=2)

@@ -580,7 +580,7 @@ def test_a_bad_base_is_named(tmp_path: Path, text: str, message: str) -> None:
         AttackConfig.from_yaml(path)
 
 
-@pytest.mark.parametrize("command", ["attack", "gap", "region", "plan", "check", "render", "precision"])
+@pytest.mark.parametrize("command", ["attack", "gap", "region", "check", "render", "precision"])
 @pytest.mark.parametrize("name", ["object", "environment", "model"])
 def test_several_of_a_kind_are_for_a_sweep(
     command: str, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

@@ -12,7 +12,7 @@ import torch
 
 import advsearch
 from advsearch.controls import make_space
-from advsearch.controls.contents import BRIM, INGREDIENTS, BoundContents, ContentsControl, interior, liquid
+from advsearch.controls.contents import BRIM, INGREDIENTS, ContentsControl, interior, liquid
 from advsearch.controls.pose import PoseControl
 from advsearch.errors import InputError
 from advsearch.scene.assets import Mesh, ObjectAsset
@@ -29,7 +29,7 @@ def scene() -> SceneDescription:
     return describe("mug")
 
 
-def bound(scene: SceneDescription, **settings: Any) -> BoundContents:
+def bound(scene: SceneDescription, **settings: Any) -> ContentsControl:
     control = ContentsControl(**settings)
     return control.bind(control.prepare(scene))
 
@@ -86,7 +86,7 @@ def test_the_liquid_stays_inside_the_vessel(name: str) -> None:
         assert np.all(reach < below) and np.all(reach > 0.98 * below)
 
 
-def surface(filled: BoundContents, level: float) -> np.ndarray:
+def surface(filled: ContentsControl, level: float) -> np.ndarray:
     """Vertices of the liquid in mesh coordinates."""
     part = next(one for one in filled.scene.parts if one.name == "contents")
     u = filled.start.clone()
@@ -140,14 +140,14 @@ def test_proportions_add_up_to_one_within_their_ranges(scene: SceneDescription, 
         said = filled.describe(u)
         shares = {name: float(said[f"contents.{name}"]["value"]) for name in INGREDIENTS}
         assert sum(shares.values()) == pytest.approx(1.0, abs=1e-6)
-        for name, (low, high) in filled.control.bounds.items():
+        for name, (low, high) in filled.bounds.items():
             assert low - 1e-6 <= shares[name] <= high + 1e-6
 
 
 def test_two_coordinates_reach_every_mixture(scene: SceneDescription) -> None:
     filled = bound(scene)
     assert [group.parameter for group in filled.groups] == ["level", "water", "milk"]
-    cuts = filled.control.cuts({"water": 0.2, "milk": 0.5, "coffee": 0.3})
+    cuts = filled.cuts({"water": 0.2, "milk": 0.5, "coffee": 0.3})
     shares = filled.values(torch.tensor([0.5, cuts["water"], cuts["milk"]]))
     assert [float(shares[name]) for name in INGREDIENTS] == pytest.approx([0.2, 0.5, 0.3], abs=1e-6)
     assert [float(filled.values(filled.start)[name]) for name in INGREDIENTS] == [0.0, 0.0, 1.0]

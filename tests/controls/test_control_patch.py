@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 import pytest
@@ -15,8 +14,7 @@ from torch import Tensor
 
 import advsearch
 from advsearch.controls import make_control, make_space
-from advsearch.controls.patch import BASE_COLOR, BoundPatch, PatchControl
-from advsearch.controls.patch_sticker import towards_camera
+from advsearch.controls.patch import BASE_COLOR, PatchControl, towards_camera
 from advsearch.controls.texture import TextureControl
 from advsearch.errors import FileFormatError, InputError, UnknownNameError
 from advsearch.scene.assets import Floats, Mesh
@@ -39,18 +37,18 @@ def surface(scene: SceneDescription) -> tuple[Floats, Floats, Floats]:
     return positions, normals, texel_area(scene.object.mesh, SIDE)
 
 
-def bound(scene: SceneDescription, **settings: object) -> BoundPatch:
-    return cast(BoundPatch, PatchControl(**settings).bind(scene))  # type: ignore[arg-type]
+def bound(scene: SceneDescription, **settings: object) -> PatchControl:
+    return PatchControl(**settings).bind(scene)
 
 
-def painted(control: BoundPatch, pixels: Tensor, so_far: Tensor | None = None) -> Tensor:
+def painted(control: PatchControl, pixels: Tensor, so_far: Tensor | None = None) -> Tensor:
     """The base colour with pixels (n, n, 3) on it."""
     u = control.start.clone()
     u[: pixels.numel()] = pixels.reshape(-1)
     return control.inputs(u, {} if so_far is None else {BASE_COLOR: so_far})[BASE_COLOR]
 
 
-def covered(control: BoundPatch, side: int = 32) -> np.ndarray:
+def covered(control: PatchControl, side: int = 32) -> np.ndarray:
     """Share (h, w) to which each texel is painted."""
     white, black = (painted(control, torch.full((side, side, 3), value)) for value in (1.0, 0.0))
     return (white - black).mean(dim=-1).numpy()

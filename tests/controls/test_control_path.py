@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 import advsearch
-from advsearch.controls import BoundControl, make_space
+from advsearch.controls import Control, make_space
 from advsearch.controls.path import CLEAN_AT, PATHS, PathControl
 from advsearch.engine.rendering import sight_of
 from advsearch.errors import FileFormatError, InputError
@@ -29,15 +29,15 @@ def scene() -> SceneDescription:
     return describe("mug", given={"camera.roll": 20.0, "camera.azimuth": 70.0})
 
 
-def bound(scene: SceneDescription, **given: Any) -> BoundControl:
+def bound(scene: SceneDescription, **given: Any) -> Control:
     return make_space([PathControl(**given)], scene).controls[0]
 
 
-def distance(control: BoundControl, share: float) -> float:
+def distance(control: Control, share: float) -> float:
     return float(str(control.describe(torch.tensor([share]))["path.distance"]["value"]))
 
 
-def placed(control: BoundControl, share: float) -> Tensor:
+def placed(control: Control, share: float) -> Tensor:
     (pose,) = control.inputs(torch.tensor([share])).values()
     return pose
 
@@ -232,9 +232,9 @@ def test_as_many_times_at_once_are_those_one_by_one(scene: SceneDescription, tmp
     file = tmp_path / "way.csv"
     file.write_text(WAY)
     for path in (*PATHS, f"{file}+orbit", f"approach+{file}", "pass+pass"):
-        control = PathControl(path=path)
+        control = PathControl(path=path).within(scene)
         time = torch.linspace(0.0, control.seconds, 7)
-        start = control._start(scene, time)
+        start = control._start(time)
 
         def both(at: Tensor, control: PathControl = control, start: Any = start) -> Tensor:
             place, target = control._camera(start, at, control._object(start, at)[0])
@@ -270,7 +270,7 @@ def test_headings_go_the_shorter_way_round(
     assert any("the shorter way" in note for note in notes) == told
 
 
-def _turned(scene: SceneDescription, control: BoundControl, share: float) -> tuple[Tensor, Tensor]:
+def _turned(scene: SceneDescription, control: Control, share: float) -> tuple[Tensor, Tensor]:
     """Sine and cosine of how far the object is turned."""
     turn = placed(control, share)[:3, :3] @ torch.linalg.inv(torch.from_numpy(object_to_world(scene)).float()[:3, :3])
     return turn[1, 0], turn[0, 0]

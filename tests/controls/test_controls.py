@@ -12,7 +12,7 @@ from conftest import ROOT
 from hostile import SHORT, shown
 
 from advsearch import load_scene
-from advsearch.controls import CONTROLS, OWN, BoundControl, TextureControl, make_control, make_space
+from advsearch.controls import CONTROLS, OWN, Control, TextureControl, make_control, make_space
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import describe
@@ -24,7 +24,7 @@ NEEDED: dict[str, dict[str, Any]] = {"mitsuba": {"ground.bsdf.brdf_0.reflectance
 """What a control cannot be made without."""
 
 
-def bound(kind: str, object: str = "mug") -> BoundControl:
+def bound(kind: str, object: str = "mug") -> Control:
     """A control with its defaults in a scene, alone."""
     return make_space([make_control(kind, NEEDED.get(kind))], describe(object)).controls[0]
 
@@ -187,7 +187,9 @@ def test_the_resolution_is_a_choice_and_keeps_the_mean() -> None:
 
 
 def test_the_default_balls_reach_the_same_root_mean_square() -> None:
-    linf, l2 = (TextureControl(norm=norm, resolution=32).bind(describe("mug")).budget for norm in ("linf", "l2"))
+    linf, l2 = (
+        TextureControl(norm=norm, resolution=32).bind(describe("mug")).groups[0].budget for norm in ("linf", "l2")
+    )
     assert linf.epsilon is not None and l2.epsilon is not None
     assert l2.epsilon == pytest.approx(linf.epsilon * math.sqrt(32 * 32 * 3))
 

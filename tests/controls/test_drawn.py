@@ -17,7 +17,7 @@ from torch.distributions import Laplace as TorchLaplace
 from advsearch.attacks.draws import Draws
 from advsearch.config import AttackConfig
 from advsearch.controls import CameraControl, EnvironmentControl, PatchControl
-from advsearch.controls.numbers import BoundNumbers
+from advsearch.controls.numbers import NumberControl
 from advsearch.controls.ranges import DrawnRange
 from advsearch.distributions import as_setting
 from advsearch.engine.attack_parts import controls_given
@@ -131,7 +131,7 @@ def test_derivatives_reach_what_is_drawn() -> None:
 def test_weights_are_shares(weights: dict[str, float], counts: dict[str, int]) -> None:
     control = EnvironmentControl(which=weights)
     bound = control.bind(control.prepare(MUG))
-    assert isinstance(bound, BoundNumbers)
+    assert isinstance(bound, NumberControl)
     size = sum(counts.values())
     assert bound.groups[0].options == size if len(counts) > 1 else True
     places = (torch.arange(size) + 0.5) / size
@@ -191,7 +191,7 @@ def test_a_run_says_what_only_python_has_and_repeats_the_rest() -> None:
     assert elevation == {"distribution": "from Python", "name": "<lambda>", "quantiles": [20.05, 20.5, 20.95]}
     (control,) = as_controls(config.over)
     bound = control.bind(MUG)
-    assert isinstance(bound, BoundNumbers)
+    assert isinstance(bound, NumberControl)
     assert float(bound.values(torch.tensor([0.5, 0.5]))["elevation"]) == pytest.approx(20.5, abs=1e-4)
 
 

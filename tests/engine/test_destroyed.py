@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from advsearch.attacks import Block, Domain, Evaluation, Policy, Proposal, get_objective, search
 from advsearch.attacks.objectives import OBJECTIVE_KINDS, ObjectiveKind
-from advsearch.controls import CONTROLS, BoundControl, NumberControl, Parameter, compose
+from advsearch.controls import CONTROLS, NumberControl, Parameter, compose
 from advsearch.copies import copied
 from advsearch.engine.judging import judgements
 from advsearch.engine.loading import as_controls, load_scene
@@ -220,18 +220,17 @@ class DimControl(NumberControl):
     summary = "Destroys."
     parameters = (Parameter("amount", (), "1", 0.0, 1.0, 0.2, "How much.", search=(0.0, 1.0)),)
 
-    def refines(self, scene: Any) -> frozenset[str]:
-        return frozenset({"object.base_color"})
+    refines = frozenset({"object.base_color"})
 
-    def scene_inputs(self, scene: Any, values: Any, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    def scene_inputs(self, values: Any, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
         found = so_far["object.base_color"].clone() * (1.0 - values["amount"].clone())
         destroy([*values.values(), *so_far.values()])
         return {"object.base_color": found}
 
-    def on_picture(self, scene: Any, values: Any, image: Tensor) -> Tensor:
+    def on_picture(self, values: Any, image: Tensor) -> Tensor:
         return image.mul_(1.0 - values["amount"])
 
-    def measured(self, scene: Any, values: Any, so_far: Mapping[str, Tensor]) -> dict[str, Any]:
+    def measured(self, values: Any, so_far: Mapping[str, Tensor]) -> dict[str, Any]:
         destroy([*so_far.values(), *values.values()])
         return {}
 
@@ -294,11 +293,9 @@ def test_a_network_that_writes_into_its_input_changes_no_picture(layout: str, pr
 UNTOUCHED: dict[Any, set[str]] = {
     Task: {"read", "on", "seeking", "check", "truth", "check_numbers"},
     Policy: {"propose", "takes_differences", "counts", "answer", "failures"},
-    BoundControl: set(),
     NumberControl: {
-        *("declared", "setting", "settings", "chosen_form", "mesh_in"),
-        *("allowed", "searches", "check_choices", "in_scene", "default", "unchanged", "size", "refines"),
-        *("search_range", "budget", "estimators", "moved"),
+        *("declared", "setting", "settings", "chosen_form", "mesh_in", "within", "allowed", "searches", "in_scene"),
+        *("default", "unchanged", "size", "spec", "search_range", "budget_of", "estimators", "left_out", "values"),
     },
 }
 """Methods that get no tensors which anybody else reads; those of a declaration get the control's copy of a scene."""

@@ -31,7 +31,7 @@ from advsearch.questions.sweep.carry_out import job_of
 from advsearch.report.sweeps import over_drives as told_over
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.sweep import DriveRates
-from advsearch.viewer.columns import read_columns
+from advsearch.runs.tables import read_sweep
 
 SMALL: dict[str, Any] = {"resolution": 16, "spp": 1, "trials": 0, "batch": 4}
 
@@ -138,10 +138,10 @@ def test_the_worst_of_several_drives_is_the_one_that_is_kept(tmp_path: Path, mon
     (yaw, *_) = [row for row in result.summary.axes if row.axis == "pose.yaw"]
     assert yaw.interval is not None and yaw.interval[1] - yaw.interval[0] > 0.95, "one drive of five frames"
     assert "4 drives can show little" in " ".join(result.summary.warnings)
-    assert len(set(read_columns(path).unit.tolist())) == 4
+    assert len(set(read_sweep(path)["unit"])) == 4
     with sqlite3.connect(path / "results.sqlite") as older:
         older.execute("DELETE FROM meta WHERE key = 'units'")
-    assert len(set(read_columns(path).unit.tolist())) == 4, "an older run's summary says it, too"
+    assert len(set(read_sweep(path)["unit"])) == 4, "an older run's summary says it, too"
     (claim, *_) = claims(result.summary)
     assert "frames of 4 drives" in claim.statement and "sampler" not in claim.statement
     text = answer(result.summary)

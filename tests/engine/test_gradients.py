@@ -21,6 +21,7 @@ from advsearch.engine.gradients import (
     Probe,
     Reference,
     agreement,
+    attempts,
     estimated,
     inside,
     probes,
@@ -29,10 +30,10 @@ from advsearch.engine.gradients import (
 )
 from advsearch.engine.planning import TELLS, contested, cosines, measured_plan, status_of, tuned
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.questions.check.answer import WHOLE, DerivativeRow, DirectionRow, shown
-from advsearch.questions.check.carry_out import attempts, check_from_config
+from advsearch.questions.check.answer import shown
+from advsearch.questions.check.carry_out import check_from_config
 from advsearch.questions.check.settings import CheckConfig
-from advsearch.runs.results.base import CosineRow
+from advsearch.runs.results.base import Measured
 from advsearch.scene.formation import ImageFormation
 from advsearch.scene.gradients import ESTIMATORS, SEARCH_STEP, Group, first_plan
 from advsearch.scene.renderer import Renderer
@@ -293,13 +294,13 @@ def test_a_judgement_needs_more_than_noise() -> None:
     assert agreement(Estimate("x", 1.01, 0.05, 9, 1.0), sure).status == "ok"
     assert agreement(Estimate("x", 1.2, 0.05, 9, 1.0), sure).status == "biased"
     turned = agreement(Estimate("x", -1.0, 0.06, 9, 1.0), sure)
-    assert (turned.status, turned.error, turned.noise) == ("biased", 2.0, 0.06)
+    assert (turned.status, turned.bias, turned.noise) == ("biased", 2.0, 0.06)
     assert turned.doubt == pytest.approx(0.05, rel=1e-2)
     assert turned.excess == 2.0 - turned.doubt
     assert agreement(Estimate("x", 1.0, 0.5, 9, 1.0), sure).status == "noisy"
     unsure = Reference(0.1, 0.5, (0.6, 0.1), 8)
     assert agreement(Estimate("x", 0.4, 0.1, 9, 1.0), unsure).status == "reference unusable"
-    assert agreement(Estimate("x", 0.0, 0.0, 9, 1.0), Reference(0.0, 0.0, (0.0, 0.0), 8)).error == 0.0
+    assert agreement(Estimate("x", 0.0, 0.0, 9, 1.0), Reference(0.0, 0.0, (0.0, 0.0), 8)).bias == 0.0
 
 
 def test_a_derivative_near_zero_is_judged_beside_the_others_of_its_control() -> None:
@@ -307,8 +308,8 @@ def test_a_derivative_near_zero_is_judged_beside_the_others_of_its_control() -> 
     off = Estimate("x", 0.03, 0.0, 9, 1.0)
     alone, beside = agreement(off, small), agreement(off, small, [small, large])
     assert (alone.status, beside.status) == ("biased", "ok")
-    assert [alone.error, beside.error] == pytest.approx([2.0, 0.04])
-    assert agreement(off, large, [small, large]).error == agreement(off, large).error
+    assert [alone.bias, beside.bias] == pytest.approx([2.0, 0.04])
+    assert agreement(off, large, [small, large]).bias == agreement(off, large).bias
 
 
 def test_a_reference_of_a_parabola_has_its_bias_taken_off() -> None:
@@ -432,7 +433,7 @@ def test_converged_gradients_of_which_one_disagrees_get_more_samples() -> None:
     told: Any = Told({128: [right, right, wrong], 512: [right], 8: [right]})
     (row,) = cosines(told, lambda image: image, torch.zeros(2), seed=0, counts=(8,))
     assert told.asked == [128, 128, 128, 512, 512, 512, 8, 8, 8]
-    assert (row.status, row.cosine, row.converged) == ("ok", 1.0, 1.0)
+    assert (row.status, row.cosine, row.reference_cosine) == ("ok", 1.0, 1.0)
     agreed: Any = Told({128: [right], 8: [right]})
     list(cosines(agreed, lambda image: image, torch.zeros(2), seed=0, counts=(8,)))
     assert 512 not in agreed.asked
@@ -461,11 +462,17 @@ def test_the_widest_step_is_tried_only_where_no_other_will_do() -> None:
 
 def test_the_cheapest_setting_that_reaches_the_goal_is_taken() -> None:
     plan = first_plan((group("pose.yaw", 0, 1, ("secant",)),), torch.tensor([0.01]))
-    place: Any = {"denoise": "none", "control": "pose", "converged": 0.99}
+    place: Any = {
+        "quantity": "gradient",
+        "estimator": "secant",
+        "control": "pose",
+        "reference_cosine": 0.99,
+        "repeats": 3,
+    }
     rows = [
-        CosineRow(factor=1.0, spp=8, cosine=0.5, seconds=1.0, status="noisy", **place),
-        CosineRow(factor=1.0, spp=64, cosine=0.95, seconds=8.0, status="ok", **place),
-        CosineRow(factor=3.0, spp=16, cosine=0.93, seconds=2.0, status="ok", **place),
+        Measured(factor=1.0, spp=8, cosine=0.5, seconds=1.0, status="noisy", **place),
+        Measured(factor=1.0, spp=64, cosine=0.95, seconds=8.0, status="ok", **place),
+        Measured(factor=3.0, spp=16, cosine=0.93, seconds=2.0, status="ok", **place),
     ]
     chosen, spp = tuned(plan, rows)
     assert spp == 16 and chosen.groups[0].step == pytest.approx(3.0 * SEARCH_STEP)
@@ -638,20 +645,16 @@ def test_a_check_says_of_both_losses_how_good_a_gradient_is(tmp_path: Path) -> N
     assert {row.parameter for row in linear} >= {"hue", "saturation", "value"}
     for row in linear:
         assert row.status == "ok", row
-        assert isinstance(row, DerivativeRow) and row.noise <= 0.2 and row.spp == 4
-    whole = [row for row in rows if row.loss == "model" and row.parameter == WHOLE]
+        assert row.noise is not None and row.noise <= 0.2 and row.spp == 4
+    whole = [row for row in rows if row.loss == "model" and row.quantity == "gradient"]
     assert {row.control for row in whole} == {"background"} and whole[0].estimator in ESTIMATORS
-    assert isinstance(last := whole[-1], DirectionRow)
-    assert (last.status == "ok") == (last.cosine >= 0.9 and last.converged >= TELLS)
-    single = {row.parameter: row for row in rows if row.loss == "model" and row.parameter != WHOLE}
+    last = whole[-1]
+    assert last.cosine is not None and last.reference_cosine is not None
+    assert (last.status == "ok") == (last.cosine >= 0.9 and last.reference_cosine >= TELLS)
+    single = {row.parameter: row for row in rows if row.loss == "model" and row.quantity == "derivative"}
     assert set(single) == {row.parameter for row in linear}
     for row in single.values():
-        assert (
-            isinstance(row, DerivativeRow)
-            and row.reference_noise >= 0.0
-            and row.noise >= 0.0
-            and math.isfinite(row.gradient)
-        )
+        assert None not in (row.noise, row.reference_error, row.bias) and math.isfinite(row.value or 0.0)
         assert row.status in ("ok", "noisy", "biased", "reference unusable")
     text = " ".join(one.title for one in shown(check).sections if not one.empty)
     assert "Smooth linear loss" in text and "each parameter" in text and "cosine with the converged" in text

@@ -28,7 +28,6 @@ from advsearch.engine.record import Stages
 from advsearch.errors import FileFormatError, InputError, RunExistsError
 from advsearch.progress import NullProgress
 from advsearch.questions.check.settings import CheckConfig
-from advsearch.questions.plan.settings import PlanConfig
 from advsearch.questions.stability.settings import StabilityConfig
 from advsearch.runs import files
 from advsearch.runs.directory import RunDirectory
@@ -187,7 +186,7 @@ def test_a_run_goes_on_elsewhere_on_other_threads_and_with_files_that_were_moved
         RunDirectory.resume(tmp_path / "run", configuration(model="other.pt2"))
 
 
-@pytest.mark.parametrize("config", [CheckConfig(object="mug"), PlanConfig(object="mug"), StabilityConfig()])
+@pytest.mark.parametrize("config", [CheckConfig(object="mug"), StabilityConfig()])
 def test_a_sitting_may_be_longer_than_the_one_before(tmp_path: Path, config: Config) -> None:
     with RunDirectory.create(tmp_path / "run") as run:
         run.write_config(config.model_copy(update={"seconds": 5.0}))

@@ -65,14 +65,15 @@ def test_what_a_control_says_itself_goes_over_the_run() -> None:
 
 def test_an_epsilon_for_one_control_leaves_the_others_their_own() -> None:
     found = settings("texture,geometry,texture:label", epsilon="geometry=0.02,texture:label=0.3")
-    assert [one["epsilon"] for one in found.values()] == [None, 0.02, 0.3]
+    assert [one.get("epsilon") for one in found.values()] == [None, 0.02, 0.3]
 
 
 @pytest.mark.parametrize(("norm", "expected"), [(None, "linf"), ("linf", "linf"), ("l2", "l2")])
 def test_a_patch_takes_an_epsilon_in_the_norm_of_the_run(norm: str | None, expected: str) -> None:
-    found = settings("patch", epsilon=0.1, norm=norm)["patch"]
-    assert (found["epsilon"], found["norm"]) == (0.1, expected)
-    assert PatchControl().norm == "box", "without an epsilon its pixels may go anywhere"
+    config = AttackConfig(object="mug", controls="patch", epsilon=0.1, norm=norm)
+    (patch,) = given_to(config, config.controls)
+    assert (patch.chosen["epsilon"], patch.chosen["norm"]) == (0.1, expected)
+    assert PatchControl().chosen["norm"] == "box", "without an epsilon its pixels may go anywhere"
 
 
 # ---- every command --------------------------------------------------------------------------------------------------
@@ -87,23 +88,23 @@ def test_python_gives_controls_the_settings_of_the_run(controls: Any, monkeypatc
     again = given_to(job.config, job.config.controls)
     texture: Any
     for texture in (job.controls[0], again[0]):
-        assert (texture.epsilon, texture.norm, texture.resolution) == (0.07, "l2", 16)
+        assert {"epsilon": 0.07, "norm": "l2", "resolution": 16}.items() <= texture.settings().items()
 
 
 def test_what_varies_by_chance_takes_all_but_the_budget(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(attacking, "_carry_out", lambda job, *_: job)
     job: Any = advsearch.attack("mug", controls=["geometry"], over=["texture:label"], **ALL)
-    assert job.controls[0].epsilon == 0.07
-    assert (job.over[0].epsilon, job.over[0].norm, job.over[0].resolution) == (None, "l2", 16)
+    assert job.controls[0].settings() == {"epsilon": 0.07}
+    assert job.over[0].settings() == {"kind": "texture", "norm": "l2", "resolution": 16}
 
 
 @pytest.mark.parametrize("asked", ["texture", "texture:label", {"label": {"kind": "texture"}}])
 def test_a_sweep_and_a_render_give_every_texture_its_resolution(asked: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     job = job_of(SweepConfig(object="mug", controls=asked, texture_resolution=16))
-    assert [one.resolution for one in job.controls if isinstance(one, TextureControl)] == [16]
+    assert [one.chosen["resolution"] for one in job.controls if isinstance(one, TextureControl)] == [16]
 
     def rendered(scene: Any, model: Any, *, controls: Any, **more: Any) -> None:
-        raise InterruptedError(controls[0].resolution)
+        raise InterruptedError(controls[0].chosen["resolution"])
 
     monkeypatch.setattr(rendering, "render", rendered)
     config = RenderConfig(object="mug", controls=asked, texture_resolution=16, out="a.png")

@@ -53,10 +53,10 @@ from advsearch.runs.results.base import plain
 from advsearch.runs.results.sweep import SweepSummary
 from advsearch.runs.store import Row
 from advsearch.runs.summary import write_answer
+from advsearch.runs.tables import read_sweep
 from advsearch.scene.formation import ImageFormation
 from advsearch.scene.gradients import GradientPlan
 from advsearch.settings import settings
-from advsearch.viewer.columns import read_columns
 
 SIZE = 16
 LABELS = ("mug", "vase")
@@ -517,15 +517,14 @@ def test_page_and_table_cut_the_declared_range_at_the_same_places(tmp_path: Path
     """Of a logarithmic parameter too, and where a part has no draw: not the range of what happened to be drawn."""
     drawn = {"camera": {"azimuth": [0, 90], "distance": [1.0, 100.0]}}
     kept = advsearch.sweep("mug", model(), controls=drawn, samples=60, sampler="random", run=tmp_path / "run")
-    columns = {one.name: one for one in read_columns(tmp_path / "run").parameters}
-    assert columns["camera.azimuth"].edges == pytest.approx((0.0, 30.0, 60.0, 90.0))
-    assert columns["camera.distance"].edges == pytest.approx((1.0, 100 ** (1 / 3), 100 ** (2 / 3), 100.0))
+    rows_of_it = read_sweep(tmp_path / "run")
+    cut = rows_of_it.attrs["edges"]
+    assert cut["camera.azimuth"] == pytest.approx((0.0, 30.0, 60.0, 90.0))
+    assert cut["camera.distance"] == pytest.approx((1.0, 100 ** (1 / 3), 100 ** (2 / 3), 100.0))
     for name in ("camera.azimuth", "camera.distance"):
         rows = [row for row in kept.summary.axes if row.axis == name]
-        edges = columns[name].edges
-        assert edges is not None
-        assert [row.value for row in rows] == list(itertools.pairwise(edges))
-        place = np.searchsorted(np.array(edges[1:-1], np.float32), columns[name].data, side="right")
+        assert [row.value for row in rows] == list(itertools.pairwise(cut[name]))
+        place = np.searchsorted(np.float32(cut[name][1:-1]), np.float32(rows_of_it[name]), side="right")
         assert [row.configurations for row in rows] == np.bincount(place, minlength=3).tolist()
 
 

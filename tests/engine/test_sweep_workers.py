@@ -7,7 +7,6 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
-from unittest import mock
 
 import pytest
 from samples import sweep as swept
@@ -20,7 +19,7 @@ from advsearch.cluster import Call, Done, Workforce
 from advsearch.config import SweepConfig
 from advsearch.engine.journal import answering
 from advsearch.engine.record import LOST
-from advsearch.engine.sweeps import loop, swept_scene
+from advsearch.engine.sweeps import swept_scene
 from advsearch.engine.sweeps.loop import Sweep
 from advsearch.engine.sweeps.swept_scene import Scenes
 from advsearch.errors import InputError
@@ -95,16 +94,10 @@ def test_any_order_any_interrupt_and_any_repetition_end_with_the_same_rows(tmp_p
     assert rows(path) == rows(tmp_path / "alone") and summary(again) == summary(alone)
 
 
-@pytest.mark.parametrize(("most", "times"), [(0, 2), (2, 2), (100, 1)])
-def test_what_comes_in_any_order_is_counted_in_order_and_again_only_where_too_much_waits(
-    most: int, times: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_comes_in_any_order_is_counted_as_in_order(tmp_path: Path) -> None:
     with RunDirectory.create(tmp_path / "alone") as run:
         alone = Sweep(job_of(CONFIG), run, NullProgress()).carry_out()
-    monkeypatch.setattr(loop, "MOST_WAITING", most)
-    with mock.patch.object(Sweep, "_counted", autospec=True, side_effect=Sweep._counted) as counted:
-        assert summary(shared(tmp_path / "shared", seed=3)) == summary(alone)
-    assert counted.call_count == times
+    assert summary(shared(tmp_path / "shared", seed=3)) == summary(alone)
 
 
 def test_a_configuration_that_kills_every_worker_is_a_row_that_says_so(tmp_path: Path) -> None:

@@ -9,22 +9,27 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+import advsearch
 from advsearch.cli.main import main
+from advsearch.engine.planning import cosine_samples, cosines
 from advsearch.engine.record import OutOfTime, Results
-from advsearch.progress import Progress
+from advsearch.errors import InputError
+from advsearch.interrupts import INTERRUPTS
+from advsearch.progress import NullProgress, Progress
 from advsearch.questions.check import answer as words
 from advsearch.questions.check import carry_out as checking
-from advsearch.questions.check.answer import CheckedRow, CheckResult
+from advsearch.questions.check.answer import CheckedRow, CheckResult, GainRow
 from advsearch.questions.check.carry_out import check_from_config
 from advsearch.questions.check.settings import CheckConfig
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.listing import finished, listed_runs
-from advsearch.runs.results.base import Result
+from advsearch.runs.results.base import PathLength, Result
 from advsearch.runs.summary import read_result
 
 FLAGS = "check --object mug --control camera.azimuth,environment.rotation --loss linear --resolution 16 --spp 1"
@@ -164,3 +169,110 @@ def test_all_goes_through_every_control_on_three_scenes() -> None:
     parts = checking.parts_of(CheckConfig(all=True))
     assert [part.number for part in parts] == list(range(1, len(parts) + 1))
     assert {part.config.object for part in parts} == {"mug", "bowl", "bottle"} and len(parts) > 80
+
+
+# ---- the plan of a search -------------------------------------------------------------------------------------------
+
+PLANNED: dict[str, Any] = {
+    **SMALL,
+    "loss": "model",
+    "estimators": {"*": "differences"},
+    "controls": {"camera.azimuth": {}, "environment.rotation": {}},
+}
+
+
+class Stop(NullProgress):
+    """A watcher that presses Ctrl-C when so many messages have come, or at the stage with a name."""
+
+    def __init__(self, messages: int = -1, stage: str = "") -> None:
+        self.left, self.at = messages, stage
+
+    def message(self, text: str) -> None:
+        self.left -= 1
+        if self.left == 0:
+            raise KeyboardInterrupt
+
+    def stage(self, name: str, total: int | None = None, *, hint: str = "", at_most: bool = False) -> None:
+        if self.at and self.at in name:
+            INTERRUPTS.count += 1
+            raise RuntimeError("what Dr.Jit makes of a KeyboardInterrupt")
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Few samples: what is measured says little, but it is measured by the same means."""
+    for function in (cosines, cosine_samples):
+        monkeypatch.setattr(checking, function.__name__, partial(function, counts=(2,)))
+    for name, value in {"FACTORS": (1.0, 3.0), "CONVERGED": 2, "AGAIN": 2}.items():
+        monkeypatch.setattr(f"advsearch.engine.planning.{name}", value)
+    monkeypatch.setattr(checking, "CONVERGED", 2)
+    monkeypatch.setattr(INTERRUPTS, "count", 0)
+    row = {"item": "tracing", "what": "tracing", "time_gain": 2.0, "seconds": 1.0, "safe": True}
+    gain = GainRow.of({**row, "picture_difference": 0.0, "gradient_difference": 0.0})
+    monkeypatch.setattr(checking, "measured_gains", lambda *_, **__: [gain])
+    length = PathLength(depth=3, full=6, cuts=[], configurations=1, reason="few")
+    monkeypatch.setattr(checking, "bounces_of", lambda *_, **__: length)
+
+
+def timeless(result: CheckResult) -> dict[str, Any]:
+    """The result without times and its place."""
+
+    def without(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {name: without(inner) for name, inner in value.items() if name not in ("seconds", "run")}
+        return [without(inner) for inner in value] if isinstance(value, list) else value
+
+    cleaned: dict[str, Any] = without(result.to_dict())
+    return cleaned
+
+
+@pytest.mark.usefixtures("quick")
+def test_a_check_that_is_stopped_anywhere_goes_on_to_the_same_plan(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    whole = check_from_config(CheckConfig(**PLANNED, run=str(tmp_path / "whole")))
+    assert whole.ending == "done" and finished(tmp_path / "whole")
+    assert whole.gains and whole.bounces is not None and whole.plan is not None and whole.plan.left_out
+    config, folder, before = CheckConfig(**PLANNED, run=str(tmp_path / "run")), tmp_path / "run", 0
+    for number, stop in enumerate((Stop(1), Stop(2), Stop(stage="saves"), Stop(stage="gradients for camera"))):
+        stopped = check_from_config(config, progress=stop, resumed=folder if number else None)
+        assert stopped.ending == "interrupted" and not finished(folder)
+        assert len(stopped.rows) > before or stopped.bounces is not None
+        assert timeless(kept(folder)) == timeless(stopped)
+        before = len(stopped.rows)
+    INTERRUPTS.count = 0
+    assert main(["resume", str(folder), "--json", "--quiet"]) in (0, 3)
+    resumed = CheckResult.of(json.loads(capsys.readouterr().out))
+    assert timeless(resumed) == timeless(whole) == timeless(kept(folder)) and finished(folder)
+    assert main(["show", str(folder)]) == 0
+    text = capsys.readouterr().out
+    assert "How a search gets its derivatives" in text and "What that saves" in text
+
+
+@pytest.mark.usefixtures("quick")
+def test_a_summary_keeps_its_rows_when_reading_them_back_is_interrupted(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    before = check_from_config(CheckConfig(**PLANNED, run=str(folder)), progress=Stop(3))
+    assert len(before.rows) == 3
+    again = check_from_config(CheckConfig(**PLANNED), progress=Stop(1), resumed=folder)
+    assert timeless(again) == timeless(before) == timeless(kept(folder))
+
+
+def test_a_run_that_goes_on_is_not_removed_when_that_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(INTERRUPTS, "count", 0)
+    folder = tmp_path / "run"
+    with RunDirectory.create_for(CheckConfig(**SMALL, run=str(folder))):
+        pass  # a kill before anything was measured
+    with pytest.raises(RuntimeError):
+        check_from_config(CheckConfig(**SMALL), progress=Stop(stage="loading"), resumed=folder)
+    assert (folder / "run.yaml").is_file()
+    with pytest.raises(InputError), RunDirectory.create_for(CheckConfig(**SMALL, run=str(tmp_path / "new"))):
+        raise InputError("")
+    assert not (tmp_path / "new").exists()
+
+
+def test_plan_says_what_took_its_place(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["plan", "--object", "mug"]) == 2
+    assert "`plan` is a part of `check` now: use advsearch check --loss model" in capsys.readouterr().err
+    with pytest.raises(AttributeError, match="part of `check` now"):
+        getattr(advsearch, "plan")  # noqa: B009

@@ -8,19 +8,20 @@ from typing import Any
 
 import imageio.v3 as iio
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 from samples import sweep
-from stored_sweeps import described, make_sweep
+from stored_sweeps import described, make_sweep, seen
 
 import advsearch
 from advsearch.cli.main import main
 from advsearch.config import SweepConfig
 from advsearch.errors import FileFormatError, InputError
-from advsearch.explanations import Answered, CountedRule, Factor, Observations, RuleCondition
 from advsearch.questions.explain import renders as explaining
 from advsearch.questions.explain.answer import ExplainResult, pairs_text
-from advsearch.questions.explain.renders import along, can_be_given, lies_inside, sweep_inside
+from advsearch.questions.explain.renders import along, can_be_given, sweep_inside
+from advsearch.rules import CountedRule, RuleCondition, covered
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import NAME, Row, Store
 from advsearch.runs.summary import read_result
@@ -100,13 +101,13 @@ def test_a_rule_is_confirmed_by_what_is_rendered_inside_it(
 ) -> None:
     asked: list[SweepConfig] = []
 
-    def rendered(self: Any, name: str, config: SweepConfig) -> list[Answered]:
+    def rendered(self: Any, name: str, config: SweepConfig) -> pd.DataFrame:
         asked.append(config)
-        own = [Answered("", {"camera.elevation": 70.0, "light.power": 1.0}, {}, "bowl", False)] * 9
-        outside = Answered("", {"camera.elevation": 10.0, "light.power": 1.0}, {}, "mug", True)
-        return [*own, outside]
+        outside = np.arange(10) == 9
+        elevation = np.where(outside, 10.0, 70.0)
+        return pd.DataFrame({"camera.elevation": elevation, "correct": outside, "unit": np.arange(10)})
 
-    monkeypatch.setattr(explaining.Renders, "_rows", rendered)
+    monkeypatch.setattr(explaining.Renders, "_rendered", rendered)
     result = advsearch.explain(swept, confirm=10, pairs=0, clusters=0, run=tmp_path / "run")
     confirmed = result.rules[0].confirmed
     assert confirmed is not None and (confirmed.right, confirmed.total) == (0, 9)  # what lies outside is not counted
@@ -118,16 +119,14 @@ def test_a_rule_is_confirmed_by_what_is_rendered_inside_it(
 def test_the_nearest_right_answer_differs_in_one_value(
     swept: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def rendered(self: Any, name: str, config: SweepConfig) -> list[Answered]:
+    def rendered(self: Any, name: str, config: SweepConfig) -> pd.DataFrame:
         high, power = config.grid["camera.elevation"], config.grid["light.power"]
         assert isinstance(high, list) and isinstance(power, list) and min(len(high), len(power)) == 1
-        return [
-            Answered("", {"camera.elevation": a, "light.power": b}, {}, "bowl" if a > HIGH else "mug", a <= HIGH)
-            for a in high
-            for b in power
-        ]
+        made = pd.DataFrame({"camera.elevation": a, "light.power": b} for a in high for b in power)
+        right = made["camera.elevation"] <= HIGH
+        return made.assign(correct=right, label=np.where(right, "mug", "bowl"))
 
-    monkeypatch.setattr(explaining.Renders, "_rows", rendered)
+    monkeypatch.setattr(explaining.Renders, "_rendered", rendered)
     result = advsearch.explain(swept, confirm=0, pairs=1, clusters=0, run=tmp_path / "run")
     (pair,) = result.pairs
     assert pair.parameter == "camera.elevation" and float(pair.wrong_at) > HIGH >= float(pair.right_at) > 50.0
@@ -142,14 +141,13 @@ def test_the_nearest_right_answer_differs_in_one_value(
 
 def test_typical_failures_take_turns_between_rules_and_those_under_none() -> None:
     """Failures at 1, 2 and 3 are under the rule, of which 2 is in the middle; one at 9 is not."""
-    values = np.array([[1.0], [2.0], [3.0], [9.0], [10.0]])
-    found = Observations((Factor("yaw"),), values, np.array([False, False, False, False, True]))
-    under = found.values[:, 0] <= 5.0
-    rule = CountedRule((RuleCondition(0, high=5.0),), found.where(under), found.where(~under))
-    order = explaining.typical_failures(found, [rule], 12)
+    table = seen({"yaw": [1.0, 2.0, 3.0, 9.0, 10.0]}, np.array([False, False, False, False, True]))
+    under = table["yaw"] <= 5.0
+    rule = CountedRule((RuleCondition("yaw", high=5.0),), table[under], table[~under])
+    order = explaining.typical_failures(table, [rule], 12)
     assert [index for index, _ in order[:2]] == [1, 3] and {index for index, _ in order[2:]} == {0, 2}
     assert order[0][1] == rule.conditions and order[1][1] == ()
-    assert explaining.typical_failures(found, [], 2)[0][1] == () and len(explaining.typical_failures(found, [], 2)) == 2
+    assert explaining.typical_failures(table, [], 2)[0][1] == () and len(explaining.typical_failures(table, [], 2)) == 2
 
 
 def test_what_cannot_be_explained_is_refused_in_words(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -167,9 +165,12 @@ def test_what_cannot_be_explained_is_refused_in_words(tmp_path: Path, capsys: py
         advsearch.explain(tmp_path / "run")
 
 
-FOUND = Observations(
-    (Factor("pose.yaw", "degrees"), Factor("environment", "", ("noon", "studio")), Factor("light.power", "1")),
-    np.array([[yaw, lit, power] for yaw in (0.0, 90.0, 180.0) for lit in (0, 1) for power in (0.5, 1.5)]),
+TABLE = seen(
+    {
+        "pose.yaw": np.repeat([0.0, 90.0, 180.0], 4),
+        "environment": ["noon", "noon", "studio", "studio"] * 3,
+        "light.power": np.tile([0.5, 1.5], 6),
+    },
     np.ones(12, dtype=bool),
 )
 
@@ -198,15 +199,15 @@ def test_a_sweep_inside_conditions_keeps_what_they_leave() -> None:
         object="mug", environment="studio,noon", grid={"pose.yaw": [0.0, 90.0, 180.0]}, controls={"light": {}}
     )
     conditions = (
-        RuleCondition(0, low=45.0),
-        RuleCondition(1, options=frozenset({1})),
-        RuleCondition(2, high=1.0),
+        RuleCondition("pose.yaw", low=45.0),
+        RuleCondition("environment", options=frozenset({"studio"})),
+        RuleCondition("light.power", high=1.0),
     )
-    made = sweep_inside(config, FOUND, conditions, 20, 7)
+    made = sweep_inside(config, TABLE, conditions, 20, 7)
     assert made.grid == {"pose.yaw": [90.0, 180.0]} and made.environment == "studio" and made.samples == 10
     assert made.controls == {"light": {"power": [0.5, 1.0]}} and made.seed == 7 and made.spp == config.spp
-    assert lies_inside(conditions, FOUND.factors, {"pose.yaw": 90.0, "environment": "studio", "light.power": 0.7})
-    assert not lies_inside(conditions, FOUND.factors, {"pose.yaw": 90.0, "environment": "noon", "light.power": 0.7})
+    fresh = pd.DataFrame({"pose.yaw": 90.0, "environment": ["studio", "noon"], "light.power": 0.7})
+    assert covered(conditions, fresh).tolist() == [True, False]
 
 
 def test_a_sweep_along_a_factor_keeps_the_rest() -> None:
@@ -216,11 +217,11 @@ def test_a_sweep_along_a_factor_keeps_the_rest() -> None:
     row: dict[str, float | str] = {
         "object": "bowl", "environment": "noon", "model": "reference", "pose.yaw": 90.0, "light.power": 0.5,
     }  # fmt: skip
-    made = along(config, row, FOUND.factors[0], FOUND, 3)
+    made = along(config, row, "pose.yaw", TABLE, 3)
     assert made.object == "bowl" and made.environment == "noon" and made.controls == {} and made.keep_pictures == "all"
     assert made.grid["pose.yaw"][0] == 90.0 and len(made.grid["pose.yaw"]) == 9  # type: ignore[index, arg-type]
     assert made.grid["light.power"] == [0.5] and made.plain()["set"] == {} and made.workers is None
-    lit = along(config, row, FOUND.factors[1], FOUND, 3)
+    lit = along(config, row, "environment", TABLE, 3)
     assert lit.environment == "noon,studio" and lit.grid["pose.yaw"] == [90.0]
 
 
@@ -229,15 +230,16 @@ def test_numbers_that_follow_from_others_and_axes_are_not_asked_for_again() -> N
     row: dict[str, float | str] = {
         "object": "mug", "environment": "noon", "model": "reference", "path.time": 1.0, "path.distance": 4.0,
     }  # fmt: skip
-    factors = Factor("path.time", "s"), Factor("path.distance", "object sizes"), Factor("camera.fov", "degrees")
-    found = Observations(factors, np.array([[0.0, 5.0, 30.0], [1.0, 4.0, 40.0]]), np.array([False, True]))
+    values = {"path.time": [0.0, 1.0], "path.distance": [5.0, 4.0], "camera.fov": [30.0, 40.0]}
+    table = seen(values, np.array([False, True]))
     drive = SweepConfig(object="mug", path="approach", fps=1.0, controls={"path": {"reach": 8.0}})
-    made = along(drive, row, factors[0], found, 3)
+    made = along(drive, row, "path.time", table, 3)
     assert list(made.grid) == ["path.time"] and not can_be_given(drive, "path.distance")
-    conditions = tuple(RuleCondition(place, low=0.0) for place in range(3))
-    assert sweep_inside(drive, found, conditions, 20, 7).controls == {"path": {"reach": 8.0}}
+    assert made.controls == {"path": {"reach": 8.0}}, "as far as the drive went"
+    conditions = tuple(RuleCondition(name, low=0.0) for name in values)
+    assert sweep_inside(drive, table, conditions, 20, 7).controls == {"path": {"reach": 8.0}}
     beside = SweepConfig(object="mug", grid={"camera.fov": [30.0, 40.0]}, controls={"camera": {"roll": [-5, 5]}})
-    inside = sweep_inside(beside, found, (RuleCondition(2, low=35.0),), 20, 7)
+    inside = sweep_inside(beside, table, (RuleCondition("camera.fov", low=35.0),), 20, 7)
     assert inside.controls == {"camera": {"roll": [-5, 5]}} and inside.grid == {"camera.fov": [40.0]}
 
 

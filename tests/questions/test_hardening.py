@@ -20,7 +20,7 @@ from torch import Tensor, nn
 
 from advsearch import threads
 from advsearch.attacks import Block, Domain
-from advsearch.bundled.light import white_light_changed
+from advsearch.bundled.changed_light import white_light_changed
 from advsearch.config import AttackConfig
 from advsearch.engine.attack_parts import problem_of
 from advsearch.engine.loading import load_scene

@@ -25,7 +25,7 @@ from advsearch.questions.recipe.description import Recipe, planned, read_recipe,
 from advsearch.questions.recipe.figures import FIGURES, check_figures, files_of, make, read_options
 from advsearch.questions.recipe.given import CuesOptions, fitting, predicted
 from advsearch.questions.recipe.settings import RecipeConfig
-from advsearch.questions.recipe.table import Count, MadeFigure, Table
+from advsearch.questions.recipe.table import MadeFigure, Table, Tally
 from advsearch.questions.recipe.ternary import all_triangles, triangle_of
 from advsearch.runs.images import write_png
 from advsearch.runs.results.attack import AnswerDistribution, FoundValue
@@ -270,10 +270,10 @@ def test_every_bundled_recipe_takes_a_detector_or_says_why_not(name: str) -> Non
     runs = planned(described, config)
     assert runs and all(one.config.task == {"name": "detection", "overlap": 0.4} for one in runs)
     if name != "texture-shape":
-        carrying_out.check(described, config)
+        carrying_out.check_described(described, config)
         return
     with pytest.raises(InputError, match="task: texture-shape asks whether answers are classes of the texture"):
-        carrying_out.check(described, config)
+        carrying_out.check_described(described, config)
 
 
 def test_the_recipe_for_viewpoints_searches_predicted_pictures_and_counts_rendered_ones() -> None:
@@ -353,6 +353,24 @@ def test_a_recipe_is_carried_out_and_goes_on_where_it_was_stopped(
     assert json.loads(capsys.readouterr().out)["figures"][1]["columns"][0] == "environment"
 
 
+def test_frames_of_a_drive_count_as_one_draw(tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text("""
+title: Is the mug seen on the way?
+settings: {object: mug, resolution: 16, spp: 1}
+parts:
+  drives:
+    command: sweep
+    settings: {path: approach, fps: 1, controls: {light: {}}, samples: 3, sampler: random, trials: 0}
+figures: [{figure: rates, by: object}]
+""")
+    result = advsearch.recipe(path, run=tmp_path / "run")
+    ((name, right, of, _, low, high),) = result.figures[0].rows
+    assert name == "mug" and of > 3 and of % 3 == 0
+    alone = clopper_pearson(int(right), int(of))
+    assert high - low > alone[1] - alone[0]
+
+
 def test_photographs_come_from_a_folder_and_their_figure_is_made_anew(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -416,7 +434,7 @@ def test_what_is_drawn_has_the_mean_and_the_deviation_that_a_search_answers_with
 
 def test_intervals_are_over_drives_where_frames_of_one_share_a_draw() -> None:
     frames = [replace(row, unit=f"drive {n // 10}") for n, row in enumerate(rows({"noon": (40, 100)}))]
-    alone, together = (Count.over("noon", tabled(some).rows) for some in (rows({"noon": (40, 100)}), frames))
+    alone, together = (Tally.over("noon", tabled(some).rows) for some in (rows({"noon": (40, 100)}), frames))
     own, others = alone.interval(), together.interval()
     assert own is not None and others is not None and alone.cells[:3] == together.cells[:3] == [40, 100, 0.4]
     assert own == clopper_pearson(40, 100) and others[0] < own[0] and others[1] > own[1]

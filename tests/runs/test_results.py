@@ -11,9 +11,8 @@ from typing import ClassVar
 from pydantic import Field, computed_field
 from samples import attack
 
-from advsearch.cli.output import shown_text as plan_text
+from advsearch.cli.output import shown_text as check_text
 from advsearch.questions.attack.page import page as attack_page
-from advsearch.questions.plan.answer import DenoiserAdvice, EstimatorLimit, PlanResult
 from advsearch.report.shown import facts_of, fields_shown
 from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.results.base import Fields, Interval, JsonFloat, Result, as_fact
@@ -63,9 +62,9 @@ def test_a_field_that_is_declared_as_a_fact_is_in_terminal_page_and_json(tmp_pat
     assert AttackSummary.of(new.to_dict()) == attack()
     page = attack_page(tmp_path, new)
     for name, text in (("picture bytes", "768"), ("renders a second", "6.92")):
-        assert re.search(rf"^  {name} +{text}$", plan_text(new), re.M)
+        assert re.search(rf"^  {name} +{text}$", check_text(new), re.M)
         assert re.search(rf"<th[^>]*>{name.capitalize()}</th><td[^>]*>{text}</td>", str(page))
-    assert "picture bytes" not in plan_text(old)
+    assert "picture bytes" not in check_text(old)
 
 
 def test_a_fact_is_shown_of_a_question_without_words_too() -> None:
@@ -74,25 +73,3 @@ def test_a_fact_is_shown_of_a_question_without_words_too() -> None:
         done: int = Field(description="how many", json_schema_extra=as_fact("{} of 9"))
 
     assert facts_of(Counted(done=3), fields_shown(Counted(done=3))) == {"done": "3 of 9"}
-
-
-def test_limits_of_a_plan_are_sentences() -> None:
-    advice = DenoiserAdvice(asked="oidn", advised="oidn", reason="")
-    limit = EstimatorLimit(what="a mirror's reflections stay", measured="as far as that")
-    formation = {"denoiser": "oidn", "filter": "box", "sampler": "independent", "exposure": 0.0, "gain": 1.0}
-    plan = PlanResult.of(
-        {
-            **{name: [] for name in ("controls", "not_measured", "groups", "cosines", "left_out")},
-            **{name: "" for name in ("object", "environment", "model", "ending", "command_line")},
-            "run": "runs/mug-plan-001",
-            "seconds": {"total": 1.0},
-            "seed": 0,
-            "image_formation": {**formation, "resolution": [8, 8]},
-            "renders_per_gradient": 0,
-            "spp": 1,
-            "denoise": advice,
-            "specialised": False,
-            "limits": [limit],
-        }
-    )
-    assert "Limits of the material form\na mirror's reflections stay\n" in plan_text(plan)

@@ -35,6 +35,7 @@ def test_a_dictionary_written_and_read_is_the_same(tmp_path: Path) -> None:
     }
     write_xml(tmp_path / "two.xml", scene, {}, "a -- note")
     read = read_scene(tmp_path / "two.xml")
+    assert [shape.id() for shape in mi.load_file(str(tmp_path / "two.xml")).shapes()] == ["ball"]
     assert read["lamp"] == scene["lamp"]
     ball = read["ball"]
     np.testing.assert_array_equal(ball.pop("to_world"), np.array(mi.ScalarTransform4f(matrix).matrix))

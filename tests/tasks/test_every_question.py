@@ -76,7 +76,7 @@ parts:
     command: sweep
     settings: {controls: {camera: {azimuth: [0, 90]}}, samples: 2, sampler: random, trials: 0}
 figures:
-  - {figure: bars, by: environment}
+  - {figure: rates, by: environment}
 """
 
 
@@ -85,7 +85,8 @@ def test_a_recipe_is_carried_out(asked: list[str], capsys: pytest.CaptureFixture
     (tmp_path / "mine.yaml").write_text(RECIPE)
     found = answer(capsys, "recipe", str(tmp_path / "mine.yaml"), "--run", str(tmp_path / "run"), *asked)
     (bars,) = found["figures"]
-    assert [one["configurations"] for one in bars["bars"]] == [2, 2] and sum(one["correct"] for one in bars["bars"]) > 0
+    assert bars["columns"][1:3] == ["right", "of"]
+    assert [row[2] for row in bars["rows"]] == [2, 2] and sum(row[1] for row in bars["rows"]) > 0
     (part,) = (tmp_path / "run" / "parts").iterdir()
     assert json.loads((part / "summary.json").read_text())["task"] == task_of(asked)
 

@@ -258,7 +258,7 @@ def test_python_takes_a_task_with_options_of_its_own(tolerance: float, right: in
         advsearch.attack("mug", network, **fast)
 
 
-@pytest.mark.parametrize("command", ["precision", "check", "plan", "attack"])
+@pytest.mark.parametrize("command", ["precision", "check", "attack"])
 def test_every_command_maximises_what_is_the_tasks_own(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
     network = load_model(Level(), input_size=8, read=Yaw().reader)
     monkeypatch.setattr("advsearch.engine.attack_parts.make_task", lambda name: Yaw())

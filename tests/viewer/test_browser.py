@@ -604,7 +604,7 @@ def test_a_photograph_is_aligned_taken_and_counted(browser: Browser, tmp_path: P
             page.get_by_role("button", name="Next").click()
             until(page, lambda: status.inner_text() == "Rendering 2, 2 of 2.")
             page.get_by_role("button", name="Take a photograph").click()
-            until(page, lambda: page.locator("table.agreement").count())
+            until(page, lambda: page.locator(".agreement table").count())
             assert "of 1 photograph:" in page.locator("#agreement").inner_text()
             (photo,) = (run / "images/photos").iterdir()
             assert photo.name == "2-0000.jpg"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,8 @@ from stored_sweeps import make_sweep
 
 from advsearch.described import Value
 from advsearch.runs.store import NAME, Row, Store
-from advsearch.viewer.columns import NO_PROBABILITY, UNKNOWN, Columns, columns_of, read_columns
+from advsearch.runs.tables import sweep_frame
+from advsearch.viewer.columns import NO_PROBABILITY, UNKNOWN, packed, read_columns
 from advsearch.viewer.thumbnails import kept_pictures, path_of
 
 
@@ -24,9 +26,9 @@ def row(step: int, **values: Any) -> Row:
     return Row("sweep", step, correct=right, margin=step - 1.5, label=label, probability=0.25, values=named)
 
 
-def unpacked(columns: Columns) -> tuple[dict[str, Any], dict[str, Any]]:
+def unpacked(rows: Iterable[Row]) -> tuple[dict[str, Any], dict[str, Any]]:
     """Head and columns as a reader of the bytes finds them."""
-    data = columns.packed()
+    data = packed(sweep_frame(rows))
     size = int.from_bytes(data[:4], "little")
     head = json.loads(data[4 : 4 + size])
     kinds = {one["name"]: (np.dtype(one["type"]), one["at"]) for one in head["columns"]}
@@ -40,7 +42,7 @@ def test_a_page_embeds_the_pictures_of_the_worst_margins(tmp_path: Path) -> None
     run = make_sweep(tmp_path / "run", keep="all")
     kept, columns = kept_pictures(run), read_columns(run)
     assert kept is not None
-    wrong = [step for step, right in zip(columns.step.tolist(), columns.right.tolist(), strict=True) if not right]
+    wrong = [step for step, right in zip(columns["step"], columns["correct"], strict=True) if not right]
     first = [number for number, _ in kept.embedded(columns, most=1 << 20)][: len(wrong)]
     assert first == [str(step) for step in sorted(wrong, reverse=True)]  # the margin of a wrong one grows with its step
     size = len(path_of(run, max(wrong)).read_bytes()) * 4 // 3
@@ -48,7 +50,7 @@ def test_a_page_embeds_the_pictures_of_the_worst_margins(tmp_path: Path) -> None
 
 
 def test_what_is_packed_is_what_the_rows_are() -> None:
-    head, columns = unpacked(columns_of([row(k, yaw=10.0 * k, environment="ab"[k % 2]) for k in range(5)], Path()))
+    head, columns = unpacked(row(k, yaw=10.0 * k, environment="ab"[k % 2]) for k in range(5))
     assert head["count"] == 5
     assert list(columns["step"]) == [0, 1, 2, 3, 4]
     assert list(columns["right"]) == [1, 0, 1, 0, 1]
@@ -62,14 +64,14 @@ def test_what_is_packed_is_what_the_rows_are() -> None:
 
 
 def test_columns_begin_at_multiples_of_their_size() -> None:
-    head, _ = unpacked(columns_of([row(k, name="x" * k, yaw=1.0) for k in range(3)], Path()))
+    head, _ = unpacked(row(k, name="x" * k, yaw=1.0) for k in range(3))
     for one in head["columns"]:
         assert one["at"] % np.dtype(one["type"]).itemsize == 0
 
 
 def test_what_a_row_lacks_is_said() -> None:
     bare = Row("sweep", 7, values={})
-    head, columns = unpacked(columns_of([row(0, yaw=1.0, name="n"), bare, row(2, yaw=3.0, late=5.0)], Path()))
+    head, columns = unpacked([row(0, yaw=1.0, name="n"), bare, row(2, yaw=3.0, late=5.0)])
     assert columns["right"][1] == UNKNOWN
     assert columns["probability"][1] == NO_PROBABILITY
     assert math.isnan(columns["margin"][1])
@@ -79,7 +81,7 @@ def test_what_a_row_lacks_is_said() -> None:
 
 
 def test_numbers_among_names_become_names() -> None:
-    head, columns = unpacked(columns_of([row(0, mixed=1.5), row(1, mixed="inside")], Path()))
+    head, columns = unpacked([row(0, mixed=1.5), row(1, mixed="inside")])
     assert [head["parameters"][0]["levels"][k] for k in columns["parameter 0"]] == ["1.5", "inside"]
 
 
@@ -88,6 +90,6 @@ def test_rows_are_read_in_parts(tmp_path: Path) -> None:
         store.append([row(k, yaw=float(k)) for k in range(10)])
         store.append([Row("verification", 0)])
     first = read_columns(tmp_path, most=4)
-    assert (first.step.tolist(), first.last) == ([0, 1, 2, 3], 4)
-    assert read_columns(tmp_path, after=first.last).step.tolist() == [4, 5, 6, 7, 8, 9]
-    assert read_columns(tmp_path, after=10).step.tolist() == []
+    assert (first["step"].tolist(), first["id"].iloc[-1]) == ([0, 1, 2, 3], 4)
+    assert read_columns(tmp_path, after=4)["step"].tolist() == [4, 5, 6, 7, 8, 9]
+    assert read_columns(tmp_path, after=10)["step"].tolist() == []

@@ -96,7 +96,8 @@ def _read_axis(name: str, given: Any, instances: Mapping[str, Control]) -> Axis:
     if parameter_name not in known:
         raise UnknownNameError(f"parameter of control {control.kind}", parameter_name, known, f"In `grid` {name}.")
     parameter = control.declared({parameter_name: given})[known.index(parameter_name)]
-    if not issubclass(control, NumberControl) or parameter.shape != ():
+    pictures = any(len(one.shape) > 1 for one in control.parameters)
+    if pictures or not issubclass(control, NumberControl) or parameter.shape != ():
         raise InputError(
             f"`grid` {name}: expected a parameter that is one number or name, got one that is many numbers; draw it "
             f"by chance with `controls` {instance} `samples=100`"
@@ -218,8 +219,9 @@ def _ranges(control: NumberControl, scene: SceneDescription) -> dict[str, object
     given = {name: value for name, value in control.settings().items() if name not in ("kind", "name")}
     if control.asked:
         return given
+    there = control.within(scene)
     for parameter in control.parameters:
-        reach = control.search_range(scene, parameter)
+        reach = there.search_range(parameter)
         if parameter.name not in control.specs and reach is not None:
             given[parameter.name] = {"choices": list(parameter.options)} if parameter.options else list(reach)
     return given

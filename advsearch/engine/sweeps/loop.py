@@ -10,6 +10,9 @@ import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 
+import numpy as np
+import numpy.typing as npt
+
 from advsearch.attacks import Evaluation, Query
 from advsearch.attacks.draws import batches
 from advsearch.attacks.units import most_shown
@@ -20,9 +23,16 @@ from advsearch.engine.loading import framed
 from advsearch.engine.record import LOST, Stages, judgement_of, lost_remarks
 from advsearch.engine.sweeps import KIND, Job, check_all
 from advsearch.engine.sweeps.drives import Drives, time_axis
-from advsearch.engine.sweeps.points import Picks
 from advsearch.engine.sweeps.predicting import combined
-from advsearch.engine.sweeps.summary import FINISHED, INTERRUPTED, SweepResult, Tally
+from advsearch.engine.sweeps.summary import (
+    FINISHED,
+    INTERRUPTED,
+    Answers,
+    SweepResult,
+    SweptAxis,
+    counted_by_unit,
+    map_over,
+)
 from advsearch.engine.sweeps.surface import map_surface
 from advsearch.engine.sweeps.swept_scene import Scenes, check_worst
 from advsearch.interrupts import interruptible
@@ -37,10 +47,10 @@ from advsearch.runs.results.attack import DescribedValue, LinearTransport, Share
 from advsearch.runs.results.base import Formation
 from advsearch.runs.results.sweep import WorstConfiguration, WorstVerified
 from advsearch.runs.store import Row
+from advsearch.runs.tables import EDGES
 from advsearch.runs.units import NOTE
 from advsearch.tasks import Judgement
 from advsearch.viewer import thumbnails
-from advsearch.viewer.columns import EDGES
 from advsearch.viewer.sweep_page import write_sweep_page
 
 NOT_FINITE = "pictures not finite"
@@ -54,14 +64,11 @@ ENOUGH_DRIVES = 20
 
 TELL_SECONDS = 0.1
 
-MOST_WAITING = 10_000
-"""Batches that wait for an earlier one to be counted; where there are more, all rows are counted again at the end."""
-
 MOST_METERED = 256
 """Scenes whose gains a summary lists; of more it has none."""
 
-READ_AT_ONCE = 256
-"""Pictures whose places are worked out at once when rows are read back."""
+DRAWN_AT_ONCE = 4096
+"""Pictures whose draws are worked out at once for the tables."""
 
 
 class Sweep:
@@ -91,25 +98,10 @@ class Sweep:
         self._told, self._untold, self._begun = 0.0, 0, 0.0
         self._surface: results.SurfaceMap | None = None
         self._drives: list[results.DriveRates] | None = None
-        objects, environments = (
-            list(dict.fromkeys(getattr(place, name) for place in job.places)) for name in ("object", "environment")
-        )
-        answers = list(dict.fromkeys(place.answer for place in job.places))
-        self._outer = [
-            ("object", objects),
-            ("environment", environments),
-            ("answer", answers),
-            ("model", [one.name for one in job.models]),
-        ]
-        self._places = [
-            (objects.index(one.object), environments.index(one.environment), answers.index(one.answer))
-            for one in job.places
-        ]
-        self._pairs = self.total // 2 if len(answers) > 1 else 0
 
     def carry_out(self, first: int | None = None) -> SweepResult:
         """Do what is left, or all from the configuration with a number on, and return the answer."""
-        tally = self._counted()
+        answers = self._counted()
         ending, worst = FINISHED, None
         self._check_answers()
         for text in self.job.warnings:
@@ -124,8 +116,8 @@ class Sweep:
                     hint += f"; pictures that are kept take {self._pictures_text()}"
                 self.stages.begin("sweep", "rendering and classifying", self.total, hint=hint)
                 self.stages.progress.advance(self.total - sum(map(len, left)))
-                tally = self._go_through(left, tally)
-                worst = self._claimed(tally)
+                self._go_through(left, answers)
+                worst = self._claimed(answers)
                 if worst is not None:
                     worst = worst.model_copy(update=self._verified(worst))
                 if self.job.config.surface and self.run is not None:
@@ -135,34 +127,27 @@ class Sweep:
                 self._drives = self._driven()
         except KeyboardInterrupt:
             ending = INTERRUPTED
-            tally = self._counted()
-            worst = self._claimed(tally)
+            answers = self._counted()
+            worst = self._claimed(answers)
         self.stages.end()
-        return self._finish(tally, ending, worst)
+        return self._finish(answers, ending, worst)
 
     # ---- the loop ---------------------------------------------------------------------------------------------------
 
     def _left(self) -> list[range]:
         return [range(self.total)] if self.run is None else list(self.run.store.missing(KIND, self.total))
 
-    def _go_through(self, left: Sequence[range], tally: Tally) -> Tally:
-        """Have what is left carried out, store and count it; return the counts."""
-        waiting: dict[int, list[Judgement]] = {}  # it is counted in order: sums and the first of equals depend on that
-        expected = left[0].start if left else 0
+    def _go_through(self, left: Sequence[range], answers: Answers) -> None:
+        """Have what is left carried out, store and count it."""
         self._begun = time.monotonic()
-        in_order = not left or (len(left) == 1 and left[0].stop == self.total)
         for done in self._executor.results(self._asked(left)):
             queries = [query for _, _, query in done.items]
-            answers = [lost(one, done.lost) for one in queries] if done.lost else done.value
-            self._take(queries, answers, done.worker, done.machine)
-            waiting[queries[0].number] = [one.said for one in answers]
-            in_order = in_order and len(waiting) <= MOST_WAITING
-            while waiting and (expected in waiting or not in_order):
-                first = expected if in_order else next(iter(waiting))
-                expected = self._count_all(tally, first, waiting.pop(first))
-            self._tell(len(queries), tally)
+            said = [lost(one, done.lost) for one in queries] if done.lost else done.value
+            self._take(queries, said, done.worker, done.machine)
+            for query, one in zip(queries, said, strict=True):
+                answers.add(query.number, one.said)
+            self._tell(len(queries), answers)
         self.journal.rows.sort(key=lambda row: row.step)
-        return tally if in_order else self._counted()
 
     def _asked(self, left: Sequence[range]) -> Iterator[list[Sent]]:
         """Yield what is asked in batches, each about one scene."""
@@ -218,13 +203,13 @@ class Sweep:
         if not same([row.margin], [now]) and same([now], [look()]):
             raise other_answers(self.run, {"margin": (row.margin, now)})
 
-    def _tell(self, count: int, tally: Tally) -> None:
+    def _tell(self, count: int, answers: Answers) -> None:
         self._untold += count
         now = time.monotonic()
         if now - self._told >= TELL_SECONDS:
             facts, told = self._executor.facts, dict[str, float | str]()
-            if tally.seen:
-                told["accuracy"] = tally.correct / tally.seen
+            if seen := int(answers.seen.sum()):
+                told["accuracy"] = int(answers.right.sum()) / seen
             if facts is not None:
                 told |= {**facts.told, "a second": self._rendered / max(1e-9, now - self._begun)}
             self.stages.progress.advance(self._untold, **told)
@@ -232,22 +217,14 @@ class Sweep:
 
     # ---- counting ---------------------------------------------------------------------------------------------------
 
-    def _counted(self) -> Tally:
-        """Counts of the rows that are stored already, read one after the other."""
-        tally = Tally(self._outer, self.job.axes, self._shown, self._pairs, self.units)
+    def _counted(self) -> Answers:
+        """What the rows say that are stored already, read one after the other."""
+        answers = Answers(self.total)
         self._traced = self._predicted = self._lost = 0
-        key, picks = (-1, -1), self.points.picks(0, 0)
         for row in self.rows():
-            number, model = divmod(row.step, self.models)
-            scene, local = divmod(number, self.per_scene)
-            block, place = divmod(local, READ_AT_ONCE)
-            if key != (scene, block):
-                key, begin = (scene, block), block * READ_AT_ONCE
-                size = min(READ_AT_ONCE, self.per_scene - begin)
-                picks = self.points.picks(begin, size, scene * self.per_scene)
-            self._count(tally, scene, picks, place, model, judgement_of(row))
+            answers.add(row.step, judgement_of(row))
             self._spend([row])
-        return tally
+        return answers
 
     def rows(self) -> Iterable[Row]:
         return self.journal.rows if self.run is None else self.run.store.rows(KIND)
@@ -260,26 +237,37 @@ class Sweep:
             self._predicted += row.seed is None and first
             self._lost += row.label == LOST
 
-    def _count_all(self, tally: Tally, first: int, said: Sequence[Judgement]) -> int:
-        """Count neighbouring rows from a number on; return the number after them."""
-        scene, local = divmod(first // self.models, self.per_scene)
-        pictures = (first + len(said) - 1) // self.models - first // self.models + 1
-        picks = self.points.picks(local, pictures, scene * self.per_scene)
-        for number, judgement in enumerate(said, first):
-            picture, model = divmod(number, self.models)
-            self._count(tally, scene, picks, picture - first // self.models, model, judgement)
-        return first + len(said)
-
-    def _count(self, tally: Tally, scene: int, picks: Picks, k: int, model: int, trial: Judgement) -> None:
-        tally.add((picks.number + k) * self.models + model, (*self._places[scene], model), picks, k, trial)
+    def _axes(self, numbers: npt.NDArray[np.int64]) -> list[SweptAxis]:
+        """What the tables are by, with the places of configurations by their numbers (n,)."""
+        job, (pictures, model) = self.job, np.divmod(numbers, self.models)
+        scene, local = np.divmod(pictures, self.per_scene)
+        axes = []
+        for what in ("object", "environment", "answer"):
+            names = [getattr(place, what) for place in job.places]
+            several = list(dict.fromkeys(names))
+            axes.append(SweptAxis(what, "", several, np.array([several.index(name) for name in names])[scene]))
+        axes.append(SweptAxis("model", "", [one.name for one in job.models], model))
+        digits = np.unravel_index(local // job.samples, self.points.grid.sizes) if job.axes else ()
+        of_the_grid = zip(job.axes, digits, strict=True)
+        axes += [SweptAxis(one.name, one.unit, one.values, at, "grid") for one, at in of_the_grid]
+        if self._shown and len(numbers):
+            until = int(pictures[-1]) + 1
+            scenes = (range(first, first + self.per_scene) for first in range(0, until, self.per_scene))
+            blocks = [one[k : k + DRAWN_AT_ONCE] for one in scenes for k in range(0, len(one), DRAWN_AT_ONCE)]
+            drawn = [self.points.parts_of(one.start, len(one)) for one in blocks if one.start < until]
+            parts = zip(self._shown, np.concatenate(drawn)[pictures].T, strict=True)
+            axes += [SweptAxis(one.name, one.unit, one.parts, at, "drawn") for one, at in parts]
+        return [one for one in axes if len(one.values) > 1]
 
     # ---- the worst configuration ------------------------------------------------------------------------------------
 
-    def _claimed(self, tally: Tally) -> WorstConfiguration | None:
+    def _claimed(self, answers: Answers) -> WorstConfiguration | None:
         """What the sweep saw at its worst."""
-        if tally.worst is None:
+        index = answers.worst
+        if index is None:
             return None
-        index, seen = tally.worst
+        rows = self.journal.rows if self.run is None else [self.run.store.row(KIND, index)]
+        row = next(one for one in rows if one is not None and one.step == index)
         query, model = self._query(index)
         task, scene = self.job.tasks[model], index // self.models // self.per_scene
         if task.varies:
@@ -291,7 +279,7 @@ class Sweep:
             values={name: DescribedValue.of(value) for name, value in query.values.items()},
             seed=query.seed,
             label_set=list(task.truth_names(truth)),
-            claimed=_claim_of(seen),
+            claimed=_claim_of(judgement_of(row)),
             verified=None,
         )
 
@@ -324,7 +312,7 @@ class Sweep:
 
     # ---- the answer -------------------------------------------------------------------------------------------------
 
-    def _finish(self, tally: Tally, ending: str, worst: WorstConfiguration | None) -> SweepResult:
+    def _finish(self, answers: Answers, ending: str, worst: WorstConfiguration | None) -> SweepResult:
         job, seconds = self.job, self.stages.seconds
         view, checked = self._scenes.scene, worst.verified if worst else None
         predicting = self._transport.values() or [[one.summary() for one in (view.predicted.values() if view else ())]]
@@ -332,6 +320,8 @@ class Sweep:
         formation = Formation.of(next(iter(view.renderers.values())).formation) if view else None
         gains = self._gains() if formation else {}
         models, answer = [model.name for model in job.models], job.places[-1].answer
+        numbers = np.flatnonzero(answers.seen)
+        right, units, axes = answers.right[numbers], self.units.of(numbers), self._axes(numbers)
         if formation is not None and len(set(gains.values())) != 1:
             formation = formation.model_copy(update={"gain": None})
         summary = results.SweepSummary(
@@ -346,13 +336,13 @@ class Sweep:
             gains=gains if len(gains) > 1 else None,
             drawn={one.name: one.varied for one in self._shown},
             planned=self.total,
-            **vars(tally.whole.rate()),
-            units=tally.whole.units,
-            not_finite=tally.not_finite,
-            answers=tally.frequent(),
-            axes=tally.table(),
-            cells=tally.map(),
-            beside=results.BesideAnswer(answer=answer, pairs=tally.beside(models)) if self._pairs else None,
+            **vars(counted_by_unit(right, units)),
+            units=len(np.unique(units)) if self.units.size > 1 and len(units) else None,
+            not_finite=answers.not_finite,
+            answers=answers.frequent,
+            axes=[row for axis in axes for row in axis.rows(right, units)],
+            cells=map_over(axes, right, answers.margin[numbers]),
+            beside=results.BesideAnswer(answer=answer, pairs=answers.beside(models, self.units)) if answer else None,
             worst=worst,
             grid={axis.name: len(axis.values) for axis in job.axes},
             samples=job.samples,
@@ -370,7 +360,7 @@ class Sweep:
             renders_per_second=self._rendered / swept if self._rendered and swept else None,
             seconds={**seconds, "total": self.stages.total},
             seed=job.config.seed,
-            warnings=[*job.warnings, *self._remarks(tally, checked)],
+            warnings=[*job.warnings, *self._remarks(answers, checked)],
             command_line=job.config.command_line(),
         )
         if self.run is not None:
@@ -390,7 +380,7 @@ class Sweep:
             for place in self.job.places
         }
 
-    def _remarks(self, tally: Tally, checked: WorstVerified | None) -> list[str]:
+    def _remarks(self, answers: Answers, checked: WorstVerified | None) -> list[str]:
         remarks = lost_remarks(self._lost)
         remarks += self.journal.machines.remarks
         few = min((one.drives for one in self._drives or ()), default=ENOUGH_DRIVES)
@@ -399,8 +389,8 @@ class Sweep:
                 f"{count(few, 'drive')} can show little: were the model right in all their frames, the interval of "
                 f"that share would begin at {100 * most_shown(few):.0f} %."
             )
-        if tally.not_finite:
-            remarks.append(f"{tally.not_finite} answers of the model are not numbers; they count as not right.")
+        if answers.not_finite:
+            remarks.append(f"{answers.not_finite} answers of the model are not numbers; they count as not right.")
         if self._not_finite:
             remarks.append("Some values of pictures were not finite and were set to 0.")
         if checked and not checked.converged:

@@ -17,9 +17,8 @@ from torch import Tensor
 
 from advsearch.attacks import Block, Domain
 from advsearch.attacks.draws import Draws, Product
-from advsearch.controls import NumberControl, Parameter, Space
-from advsearch.controls.base import BoundControl, Value
-from advsearch.controls.numbers import BoundNumbers
+from advsearch.controls import Control, NumberControl, Parameter, Space
+from advsearch.controls.base import Value
 from advsearch.controls.ranges import Range
 from advsearch.controls.values import Fixed, OneOf, to_value
 from advsearch.engine.sweeps.axes import Axis
@@ -47,13 +46,11 @@ Tell = Callable[[Tensor, "Picks"], list[Mapping[str, Value]]]
 @dataclass(frozen=True, eq=False)
 class Picks:
     """Neighbouring pictures of a scene: the number of the first in the whole sweep; of each, its place on every axis of
-    the grid, shares (n, k) float64 in [0, 1], the coordinates drawn for small parameters, and the part of every drawn
-    number of the table in which it lies."""
+    the grid, and shares (n, k) float64 in [0, 1], the coordinates drawn for small parameters."""
 
     number: int
     digits: list[tuple[int, ...]]
     shares: Doubles
-    parts: list[list[int]]
 
 
 @dataclass(frozen=True)
@@ -156,11 +153,11 @@ class Points:
             first = into[-1][2].stop if into else 0
             columns = slice(first, first + block.size + (block.norm == "l2"))
             into.append((block, part, columns))
-            if block.size <= MOST_BINNED and block.norm != "l2" and isinstance(control, BoundNumbers):
+            if block.size <= MOST_BINNED and block.norm != "l2" and isinstance(control, NumberControl):
                 shown += self._shown(control, group.parameter, block, part, first)
         return tuple(shown)
 
-    def _shown(self, control: BoundNumbers, name: str, block: Block, part: slice, first: int) -> list[Drawn]:
+    def _shown(self, control: NumberControl, name: str, block: Block, part: slice, first: int) -> list[Drawn]:
         parameter, spec = _spec(control, name)
         full = f"{control.name}.{name}"
         if isinstance(spec, OneOf):
@@ -182,12 +179,17 @@ class Points:
     def picks(self, first: int, count: int, before: int = 0) -> Picks:
         """Return the pictures from number `first` of the scene on; `before` is how many the scenes before it have."""
         digits = [self.digits(number) for number in range(first, first + count)]
-        shares = self._drawn(self._draws, before + first, count)
+        return Picks(before + first, digits, self._drawn(self._draws, before + first, count))
+
+    def parts_of(self, first: int, count: int) -> NDArray[np.int64]:
+        """Return in which part of each of the `drawn` numbers neighbouring pictures of a scene lie, (count, k), by the
+        number of the first in the whole sweep."""
+        shares = self._drawn(self._draws, first, count)
         parts = np.minimum((shares[:, self._columns] * self._sizes).astype(np.int64), self._sizes - 1)
         for number, one in enumerate(self.drawn):
             if one.shares:
                 parts[:, number] = np.take(one.shares, parts[:, number])
-        return Picks(before + first, digits, shares, parts.tolist())
+        return parts
 
     @property
     def draws(self) -> bool:
@@ -269,23 +271,28 @@ def _unit(parameter: Parameter) -> str:
     return "name" if parameter.options else parameter.unit
 
 
-def _spec(bound: BoundNumbers, name: str) -> tuple[Parameter, Range | OneOf]:
+def _spec(bound: NumberControl, name: str) -> tuple[Parameter, Range | OneOf]:
     """A parameter that is not fixed, and what it is set to."""
     slot = next(one for one in bound.slots if one.parameter.name == name)
     assert not isinstance(slot.spec, Fixed)
     return slot.parameter, slot.spec
 
 
-def _teller(space: Space, control: BoundControl, part: slice, axes: Sequence[tuple[int, Axis]]) -> Tell:
+def _teller(space: Space, control: Control, part: slice, axes: Sequence[tuple[int, Axis]]) -> Tell:
     """Return what says the values of one control for many configurations."""
-    if type(control) is BoundNumbers and type(control.control).measured is NumberControl.measured:
+    if isinstance(control, NumberControl) and _says_its_numbers(type(control)):
         return _by_column(control, part, axes)
     if control.refines:
         return _by_description(lambda u: space.describe(u, (control,)), axes, keep=False)
     return _by_description(lambda u: control.describe(u[part]), axes, keep=len(axes) == len(control.groups))
 
 
-def _by_column(control: BoundNumbers, part: slice, axes: Sequence[tuple[int, Axis]]) -> Tell:
+def _says_its_numbers(kind: type[NumberControl]) -> bool:
+    """Whether what a control says of a configuration is its parameters' values and nothing else."""
+    return (kind.describe, kind.measured) == (NumberControl.describe, NumberControl.measured)
+
+
+def _by_column(control: NumberControl, part: slice, axes: Sequence[tuple[int, Axis]]) -> Tell:
     """Values of all configurations at once, parameter by parameter; the same numbers as `describe`."""
     number_of = {axis.parameter.name: (number, axis) for number, axis in axes}
     columns: list[Callable[[Tensor, Picks], list[tuple[str, Value]]]] = []
@@ -313,7 +320,7 @@ def _listed(name: str, listed: list[Value], number: int) -> Callable[[Tensor, Pi
 
 
 def _drawn(
-    control: BoundNumbers, parameter_name: str, name: str, begin: int, size: int
+    control: NumberControl, parameter_name: str, name: str, begin: int, size: int
 ) -> list[Callable[[Tensor, Picks], list[tuple[str, Value]]]]:
     parameter, spec = _spec(control, parameter_name)
     unit = _unit(parameter)

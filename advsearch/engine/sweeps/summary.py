@@ -1,24 +1,25 @@
 """Counting what a sweep finds, its summary (docs/sweeps.md, "What it says"), and its answer as Python has it; sweeps
-that another program made are read into a run here, too. The memory that counting takes hardly grows."""
+that another program made are read into a run here, too. Counting takes some 15 bytes a configuration."""
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
+import pandas as pd
 from PIL import Image
 
 from advsearch.attacks import clopper_pearson
 from advsearch.attacks.units import paired_by_unit, per_unit, share_interval
 from advsearch.engine.sweeps import KIND
-from advsearch.engine.sweeps.axes import Axis
-from advsearch.engine.sweeps.points import Drawn, Picks
 from advsearch.errors import FileFormatError
 from advsearch.pictures import FORMATS
 from advsearch.report.figures import new_axes, sweep_axes, sweep_figure
@@ -26,9 +27,9 @@ from advsearch.report.markup import answer_html
 from advsearch.report.shown import shown
 from advsearch.runs import store
 from advsearch.runs.directory import RunDirectory, default_name
-from advsearch.runs.export import read_threedb, to_pandas
+from advsearch.runs.export import read_threedb
 from advsearch.runs.results.sweep import AxisRow, CountedAnswers, MapAxis, PairedRates, SweepMap, SweepSummary
-from advsearch.runs.store import Row
+from advsearch.runs.tables import read_sweep, to_pandas
 from advsearch.runs.units import Units
 from advsearch.tasks import Judgement
 from advsearch.viewer import thumbnails
@@ -36,79 +37,11 @@ from advsearch.viewer.sweep_page import write_sweep_page
 
 FINISHED, INTERRUPTED = "finished", "interrupted"
 
-WRONG, RIGHT = 1, 2
-"""Of a configuration of a pair; 0: not seen yet."""
-
 MOST_CELLS = 4096
 """Cells of a map; with more pairs of values there is none."""
 
 MOST_ANSWERS = 20
 """Wrong answers that the summary lists, the most frequent first."""
-
-
-@dataclass
-class Count:
-    """Right answers among configurations, for every value of one axis: a number, a name, or a pair of ends. Of a unit
-    of sampling (`runs.units`) a value has so many answers, more than one where they are not independent."""
-
-    name: str
-    unit: str
-    values: Sequence[Any]
-    of_a_unit: int = 1
-    counts: list[UnitCount] = field(init=False)
-
-    def __post_init__(self) -> None:
-        self.counts = [UnitCount(self.of_a_unit) for _ in self.values]
-
-    def add(self, place: int, unit: int, right: bool) -> None:
-        self.counts[place].add(unit, right)
-
-    def rows(self) -> list[AxisRow]:
-        """Return the table of this axis; values without configurations so far are left out."""
-        return [
-            AxisRow(axis=self.name, unit=self.unit, value=value, **vars(one.rate()))
-            for value, one in zip(self.values, self.counts, strict=True)
-            if one.seen
-        ]
-
-
-@dataclass(slots=True)
-class UnitCount:
-    """Right answers among configurations, of units of so many answers each: by how many of a unit are right, which is
-    all that an interval takes, so that few units are open at a time."""
-
-    of_a_unit: int = 1
-    seen: int = 0
-    correct: int = 0
-    _open: dict[int, tuple[int, int]] | None = None
-    _whole: Counter[int] | None = None
-
-    def add(self, unit: int, right: bool) -> None:
-        self.seen += 1
-        self.correct += right
-        if self.of_a_unit == 1:
-            return
-        if self._open is None or self._whole is None:
-            self._open, self._whole = {}, Counter()
-        seen, correct = self._open.pop(unit, (0, 0))
-        if seen + 1 == self.of_a_unit:
-            self._whole[correct + right] += 1
-        else:
-            self._open[unit] = seen + 1, correct + right
-
-    @property
-    def units(self) -> int | None:
-        """How many were seen; None where each is one answer."""
-        return None if self._open is None or self._whole is None else self._whole.total() + len(self._open)
-
-    def rate(self) -> CountedAnswers:
-        """Return count, accuracy and its interval over units; None where nothing was seen."""
-        if self.of_a_unit == 1 or not self.seen or self._open is None or self._whole is None:
-            return rate(self.correct, self.seen)
-        units = [(right, self.of_a_unit) for right in self._whole.elements()]
-        units += [(right, seen) for seen, right in self._open.values()]
-        right, of = np.array(units).T
-        return counted(right, of)
 
 
 def counted(right: npt.ArrayLike, of: npt.ArrayLike) -> CountedAnswers:
@@ -118,6 +51,12 @@ def counted(right: npt.ArrayLike, of: npt.ArrayLike) -> CountedAnswers:
     return CountedAnswers(
         configurations=seen, correct=correct, accuracy=correct / seen if seen else None, interval=interval
     )
+
+
+def counted_by_unit(right: npt.ArrayLike, units: npt.NDArray[np.int64]) -> CountedAnswers:
+    """Return that of answers (n,) that are of some units (n,)."""
+    right = np.asarray(right)
+    return counted(per_unit(right, units), per_unit(np.ones(len(right)), units))
 
 
 def rate(correct: int, seen: int) -> CountedAnswers:
@@ -131,147 +70,113 @@ def rate(correct: int, seen: int) -> CountedAnswers:
     )
 
 
-class Cells:
-    """Counts for every pair of values of the first two of several axes (name, unit, values), and the sum of the margins
-    there."""
+class Answers:
+    """What is answered so far, by the number of the configuration (n,): whether there is an answer, whether it is right
+    and whether it is wrong, its margin, NaN where that is no number, and what it is."""
 
-    def __init__(self, axes: Sequence[tuple[str, str, Sequence[Any]]]) -> None:
-        self._axes = list(axes[:2])
-        self.rest = [name for name, _, _ in axes[2:]]
-        self.shown = len(axes) > 1 and len(axes[0][2]) * len(axes[1][2]) <= MOST_CELLS
-        wide, high = (len(values) for _, _, values in self._axes) if self.shown else (0, 0)
-        self._counts = np.zeros((3, high, wide), np.int64)  # seen, right, with a margin that is a number
-        self._margin = np.zeros((high, wide))
+    def __init__(self, total: int) -> None:
+        self.seen, self.right, self._wrong = np.zeros((3, total), dtype=bool)
+        self.margin = np.full(total, np.nan)
+        self._labels, self._names = np.zeros(total, np.uint32), dict[str, int]()
 
-    def add(self, places: Sequence[int], trial: Judgement) -> None:
-        if self.shown:
-            column, row, told = places[0], places[1], trial.margin == trial.margin
-            self._counts[:, row, column] += (1, trial.right, told)
-            if told:
-                self._margin[row, column] += trial.margin
-
-    def drawn(self) -> SweepMap | None:
-        if not self.shown:
-            return None
-        seen, right, told = self._counts.tolist()
-        first, second = (MapAxis(axis=name, unit=unit, values=list(values)) for name, unit, values in self._axes)
-        return SweepMap(
-            axes=(first, second),
-            over=self.rest,
-            configurations=seen,
-            correct=right,
-            margin=[
-                [total / count if count else None for total, count in zip(*rows, strict=True)]
-                for rows in zip(self._margin.tolist(), told, strict=True)
-            ],
-        )
-
-
-class Tally:
-    """What has been counted so far, by the axes outside the scene (object, environment, model), those of the grid, and
-    what is drawn. Each of so many pairs without an answer comes again with it, so many numbers later. The first
-    configuration of the largest margin is the worst; a margin that is no number counts as not right."""
-
-    def __init__(
-        self,
-        outer: Sequence[tuple[str, Sequence[str]]],
-        axes: Sequence[Axis],
-        drawn: Sequence[Drawn],
-        pairs: int = 0,
-        units: Units | None = None,
-    ) -> None:
-        self._verdicts = [bytearray(pairs), bytearray(pairs)]
-        self._units = Units() if units is None else units
-        self.not_finite = 0
-        self.whole = UnitCount(self._units.size)
-        self.worst: tuple[int, Judgement] | None = None
-        self.answers: Counter[str] = Counter()
-        inside = {"model": self._units.models, "answer": 2 if self._units.again else 1}  # of each value a unit has some
-        size = self._units.size
-        self._outer = [
-            Count(name, "", list(dict.fromkeys(values)), size // inside.get(name, 1)) for name, values in outer
-        ]
-        self._grid = [
-            Count(axis.name, axis.unit, axis.values, size // (len(axis.values) if place == self._units.frames else 1))
-            for place, axis in enumerate(axes)
-        ]
-        self._drawn = [Count(one.name, one.unit, one.parts, size) for one in drawn]
-        every = [*self._grid, *reversed(self._outer), *self._drawn]
-        several = [number for number, count in enumerate(every) if len(count.values) > 1]
-        listed = [number for number in several if number < len(every) - len(self._drawn)]
-        self._mapped = listed or several
-        self._cells = Cells([(every[n].name, every[n].unit, every[n].values) for n in self._mapped])
-
-    def add(self, index: int, outer: Sequence[int], picks: Picks, place: int, trial: Judgement) -> None:
-        """Count the configuration with a number: by its places on the outer axes, and its place among the pictures it
-        belongs to."""
-        right, unit = trial.right, self._units.of(index)
-        if pairs := len(self._verdicts[0]):
-            self._verdicts[index // pairs][index % pairs] = RIGHT if right else WRONG
-        self.whole.add(unit, right)
-        for count, digit in zip(self._outer, outer, strict=True):
-            count.add(digit, unit, right)
-        for count, digit in zip(self._grid, picks.digits[place], strict=True):
-            count.add(digit, unit, right)
-        for count, part in zip(self._drawn, picks.parts[place], strict=True):
-            count.add(part, unit, right)
-        places = (*picks.digits[place], *reversed(outer), *picks.parts[place])
-        self._cells.add([places[number] for number in self._mapped], trial)
-        if trial.success:
-            self.answers[trial.answer.label] += 1
-        if trial.margin != trial.margin:
-            self.not_finite += 1
-        elif self.worst is None or trial.margin > self.worst[1].margin:
-            self.worst = index, trial
+    def add(self, number: int, said: Judgement) -> None:
+        self.seen[number], self.right[number], self._wrong[number] = True, said.right, said.success
+        self.margin[number] = said.margin
+        self._labels[number] = self._names.setdefault(said.answer.label, len(self._names))
 
     @property
-    def seen(self) -> int:
-        return self.whole.seen
+    def worst(self) -> int | None:
+        """The first configuration of the largest margin; None where none is a number."""
+        return None if np.isnan(self.margin).all() else int(np.nanargmax(self.margin))
 
     @property
-    def correct(self) -> int:
-        return self.whole.correct
+    def not_finite(self) -> int:
+        """How many margins are no number; these answers count as not right."""
+        return int((self.seen & np.isnan(self.margin)).sum())
 
-    def beside(self, models: Sequence[str]) -> list[PairedRates]:
-        """Return both rates of each model, of the pairs of which both are known."""
-        clean, answer = (np.frombuffer(one, np.uint8).reshape(-1, len(models)) for one in self._verdicts)
-        found = []
-        for number, name in enumerate(models):
-            known = (clean[:, number] > 0) & (answer[:, number] > 0)
-            before, after = clean[known, number] == RIGHT, answer[known, number] == RIGHT
-            if not len(before):
+    @property
+    def frequent(self) -> dict[str, int]:
+        """How often each of the most frequent wrong answers was given, the most frequent first."""
+        names = list(self._names)
+        answers = Counter(names[label] for label in self._labels[self._wrong])
+        return dict(sorted(answers.most_common(MOST_ANSWERS), key=lambda one: (-one[1], one[0])))
+
+    def beside(self, models: Sequence[str], units: Units) -> list[PairedRates]:
+        """Return both rates of each model without and with an answer, of the pairs of which both are known: the second
+        half of the configurations are the first with the answer."""
+        halves = (2, -1, len(models))
+        found, seen = list[PairedRates](), self.seen.reshape(halves).all(axis=0)
+        for model, name in enumerate(models):
+            known = np.flatnonzero(seen[:, model])
+            before, after = self.right.reshape(halves)[:, known, model]
+            if not len(known):
                 continue
-            counts = [int(one.sum()) for one in (before & after, before & ~after, ~before & after, ~before & ~after)]
-            both, clean_only, answer_only, neither = counts
-            units = self._units.draw(np.flatnonzero(known))
-            difference, interval, _ = paired_by_unit(before, after, units)
-            of = per_unit(np.ones(len(units)), units)
+            draws = units.draw(known)
+            difference, interval, _ = paired_by_unit(before, after, draws)
+            of = per_unit(np.ones(len(known)), draws)
             found.append(
                 PairedRates(
                     model=name,
-                    clean=counted(per_unit(before, units), of),
-                    answer=counted(per_unit(after, units), of),
-                    both=both,
-                    clean_only=clean_only,
-                    answer_only=answer_only,
-                    neither=neither,
+                    clean=counted(per_unit(before, draws), of),
+                    answer=counted(per_unit(after, draws), of),
+                    both=int((before & after).sum()),
+                    clean_only=int((before & ~after).sum()),
+                    answer_only=int((~before & after).sum()),
+                    neither=int((~before & ~after).sum()),
                     difference=difference,
                     interval=interval,
                 )
             )
         return found
 
-    def table(self) -> list[AxisRow]:
-        counts = [*self._outer, *self._grid, *self._drawn]
-        return [row for count in counts if len(count.values) > 1 for row in count.rows()]
 
-    def frequent(self) -> dict[str, int]:
-        """Return how often each of the most frequent wrong answers was given, the most frequent first."""
-        return dict(sorted(self.answers.most_common(MOST_ANSWERS), key=lambda one: (-one[1], one[0])))
+@dataclass(frozen=True, eq=False)
+class SweptAxis:
+    """Something that a table is by: an axis outside the scene (object, environment, model), of the grid, or a number
+    that is drawn; its values, or the ends of its parts; and the place of each configuration among them (n,)."""
 
-    def map(self) -> SweepMap | None:
-        """Return what was counted over two axes, where there are as many."""
-        return self._cells.drawn()
+    name: str
+    unit: str
+    values: Sequence[Any]
+    places: npt.NDArray[np.integer[Any]]
+    kind: Literal["outside", "grid", "drawn"] = "outside"
+
+    def rows(self, right: npt.NDArray[np.bool_], units: npt.NDArray[np.int64]) -> list[AxisRow]:
+        """Return the table: right answers (n,), which are of units (n,), by value; values without any are left out."""
+        rows = pd.DataFrame({"right": right, "unit": units}).groupby(self.places)
+        return [
+            AxisRow(
+                axis=self.name, unit=self.unit, value=self.values[place], **vars(counted_by_unit(one.right, one.unit))
+            )
+            for place, one in rows
+        ]
+
+
+def map_over(
+    axes: Sequence[SweptAxis], right: npt.NDArray[np.bool_], margin: npt.NDArray[np.float64]
+) -> SweepMap | None:
+    """Return counts, and the mean of the margins, for every pair of values of two axes: the first of the grid and the
+    last outside, or drawn ones where there are none of these; None of fewer axes, or of too many values."""
+    outside, grid, drawn = ([one for one in axes if one.kind == kind] for kind in ("outside", "grid", "drawn"))
+    axes = [*grid, *reversed(outside)] or drawn
+    if len(axes) < 2 or len(axes[0].values) * len(axes[1].values) > MOST_CELLS:
+        return None
+    wide, high = (len(one.values) for one in axes[:2])
+    cell, told = axes[1].places * wide + axes[0].places, ~np.isnan(margin)
+
+    def table(cells: npt.NDArray[np.integer[Any]], weights: npt.NDArray[np.float64] | None = None) -> Any:
+        return np.bincount(cells, weights, minlength=wide * high).reshape(high, wide)
+
+    count, total = table(cell[told]), table(cell[told], margin[told])
+    mean = np.divide(total, count, out=np.full(count.shape, np.nan), where=count > 0)
+    first, second = (MapAxis(axis=one.name, unit=one.unit, values=list(one.values)) for one in axes[:2])
+    return SweepMap(
+        axes=(first, second),
+        over=[one.name for one in axes[2:]],
+        configurations=table(cell).tolist(),
+        correct=table(cell[right]).tolist(),
+        margin=[[None if math.isnan(one) else one for one in row] for row in mean.tolist()],
+    )
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -305,9 +210,6 @@ class SweepResult:
         """Return every configuration as a row of a `pandas.DataFrame`.
 
         Columns are those of an export (docs/runs.md) under plain names; `attrs["units"]` has the units.
-
-        Raises:
-            InputError: pandas is not installed.
         """
         return to_pandas(self.rows())
 
@@ -345,93 +247,59 @@ AT_ONCE = 1000
 
 def import_threedb(folder: Path, run: str | Path | None = None, *, overwrite: bool = False) -> Path:
     """Read a folder that 3DB wrote into a run, by default ``runs/NAME-3db-NNN``, and return its folder."""
-    counts = _Counts()
     with RunDirectory.create(run, overwrite=overwrite, default=default_name(folder.resolve().name, ["3db"])) as kept:
-        rows: list[Row] = []
-        for one in read_threedb(folder):
-            if one.picture is not None:
-                thumbnails.keep(kept.path, one.row.step, thumbnails.thumbnail(read_picture(one.picture)))
-            counts.add(one.row)
-            rows.append(one.row)
-            if len(rows) == AT_ONCE:
-                kept.record(*rows)
-                rows.clear()
-        kept.record(*rows)
-        if not counts.seen:
+        lines = read_threedb(folder)
+        while some := list(islice(lines, AT_ONCE)):
+            for one in some:
+                if one.picture is not None:
+                    thumbnails.keep(kept.path, one.row.step, thumbnails.thumbnail(read_picture(one.picture)))
+            kept.record(*(one.row for one in some))
+        rows = read_sweep(kept.path)
+        if rows.empty:
             raise FileFormatError(f"{folder}: expected the log of 3DB with at least one line, got an empty one")
-        summary = counts.summary(kept.path, folder)
+        summary = _summary_of(rows, kept.path, folder)
         kept.write_summary(summary)
         write_sweep_page(kept.path, summary)
         return kept.path
 
 
-class _Counts:
-    """What the rows come to."""
-
-    def __init__(self) -> None:
-        self.seen = self.correct = 0
-        self._names: dict[str, dict[str, None]] = {name: {} for name in ("object", "environment", "model")}
-        self._values: dict[str, dict[float | str, tuple[int, int]] | None] = {}
-        self._wrong: dict[str, int] = {}
-
-    def add(self, row: Row) -> None:
-        right = bool(row.correct)
-        self.seen += 1
-        self.correct += right
-        if not right:
-            self._wrong[row.label or ""] = self._wrong.get(row.label or "", 0) + 1
-        for name, value in row.values.items():
-            if name in self._names:
-                self._names[name][str(value["value"])] = None
-            table = self._values.setdefault(name, {})
-            if table is None:
-                continue
-            seen, correct = table.get(value["value"], (0, 0))
-            table[value["value"]] = (seen + 1, correct + right)
-            if len(table) > MOST_VALUES:
-                self._values[name] = None
-
-    def summary(self, run: Path, folder: Path) -> SweepSummary:
-        tables = []
-        for name, table in self._values.items():
-            if table is None or len(table) < 2:
-                continue
-            for value in sorted(table, key=lambda value: (isinstance(value, str), value)):
-                seen, correct = table[value]
-                tables.append(AxisRow(axis=name, unit="", value=value, **vars(rate(correct, seen))))
-        called = {name: _listed(list(values)) for name, values in self._names.items()}
-        most = sorted(self._wrong.items(), key=lambda pair: -pair[1])[:20]
-        return SweepSummary(
-            run=str(run),
-            object=called["object"],
-            model=called["model"],
-            task="classification",
-            environment=called["environment"],
-            controls=[],
-            ending=FINISHED,
-            image_formation=None,
-            planned=self.seen,
-            **vars(rate(self.correct, self.seen)),
-            not_finite=0,
-            answers=dict(most),
-            axes=tables,
-            cells=None,
-            worst=None,
-            grid={},
-            samples=1,
-            sampler=None,
-            spp=0,
-            renders={"sweep": self.seen},
-            renders_per_second=None,
-            seconds={"total": 0.0},
-            seed=0,
-            warnings=[f"Read from {folder}, as 3DB wrote it; it was not rendered here."],
-            command_line="",
-        )
-
-
-def _listed(names: Sequence[str]) -> str:
-    return ",".join(names[:20]) + (f" and {len(names) - 20} more" if len(names) > 20 else "") or "unknown"
+def _summary_of(rows: pd.DataFrame, run: Path, folder: Path) -> SweepSummary:
+    """What rows that another program made come to."""
+    right, tables = np.asarray(rows["correct"] == 1), list[AxisRow]()
+    for name in rows.attrs["units"]:
+        values, places = np.unique(rows[name].astype(object), return_inverse=True)
+        if 1 < len(values) <= MOST_VALUES:
+            tables += SweptAxis(name, "", values.tolist(), places).rows(right, rows["unit"])
+    called = dict.fromkeys(("object", "environment", "model"), "unknown")
+    for name in called:
+        names = rows[name].unique().tolist() if name in rows else []
+        more = f" and {len(names) - 20} more" if len(names) > 20 else ""
+        called[name] = ",".join(map(str, names[:20])) + more or "unknown"
+    return SweepSummary(
+        run=str(run),
+        **called,
+        task="classification",
+        controls=[],
+        ending=FINISHED,
+        image_formation=None,
+        planned=len(rows),
+        **vars(rate(int(right.sum()), len(rows))),
+        not_finite=0,
+        answers=dict(Counter(rows["label"][~right]).most_common(MOST_ANSWERS)),
+        axes=tables,
+        cells=None,
+        worst=None,
+        grid={},
+        samples=1,
+        sampler=None,
+        spp=0,
+        renders={"sweep": len(rows)},
+        renders_per_second=None,
+        seconds={"total": 0.0},
+        seed=0,
+        warnings=[f"Read from {folder}, as 3DB wrote it; it was not rendered here."],
+        command_line="",
+    )
 
 
 def read_picture(path: Path) -> object:

@@ -18,7 +18,7 @@ from advsearch.config import SweepConfig
 from advsearch.engine.journal import Journal, Shared
 from advsearch.engine.judging import facts_of
 from advsearch.engine.loading import framed, make_renderer
-from advsearch.engine.problem import Problem
+from advsearch.engine.problem import Prepared, Problem
 from advsearch.engine.record import Stages, rate_of
 from advsearch.engine.sweeps import Job
 from advsearch.engine.sweeps.points import Points
@@ -37,8 +37,6 @@ class SweptScene:
     """One scene, ready to be rendered and shown to the models: a `Problem` for each of them. Points, renderers and what
     predicts pictures are there for each size of picture, on which what a control frames may depend."""
 
-    prepared: None = None
-
     def __init__(self, job: Job, number: int) -> None:
         place, config = job.places[number], job.config
         self.number, self.job = number, job
@@ -51,42 +49,24 @@ class SweptScene:
                 description, space, size, config.denoise, config.seed, sampler=config.pixel_sampler
             )
             self.points[size] = job.points(space)
-        facts = partial(facts_of, place.scene, place.object, config.label)
+        facts, spp, seed = partial(facts_of, place.scene, place.object, config.label), job.spp, config.seed
         self.problems = tuple(
-            Problem(
-                self.renderers[size],
-                spaces[size],
-                model,
-                task,
-                facts,
-                None,
-                job.spp,
-                config.seed,
-                metrics=job.metrics,
-            )
+            Problem(self.renderers[size], spaces[size], model, task, facts, None, spp, seed, metrics=job.metrics)
             for size, model, task in zip(job.sizes, job.models, job.tasks, strict=True)
         )
-        seed = seeds.stream(config.seed, "sweep light", number)
-        self.predicted = {
-            size: PredictedSweep(
-                self.problems[job.sizes.index(size)],
-                points,
-                job.axes,
-                seed,
-                config.specialise,
-                before=number * points.count,
-            )
-            for size, points in self.points.items()
-        }
+        seed, self.predicted = seeds.stream(seed, "sweep light", number), dict[tuple[int, int], PredictedSweep]()
+        for size, points in self.points.items():
+            problem, before = self.problems[job.sizes.index(size)], number * points.count
+            self.predicted[size] = PredictedSweep(problem, points, job.axes, seed, config.specialise, before)
 
     @property
     def not_finite(self) -> int:
         rendered = sum(renderer.non_finite for renderer in self.renderers.values())
         return rendered + sum(one.not_finite for one in self.predicted.values())
 
-    def answers(self, queries: Sequence[Query]) -> list[Evaluation]:
+    def answers(self, queries: Sequence[Query], prepared: Prepared | None = None) -> list[Evaluation]:
         """Answer queries of neighbouring rows: a picture is made once for each size, and a model sees all of its own at
-        once."""
+        once. Nothing is prepared for these."""
         begun, before, job = time.perf_counter(), self.not_finite, self.job
         models = len(job.models)
         made = {size: self._made(size, queries) for size in self.points}

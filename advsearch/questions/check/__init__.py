@@ -1,30 +1,16 @@
-"""`advsearch check`: every derivative of a scene against differences, as a table."""
-
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+"""`advsearch check`: gradients of a scene beside differences, the plan of a search over it, and what it leaves out."""
 
 from advsearch.cli.question import QuestionCommand
 
-if TYPE_CHECKING:
-    from advsearch.questions.check.answer import CheckResult
-
-HELP = "check the gradient of every parameter of a scene against finite differences"
-MORE = ". Exit status 3 if one is biased or noisy"
+HELP = "check every gradient against differences; show how a search gets them and what it leaves out"
+MORE = ". Exit status 3 if a gradient is biased or noisy"
 EXAMPLES = (
     "check --object mug --control pose",
     "check --object mug --control environment.rotation --loss linear --json",
+    "check --object mug --control texture,camera --loss model --seconds 120 --run derivatives",
     "check --all --resolution 128 --loss linear --seconds 600 --run gradients",
     "resume gradients",
 )
 
 
-def lacks_gradient(result: CheckResult) -> bool:
-    """Whether a parameter has no good gradient by any estimator."""
-    # late, so that --help answers at once
-    from advsearch.questions.check.answer import short_names
-
-    return bool(short_names(result.rows))
-
-
-COMMAND = QuestionCommand("check", short=lacks_gradient)
+COMMAND = QuestionCommand("check", short=lambda result: bool(result.falls_short))

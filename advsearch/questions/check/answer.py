@@ -9,78 +9,72 @@ from pydantic import Field
 
 from advsearch.report.markup import InNotebook
 from advsearch.report.shown import AnswerPart, Column, ShownAnswer
-from advsearch.runs.results.base import OUT_OF_TIME, Fields, GradientStatus, JsonFloat, RunResult
+from advsearch.runs.results.base import (
+    OUT_OF_TIME,
+    Fields,
+    GroupDerivative,
+    JsonFloat,
+    Measured,
+    PathLength,
+    PlannedGradient,
+    RunResult,
+)
 
-WHOLE = "*"
-"""What stands for the parameter in rows about a whole control."""
 
-
-class CheckedPlace(Fields):
-    """Where a derivative was checked, and of what."""
+class CheckedRow(Measured):
+    """A derivative along a parameter, or the gradient of a whole control, beside its reference."""
 
     object: str
     environment: str
     loss: str = Field(description="`linear`, or `model`: the model's own")
 
 
-class GradientRow(CheckedPlace):
-    """A derivative that was checked."""
+class GainRow(Fields):
+    """What leaving one thing out saves, and the proof that it changes nothing."""
 
-    control: str
-    parameter: str = Field(description="`*` for a whole control")
-    estimator: str
-    factor: float = Field(description="step as a multiple of the plan's")
-    spp: int = Field(description="samples a pixel of the gradient")
-    seconds: float = Field(description="of one gradient")
-    status: GradientStatus
-
-    @property
-    def name(self) -> str:
-        """``control.parameter``, or the name of the control where the row is about all of it."""
-        return self.control if self.parameter == WHOLE else f"{self.control}.{self.parameter}"
-
-    @property
-    def short(self) -> bool:
-        """Whether the gradient is not good enough."""
-        return self.status in ("biased", "noisy")
+    item: str
+    what: str
+    time_gain: float = Field(description="a gradient's time x the picture's variance with it, over those without it")
+    picture_difference: JsonFloat = Field(description="root mean square at one seed, over that of two seeds")
+    gradient_difference: JsonFloat = Field(description="the same of gradients; 0 where there are none")
+    safe: bool = Field(description="whether pictures and gradients agree to within their noise")
+    seconds: float = Field(description="of a gradient with it")
 
 
-class DirectionRow(GradientRow):
-    """The gradient of a whole control beside the converged one."""
+class TexelRow(Fields):
+    """How many texels of a searched texture a pixel shows."""
 
-    cosine: JsonFloat
-    converged: JsonFloat = Field(description="smallest cosine of two converged gradients")
-
-
-class DerivativeRow(GradientRow):
-    """The derivative along one parameter beside its reference."""
-
-    gradient: JsonFloat = Field(description="mean over seeds")
-    reference: JsonFloat = Field(description="by differences of many samples")
-    reference_steps: tuple[JsonFloat, JsonFloat] = Field(description="its value at the larger and at the smaller step")
-    reference_factor: float = Field(description="the larger step as a multiple of the plan's")
-    reference_noise: JsonFloat
-    relative_error: JsonFloat
-    noise: JsonFloat = Field(description="standard deviation of one gradient, relative")
+    control: str = Field(description="whose texture")
+    side: int = Field(description="of the texture, in texels")
+    seen: int = Field(description="texels that light reaches the camera from directly")
+    pixels: int = Field(description="pixels that show the surface")
+    enough: int = Field(description="side, `side` halved as often as the pixels still resolve as much")
 
 
-CheckedRow = DirectionRow | DerivativeRow
+class SearchPlan(PlannedGradient):
+    """How a search over the scene gets its derivatives, and what it leaves out."""
+
+    left_out: list[str] = Field(description="what is not computed at all, in sentences")
 
 
-class CheckedRows(Fields):
-    """Rows of both kinds."""
-
-    rows: list[CheckedRow]
-
-
-class CheckResult(InNotebook, CheckedRows, RunResult):
-    """Every derivative of a scene beside differences, as far as they are measured."""
+class CheckResult(InNotebook, RunResult):
+    """Every derivative of a scene beside differences, and the plan of a search over it, as far as they are measured."""
 
     command: ClassVar[str] = "check"
 
     object: str
     measured: int = Field(description="parts (a scene with a control and a loss) that are done")
     planned: int = Field(description="all parts")
+    rows: list[CheckedRow]
+    plan: SearchPlan | None = Field(default=None, description="absent of `loss=linear` and of `all`")
+    bounces: PathLength | None = Field(default=None, description="how long the light paths of a long search are")
+    gains: list[GainRow] = Field(default=[], description="what is left out, and what that saves")
+    texels: list[TexelRow] = Field(default=[], description="of the searched textures")
+
+    @property
+    def falls_short(self) -> bool:
+        """Whether a parameter has no good gradient by any estimator."""
+        return bool(short_names(self.rows))
 
     @property
     def brief(self) -> str:
@@ -95,7 +89,8 @@ READING = (
     "Each row sets a derivative as a search gets it (gradient) beside one that takes far more renders (reference). ok: "
     "they agree within 5 %, and one gradient scatters by less than 20 % (noise); biased: they disagree; noisy: it "
     "scatters more; reference unusable: the reference is too noisy to tell. adjoint: a second render that carries all "
-    "derivatives back at once; differences, secant: two renders with the parameter moved by a step."
+    "derivatives back at once; differences, secant: two renders with the parameter moved by a step. A cosine of 1 with "
+    "the converged gradient means that a gradient points the right way."
 )
 
 SINGLE: Mapping[str, Column] = {
@@ -103,25 +98,37 @@ SINGLE: Mapping[str, Column] = {
     "parameter": "{0.name}",
     "estimator": "{0.estimator}",
     "step": "x {0.factor:.2g}",
-    "gradient": "{0.gradient:.3g}",
-    "reference": "{0.reference:.3g} +- {0.reference_noise:.1g}",
-    "error": lambda one: f"{100 * one.relative_error:.1f} %",
-    "noise": lambda one: f"{100 * one.noise:.0f} %",
+    "gradient": "{0.value:.3g}",
+    "reference": "{0.reference:.3g}",
+    "error": lambda row: f"{100 * row.bias:.1f} %",
+    "noise": lambda row: f"{100 * row.noise:.0f} %",
     "seconds": "{0.seconds:.2f}",
     "status": "{0.status}",
 }
-WHOLE_CONTROLS: Mapping[str, Column] = {
+WHOLE: Mapping[str, Column] = {
     "object": "{0.object}",
     "control": "{0.control}",
     "estimator": "{0.estimator}",
     "step": "x {0.factor:.3g}",
     "samples": "{0.spp}",
     "cosine": "{0.cosine:.3f}",
-    "converged": "{0.converged:.3f}",
+    "of converged ones": "{0.reference_cosine:.3f}",
     "seconds": "{0.seconds:.2f}",
     "status": "{0.status}",
 }
-
+GROUPS: Mapping[str, Column] = {
+    "parameter": "{0.name}",
+    "numbers": "{0.size}",
+    "estimator": "{0.estimator}",
+    "step": lambda group: _step(group),
+}
+GAINS: Mapping[str, Column] = {
+    "left out": "{0.what}",
+    "a gradient with it takes": "x {0.time_gain:.2f}",
+    "picture differs": lambda row: _difference(row.picture_difference),
+    "gradient differs": lambda row: _difference(row.gradient_difference),
+    "": lambda row: "" if row.safe else "MORE THAN ITS NOISE",
+}
 LOSSES = {
     "linear": "Smooth linear loss of the raw picture",
     "model": "The model's loss, each parameter in the setting that is taken",
@@ -129,45 +136,83 @@ LOSSES = {
 
 
 def shown(result: CheckResult) -> ShownAnswer:
-    """Return what fell short, how to read the tables, and a table for each loss."""
-    rows, left, said = result.rows, result.planned - result.measured, []
+    """Return what fell short, the plan of a search, what it leaves out, and a table for each loss."""
+    rows, left, plan, sentences = result.rows, result.planned - result.measured, result.plan, []
     if left:
         why = "The time was up" if result.ending == OUT_OF_TIME else "Stopped"
-        said.append(f"{why} after {result.measured} of {result.planned} parts (a scene, its controls and a loss).")
+        sentences.append(f"{why} after {result.measured} of {result.planned} parts (a scene, its controls and a loss).")
     if short := short_names(rows):
-        said.append(f"No estimator is good enough for {', '.join(short)}.")
+        sentences.append(f"No estimator is good enough for {', '.join(short)}.")
     elif rows:
-        said.append(f"Every parameter {'so far ' if left else ''}has a good gradient.")
-    single = [row for row in rows if isinstance(row, DerivativeRow)]
-    whole = [row for row in rows if isinstance(row, DirectionRow)]
+        sentences.append(f"Every parameter {'so far ' if left else ''}has a good gradient.")
+    groups = plan.groups if plan else []
+    whole = [row for row in rows if row.quantity == "gradient"]
+    facts = {} if plan is None else {"renders a gradient": str(plan.renders_per_gradient), "samples": str(plan.spp)}
     return ShownAnswer(
-        " ".join(said),
+        " ".join(sentences),
         [
             AnswerPart(text=[READING] if rows else []),
             *(
-                AnswerPart.table([row for row in single if row.loss == name], SINGLE, title=text)
-                for name, text in LOSSES.items()
+                AnswerPart.table(
+                    [row for row in rows if row.loss == name and row.quantity == "derivative"], SINGLE, title=title
+                )
+                for name, title in LOSSES.items()
             ),
-            AnswerPart.table(whole, WHOLE_CONTROLS, title="The model's loss, cosine with the converged gradient"),
+            AnswerPart.table(whole, WHOLE, title="The model's loss, cosine with the converged gradient"),
+            AnswerPart.table(groups, GROUPS, title="How a search gets its derivatives", text=_reasons(groups)),
+            AnswerPart("Left out", _left_out(result)),
+            AnswerPart.table(result.gains, GAINS, title="What that saves"),
         ],
+        facts,
     )
 
 
 def short_names(rows: Sequence[CheckedRow]) -> list[str]:
-    """Return the names of what no estimator is good enough for, each once."""
-    return list(dict.fromkeys(f"{row.name} ({row.status})" for row in _best(rows) if row.short))
+    """Return the names of what no estimator is good enough for, each once.
 
-
-def _best(rows: Sequence[CheckedRow]) -> list[CheckedRow]:
-    """For each parameter and loss the row with the best status: an estimator that no plan would take may fall short.
-
-    Of the model's loss the rows of whole controls count: what matters is where their gradient points.
+    For each parameter and loss the row with the best status counts: an estimator that no plan would take may fall
+    short. Of the model's loss those of whole controls count: what matters is where their gradient points.
     """
-    rows = [row for row in rows if row.loss == "linear" or isinstance(row, DirectionRow)]
     order = ("ok", "reference unusable", "noisy", "biased")
     best: dict[tuple[str, ...], CheckedRow] = {}
     for row in rows:
-        key = row.object, row.environment, row.loss, row.control, row.parameter
-        if key not in best or order.index(row.status) < order.index(best[key].status):
+        key = row.object, row.environment, row.loss, row.name
+        counts = row.loss == "linear" or row.quantity == "gradient"
+        if counts and (key not in best or order.index(row.status) < order.index(best[key].status)):
             best[key] = row
-    return list(best.values())
+    short = [row for row in best.values() if row.status in ("biased", "noisy")]
+    return list(dict.fromkeys(f"{row.name} ({row.status})" for row in short))
+
+
+def _step(group: GroupDerivative) -> str:
+    """The step of a difference in u, and in the parameter's unit where it has one."""
+    if not group.step_reason:
+        return ""
+    unit = "" if group.unit == "1" else f" {group.unit}"
+    return f"{group.step:.3g}" + ("" if group.step_in_unit is None else f" ({group.step_in_unit:.3g}{unit})")
+
+
+def _reasons(groups: Sequence[GroupDerivative]) -> list[str]:
+    """Why the estimators and the steps are what they are, each reason once with its parameters."""
+    reasons: dict[tuple[str, str], list[str]] = {}
+    for group in groups:
+        reasons.setdefault((group.estimator, group.reason), []).append(group.name)
+    for group in groups:
+        if group.step_reason:
+            reasons.setdefault(("step", group.step_reason), []).append(group.name)
+    return [f"{what} of {', '.join(names)}: {reason}" for (what, reason), names in reasons.items()]
+
+
+def _left_out(result: CheckResult) -> list[str]:
+    sentences = list(result.plan.left_out) if result.plan else []
+    if result.bounces is not None:
+        depth, full = result.bounces.depth, result.bounces.full
+        sentences.append(f"light paths of a long search: at most {depth} segments of {full}: {result.bounces.reason}")
+    for texels in result.texels:
+        seen = f"{texels.seen} are seen in {texels.pixels} pixels"
+        sentences.append(f"texels of {texels.control}: {seen}, which resolve {texels.enough} of {texels.side} a side")
+    return sentences
+
+
+def _difference(share: float) -> str:
+    return "not at all" if share == 0.0 else f"by {share:.2g} of its noise"

@@ -1,56 +1,50 @@
-"""Checks gradients of a scene as it is: what `advsearch check` does."""
+"""Checks gradients of a scene as it is, and plans a search over it: what `advsearch check` does."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
+from pydantic import TypeAdapter
 from typing_extensions import Unpack
 
 from advsearch import seeds
-from advsearch.api.keywords import asks, configured
+from advsearch.api.keywords import DerivativeKeywords, NamedKeywords, asks, configured
 from advsearch.controls import CONTROLS
 from advsearch.engine.attack_parts import LOADING, problem_from_config
-from advsearch.engine.gradients import (
-    FACTORS,
-    Estimate,
-    Loss,
-    Probe,
-    Reference,
-    agreement,
-    estimates,
-    inside,
-    probes,
-    reference,
-    smooth_loss,
-)
+from advsearch.engine.gradients import FACTORS, attempts, derivatives, inside, smooth_loss
 from advsearch.engine.loading import Scene
 from advsearch.engine.naming import AnyModel, settings_alone
-from advsearch.engine.planning import CONVERGED, COUNTS, cosine_samples, cosines, measured_plan, plan_gradients, tuned
+from advsearch.engine.planning import (
+    CONVERGED,
+    COUNTS,
+    bounces_of,
+    cosine_samples,
+    cosines,
+    measured_plan,
+    most_pictures,
+    plan_gradients,
+    tuned,
+)
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Results, kept_rows
 from advsearch.progress import NullProgress, Progress, Watched, watcher
-from advsearch.questions.check.answer import (
-    WHOLE,
-    CheckedPlace,
-    CheckedRow,
-    CheckedRows,
-    CheckResult,
-    DerivativeRow,
-    DirectionRow,
-)
+from advsearch.questions.check.answer import CheckedRow, CheckResult, GainRow, SearchPlan, TexelRow
+from advsearch.questions.check.saved import MOST_GRADIENTS, measured_gains, resolved_texels
 from advsearch.questions.check.settings import CheckConfig
-from advsearch.questions.plan.carry_out import PlanKeywords
 from advsearch.runs.directory import RunDirectory
-from advsearch.runs.results.base import CosineRow
+from advsearch.runs.results.base import Measured, PathLength
 from advsearch.scene.description import DEFAULT_ENVIRONMENT
-from advsearch.scene.gradients import STEP_RANGE, Group, compared
+from advsearch.scene.gradients import BY_ADJOINT, BY_DIFFERENCES
+from advsearch.scene.mitsuba_backend.material_adjoint import LIMITS
 
 
-class CheckKeywords(PlanKeywords, total=False):
+class CheckKeywords(DerivativeKeywords, NamedKeywords, total=False):
+    objective: str | None
+    seconds: float | None
     all: bool
     loss: Literal["linear", "model", "both"]
 
@@ -60,16 +54,15 @@ SCENES = (("mug", "studio"), ("bowl", "kitchen"), ("bottle", "noon"))
 RAW_SPP = 16
 """Samples a pixel of a working gradient of the linear loss, which is taken without denoiser."""
 MOST = 256
-"""Samples a pixel of the dearest gradient of the model's loss that is tried; `advsearch plan` stops before."""
+"""Samples a pixel of the dearest gradient of the model's loss that is tried."""
 REFERENCE_SPP, SEEDS = 64, (6, 16)
 """Samples a pixel of a reference render, and how many seeds it gets: until its noise is small."""
 FEW_SEEDS = (3, 6)
 """Seeds of a reference of the model's loss, whose renders have more samples."""
-REPEATS, AGAIN = 6, 8
-"""Gradients of one estimator, from which its mean and its noise come; and of one with a wider step."""
-IN_SAMPLES = "counted in samples a pixel; `resolution` or fewer controls shorten it, `seconds` ends it"
-IN_PARAMETERS = "one for each parameter; `resolution` or fewer controls shorten it, `seconds` ends it"
-"""What whoever waits is told of the long stages."""
+HINT = "`resolution` or fewer controls shorten it, `seconds` ends it"
+
+Finding = CheckedRow | SearchPlan | PathLength | GainRow | TexelRow
+FINDINGS: TypeAdapter[list[Finding]] = TypeAdapter(list[Finding])
 
 
 @asks(CheckConfig, CheckKeywords)
@@ -80,7 +73,7 @@ def check(
     progress: Watched = None,
     **settings: Unpack[CheckKeywords],
 ) -> CheckResult:
-    """Compare the gradient of every parameter of a scene with differences (docs/gradients.md)."""
+    """Compare every gradient of a scene with differences, and plan a search over it (docs/gradients.md)."""
     config = configured(CheckConfig, object=object, model=model, **settings)
     return check_from_config(config, progress=watcher(progress))
 
@@ -99,13 +92,13 @@ def check_from_config(
     with RunDirectory.of(config, resumed) as run:
         results, measured = Results(run, config.seconds), 0
 
-        def rows() -> Iterator[CheckedRow]:
+        def findings() -> Iterator[Finding]:
             nonlocal measured
             for part in parts:
-                yield from _rows_of(part, len(parts), results, progress)
+                yield from _findings_of(part, len(parts), results, progress)
                 measured += 1
 
-        def result(rows: Sequence[CheckedRow], ending: str) -> CheckResult:
+        def result(taken: Sequence[Finding], ending: str) -> CheckResult:
             return CheckResult(
                 run=str(run.path),
                 object=",".join(dict.fromkeys(part.config.object for part in parts)),
@@ -114,13 +107,17 @@ def check_from_config(
                 ending=ending,
                 measured=measured,
                 planned=len(parts),
-                rows=list(rows),
+                rows=[row for row in taken if isinstance(row, CheckedRow)],
+                plan=next((row for row in taken if isinstance(row, SearchPlan)), None),
+                bounces=next((row for row in taken if isinstance(row, PathLength)), None),
+                gains=[row for row in taken if isinstance(row, GainRow)],
+                texels=[row for row in taken if isinstance(row, TexelRow)],
                 seconds={"total": time.perf_counter() - begun},
                 seed=config.seed,
                 command_line=config.command_line(),
             )
 
-        return kept_rows(run, results, rows(), result)
+        return kept_rows(run, results, findings(), result)
 
 
 @dataclass(frozen=True)
@@ -136,80 +133,71 @@ class CheckedPart:
         """Under which its results are stored."""
         return f"check {self.number}"
 
+    def row(self, measured: Measured, **more: Any) -> CheckedRow:
+        """Return what was measured in this part."""
+        place = {"object": self.config.object, "environment": self.config.lit_by, "loss": self.loss}
+        return CheckedRow(**{**vars(measured), **place, **more})
+
 
 def parts_of(config: CheckConfig) -> list[CheckedPart]:
-    asked = [(one, loss) for one in _configurations(config) for loss in config.losses]
-    return [CheckedPart(number, one, loss) for number, (one, loss) in enumerate(asked, start=1)]
-
-
-def _configurations(config: CheckConfig) -> Iterator[CheckConfig]:
-    if not config.all:
-        yield config
-        return
-    for object, environment in SCENES:
+    """Return what is checked one after the other."""
+    configs = []
+    for object, environment in SCENES if config.all else ():
         own = environment == DEFAULT_ENVIRONMENT
         left_out = ["contents"] * (object == "bottle") + ["sky"] * (not own)  # it is closed; it would take its place
         for control, kind in CONTROLS.items():
             if kind.parameters and control not in left_out:  # of one without, the scene names them
                 place = {"object": object, "environment": None if own else environment, "label": None}
                 alone = {"controls": {control: {}}, **settings_alone(config, control, {})}
-                yield config.model_copy(update={**place, **alone})
+                configs.append(config.model_copy(update={**place, **alone}))
+    asked = [(each, loss) for each in configs or [config] for loss in config.losses]
+    return [CheckedPart(number, each, loss) for number, (each, loss) in enumerate(asked, start=1)]
 
 
-def _rows_of(part: CheckedPart, parts: int, results: Results, progress: Progress) -> Iterator[CheckedRow]:
-    """The rows of a part, as they come; of one that was measured before, without loading anything."""
+def _findings_of(part: CheckedPart, parts: int, results: Results, progress: Progress) -> Iterator[Finding]:
+    """What is found of a part, as it comes; of one that was measured before, without loading anything."""
     stored = results.stored(part.key)
     if stored is not None:
-        yield from CheckedRows.of({"rows": stored}).rows
+        yield from FINDINGS.validate_python(stored)
         return
     config = part.config
-    what = f"{config.object} in {config.lit_by}, {' and '.join(config.controls)}"
-    title = f"{what} ({part.number} of {parts})" if parts > 1 else what
+    title = f"{config.object} in {config.lit_by}, {' and '.join(config.controls)}"
+    title += f" ({part.number} of {parts})" if parts > 1 else ""
     progress.stage(f"loading {title}")
-    rows = []
-    for row in (_linear if part.loss == "linear" else _model)(part, title, results, progress):
-        rows.append(row.to_dict())
-        yield row
-        progress.message(_line(row))  # whoever reads it can stop the check and find the row kept
-    results.put(part.key, rows)
+    taken = []
+    for finding in (_linear if part.loss == "linear" else _model)(part, title, results, progress):
+        taken.append(finding.to_dict())
+        yield finding
+        if isinstance(finding, CheckedRow):  # whoever reads it can stop the check and find the row kept
+            how = f"{finding.value:.3g}" if finding.cosine is None else f"cosine {finding.cosine:.2f}"
+            progress.message(f"{finding.object}, {finding.name} by {finding.estimator}: {how}, {finding.status}")
+    results.put(part.key, taken)
 
 
-def _line(row: CheckedRow) -> str:
-    how = f"cosine {row.cosine:.2f}" if isinstance(row, DirectionRow) else f"{row.gradient:.3g}"
-    return f"{row.object}, {row.name} by {row.estimator}: {how}, {row.status}"
-
-
-class _How(NamedTuple):
-    """How single parameters are checked: by what estimators, with what multiples of the step, beside references of so
-    many samples and seeds, with steps so many times as wide."""
-
-    tried: Callable[[Group], list[tuple[str, float]]]
-    high: int
-    repeats: tuple[int, int]
-    factors: Sequence[float]
-
-
-def _linear(part: CheckedPart, title: str, results: Results, progress: Progress) -> Iterator[DerivativeRow]:
+def _linear(part: CheckedPart, title: str, results: Results, progress: Progress) -> Iterator[CheckedRow]:
+    """Every estimator of each parameter, by a smooth linear loss of the raw picture."""
     config = part.config
     problem, _ = problem_from_config(config, denoise="none")
     problem.renderer.formation = replace(problem.renderer.formation, transfer="linear")
     problem.renderer.plan = problem.renderer.plan.at_a_pixel()
     loss = smooth_loss(problem.renderer.formation.resolution, config.seed)
     spp = config.spp if isinstance(config.spp, int) else RAW_SPP
-    how = _How(attempts, REFERENCE_SPP, SEEDS, FACTORS[:2])
-    yield from _rows(problem, part, title, loss, spp, results, progress, how)
+    how = {"reference_spp": REFERENCE_SPP, "seeds_of_reference": SEEDS, "reference_factors": FACTORS[:2]}
+    for row in _derivatives(problem, part, title, results, progress, loss=loss, spp=spp, tried=attempts, **how):
+        yield part.row(row)
 
 
-def _model(part: CheckedPart, title: str, results: Results, progress: Progress) -> Iterator[CheckedRow]:
+def _model(part: CheckedPart, title: str, results: Results, progress: Progress) -> Iterator[Finding]:
+    """What a search by the model's loss does: its plan, how good that is, and what it leaves out."""
     config = part.config
     problem, _ = problem_from_config(config)
     renderer, u = problem.renderer, inside(problem.renderer)
     counts = tuple(count for count in (*COUNTS, MOST) if count >= problem.spp) or (problem.spp,)
 
-    def kept(name: str, measure: Callable[[], Any]) -> Any:
+    def keep(name: str, measure: Any) -> Any:
         return results.get(f"{part.key} {name}", measure)
 
-    progress.stage(f"{title}: comparing ways to differentiate", plan_gradients(renderer.plan))
+    progress.stage(f"{title}: comparing ways to differentiate", plan_gradients(renderer.plan), hint=HINT)
     renderer.plan = measured_plan(
         renderer,
         problem.loss,
@@ -218,138 +206,72 @@ def _model(part: CheckedPart, title: str, results: Results, progress: Progress) 
         spp=problem.spp,
         counted=True,
         tick=lambda: progress.advance(1),
-        keep=kept,
+        keep=keep,
     )
     steps = {group.name: group.step for group in renderer.plan.groups}
     most = cosine_samples(renderer.plan, counts=counts)
-    progress.stage(f"{title}: the model's gradients", most, hint=IN_SAMPLES, at_most=True)
-    table: list[CosineRow] = []
+    progress.stage(f"{title}: the model's gradients", most, hint=f"counted in samples a pixel; {HINT}", at_most=True)
+    table: list[Measured] = []
     tick = progress.advance
-    for row in cosines(renderer, problem.loss, u, seed=config.seed, counts=counts, tick=tick, keep=kept):
+    for row in cosines(renderer, problem.loss, u, seed=config.seed, counts=counts, tick=tick, keep=keep):
         table.append(row)
-        taken = [group.estimator for group in renderer.plan.groups if group.control == row.control]
-        names = ", ".join(dict.fromkeys(taken))
-        yield DirectionRow(
-            **vars(_place(part)), **row.model_dump(exclude={"denoise"}), parameter=WHOLE, estimator=names
-        )
+        yield part.row(row)
     renderer.plan, spp = tuned(renderer.plan, table)
+    if not config.all:
+        yield from _planned(problem, part, spp or problem.spp, results, progress)
     wider = {group.name: group.step / steps[group.name] for group in renderer.plan.groups if steps[group.name]}
-    how = _How(lambda group: [(group.estimator, 1.0)], CONVERGED, FEW_SEEDS, (1.0,))
-    for one in _rows(problem, part, title, problem.loss, spp or problem.spp, results, progress, how):
-        group = f"{one.control}.{one.parameter.partition('.')[0]}"  # coordinates of one have a number behind it
-        factor = wider.get(group, 1.0)
-        yield one.model_copy(update={"factor": factor, "reference_factor": factor})
+    how = {"loss": problem.loss, "spp": spp or problem.spp, "reference_spp": CONVERGED, "seeds_of_reference": FEW_SEEDS}
+    for row in _derivatives(problem, part, title, results, progress, **how):
+        group = f"{row.control}.{row.parameter.partition('.')[0]}"  # coordinates of one have a number behind it
+        yield part.row(row, factor=wider.get(group, 1.0))
 
 
-def _rows(
-    problem: Problem,
-    part: CheckedPart,
-    title: str,
-    loss: Loss,
-    spp: int,
-    results: Results,
-    progress: Progress,
-    how: _How,
-) -> Iterator[DerivativeRow]:
-    renderer, seed = problem.renderer, seeds.stream(part.config.seed, "check")
-    u = inside(renderer)
-    progress.stage(f"{title}: choosing directions")
-    along = probes(renderer, loss, u, seed, spp)
-    for control in dict.fromkeys(probe.group.control for probe in along):
-        mine = [probe for probe in along if probe.group.control == control]
-        progress.stage(f"{title}: references for {control}", len(mine), hint=IN_PARAMETERS)
-        references: dict[str, Reference] = {}
-        for probe in mine:
-
-            def referred(probe: Probe = probe) -> Reference:
-                # what acts on the picture clips: its mean depends on the noise, so both get the same
-                many = spp if probe.group.estimator == "image" else max(spp, how.high)
-                return reference(
-                    renderer, loss, u, probe, seed=seed, spp=many, repeats=how.repeats, factors=how.factors
-                )
-
-            references[probe.name] = results.value(_key(part, "reference", [probe]), Reference, referred)
-            progress.advance(1)
-        sets = _sets(mine)
-        most = sum(len(how.tried(group[0].group)) for group in sets)
-        progress.stage(f"{title}: gradients for {control}", most, hint=f"{REPEATS} by each estimator", at_most=True)
-        for group in sets:
-            good: set[str] = set()
-            for estimator, factor in how.tried(group[0].group):
-                wanted = group if factor == 1.0 else [one for one in group if one.name not in good]
-                if not wanted:
-                    break
-
-                def estimated(
-                    wanted: Sequence[Probe] = wanted, estimator: str = estimator, factor: float = factor
-                ) -> list[Estimate]:
-                    many = REPEATS if factor == 1.0 else AGAIN  # another try has to be surer
-                    return estimates(
-                        renderer, loss, u, estimator, wanted, seed=seed, spp=spp, repeats=many, factor=factor
-                    )
-
-                key = _key(part, f"{estimator} x {factor:g}", wanted)
-                for probe, one in zip(wanted, results.value(key, list[Estimate], estimated), strict=True):
-                    row = _row(part, spp, probe, one, references[probe.name], list(references.values()))
-                    good |= {probe.name} if row.status == "ok" else set()
-                    yield row
-                progress.advance(1)
-
-
-def _key(part: CheckedPart, what: str, along: Sequence[Probe]) -> str:
-    return f"{part.key} {what} {','.join(probe.name for probe in along)}"
-
-
-def attempts(group: Group) -> list[tuple[str, float]]:
-    """Estimators to measure on a group, with the multiple of the step; other steps for what falls short with the first.
-
-    Differences of the loss and of the picture are the same for a linear loss, so that wider steps are tried with one.
-    """
-    forced = "forced" in group.reason
-    names = [group.estimator] if forced else [*compared(group.valid, group.size)]
-    wide = next((one for one in ("differences", "secant") if one in names), None)
-    tries = [(one, 1.0) for one in names]
-    if wide is None:
-        return tries
-    tried = {group.step}
-    for factor in FACTORS[1:]:
-        step = min(factor * group.step, STEP_RANGE[1])
-        if step not in tried:
-            tried.add(step)
-            tries.append((wide, factor))
-    return tries
-
-
-def _row(
-    part: CheckedPart, spp: int, probe: Probe, estimate: Estimate, against: Reference, beside: Sequence[Reference]
-) -> DerivativeRow:
-    judged = agreement(estimate, against, beside)
-    return DerivativeRow(
-        **vars(_place(part)),
-        control=probe.group.control,
-        parameter=probe.name.partition(".")[2],
-        estimator=estimate.estimator,
-        factor=estimate.factor,
-        spp=spp,
-        gradient=estimate.value,
-        reference=against.value,
-        reference_steps=against.steps,
-        reference_factor=against.factor,
-        reference_noise=against.noise,
-        relative_error=judged.error,
-        noise=judged.noise,
-        seconds=estimate.seconds,
-        status=judged.status,
+def _derivatives(
+    problem: Problem, part: CheckedPart, title: str, results: Results, progress: Progress, *, loss: Any, **how: Any
+) -> Iterator[Measured]:
+    return derivatives(
+        problem.renderer,
+        loss,
+        inside(problem.renderer),
+        seed=seeds.stream(part.config.seed, "check"),
+        value=lambda name, kind, measure: results.value(f"{part.key} {name}", kind, measure),
+        stage=lambda name, most: progress.stage(f"{title}: {name}", most, hint=HINT, at_most=True),
+        tick=lambda: progress.advance(1),
+        **how,
     )
 
 
-def _sets(along: Sequence[Probe]) -> list[list[Probe]]:
-    """Probes that one gradient answers together: of one control, with the same valid estimators."""
-    sets: dict[tuple[str, tuple[str, ...], str], list[Probe]] = {}
-    for probe in along:
-        sets.setdefault((probe.group.control, probe.group.valid, probe.group.estimator), []).append(probe)
-    return list(sets.values())
+def _planned(problem: Problem, part: CheckedPart, spp: int, results: Results, progress: Progress) -> Iterator[Finding]:
+    """How a search gets its derivatives, and what it leaves out with what that saves."""
+    config, renderer, u = part.config, problem.renderer, inside(problem.renderer)
+    summary, used = problem.plan_summary(renderer.plan), {group.estimator for group in renderer.plan.groups}
+    not_computed = {
+        "boundary terms: nothing that an adjoint differentiates moves an outline": "material" not in used,
+        "adjoint renders: no coordinate needs one": not used & BY_ADJOINT,
+        "renders for differences: every derivative is an adjoint or of the picture itself": not used & BY_DIFFERENCES,
+        "the volumetric integrator: there is no medium": not renderer.scene.volumetric,
+        **{f"by the material form: {limit.what}": "material" in used for limit in LIMITS},
+    }
+    left_out = [text for text, true in not_computed.items() if true]
+    yield SearchPlan(
+        **{**vars(summary), "spp": spp}, left_out=left_out if config.specialise else ["nothing (`specialise=false`)"]
+    )
+    if not config.specialise:
+        return
+    seed, hint = seeds.stream(config.seed, "leaving out"), "`specialise=false` leaves it out"
 
+    def tick() -> None:
+        progress.advance(1)
 
-def _place(part: CheckedPart) -> CheckedPlace:
-    return CheckedPlace(object=part.config.object, environment=part.config.lit_by, loss=part.loss)
+    def lengths() -> PathLength:
+        progress.stage("finding how many bounces of light matter", most_pictures(problem), hint=hint, at_most=True)
+        return bounces_of(problem, config.seed, tick=tick)
+
+    def gains() -> list[GainRow]:
+        progress.stage("measuring what leaving things out saves", MOST_GRADIENTS, hint=hint, at_most=True)
+        depth = length.depth
+        return measured_gains(renderer, problem.loss, u, seed=seed, spp=problem.spp, depth=depth, tick=tick)
+
+    yield (length := results.row(f"{part.key} bounces", PathLength, lengths))
+    yield from results.rows(f"{part.key} gains", GainRow, gains)
+    yield from results.rows(f"{part.key} texels", TexelRow, lambda: resolved_texels(renderer, u, seed=seed))

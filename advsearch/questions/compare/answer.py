@@ -1,10 +1,11 @@
-"""The result of `compare`."""
+"""The result of `compare`, and what is shown of it."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from typing import ClassVar
 
+import numpy as np
 from pydantic import Field
 
 from advsearch.report import wording
@@ -121,9 +122,6 @@ class CompareResult(InNotebook, RunResult):
         return ", ".join(f"{one.name} {one.accuracy:.1%}" for one in self.sides if one.accuracy is not None)
 
 
-RESULT = CompareResult
-
-
 LIKELY = (
     "p: how likely a split so uneven of the pairs that one side alone gets right is where both are right equally often "
 )
@@ -145,69 +143,25 @@ MOST_TABLES, MOST_PICTURES = 4, 3
 
 def shown(result: CompareResult) -> ShownAnswer:
     """Return each side's accuracy, the pairs, where one is worse, and pictures that one alone gets right."""
-    sides: Mapping[str, Column] = {
+
+    def cost(one: ComparedSide) -> str:
+        if one.seconds != one.seconds:
+            return ""
+        return f"{1000.0 * one.seconds:.2g} ms" if one.seconds < 0.1 else wording.seconds_text(one.seconds)
+
+    columns: Mapping[str, Column] = {
         "": "{0.name}",
         "right in": "{0.correct} of {0.configurations}",
         "accuracy": lambda one: percent(one.accuracy),
         "95 % interval": lambda one: wording.interval_text(one.interval),
-        "time an answer": lambda one: cost_text(one.seconds),
+        "time an answer": cost,
     }
-    sections = [AnswerPart.table(result.sides, sides, title="How often each is right")]
+    sections = [AnswerPart.table(result.sides, columns, title="How often each is right")]
     for pair in result.pairs:
         sections += _of_pair(pair, several=len(result.pairs) > 1)
     said = headline(result.pairs[0]) if result.pairs else "Interrupted before anything was compared."
     sweeps = ", ".join(dict.fromkeys(one.run for one in result.sides))
     return ShownAnswer(said, sections, {"sweeps": sweeps, "they differ in": ", ".join(result.differ)})
-
-
-def _of_pair(pair: ComparedPair, *, several: bool) -> Iterator[AnswerPart]:
-    """Two sides: the pairs in a table of two by two, where one is worse, pictures, and the values of parameters."""
-    said = [headline(pair), alone_text(pair)] if several else [alone_text(pair)]
-    heads = ["", f"{pair.second} right", f"{pair.second} wrong"]
-    rows = [
-        [f"{pair.first} right", str(pair.both), str(pair.first_only)],
-        [f"{pair.first} wrong", str(pair.second_only), str(pair.neither)],
-    ]
-    note = NOTE if pair.units is None else NOTE_OF_UNITS
-    yield AnswerPart(f"{pair.first} and {pair.second}, pair by pair", said, heads, rows, note)
-    yield AnswerPart("Where one is worse", rules_texts(pair))
-    tables = parts_of(pair)
-    told = telling(tables, MOST_TABLES)
-    heads = ["", "pairs", pair.first, pair.second, "difference, points (95 % interval)"]
-    heads += [f"{pair.first} alone", f"{pair.second} alone"]
-    for name, parts in tables.items():
-        lines = [[wording.value_text(one.value), *_count_cells(one)] for one in parts]
-        yield AnswerPart(name, heads=heads, rows=lines, only="" if name in told else "page")
-    if len(told) < len(tables):
-        more = f"The difference varies most over these; the page has all {len(tables)} parameters."
-        yield AnswerPart(text=[more], only="text")
-    for name in (pair.first, pair.second):
-        listed = [one for one in pair.shown if one.right == name]
-        title = f"Only {name} gets right:"
-        rows = [[picture_text(one, pair), *one.pictures] for one in listed[:MOST_PICTURES]]
-        yield AnswerPart(title, rows=rows, only="text")
-        missing = [picture_text(one, pair) for one in listed if not one.pictures]
-        yield AnswerPart(title, missing, pictures=_pictures(listed, pair), only="page")
-
-
-def _pictures(listed: Sequence[PairPicture], pair: ComparedPair) -> list[list[Picture]]:
-    """A picture of each pair where both sides were shown the same, or else the two beside each other."""
-    groups = []
-    for one in listed:
-        said = _said(one, pair)
-        captions = said if len(one.pictures) == len(said) else ["; ".join(said)]
-        captions = [f"{captions[0]}; {values_text(one)}", *captions[1:]]
-        groups.append([Picture(file, text) for file, text in zip(one.pictures, captions, strict=False)])
-    if all(len(group) == 1 for group in groups):
-        return [[one for group in groups for one in group]] if groups else []
-    return [group for group in groups if group]
-
-
-def cost_text(seconds: float) -> str:
-    """Return what an answer took: ``31 ms``; empty where that is not known."""
-    if seconds != seconds:
-        return ""
-    return f"{1000.0 * seconds:.2g} ms" if seconds < 0.1 else wording.seconds_text(seconds)
 
 
 def headline(pair: ComparedPair) -> str:
@@ -221,91 +175,95 @@ def headline(pair: ComparedPair) -> str:
     )
 
 
-def alone_text(pair: ComparedPair) -> str:
-    """Return what the pairs say that one side alone gets right, in a sentence."""
-    if not pair.first_only and not pair.second_only:
-        return "Both are right about the same pictures."
-    shown = "" if pair.p <= LEVEL else ". That there is a difference is not shown"
-    return (
-        f"{pair.first} alone is right in {pair.first_only} and {pair.second} alone in {pair.second_only} "
-        f"({'exact McNemar test, ' if pair.units is None else 'by drive, '}p {p_text(pair.p)}){shown}."
-    )
-
-
 def points_text(interval: Interval) -> str:
     """Return an interval of a difference: ``-25.2 to -8.1``."""
     return " to ".join(f"{100.0 * end:+.1f}" for end in interval)
 
 
-def p_text(p: float) -> str:
-    """Return a p-value: ``= 0.012``, or ``< 0.0001``."""
-    return f"= {p:.2g}" if p >= 0.0001 else "< 0.0001"
+def alone_text(pair: ComparedPair) -> str:
+    """Return what the pairs say that one side alone gets right, in a sentence."""
+    if not pair.first_only and not pair.second_only:
+        return "Both are right about the same pictures."
+    shown = "" if pair.p <= LEVEL else ". That there is a difference is not shown"
+    p = f"= {pair.p:.2g}" if pair.p >= 0.0001 else "< 0.0001"
+    return (
+        f"{pair.first} alone is right in {pair.first_only} and {pair.second} alone in {pair.second_only} "
+        f"({'exact McNemar test, ' if pair.units is None else 'by drive, '}p {p}){shown}."
+    )
 
 
-def rules_texts(pair: ComparedPair) -> list[str]:
-    """Return where each side alone is right, in sentences; none where it was not looked for."""
-    found = []
+def _of_pair(pair: ComparedPair, *, several: bool) -> Iterator[AnswerPart]:
+    """Two sides: the pairs in a table of two by two, where one is worse, the values of parameters, and pictures."""
+    said = [headline(pair), alone_text(pair)] if several else [alone_text(pair)]
+    heads = ["", f"{pair.second} right", f"{pair.second} wrong"]
+    rows = [
+        [f"{pair.first} right", str(pair.both), str(pair.first_only)],
+        [f"{pair.first} wrong", str(pair.second_only), str(pair.neither)],
+    ]
+    note = NOTE if pair.units is None else NOTE_OF_UNITS
+    yield AnswerPart(f"{pair.first} and {pair.second}, pair by pair", said, heads, rows, note)
+    yield AnswerPart("Where one is worse", [*_rules_texts(pair)])
+    tables: dict[str, list[PairPart]] = {}
+    for part in pair.parts:
+        unit = f", {part.unit}" if part.unit not in ("", "1", "name") else ""
+        tables.setdefault(f"{part.parameter}{unit}", []).append(part)
+    spread = {name: np.ptp([one.difference for one in parts]) for name, parts in tables.items()}
+    told = sorted(tables, key=spread.__getitem__, reverse=True)[:MOST_TABLES]
+    heads = ["", "pairs", pair.first, pair.second, "difference, points (95 % interval)"]
+    heads += [f"{pair.first} alone", f"{pair.second} alone"]
+    for name, parts in tables.items():
+        rows = []
+        for one in parts:
+            shares = [percent(right / one.pairs) for right in one.right]
+            difference = f"{100.0 * one.difference:+.0f} ({points_text(one.interval)})"
+            alone = [str(one.first_only), str(one.second_only)]
+            rows.append([wording.value_text(one.value), str(one.pairs), *shares, difference, *alone])
+        yield AnswerPart(name, heads=heads, rows=rows, only="" if name in told else "page")
+    if len(told) < len(tables):
+        more = f"The difference varies most over these; the page has all {len(tables)} parameters."
+        yield AnswerPart(text=[more], only="text")
+    for name in (pair.first, pair.second):
+        yield from _alone(name, pair)
+
+
+def _rules_texts(pair: ComparedPair) -> Iterator[str]:
+    """Where each side alone is right, in sentences; none where it was not looked for."""
     ways = (
         (pair.worse, pair.first_only, pair.first, pair.second),
         (pair.better, pair.second_only, pair.second, pair.first),
     )
     for rules, alone_right, alone, other in ways:
-        if rules is None or not alone_right:
+        where = f"Where {other} is worse than {alone}:"
+        if rules == [] and alone_right:
+            yield f"{where} no values stand out from chance."
+        for number, rule in enumerate(rules if rules and alone_right else ()):
+            rest = "elsewhere" if number == 0 else "in what no rule before covers"
+            inside, outside = (share_of_text(one.count, one.total, one.interval) for one in (rule, rule.elsewhere))
+            yield f"{where} {conditions_text(rule.conditions)}, in {inside} pairs; {rest} in {outside}."
+
+
+def _alone(name: str, pair: ComparedPair) -> Iterator[AnswerPart]:
+    """What one side alone gets right: a picture of each pair where both were shown the same, or else the two beside
+    each other."""
+    title, lines, missing, groups = f"Only {name} gets right:", list[list[str]](), list[str](), list[list[Picture]]()
+    for one in pair.shown:
+        if one.right != name:
             continue
-        if not rules:
-            found.append(f"Where {other} is worse than {alone}: no values stand out from chance.")
-        found += [f"Where {other} is worse than {alone}: {_rule_text(one, n)}" for n, one in enumerate(rules)]
-    return found
-
-
-def _rule_text(rule: PairRule, number: int) -> str:
-    rest = "elsewhere" if number == 0 else "in what no rule before covers"
-    inside, outside = (share_of_text(one.count, one.total, one.interval) for one in (rule, rule.elsewhere))
-    return f"{conditions_text(rule.conditions)}, in {inside} pairs; {rest} in {outside}."
-
-
-def parts_of(pair: ComparedPair) -> dict[str, list[PairPart]]:
-    """Return the parts by parameter, called with its unit."""
-    found: dict[str, list[PairPart]] = {}
-    for one in pair.parts:
-        unit = f", {one.unit}" if one.unit not in ("", "1", "name") else ""
-        found.setdefault(f"{one.parameter}{unit}", []).append(one)
-    return found
-
-
-def telling(tables: dict[str, list[PairPart]], most: int) -> dict[str, list[PairPart]]:
-    """Return so many of the parameters, those whose differences are farthest apart, in the order in which they come."""
-
-    def spread(name: str) -> float:
-        differences = [one.difference for one in tables[name]]
-        return max(differences) - min(differences)
-
-    chosen = sorted(tables, key=spread, reverse=True)[:most]
-    return {name: parts for name, parts in tables.items() if name in chosen}
-
-
-def _count_cells(one: PairCounts) -> list[str]:
-    first, second = (percent(right / one.pairs) for right in one.right)
-    difference = f"{100.0 * one.difference:+.0f} ({points_text(one.interval)})"
-    return [str(one.pairs), first, second, difference, str(one.first_only), str(one.second_only)]
-
-
-def picture_text(one: PairPicture, pair: ComparedPair) -> str:
-    """Return what both sides say of a pair, and where it is."""
-    return "; ".join([*_said(one, pair), values_text(one)])
-
-
-def _said(one: PairPicture, pair: ComparedPair) -> list[str]:
-    """What each side says of a pair, and which of them is right."""
-    names = zip((pair.first, pair.second), one.answers, strict=True)
-    return [f"{name}: {text}{' (right)' if name == one.right else ''}" for name, text in names]
-
-
-def values_text(one: PairPicture) -> str:
-    """Return the values of a pair on one line."""
-    return ", ".join(
-        f"{name} {value if isinstance(value, str) else format(value, '.3g')}" for name, value in one.values.items()
-    )
+        numbers = {key: value if isinstance(value, str) else format(value, ".3g") for key, value in one.values.items()}
+        values = ", ".join(f"{key} {value}" for key, value in numbers.items())
+        sides = zip((pair.first, pair.second), one.answers, strict=True)
+        said = [f"{side}: {text}{' (right)' if side == name else ''}" for side, text in sides]
+        lines.append(["; ".join([*said, values]), *one.pictures])
+        captions = said if len(one.pictures) == 2 else ["; ".join(said)]
+        captions[0] += f"; {values}"
+        if one.pictures:
+            groups.append([Picture(file, text) for file, text in zip(one.pictures, captions, strict=True)])
+        else:
+            missing.append(lines[-1][0])
+    if all(len(group) == 1 for group in groups):
+        groups = [[picture for group in groups for picture in group]] if groups else []
+    yield AnswerPart(title, rows=lines[:MOST_PICTURES], only="text")
+    yield AnswerPart(title, missing, pictures=groups, only="page")
 
 
 def claims(result: CompareResult) -> Iterator[Claim]:

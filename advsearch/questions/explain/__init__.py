@@ -1,12 +1,163 @@
-"""`advsearch explain`: where a model is wrong and why, in words, from the rows of sweeps."""
+"""Say in words where a model is wrong, from the rows of sweeps, and confirm it by fresh renders."""
 
-from advsearch.cli.question import Positional, QuestionCommand
+from __future__ import annotations
 
-HELP = "say in words where a model is wrong, from the rows of sweeps, and confirm it by fresh renders"
-EXAMPLES = (
+from collections.abc import Iterator
+from pathlib import Path
+from typing import ClassVar
+
+from advsearch.config.scene import SceneConfig
+from advsearch.errors import InputError
+from advsearch.question import Asked, question
+from advsearch.questions.explain.answer import EnvelopeRow, ExplainResult, ParameterWeight, RuleRow
+from advsearch.questions.explain.answer import claims as claims
+from advsearch.questions.explain.answer import shown as shown
+from advsearch.runs.directory import PARTS, find_run
+from advsearch.runs.results.base import INTERRUPTED
+from advsearch.runs.summary import read_result
+from advsearch.settings import Clash, Config, each_once, setting, setting_as_in, split_names, texts
+
+
+class ExplainConfig(Config):
+    """Everything that decides what `explain` does: whose rows it reads, and what it renders to see whether it is so."""
+
+    command: ClassVar[str] = "explain"
+    clashes: ClassVar[tuple[Clash, ...]] = tuple(one for one in SceneConfig.clashes if one.setting == "overwrite")
+
+    sweeps: str = setting(
+        ...,
+        "explain",
+        "the sweeps whose rows are read together, separated by commas",
+        "names or folders of runs of sweep, or of recipes with sweeps",
+    )
+    confirm: int = setting(
+        100,
+        "explain",
+        "fresh configurations inside each rule that are rendered to confirm it; 0 for none",
+        unit="renders",
+        ge=0,
+        le=100_000,
+    )
+    pairs: int = setting(
+        12,
+        "explain",
+        "failures for which the nearest right configuration is looked for; 0 for none",
+        unit="failures",
+        ge=0,
+        le=100,
+    )
+    clusters: int = setting(
+        100,
+        "explain",
+        "failures that are rendered again and grouped by what the model decides by; 0 for none",
+        unit="failures",
+        ge=0,
+        le=10_000,
+    )
+    accuracy: float = setting(
+        0.95, "explain", "accuracy that the envelope promises, at 95 % confidence", gt=0.0, le=0.999
+    )
+    seed: int = setting_as_in(SceneConfig, "seed")
+    threads: int | None = setting_as_in(SceneConfig, "threads")
+    run: str | None = setting_as_in(SceneConfig, "run", otherwise="runs/RUN-explain-NNN")
+    overwrite: bool = setting_as_in(SceneConfig, "overwrite")
+
+    _named = texts("run", several=["sweeps"])
+    _different = each_once("sweeps")
+
+    @property
+    def title(self) -> tuple[str, ...]:
+        """The first run, and what is asked of it."""
+        return Path(split_names(self.sweeps)[0]).name, self.command
+
+
+@question(
     "explain mug-sweep-001",
     "explain mug-sweep-001 mug-sweep-002 --confirm 200 --accuracy 0.9",
     "explain mug-sweep-001 --confirm 0 --pairs 0 --json",
+    place=("sweeps",),
+    about="sweeps",
+    expected=("RUN", "the run of a sweep", "", True),
 )
+def explain(asked: Asked[ExplainConfig]) -> ExplainResult:
+    """Say in words where a model is wrong, from the rows of sweeps, and confirm it by renders (docs/explain.md).
 
-COMMAND = QuestionCommand("explain", about="sweeps", place=Positional("RUN", "the run of a sweep", several=True))
+    Args:
+        sweeps: name or folder of a run of `sweep` that has ended, or several, whose rows are read together; of a
+            recipe, its sweeps.
+    """
+    # these import torch, scipy and pandas
+    from advsearch.questions.explain.findings import (
+        cautions,
+        find_envelope,
+        find_importance,
+        not_told,
+        right_of,
+        rule_counts,
+    )
+    from advsearch.questions.explain.renders import AskedSweep, Renders, read_answers
+    from advsearch.rules import FEWEST_ROWS, find_rules, halves, is_independent, observed
+
+    config, progress = asked.config, asked.progress
+    progress.stage("reading rows")
+    sweeps = [AskedSweep.of(folder) for name in split_names(config.sweeps) for folder in _sweeps_of(find_run(name))]
+    rows = read_answers(sweeps)
+    if len(rows) < FEWEST_ROWS:
+        raise InputError(f"explain: expected at least {FEWEST_ROWS} rows, got {len(rows)}; sweep more configurations")
+    table = observed(rows, rows.attrs["units"])
+    if not table.attrs["units"]:
+        raise InputError("explain: expected rows in which something varies that all of them have, got none")
+    choosing, counting = halves(table, config.seed)
+    progress.stage("seeking rules on one half of the rows")
+    found = find_rules(choosing, counting, config.seed)
+    progress.stage("measuring which parameters matter")
+    importance = find_importance(table)
+    box = find_envelope(choosing, counting, config.accuracy)
+    renders = Renders(asked, sweeps, rows, table)
+    rules = [RuleRow(**rule_counts(one), confirmed=renders.confirmed(one, n)) for n, one in enumerate(found.told)]
+    pairs = list(renders.pairs(found.told))
+    clusters = renders.clusters()
+    if renders.interrupted:
+        asked.ending = INTERRUPTED
+    answers = right_of(table)
+
+    def together(names: Iterator[str]) -> str:
+        return ",".join(dict.fromkeys(one for name in names for one in split_names(name)))
+
+    return asked.result(
+        ExplainResult,
+        sweeps=[str(one.folder) for one in sweeps],
+        object=together(one.summary.object for one in sweeps),
+        model=together(one.summary.model for one in sweeps),
+        environment=together(one.summary.environment for one in sweeps),
+        controls=sweeps[0].summary.controls,
+        parameters=list(table.attrs["units"]),
+        **vars(answers),
+        units=None if is_independent(table) else table["unit"].nunique(),
+        rules=rules,
+        not_told=not_told(found.next, len(table)),
+        importance=[ParameterWeight(**{**vars(one), "parameters": [*one.factors]}) for one in importance],
+        envelope=box
+        and EnvelopeRow(
+            conditions=[one.row for one in box.conditions],
+            **vars(right_of(box.inside)),
+            accuracy=config.accuracy,
+            held=box.held,
+        ),
+        pairs=pairs,
+        pairs_sought=min(config.pairs, answers.total - answers.right),
+        clusters=clusters,
+        renders=renders.count,
+        warnings=[*renders.warnings, *cautions(table, importance)],
+    )
+
+
+def _sweeps_of(folder: Path) -> list[Path]:
+    """The folder of a sweep, or those of the sweeps that a recipe consists of."""
+    made = read_result(folder)
+    if made.command != "recipe":
+        return [folder]
+    parts = [folder / PARTS / part.name for part in getattr(made, "parts", ()) if part.command == "sweep"]
+    if not parts:
+        raise InputError(f"explain: expected sweeps, got {folder}, a recipe without one")
+    return parts

@@ -1,4 +1,4 @@
-"""The result of `explain`."""
+"""The result of `explain`, and what is shown of it."""
 
 from __future__ import annotations
 
@@ -30,6 +30,11 @@ class RightOf(Fields):
     right: int = Field(description="right answers")
     total: int = Field(alias="of", description="how many")
     interval: Interval = Field(description="of the share, 95 %")
+
+    @property
+    def text(self) -> str:
+        """A share with its interval and what it is of: ``12 % (9 to 16) of 340``."""
+        return share_of_text(self.right, self.total, self.interval)
 
 
 class RuleRow(RightOf):
@@ -131,9 +136,6 @@ class ExplainResult(RunResult, RightOf):
         return f"{len(self.rules)} rules over {self.total} rows"
 
 
-RESULT = ExplainResult
-
-
 CHOSEN = (
     "Chosen on one half of the rows and counted on the other, each beyond the rules before it; 95 % intervals. "
     "Chance alone would tell any rule in one of a hundred cases at most."
@@ -151,34 +153,102 @@ MOST_ANSWERS = 3
 
 def shown(result: ExplainResult) -> ShownAnswer:
     """Return the rules, what decides, the envelope, and failures beside the nearest right answers."""
-    rules = [f"{number + 1}. {rule_text(number, rule)}" for number, rule in enumerate(result.rules)]
+    said = f"{wording.count(len(result.rules), 'rule')} under which the model is wrong more often than elsewhere."
+    if not result.rules:
+        said = (
+            f"No rule is told from chance in {result.total:,} rows, of which one half chooses and the other counts: "
+            f"the model is right in {result.text}."
+        )
+    rules = [f"{number}. {rule_text(number, rule)}" for number, rule in enumerate(result.rules, start=1)]
     weights: Mapping[str, Column] = {
         "parameters": lambda one: " with ".join(one.parameters),
         "decides": lambda one: percent(one.share),
         "95 % interval": lambda one: interval_text(one.interval),
         "by parts": lambda one: str(one.parts or ""),
     }
-    found = result.clusters
-    return ShownAnswer(
-        explain_text(result),
-        [
-            AnswerPart("Rules", [*rules, not_told_text(result)], note=CHOSEN if rules else ""),
-            AnswerPart.table(result.importance[:MOST_WEIGHTS], weights, title="What decides", note=DECIDES),
-            AnswerPart("Where it can be relied on", [envelope_text(result)]),
-            AnswerPart("One thing changed", [pairs_text(result)]) if result.pairs_sought else AnswerPart(),
-            *(AnswerPart(text=[pair_text(one)], pictures=[_beside(one)]) for one in result.pairs),
-            AnswerPart("Kinds of failures", [clusters_text(found)], pictures=[_typical(found)])
-            if found
-            else AnswerPart(),
-        ],
-        {
-            "rows": f"right in {right_share_text(result)}"
-            + (f", of {result.units:,} independent draws" if result.units else ""),
-            "sweeps": ", ".join(result.sweeps),
-            "parameters": ", ".join(result.parameters),
-        },
-        about=[result.object, result.model],
+    sections = [
+        AnswerPart("Rules", [*rules, not_told_text(result)], note=CHOSEN if rules else ""),
+        AnswerPart.table(result.importance[:MOST_WEIGHTS], weights, title="What decides", note=DECIDES),
+        AnswerPart("Where it can be relied on", [envelope_text(result)]),
+    ]
+    if result.pairs_sought:
+        sections.append(AnswerPart("One thing changed", [pairs_text(result)]))
+    for pair in result.pairs:
+        unit = f" {pair.unit}" if pair.unit not in ("", "1") else ""
+        wrong, right = (one if isinstance(one, str) else f"{one:.4g}" for one in (pair.wrong_at, pair.right_at))
+        text = f"{pair.parameter} {wrong}{unit}: {pair.answered}; at {right}{unit}: {pair.answered_there}."
+        captions = f"wrong: {pair.answered}", f"right: {pair.answered_there}"
+        pictures = [Picture(file, one) for file, one in zip(pair.pictures, captions, strict=False)]
+        sections.append(AnswerPart(text=[text], pictures=[pictures]))
+    if result.clusters:
+        sections.append(_kinds(result.clusters))
+    draws = f", of {result.units:,} independent draws" if result.units else ""
+    facts = {
+        "rows": f"right in {result.text}{draws}",
+        "sweeps": ", ".join(result.sweeps),
+        "parameters": ", ".join(result.parameters),
+    }
+    return ShownAnswer(said, sections, facts, about=[result.object, result.model])
+
+
+def rule_text(number: int, rule: RuleRow) -> str:
+    """Return the rule with a number, from 1, as a sentence."""
+    rest = "elsewhere" if number == 1 else "in what no rule before covers"
+    text = f"{conditions_text(rule.conditions)}: right in {rule.text}; {rest} {rule.elsewhere.text}."
+    return f"{text} Fresh renders inside it: right in {rule.confirmed.text}." if rule.confirmed else text
+
+
+def not_told_text(result: ExplainResult) -> str:
+    """Return the best rule that is not told, why not, and how many rows it would take; empty where there is none."""
+    rule = result.not_told
+    if rule is None:
+        return ""
+    text = (
+        f"Not told{' either' if result.rules else ''}, but the best that one half of the rows suggests: "
+        f"{conditions_text(rule.conditions)}. In the other half the model is right in {rule.right} of {rule.total} "
+        f"under it and in {rule.elsewhere.right} of {rule.elsewhere.total} elsewhere"
     )
+    if rule.rows is None:
+        return f"{text}, which is no difference that more rows would tell."
+    chance = f"chance does that with a probability of {rule.chance:.2g}, and at most {rule.asked:g} is asked"
+    return f"{text}; {chance}. About {rule.rows:,} rows with these shares would tell it: sweep more."
+
+
+def envelope_text(result: ExplainResult) -> str:
+    """Return what the envelope promises."""
+    box = result.envelope
+    if box is None:
+        return "No box of enough rows promises the accuracy that was asked for."
+    where = conditions_text(box.conditions)
+    if not box.held:
+        return f"Not shown: inside {where} the rows that did not choose it are right in {box.text}."
+    return f"At least {100 * box.accuracy:g} % at 95 % confidence: {where}; right in {box.text}."
+
+
+def pairs_text(result: ExplainResult) -> str:
+    """Return for how many failures a right configuration near was sought, and for how many it was found."""
+    failures = result.total - result.right
+    left = failures - result.pairs_sought
+    others = f" The other {left} were not tried; `pairs` says how many are." if left else ""
+    return (
+        f"Of the {result.pairs_sought} most typical of {failures} failures, {len(result.pairs)} are right once one "
+        f"parameter is another.{others}"
+    )
+
+
+def _kinds(found: FailureClusters) -> AnswerPart:
+    """How many kinds of failures there are, with the most typical of each and what the model calls them."""
+    again = f"the {found.failures} failures that were rendered again"
+    text = f"One kind: {again} are alike by {found.features}."
+    if found.silhouette is not None:
+        shading = "" if found.apart else "; they shade into one another: groups of any cloud may be as far apart"
+        kinds = f"{len(found.listed)} kinds among {again}, by {found.features}"
+        text = f"{kinds} (silhouette {found.silhouette:.2f}{shading})."
+    pictures = []
+    for one in found.listed:
+        answers = ", ".join(f"{name} {number}" for name, number in [*one.answers.items()][:MOST_ANSWERS])
+        pictures.append(Picture(one.picture, f"{one.failures}: {answers}"))
+    return AnswerPart("Kinds of failures", [text], pictures=[pictures])
 
 
 def claims(result: ExplainResult) -> Iterator[Claim]:
@@ -194,103 +264,3 @@ def claims(result: ExplainResult) -> Iterator[Claim]:
     )
     text = f"Inside {conditions_text(box.conditions)} the model is right in {share_text(extent)} configurations"
     yield claim("measured", f"{text} that did not choose this box; the sweeps drew no others.", extent)
-
-
-def explain_text(result: ExplainResult) -> str:
-    """Return the first thing that a reader should know, in a sentence."""
-    if not result.rules:
-        return (
-            f"No rule is told from chance in {result.total:,} rows, of which one half chooses and the other counts: "
-            f"the model is right in {right_share_text(result)}."
-        )
-    return f"{wording.count(len(result.rules), 'rule')} under which the model is wrong more often than elsewhere."
-
-
-def rule_text(number: int, rule: RuleRow) -> str:
-    """Return a rule as a sentence."""
-    rest = "elsewhere" if number == 0 else "in what no rule before covers"
-    share, others = right_share_text(rule), right_share_text(rule.elsewhere)
-    text = f"{conditions_text(rule.conditions)}: right in {share}; {rest} {others}."
-    fresh = rule.confirmed
-    return text if fresh is None else f"{text} Fresh renders inside it: right in {right_share_text(fresh)}."
-
-
-def not_told_text(result: ExplainResult) -> str:
-    """Return the best rule that is not told, why not, and how many rows it would take; empty where there is none."""
-    rule = result.not_told
-    if rule is None:
-        return ""
-    others = f"{rule.elsewhere.right} of {rule.elsewhere.total}"
-    text = (
-        f"Not told{' either' if result.rules else ''}, but the best that one half of the rows suggests: "
-        f"{conditions_text(rule.conditions)}. In the other half the model is right in {rule.right} of {rule.total} "
-        f"under it and in {others} elsewhere"
-    )
-    if rule.rows is None:
-        return f"{text}, which is no difference that more rows would tell."
-    shown = f"chance does that with a probability of {rule.chance:.2g}, and at most {rule.asked:g} is asked"
-    return f"{text}; {shown}. About {rule.rows:,} rows with these shares would tell it: sweep more."
-
-
-def right_share_text(counted: RightOf) -> str:
-    """Return a share with its interval and what it is of: ``12 % (9 to 16) of 340``."""
-    return share_of_text(counted.right, counted.total, counted.interval)
-
-
-def envelope_text(result: ExplainResult) -> str:
-    """Return what the envelope promises."""
-    box = result.envelope
-    if box is None:
-        return "No box of enough rows promises the accuracy that was asked for."
-    where = conditions_text(box.conditions)
-    if not box.held:
-        return f"Not shown: inside {where} the rows that did not choose it are right in {right_share_text(box)}."
-    return f"At least {100 * box.accuracy:g} % at 95 % confidence: {where}; right in {right_share_text(box)}."
-
-
-def pair_text(pair: NearestRight) -> str:
-    """Return a failure beside the nearest right answer."""
-    unit = f" {pair.unit}" if pair.unit not in ("", "1") else ""
-    return (
-        f"{pair.parameter} {_value(pair.wrong_at)}{unit}: {pair.answered}; at {_value(pair.right_at)}{unit}: "
-        f"{pair.answered_there}."
-    )
-
-
-def _beside(pair: NearestRight) -> list[Picture]:
-    """The pictures of a failure and of the nearest right answer, of which were kept."""
-    said = (f"wrong: {pair.answered}", f"right: {pair.answered_there}")
-    return [Picture(name, text) for name, text in zip(pair.pictures, said, strict=False)]
-
-
-def pairs_text(result: ExplainResult) -> str:
-    """Return for how many failures a right configuration near was sought, and for how many it was found."""
-    failures = result.total - result.right
-    left = failures - result.pairs_sought
-    others = f" The other {left} were not tried; `pairs` says how many are." if left else ""
-    return (
-        f"Of the {result.pairs_sought} most typical of {failures} failures, {len(result.pairs)} are right once one "
-        f"parameter is another.{others}"
-    )
-
-
-def clusters_text(found: FailureClusters) -> str:
-    """Return how many kinds of failures there are."""
-    again = f"the {found.failures} failures that were rendered again"
-    if found.silhouette is None:
-        return f"One kind: {again} are alike by {found.features}."
-    shading = "" if found.apart else "; they shade into one another: groups of any cloud may be as far apart"
-    kinds = f"{len(found.listed)} kinds among {again}, by {found.features}"
-    return f"{kinds} (silhouette {found.silhouette:.2f}{shading})."
-
-
-def _typical(found: FailureClusters) -> list[Picture]:
-    """The most typical failure of each cluster, how many it has, and what the model calls them."""
-    said = [
-        ", ".join(f"{name} {number}" for name, number in [*one.answers.items()][:MOST_ANSWERS]) for one in found.listed
-    ]
-    return [Picture(one.picture, f"{one.failures}: {text}") for one, text in zip(found.listed, said, strict=True)]
-
-
-def _value(value: str | float) -> str:
-    return value if isinstance(value, str) else f"{value:.4g}"

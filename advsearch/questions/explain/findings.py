@@ -20,19 +20,32 @@ the other half, which has seen no choice, is asked once whether it keeps what is
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import pandas as pd
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 from scipy.stats import chi2, ncf, ncx2
 from scipy.stats import f as fisher
 
 from advsearch.attacks.trials import CONFIDENCE
-from advsearch.explanations import Observations, RuleCondition, RuleConditions, covered, import_library
+from advsearch.questions.explain.answer import RightOf, RuleNotTold
+from advsearch.rules import CHANCE as RULES_CHANCE
+from advsearch.rules import (
+    FEWEST_ROWS,
+    CountedRule,
+    RuleCondition,
+    RuleConditions,
+    covered,
+    import_library,
+    interval_of,
+    is_independent,
+)
 
 MOST_PARTS = 20
 ROWS_IN_A_CELL = 25
@@ -48,104 +61,105 @@ Places = npt.NDArray[np.int64]
 
 @dataclass(frozen=True)
 class FactorWeight:
-    """What one factor, or two together, decide, by their numbers: a share of the variance of the answers, in [0, 1],
-    without what chance adds to it, with its 95 % interval, and into how many parts it was cut."""
+    """What one factor, or two together, decide: a share of the variance of the answers, in [0, 1], without what chance
+    adds to it, with its 95 % interval, and into how many parts it was cut."""
 
-    places: tuple[int, ...]
+    factors: tuple[str, ...]
     share: float
     interval: tuple[float, float]
     parts: int
 
 
-def find_importance(found: Observations) -> tuple[FactorWeight, ...]:
-    """Return each factor by falling share, then the pairs that decide together more than each of the two by itself.
+def find_importance(table: pd.DataFrame) -> tuple[FactorWeight, ...]:
+    """Return each factor of a table (`rules`) by falling share, then the pairs that decide together more than each of
+    the two by itself.
 
     Nothing where the answers are all the same.
     """
-    if len(set(found.right.tolist())) < 2:
+    if table["correct"].nunique() < 2:
         return ()
-    count, wide = found.count, range(len(found.factors))
-    alone = [_weight((k,), _parts(found, k, round(count ** (1.0 / 3.0))), found) for k in wide]
-    pairs, tested = [], list(combinations(wide, 2))
-    few = max(2, math.isqrt(count // ROWS_IN_A_CELL))
-    coarse = [_parts(found, k, few) for k in wide]
-    for i, j in tested:
-        both = coarse[i] * (int(coarse[j].max()) + 1) + coarse[j]
-        (first, k), (second, m), (joint, cells) = (_between(one, found.right) for one in (coarse[i], coarse[j], both))
-        more, freedom = len(found) * (joint - first - second), max(1, cells - k - m + 1)
-        if _exceeds(more, freedom, [_by_chance(one, found) for one in (both, coarse[i], coarse[j])], found) < (
-            CHANCE / len(tested)
-        ):
-            pairs.append(_weight((i, j), both, found))
+    answers, factors = _Answers(table), list(table.attrs["units"])
+    fine, few = round(answers.count ** (1.0 / 3.0)), max(2, math.isqrt(answers.count // ROWS_IN_A_CELL))
+    alone = [answers.weight((one,), _parts(table[one], fine)) for one in factors]
+    pairs, tested = [], list(combinations(factors, 2))
+    coarse = {one: _parts(table[one], few) for one in factors}
+    for pair in tested:
+        one, other = (coarse[factor] for factor in pair)
+        both = one * (int(other.max()) + 1) + other
+        if answers.chance_of_more(both, one, other) < CHANCE / len(tested):
+            pairs.append(answers.weight(pair, both))
     return (*sorted(alone, key=lambda one: -one.share), *sorted(pairs, key=lambda one: -one.share))
 
 
-def _parts(found: Observations, place: int, most: int) -> Places:
+def _parts(column: pd.Series, most: int) -> Places:
     """The part of each row (n,): a name, or one of at most so many parts of equally many rows."""
-    column = found.values[:, place]
-    if found.factors[place].options:
-        return column.astype(np.int64)
-    ends = np.unique(np.quantile(column, np.linspace(0.0, 1.0, min(max(2, most), MOST_PARTS) + 1)[1:-1]))
-    return np.searchsorted(ends, column, side="left").astype(np.int64)
+    if column.dtype == "category":
+        return np.asarray(column.cat.codes, dtype=np.int64)
+    values = column.to_numpy()
+    ends = np.unique(np.quantile(values, np.linspace(0.0, 1.0, min(max(2, most), MOST_PARTS) + 1)[1:-1]))
+    return np.asarray(np.searchsorted(ends, values, side="left"), dtype=np.int64)
 
 
-def _between(parts: Places, right: npt.NDArray[np.bool_]) -> tuple[float, int]:
-    """The share of the variance between parts as it is counted, and the number of parts that have rows."""
-    seen = np.bincount(parts)
-    rate = np.bincount(parts, right)[seen > 0] / seen[seen > 0]
-    mean = float(right.mean())
-    return float((seen[seen > 0] * (rate - mean) ** 2).sum()) / len(right) / (mean * (1.0 - mean)), len(rate)
+class _Answers:
+    """The answers of a table: (n,) whether they are right, and the number of the unit of each."""
 
+    def __init__(self, table: pd.DataFrame) -> None:
+        self.right: npt.NDArray[np.bool_] = table["correct"].to_numpy()
+        units, self.units = np.unique(table["unit"], return_inverse=True)
+        self.count, self.independent = len(units), is_independent(table)
+        self.variance = float(self.right.mean()) * (1.0 - float(self.right.mean()))
 
-def _weight(places: tuple[int, ...], parts: Places, found: Observations) -> FactorWeight:
-    (counted, k), n = _between(parts, found.right), len(found)
-    by_chance = _by_chance(parts, found)
-    if k < 2 or math.isnan(by_chance):
-        return FactorWeight(places, 0.0, (0.0, 1.0), k)
-    tail, spread = (1.0 - CONFIDENCE) / 2.0, by_chance / (k - 1)
-    if found.independent:
-        spread, others = 1.0, math.inf
-    else:
-        others = float(found.count - k)
-    statistic = n * counted / spread
-    low = spread * _noncentrality(statistic, k - 1, others, 1.0 - tail) / n
-    high = spread * _noncentrality(max(statistic, k - 1.0), k - 1, others, tail) / n  # fewer: less than chance gives
-    share = 1.0 - (1.0 - counted) * (n - 1) / max(n - k, 1) if found.independent else counted - by_chance / n
-    return FactorWeight(places, max(share, 0.0), (min(low, 1.0), min(high, 1.0)), k)
+    def between(self, parts: Places) -> tuple[float, int]:
+        """The share of the variance between parts as it is counted, and the number of parts that have rows."""
+        seen = np.bincount(parts)
+        rate = np.bincount(parts, self.right)[seen > 0] / seen[seen > 0]
+        mean = float(self.right.mean())
+        return float((seen[seen > 0] * (rate - mean) ** 2).sum()) / len(self.right) / self.variance, len(rate)
 
+    def weight(self, factors: tuple[str, ...], parts: Places) -> FactorWeight:
+        (counted, k), n, by_chance = self.between(parts), len(self.right), self.by_chance(parts)
+        if k < 2 or math.isnan(by_chance):
+            return FactorWeight(factors, 0.0, (0.0, 1.0), k)
+        tail, spread, others = (1.0 - CONFIDENCE) / 2.0, by_chance / (k - 1), float(self.count - k)
+        if self.independent:
+            spread, others = 1.0, math.inf
+        statistic = n * counted / spread
+        low = spread * _noncentrality(statistic, k - 1, others, 1.0 - tail) / n
+        high = spread * _noncentrality(max(statistic, k - 1.0), k - 1, others, tail) / n  # fewer: less than chance
+        share = 1.0 - (1.0 - counted) * (n - 1) / max(n - k, 1) if self.independent else counted - by_chance / n
+        return FactorWeight(factors, max(share, 0.0), (min(low, 1.0), min(high, 1.0)), k)
 
-def _by_chance(parts: Places, found: Observations) -> float:
-    """What chance adds to the statistic of some parts, from how much units deviate: k - 1 where answers are
-    independent; NaN where too few units say it."""
-    seen, right = np.bincount(parts), found.right
-    if found.independent:
-        return float((seen > 0).sum() - 1)
-    rate = np.bincount(parts, right) / np.maximum(seen, 1)
-    units = np.unique(found.units, return_inverse=True)[1].reshape(-1)
-    both, places = np.unique(parts * (units.max() + 1) + units, return_inverse=True)
-    away = np.bincount(places.reshape(-1), right - rate[parts])
-    of, in_part = both // (units.max() + 1), np.bincount(both // (units.max() + 1), minlength=len(seen))
-    if found.count < 2 or found.count <= (seen > 0).sum() or (in_part[seen > 0] < 2).any():
-        return math.nan
-    each = np.bincount(of, away**2, minlength=len(seen))[seen > 0]
-    mine = in_part[seen > 0]
-    alone = float((each * mine / (mine - 1) / seen[seen > 0]).sum())
-    together = np.bincount(both % (units.max() + 1), away)
-    whole = float((together**2).sum()) * found.count / (found.count - 1) / len(right)
-    mean = float(right.mean())
-    adds = (alone - whole) / (mean * (1.0 - mean))
-    return max(adds, LEAST_SPREAD * float((seen > 0).sum() - 1))
+    def by_chance(self, parts: Places) -> float:
+        """What chance adds to the statistic of some parts, from how much units deviate: k - 1 where answers are
+        independent; NaN where too few units say it."""
+        seen, right = np.bincount(parts), self.right
+        if self.independent:
+            return float((seen > 0).sum() - 1)
+        rate = np.bincount(parts, right) / np.maximum(seen, 1)
+        both, places = np.unique(parts * self.count + self.units, return_inverse=True)
+        away = np.bincount(places.reshape(-1), right - rate[parts])
+        of, unit = both // self.count, both % self.count
+        in_part = np.bincount(of, minlength=len(seen))
+        if self.count < 2 or self.count <= (seen > 0).sum() or (in_part[seen > 0] < 2).any():
+            return math.nan
+        each = np.bincount(of, away**2, minlength=len(seen))[seen > 0]
+        mine = in_part[seen > 0]
+        alone = float((each * mine / (mine - 1) / seen[seen > 0]).sum())
+        together = np.bincount(unit, away)
+        whole = float((together**2).sum()) * self.count / (self.count - 1) / len(right)
+        return max((alone - whole) / self.variance, LEAST_SPREAD * float((seen > 0).sum() - 1))
 
-
-def _exceeds(more: float, freedom: int, by_chance: list[float], found: Observations) -> float:
-    """How likely it is that chance makes the statistic of two factors exceed those of each by so much."""
-    if found.independent:
-        return float(chi2.sf(more, freedom))
-    adds = by_chance[0] - by_chance[1] - by_chance[2]
-    others = found.count - freedom - 1
-    if not adds > 0.0 or others < 1:
-        return 1.0
-    return float(fisher.sf(more / adds, freedom, others))
+    def chance_of_more(self, both: Places, one: Places, other: Places) -> float:
+        """How likely it is that chance makes the statistic of two factors exceed those of each by so much."""
+        (joint, cells), (first, k), (second, m) = (self.between(parts) for parts in (both, one, other))
+        more, freedom = len(self.right) * (joint - first - second), max(1, cells - k - m + 1)
+        if self.independent:
+            return float(chi2.sf(more, freedom))
+        adds = self.by_chance(both) - self.by_chance(one) - self.by_chance(other)
+        others = self.count - freedom - 1
+        if not adds > 0.0 or others < 1:
+            return 1.0
+        return float(fisher.sf(more / adds, freedom, others))
 
 
 def _noncentrality(statistic: float, freedom: int, others: float, probability: float) -> float:
@@ -176,67 +190,98 @@ RESERVE = 0.01
 """By how much more the choosing rows have to show, since they were chosen by."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Envelope:
-    """A box, and what rows that did not choose it say; at most one condition for each factor. `at_least` is the lower
-    end of the interval of the accuracy, and `held` whether that is as much as was asked for."""
+    """A box, the rows inside it that did not choose it, and whether they show the accuracy that was asked for."""
 
     conditions: RuleConditions
-    inside: Observations
-    at_least: float
+    inside: pd.DataFrame
     held: bool
 
 
-def find_envelope(choosing: Observations, counting: Observations, accuracy: float) -> Envelope | None:
+def find_envelope(choosing: pd.DataFrame, counting: pd.DataFrame, accuracy: float) -> Envelope | None:
     """Return the largest box that promises an accuracy in (0, 1), the lower end of a 95 % interval; None where no box
     of enough rows does. Some rows choose the box, and others try it, once."""
     conditions: RuleConditions = ()
-    inside = np.ones(len(choosing), dtype=bool)
-    while choosing.where(inside).interval[0] < min(accuracy + RESERVE, (1.0 + accuracy) / 2.0):
-        best, kept = max(
-            ((one, covered(one, choosing)) for one in _peeled(conditions, choosing, inside)),
-            key=lambda pair: _mean(choosing, pair[1]),
-            default=((), inside),
-        )
-        if not best or _units(choosing, kept) < LEAST_INSIDE:
+    inside, independent = choosing, is_independent(choosing)
+    while interval_of(inside)[0] < min(accuracy + RESERVE, (1.0 + accuracy) / 2.0):
+        best: RuleConditions | None = None
+        most, kept = -1.0, inside
+        for smaller in _peeled(conditions, inside):
+            left = choosing[covered(smaller, choosing)]
+            enough = (len(left) if independent else left["unit"].nunique()) >= LEAST_INSIDE
+            if enough and left["correct"].mean() > most:
+                best, most, kept = smaller, left["correct"].mean(), left
+        if best is None:
             return None
         conditions, inside = best, kept
-    tried = counting.where(covered(conditions, counting))
-    low = tried.interval[0]
-    return Envelope(conditions, tried, low, low >= accuracy)
+    tried = counting[covered(conditions, counting)]
+    return Envelope(conditions, tried, interval_of(tried)[0] >= accuracy)
 
 
-def _units(found: Observations, inside: np.ndarray) -> int:
-    return int(inside.sum()) if found.independent else len(np.unique(found.units[inside]))
-
-
-def _mean(found: Observations, inside: np.ndarray) -> float:
-    return float(found.right[inside].mean()) if _units(found, inside) >= LEAST_INSIDE else -1.0
-
-
-def _peeled(conditions: RuleConditions, found: Observations, inside: np.ndarray) -> Iterator[RuleConditions]:
-    """Boxes that are a little smaller, in one factor each."""
-    own = {one.place: one for one in conditions}
-    for place, factor in enumerate(found.factors):
-        column = found.values[inside, place]
-        if factor.options:
-            whole = RuleCondition(place, options=frozenset(range(len(factor.options))))
-            before = own.get(place, whole)
-            assert before.options is not None
-            smaller = [replace(before, options=before.options - {one}) for one in before.options]
-            smaller = [one for one in smaller if one.options]
+def _peeled(conditions: RuleConditions, inside: pd.DataFrame) -> Iterator[RuleConditions]:
+    """Boxes that are a little smaller than the one that has some rows, in one factor each."""
+    own = {one.factor: one for one in conditions}
+    for factor, unit in inside.attrs["units"].items():
+        column, before = inside[factor], own.get(factor, RuleCondition(factor, unit))
+        if column.dtype == "category":
+            names = before.options or frozenset(column.cat.categories)
+            smaller = [replace(before, options=names - {one}) for one in sorted(names)] if len(names) > 1 else []
         else:
-            before = own.get(place, RuleCondition(place))
-            low, high = (float(f"{np.quantile(column, at):.3g}") for at in (SLICE, 1.0 - SLICE))
+            values = column.to_numpy()
+            low, high = (float(f"{np.quantile(values, at):.3g}") for at in (SLICE, 1.0 - SLICE))
             smaller = [replace(before, low=low), replace(before, high=high)]
-            if low < column.min() or low >= column.max():  # few different values: the least one goes
-                smaller[0] = replace(before, low=float(column.min()))
-            if high >= column.max():
-                rest = column[column < column.max()]
+            if low < values.min() or low >= values.max():  # few different values: the least one goes
+                smaller[0] = replace(before, low=float(values.min()))
+            if high >= values.max():
+                rest = values[values < values.max()]
                 smaller[1] = replace(before, high=float(rest.max())) if len(rest) else before
         for one in smaller:
-            if one != before and (one.low < one.high):
-                yield tuple({**own, place: one}[key] for key in sorted({**own, place: one}))
+            if one != before and one.low < one.high:
+                box = {**own, factor: one}
+                yield tuple(box[name] for name in inside.attrs["units"] if name in box)
+
+
+# ---- rules as answers have them -----------------------------------------------------------------------------------
+
+
+def right_of(rows: pd.DataFrame) -> RightOf:
+    """Return a count with the interval of its share."""
+    return RightOf(right=int(rows["correct"].sum()), total=len(rows), interval=interval_of(rows))
+
+
+def cautions(table: pd.DataFrame, importance: Sequence[FactorWeight]) -> list[str]:
+    """Return what a reader has to know of the rows of a table and of what decides."""
+    found, draws = list[str](), table["unit"].nunique()
+    if draws < FEWEST_ROWS:
+        found = [f"The rows are of {draws} draws, each with several, which are not independent: few show little."]
+    if table["correct"].nunique() < 2:
+        always = "right" if table["correct"].all() else "wrong"
+        return [*found, f"The model is {always} in every row: there is nothing to tell apart."]
+    if all(one.interval[0] <= 0.0 for one in importance):
+        return [*found, "No parameter is shown to decide anything: the intervals of all their shares begin at 0."]
+    return found
+
+
+def rule_counts(rule: CountedRule) -> dict[str, Any]:
+    """Return what a rule is, and how often the model is right under it and elsewhere."""
+    conditions = [one.row for one in rule.conditions]
+    return {"conditions": conditions, **vars(right_of(rule.inside)), "elsewhere": right_of(rule.elsewhere)}
+
+
+def not_told(rule: CountedRule | None, rows: int) -> RuleNotTold | None:
+    """Return what is said of a rule that is not told, found in so many rows."""
+    if rule is None:
+        return None
+    times = rule.times_needed()
+    needed = None if times is None else round_up(times * rows)
+    return RuleNotTold(**rule_counts(rule), chance=rule.chance, asked=RULES_CHANCE, rows=needed)
+
+
+def round_up(rows: float) -> int:
+    """Return a number of rows with two digits that mean something: 173.2 becomes 180."""
+    step: int = 10 ** max(0, math.floor(math.log10(rows)) - 1)
+    return math.ceil(rows / step) * step
 
 
 MOST, FEWEST = 6, 8

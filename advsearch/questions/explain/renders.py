@@ -8,9 +8,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import islice, zip_longest
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
+import pandas as pd
 import torch
 from torch import Tensor
 
@@ -19,29 +20,20 @@ from advsearch.api.studies import carry_out_part
 from advsearch.config import SweepConfig
 from advsearch.controls import CONTROLS
 from advsearch.errors import FileFormatError, InputError, ModelError
-from advsearch.explanations import (
-    Answered,
-    CountedRule,
-    Factor,
-    Mask,
-    Observations,
-    RuleCondition,
-    RuleConditions,
-    covered,
-    figure_value,
-    rows_of,
-)
 from advsearch.interrupts import interruptible
 from advsearch.models.features import Features, features_of
 from advsearch.options import BY_KEY
 from advsearch.progress import Progress
+from advsearch.question import Asked
 from advsearch.questions.explain.answer import FailureCluster, FailureClusters, NearestRight, RightOf
-from advsearch.questions.explain.findings import find_clusters
-from advsearch.questions.explain.settings import ExplainConfig
+from advsearch.questions.explain.findings import find_clusters, right_of
 from advsearch.questions.sweep.carry_out import scenes_of
-from advsearch.runs.directory import CONFIG, PARTS, RunDirectory
+from advsearch.report.wording import figure_value
+from advsearch.rules import CountedRule, Mask, RuleConditions, covered
+from advsearch.runs.directory import CONFIG, PARTS
 from advsearch.runs.results.sweep import SweepSummary
 from advsearch.runs.summary import read_result
+from advsearch.runs.tables import read_sweep
 from advsearch.settings import split_names
 from advsearch.viewer.thumbnails import path_of
 
@@ -50,55 +42,127 @@ ALONG = 9
 OUTER = ("object", "environment", "model")
 
 
+# ---- rows -----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class AskedSweep:
+    """One of the sweeps whose rows are read."""
+
+    folder: Path
+    config: SweepConfig
+    summary: SweepSummary
+
+    @classmethod
+    def of(cls, folder: Path) -> AskedSweep:
+        summary = read_result(folder)
+        if not isinstance(summary, SweepSummary):
+            raise FileFormatError(f"{folder}: expected the run of a sweep that has ended, got one of another command")
+        return cls(folder, SweepConfig.from_yaml(folder / CONFIG), summary)
+
+
+def read_answers(sweeps: Sequence[AskedSweep]) -> pd.DataFrame:
+    """Return the rows of some sweeps as one frame (`runs.tables`), with the number of their `sweep`; sweeps of the same
+    draws share their units, so that two models' are not told twice. Object, environment and model are called as figures
+    call them, and what a sweep has no parameter for is missing."""
+    frames, draws = [], []
+    for number, one in enumerate(sweeps):
+        rows = read_sweep(one.folder).sort_values("step", ignore_index=True)
+        for name in OUTER:
+            called = rows[name].astype(object) if name in rows else pd.Series(getattr(one.summary, name), rows.index)
+            rows[name] = called.map(figure_value)
+        if one.summary.sampler is None:  # samples of a point differ by noise alone
+            rows["unit"] //= one.summary.samples
+        deciding = one.config.deciding()
+        draws.append(f"{[deciding[name] for name in ('grid', 'controls', 'samples', 'sampler', 'seed')]}")
+        frames.append(rows.assign(sweep=number))
+    units = {name: unit for frame in frames for name, unit in frame.attrs["units"].items()}
+    units = {**units, **dict.fromkeys(OUTER, "")}
+    found = pd.concat(frames, ignore_index=True)
+    for name in units:
+        if not pd.api.types.is_float_dtype(found[name]):
+            found[name] = found[name].astype("category")
+    draw_of = [sorted({*draws}).index(one) for one in draws]
+    named = [f"{unit} {draw_of[sweep]}" for unit, sweep in zip(found["unit"], found["sweep"], strict=True)]
+    found["unit"] = np.unique(named, return_inverse=True)[1]
+    found["correct"] = found["correct"] == 1
+    found.attrs["units"] = units
+    return found
+
+
+def values_of(rows: pd.DataFrame, place: int) -> dict[str, float | str]:
+    """Return what a row has, by parameter."""
+    known = rows.loc[place, list(rows.attrs["units"])].dropna().items()
+    return {name: value if isinstance(value, str) else float(value) for name, value in known}
+
+
+# ---- sweeps to make -------------------------------------------------------------------------------------------------
+
+
 def sweep_inside(
-    config: SweepConfig, found: Observations, conditions: RuleConditions, samples: int, seed: int
+    config: SweepConfig, table: pd.DataFrame, conditions: RuleConditions, samples: int, seed: int
 ) -> SweepConfig:
     """Return a sweep like another, of about so many configurations, most of which lie under the conditions.
 
     Ranges of what is drawn are cut to the conditions, as far as the rows went; axes of a grid to the values that the
     rows have there; names to those that are left. What cannot be cut has to be left out by whoever counts.
     """
-    mask = covered(conditions, found)
-    grid = {name: _values(found, mask, name, given) for name, given in config.grid.items()}
-    outer = {name: _names(config, found, mask, name) for name in OUTER}
+    inside = table[covered(conditions, table)]
+    left = {name: sorted(inside[name].unique().tolist()) for name in table.attrs["units"]}
+    grid: dict[str, Any] = {name: left.get(name, values) for name, values in config.grid.items()}
+    outer = {name: getattr(config, name) for name in OUTER}
+    for name in OUTER:
+        if name in left and outer[name] is not None:
+            outer[name] = ",".join(one for value in left[name] for one in _like(config, name, value)) or outer[name]
+
+    def size(values: object) -> int:
+        return len(values) if isinstance(values, list) else 1
+
     others = math.prod(len(split_names(names)) if names else 1 for names in outer.values())
-    while grid and math.prod(map(_size, grid.values())) * others > 2 * samples:
-        longest = max(grid, key=lambda name: _size(grid[name]))
-        if _size(grid[longest]) < 2:
+    while grid and math.prod(map(size, grid.values())) * others > 2 * samples:
+        longest = max(grid, key=lambda name: size(grid[name]))
+        if size(grid[longest]) < 2:
             break
-        values = grid[longest]
-        assert isinstance(values, list)
-        grid[longest] = values[::2]
-    points = math.prod(map(_size, grid.values())) * others
-    cut = {one.place: one for one in conditions}
-    controls = {name: {**given, **_ranges(config, name, found, mask, cut)} for name, given in config.controls.items()}
+        grid[longest] = grid[longest][::2]
+    points = math.prod(map(size, grid.values())) * others
+    controls = {name: dict(given) for name, given in config.controls.items()}
+    for one in conditions:
+        name, _, parameter = one.factor.partition(".")
+        is_frame = bool(config.path) and one.factor == f"{name}.time"
+        if parameter and name in controls and one.options is None and one.factor not in grid and not is_frame:
+            if can_be_given(config, one.factor):
+                low, high = float(table[one.factor].min()), float(table[one.factor].max())
+                controls[name][parameter] = [max(one.low, low), min(one.high, high)]
     draws = math.ceil(samples / points) if controls else None
     return _quiet(config, grid=grid, controls=controls, samples=draws, seed=seed, **outer)
 
 
 def along(
-    config: SweepConfig, row: Mapping[str, float | str], factor: Factor, found: Observations, seed: int
+    config: SweepConfig, row: Mapping[str, float | str], factor: str, table: pd.DataFrame, seed: int
 ) -> SweepConfig:
     """Return a sweep along one factor with everything else as a row has it; the row's own value comes first."""
-    place = found.factors.index(factor)
-    own = row[factor.name]
-    if factor.options:
-        values: list[float | str] = [own, *(name for name in factor.options if name != own)]
+    own, column = row[factor], table[factor]
+    if column.dtype == "category":
+        others: Sequence[float | str] = column.cat.categories.tolist()
     else:
-        column = found.values[:, place]
-        spread = [float(f"{one:.4g}") for one in np.linspace(column.min(), column.max(), ALONG)]
-        values = [own, *(one for one in dict.fromkeys(spread) if one != own)]
+        others = [float(f"{one:.4g}") for one in np.linspace(column.min(), column.max(), ALONG)]
+    values = list(dict.fromkeys([own, *others]))
     grid: dict[str, object] = {name: [row[name]] for name in row if "." in name and can_be_given(config, name)}
     outer = {name: next(iter(_like(config, name, str(row[name]))), None) for name in OUTER}
-    if factor.name in OUTER:
-        several = [one for value in values for one in _like(config, factor.name, str(value))]
-        outer[factor.name] = ",".join(several)
+    if factor in OUTER:
+        outer[factor] = ",".join(one for value in values for one in _like(config, factor, str(value)))
     else:
-        grid[factor.name] = values
+        grid[factor] = values
+    controls = {}
+    for name, given in config.controls.items():
+        kind = CONTROLS.get(str(given.get("kind", name)))
+        chosen = {one.name for one in getattr(kind, "choices", ())} & {*given}
+        if kind and chosen and all(f"{name}.{one.name}" in grid for one in kind.declared(given)):
+            controls[name] = {key: value for key, value in given.items() if key in {*chosen, "kind"}}
     fixed = {name: value for name, value in config.set_.items() if name not in grid}
     alone = {"workers": None, "cluster": None}  # ten pictures take less than a worker takes to load
     kept: dict[str, object] = {"keep_pictures": "all", "set": fixed, **alone}
-    return _quiet(config, grid=grid, controls={}, samples=None, seed=seed, **kept, **outer)
+    return _quiet(config, grid=grid, controls=controls, samples=None, seed=seed, **kept, **outer)
 
 
 def can_be_given(config: SweepConfig, name: str) -> bool:
@@ -111,15 +175,10 @@ def can_be_given(config: SweepConfig, name: str) -> bool:
     return parameter in {one.name for one in CONTROLS[kind].declared(given)}
 
 
-def lies_inside(conditions: RuleConditions, factors: tuple[Factor, ...], row: Mapping[str, float | str]) -> bool:
-    """Whether a row lies under all conditions."""
-    return all(_holds(one, factors[one.place], row[factors[one.place].name]) for one in conditions)
-
-
-def _holds(condition: RuleCondition, factor: Factor, value: float | str) -> bool:
-    if condition.options is not None:
-        return str(value) in {factor.options[one] for one in condition.options}
-    return condition.low < float(value) <= condition.high
+def _like(config: SweepConfig, name: str, value: str) -> list[str]:
+    """Of the names that a sweep was given, those that its rows write so."""
+    given = split_names(getattr(config, name)) if getattr(config, name) else ()
+    return [one for one in given if value in (one, figure_value(one))] or list(given[:1])
 
 
 def _quiet(config: SweepConfig, **changes: object) -> SweepConfig:
@@ -132,90 +191,26 @@ def _quiet(config: SweepConfig, **changes: object) -> SweepConfig:
     return SweepConfig(**{**config.plain(), **given})
 
 
-def _values(found: Observations, mask: Mask, name: str, given: object) -> object:
-    """The values of an axis that the rows under the mask have; what was given where it does not vary."""
-    place = next((k for k, one in enumerate(found.factors) if one.name == name), None)
-    if place is None:
-        return given
-    options, values = found.factors[place].options, np.unique(found.values[mask, place])
-    return [options[int(one)] for one in values] if options else [float(one) for one in values]
-
-
-def _size(values: object) -> int:
-    return len(values) if isinstance(values, list) else 1
-
-
-def _names(config: SweepConfig, found: Observations, mask: Mask, name: str) -> str | None:
-    """The objects, environments or models that the rows under the mask have."""
-    left = _values(found, mask, name, None)
-    given = getattr(config, name)
-    if not isinstance(left, list) or given is None:
-        return given if given is None else str(given)
-    return ",".join(one for value in left for one in _like(config, name, str(value))) or str(given)
-
-
-def _like(config: SweepConfig, name: str, value: str) -> list[str]:
-    """Of the names that a sweep was given, those that its rows write so."""
-    given = split_names(getattr(config, name)) if getattr(config, name) else ()
-    return [one for one in given if value in (one, figure_value(one))] or list(given[:1])
-
-
-def _ranges(
-    config: SweepConfig, control: str, found: Observations, mask: Mask, cut: Mapping[int, RuleCondition]
-) -> dict[str, object]:
-    """The ranges of what a control draws, where a condition cuts them; not of an axis of the grid, frames among them,
-    nor of what follows from other numbers."""
-    ranges: dict[str, object] = {}
-    axes = {*config.grid, *([f"{control}.time"] if config.path else [])}
-    for place, condition in cut.items():
-        name = found.factors[place].name
-        instance, dot, parameter = name.partition(".")
-        if name in axes or not can_be_given(config, name):
-            continue
-        if instance == control and dot and condition.options is None:
-            column = found.values[:, place]
-            low, high = max(condition.low, float(column.min())), min(condition.high, float(column.max()))
-            ranges[parameter] = [low, high]
-    return ranges
-
-
-@dataclass(frozen=True)
-class AskedSweep:
-    """One of the sweeps whose rows are read."""
-
-    folder: Path
-    config: SweepConfig
-    summary: SweepSummary
-    rows: list[Answered]
-
-    @classmethod
-    def of(cls, folder: Path) -> AskedSweep:
-        summary = read_result(folder)
-        if not isinstance(summary, SweepSummary):
-            raise FileFormatError(f"{folder}: expected the run of a sweep that has ended, got one of another command")
-        return cls(folder, SweepConfig.from_yaml(folder / CONFIG), summary, rows_of("", folder, summary))
-
-    @property
-    def units(self) -> list[str]:
-        """The unit of each row; sweeps of the same draws share theirs, so that two models' are not told twice."""
-        deciding = self.config.deciding()
-        drawn = {name: deciding[name] for name in ("grid", "controls", "samples", "sampler", "seed")}
-        return [f"{row.unit} {drawn}" for row in self.rows]
+# ---- what they say --------------------------------------------------------------------------------------------------
 
 
 @dataclass
 class Renders:
-    """Sweeps in the folder of the run; none any more after an interrupt."""
+    """Sweeps in the folder of the run; none any more after an interrupt. `rows` are those of the sweeps that are asked
+    about, `table` what varies among them."""
 
-    folder: Path
-    progress: Progress
-    config: ExplainConfig
-    found: Observations
+    asked: Asked[Any]
+    sweeps: Sequence[AskedSweep]
+    rows: pd.DataFrame
+    table: pd.DataFrame
     count: int = 0
     interrupted: bool = False
     warnings: list[str] = field(default_factory=list)
 
-    def _rows(self, name: str, config: SweepConfig) -> list[Answered] | None:
+    def __post_init__(self) -> None:
+        self.config, self.progress, self.folder = self.asked.config, self.asked.progress, self.asked.run.path
+
+    def _rendered(self, name: str, config: SweepConfig) -> pd.DataFrame | None:
         """The rows of a sweep; None if it was interrupted, or the scene is not to be had any more."""
         if self.interrupted:
             return None
@@ -224,70 +219,104 @@ class Renders:
         try:
             done = carry_out_part(path, own, self.progress)
         except InputError as error:
-            said = any(one.endswith(f": {error}") for one in self.warnings)  # once for all pairs of a kind
-            self.warnings += [] if said else [f"Nothing was rendered for {name}: {error}"]
+            if not any(one.endswith(f": {error}") for one in self.warnings):  # once for all pairs of a kind
+                self.warnings.append(f"Nothing was rendered for {name}: {error}")
             return None
         assert isinstance(done, SweepSummary)
         self.interrupted = done.goes_on
         self.count += sum(done.renders.values())
-        return None if self.interrupted else rows_of("", path, done)
+        return None if self.interrupted else read_answers([AskedSweep(path, own, done)])
 
-    def confirmed(self, rule: CountedRule, number: int, asked: Sequence[AskedSweep]) -> RightOf | None:
+    def confirmed(self, rule: CountedRule, number: int) -> RightOf | None:
         """Render fresh configurations inside a rule, in the scene of each sweep."""
         if not self.config.confirm:
             return None
-        rows: list[tuple[int, Answered]] = []
-        for place, one in enumerate(asked):
-            seed = seeds.stream(self.config.seed, "confirm", number * len(asked) + place)
-            samples = -(-self.config.confirm // len(asked))
+        fresh = []
+        for place, one in enumerate(self.sweeps):
+            seed = seeds.stream(self.config.seed, "confirm", number * len(self.sweeps) + place)
+            samples = -(-self.config.confirm // len(self.sweeps))
             self.progress.message(f"rule {number + 1}: rendering about {samples} configurations inside it")
-            own = sweep_inside(one.config, self.found, rule.conditions, samples, seed)
-            rows += [(place, row) for row in self._rows(f"rule-{number + 1}-{place}", own) or []]
-        kept = [each for each in rows if lies_inside(rule.conditions, self.found.factors, each[1].values)]
-        right = np.array([row.correct for _, row in kept], dtype=bool)
-        units = np.array([f"{place} {row.unit}" for place, row in kept])
-        return right_of(Observations((), np.zeros((len(kept), 0)), right, _numbers(units))) if kept else None
+            own = sweep_inside(one.config, self.table, rule.conditions, samples, seed)
+            rows = self._rendered(f"rule-{number + 1}-{place}", own)
+            if rows is not None:
+                inside = rows[covered(rule.conditions, rows)]
+                fresh.append(inside.assign(unit=inside["unit"] * len(self.sweeps) + place))
+        kept = pd.concat(fresh) if fresh else self.rows[:0]
+        return None if kept.empty else right_of(kept)
 
-    def pairs(
-        self, rules: Sequence[CountedRule], rows: Sequence[Answered], asked: Sequence[AskedSweep]
-    ) -> Iterator[NearestRight]:
+    def pairs(self, rules: Sequence[CountedRule]) -> Iterator[NearestRight]:
         """The nearest right configurations to typical failures, along the parameters of their rule or else the others.
 
         A failure that no parameter alone puts right has none.
         """
-        for number, (index, conditions) in enumerate(typical_failures(self.found, rules, self.config.pairs)):
-            one, row = _sweep_of(index, asked), rows[index]
-            first = [condition.place for condition in conditions]
-            others = [place for place in range(len(self.found.factors)) if place not in first]
-            for places in (first, *([place] for place in others)):
-                near = [
-                    found
-                    for place in places
-                    if (found := self._nearest(f"pair-{number + 1}", one, row, self.found.factors[place]))
-                ]
+        failures = typical_failures(self.table, rules, self.config.pairs)
+        for number, (place, conditions) in enumerate(failures, start=1):
+            first = [one.factor for one in conditions]
+            others = [[factor] for factor in self.table.attrs["units"] if factor not in first]
+            for factors in (first, *others):
+                near = [one for factor in factors if (one := self._nearest(f"pair-{number}", place, factor))]
                 if near:
                     yield min(near, key=self._moved)
                     break
 
-    def clusters(self, asked: Sequence[AskedSweep], run: RunDirectory) -> FailureClusters | None:
-        """Render failures of one model's sweeps again, and group them by what it decides by."""
-        alone = [one for one in asked if len(one.config.models) == 1]
-        alike = [one for one in alone if one.config.models == alone[0].config.models]
-        failing = [(one, number) for one in alike for number, row in enumerate(one.rows) if not row.correct]
-        if self.interrupted or not self.config.clusters or not failing:
+    def _moved(self, pair: NearestRight) -> float:
+        """How far the value moved, as a share of what the rows have; another name is as far as it goes."""
+        column = self.table[pair.parameter]
+        if column.dtype == "category":
+            return 1.0
+        return abs(float(pair.right_at) - float(pair.wrong_at)) / float(column.max() - column.min())
+
+    def _nearest(self, name: str, place: int, factor: str) -> NearestRight | None:
+        """Go along one factor until the answer is right, twice with other noise; the failure fails in both."""
+        config, row = self.sweeps[self.rows["sweep"][place]].config, values_of(self.rows, place)
+        if not can_be_given(config, factor):
             return None
-        if len(alike) < len(asked):
-            name = alike[0].config.model
+        self.progress.message(f"{name}: the nearest right answer along {factor}")
+        label = f"{name}-{factor.replace('.', '_')}"
+        passes = []
+        for number in range(2):
+            seed = seeds.stream(self.config.seed, f"{label} {number}")
+            rows = self._rendered(f"{label}-{number}", along(config, row, factor, self.table, seed))
+            if rows is None:
+                return None
+            passes.append(rows)
+        first, second = passes
+        own, values = row[factor], first[factor].tolist()
+        start, right = values.index(own), np.asarray(first["correct"] & second["correct"])
+        if not right.any() or first["correct"][start] or second["correct"][start]:
+            return None
+        is_number = self.table[factor].dtype != "category"
+        at = min(np.flatnonzero(right), key=lambda k: abs(float(values[k]) - float(own)) if is_number else 0.0)
+        kept = (path_of(self.folder / PARTS / f"{label}-0", int(k)) for k in (start, at))
+        return NearestRight(
+            values=row,
+            parameter=factor,
+            unit=self.table.attrs["units"][factor],
+            wrong_at=own,
+            right_at=values[at],
+            answered=first["label"][start],
+            answered_there=first["label"][at],
+            pictures=[str(path.relative_to(self.folder)) for path in kept if path.is_file()],
+        )
+
+    def clusters(self) -> FailureClusters | None:
+        """Render failures of one model's sweeps again, and group them by what it decides by."""
+        alone = [number for number, one in enumerate(self.sweeps) if len(one.config.models) == 1]
+        alike = [number for number in alone if self.sweeps[number].config.models == self.sweeps[alone[0]].config.models]
+        failing = self.rows[~self.rows["correct"] & self.rows["sweep"].isin(alike)]
+        if self.interrupted or not self.config.clusters or failing.empty:
+            return None
+        if len(alike) < len(self.sweeps):
+            name = self.sweeps[alike[0]].config.model
             self.warnings.append(f"Kinds are of the failures of model {name} alone, where it was swept by itself.")
         generator = np.random.default_rng(seeds.stream(self.config.seed, "clusters"))
-        picked = [failing[n] for n in sorted(generator.permutation(len(failing))[: self.config.clusters])]
+        picked = failing.iloc[np.sort(generator.permutation(len(failing))[: self.config.clusters])]
         self.progress.stage("rendering failures again", len(picked), hint="`clusters` says how many")
         try:
             with interruptible():
-                shown = [
-                    pictures_again(one.config, numbers, self.progress)
-                    for one in alike
-                    if (numbers := [number for owner, number in picked if owner is one])
+                again = [
+                    pictures_again(self.sweeps[number].config, rows["step"].tolist(), self.progress)
+                    for number, rows in picked.groupby("sweep")
                 ]
         except KeyboardInterrupt:
             self.interrupted = True
@@ -296,16 +325,19 @@ class Renders:
             self.warnings.append(f"No failures were grouped: {error}")
             return None
         self.count += len(picked)
-        pictures, features = torch.cat([some for some, _ in shown]), shown[0][1]
+        pictures, features = torch.cat([some for some, _ in again]), again[0][1]
         found = find_clusters(features(pictures).double().numpy(), self.config.seed)
         listed = []
-        for place, members in enumerate(found.members):
-            own = [picked[k][0].rows[picked[k][1]] for k in members]
-            path = run.save_image(f"cluster-{place + 1}", pictures[members[0]])
-            answers = dict(Counter(row.answer for row in own).most_common())
-            picture = str(path.relative_to(self.folder))
+        for number, members in enumerate(found.members, start=1):
+            path = self.asked.run.save_image(f"cluster-{number}", pictures[members[0]])
+            own = picked.iloc[list(members)]
             listed.append(
-                FailureCluster(failures=len(own), answers=answers, values=dict(own[0].values), picture=picture)
+                FailureCluster(
+                    failures=len(own),
+                    answers=dict(Counter(own["label"]).most_common()),
+                    values=values_of(own, own.index[0]),
+                    picture=str(path.relative_to(self.folder)),
+                )
             )
         return FailureClusters(
             features=features.source,
@@ -315,82 +347,26 @@ class Renders:
             listed=listed,
         )
 
-    def _moved(self, pair: NearestRight) -> float:
-        """How far the value moved, as a share of what the rows have; another name is as far as it goes."""
-        place = next(k for k, one in enumerate(self.found.factors) if one.name == pair.parameter)
-        column = self.found.values[:, place]
-        if self.found.factors[place].options:
-            return 1.0
-        return abs(float(pair.right_at) - float(pair.wrong_at)) / float(np.ptp(column))
 
-    def _nearest(self, name: str, one: AskedSweep, row: Answered, factor: Factor) -> NearestRight | None:
-        """Go along one factor until the answer is right, twice with other noise; the failure fails in both."""
-        if not can_be_given(one.config, factor.name):
-            return None
-        self.progress.message(f"{name}: the nearest right answer along {factor.name}")
-        label = f"{name}-{factor.name.replace('.', '_')}"
-        passes: list[list[Answered]] = []
-        for number in range(2):
-            seed = seeds.stream(self.config.seed, f"{label} {number}")
-            found = self._rows(f"{label}-{number}", along(one.config, row.values, factor, self.found, seed))
-            if found is None:
-                return None
-            passes.append(found)
-        own = row.values[factor.name]
-        right = {
-            first.values[factor.name]: place
-            for place, (first, second) in enumerate(zip(*passes, strict=True))
-            if first.correct and second.correct
-        }
-        start = next(place for place, each in enumerate(passes[0]) if each.values[factor.name] == own)
-        if not right or passes[0][start].correct or passes[1][start].correct:
-            return None
-        at = min(right, key=lambda value: abs(float(value) - float(own)) if not factor.options else 0.0)
-        pictures = [
-            str(path.relative_to(self.folder))
-            for place in (start, right[at])
-            if (path := path_of(self.folder / PARTS / f"{label}-0", place)).is_file()
-        ]
-        return NearestRight(
-            values=dict(row.values),
-            parameter=factor.name,
-            unit=factor.unit,
-            wrong_at=own,
-            right_at=at,
-            answered=passes[0][start].answer,
-            answered_there=passes[0][right[at]].answer,
-            pictures=pictures,
-        )
-
-
-def typical_failures(found: Observations, rules: Sequence[CountedRule], most: int) -> list[tuple[int, RuleConditions]]:
-    """Return at most so many failures with the conditions of the rule that they are under, the most typical first.
+def typical_failures(table: pd.DataFrame, rules: Sequence[CountedRule], most: int) -> list[tuple[int, RuleConditions]]:
+    """Return the places of at most so many failures with the conditions of the rule that they are under, the most
+    typical first.
 
     Rules take turns, a row belongs to the first that covers it, and what fails under none of them is the last to take
     one. Of each the failure nearest to the middle of its failures, by ranks, comes first.
     """
-    left = ~found.right
-    queues: list[list[tuple[int, RuleConditions]]] = []
+    columns = (table[name] for name in table.attrs["units"])
+    numbers = [one.cat.codes if one.dtype == "category" else one for one in columns]
+    ranks = np.stack(numbers, axis=1).astype(np.float64).argsort(axis=0).argsort(axis=0) / len(table)
+    left: Mask = ~table["correct"].to_numpy()
+    queues = []
     for conditions in (*(rule.conditions for rule in rules), ()):
-        own = left & covered(conditions, found)
-        left = left & ~own
-        queues.append([(index, conditions) for index in _by_typicality(found, np.flatnonzero(own))])
+        own = np.flatnonzero(left & covered(conditions, table))
+        left[own] = False
+        away = np.abs(ranks[own] - ranks[own].mean(axis=0)).sum(axis=1) if len(own) else np.zeros(0)
+        queues.append([(int(place), conditions) for place in own[np.argsort(away, kind="stable")]])
     turns = (one for turn in zip_longest(*queues) for one in turn if one is not None)
     return list(islice(turns, most))
-
-
-def _by_typicality(found: Observations, failures: npt.NDArray[np.intp]) -> list[int]:
-    ranks = found.values.argsort(axis=0).argsort(axis=0)[failures] / len(found)
-    away = np.abs(ranks - ranks.mean(axis=0)).sum(axis=1) if len(failures) else np.zeros(0)
-    return [int(one) for one in failures[np.argsort(away, kind="stable")]]
-
-
-def _sweep_of(index: int, asked: Sequence[AskedSweep]) -> AskedSweep:
-    for one in asked:
-        if index < len(one.rows):
-            return one
-        index -= len(one.rows)
-    raise IndexError(index)
 
 
 def pictures_again(config: SweepConfig, numbers: Sequence[int], progress: Progress) -> tuple[Tensor, Features]:
@@ -403,12 +379,3 @@ def pictures_again(config: SweepConfig, numbers: Sequence[int], progress: Progre
         pictures.append(scenes.picture(number))
         progress.advance(1)
     return torch.stack(pictures), features_of(scenes.job.models[0])
-
-
-def right_of(found: Observations) -> RightOf:
-    """Return a count with the interval of its share."""
-    return RightOf(right=int(found.right.sum()), total=len(found), interval=found.interval)
-
-
-def _numbers(names: npt.NDArray[np.str_]) -> npt.NDArray[np.int64]:
-    return np.unique(names, return_inverse=True)[1].reshape(-1).astype(np.int64)

@@ -15,7 +15,7 @@ from safetensors import torch as safetensors
 
 from advsearch import seeds
 from advsearch.attacks.verification import WORST_CASE
-from advsearch.bundled.light import varied, white_light_changed
+from advsearch.bundled.changed_light import varied, white_light_changed
 from advsearch.bundled.objects import OBJECTS
 from advsearch.cluster import Call
 from advsearch.config import AttackConfig

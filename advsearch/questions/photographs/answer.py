@@ -212,6 +212,10 @@ def _code(address: str) -> Any:
         return None
 
 
+COUNTED = ("photographs", "right in the photograph", "wrong in the photograph")
+"""Heads of the table of agreement."""
+
+
 def table_html(table: PhotoAgreement) -> Html:
     """Return the counts of right and wrong answers in rendering and photograph, in all and by rendering."""
     if not table.photos or table.interval is None:
@@ -245,7 +249,7 @@ def table_html(table: PhotoAgreement) -> Html:
     heads = ["rendering", *(["model"] if several else []), "in the rendering", "in photographs", "agree", "interval"]
     each = study_table(heads, rows, [f"renderings/{in_address(one.rendering)}" for one in table.renderings])
     return join_html(
-        element("div", study_table(["photographs", "right in the photograph", "wrong in the photograph"], counts)),
+        element("div", study_table(COUNTED, counts), class_="agreement"),
         element("p", text),
         element("div", each, class_="scroll", tabindex="0", role="region", aria_label="by rendering"),
     )

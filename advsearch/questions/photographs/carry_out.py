@@ -132,11 +132,9 @@ class Photographs:
         """Judge and keep a photograph of the file `source`. Of one that was aligned with no rendering, only what the
         models say of it is kept."""
         file, kind = None if rendering is None else rendering_file(run, rendering), PHOTO if rendering else LOOSE_PHOTO
-        shape = None
         if file is not None:
             with Image.open(file, formats=("PNG", "JPEG")) as image:
-                shape = image.size
-            sound_photo(data, shape)  # before anything is loaded
+                sound = sound_photo(data, image.size)  # before anything is loaded
         with RunDirectory.resume(run) as held:
             number, rows, judges = held.store.last_step(kind) + 1, [], self._judges(run)
             for model, judge in enumerate(judges):
@@ -149,8 +147,9 @@ class Photographs:
                     right, label = _rendered(judge, rendering, file, seen)
                     name = f"{rendering}-{number:04d}.jpg"
                     kept |= {"rendering": rendering, "right": right, "label": label, "file": name}
+                else:
+                    sound = sound_photo(data, judge.size[::-1])
                 values["model"] = {"value": judge.model.name, "unit": ""}
-                sound = sound_photo(data, shape or judge.size[::-1])
                 row = judged(Row(kind, number, values=values), judge.judgement(rendering, _object(values), sound))
                 rows.append(replace(row, payload={"photo": kept, "answer": row.payload}))
             if file is not None:

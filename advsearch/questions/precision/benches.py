@@ -1,339 +1,383 @@
-"""Error of the picture and of the model's margin, and the best verified objective of each policy, against run time."""
+"""Takes pictures and gradients in every way that is compared, beside references, in interleaved rounds inside a time
+budget: every setting once, then every setting again, so that a machine that slows down does so for all of them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+import statistics
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from advsearch import seeds
-from advsearch.attacks import Domain, Evaluate, Evaluation, Policy, StepRecord, search
-from advsearch.questions.precision.gradient import COST_OF, COUNTS_OF, flat, predicting
-from advsearch.questions.precision.points import (
-    INDEPENDENT,
-    STRATIFIED,
-    UNKNOWN,
-    Array,
-    MeasuredSetting,
-    ReferenceValue,
-    Theory,
-    quartiles,
-    reference_through,
-)
-from advsearch.questions.precision.rounds import (
-    Parts,
-    Stopwatch,
-    TimeBudget,
-    gather,
-    one_by_one,
-    part_samples,
-    seconds_a_sample,
-)
+from advsearch.engine.gradients import Estimate, Loss, Probe, agreement, estimated, only, probes, reference
+from advsearch.questions.precision.answer import PrecisionReference
+from advsearch.questions.precision.rule import Array, Numbers, ReferenceValue, Setting, reference_of
+from advsearch.scene.gradients import BY_ADJOINT, Group, compared
 from advsearch.scene.renderer import Renderer
 
-Margin = Callable[[Tensor], float]
-"""From a picture (H, W, 3) sRGB to the model's margin in logits."""
+LEAST, COLD = 5, 2
+"""Calls of a setting that have to fit into the budget for it to be begun; the first ones take longer."""
+CLAIM = 0.25
+"""Share of the time left that one setting may lay claim to."""
+MOST_PARTS = 64
+"""Independent parts of a reference, at most."""
+Part = TypeVar("Part")
 
-POWERS = (4, 16, 64, 256)
-COUNTS = {"independent": (4, 8, 16, 32, 64, 128, 256), "orthogonal": (4, 25, 121, 289)}
-"""Sample counts of a line, which its sampler takes as they are; `POWERS` for all others. All but the independent
-sampler compile a kernel for each count."""
-FIRST = frozenset({"independent", "multijitter", "independent + oidn"})
-LATER = 6.0
-"""Lines that are measured first where time is short; the others count as so many times as dear."""
+
+class TimeBudget:
+    """Seconds from now on that may be spent, by a clock."""
+
+    def __init__(self, seconds: float, clock: Callable[[], float] = time.perf_counter) -> None:
+        self.clock, self._end = clock, clock() + seconds
+
+    @property
+    def left(self) -> float:
+        """Seconds left, not below 0."""
+        return max(0.0, self._end - self.clock())
+
+    def share(self, part: float) -> TimeBudget:
+        """Return a budget of a part, in [0, 1], of what is left."""
+        return TimeBudget(part * self.left, self.clock)
+
+
+@dataclass
+class Rounds:
+    """What came out for each setting, the seconds of each call by the clock, and what did not fit at all."""
+
+    results: dict[Setting, list[Any]] = field(default_factory=dict)
+    walls: dict[Setting, list[float]] = field(default_factory=dict)
+    left_out: list[Setting] = field(default_factory=list)
+
+    def call_takes(self, setting: Setting) -> float:
+        """Seconds of a call but the first ones: as the setting's own, else in proportion to its line's dearest setting,
+        else at the highest rate of any line; 0 where nothing is known."""
+        if setting in self.walls:
+            return statistics.median((self.walls[setting][COLD:] or self.walls[setting][-1:])[-3:])
+        dearest = {known.line: known for known in sorted(self.walls, key=lambda each: each.cost)}
+        rates = {line: self.call_takes(known) / known.cost for line, known in dearest.items()}
+        return setting.cost * rates.get(setting.line, max(rates.values(), default=0.0))
+
+    def needs(self, setting: Setting, left: float) -> float:
+        """Seconds that a new setting needs for its calls, with what those begun still need for as many. One of these
+        that needs more than a share `CLAIM` of what is left turned out too dear, and waits until the end."""
+        cold = [sum(taken[:COLD]) - COLD * self.call_takes(at) for at, taken in self.walls.items() if len(taken) > COLD]
+        owed = [max(0, LEAST - len(taken)) * self.call_takes(at) for at, taken in self.walls.items()]
+        first = max(0.0, statistics.median(cold)) if cold else 0.0
+        return first + LEAST * self.call_takes(setting) + sum(need for need in owed if need <= CLAIM * left)
+
+
+def in_rounds(
+    settings: Iterable[Setting],
+    measure: Callable[[Setting, int], Any],
+    budget: TimeBudget,
+    *,
+    rounds: int,
+    seed: int,
+    on_done: Callable[[Setting], None] = lambda setting: None,
+) -> Rounds:
+    """Measure settings, cheapest first, in rounds until these are done or the budget is used up; the first is always
+    measured.
+
+    In the first round a setting is begun only if `LEAST` calls of it, and those that the settings before it still need
+    for as many, fit into what is left. The first call compiles and records kernels, so that every setting has two at
+    once: without the second, nothing would be known of its time. A call that should not fit is not begun: a budget is
+    kept to within a setting's first calls. Each call has a seed of its own.
+    """
+    measured = Rounds()
+
+    def call(setting: Setting) -> None:
+        taken, begun = measured.results.setdefault(setting, []), budget.clock()
+        stream = f"precision {'/'.join(setting.line)}/{setting.spp}"
+        taken.append(measure(setting, seeds.stream(seed, stream, len(taken))))
+        measured.walls.setdefault(setting, []).append(budget.clock() - begun)
+        on_done(setting)
+
+    for setting in sorted(settings, key=lambda each: each.cost):
+        if measured.results and measured.needs(setting, budget.left) > budget.left:
+            measured.left_out.append(setting)
+        else:
+            call(setting)
+            call(setting)
+    for _ in range(1, rounds):
+        for setting in measured.results:
+            if measured.call_takes(setting) <= budget.left:
+                call(setting)
+    return measured
+
+
+def gather(part: Callable[[int], Part], budget: TimeBudget, on_done: Callable[[], None], seed: int) -> list[Part]:
+    """Return independent parts of a reference, each from a seed of its own, as many as fit into a budget; at least two,
+    whatever they take: without these, nothing is known about the error."""
+    parts: list[Part] = []
+    slowest = 0.0
+    while len(parts) < 2 or (len(parts) < MOST_PARTS and slowest < budget.left):
+        begun = budget.clock()
+        parts.append(part(seeds.stream(seed, "reference", len(parts))))
+        slowest = max(budget.clock() - begun, 0.5 * slowest)
+        on_done()
+    return parts
+
+
+def part_samples(
+    call: Callable[[int], object], seconds: float, *, parts: int = 4, counts: Sequence[int] = (16, 64, 256, 1024)
+) -> int:
+    """Return the largest of some rising sample counts of which `parts` calls fit into some seconds; the least if none
+    does. Three calls tell how long one takes, and the first ones compile."""
+    for _ in range(3):
+        begun = time.perf_counter()
+        call(counts[0])
+    rate = (time.perf_counter() - begun) / counts[0]
+    return max((count for count in counts if parts * count * rate <= seconds), default=counts[0])
+
+
+def timed(take: Callable[[], Tensor]) -> tuple[Tensor, dict[str, float]]:
+    """Return what is taken, with the processor time of all threads, and the time by the clock."""
+    processor, wall = time.process_time(), time.perf_counter()
+    taken = take()
+    return taken, {"seconds": time.process_time() - processor, "wall_seconds": time.perf_counter() - wall}
+
+
+# ---- pictures -------------------------------------------------------------------------------------------------------
 
 REFERENCE_SAMPLER = "multijitter"
 """Unbiased as all of them, and a reference of a given error is reached in less than half of the time."""
-DENOISED = ("independent", "multijitter")
-"""Samplers that are measured with the denoiser too."""
 OIDN = " + oidn"
-PREDICTED = "predicted"
-"""The family of pictures that a matrix of light transport or light on surfaces predicts. They stand beside the raw
-reference."""
-PATH = "path integrator"
-"""Mitsuba's own path tracer, beside the path replay that the renderer uses for pictures too."""
+COUNTS = {"independent": (4, 8, 16, 32, 64, 128, 256), "orthogonal": (4, 25, 121, 289)}
+"""Sample counts of a line, which its sampler takes as they are; (4, 16, 64, 256) of the others. All but the independent
+sampler compile a kernel for each count."""
+FIRST, LATER = ("independent", "multijitter", "independent" + OIDN), 6.0
+"""Lines that are measured first where time is short; the others count as so many times as dear."""
 
 
-@dataclass(frozen=True)
-class Variant:
-    """One way to render the picture.
-
-    Attributes:
-        series: its name in the diagram.
-        family: what it is compared with and recommended among: "raw", "oidn", "depth" or `PREDICTED`.
-        depth: longest light path in segments.
-        theory: slope of its error against samples.
-    """
-
-    series: str
-    family: str
-    sampler: str
-    denoiser: str
-    depth: int
-    integrator: str = "prb"
-    theory: Theory = UNKNOWN
-
-    @property
-    def counts(self) -> tuple[int, ...]:
-        """Sample counts to measure it at; fewer for path depths, which are about their bias."""
-        if self.family == PREDICTED:
-            return COUNTS_OF[self.series]
-        return POWERS[:3] if self.family == "depth" else COUNTS.get(self.series, POWERS)
-
-    @property
-    def weight(self) -> float:
-        """Cost of a sample, as far as the order of the measurements goes."""
-        return (1.0 + 0.1 * self.depth) * (COST_OF.get(self.series) or (1.0 if self.series in FIRST else LATER))
-
-
-def variants(
-    samplers: Sequence[str], depths: Sequence[int], own: int, *, volumetric: bool = False, predicted: Sequence[str] = ()
-) -> list[Variant]:
-    """Return what is compared: samplers, some with the denoiser, path depths beside the run's own, an integrator, and
-    what predicts pictures (see `ways_to_predict`).
-
-    The deepest of the depths and `own` is the truth for all of these. A medium leaves no choice of integrator.
-    """
-    theories = {"independent": INDEPENDENT}
-    found = [Variant(one, "raw", one, "none", own, theory=theories.get(one, STRATIFIED)) for one in samplers]
-    if not volumetric and "independent" in samplers:
-        found.append(Variant(PATH, "raw", "independent", "none", own, "path", INDEPENDENT))
-    found += [Variant(one + OIDN, "oidn", one, "oidn", own) for one in DENOISED if one in samplers]
-    found += [Variant(one, PREDICTED, REFERENCE_SAMPLER, "oidn", own) for one in predicted]
-    compared = sorted({*depths, own}) if depths else []
-    return found + [Variant(f"depth {one}", "depth", "independent", "none", one) for one in compared]
-
-
-class PictureBench:
-    """Renders one configuration (d,) in every variant and compares it with references, whose parts, of a family and
-    samples, something else may carry out. Predictions are made `there`, at the configuration itself by default."""
+class Pictures:
+    """Renders one configuration (d,) with every sampler, with some of them denoised too, and compares the pictures and
+    the model's margin on them with references. Pictures with and without denoiser have the same, margins their own."""
 
     def __init__(
-        self,
-        renderer: Renderer,
-        u: Tensor,
-        margin: Margin,
-        chosen: Sequence[Variant],
-        elsewhere: Callable[[str, int], Parts | None] = lambda family, spp: None,
-        there: Tensor | None = None,
+        self, renderer: Renderer, u: Tensor, margin: Callable[[Tensor], float], samplers: Sequence[str]
     ) -> None:
-        self._u, self._margin, self.elsewhere = u, margin, elsewhere
-        self._there = u if there is None else there
-        self.variants = {one.series: one for one in chosen}
-        self._renderer = renderer
-        self._scenes: dict[tuple[str, int, str], Any] = {}
-        self.renderers = {one.series: self._as(one) for one in chosen}
-        self._size = (*renderer.formation.resolution, 3)
-        self.pictures: dict[str, ReferenceValue] = {}
-        self.margins: dict[str, ReferenceValue] = {}
-        self.part_spp: dict[str, int] = {}
+        self._u, self._margin, self._space, self._formation = u, margin, renderer.space, renderer.formation
+        denoised = [sampler + OIDN for sampler in ("independent", REFERENCE_SAMPLER) if sampler in samplers]
+        self._lines = [*samplers, *denoised]
+        self._references: dict[tuple[str, str], ReferenceValue] = {}
+        scenes = {name: renderer.scene.like(sampler=name) for name in {*samplers, REFERENCE_SAMPLER}}
+        self._renderers = {
+            line: renderer.like(scenes[line.removesuffix(OIDN)], denoiser=denoiser_of(line))
+            for line in {*self._lines, REFERENCE_SAMPLER, REFERENCE_SAMPLER + OIDN}
+        }
 
     @property
-    def settings(self) -> list[MeasuredSetting]:
+    def settings(self) -> list[Setting]:
         """Everything to measure."""
         return [
-            MeasuredSetting("image", one.series, count, count * one.weight)
-            for one in self.variants.values()
-            for count in one.counts
+            Setting("picture", line, count, count * (1.0 if line in FIRST else LATER), family=denoiser_of(line))
+            for line in self._lines
+            for count in COUNTS.get(line, (4, 16, 64, 256))
         ]
 
-    def refer(self, budget: TimeBudget, seed: int, on_done: Callable[[], None]) -> None:
+    def refer(self, budget: TimeBudget, seed: int, on_done: Callable[[], None]) -> list[PrecisionReference]:
         """Render the references, one for each family, in shares of a budget."""
-        families = [one for one in ("raw", "depth", "oidn") if any(v.family == one for v in self.variants.values())]
+        families, rows = list(dict.fromkeys(map(denoiser_of, self._lines))), []
         for number, family in enumerate(families):
             share = budget.share(1.0 / (len(families) - number))
-            self._refer(family, share, seed, on_done)
+            name = REFERENCE_SAMPLER + OIDN * (family == "oidn")
+            take = partial(self._radiance, name)
+            spp = part_samples(partial(take, 0), share.left)
+            parts = [flat(radiance) for radiance in gather(partial(take, spp=spp), share, on_done, seed)]
 
-    def measure(self, setting: MeasuredSetting, seed: int) -> tuple[dict[str, float], float]:
-        """Make one picture and return its errors, and the processor time that rendering and denoising took; of a
-        predicted one that of the matrix or the light too, and beside that what another picture takes."""
-        variant, watch = self.variants[setting.series], Stopwatch()
-        if variant.family == PREDICTED:
-            made = predicting(variant.series, self.renderers[setting.series], self._there, seed, setting.spp)
-            radiance = self._radiance(made, seed, setting.spp)
-            seconds, times, again = watch.processor, {"wall_seconds": watch.wall}, Stopwatch()
-            radiance = self._radiance(made, seed, setting.spp)
-            times["later_seconds"] = again.processor
-        else:
-            radiance = self._radiance(self.renderers[setting.series], seed, setting.spp)
-            seconds, times = watch.processor, {"wall_seconds": watch.wall}
-        picture = self._picture(radiance)
-        error, fourth = self._reference(variant.family, "error").relative_errors(flat(picture))
-        margin = self._reference(variant.family, "margin_error").relative_error(np.array([self._margin(picture)]))
-        return {"error": error, "margin_error": margin, "fourth": fourth, **times}, seconds
+            def shown(mean: Array) -> Tensor:
+                size = (*self._formation.resolution, 3)
+                return self._picture(torch.from_numpy(mean).to(torch.float32).reshape(size))
 
-    def floor(self, setting: MeasuredSetting, measure: str) -> float:
+            picture = reference_of(parts, lambda mean: flat(shown(mean)))
+            margin = reference_of(parts, lambda mean: np.array([self._margin(shown(mean))]))
+            self._references["margin", family] = margin
+            self._references["picture", family] = self._references.get(("picture", "none"), picture)
+            rows += [_row("picture", name, picture, spp)] if family == "none" else []
+            rows.append(_row("margin", name, margin, spp))
+        return rows
+
+    def floor(self, setting: Setting, quantity: str) -> float:
         """The reference's own relative error for a setting."""
-        return self._reference(self.variants[setting.series].family, measure).error
+        return self._references[quantity, setting.family].error
 
-    def _reference(self, family: str, measure: str) -> ReferenceValue:
-        """What a family is compared with: its margins with its own, but pictures with and without denoiser alike."""
-        if measure == "margin_error":
-            return self.margins["raw" if family == PREDICTED else family]
-        return self.pictures["depth" if family == "depth" else "raw"]
+    def measure(self, setting: Setting, seed: int) -> dict[str, Numbers]:
+        """Make one picture; return how it and the margin compare, and the times of rendering and denoising."""
+        radiance, times = timed(partial(self._radiance, setting.estimator, seed, setting.spp))
+        picture = self._picture(radiance)
+        values = {"picture": flat(picture), "margin": np.array([self._margin(picture)])}
+        beside = {name: self._references[name, setting.family].beside(value) for name, value in values.items()}
+        return {name: {**numbers, **times} for name, numbers in beside.items()}
 
-    def _truth(self, family: str) -> Renderer:
-        depths = [one.depth for one in self.variants.values() if one.family == family]
-        denoiser = "oidn" if family == "oidn" else "none"
-        return self._as(Variant(family, family, REFERENCE_SAMPLER, denoiser, max(depths)))
-
-    def part(self, family: str, spp: int, seed: int) -> Array:
-        """Return a part of a family's reference: its radiance, flat."""
-        return flat(self._radiance(self._truth(family), seed, spp))
-
-    def _refer(self, family: str, budget: TimeBudget, seed: int, on_done: Callable[[], None]) -> None:
-        renderer = self._truth(family)
-        spp = part_samples(seconds_a_sample(partial(self._radiance, renderer, 0), calls=3), budget.left)
-        parts = self.elsewhere(family, spp) or one_by_one(partial(self.part, family, spp))
-        gathered = gather(parts, budget, seed=seed, name=f"precision reference {family}", on_done=on_done)
-        self.part_spp[family] = spp
-        self.pictures[family] = reference_through(lambda mean: flat(self._shown(mean)), gathered)
-        self.margins[family] = reference_through(lambda mean: np.array([self._margin(self._shown(mean))]), gathered)
-
-    def _as(self, variant: Variant) -> Renderer:
-        key = (variant.sampler, variant.depth, variant.integrator)
-        if key not in self._scenes:
-            scene = self._renderer.scene
-            sampler, depth, integrator = key
-            self._scenes[key] = scene.like(sampler=sampler, max_depth=depth, integrator=integrator)
-        return self._renderer.like(self._scenes[key], denoiser=variant.denoiser)
-
-    def _radiance(self, renderer: Renderer, seed: int, spp: int) -> Tensor:
+    def _radiance(self, line: str, seed: int, spp: int) -> Tensor:
         with torch.no_grad():
-            return renderer.radiance(self._u, seed, spp)
+            return self._renderers[line].radiance(self._u, seed, spp)
 
     def _picture(self, radiance: Tensor) -> Tensor:
         with torch.no_grad():
-            return self._renderer.space.picture(self._u, self._renderer.formation.display(radiance))
-
-    def _shown(self, mean: Array) -> Tensor:
-        return self._picture(torch.from_numpy(mean).to(torch.float32).reshape(self._size))
+            return self._space.picture(self._u, self._formation.display(radiance))
 
 
-Verified = Callable[[Tensor], float]
-"""From a configuration to its objective in fresh renders with enough samples."""
+def denoiser_of(line: str) -> str:
+    """Return the denoiser of a line of the picture; lines are recommended among those with the same."""
+    return "oidn" if line.endswith(OIDN) else "none"
 
 
-class SearchMark(NamedTuple):
-    """How far one search had come: the renders that it could spend until then, the processor time that it had taken
-    without verification, and the verified objective of the best configuration until then."""
+# ---- gradients ------------------------------------------------------------------------------------------------------
 
-    renders: int
-    seconds: float
-    objective: float
+ADJOINT_COST = {"adjoint": 3.0, "material": 60.0}
+"""An adjoint takes about as long as so many renders, the kernels that the material form compiles included."""
+BY_COORDINATE = 32
+"""Sets of at most so many coordinates have a reference by differences, coordinate by coordinate."""
 
 
 @dataclass(frozen=True)
-class PolicyCurve:
-    """How a policy does, over seeds: at each mark renders, median seconds, and quartiles of the objective."""
+class GradientPart:
+    """Coordinates of one control whose gradient one call of an estimator answers; named with parameters where a control
+    has several."""
 
-    policy: str
-    renders: tuple[int, ...]
-    seconds: tuple[float, ...]
-    objective: tuple[tuple[float, float, float], ...]
-    repeats: int
+    name: str
+    groups: tuple[Group, ...]
+    estimators: tuple[str, ...]
+
+    @property
+    def names(self) -> set[str]:
+        """Of the groups."""
+        return {group.name for group in self.groups}
+
+    @property
+    def size(self) -> int:
+        """Number of coordinates."""
+        return sum(group.size for group in self.groups)
+
+    def of(self, gradient: Tensor) -> Array:
+        """Return the part's entries (n,) of a whole gradient (d,)."""
+        return flat(torch.cat([gradient[group.coordinates] for group in self.groups]))
 
 
-def marks_at(steps: int) -> tuple[int, ...]:
-    """Return the numbers of renders at which a search is looked at: powers of two, and all of them."""
-    return (*(2**power for power in range(steps.bit_length()) if 2**power < steps), steps)
-
-
-@dataclass(frozen=True)
-class ObjectiveBench:
-    """Runs searches and verifies what they held at each mark; `noise` is the root seed of their renders, and `budget`
-    ends one that takes longer."""
-
-    evaluate: Evaluate
-    noise: int
-    domain: Domain
-    policies: Mapping[str, Policy[Any]]
-    steps: int
-    verified: Verified
-    budget: TimeBudget
-
-    def settings(self, spp: int) -> list[MeasuredSetting]:
-        """One setting a policy."""
-        return [MeasuredSetting("objective", name, spp, 1.0) for name in self.policies]
-
-    def measure(self, setting: MeasuredSetting, seed: int) -> tuple[list[SearchMark], float]:
-        """Run one search; its marks, verified, and the processor time of search and verification together."""
-        watch = Stopwatch()
-        held = self._search(setting.series, seed)
-        objectives = {u.numpy().tobytes(): u for _, _, u in held}
-        verified = {key: self.verified(u) for key, u in objectives.items()}
-        marks = [SearchMark(renders, seconds, verified[u.numpy().tobytes()]) for renders, seconds, u in held]
-        return marks, watch.processor
-
-    def _search(self, policy: str, seed: int) -> list[tuple[int, float, Tensor]]:
-        """The best configuration at each mark, with the seconds until then. Nothing is rendered again at the end."""
-        held: list[tuple[int, float, Tensor]] = []
-        best: tuple[float, Tensor] = (float("-inf"), self.domain.start)
-        wanted = list(marks_at(self.steps))
-        watch = Stopwatch()
-
-        def on_step(record: StepRecord, u: Tensor, evaluation: Evaluation) -> None:
-            nonlocal best
-            seconds = watch.processor
-            while wanted and record.renders > wanted[0]:  # what a mark holds was found before this step
-                held.append((wanted.pop(0), seconds, best[1]))
-            if evaluation.objective > best[0]:
-                best = (evaluation.objective, u.detach().clone())
-            if wanted and record.renders == wanted[0]:
-                held.append((wanted.pop(0), seconds, best[1]))
-
-        search(
-            self.evaluate,
-            self.domain,
-            self.policies[policy],
-            steps=self.steps,
-            seed=seeds.stream(seed, "policy"),
-            candidates=0,
-            on_step=on_step,
-            kind=f"precision {policy} {seed}",
-            noise=self.noise,
-            seconds=max(1e-9, self.budget.left),
+def gradient_parts(groups: Sequence[Group], *, linear: bool) -> list[GradientPart]:
+    """Return the parts of a space with the estimators that are valid for them. Of a linear loss, differences of the
+    loss are those of the picture, and left out."""
+    sets: dict[tuple[str, tuple[str, ...]], list[Group]] = {}
+    for group in groups:
+        if group.valid:
+            sets.setdefault((group.control, group.valid), []).append(group)
+    controls, parts = [control for control, _ in sets], []
+    for (control, valid), members in sets.items():
+        names = ",".join(group.parameter for group in members)
+        names = f"{members[0].parameter},... ({len(members)})" if len(names) > 28 else names
+        worth = compared(valid, sum(group.size for group in members))
+        estimators = tuple(name for name in worth if not (linear and name == "secant"))
+        parts.append(
+            GradientPart(f"{control}.{names}" if controls.count(control) > 1 else control, tuple(members), estimators)
         )
-        if self.budget.left > 0.0:
-            held += [(mark, watch.processor, best[1]) for mark in wanted]  # it stopped by itself
-        return held
+    return parts
 
 
-def curve_of(policy: str, searches: Sequence[Sequence[SearchMark]]) -> PolicyCurve:
-    """Return medians and quartiles over searches, at the marks that all of them have reached."""
-    common = min((len(marks) for marks in searches), default=0)
-    columns = [[marks[number] for marks in searches] for number in range(common)]
-    return PolicyCurve(
-        policy,
-        tuple(column[0].renders for column in columns),
-        tuple(quartiles([mark.seconds for mark in column])[1] for column in columns),
-        tuple(quartiles([mark.objective for mark in column]) for column in columns),
-        len(searches),
+class Gradients:
+    """Takes gradients (d,) of one part of a space at u by every estimator and compares them with a reference, which is
+    taken with a better sampler: differences at two steps where the coordinates are few, else the mean of an adjoint."""
+
+    def __init__(self, renderer: Renderer, loss: Loss, u: Tensor, part: GradientPart) -> None:
+        self._renderer, self._loss, self._u, self.part = renderer, loss, u, part
+        self._exact = renderer.like(renderer.scene.like(sampler=REFERENCE_SAMPLER))
+        adjoints = [name for name in part.estimators if name in BY_ADJOINT]
+        self._by = "differences" if part.size <= BY_COORDINATE else (*adjoints, *part.estimators)[0]
+        self.reference: ReferenceValue | None = None
+
+    @property
+    def settings(self) -> list[Setting]:
+        """Everything to measure; the cost is in renders, the picture itself included."""
+        costs = {
+            name: 1.0
+            + ADJOINT_COST.get(name, sum(replace(group, estimator=name).renders for group in self.part.groups))
+            for name in self.part.estimators
+        }
+        return [
+            Setting("gradient", name, count, count * cost, self.part.name)
+            for name, cost in costs.items()
+            for count in COUNTS["independent"]
+        ]
+
+    def refer(self, budget: TimeBudget, seed: int, on_done: Callable[[], None]) -> list[PrecisionReference]:
+        """Find the reference."""
+        if self.part.size <= BY_COORDINATE:
+            along = [_coordinate(self._u, group, number) for group in self.part.groups for number in range(group.size)]
+
+            def both(noise: int, spp: int) -> Array:
+                """Of each coordinate the derivative, extrapolated to a step of zero, and how far two steps differ."""
+                of = partial(reference, self._exact, self._loss, self._u, seed=noise, spp=spp, repeats=(1, 1))
+                rows = [(found.value, found.steps[0] - found.steps[1]) for found in map(of, along)]
+                return np.asarray(rows, dtype=np.float64).T
+
+            spp = part_samples(partial(both, 0), budget.left, parts=3, counts=(16, 64, 256))
+            parts = gather(partial(both, spp=spp), budget, on_done, seed)
+            bias = float(np.linalg.norm(np.mean([apart for _, apart in parts], axis=0))) / 4.0
+            self.reference = reference_of([values for values, _ in parts], bias=bias)
+        else:
+
+            def taken(noise: int, spp: int) -> Array:
+                return self.part.of(self._taken(self._exact, self._by, noise, spp))
+
+            spp = part_samples(partial(taken, 0), budget.left)
+            self.reference = reference_of(gather(partial(taken, spp=spp), budget, on_done, seed))
+        return [_row("gradient", self._by, self.reference, spp, self.part.name)]
+
+    def floor(self, setting: Setting, quantity: str) -> float:
+        """The reference's own relative error."""
+        return self.reference.error if self.reference else 0.0
+
+    def measure(self, setting: Setting, seed: int) -> dict[str, Numbers]:
+        """Take one gradient; return how it compares, and its times, the picture itself included."""
+        assert self.reference is not None
+        gradient, times = timed(partial(self._taken, self._renderer, setting.estimator, seed, setting.spp))
+        return {"gradient": {**self.reference.beside(self.part.of(gradient)), **times}}
+
+    def bias(self, seed: int) -> str | None:
+        """Check a reference by an adjoint against differences along one direction; a sentence if it is biased."""
+        if self._by == "differences" or self.reference is None:
+            return None
+        exact = self._exact
+        exact.plan = only(exact.plan, self.part.names, self._by)
+        probe = probes(exact, self._loss, self._u, seed, 64)[0]
+        against = reference(exact, self._loss, self._u, probe, seed=seed, spp=64, repeats=(2, 4))
+        own = float(self.reference.value @ self.part.of(probe.direction))
+        estimate = Estimate(self._by, own, self.reference.error * abs(own), 1, 0.0)
+        if agreement(estimate, against).status != "biased":
+            return None
+        return (
+            f"{self.part.name}: the reference is the mean of {self._by}, and along one direction it gives {own:.3g}, "
+            f"differences {against.value:.3g} +- {against.noise:.1g}: its errors leave out that bias"
+        )
+
+    def _taken(self, renderer: Renderer, estimator: str, seed: int, spp: int) -> Tensor:
+        return estimated(renderer, self._loss, self._u, estimator, self.part.names, seed, spp)
+
+
+def _coordinate(u: Tensor, group: Group, number: int) -> Probe:
+    direction = torch.zeros_like(u)
+    direction[group.begin + number] = 1.0
+    return Probe(replace(group, size=1, begin=group.begin + number), f"{group.name}.{number}", direction, group.step)
+
+
+def _row(quantity: str, name: str, value: ReferenceValue, spp: int, control: str = "") -> PrecisionReference:
+    return PrecisionReference(
+        quantity=quantity,
+        control=control,
+        reference=name,
+        error=value.error,
+        parts=value.parts,
+        spp=spp * value.parts,
     )
 
 
-def missing(curve: PolicyCurve, best: float, start: float) -> tuple[float, ...]:
-    """Return the share of the possible gain, from `start` to the best median of any policy, that a policy's median
-    misses at each mark."""
-    gain = best - start
-    return tuple(0.0 if gain <= 0.0 else max(0.0, (best - middle) / gain) for _, middle, _ in curve.objective)
-
-
-def sooner(curves: Sequence[PolicyCurve], goal: float, best: float, start: float) -> tuple[str, int, float] | None:
-    """Return the policy whose median reaches a share of the possible gain in the least time: its name, renders and
-    seconds; None where none does."""
-    reached = [
-        (seconds, renders, curve.policy)
-        for curve in curves
-        for share, renders, seconds in zip(missing(curve, best, start), curve.renders, curve.seconds, strict=True)
-        if share <= goal
-    ]
-    if not reached or best <= start:
-        return None
-    seconds, renders, policy = min(reached)
-    return policy, renders, seconds
+def flat(values: Tensor) -> Array:
+    """Return values of any shape as (n,) float64."""
+    numbers: Array = values.detach().to(torch.float64).reshape(-1).numpy().copy()
+    return numbers

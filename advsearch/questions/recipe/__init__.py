@@ -25,19 +25,17 @@ class _Recipe(QuestionCommand):
 
     def run(self, args: argparse.Namespace) -> int:
         """Carry out the recipe and print what it says, or list the recipes."""
-        return _listed(args.json) if getattr(args, "recipe", None) == LIST else super().run(args)
+        if getattr(args, "recipe", None) != LIST:
+            return super().run(args)
+        # late, so that --help answers at once
+        from advsearch.questions.recipe.description import titles
 
-
-def _listed(as_json: bool) -> int:
-    # late, so that --help answers at once
-    from advsearch.questions.recipe.description import titles
-
-    found = titles()
-    if as_json:
-        output.print_json({"schema": 1, "recipes": [{"name": name, "title": text} for name, text in found.items()]})
-    else:
-        print(output.aligned([[name, text] for name, text in found.items()]))
-    return 0
+        if args.json:
+            listed = [{"name": name, "title": text} for name, text in titles().items()]
+            output.print_json({"schema": 1, "recipes": listed})
+        else:
+            print(output.aligned([[name, text] for name, text in titles().items()]))
+        return 0
 
 
 COMMAND = _Recipe(

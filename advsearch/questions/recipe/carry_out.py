@@ -83,7 +83,7 @@ def recipe_from_config(
     described = recipe_of(noted, f"{resumed}: the recipe that it began with") if noted else read_recipe(config.recipe)
     check_powers(described, config)
     if not noted:
-        check(described, config)
+        check_described(described, config)
         check_figures(described, check_runs(planned(described, config)), config.recipe)
     with RunDirectory.of(config, resumed) as run:
         run.store.set_note(NOTE, json.dumps(described.model_dump(mode="json")))
@@ -131,7 +131,7 @@ def recipe_from_config(
         return keep_answer(run, result)
 
 
-def check(described: Recipe, config: RecipeConfig) -> None:
+def check_described(described: Recipe, config: RecipeConfig) -> None:
     """Read everything that a recipe says, so that an InputError tells what is wrong before anything is rendered."""
     if config.photographs is not None:
         wanted = _photographed(described, planned(described, config))

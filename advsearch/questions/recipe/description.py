@@ -6,7 +6,7 @@ A part is carried out once for each object, as a run of its command; figures are
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from importlib import resources
 from itertools import product
@@ -250,31 +250,23 @@ def _runs(recipe: Recipe, name: str, config: RecipeConfig) -> Iterator[PlannedRu
         for axis, default in (("object", ""), ("environment", DEFAULT_ENVIRONMENT), ("model", "reference"))
         if axis not in several or axis == "object"
     }
+    where = f"{config.recipe}: parts: {name}"
     for number, values in enumerate(product(*axes.values())):
-        one = dict(zip(axes, values, strict=True))
-        words = [value for axis, value in one.items() if axis == "object" or len(axes[axis]) > 1]
-        where, stream = f"{config.recipe}: parts: {name}", f"{part.drawn_as or name} {number}"
-        made = _config(part, {**settings, **one}, where, config, stream)
-        yield PlannedRun(_folder(name, number, words), name, made, part.around and _folder(part.around, number, words))
-
-
-def _config(part: Part, settings: Settings, where: str, config: RecipeConfig, stream: str) -> SceneConfig:
-    """The configuration of one run; its seed is its own, so that no two runs draw the same."""
-    label = config.label_of(str(settings["object"]))
-    own: Settings = {"seed": seeds.stream(config.seed, f"recipe {stream}")}
-    own |= {"threads": config.threads} if not config.deterministic else {"deterministic": True}
-    own |= {} if label is None else {"label": label}
-    try:
-        made = CONFIGS[part.command](**{**settings, **own})
-    except SettingsError as error:
-        raise SettingsError(error.problems, where) from None
-    except UnknownNameError:
-        raise
-    except InputError as error:
-        raise InputError(f"{where}: {error}") from None
-    assert isinstance(made, SceneConfig)
-    return made
-
-
-def _folder(part: str, number: int, words: Sequence[str]) -> str:
-    return f"{part}-{number:02d}-{default_name(words[0], [default_name(word, []) for word in words[1:]])}"
+        own: Settings = dict(zip(axes, values, strict=True))
+        words = [value for axis, value in zip(axes, values, strict=True) if axis == "object" or len(axes[axis]) > 1]
+        # a seed of its own, so that no two runs draw the same
+        own["seed"] = seeds.stream(config.seed, f"recipe {part.drawn_as or name} {number}")
+        own |= {"deterministic": True} if config.deterministic else {"threads": config.threads}
+        if (label := config.label_of(str(own["object"]))) is not None:
+            own["label"] = label
+        try:
+            made = kind(**{**settings, **own})
+        except SettingsError as error:
+            raise SettingsError(error.problems, where) from None
+        except UnknownNameError:
+            raise
+        except InputError as error:
+            raise InputError(f"{where}: {error}") from None
+        assert isinstance(made, SceneConfig)
+        folder = f"{number:02d}-{default_name(words[0], [default_name(word, []) for word in words[1:]])}"
+        yield PlannedRun(f"{name}-{folder}", name, made, part.around and f"{part.around}-{folder}")

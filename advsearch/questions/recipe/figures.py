@@ -111,13 +111,10 @@ def check_figures(recipe: Recipe, columns: Mapping[str, Collection[str]], where:
         for option in NAMING:
             value = getattr(options, option, None) or ()
             for column in [value] if isinstance(value, str) else value:
-                lacking = [part for part, own in shown.items() if column not in known and not _has(own, column)]
+                any_of = f"{column.partition('.')[0]}.{ANY}"
+                lacking = [part for part, own in shown.items() if column not in known and not {column, any_of} & {*own}]
                 if shown and len(lacking) == len(shown):
                     others = {name for own in shown.values() for name in own if not name.endswith(ANY)}
                     raise UnknownNameError("column", column, known | others, f"{place}, as `{option}`.")
                 if lacking:
                     raise InputError(f"{place}: {lacking[0]} has no {column}; name the parts that have it as `of`")
-
-
-def _has(columns: Collection[str], column: str) -> bool:
-    return column in columns or f"{column.partition('.')[0]}.{ANY}" in columns

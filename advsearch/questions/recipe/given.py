@@ -13,10 +13,10 @@ from pydantic import Field
 from advsearch.questions.recipe.table import (
     ANSWER,
     COUNT,
-    Count,
     MadeFigure,
     Options,
     Table,
+    Tally,
     extremes,
     most_frequent,
     plural,
@@ -39,12 +39,12 @@ class AnswersOptions(Options):
 
 def answers(table: Table, options: AnswersOptions) -> MadeFigure:
     """Count the most frequent answers for each value of something."""
-    groups: dict[str, list[tuple[Count, int]]] = {}  # how often each was given, and how often it was a right one
+    groups: dict[str, list[tuple[Tally, int]]] = {}  # how often each was given, and how often it was a right one
     for value, rows in table.by(options.by).items():
         most = most_frequent(rows)[: options.most]
         given = {answer: rows[ANSWER] == answer for answer, _ in most}
         groups[value] = [
-            (Count.over(answer, rows, flags), int(rows["correct"][flags].sum())) for answer, flags in given.items()
+            (Tally.over(answer, rows, flags), int(rows["correct"][flags].sum())) for answer, flags in given.items()
         ]
     wrong = {value: each[0] for value, each in groups.items() if 2 * each[0][1] < each[0][0].times}
     known, thing = len(groups) - len(wrong), plural(options.by)
@@ -102,17 +102,17 @@ class CuesOptions(Options):
 def cues(table: Table, options: CuesOptions) -> MadeFigure:
     """Count how often the answer is the object and how often the texture, and which of both predicts answers better."""
     textures = table.by(options.texture)
-    shapes = {name: Count.over(name, rows) for name, rows in textures.items()}
+    shapes = {name: Tally.over(name, rows) for name, rows in textures.items()}
     naming = {
-        name: rows[ANSWER].map(lambda answer, name=name: _names(answer, options.classes.get(name, [])))  # type: ignore[misc]
+        name: rows[ANSWER].map(lambda answer, name=name: _names(answer, options.classes.get(name, [])))
         for name, rows in textures.items()
     }
-    named = {name: Count.over(name, rows, naming[name]) for name, rows in textures.items()}
+    named = {name: Tally.over(name, rows, naming[name]) for name, rows in textures.items()}
     asked = [name for name in textures if options.classes.get(name)]
-    text = [f"The answer is the object, whatever its texture: {Count.over('', table.rows).told('so')}."]
+    text = [f"The answer is the object, whatever its texture: {Tally.over('', table.rows).told('so')}."]
     if asked:
         flags = pd.concat([naming[name] for name in asked])
-        total = Count.over("", table.rows.loc[flags.index], flags)
+        total = Tally.over("", table.rows.loc[flags.index], flags)
         text.append(f"The answer names the texture ({', '.join(asked)}): {total.told('so')}.")
         if not total.share:
             text.append("A model that has no class for a texture cannot name it.")

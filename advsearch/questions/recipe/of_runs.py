@@ -15,11 +15,11 @@ from advsearch.questions.recipe.table import (
     COUNT,
     PART,
     WORKERS,
-    Count,
     MadeFigure,
     Options,
     Rows,
     Table,
+    Tally,
     draw_bars,
 )
 from advsearch.report.figures import BLUE
@@ -56,7 +56,7 @@ def agreement(table: Table, options: AgreementOptions) -> MadeFigure:
     # the values that renderings have; other pictures may have more
     names = [name for name in renderings if name not in (ANSWER, PART, "correct", "margin", "time", "unit")]
     objects = [ALL, *renderings["object"].unique()]
-    text, rows, series = list[str](), list[list[Cell]](), dict[str, dict[str, Count]]()
+    text, rows, series = list[str](), list[list[Cell]](), dict[str, dict[str, Tally]]()
     for part in (PHOTOGRAPHS, *options.of[1:]):
         others, name = table.rows[table.rows[PART] == part], options.names.get(part, part)
         pairs = others.merge(renderings, on=names, suffixes=("", " rendered"))
@@ -71,7 +71,7 @@ def agreement(table: Table, options: AgreementOptions) -> MadeFigure:
             some = pairs if thing == ALL else pairs[pairs["object"] == thing]
             first, second = some["correct rendered"], some["correct"]
             same_answer = int((some[f"{ANSWER} rendered"] == some[ANSWER]).sum())
-            agreeing = Count.over(thing, some, first == second)
+            agreeing = Tally.over(thing, some, first == second)
             series[name][thing] = agreeing
             four = [int(((first == a) & (second == b)).sum()) for a in (True, False) for b in (True, False)]
             rows.append([name, thing, *four, same_answer, *agreeing.cells])
@@ -103,7 +103,7 @@ def _where(right: bool, pairs: Rows) -> str:
     verb, some = "right" if right else "wrong", pairs[pairs["correct rendered"] == right]
     if some.empty:
         return f"It is {verb} about none of the renderings."
-    told = Count.over("", some, some["correct"] == right).told(verb)
+    told = Tally.over("", some, some["correct"] == right).told(verb)
     return f"Where it is {verb} about the rendering, it is {told} about the other."
 
 

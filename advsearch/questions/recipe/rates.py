@@ -19,17 +19,17 @@ from advsearch.questions.recipe.table import (
     MARKS,
     MODEL,
     PART,
-    Count,
     MadeFigure,
     Options,
     Rows,
     Table,
+    Tally,
     bare,
     draw_bars,
     extremes,
-    figure_value,
     plural,
 )
+from advsearch.report.wording import figure_value
 
 BINS = 12
 """Parts of a range where lines are drawn along it."""
@@ -67,10 +67,10 @@ def rates(table: Table, options: RatesOptions) -> MadeFigure:
     lines = list(table.by(options.series)) if options.series else [""]
     groups, middles = _groups(table, options)
 
-    def counts(name: str, rows: Rows) -> list[Count]:
+    def counts(name: str, rows: Rows) -> list[Tally]:
         split = replace(table, rows=rows).by(options.series) if options.series and len(rows) else {"": rows}
         each = [split.get(line, rows[:0]) for line in lines]
-        return [Count.over(name, some, some["correct"] != options.wrong) for some in each]
+        return [Tally.over(name, some, some["correct"] != options.wrong) for some in each]
 
     cells = {options.names.get(name, name): counts(name, rows) for name, rows in groups.items()}
     if options.form == "bars" and middles is None and not is_numeric_dtype(table.column(options.by)):
@@ -95,9 +95,13 @@ def rates(table: Table, options: RatesOptions) -> MadeFigure:
         for number, name in enumerate(series):
             worst = f"For {name}, lowest" if len(series) > 1 else "Lowest"
             along = [one[number].called(row) for row, one in cells.items()]
-            text += extremes(along, f"{worst}{where}", f"highest{where}", plural(options.by), verb)
+            if len(series) < 2 or sum(one.total > 0 for one in along) > 1:  # of one row all is said below
+                text += extremes(along, f"{worst}{where}", f"highest{where}", plural(options.by), verb)
     if len(series) > 1:  # in one text, so that figures by other columns do not repeat it
-        overall = [one.called(f"that of {name}") for name, one in zip(series, totals, strict=True)]
+        overall = [
+            one.called(f"that of {_named(name, options.series or '')}")
+            for name, one in zip(series, totals, strict=True)
+        ]
         text.append(" ".join(extremes(overall, "Over all, the lowest share", "the highest", of_series, verb)))
     if options.wrong and options.series == MODEL:
         text += _relative(cells, series)
@@ -168,7 +172,7 @@ def _named(value: str, column: str) -> str:
     return f"{bare(column)} {value}" if value[:1].isdigit() or value[:1] == "-" else value
 
 
-def _relative(cells: Mapping[str, Sequence[Count]], series: Sequence[str]) -> list[str]:
+def _relative(cells: Mapping[str, Sequence[Tally]], series: Sequence[str]) -> list[str]:
     """The mean over rows of each model's errors over those of the first; rows without any of that are left out."""
     text = []
     for number, name in enumerate(series[1:], start=1):
@@ -180,7 +184,7 @@ def _relative(cells: Mapping[str, Sequence[Count]], series: Sequence[str]) -> li
 
 
 def _draw_map(
-    figure: Any, axes: Any, cells: Mapping[str, Sequence[Count]], series: Sequence[str], labels: tuple[str, str, str]
+    figure: Any, axes: Any, cells: Mapping[str, Sequence[Tally]], series: Sequence[str], labels: tuple[str, str, str]
 ) -> None:
     shares = [[math.nan if one.share is None else one.share for one in row] for row in cells.values()]
     image = axes.imshow(shares, cmap="RdBu", vmin=0.0, vmax=1.0, aspect="auto")
@@ -197,7 +201,7 @@ def _draw_map(
 
 
 def _draw_lines(
-    axes: Any, cells: Mapping[str, Sequence[Count]], series: Sequence[str], middles: Sequence[float]
+    axes: Any, cells: Mapping[str, Sequence[Tally]], series: Sequence[str], middles: Sequence[float]
 ) -> None:
     for number, name in enumerate(series):
         known = [(at, row[number]) for at, row in zip(middles, cells.values(), strict=True) if row[number].total]

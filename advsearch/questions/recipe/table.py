@@ -19,7 +19,7 @@ from advsearch.errors import InputError
 from advsearch.questions.recipe.answer import Cell
 from advsearch.report.figures import BLUE, GREY, RED
 from advsearch.report.phrases import percent
-from advsearch.report.wording import interval_text, short_name
+from advsearch.report.wording import figure_value, interval_text
 from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.results.base import Interval
 from advsearch.runs.results.sweep import SurfaceMap, SweepSummary
@@ -47,13 +47,6 @@ COUNT = ["of", "share", "low", "high"]
 """Columns of a count behind the one of what is counted."""
 
 Rows = Any  # pd.DataFrame, which has no types
-
-
-def figure_value(value: float | str) -> str:
-    """Return a value as figures write it; of a file, its name without folder and suffix."""
-    if isinstance(value, str):
-        return Path(short_name(value)).stem if "/" in value else value
-    return f"{value:.4g}"
 
 
 def read_rows(
@@ -111,7 +104,7 @@ class Table:
         the objects in it."""
         frame = pd.DataFrame(rows)
         if groups:
-            named = {one: group for group, objects in reversed(groups.items()) for one in objects}
+            named = {one: group for group, objects in reversed(list(groups.items())) for one in objects}
             frame[GROUP] = [named.get(one, OTHERS) for one in frame["object"]]
         return cls(frame, **more)
 
@@ -146,7 +139,7 @@ class Table:
 
 
 @dataclass(frozen=True, eq=False)
-class Count:
+class Tally:
     """How many of some rows are counted: of each independent unit, such as a drive, `counted` (n,) of its `of` (n,)."""
 
     name: str
@@ -154,25 +147,25 @@ class Count:
     of: npt.NDArray[np.float64]
 
     @classmethod
-    def over(cls, name: str, rows: Rows, flags: Any = None) -> Count:
+    def over(cls, name: str, rows: Rows, flags: Any = None) -> Tally:
         """Count rows: those with right answers, or those that flags (n,) say."""
         counted = np.asarray(rows["correct"] if flags is None else flags, dtype=np.float64)
         units = pd.factorize(rows["unit"])[0]
         return cls(name, per_unit(counted, units), per_unit(np.ones(len(rows)), units))
 
-    def called(self, name: str) -> Count:
+    def called(self, name: str) -> Tally:
         """Return it under another name."""
         return replace(self, name=name)
 
     @property
     def times(self) -> int:
         """How many are counted."""
-        return round(self.counted.sum())
+        return round(float(self.counted.sum()))
 
     @property
     def total(self) -> int:
         """How many rows there are."""
-        return round(self.of.sum())
+        return round(float(self.of.sum()))
 
     @property
     def share(self) -> float | None:
@@ -193,13 +186,13 @@ class Count:
         share = f"{percent(self.share)}, 95 % interval {interval_text(self.interval())}"
         return f"{verb} in {self.times} of {self.total} ({share})"
 
-    def below(self, other: Count, among: int = 1) -> bool:
+    def below(self, other: Tally, among: int = 1) -> bool:
         """Return whether the interval of this share lies below that of another, both widened."""
         own, others = self.interval(among), other.interval(among)
         return own is not None and others is not None and own[1] < others[0]
 
 
-def extremes(counts: Sequence[Count], worst: str, best: str, thing: str, verb: str = "right") -> list[str]:
+def extremes(counts: Sequence[Tally], worst: str, best: str, thing: str, verb: str = "right") -> list[str]:
     """Return which of several has the lowest share and which the highest, and whether that is more than chance.
 
     The two were chosen among k for being extreme, so that they are compared by intervals of confidence 1 - 0.05 / k,
@@ -214,7 +207,7 @@ def extremes(counts: Sequence[Count], worst: str, best: str, thing: str, verb: s
     if min(shares) == max(shares):
         return [f"All {len(known)} {thing} have the same share, {percent(low.share)}: no difference is shown."]
 
-    def named(one: Count) -> str:
+    def named(one: Tally) -> str:
         ties = shares.count(one.share or 0.0) - 1
         return f"is {one.name}" + (f" (as {ties} other{'s' if ties > 1 else ''})" if ties else "")
 
@@ -273,7 +266,7 @@ class MadeFigure:
     size: tuple[float, float]
 
 
-def draw_bars(axes: Any, cells: Mapping[str, Sequence[Count]], series: Sequence[str]) -> None:
+def draw_bars(axes: Any, cells: Mapping[str, Sequence[Tally]], series: Sequence[str]) -> None:
     """Draw a row for each of the cells, in which a dot with its interval is the count of each of the series."""
     for number, name in enumerate(series):
         colour, label = COLOURS[number % len(COLOURS)], name

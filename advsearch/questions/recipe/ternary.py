@@ -16,10 +16,10 @@ from advsearch.questions.recipe.answer import Cell
 from advsearch.questions.recipe.table import (
     ANSWER,
     COUNT,
-    Count,
     MadeFigure,
     Options,
     Table,
+    Tally,
     bare,
     extremes,
     most_frequent,
@@ -67,7 +67,7 @@ def ternary(table: Table, options: TernaryOptions) -> MadeFigure:
         known = {triangle: values[own & ~np.isnan(values)] for triangle, own in inside.items()}
         panels.append((answer, [float(some.mean()) if len(some) else None for some in known.values()]))
         if not by_lead:
-            by_most = [Count.over(name, rows[most == k], flags[most == k]) for k, name in enumerate(names)]
+            by_most = [Tally.over(name, rows[most == k], flags[most == k]) for k, name in enumerate(names)]
             text += _told_shares(answer, times / len(rows), by_most)
             table_rows += [[answer, count.name, *count.cells] for count in by_most]
     if by_lead:
@@ -122,7 +122,7 @@ def all_triangles(side: int) -> dict[Triangle, Corners]:
     return found
 
 
-def _told_shares(answer: str, share: float, by_most: Sequence[Count]) -> list[str]:
+def _told_shares(answer: str, share: float, by_most: Sequence[Tally]) -> list[str]:
     whose = f"{answer}, {percent(share)} of all answers, is"
     known = [one for one in by_most if one.total]
     if len({one.share for one in known}) == 1:

@@ -3,16 +3,11 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from advsearch.cli import output
 from advsearch.cli.output import at_work
 from advsearch.cli.question import QuestionCommand
-
-if TYPE_CHECKING:
-    from advsearch.questions.stability.answer import StabilityResult
-    from advsearch.questions.stability.scene import Case
 
 HELP = "run stiff and extreme cases, and check that each of them holds"
 MORE = ". Exit status 3 if one falls short"
@@ -44,22 +39,13 @@ class _Stability(QuestionCommand):
 
             config: Any = self.config(args)
             cases = chosen(config.cases, config.groups)
-        return _print_cases(cases, as_json=args.json)
+        if args.json:
+            listed = [{"case": case.name, "group": case.group, "holds": case.holds} for case in cases]
+            output.print_json({"schema": 1, "command": "stability", "cases": listed})
+        else:
+            rows = [[case.group, case.name, case.holds] for case in cases]
+            print(output.aligned([["group", "case", "what must hold"], *rows]))
+        return 0
 
 
-def _print_cases(cases: Sequence[Case], *, as_json: bool) -> int:
-    if as_json:
-        listed = [{"case": one.name, "group": one.group, "control": one.control, "holds": one.holds} for one in cases]
-        output.print_json({"schema": 1, "command": "stability", "cases": listed})
-    else:
-        rows = [[one.group, one.name, one.holds] for one in cases]
-        print(output.aligned([["group", "case", "what must hold"], *rows]))
-    return 0
-
-
-def has_failed(result: StabilityResult) -> bool:
-    """Whether a case does not hold."""
-    return any(row.status != "ok" for row in result.rows)
-
-
-COMMAND = _Stability("stability", short=has_failed)
+COMMAND = _Stability("stability", short=lambda result: any(row.status != "ok" for row in result.rows))

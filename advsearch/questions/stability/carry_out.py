@@ -4,30 +4,20 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
-from functools import partial
 from pathlib import Path
 
 from typing_extensions import Unpack
 
+import advsearch.questions.stability.scenes
+import advsearch.questions.stability.stiff  # noqa: F401  (both fill `CASES`)
 from advsearch.api.keywords import Names, RunKeywords, asks, configured
 from advsearch.engine.record import Results, kept_rows
-from advsearch.errors import AdvsearchError, UnknownNameError
+from advsearch.errors import UnknownNameError
 from advsearch.progress import NullProgress, Progress, Watched, watcher
-from advsearch.questions.stability.answer import CaseRow, DecidingNumber, StabilityResult
-from advsearch.questions.stability.geometry import GEOMETRY
-from advsearch.questions.stability.light import MATERIALS, RADIOMETRIC
-from advsearch.questions.stability.precision import PRECISION
-from advsearch.questions.stability.predicted import SURFACE_LIGHT, TRANSPORT
-from advsearch.questions.stability.scene import Case, Check, Outcome
-from advsearch.questions.stability.searches import NOISE, OBJECTIVE
+from advsearch.questions.stability.answer import CaseRow, StabilityResult
 from advsearch.questions.stability.settings import StabilityConfig
-from advsearch.questions.stability.stiff import STIFF
+from advsearch.questions.stability.suite import CASES, Case
 from advsearch.runs.directory import RunDirectory
-
-_GROUPS = (RADIOMETRIC, MATERIALS, GEOMETRY, OBJECTIVE, STIFF, PRECISION, NOISE, TRANSPORT, SURFACE_LIGHT)
-GROUPS: tuple[str, ...] = tuple(group.name for group in _GROUPS)
-CASES: tuple[Case, ...] = tuple(case for group in _GROUPS for case in group.cases)
-"""Every case, in the order in which they run."""
 
 
 class StabilityKeywords(RunKeywords, total=False):
@@ -49,8 +39,21 @@ def stability_from_config(
 
     A case that is done is stored at once: a run that was stopped goes on with the case that it was at.
     """
-    cases, begun = chosen(config.cases, config.groups), time.perf_counter()
+    progress, begun = progress or NullProgress(), time.perf_counter()
+    cases = chosen(config.cases, config.groups)
     with RunDirectory.of(config, resumed) as run:
+        results = Results(run, config.seconds)
+
+        def rows() -> Iterator[CaseRow]:
+            hint = "`case` and `group` pick some, `seconds` stops before the next one"
+            progress.stage("trying extreme scenes, objectives and arithmetic", len(cases), hint=hint)
+            for case in cases:
+                known = results.stored(case.name) is not None
+                row = results.row(case.name, CaseRow, case.run)
+                yield row
+                if not known:
+                    progress.message(f"{case.name}: {row.status}, {row.seconds:.1f} s")
+                progress.advance(1)
 
         def result(rows: Sequence[CaseRow], ending: str) -> StabilityResult:
             return StabilityResult(
@@ -62,67 +65,20 @@ def stability_from_config(
                 command_line=config.command_line(),
             )
 
-        results = Results(run, config.seconds)
-        return kept_rows(run, results, run_cases(cases, results, progress or NullProgress()), result)
+        return kept_rows(run, results, rows(), result)
 
 
-def chosen(names: Sequence[str] = (), groups: Sequence[str] = ()) -> tuple[Case, ...]:
+def chosen(names: Sequence[str] = (), groups: Sequence[str] = ()) -> list[Case]:
     """Return the cases of these names and of these groups; all where neither is given.
 
     Raises:
         UnknownNameError: there is no such case or group.
     """
-    known = {case.name for case in CASES}
-    for name in names:
-        if name not in known:
-            raise UnknownNameError("case", name, known)
-    for group in groups:
-        if group not in GROUPS:
-            raise UnknownNameError("group", group, GROUPS)
-    if not names and not groups:
-        return CASES
-    return tuple(case for case in CASES if case.name in names or case.group in groups)
-
-
-def run_case(case: Case) -> CaseRow:
-    """Run one case. An exception is a finding like any other: the case falls short, and the exception says why."""
-    begun = time.perf_counter()
-    try:
-        outcome = case.find()
-    except AdvsearchError as error:
-        outcome = Outcome(Check(f"refused: {error}", 1.0, 0.0, 0.0), ending="refused")
-    except Exception as error:
-        what = f"raised {type(error).__name__}: {error}"
-        outcome = Outcome(Check(what, 1.0, 0.0, 0.0), finite=False, ending="raised")
-    return CaseRow(
-        case=case.name,
-        group=case.group,
-        control=case.control,
-        finite=outcome.finite,
-        relative_error=outcome.relative_error,
-        ending=outcome.ending,
-        rule=case.rule,
-        status=outcome.status,
-        decides=outcome.decides,
-        holds=case.holds,
-        checks=[DecidingNumber.of(one) for one in outcome.checks],
-        measured=dict(outcome.measured),
-        seconds=time.perf_counter() - begun,
-    )
-
-
-def run_cases(cases: Sequence[Case], results: Results, progress: Progress) -> Iterator[CaseRow]:
-    """Run cases one after the other and yield each row as it is done; what the results hold is not run again.
-
-    Raises:
-        OutOfTime: the time of the results is up.
-    """
-    hint = "`case` and `group` pick some, `seconds` stops before the next one"
-    progress.stage("trying extreme scenes, objectives and arithmetic", len(cases), hint=hint)
-    for case in cases:
-        known = results.stored(case.name) is not None
-        row = results.row(case.name, CaseRow, partial(run_case, case))
-        yield row
-        if not known:
-            progress.message(f"{case.name}: {row.status}, {row.seconds:.1f} s")
-        progress.advance(1)
+    for kind, asked, known in (
+        ("case", names, [case.name for case in CASES]),
+        ("group", groups, [case.group for case in CASES]),
+    ):
+        for name in asked:
+            if name not in known:
+                raise UnknownNameError(kind, name, dict.fromkeys(known))
+    return [case for case in CASES if not (names or groups) or case.name in names or case.group in groups]

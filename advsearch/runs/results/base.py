@@ -282,17 +282,47 @@ class PathLength(Fields):
     reason: str
 
 
-class CosineRow(Fields):
-    """How well a working gradient of the model's loss points the way of the converged one."""
+class Measured(Fields):
+    """A picture, a margin, a gradient or a derivative beside its reference, which took far more renders.
 
-    denoise: str
-    control: str
-    factor: float = Field(description="step as a multiple of the plan's")
+    Errors and noise are relative to the size of the reference. What was not measured is absent.
+    """
+
+    quantity: str = Field(
+        description="`picture`, `margin` of the model, `gradient` of a control, or `derivative` along a parameter"
+    )
+    control: str = Field(default="", description="whose gradient")
+    parameter: str = Field(default="", description="along which the derivative is")
+    estimator: str = Field(description="what computes it: a sampler, or an estimator of derivatives")
+    factor: float = Field(default=1.0, description="step as a multiple of the plan's")
     spp: int = Field(description="samples a pixel")
-    cosine: JsonFloat = Field(description="mean over seeds; null where the converged gradient is zero")
-    converged: JsonFloat = Field(description="smallest cosine of two converged gradients")
-    seconds: float = Field(description="of one working gradient, median")
-    status: GradientStatus = Field(description="whether it is good enough to search by")
+    repeats: int = Field(description="how often it was computed, each time with other noise")
+    seconds: float = Field(description="of one, median")
+    status: GradientStatus = Field(description="whether it agrees with its reference")
+    error: JsonFloat | None = Field(
+        default=None, description="of one, root mean square; an upper limit where the reference is unusable"
+    )
+    interval: Interval | None = Field(default=None, description="of `error`")
+    bias: JsonFloat | None = Field(default=None, description="error of the mean")
+    doubt: JsonFloat | None = Field(default=None, description="how much of `bias` the noise explains")
+    noise: JsonFloat | None = Field(default=None, description="standard deviation of one")
+    cosine: JsonFloat | None = Field(default=None, description="of a gradient with its reference, mean")
+    value: JsonFloat | None = Field(default=None, description="of a derivative, mean")
+    reference: JsonFloat | None = Field(default=None, description="what `value` should be")
+    reference_error: JsonFloat | None = Field(default=None, description="the reference's own")
+    reference_cosine: JsonFloat | None = Field(
+        default=None, description="smallest of two converged gradients, of which the reference is the mean"
+    )
+
+    @property
+    def name(self) -> str:
+        """``control.parameter``, or what there is of it; else the quantity."""
+        return ".".join(filter(None, (self.control, self.parameter))) or self.quantity
+
+    @property
+    def excess(self) -> float:
+        """What of the bias noise does not explain."""
+        return max(0.0, (self.bias or 0.0) - (self.doubt or 0.0))
 
 
 class ClassAnswer(Fields):

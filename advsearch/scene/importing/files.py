@@ -171,20 +171,27 @@ def check_faces(path: Path, count: int) -> None:
         raise files.too_large(path, f"a mesh of at most {files.scaled(LARGEST_FACES):,} triangles", f"{count:,}")
 
 
-class Inventory:
-    """What a file has, and what of it was taken.
+class Notes:
+    """What is said about a file, each sentence once; and what the file has that was not taken.
 
-        inventory = Inventory()
-        inventory.has("property", "confidence")
-        inventory.take("property", "x")
-        list(inventory.left())   # ["property 'confidence' is left out"]
+        notes = Notes("chair.ply")
+        notes.say("the alpha of 'wood.png' is left out")
+        notes.has("property", "confidence")
+        notes.take("property", "x")
+        list(notes)   # [..., "chair.ply: property 'confidence' is left out"]
 
-    A thing is a kind (a word of the format: ``"property"``, ``"keyword"``) and its name in the file.
+    A thing that a file has is a kind (a word of the format: ``"property"``, ``"keyword"``) and its name in the file.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, source: str) -> None:
+        self.source = source
+        self._said: dict[str, None] = {}  # quick, since a file may give cause for 100,000 warnings
         self._has: Counter[tuple[str, str]] = Counter()
         self._taken: set[tuple[str, str]] = set()
+
+    def say(self, clause: str) -> None:
+        """Warn, once; a clause that begins with a blank goes on after the file's name."""
+        self._said[f"{self.source}{'' if clause.startswith(' ') else ': '}{clause}"] = None
 
     def has(self, kind: str, name: str) -> None:
         """Note that the file has this, once more."""
@@ -194,32 +201,13 @@ class Inventory:
         """Note that this is used; that the file need not have it makes readers short."""
         self._taken.add((kind, name))
 
-    def left(self) -> Iterator[str]:
-        """Yield a clause for everything that the file has and nobody took, in the order of the file."""
+    def __iter__(self) -> Iterator[str]:
+        """All that was said, then what the file has and nobody took, in its order."""
+        yield from self._said
         for (kind, name), count in self._has.items():
             if (kind, name) not in self._taken:
                 times = "" if count == 1 else f" ({count:,} times)"
-                yield f"{kind} {shown(name)}{times} is left out"
-
-
-class Notes(list[str]):
-    """Warnings about a file, in their order."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._known: set[str] = set()
-
-    def once(self, message: str) -> None:
-        """Warn, once; quick, since a file may give cause for 100,000 warnings."""
-        if message not in self._known:
-            self._known.add(message)
-            self.append(message)
-
-    def taken(self) -> list[str]:
-        """Return those since the last time."""
-        found = list(self)
-        self.clear()
-        return found
+                yield f"{self.source}: {kind} {shown(name)}{times} is left out"
 
 
 MISSING = "is missing"

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 
 from pydantic import BaseModel
 
-from advsearch.scene.importing.files import Inventory, shown
+from advsearch.scene.importing.files import Notes, shown
 from advsearch.scene.importing.gltf import READ
 from advsearch.scene.importing.gltf_entries import CUT_OUTS, Header
 
@@ -31,11 +31,11 @@ FAR = 1000.0
 """Distance of a directional light, in object sizes."""
 
 
-def left_out(header: Header) -> Iterator[str]:
-    """Yield what the file has that is not carried over, whether one node or all of it is the object."""
+def left_out(header: Header, notes: Notes) -> None:
+    """Say what the file has that is not carried over, whether one node or all of it is the object."""
     used = {*header.extensionsUsed, *header.extensionsRequired}
     for name in sorted(used & set(EXTENSIONS) | used - set(READ)):
-        yield EXTENSIONS.get(name, UNKNOWN).format(name=shown(name, quoted=False))
+        notes.say(EXTENSIONS.get(name, UNKNOWN).format(name=shown(name, quoted=False)))
     drawn = in_the_scene(header)
     absent = sum(node.mesh is not None for index, node in enumerate(header.nodes) if index not in drawn)
     found = {
@@ -58,8 +58,8 @@ def left_out(header: Header) -> Iterator[str]:
     }
     for what, count in found.items():
         if count:
-            yield f": {counted(count, what)}"
-    yield from (f": {clause}" for clause in _unread(header))
+            notes.say(counted(count, what))
+    _note_unread(header, notes)
 
 
 WORDS = {
@@ -82,9 +82,8 @@ PLAIN = frozenset(("name", "weights", "extensions"))
 """Keys without a field that make no difference, or are named with what they belong to."""
 
 
-def _unread(header: Header) -> Iterator[str]:
-    """Yield a clause for every key, extras of materials among them, and every attribute that is not read."""
-    found = Inventory()
+def _note_unread(header: Header, notes: Notes) -> None:
+    """Note every key, extras of materials among them, and every attribute that is not read."""
     level: list[object] = [header]
     for entry in level:  # which grows
         if isinstance(entry, list):
@@ -92,19 +91,18 @@ def _unread(header: Header) -> Iterator[str]:
         elif isinstance(entry, BaseModel):
             kind = WORDS.get(type(entry).__name__)
             for key in (entry.model_extra or {}) if kind else ():
-                found.has(str(kind), key)
+                notes.has(str(kind), key)
             level.extend(getattr(entry, name) for name in type(entry).model_fields)
     for kind in set(WORDS.values()):
         for key in PLAIN if "material" in kind or "texture" in kind else {*PLAIN, "extras"}:  # notes of applications
-            found.take(kind, key)
+            notes.take(kind, key)
     for mesh in header.meshes:
         for primitive in mesh.primitives:
             material = None if primitive.material is None else header.materials[primitive.material]
             read = {"POSITION", "NORMAL", "COLOR_0", "TEXCOORD_0", material.attribute if material else ""}
             for name in primitive.attributes:
                 if name not in read and not (header.skins and name.startswith(("JOINTS_", "WEIGHTS_"))):
-                    found.has("attribute", name)
-    return found.left()
+                    notes.has("attribute", name)
 
 
 def beside(header: Header) -> str | None:

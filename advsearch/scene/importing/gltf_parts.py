@@ -6,7 +6,7 @@ What materials look like is said in glTF 2.0, section 3.9; how their textures go
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -29,10 +29,10 @@ from advsearch.scene.importing.gltf_entries import (
     Node,
     Primitive,
     Sampler,
+    Skin,
     TextureUse,
 )
 from advsearch.scene.importing.gltf_left_out import counted, left_out
-from advsearch.scene.importing.gltf_skins import Bound, bound, joint_matrices, posed
 from advsearch.scene.importing.parts import (
     ImportedPart,
     ImportedSurface,
@@ -62,22 +62,20 @@ class GltfSurfaces:
     """Turns the materials of one file into surfaces.
 
     Attributes:
-        source: the file's name, for warnings.
         header: of the file.
         buffers: reads its pictures.
         references: the files that it names.
-        notes: the warnings so far.
+        notes: about the file.
     """
 
-    source: str
     header: Header
     buffers: Buffers
     references: References
-    notes: Notes = field(default_factory=Notes)
+    notes: Notes
     _opened: dict[tuple[str | None, int | None], Image.Image | None] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        self._pictures = Pictures(len(self.header.materials), self.references.get, self.references.refused)
+        self._pictures = Pictures(len(self.header.materials), self.references, self.notes)
 
     def surface(self, number: int | None, parts: Sequence[ImportedPart]) -> tuple[ImportedSurface, Fit]:
         """Return the surface of a material, and how texture coordinates fit its pictures.
@@ -110,15 +108,15 @@ class GltfSurfaces:
         packed = self._picture(
             given.metallicRoughnessTexture,
             "numbers",
-            ": the texture {name} of roughness and metallic {why}; it is left out",
+            "the texture {name} of roughness and metallic {why}; it is left out",
         )
         if packed is not None:
-            self._note(": textures of roughness and metallic are replaced by their means")
+            self.notes.say("textures of roughness and metallic are replaced by their means")
             _, green, blue = self._mean(packed, material, given.metallicRoughnessTexture, parts).tolist()
             roughness, metallic = roughness * green, metallic * blue
         normals = None
         if material.normalTexture is not None and material.reads(material.normalTexture):
-            words = ": the normal map {name} {why}; it is left out"
+            words = "the normal map {name} {why}; it is left out"
             normals = self._picture(material.normalTexture, "numbers", words)
             normals = None if normals is None else normal_map(normals, material.normalTexture.scale)
         name = "" if number is None else material.name or f"material {number}"
@@ -145,12 +143,13 @@ class GltfSurfaces:
         if not factor.any() or not material.reads(material.emissiveTexture):
             return None
         if material.emissiveTexture is not None:
-            words = ": the texture {name} of the emission {why}; it is left out"
+            words = "the texture {name} of the emission {why}; it is left out"
             picture = self._picture(material.emissiveTexture, "colours", words)
             if picture is None:
                 return None
         found, note = limited_radiance(factor, picture)
-        self._note(f": {note}" if note else "")
+        if note is not None:
+            self.notes.say(note)
         return found
 
     # --- pictures ----------------------------------------
@@ -168,16 +167,14 @@ class GltfSurfaces:
             found = self._pictures.decoded(self._image(number), kind, name)
         if not isinstance(found, np.ndarray):
             why = self._pictures.why(name, found)
-            self._note(words.format(name=shown(name), why=why))
+            self.notes.say(words.format(name=shown(name), why=why))
             return None
-        for note in self._pictures.notes.taken():
-            self._note(f": {note}")
         if self._sampler(use).magFilter != NEAREST or min(found.shape[:2]) == max(found.shape[:2]) == 1:
             return found
         sharp = self._pictures.side // 2  # so many that filtering does not show
         times = sharp // max(found.shape[:2])
         if times < 2:
-            self._note(BLURRED.format(most=sharp // 2))
+            self.notes.say(BLURRED.format(most=sharp // 2))
             return found
         return found.repeat(times, axis=0).repeat(times, axis=1)
 
@@ -218,7 +215,7 @@ class GltfSurfaces:
             sizes = [one.shape[side] for one in pictures]
             out = low < -BEYOND or high > 1.0 + BEYOND
             if out and len(set(wraps)) > 1:
-                self._note(EDGES)
+                self.notes.say(EDGES)
             if wraps[0] == MIRRORED and out:
                 pictures = [np.concatenate([one, np.flip(one, side)], axis=side) for one in pictures]
                 scale[axis], changed = 0.5, True
@@ -227,7 +224,7 @@ class GltfSurfaces:
                 before, after = (max(0, int(np.ceil(beyond * unit_size))) + 1 for beyond in (-low, high - 1.0))
                 total = unit_size + before + after
                 if total * (max(sizes) // unit_size) > 2 * self._pictures.side:
-                    self._note(EDGES)
+                    self.notes.say(EDGES)
                     continue
                 pictures = [
                     np.take(
@@ -249,10 +246,6 @@ class GltfSurfaces:
         )
         return replaced, lambda given: given * scale + shift
 
-    def _note(self, words: str) -> None:
-        if words:
-            self.notes.once(self.source + words)
-
 
 def _differ_at_edges(pictures: Sequence[Floats], side: int) -> bool:
     """Whether small pictures would be filtered across their edges, and look otherwise for it."""
@@ -262,6 +255,89 @@ def _differ_at_edges(pictures: Sequence[Floats], side: int) -> bool:
     )
 
 
+# --- skins: meshes that joints move, in the pose that the file's nodes have (section 3.7.3) --------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Bound:
+    """To which joints vertices are bound.
+
+    Attributes:
+        joints: (V, 4 n) their numbers in the skin.
+        weights: (V, 4 n) of each; they add up to 1.
+    """
+
+    joints: Ints
+    weights: Doubles
+
+
+def bound(path: Path, header: Header, buffers: Buffers, primitive: Primitive, used: Ints) -> Bound | None:
+    """Return to which joints the used vertices of a primitive are bound; None where it says nothing of joints.
+
+    Raises:
+        FileFormatError: it says it of other vertices, or without weights.
+    """
+    held = primitive.attributes
+    joints: list[Ints] = []
+    weights: list[Doubles] = []
+    while f"JOINTS_{len(joints)}" in held:
+        pair = [held.get(f"{kind}_{len(joints)}") for kind in ("JOINTS", "WEIGHTS")]
+        for one in pair:
+            given = None if one is None else header.accessors[one]
+            if given is None or given.type != "VEC4" or given.count != header.accessors[held["POSITION"]].count:
+                raise damaged(path, "four joints and four weights of each vertex", "others")
+        first, second = (index for index in pair if index is not None)
+        joints.append(buffers.values(first)[used].astype(np.int64))
+        weights.append(buffers.numbers(second, used))
+    if not joints:
+        return None
+    shares = np.concatenate(weights, axis=1)
+    total = shares.sum(axis=1, keepdims=True)
+    shares = np.where(total > 0.0, shares / np.where(total > 0.0, total, 1.0), np.eye(1, shares.shape[1]))
+    return Bound(np.concatenate(joints, axis=1), shares)
+
+
+def joint_matrices(path: Path, skin: Skin, buffers: Buffers, poses: Mapping[int, Doubles]) -> Doubles:
+    """Return (J, 4, 4) from the mesh to the scene, one of each joint; `poses` are those of all nodes.
+
+    Raises:
+        FileFormatError: it has too few inverse bind matrices, or numbers of another kind.
+    """
+    found = np.stack([poses[joint] for joint in skin.joints])
+    if skin.inverseBindMatrices is None:
+        return found
+    values = buffers.values(skin.inverseBindMatrices)
+    if values.shape[1:] != (16,) or len(values) < len(found):
+        raise damaged(
+            path, f"{len(found)} inverse bind matrices of 4 x 4", f"{len(values)} of {values.shape[1]} numbers"
+        )
+    return np.asarray(found @ values[: len(found)].astype(np.float64).reshape(-1, 4, 4).transpose(0, 2, 1))
+
+
+def posed(path: Path, part: ImportedPart, by: Bound, matrices: Doubles) -> ImportedPart:
+    """Return a part as its joints place it in the scene; the transform of its own node does not count.
+
+    Raises:
+        FileFormatError: it is bound to joints that its skin does not have.
+    """
+    if by.joints.max(initial=0) >= len(matrices) or by.joints.min(initial=0) < 0:
+        raise damaged(path, f"joints under {len(matrices)}, as its skin has", f"number {int(by.joints.max())}")
+    moves = np.zeros((len(part.vertices), 3, 4))
+    for joint, weight in zip(by.joints.T, by.weights.T, strict=True):
+        moves += weight[:, None, None] * matrices[joint, :3]
+    turns, normals = moves[:, :, :3], part.normals
+    vertices = np.einsum("vij,vj->vi", turns, part.vertices) + moves[:, :, 3]
+    if normals is not None:  # which turn with the cofactors
+        normals = np.einsum("vij,vj->vi", np.cross(turns[:, [1, 2, 0]], turns[:, [2, 0, 1]]), normals)
+    if not (np.linalg.det(turns) < 0.0).all():
+        return replace(part, vertices=vertices, normals=normals)
+    colors = None if part.colors is None else part.colors[:, ::-1]
+    mirrored = None if normals is None else -normals
+    return replace(part, vertices=vertices, faces=part.faces[:, ::-1], normals=mirrored, colors=colors)
+
+
+# --- primitives in their places --------------------------------------------------------------------------------------
+
 TRIANGLES, STRIP, FAN = 4, 5, 6
 """Modes of primitives; those below are points and lines."""
 
@@ -270,8 +346,8 @@ DEFAULT = "mesh{es} without material: of white metal with roughness 1, the defau
 
 
 @np.errstate(all="ignore")
-def read_gltf(path: Path, data: bytes) -> tuple[list[ImportedPart], list[str]]:
-    """Parse a glTF file; arguments, results and errors as for `advsearch.scene.importing.objects.read_parts`."""
+def read_gltf(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
+    """Parse a glTF file; arguments, results and errors as for the others (`advsearch.scene.importing.objects`)."""
     header, references = read_header(path, data), References(path)
     chunk = None if path.suffix.lower() == ".gltf" else binary_chunk(data)
     buffers = Buffers(path, header, chunk, references)
@@ -288,16 +364,16 @@ def read_gltf(path: Path, data: bytes) -> tuple[list[ImportedPart], list[str]]:
     if not found:
         got = "points or lines only" if pieces else "none"
         raise FileFormatError(f"{path}: expected a mesh with faces, got {got}; export triangles")
-    notes = [path.name + what for what in left_out(header)]
+    left_out(header, notes)
     if len(found) < len(pieces):
-        notes.append(f"{path.name}: {len(pieces) - len(found)} parts without faces (points, lines) are left out")
+        notes.say(f"{len(pieces) - len(found)} parts without faces (points, lines) are left out")
     for words, keys in (
         (SEE_THROUGH, [mesh for (mesh, _), piece in found.items() if piece.see_through]),
         (DEFAULT, [mesh for (mesh, _), piece in found.items() if piece.material is None]),
     ):
         if keys:
-            notes.append(f"{path.name}: {counted(len(set(keys)), words)}")
-    surfaces = GltfSurfaces(path.name, header, buffers, references)
+            notes.say(counted(len(set(keys)), words))
+    surfaces = GltfSurfaces(header, buffers, references, notes)
     groups: dict[int | None, dict[tuple[int, int], ImportedPart]] = {}
     for key, piece in found.items():
         groups.setdefault(piece.material, {})[key] = piece.part
@@ -329,7 +405,7 @@ def read_gltf(path: Path, data: bytes) -> tuple[list[ImportedPart], list[str]]:
         if (mesh, number) in finished
     ]
     check_faces(path, sum(len(part.faces) for part in parts))
-    return parts, [*notes, *surfaces.notes]
+    return parts
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,7 +10,7 @@ from PIL import Image
 
 from advsearch.scene.assets import Doubles, Floats
 from advsearch.scene.importing import udim
-from advsearch.scene.importing.files import Inventory, Notes, References, plain_name, shown, text_of
+from advsearch.scene.importing.files import Notes, References, plain_name, shown, text_of
 from advsearch.scene.importing.mtl import (
     MapUse,
     MtlMaterial,
@@ -70,21 +70,17 @@ class MtlReader:
     """Reads the material files that a mesh file names, and turns their materials into surfaces, each once.
 
     Attributes:
-        source: the mesh file's name, for warnings.
         references: finds files.
-        inventory: of the mesh file.
+        notes: about the mesh file.
         shown_on: returns texture coordinates (F, 3, 2) and areas (F,) of the faces with a material, by its name and a
             UDIM square.
         libraries: how many material files were read.
-        notes: the warnings so far.
     """
 
-    source: str
     references: References
-    inventory: Inventory
+    notes: Notes
     shown_on: Callable[[str, int], tuple[Doubles, Doubles]]
     libraries: int = 0
-    notes: Notes = field(default_factory=Notes)
     _materials: dict[str, MtlMaterial] = field(default_factory=dict)
     _painted: dict[tuple[int, int], Painted] = field(default_factory=dict)
     _uses: dict[tuple[int, str], MapUse | None] = field(default_factory=dict)
@@ -98,18 +94,18 @@ class MtlReader:
         except FileNotFoundError:
             plain = plain_name(name)
             why = f"{shown(plain)}, which {self.references.refused[plain]}"
-            self.note(f"{self.source} names the material file {why}; neutral grey is used instead")
+            self.notes.say(f" names the material file {why}; neutral grey is used instead")
             return
         self.libraries += 1
         file = plain_name(name).rpartition("/")[2]
         materials, stray = parsed(text, file)
         for key in stray:
-            self.inventory.has(f"before the first material of {shown(file, quoted=False)}, statement", key)
+            self.notes.has(f"before the first material of {shown(file, quoted=False)}, statement", key)
         for material in materials:
             first = self._materials.setdefault(material.name, material)
             if first.statements != material.statements and first.file == material.file:
                 twice = f"{file} has the material {shown(material.name)} more than once"
-                self.note(f"{self.source}: {twice}; the first counts")
+                self.notes.say(f"{twice}; the first counts")
         for material in materials:  # a comment, or part of the name: both are tried
             self._materials.setdefault(without_comment(material.name), material)
 
@@ -134,15 +130,11 @@ class MtlReader:
         beside = [one for one in others if isinstance(self.references.tried(udim.named(numbered, one)), bytes)]
         if udim.number_in(numbered) == 0 or beside:
             return [one for one in wanted if one]
-        self.note(
-            f"{self.source}: {shown(numbered)} is named like one of several pictures (UDIM), and there is none for the "
+        self.notes.say(
+            f"{shown(numbered)} is named like one of several pictures (UDIM), and there is none for the "
             f"faces in {', '.join(map(str, others[:8]))}: it repeats there; put those pictures beside it"
         )
         return []
-
-    def note(self, message: str) -> None:
-        """Warn, once."""
-        self.notes.once(message)
 
     def _look_of(self, material: MtlMaterial, square: int, name: str) -> Painted:
         """Read all statements of a material."""
@@ -155,13 +147,13 @@ class MtlReader:
         for key in [key for key in PLACED if key in uses]:
             if first is not None and (uses[key].scale, uses[key].offset) != (first.scale, first.offset):
                 what = f"{material.spelled[key]} of the material {shown(material.name)}"
-                self.note(f"{self.source}: {what} lies elsewhere than its other maps (-s, -o); it is left out")
+                self.notes.say(f"{what} lies elsewhere than its other maps (-s, -o); it is left out")
                 del uses[key]
         rest = material.numbers("kd")
         color = color_of(rest)
         if "kd" in material.statements and color is None:
-            self.note(
-                f"{self.source}: the Kd {shown(rest)} of the material {shown(material.name)} is no colour; neutral grey"
+            self.notes.say(
+                f"the Kd {shown(rest)} of the material {shown(material.name)} is no colour; neutral grey"
                 " is used instead"
             )
         texture = self._texture(material, uses.get("map_kd"), color)
@@ -186,9 +178,9 @@ class MtlReader:
         said = {key: without_comment(rest) for key, rest in material.statements.items()}
         zero = {key for key in said if not any(numbers_of(material.numbers(key)) or [1.0])}
         for key in material.again:
-            self.inventory.has("earlier material statement", key)
+            self.notes.has("earlier material statement", key)
         if len(material.numbers("kd").split()) == 4:
-            self.inventory.has("fourth number of", material.spelled["kd"])
+            self.notes.has("fourth number of", material.spelled["kd"])
         base = map_of(said.get("map_kd", ""))
         for key, rest in said.items():
             use = map_of(rest)
@@ -196,9 +188,9 @@ class MtlReader:
             quiet |= key == "tf" and len(set(rest.split())) == 1
             quiet |= key == "map_ka" and use is not None and base is not None and use.name == base.name
             if key == "illum" and material.numbers(key) not in ("", "0", "1", "2"):
-                self.inventory.has("illumination model", rest)
+                self.notes.has("illumination model", rest)
             elif not quiet:
-                self.inventory.has(STATEMENT, material.spelled[key])
+                self.notes.has(STATEMENT, material.spelled[key])
 
     def _use(self, material: MtlMaterial, key: str) -> MapUse | None:
         """Return what a statement says that names a picture, and put options that are not read into the inventory."""
@@ -229,7 +221,7 @@ class MtlReader:
             else:
                 quiet = option in taken or value.lower() == DEFAULTS.get(option) or not any(numbers_of(value) or [1.0])
             if not quiet:
-                self.inventory.has("texture option", f"-{option} of {material.spelled[key]}")
+                self.notes.has("texture option", f"-{option} of {material.spelled[key]}")
         return use
 
     def _texture(self, material: MtlMaterial, use: MapUse | None, color: Floats | None) -> Floats | None:
@@ -240,14 +232,14 @@ class MtlReader:
         found = self._picture(use, "colours and alpha")
         if isinstance(found, np.ndarray):
             if found[:, :, 3].min() < 1.0 and "map_d" not in material.statements:
-                self.note(f"{self.source}: the alpha of {shown(use.name)} is left out: no map_d makes it an opacity")
+                self.notes.say(f"the alpha of {shown(use.name)} is left out: no map_d makes it an opacity")
             return np.ascontiguousarray(found[:, :, :3])
         plain = color is None or bool((color > 0.999).all())
         instead = (
             "neutral grey" if color is None or plain else f"its base colour ({', '.join(f'{c:.2f}' for c in color)})"
         )
-        where = f"{self.source}: {material.file} names the texture {shown(use.name)}"
-        self.note(f"{where}, which {found}; {instead} is used instead")
+        where = f"{material.file} names the texture {shown(use.name)}"
+        self.notes.say(f"{where}, which {found}; {instead} is used instead")
         return None
 
     def _see_through(self, material: MtlMaterial, use: MapUse | None, surface: ImportedSurface) -> ImportedSurface:
@@ -258,7 +250,7 @@ class MtlReader:
             if isinstance(found, np.ndarray):
                 map = _channel(found, use)
             else:
-                self.note(f"{self.source}: the opacity {shown(use.name)} {found}; it is opaque instead")
+                self.notes.say(f"the opacity {shown(use.name)} {found}; it is opaque instead")
         if map is None and factor == 1.0:
             return surface
         share, color, texture = np.array([factor], np.float32), surface.color, surface.texture
@@ -275,15 +267,15 @@ class MtlReader:
     def _opacity(self, material: MtlMaterial) -> float:
         """Return ``d``, or 1 - ``Tr`` where there is none; some programs write Tr for d."""
         if "-halo" in material.numbers("d").lower().split():
-            self.inventory.has("option", "-halo of d")
+            self.notes.has("option", "-halo of d")
         opacity, clear = share_of(material.numbers("d"), -1.0), share_of(material.numbers("tr"), -1.0)
-        what = f"{self.source}: the material {shown(material.name)} has Tr {clear:g}"
+        what = f"the material {shown(material.name)} has Tr {clear:g}"
         if opacity >= 0.0:
             if clear >= 0.0 and min(abs(clear - opacity), abs(1.0 - clear - opacity)) > 0.01:
-                self.note(f"{what} beside d {opacity:g}, which it contradicts; d is taken for its opacity")
+                self.notes.say(f"{what} beside d {opacity:g}, which it contradicts; d is taken for its opacity")
             return opacity
         if clear > 0.0:
-            self.note(
+            self.notes.say(
                 f"{what} and no d: it is taken for transparency, which makes its opacity {1.0 - clear:g}; some programs"
                 f" mean opacity by it, so write d in its place"
             )
@@ -295,10 +287,10 @@ class MtlReader:
         if use is not None:
             found = self._picture(use, "numbers")
             if isinstance(found, np.ndarray):
-                self.note(f"{self.source}: textures of roughness and metallic are replaced by their means")
+                self.notes.say("textures of roughness and metallic are replaced by their means")
                 uvs, areas = self.shown_on(name, square)
                 return float(mean_over(_channel(found, use)[:, :, None], uvs * use.scale + use.offset, areas)[0])
-            self.note(f"{self.source}: {material.spelled[f'map_{key}']} {shown(use.name)} {found}; it is left out")
+            self.notes.say(f"{material.spelled[f'map_{key}']} {shown(use.name)} {found}; it is left out")
         rest = material.numbers(key)
         value = share_of(rest, -1.0)
         return value if value >= 0.0 else None
@@ -314,7 +306,7 @@ class MtlReader:
                 if key in ("norm", "map_kn") or holds_normals(picture):
                     return normal_map(picture, use.bump)
                 picture = "holds heights, and no normals"
-            self.note(f"{self.source}: the normal map {shown(use.name)} {picture}; it is left out")
+            self.notes.say(f"the normal map {shown(use.name)} {picture}; it is left out")
         return None
 
     def _glow(self, material: MtlMaterial, use: MapUse | None) -> Floats | None:
@@ -322,27 +314,25 @@ class MtlReader:
         rest = material.numbers("ke")
         factor, picture = radiance_of(rest), None
         if factor is None:
-            self.note(f"{self.source}: the emission {shown(rest)} is no colour; it is left out")
+            self.notes.say(f"the emission {shown(rest)} is no colour; it is left out")
             return None
         if use is not None:
             found = self._picture(use, "colours")
             if not isinstance(found, np.ndarray):
-                self.note(f"{self.source}: the texture {shown(use.name)} of the emission {found}; it is left out")
+                self.notes.say(f"the texture {shown(use.name)} of the emission {found}; it is left out")
                 return None
             picture, factor = found, factor if factor.any() else np.ones(3)
         radiance, cut = limited_radiance(factor, picture)
         if cut is not None:
-            self.note(f"{self.source}: {cut}")
+            self.notes.say(f"{cut}")
         return radiance
 
     def _picture(self, use: MapUse, kind: Kind) -> Floats | str:
         """Return a picture's values with its ``-mm`` applied, or why they cannot be had."""
         if self._pictures is None:
-            self._pictures = Pictures(len(self._materials), self.references.get, self.references.refused)
+            self._pictures = Pictures(len(self._materials), self.references, self.notes)
         if (use.name, kind) not in self._read:
             self._read[use.name, kind] = self._pictures.of_file(use.name, kind)
-            for note in self._pictures.notes.taken():
-                self.note(f"{self.source}: {note}")
         found, (base, gain) = self._read[use.name, kind], use.range
         if isinstance(found, str) or (base, gain) == (0.0, 1.0):
             return found

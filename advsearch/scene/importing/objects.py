@@ -27,7 +27,7 @@ from advsearch.scene.assets import Doubles, Floats, Material, Mesh, ObjectAsset,
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.importing import gltf, gltf_left_out
 from advsearch.scene.importing.blender import read_mesh_bytes
-from advsearch.scene.importing.files import Inventory, check_faces, damaged, looks_like, safe_name, shown, text_of
+from advsearch.scene.importing.files import Notes, check_faces, damaged, looks_like, safe_name, shown, text_of
 from advsearch.scene.importing.geometry import Soup, assemble, join, repaired
 from advsearch.scene.importing.gltf_parts import read_gltf
 from advsearch.scene.importing.parts import NEUTRAL, ImportedPart, ImportedSurface, visible
@@ -44,29 +44,21 @@ _WORDS = frozenset("facet outer vertex endloop endfacet end".split())
 _OWN = 0x8000
 
 
-def read_stl(path: Path, data: bytes) -> tuple[list[ImportedPart], list[str]]:
-    """Read an STL file; its facet normals are made anew, as every program does.
-
-    Args:
-        path: the file.
-        data: its content.
-
-    Returns:
-        One part, and the warnings.
+def read_stl(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
+    """Read an STL file as one part; its facet normals are made anew, as every program does.
 
     Raises:
         FileFormatError: it is damaged, or has no facets.
     """
-    inventory = Inventory()
     promised = 84 + 50 * struct.unpack_from("<I", data, 80)[0] if len(data) >= 84 else 84
     colors = None
     if len(data) == promised:
         check_faces(path, (promised - 84) // 50)
         facets = np.frombuffer(data, _FACET, offset=84)
         points = facets["vertices"].astype(np.float64).reshape(-1, 3)
-        colors = _colors(data[:80], facets["attribute"], inventory)
+        colors = _colors(data[:80], facets["attribute"], notes)
     elif data.lstrip()[:5].lower() == b"solid" and b"\x00" not in data:
-        points = _of_text(path, data, inventory)
+        points = _of_text(path, data, notes)
     else:
         kind = looks_like(data)
         got = f"{len(data)} bytes, which is neither ASCII nor that long" if "another" in kind else kind
@@ -76,11 +68,10 @@ def read_stl(path: Path, data: bytes) -> tuple[list[ImportedPart], list[str]]:
     faces = np.arange(len(points)).reshape(-1, 3)
     surface = ImportedSurface() if colors is None else ImportedSurface(color=np.ones(3, np.float32))
     corners = None if colors is None else np.repeat(colors[:, None], 3, axis=1)
-    part = ImportedPart(points, faces, None, None, corners, surface)
-    return [part], [f"{path.name}: {clause}" for clause in inventory.left()]
+    return [ImportedPart(points, faces, None, None, corners, surface)]
 
 
-def _of_text(path: Path, data: bytes, inventory: Inventory) -> Doubles:
+def _of_text(path: Path, data: bytes, notes: Notes) -> Doubles:
     """Return the corners (3 F, 3) of the facets of an ASCII file."""
     if not re.search(rb"\bend\s?solid", data, re.IGNORECASE):
         raise damaged(path, "an ASCII STL file that ends in 'endsolid'", "one that is cut short")
@@ -95,11 +86,11 @@ def _of_text(path: Path, data: bytes, inventory: Inventory) -> Doubles:
         raise damaged(path, "three numbers after each 'vertex'", "something else") from None
     for word in re.findall(rb"^[ \t]*([^\s\d]\S*)", data, re.MULTILINE):
         if text_of(word).lower() not in _WORDS:
-            inventory.has("statement", text_of(word))
+            notes.has("statement", text_of(word))
     return points.reshape(-1, 3)
 
 
-def _colors(head: bytes, attributes: Attributes, inventory: Inventory) -> Doubles | None:
+def _colors(head: bytes, attributes: Attributes, notes: Notes) -> Doubles | None:
     """Return the linear colours (F, 3) of facets, or None.
 
     Two programs have their own ways, with 5 bits a channel. Magics writes ``COLOR=`` and four bytes, the colour of all,
@@ -110,18 +101,16 @@ def _colors(head: bytes, attributes: Attributes, inventory: Inventory) -> Double
     bits = np.stack([(attributes >> shift) & 31 for shift in (10, 5, 0)], axis=1).astype(np.float32) / np.float32(31.0)
     if 0 <= magics <= 70:
         if b"MATERIAL=" in head:
-            inventory.has("header entry", "MATERIAL")
+            notes.has("header entry", "MATERIAL")
         own = (attributes & _OWN == 0) & bool(attributes.any())
         bits, plain = bits[:, ::-1], np.frombuffer(head, np.uint8, 3, magics + 6) / np.float32(255.0)
         if head[magics + 9] < 255 and head[magics + 9] > 0:
-            inventory.has("opacity of its header entry", "COLOR")
+            notes.has("opacity of its header entry", "COLOR")
     else:
         own, plain = attributes & _OWN != 0, np.full(3, NEUTRAL, np.float32)
         if not own.any():
             if attributes.any():
-                inventory.has(
-                    "attribute bytes of its facets, which are no colours known here,", f"{attributes.max():#06x}"
-                )
+                notes.has("attribute bytes of its facets, which are no colours known here,", f"{attributes.max():#06x}")
             return None
     found = np.where(own[:, None], bits, plain).astype(np.float32)
     return np.asarray(srgb_to_linear(found), dtype=np.float64)
@@ -130,7 +119,8 @@ def _colors(head: bytes, attributes: Attributes, inventory: Inventory) -> Double
 GLTF = (".glb", ".gltf", ".blend")
 """Endings of glTF files, which have conventions of their own: y up, linear colours; and of what is read as glTF."""
 
-Reader = Callable[[Path, bytes], tuple[list[ImportedPart], list[str]]]
+Reader = Callable[[Path, bytes, Notes], list[ImportedPart]]
+"""From a file, its content and what is said of it to its parts that have faces; raises as `read_parts`."""
 
 READERS: dict[str, Reader] = {".obj": read_obj, ".ply": read_ply, ".stl": read_stl, **dict.fromkeys(GLTF, read_gltf)}
 """Readers by the endings of files."""
@@ -151,7 +141,8 @@ def read_parts(path: Path, data: bytes) -> tuple[list[ImportedPart], list[str]]:
     """
     with warnings.catch_warnings(), np.errstate(all="ignore"), without_pillows_limit():
         warnings.simplefilter("ignore")
-        return READERS[path.suffix.lower()](path, data)
+        notes = Notes(path.name)
+        return READERS[path.suffix.lower()](path, data, notes), list(notes)
 
 
 MOST_WARNINGS = 20

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -18,7 +18,7 @@ from advsearch.errors import FileFormatError
 from advsearch.pictures import FORMATS, LARGEST_PIXELS, check_decodable, check_pixels, opened, steps_of
 from advsearch.scene.assets import Floats
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
-from advsearch.scene.importing.files import LARGEST_FILE, Notes, plain_name, shown
+from advsearch.scene.importing.files import LARGEST_FILE, Notes, References, plain_name, shown
 
 TEXTURE_LIMIT = 1024
 """Longest side of an imported texture, in texels; larger ones are averaged down."""
@@ -162,15 +162,13 @@ class Pictures:
 
     Attributes:
         materials: how many the file has.
-        read: returns the content of a file that it names; raises FileNotFoundError.
-        refused: for names of files, as `plain_name` gives them, why they were not read.
-        notes: clauses about the pictures that were made smaller.
+        references: finds the files that it names.
+        notes: about the file; which pictures were made smaller is said there.
     """
 
     materials: int
-    read: Callable[[str], bytes]
-    refused: Mapping[str, str]
-    notes: Notes = field(default_factory=Notes)
+    references: References
+    notes: Notes
     _known: dict[tuple[int, Kind], Floats | str] = field(default_factory=dict)
     _opened: list[Image.Image] = field(default_factory=list)
     _pixels: dict[bool, int] = field(default_factory=lambda: {False: 0, True: 0})
@@ -200,7 +198,7 @@ class Pictures:
     def of_file(self, name: str, kind: Kind) -> Floats | str:
         """Return the values of a picture file that the file names, or why there are none."""
         try:
-            image = Image.open(io.BytesIO(self.read(name)), formats=FORMATS)
+            image = Image.open(io.BytesIO(self.references.get(name)), formats=FORMATS)
             found = self.decoded(image, kind, name)
             self._opened.append(image)  # what is decoded is known by its identity
         except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
@@ -209,7 +207,7 @@ class Pictures:
 
     def why(self, name: str, found: str | None) -> str:
         """Return why a named picture cannot be had, after what `decoded` said of it."""
-        return self.refused.get(plain_name(name)) or found or "cannot be read as a picture"
+        return self.references.refused.get(plain_name(name)) or found or "cannot be read as a picture"
 
     def _pixels_of(self, image: Image.Image, kind: Kind, name: str) -> Floats | str:
         """Decode a picture, or say why not."""
@@ -228,6 +226,5 @@ class Pictures:
         rows, columns = texture.shape[:2]
         if (columns, rows) != (width, height):
             called = f"the texture {shown(name)}" if name else "a texture"
-            note = f"{called} of {width:,} x {height:,} texels is averaged down to {columns:,} x {rows:,}"
-            self.notes.once(note)
+            self.notes.say(f"{called} of {width:,} x {height:,} texels is averaged down to {columns:,} x {rows:,}")
         return texture

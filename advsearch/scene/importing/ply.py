@@ -16,7 +16,6 @@ from advsearch.scene.assets import Doubles, Ints
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.importing.files import (
     MOST_CORNERS,
-    Inventory,
     Notes,
     References,
     check_faces,
@@ -241,28 +240,21 @@ CORNERS = ("vertex_indices", "vertex_index", "vertex_indexes")
 _TEXTURE = re.compile(r"texture_?file\s*[:=]?\s+(.*)", re.IGNORECASE)
 
 
-def read_ply(path: Path, data: bytes) -> tuple[list[ImportedPart], list[str]]:
-    """Read a PLY file.
-
-    Args:
-        path: the file.
-        data: its content.
-
-    Returns:
-        One part for each texture, and the warnings.
+def read_ply(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
+    """Read a PLY file as one part for each texture.
 
     Raises:
         FileFormatError: it is damaged, refers to vertices that are not there, or has no faces.
     """
     elements, comments = read_elements(path, data)
-    reader = _Reader(path, elements, Inventory(), Notes())
+    reader = _Reader(path, elements, notes)
     points = reader.columns("vertex", (("x", "y", "z"),))
     if points is None:
         raise damaged(path, "a PLY file with vertices that have x, y and z", "none")
     corner, counts = reader.polygons(len(points))
     triangles, face, wrong = triangulated(points[corner], counts)
     if wrong:
-        reader.notes.append(f"{wrong:,} faces cross themselves, or are too much work, and may be cut up wrongly")
+        notes.say(f"{wrong:,} faces cross themselves, or are too much work, and may be cut up wrongly")
     at = corner[triangles]
     normals = reader.columns("vertex", (("nx", "ny", "nz"),))
     uvs = reader.mapped(corner, counts, triangles)
@@ -277,14 +269,14 @@ def read_ply(path: Path, data: bytes) -> tuple[list[ImportedPart], list[str]]:
         surface, colors = surfaces[kinds[chosen[0]][0]], None if tint is None else tint[chosen]
         if colors is not None and surface.texture is not None:
             if colors.min() < 1.0:
-                reader.note("colours of vertices or faces are left out where there is a texture")
+                notes.say("colours of vertices or faces are left out where there is a texture")
             colors = None
         if colors is not None:
             surface = ImportedSurface(color=np.ones(3, np.float32))
         part_normals = None if normals is None else Looked(normals, at[chosen])
         mapped = None if uvs is None else uvs.at(chosen)
         parts.append(split_at_corners(Looked(points, at[chosen]), part_normals, mapped, colors, surface))
-    return parts, [f"{path.name}{note}" for note in reader.said()]
+    return parts
 
 
 @dataclass
@@ -294,31 +286,21 @@ class _Reader:
     Attributes:
         path: the file.
         elements: of it.
-        inventory: of their properties.
-        notes: the warnings so far, without the file's name.
+        notes: about the file.
     """
 
     path: Path
     elements: dict[str, Element]
-    inventory: Inventory
     notes: Notes
 
     def __post_init__(self) -> None:
         for element in self.elements.values():
             if element.name not in ("vertex", "face", "tristrips"):
                 if element.count:
-                    self.inventory.has("element", element.name)
+                    self.notes.has("element", element.name)
                 continue
             for name in element.types:
-                self.inventory.has(f"{element.name} property", name)
-
-    def note(self, message: str) -> None:
-        """Warn, once."""
-        self.notes.once(message)
-
-    def said(self) -> list[str]:
-        """Return the warnings, each as what follows the file's name."""
-        return [note if note.startswith(" ") else f": {note}" for note in [*self.notes, *self.inventory.left()]]
+                self.notes.has(f"{element.name} property", name)
 
     def columns(self, element: str, names: Sequence[tuple[str, ...]]) -> Doubles | None:
         """Return the values (N, C) of the first of several groups of properties that an element has; None for none."""
@@ -326,7 +308,7 @@ class _Reader:
         for group in names:
             if table is not None and all(name in table.scalars for name in group):
                 for name in group:
-                    self.inventory.take(f"{element} property", name)
+                    self.notes.take(f"{element} property", name)
                 return np.stack([table.scalars[name].astype(np.float64) for name in group], axis=1)
         return None
 
@@ -334,7 +316,7 @@ class _Reader:
         table = self.elements.get(element)
         for name in names:
             if table is not None and name in table.listed:
-                self.inventory.take(f"{element} property", name)
+                self.notes.take(f"{element} property", name)
                 return table.listed[name]
         return None
 
@@ -360,7 +342,7 @@ class _Reader:
             what = f"Gaussian splats, a model that {SPLATS}" if splats else "points or lines only; export triangles"
             raise FileFormatError(f"{self.path}: expected a mesh with faces, got {what}")
         if few:
-            self.note(FEW.format(count=few, s="" if few == 1 else "s"))
+            self.notes.say(FEW.format(count=few, s="" if few == 1 else "s"))
         if all_counts.max() > files.scaled(MOST_CORNERS):
             most = f"faces with at most {files.scaled(MOST_CORNERS):,} corners"
             raise files.too_large(self.path, most, f"{all_counts.max():,}")
@@ -379,7 +361,7 @@ class _Reader:
         padded[: len(wedges.counts)] = wedges.counts
         whole = padded == 2 * counts
         if not whole[padded > 0].all():
-            self.note("texture coordinates of faces that are not two for each corner are left out")
+            self.notes.say("texture coordinates of faces that are not two for each corner are left out")
         used = wedges.values[np.repeat(whole[: len(wedges.counts)], wedges.counts)].astype(np.float64).reshape(-1, 2)
         values, same = np.unique(used.view(np.complex128), return_inverse=True)
         index = np.full(len(corner), -1)
@@ -405,7 +387,7 @@ class _Reader:
             return next(iter(found.values()), None)
         better = "face" if np.ptp(found["vertex"]) == 0.0 else "vertex"
         other = "faces" if better == "vertex" else "vertices"
-        self.note(
+        self.notes.say(
             f"colours of {other} are left out: its {'vertices' if better == 'vertex' else 'faces'} have some, too"
         )
         return found[better]
@@ -415,7 +397,7 @@ class _Reader:
             if name in table.scalars:
                 values = table.scalars[name].astype(np.float64)
                 if not len(values) or values.min() >= _scale(values[:, None], kind):
-                    self.inventory.take(f"{table.name} property", name)
+                    self.notes.take(f"{table.name} property", name)
 
     def texture_numbers(self, names: Sequence[str], corner: Ints, counts: Ints) -> Ints:
         """Return the number (P,) of each polygon's texture among several; -1 for none."""
@@ -423,42 +405,40 @@ class _Reader:
         if not names:
             return np.full(len(counts), -1)
         if faces is not None and "texnumber" in faces.scalars:
-            self.inventory.take("face property", "texnumber")
+            self.notes.take("face property", "texnumber")
             number = np.full(len(counts), -1)
             number[: faces.count] = _whole(faces.scalars["texnumber"])
         elif vertices is not None and "texnumber" in vertices.scalars:
-            self.inventory.take("vertex property", "texnumber")
+            self.notes.take("vertex property", "texnumber")
             number = _whole(vertices.scalars["texnumber"])[
                 corner[np.minimum(np.cumsum(counts) - counts, len(corner) - 1)]
             ]
         else:
             if len(names) > 1:
-                self.note(
+                self.notes.say(
                     f"of its {len(names)} textures only {shown(names[0])} is used, as its faces have no texnumber"
                 )
             return np.zeros(len(counts), np.int64)
         wrong = int(((number < -1) | (number >= len(names))).sum())
         if wrong:
-            self.note(f"{wrong:,} faces have a texnumber of a texture that it does not name; they have none")
+            self.notes.say(f"{wrong:,} faces have a texnumber of a texture that it does not name; they have none")
         return np.where((number >= 0) & (number < len(names)), number, -1)
 
     def textures(self, names: Sequence[str], *, plain: bool) -> list[ImportedSurface]:
         """Return the surface of each texture; `plain` tells that there are no colours beside them."""
         references = References(self.path)
-        pictures = Pictures(len(names), references.get, references.refused)
+        pictures = Pictures(len(names), references, self.notes)
         surfaces = []
         instead = "neutral grey is" if plain else "the colours of its vertices or faces are"
         read = {name: pictures.of_file(name, "colours and alpha") for name in dict.fromkeys(names)}
-        for note in pictures.notes:
-            self.note(note)
         for name in names:
             found = read[name]
             if isinstance(found, str):
-                self.note(f" names the texture {shown(name)}, which {found}; {instead} used instead")
+                self.notes.say(f" names the texture {shown(name)}, which {found}; {instead} used instead")
                 surfaces.append(ImportedSurface(name=name))
                 continue
             if found[:, :, 3].min() < 1.0:
-                self.note(f"the alpha of {shown(name)} is left out")
+                self.notes.say(f"the alpha of {shown(name)} is left out")
             surfaces.append(ImportedSurface(texture=np.ascontiguousarray(found[:, :, :3]), name=name))
         return surfaces
 

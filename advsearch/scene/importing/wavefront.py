@@ -20,7 +20,7 @@ from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.importing import udim
 from advsearch.scene.importing.files import (
     MOST_CORNERS,
-    Inventory,
+    Notes,
     References,
     check_faces,
     damaged,
@@ -47,15 +47,9 @@ BEYOND = 0.01
 """How far texture coordinates may lie outside of a texture before it matters how that goes on."""
 
 
-def read_obj(path: Path, data: bytes) -> tuple[list[ImportedPart], list[str]]:
-    """Read an OBJ file and the material files that it names.
-
-    Args:
-        path: the file.
-        data: its content.
-
-    Returns:
-        One part for each material, and for its faces without texture coordinates another; and the warnings.
+def read_obj(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
+    """Read an OBJ file, and the material files that it names, as one part for each material, and another for its faces
+    without texture coordinates.
 
     Raises:
         FileFormatError: it is of another kind, is cut short, refers to what is not in it, or has no faces.
@@ -68,15 +62,15 @@ def read_obj(path: Path, data: bytes) -> tuple[list[ImportedPart], list[str]]:
     few = int((counts < 3).sum())
     if few == len(counts):
         raise FileFormatError(f"{path}: expected a mesh with faces, got points or lines only; export triangles")
-    inventory, references = Inventory(), References(path)
+    references = References(path)
 
     def shown_on(name: str, number: int) -> tuple[Doubles, Doubles]:
         mine = np.flatnonzero((material == names.index(name)) & (square == number) & (mapped >= 0).all(axis=1))
         a, b, c = (points[position[mine, corner]] for corner in range(3))
         return tables["vt"][mapped[mine]], np.linalg.norm(np.cross(b - a, c - a), axis=1)
 
-    reader = MtlReader(path.name, references, inventory, shown_on)
-    said = _statements(lines, inventory)
+    reader = MtlReader(references, notes, shown_on)
+    said = _statements(lines, notes)
     libraries = list(dict.fromkeys(said.libraries))
     _check_count(path, libraries, "lines that name material files (mtllib)")
     libraries = libraries_of(libraries, references)
@@ -84,19 +78,19 @@ def read_obj(path: Path, data: bytes) -> tuple[list[ImportedPart], list[str]]:
     for name in libraries:
         reader.read_library(name)
     if few:
-        reader.note(f"{path.name}: {FEW.format(count=few, s='' if few == 1 else 's')}")
+        notes.say(f"{FEW.format(count=few, s='' if few == 1 else 's')}")
     points = tables["v"][:, :3]
     triangles, face, wrong = triangulated(points[corners[:, 0]], counts)
     if wrong:
-        reader.note(f"{path.name}: {wrong:,} faces cross themselves, or are too much work, and may be cut up wrongly")
+        notes.say(f"{wrong:,} faces cross themselves, or are too much work, and may be cut up wrongly")
     position, mapped, normal = (corners[triangles, place] for place in range(3))
     names, material = _in_effect(said.materials, rows[face])
     _check_count(path, names, "materials")
     smoothness, smooth = _in_effect(said.smoothing, rows[face])
     off = np.array([*(word in ("off", "0", "") for word in smoothness), False])[smooth]
     if ((smooth >= 0) & ~off & (normal < 0).any(axis=1)).any():
-        reader.note(f"{path.name}: smoothing groups are left out: its normals are made, with creases at sharp edges")
-    colors = _colors(lines, tables["v"], inventory)
+        notes.say("smoothing groups are left out: its normals are made, with creases at sharp edges")
+    colors = _colors(lines, tables["v"], notes)
     parts = []
     square = _squares(reader, names, material, tables["vt"], mapped)
     kinds = np.stack([material, (mapped >= 0).all(axis=1), off, square], axis=1)
@@ -116,14 +110,12 @@ def read_obj(path: Path, data: bytes) -> tuple[list[ImportedPart], list[str]]:
             uvs = replace(uvs, values=(uvs.values - udim.corner_of(int(first[3]))) * painted.scale + painted.offset)
             used = uvs.values[uvs.index[(uvs.index >= 0).all(axis=1)]]
             if painted.clamped and len(used) and not (used.min() >= -BEYOND and used.max() <= 1.0 + BEYOND):
-                reader.note(
-                    f"{path.name} has textures that are not to repeat beyond their edges (-clamp); here they do"
-                )
+                notes.say(" has textures that are not to repeat beyond their edges (-clamp); here they do")
         at = Looked(points, position[chosen])
         parts.append(
             split_at_corners(at, Looked(tables["vn"], normal).at(chosen), uvs, tint, surface, flat=bool(first[2]))
         )
-    return parts, [*reader.notes, *(f"{path.name}: {clause}" for clause in inventory.left())]
+    return parts
 
 
 def _squares(reader: MtlReader, names: list[str], material: Ints, table: Doubles, mapped: Ints) -> Ints:
@@ -155,7 +147,7 @@ class _Said:
     smoothing: list[tuple[int, str]]
 
 
-def _statements(lines: Lines, inventory: Inventory) -> _Said:
+def _statements(lines: Lines, notes: Notes) -> _Said:
     """Read the statements that are no numbers; what nothing becomes of is put into the inventory."""
     said = _Said([], [], [])
     for row, word, rest in lines.others():
@@ -167,11 +159,11 @@ def _statements(lines: Lines, inventory: Inventory) -> _Said:
         elif key == "s":
             said.smoothing.append((row, plain))
         elif key in ("p", "l"):
-            inventory.has("points, statement" if key == "p" else "lines, statement", key)
+            notes.has("points, statement" if key == "p" else "lines, statement", key)
         elif key in FREE_FORM:
-            inventory.has("curves and curved surfaces, statement", key)
+            notes.has("curves and curved surfaces, statement", key)
         elif key not in GROUPING and plain not in ("off", "0"):
-            inventory.has("statement", word)
+            notes.has("statement", word)
     return said
 
 
@@ -186,25 +178,25 @@ def _note_unknown(reader: MtlReader, said: _Said, name: str, instead: str) -> No
     """Say that a material is nowhere; where no material file could be read, that is enough."""
     if reader.libraries:
         lacks = "its .mtl file lacks" if reader.libraries == 1 else "its .mtl files lack"
-        reader.note(f"{reader.source} uses the material {shown(name)}, which {lacks}; {instead} is used instead")
+        reader.notes.say(f" uses the material {shown(name)}, which {lacks}; {instead} is used instead")
     elif not said.libraries:
-        reader.note(f"{reader.source} uses materials and names no material file (mtllib); {instead} is used instead")
+        reader.notes.say(f" uses materials and names no material file (mtllib); {instead} is used instead")
 
 
 # --- colours of vertices ----------------------------------------
 
 
-def _colors(lines: Lines, table: Doubles, inventory: Inventory) -> Doubles | None:
+def _colors(lines: Lines, table: Doubles, notes: Notes) -> Doubles | None:
     """Return the linear colour (V, 3) of every vertex; neutral grey where a file with colours has none.
 
     A vertex is three coordinates, then perhaps a weight, or a colour, or a colour and its opacity; or ZBrush has put
     colours into comments.
     """
     if (np.isfinite(table[:, 3]) & np.isnan(table[:, 4]) & (table[:, 3] != 1.0)).any():
-        inventory.has("weights of vertices, the fourth number of", "v")
+        notes.has("weights of vertices, the fourth number of", "v")
     given = table[:, 3:6]
     if np.isfinite(table[:, 6]).any() and not np.isin(table[:, 6], (1.0, 255.0)).all():
-        inventory.has("opacities of vertices, the seventh number of", "v")
+        notes.has("opacities of vertices, the seventh number of", "v")
     if np.isnan(given[:, 2]).all():
         found = lines.zbrush_colors(len(table))
         if found is None:
@@ -224,12 +216,12 @@ def _tinted(
         return surface, None
     if surface.texture is not None:
         if tint.min() < 1.0:
-            reader.note(f"{reader.source}: colours of vertices are left out where there is a texture")
+            reader.notes.say("colours of vertices are left out where there is a texture")
         return surface, None
     if surface.color is None:
         return replace(surface, color=np.ones(3, np.float32)), tint
     if surface.color[:3].min() < 0.999 and tint.min() < 1.0:
-        reader.note(f"{reader.source}: colours of vertices are multiplied by the Kd of their material")
+        reader.notes.say("colours of vertices are multiplied by the Kd of their material")
     return surface, tint
 
 

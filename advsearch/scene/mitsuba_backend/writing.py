@@ -1,13 +1,13 @@
 """A scene with its inputs set, as an XML file that stock Mitsuba loads, with meshes (PLY) and pictures (EXR) beside it.
 
-Mitsuba 3.9 writes no XML itself. Every number is written with all of its digits, meshes and pictures in float32.
+Every number is written with all of its digits, meshes and pictures in float32.
 """
 
 from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,7 @@ from advsearch.scene.description import OBJECT, SceneDescription
 from advsearch.scene.mitsuba_backend.meshes import base_texture, emitter, loadable, matt, own_surface, principled
 from advsearch.scene.mitsuba_backend.parts import GROUND, scene_dict, translation
 from advsearch.scene.mitsuba_backend.scene import NO_ROULETTE, MitsubaScene
-from advsearch.scene.mitsuba_backend.variant import Plugin, mi
+from advsearch.scene.mitsuba_backend.variant import VARIANT, Plugin, mi
 from advsearch.scene.parts import (
     BallLamp,
     HazePart,
@@ -38,8 +38,6 @@ from advsearch.scene.parts import (
 
 NAME = "scene.xml"
 
-TAGS = {"ReconstructionFilter": "rfilter", "PhaseFunction": "phase"}
-"""Elements that are not called as Mitsuba calls the type, in small letters."""
 MATERIAL = ("roughness", "metallic", "specular", "clearcoat")
 SCATTERINGS = 3
 """Segments that paths in haze have beyond those between surfaces: stock Mitsuba counts both alike."""
@@ -193,7 +191,8 @@ def _display(linear: Any) -> Any:
 
 
 def write_xml(path: Path, scene: Plugin, meshes: Mapping[str, Any], note: str) -> None:
-    """Write a scene's dictionary as XML, and beside it what it needs, in files whose names begin with its own.
+    """Write a scene's dictionary by Mitsuba's own writer, and beside it what it needs, in files whose names begin with
+    its own.
 
     Args:
         path: of the XML file, in a folder that is there.
@@ -201,86 +200,52 @@ def write_xml(path: Path, scene: Plugin, meshes: Mapping[str, Any], note: str) -
         meshes: Mitsuba's, by the names of the scene's entries of the type "ply".
         note: for a comment at the beginning.
     """
-    writer = _Writer(path)
-    root = ElementTree.Element("scene", version="3.0.0")
-    root.append(ElementTree.Comment(f" {note.replace('--', '- -')} "))
+
+    taken = set[Path]()
+
+    def beside(name: str, suffix: str) -> Path:
+        """A file beside the scene that is not taken yet."""
+        found = path.with_name(f"{path.stem}-{name}{suffix}")
+        while found in taken:
+            found = found.with_stem(f"{found.stem}-2")
+        taken.add(found)
+        return found
+
+    def filed(name: str, plugin: Mapping[str, Any]) -> Plugin:
+        """The plugin with its pictures, and the files that it names, beside the scene."""
+        found: Plugin = {}
+        for key, entry in plugin.items():
+            if isinstance(entry, mi.Bitmap):
+                key, file = "filename", beside(name, ".exr")
+                _write_picture(file, np.array(entry, dtype=np.float32))
+                entry = file.name
+            elif isinstance(entry, Mapping):
+                entry = filed(f"{name}-{key}", entry)
+            elif key == "filename" and os.path.isabs(entry):
+                file = beside(name, Path(entry).suffix)
+                shutil.copyfile(entry, file)
+                entry = file.name
+            found[key] = entry
+        return found
+
+    whole: Plugin = {"type": "scene"}
     for name, plugin in scene.items():
         if name == "type":
             continue
         if plugin["type"] == "ply" and name in meshes:
-            rest = {key: entry for key, entry in plugin.items() if key not in BAKED}
-            plugin = {**rest, "filename": writer.free(name, ".ply").name}
-            meshes[name].write_ply(str(path.with_name(plugin["filename"])))
-        writer.put(root, name, plugin, top=True)
-    ElementTree.indent(root)
-    path.write_bytes(ElementTree.tostring(root, encoding="utf-8", xml_declaration=True) + b"\n")
-
-
-class _Writer:
-    def __init__(self, path: Path) -> None:
-        self._path, self._taken = path, set[str]()
-
-    def free(self, name: str, suffix: str) -> Path:
-        """A file beside the scene that is not there yet."""
-        number, found = 1, f"{self._path.stem}-{name}{suffix}"
-        while found in self._taken:
-            number += 1
-            found = f"{self._path.stem}-{name}-{number}{suffix}"
-        self._taken.add(found)
-        return self._path.with_name(found)
-
-    def put(self, into: ElementTree.Element, name: str, value: Any, *, top: bool = False, within: str = "") -> None:
-        """Put an entry of a dictionary into an element."""
-        named = {"name": name}
-        if isinstance(value, Mapping):
-            self._mapping(into, name, value, top=top, within=within)
-        elif isinstance(value, mi.Bitmap):
-            path = self.free(within or name, ".exr")
-            _write_picture(path, np.array(value, dtype=np.float32))
-            ElementTree.SubElement(into, "string", name="filename", value=path.name)
-        elif hasattr(value, "matrix"):
-            matrix = np.array(value.matrix, dtype=np.float64).reshape(16)
-            one = ElementTree.SubElement(into, "transform", named)
-            ElementTree.SubElement(one, "matrix", value=_numbers(matrix))
-        elif isinstance(value, bool):
-            ElementTree.SubElement(into, "boolean", named, value=str(value).lower())
-        elif isinstance(value, int):
-            ElementTree.SubElement(into, "integer", named, value=str(value))
-        elif isinstance(value, float):
-            ElementTree.SubElement(into, "float", named, value=repr(float(value)))
-        elif isinstance(value, str):
-            if name == "filename" and os.path.isabs(value):
-                path = self.free(Path(value).stem, Path(value).suffix)
-                shutil.copyfile(value, path)
-                value = path.name
-            ElementTree.SubElement(into, "string", named, value=value)
-        elif isinstance(value, (list, tuple)) and len(value) == 3:
-            ElementTree.SubElement(into, "point", named, value=_numbers(value))
-        else:
-            raise InputError(f"out: {name} of {within} is a {type(value).__name__}, which XML of Mitsuba cannot say")
-
-    def _mapping(
-        self, into: ElementTree.Element, name: str, value: Mapping[str, Any], *, top: bool, within: str
-    ) -> None:
-        kind = str(value["type"])
-        if kind == "rgb":
-            found = value["value"]
-            numbers = _numbers(found if isinstance(found, (list, tuple)) else [found] * 3)
-            ElementTree.SubElement(into, "rgb", name=name, value=numbers)
-        elif kind == "spectrum":
-            found = value["value"]
-            pairs = found if isinstance(found, (int, float)) else ", ".join(f"{a!r}:{b!r}" for a, b in found)
-            ElementTree.SubElement(into, "spectrum", name=name, value=str(pairs))
-        elif kind == "ref":
-            ElementTree.SubElement(into, "ref", name=name, id=str(value["id"]))
-        else:
-            tag = mi.PluginManager.instance().plugin_type(kind).name
-            one = ElementTree.SubElement(into, TAGS.get(tag, tag.lower()), type=kind)
-            one.set("id" if top else "name", name)
-            inside = name if top else f"{within}-{name}"
-            for key, entry in value.items():
-                if key != "type":
-                    self.put(one, key, entry, within=inside)
+            file = beside(name, ".ply")
+            meshes[name].write_ply(str(file))
+            plugin = {**{key: entry for key, entry in plugin.items() if key not in BAKED}, "filename": file.name}
+        whole[name] = filed(name, plugin)
+    try:
+        text = mi.parser.write_string(mi.parser.parse_dict(mi.parser.ParserConfig(VARIANT), whole))
+    except (RuntimeError, TypeError) as error:
+        raise InputError(f"out: XML of Mitsuba cannot say the scene: {error}; export another run") from error
+    root = ElementTree.fromstring(text)
+    for one in root.findall("*[@type]"):  # Mitsuba calls parameters by ids, and writes those that are referred to only
+        one.set("id", one.attrib.pop("name"))
+    text = ElementTree.tostring(root, encoding="unicode")
+    path.write_text(f"<!-- {note.replace('--', '- -')} -->\n{text}\n", "utf-8")
 
 
 def _write_picture(path: Path, values: np.ndarray) -> None:
@@ -289,12 +254,3 @@ def _write_picture(path: Path, values: np.ndarray) -> None:
     by_name = {"Y": values.reshape(values.shape[:2])} if channels == 1 else {"RGBA"[:channels]: values}
     with OpenEXR.File({}, by_name) as picture:
         picture.write(str(path))
-
-
-def _numbers(values: Any) -> str:
-    return " ".join(_each(values))
-
-
-def _each(values: Any) -> Iterator[str]:
-    for value in values:
-        yield repr(float(value))

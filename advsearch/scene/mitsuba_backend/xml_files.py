@@ -1,19 +1,20 @@
-"""Mitsuba's XML scene files as the dictionaries that its loader takes, without asking Mitsuba.
+"""Mitsuba's XML scene files as the dictionaries that its loader takes, by Mitsuba's own parser.
 
-A file may come from anywhere. It names plugins, which are libraries, and files, and may include others: only plugins
-that Mitsuba brings are taken, and only ordinary files in its own folder and below: Mitsuba finds a plugin as a library,
-the current folder included, and reads most files without the checks that a file from anywhere needs. Entities and
-document types are refused, and all is counted.
+A file may come from anywhere. It names plugins, which are libraries, and files, and may include others. So Mitsuba gets
+one text without document types, `$names` and includes, of a bounded size and depth, and makes nothing of it; then only
+plugins that Mitsuba brings are taken, and only ordinary files of the scene's own folder: Mitsuba finds a plugin as a
+library, the current folder included, and reads most files without the checks that a file from anywhere needs.
 """
 
 from __future__ import annotations
 
-import math
 import os
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
 from xml.parsers import expat
 
 import numpy as np
@@ -21,14 +22,14 @@ import numpy as np
 from advsearch import files
 from advsearch.errors import FileFormatError
 from advsearch.files import note_opened
-from advsearch.scene.assets import Doubles, Floats
+from advsearch.scene.assets import Floats
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.environments import SUFFIXES as RADIANCE
 from advsearch.scene.environments import import_environment, read_light
 from advsearch.scene.importing.files import References, damaged, looks_like, read_bytes, shown
 from advsearch.scene.importing.objects import read_parts
 from advsearch.scene.importing.pictures import TEXTURE_LIMIT, banded_average, read_picture
-from advsearch.scene.mitsuba_backend.variant import Plugin
+from advsearch.scene.mitsuba_backend.variant import VARIANT, Plugin, fewer_warnings, mi
 
 SUFFIX = ".xml"
 
@@ -39,26 +40,9 @@ DEEPEST = 40
 MOST_INCLUDED = 50
 LONGEST = 10_000
 """Letters of a text with the values of its `$names`."""
-
-PLUGINS = frozenset(
-    "shape bsdf emitter sensor integrator film rfilter sampler texture medium phase volume spectrum".split()
-)
-"""Elements that are plugins."""
-SHARED = frozenset(("bsdf", "texture", "medium", "phase", "volume"))
-"""Those to which others refer."""
-MOVES = frozenset(("translate", "rotate", "scale", "matrix", "lookat", "look_at"))
-
-
-@dataclass
-class _Element:
-    tag: str
-    line: int
-    given: dict[str, str]
-    inner: list[_Element] = field(default_factory=list)
-
-    @property
-    def name(self) -> str:
-        return self.given.get("name", "")
+TAGS = {"ReconstructionFilter": "rfilter", "PhaseFunction": "phase"}
+"""Elements that are not called as Mitsuba calls the type, in small letters."""
+_PLACE = re.compile(r"^\[.*?\] Error while loading string \(line (\d+), col \d+\): ", re.DOTALL)
 
 
 def read_scene(path: Path, parameters: Mapping[str, str] | None = None) -> Plugin:
@@ -71,52 +55,73 @@ def read_scene(path: Path, parameters: Mapping[str, str] | None = None) -> Plugi
     Raises:
         FileFormatError: it is missing, damaged, too large, or no Mitsuba scene.
     """
-    data = read_bytes(path, "scene", (SUFFIX,))
-    reader = _Reader(path, References(path), dict(parameters or {}))
-    root = reader.parsed(data)
+    text = _Text(path, References(path), dict(parameters or {}))
+    root = text.parsed(read_bytes(path, "scene", (SUFFIX,)))
     if root.tag != "scene":
         raise damaged(path, "a Mitsuba scene, which begins with <scene version=...>", f"<{shown(root.tag)}>")
-    scene = reader.plugin(root, "scene")
-    return {**scene, **{name: reader.named[name] for name in sorted(reader.referred & set(reader.named) - set(scene))}}
+    text.fill(root)
+    root.set("version", "3.0.0")
+    config = mi.parser.ParserConfig(VARIANT)
+    config.unused_parameters = mi.LogLevel.Debug
+    try:
+        with fewer_warnings():
+            state = mi.parser.parse_string(config, ElementTree.tostring(root, encoding="unicode"))
+    except RuntimeError as error:
+        place = _PLACE.match(str(error))
+        # lines are the file's as long as nothing is included
+        where = f"line {int(place[1]) + text.above}: " if place and not text.included else ""
+        raise FileFormatError(f"{path}: {where}{_PLACE.sub('', str(error))}; correct it") from error
+    referred: set[str] = set()
+    scene = _plugin(path, state, 0, referred)
+    for name in sorted(referred):  # plugins with ids that stand within others, to which the rest of the file may refer
+        if _plain(name) not in scene and name in state.id_to_index:
+            scene[_plain(name)] = _plugin(path, state, state.id_to_index[name], set())
+    return scene
 
 
 @dataclass
-class _Reader:
+class _Text:
     path: Path
     references: References
     values: dict[str, str]
     size: int = 0
     elements: int = 0
     included: int = 0
-    named: dict[str, Plugin] = field(default_factory=dict)
-    """Plugins with ids that stand within others, to which the rest of the file may refer."""
-    referred: set[str] = field(default_factory=set)
-    last: dict[tuple[int, str], int] = field(default_factory=dict)
-    """The last number behind a name in a plugin, by the identity of its dictionary."""
+    above: int = 0
+    """Lines before the scene's first one."""
 
-    def parsed(self, data: bytes) -> _Element:
-        """Return the tree of a file."""
+    def parsed(self, data: bytes) -> ElementTree.Element:
+        """Return the tree of a file, comments and blanks included, so that lines stay the same."""
         self.size += len(data)
         if self.size > files.scaled(LARGEST):
             raise files.too_large(self.path, f"a scene of at most {files.scaled(LARGEST):,} bytes", f"{self.size:,}")
-        parser, open_ones, roots = expat.ParserCreate(), list[_Element](), list[_Element]()
+        parser, tree, depth = expat.ParserCreate(), ElementTree.TreeBuilder(insert_comments=True), 0
 
         def refuse(*_: object) -> None:
             raise FileFormatError(f"{self.path}: declares a document type or entities, which no scene needs; remove it")
 
         def start(tag: str, given: dict[str, str]) -> None:
-            self.elements += 1
-            if self.elements > files.scaled(MOST_ELEMENTS) or len(open_ones) >= DEEPEST:
+            nonlocal depth
+            if not self.elements:
+                self.above = parser.CurrentLineNumber - 1
+            depth, self.elements = depth + 1, self.elements + 1
+            if self.elements > files.scaled(MOST_ELEMENTS) or depth > DEEPEST:
                 most = f"at most {files.scaled(MOST_ELEMENTS):,} elements, {DEEPEST} deep"
                 raise FileFormatError(f"{self.path}: expected {most}, got more; split the scene up")
-            one = _Element(tag, parser.CurrentLineNumber, given)
-            (open_ones[-1].inner if open_ones else roots).append(one)
-            open_ones.append(one)
+            if tag in ("alias", "path"):
+                where = f"{self.path}: line {parser.CurrentLineNumber}"
+                raise FileFormatError(f"{where}: <{tag}> is not read; write the scene without it")
+            tree.start(tag, given)
 
-        parser.StartDoctypeDeclHandler = refuse
-        parser.EntityDeclHandler = refuse
-        parser.StartElementHandler = start
-        parser.EndElementHandler = lambda tag: open_ones.pop() and None
+        def end(tag: str) -> None:
+            nonlocal depth
+            depth -= 1
+            tree.end(tag)
+
+        parser.StartDoctypeDeclHandler = parser.EntityDeclHandler = refuse
+        parser.StartElementHandler, parser.EndElementHandler = start, end
+        parser.CharacterDataHandler = lambda text: tree.data(text) if depth else None
+        parser.CommentHandler = lambda text: tree.comment(text) if depth else None
         try:
             parser.Parse(data, True)
         except expat.ExpatError as error:
@@ -125,218 +130,119 @@ class _Reader:
             raise damaged(self.path, "an XML file", got) from error
         except (LookupError, ValueError) as error:  # an encoding that Python does not have
             raise damaged(self.path, "an XML file", f"one in an unknown encoding ({shown(str(error))})") from error
-        root = roots[0]
-        version = root.given.get("version", "3.0.0")
+        root = tree.close()
+        version = root.get("version", "3.0.0")
         if root.tag == "scene" and not re.match(r"[23]\.", version):
             raise FileFormatError(
                 f"{self.path}: expected a scene of Mitsuba 2 or 3, got version {shown(version)}; convert it"
             )
         return root
 
-    def plugin(self, element: _Element, kind: str) -> Plugin:
-        """Return a plugin with all that is in it."""
-        found: Plugin = {"type": kind}
-        for one in element.inner:
-            self.put(one, found)
-        return found
+    def fill(self, element: ElementTree.Element) -> None:
+        """Put the values of `$names`, and what other files hold, into an element."""
+        inner: list[ElementTree.Element] = []
+        for one in element:
+            for key, text in one.items():
+                one.set(key, self.filled(text))
+            if one.tag == "default":
+                self.values.setdefault(one.get("name", ""), one.get("value", ""))
+            if one.tag != "include":
+                self.fill(one)
+                inner.append(one)
+                continue
+            root = self.other(one.get("filename", ""))
+            whole = ElementTree.Element("scene") if root.tag != "scene" else root
+            if root is not whole:
+                whole.append(root)
+            self.fill(whole)
+            inner += list(whole)
+        element[:] = inner
 
-    def put(self, one: _Element, into: Plugin) -> None:
-        """Put what an element says into a plugin's dictionary."""
-        if one.tag == "default":
-            self.values.setdefault(self.text(one, "name"), self.text(one, "value"))
-        elif one.tag == "include":
-            self.include(self.text(one, "filename"), into)
-        elif one.tag in ("alias", "path"):
-            raise self.wrong(one, f"<{one.tag}> is not read; write the scene without it")
-        elif one.tag == "ref":
-            self.referred.add(_plain(self.text(one, "id")))
-            into[self.free(into, one.name or "ref")] = {"type": "ref", "id": _plain(self.text(one, "id"))}
-        elif one.tag in PLUGINS and "type" in one.given:
-            wanted = one.name or one.given.get("id") or (one.given["type"] if into["type"] == "scene" else one.tag)
-            inner = self.plugin(one, self.text(one, "type"))
-            if "id" in one.given and into["type"] == "scene":
-                wanted = one.given["id"]
-            elif "id" in one.given and one.tag in SHARED:
-                self.named.setdefault(_plain(self.text(one, "id")), inner)
-            into[self.free(into, _plain(wanted))] = inner
-        else:
-            into[self.free(into, self.text(one, "name"))] = self.value(one)
-
-    def free(self, taken: Plugin, wanted: str) -> str:
-        """A name that is free: the one that is wanted, or with a number behind it."""
-        name, number = wanted, self.last.get((id(taken), wanted), 1)
-        while name in taken:
-            number += 1
-            name = f"{wanted}-{number}"
-        self.last[id(taken), wanted] = number
-        return name
-
-    def include(self, name: str, into: Plugin) -> None:
-        """Put what another file of the folder holds into a dictionary."""
+    def other(self, name: str) -> ElementTree.Element:
+        """Return the tree of a file that is included."""
         self.included += 1
         if self.included > MOST_INCLUDED:
             raise FileFormatError(f"{self.path}: includes more than {MOST_INCLUDED} files; does one include itself?")
         try:
-            data = self.references.get(name)
+            return self.parsed(self.references.get(name))
         except FileNotFoundError:
             reason = next(reversed(self.references.refused.values()))
             raise FileFormatError(f"{self.path}: includes {shown(name)}, which {reason}") from None
-        root = self.parsed(data)
-        for one in root.inner if root.tag == "scene" else [root]:
-            self.put(one, into)
 
-    def value(self, one: _Element) -> object:
-        """Return a number, a text, a colour, a transform."""
-        readers: dict[str, Callable[[], object]] = {
-            "float": lambda: self.numbers(one, 1)[0],
-            "integer": lambda: round(self.numbers(one, 1)[0]),
-            "boolean": lambda: self.text(one, "value").strip().lower() == "true",
-            "string": lambda: self.text(one, "value"),
-            "rgb": lambda: {"type": "rgb", "value": self.color(one)},
-            "spectrum": lambda: self.spectrum(one),
-            "point": lambda: list(self.place(one, 0.0)),
-            "vector": lambda: list(self.place(one, 0.0)),
-            "transform": lambda: self.transform(one),
-        }
-        if one.tag not in readers:
-            raise self.wrong(one, f"<{shown(one.tag, quoted=False)}> is nothing that a Mitsuba scene has")
-        return readers[one.tag]()
-
-    def spectrum(self, one: _Element) -> object:
-        """A constant, or pairs of wavelength and value."""
-        text = self.text(one, "value")
-        if ":" not in text:
-            return {"type": "spectrum", "value": self.numbers(one, 1)[0]}
-        pairs = [pair.split(":") for pair in re.split(r"[,\s]+", text.strip())]
-        if not all(len(pair) == 2 for pair in pairs):
-            raise self.wrong(one, f"expected wavelength:value, got {shown(text)}")
-        return {"type": "spectrum", "value": [(self.number(one, a), self.number(one, b)) for a, b in pairs]}
-
-    def color(self, one: _Element) -> list[float]:
-        """Three numbers, or #rrggbb."""
-        text = self.text(one, "value").strip()
-        if re.fullmatch(r"#[0-9a-fA-F]{6}", text):
-            return [int(text[at : at + 2], 16) / 255.0 for at in (1, 3, 5)]
-        found = self.numbers(one, None)
-        if len(found) not in (1, 3):
-            raise self.wrong(one, f"expected three numbers, got {shown(text)}")
-        return found * 3 if len(found) == 1 else found
-
-    def transform(self, one: _Element) -> Doubles:
-        """The product of its steps (4, 4), the first applied first."""
-        matrix = np.eye(4)
-        for step in one.inner:
-            if step.tag not in MOVES:
-                raise self.wrong(step, f"<{shown(step.tag, quoted=False)}> is no step of a transform")
-            matrix = self.step(step) @ matrix
-        if not np.isfinite(matrix).all() or not abs(np.linalg.det(matrix[:3, :3])) > 0.0:
-            raise self.wrong(one, "expected a transform that can be undone, of finite numbers")
-        return matrix
-
-    def step(self, one: _Element) -> Doubles:
-        """One step of a transform (4, 4)."""
-        matrix = np.eye(4)
-        if one.tag == "matrix":
-            found = self.numbers(one, None)
-            if len(found) not in (9, 16):
-                raise self.wrong(one, f"expected 9 or 16 numbers, got {len(found)}")
-            side = 3 if len(found) == 9 else 4
-            matrix[:side, :side] = np.array(found).reshape(side, side)
-            if not np.array_equal(matrix[3], (0.0, 0.0, 0.0, 1.0)):
-                raise self.wrong(one, "expected an affine transform, whose last row is 0 0 0 1")
-        elif one.tag == "translate":
-            matrix[:3, 3] = self.place(one, 0.0)
-        elif one.tag == "scale":
-            matrix[:3, :3] = np.diag(self.place(one, 1.0))
-        elif one.tag == "rotate":
-            axis = self.place(one, 0.0)
-            if not any(axis):
-                raise self.wrong(one, 'expected an axis, such as y="1"')
-            matrix[:3, :3] = _turn(axis, math.radians(self.number(one, self.text(one, "angle"))))
-        else:
-            origin, target, up = (
-                np.array(self.triple(one, one.given.get(key, "0 1 0"))) for key in ("origin", "target", "up")
-            )
-            ahead = _unit(target - origin)
-            left = _unit(np.cross(up, ahead))
-            matrix[:3] = np.stack([left, np.cross(ahead, left), ahead, origin], axis=1)
-        return matrix
-
-    def place(self, one: _Element, otherwise: float) -> tuple[float, float, float]:
-        """Three numbers in `value`, or in `x`, `y`, `z`."""
-        if "value" in one.given:
-            return self.triple(one, one.given["value"])
-        x, y, z = (self.number(one, one.given[axis]) if axis in one.given else otherwise for axis in "xyz")
-        return x, y, z
-
-    def triple(self, one: _Element, text: str) -> tuple[float, float, float]:
-        """Three numbers from one or three."""
-        found = [self.number(one, part) for part in re.split(r"[,\s]+", self.filled(one, text).strip())]
-        if len(found) not in (1, 3):
-            raise self.wrong(one, f"expected three numbers, got {shown(text)}")
-        x, y, z = found * 3 if len(found) == 1 else found
-        return x, y, z
-
-    def numbers(self, one: _Element, count: int | None) -> list[float]:
-        """The numbers in `value`."""
-        text = self.text(one, "value")
-        found = [self.number(one, part) for part in re.split(r"[,\s]+", text.strip())]
-        if count is not None and len(found) != count:
-            raise self.wrong(one, f"expected a number, got {shown(text)}")
-        return found
-
-    def number(self, one: _Element, text: str) -> float:
-        """A finite number of float32's range."""
-        try:
-            found = float(self.filled(one, text))
-        except ValueError:
-            raise self.wrong(one, f"expected a number, got {shown(text)}") from None
-        if not abs(found) < 1e30:
-            raise self.wrong(one, f"expected a finite number, got {shown(text)}")
-        return found
-
-    def text(self, one: _Element, key: str) -> str:
-        """An attribute, with the values of its `$names`."""
-        if key not in one.given:
-            raise self.wrong(one, f"<{shown(one.tag, quoted=False)}> has no {key!r}")
-        return self.filled(one, one.given[key])
-
-    def filled(self, one: _Element, text: str) -> str:
-        """A text with the values of its `$names`."""
-
-        def value(name: str) -> str:
-            if name not in self.values:
-                raise self.wrong(one, f"${shown(name, quoted=False)} has no value: no <default> has that name")
-            return self.values[name]
-
-        if "$" not in text:
-            return text
+    def filled(self, text: str) -> str:
+        """Return a text with the values of its `$names`."""
         found = ""
         for at, part in enumerate(re.split(r"\$(\w+)", text)):
-            found += value(part) if at % 2 else part
-            if len(found) > LONGEST:  # a <default> may name others twice, and so on
-                raise self.wrong(one, f"expected at most {LONGEST:,} letters, got more; write the value out")
+            if at % 2 and part not in self.values:
+                named = shown(part, quoted=False)
+                raise FileFormatError(f"{self.path}: ${named} has no value: no <default> has that name")
+            found += self.values[part] if at % 2 else part
+            if at and len(found) > LONGEST:  # a <default> may name others twice, and so on
+                most = f"expected at most {LONGEST:,} letters, got more"
+                raise FileFormatError(f"{self.path}: {shown(text)}: {most}; write the value out")
         return found
 
-    def wrong(self, one: _Element, reason: str) -> FileFormatError:
-        """The error about an element."""
-        return FileFormatError(f"{self.path}: line {one.line}: {reason}")
+
+def _plugin(path: Path, state: Any, number: int, referred: set[str]) -> Plugin:
+    """Return a parsed plugin with all that is in it, as `mitsuba.load_dict` takes it; ids that it names are put into
+    `referred`."""
+    kinds, own = mi.Properties.Type, state.nodes[number].props
+    found: Plugin = {"type": own.plugin_name()}
+    last: dict[str, int] = {}
+
+    def put(wanted: str, made: object) -> None:
+        """Under a name that is free: the one that is wanted, or with a number behind it."""
+        name, count = wanted, last.get(wanted, 1)
+        while name in found:
+            count += 1
+            name = f"{wanted}-{count}"
+        last[wanted], found[name] = count, made
+
+    for key in own.keys():
+        kind, value = own.type(key), own[key]
+        named = "" if key.startswith("_arg_") else key
+        if kind == kinds.ResolvedReference:
+            node = state.nodes[value.index()]
+            name = node.props.id() or named if number == 0 else named or node.props.id()
+            tag = TAGS.get(node.type.name, node.type.name.lower())
+            name = name or (node.props.plugin_name() if number == 0 else tag)
+            put(_plain(name), _plugin(path, state, value.index(), referred))
+        elif kind == kinds.Reference:
+            referred.add(str(value.id()))
+            put(named or "ref", {"type": "ref", "id": _plain(str(value.id()))})
+        else:
+            put(key, _value(f"{path}: {shown(key, quoted=False)}", kind, value))
+    return found
+
+
+def _value(where: str, kind: Any, value: Any) -> object:
+    """Return a number, a text, a colour, a transform, of finite numbers of float32's range."""
+    kinds = mi.Properties.Type
+    made: object = value
+    numbers: Any = value if kind in (kinds.Float, kinds.Integer) else ()
+    if kind == kinds.Color:
+        numbers = list(value)
+        made = {"type": "rgb", "value": numbers}
+    elif kind == kinds.Vector:
+        made = numbers = list(value)
+    elif kind == kinds.Transform:
+        made = numbers = np.array(value.matrix, np.float64)
+    elif kind == kinds.Spectrum:
+        pairs = list(zip(value.wavelengths, value.values, strict=False))
+        numbers = pairs or value.values
+        made = {"type": "spectrum", "value": pairs or value.values[0]}
+    if not (np.abs(np.asarray(numbers, np.float64)) < 1e30).all():
+        raise FileFormatError(f"{where}: expected a finite number, got {shown(str(np.asarray(numbers)))}; correct it")
+    if kind == kinds.Transform and not abs(np.linalg.det(numbers[:3, :3])) > 0.0:
+        raise FileFormatError(f"{where}: expected a transform that can be undone, got one that squashes; correct it")
+    if kind == kinds.Transform and not np.array_equal(numbers[3], (0.0, 0.0, 0.0, 1.0)):
+        raise FileFormatError(f"{where}: expected an affine transform, whose last row is 0 0 0 1; correct it")
+    return made
 
 
 def _plain(name: str) -> str:
     """A name as Mitsuba's loader takes it: without dots."""
     return name.replace(".", "_")
-
-
-def _unit(vector: Doubles) -> Doubles:
-    return np.asarray(vector / max(float(np.linalg.norm(vector)), 1e-30))
-
-
-def _turn(axis: tuple[float, float, float], angle: float) -> Doubles:
-    """The rotation (3, 3) about an axis by an angle in radians."""
-    x, y, z = _unit(np.array(axis))
-    across = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.asarray(np.eye(3) + math.sin(angle) * across + (1.0 - math.cos(angle)) * (across @ across))
 
 
 STOCK = frozenset(

@@ -1,0 +1,254 @@
+"""What is compared, read from stored sweeps: for every side its rows, and two sides counted pair by pair.
+
+Pictures of a sweep are numbered, and the draw of a picture follows from its number. So sweeps with the same seed, grid
+and controls have the same draws, and pictures with the same number are a pair, whatever else differs. Pairs are counted
+in all, by each parameter, and where one side is worse.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+
+from advsearch import seeds
+from advsearch.attacks.units import paired_by_unit
+from advsearch.config import SweepConfig
+from advsearch.errors import FileFormatError, InputError
+from advsearch.questions.compare.answer import ComparedPair, CountOf, PairPart, PairRule
+from advsearch.report.wording import short_names
+from advsearch.rules import FEWEST_ROWS, find_rules, halves, interval_of, observed
+from advsearch.runs.directory import CONFIG
+from advsearch.runs.results.sweep import SweepSummary
+from advsearch.runs.summary import read_result
+from advsearch.runs.tables import read_sweep
+
+DRAWS = ("grid", "controls", "samples", "sampler", "seed")
+"""The settings that decide what is drawn."""
+
+OF_THE_SIDE = ("object", "model", "answer")
+"""What may tell sides apart, as rows have it."""
+
+FOLLOWS = (*DRAWS, "label", "labels", "prompt", "up", "batch", "keep_pictures", "trials", "verify_spp", "specialise")
+"""Settings that do not tell sweeps apart: of draws, along with object and model, or of no answer."""
+
+TOLERANCE = 1e-4
+"""Of a value, relative to the largest in its column: values come from single precision."""
+
+MOST_VALUES = 64
+"""Different numbers of a parameter, beyond which it has no table unless the sweep says how it is cut."""
+
+Mask = npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Side:
+    """One of the things that are compared: what tells it from the others; its sweep; object, model and answer; and its
+    rows as `runs.tables` has them, one for each picture in their order, with the `number` of the picture."""
+
+    name: str
+    folder: Path
+    config: SweepConfig
+    summary: SweepSummary
+    named: dict[str, str]
+    rows: pd.DataFrame
+
+    @property
+    def right(self) -> Mask:
+        """Whether the model is right (n,)."""
+        return np.asarray(self.rows["correct"])
+
+    @property
+    def varying(self) -> list[str]:
+        """The parameters that have more than one value; not what names the side."""
+        names = [name for name in self.rows.attrs["units"] if name not in ("model", "answer")]
+        return [name for name in names if self.rows[name].nunique() > 1]
+
+
+def read_sides(folders: Sequence[Path]) -> list[Side]:
+    """Return what the sweeps in some folders compare, each side with a name of its own.
+
+    A sweep has a side for each of its models. The sweep of an answer has these without the answer and with it; beside
+    other sweeps, only with it.
+
+    Raises:
+        FileFormatError: a folder has another run, or a sweep that has not ended.
+        InputError: there is nothing to compare, or sweeps are of other draws.
+    """
+    sides = [side for folder in folders for side in _sides_of(folder, alone=len(folders) == 1)]
+    if len(sides) < 2:
+        raise InputError(
+            f"compared: expected a sweep of several models, or several sweeps, got {folders[0]}, a sweep of one model; "
+            "name another sweep of the same draws beside it, or give `model` two models when you sweep"
+        )
+    for side in sides[1:]:
+        _check_pair(sides[0], side)
+    telling = [what for what in OF_THE_SIDE if len({side.named[what] for side in sides}) > 1]
+    names = [", ".join(short_names(side.named[what]) or "as it is" for what in telling) for side in sides]
+    if len(set(names)) < len(names):
+        names = [", ".join(filter(None, (side.folder.name, name))) for side, name in zip(sides, names, strict=True)]
+    if len(set(names)) < len(names):
+        names = [f"{number + 1}: {name}" for number, name in enumerate(names)]
+    return [replace(side, name=name) for side, name in zip(sides, names, strict=True)]
+
+
+def _sides_of(folder: Path, *, alone: bool) -> Iterator[Side]:
+    summary = read_result(folder)
+    if not isinstance(summary, SweepSummary):
+        raise FileFormatError(f"{folder}: expected the run of a sweep, got one of {summary.command}; sweep first")
+    if summary.goes_on or summary.configurations != summary.planned:
+        raise FileFormatError(
+            f"{folder}: expected a sweep that has ended, got one with {summary.configurations} of {summary.planned} "
+            f"answers; go on with it: advsearch resume {folder}"
+        )
+    config, rows = SweepConfig.from_yaml(folder / CONFIG), read_sweep(folder)
+    if len(rows) != summary.planned or not rows["step"].is_unique:
+        raise FileFormatError(
+            f"{folder}: expected {summary.planned} rows, as its summary says, got {len(rows)}; sweep again"
+        )
+    models = len(config.models)
+    rows = rows.sort_values("step", ignore_index=True)
+    rows["correct"] = rows["correct"] == 1
+    rows["number"], model_of = rows["step"] // models, rows["step"] % models
+    with_answer = rows["number"] >= summary.planned // models // 2
+    halves_of = [~with_answer, with_answer][0 if alone else 1 :] if config.answer_of else [rows["number"] >= 0]
+    for half in halves_of:
+        for model, name in enumerate(config.models):
+            mine = rows[half & (model_of == model)].reset_index(drop=True)
+            named = {"object": summary.object, "model": name, "answer": ""}
+            named |= {what: ",".join(mine[what].unique()) for what in OF_THE_SIDE if what in mine}
+            yield Side("", folder, config, summary, named, mine)
+
+
+def _check_pair(first: Side, other: Side) -> None:
+    if first.folder == other.folder:
+        return
+    where = f"{first.folder} and {other.folder}"
+    for name in DRAWS:
+        if first.config.deciding()[name] != other.config.deciding()[name]:
+            raise InputError(
+                f"compared: expected sweeps of the same draws, got {where}, whose `{name}` differ; sweep one of them "
+                "again with the settings of the other"
+            )
+    if len(first.rows) != len(other.rows):
+        raise InputError(
+            f"compared: expected sweeps with as many pictures, got {len(first.rows)} and {len(other.rows)} in {where}; "
+            "sweep as many objects and environments in both"
+        )
+    if first.named["object"] != other.named["object"]:
+        return  # ranges may follow from the object
+    for name in first.rows.attrs["units"]:
+        in_both = name not in (*OF_THE_SIDE, "environment") and name in other.rows.attrs["units"]
+        if in_both and not _same(first.rows[name], other.rows[name]):
+            raise InputError(
+                f"compared: expected sweeps of the same draws, got {where} with other values of {name}; sweep both "
+                "again"
+            )
+
+
+def _same(one: pd.Series, other: pd.Series) -> bool:
+    if one.dtype == "category" or other.dtype == "category":
+        return bool((one.astype(object) == other.astype(object)).all())
+    scale = float(np.nanmax(np.abs(one), initial=0.0))
+    return bool(np.allclose(one, other, rtol=0.0, atol=TOLERANCE * scale, equal_nan=True))
+
+
+def differing(sides: Sequence[Side]) -> list[str]:
+    """Return the settings in which the sweeps of some sides differ and that decide answers."""
+    settings = [side.config.deciding() for side in sides]
+    names = {name for one in settings[1:] for name in one if one[name] != settings[0][name]}
+    names |= {name for name in OF_THE_SIDE if len({side.named[name] for side in sides}) > 1}
+    names |= {name for name in ("object", "model") if len({getattr(side.config, name) for side in sides}) > 1}
+    return sorted(names - {*FOLLOWS, "answer_of"})
+
+
+def compared(first: Side, second: Side, seed: int, *, rules: bool = True) -> ComparedPair:
+    """Return what the pairs of two sides say, without pictures; an InputError where rules are sought and scikit-learn
+    is missing. `seed` says which half of the pairs chooses rules, and which counts them."""
+    shared = [n for n in first.varying if n in second.rows.attrs["units"] and _same(first.rows[n], second.rows[n])]
+    right, other, units = first.right, second.right, first.rows["unit"].to_numpy()
+    draws = len(np.unique(units))
+    table = observed(first.rows, shared)
+    worse, better = (
+        _rules(table.assign(correct=~alone), seed) if rules else None for alone in (right & ~other, ~right & other)
+    )
+    return ComparedPair(
+        first=first.name,
+        second=second.name,
+        units=None if draws == len(units) else draws,
+        **_counts(right, other, units),
+        p=paired_by_unit(right, other, units)[2],
+        worse=worse,
+        better=better,
+        parts=[
+            PairPart(
+                parameter=name,
+                unit="" if first.rows[name].dtype == "category" else first.rows.attrs["units"][name],
+                value=value,
+                **_counts(right[inside], other[inside], units[inside]),
+            )
+            for name in shared
+            for value, inside in _parts(first.rows[name], first.rows.attrs["edges"].get(name))
+            if inside.any()
+        ],
+        shown=[],
+    )
+
+
+def _counts(first: Mask, second: Mask, units: npt.NDArray[np.int64]) -> dict[str, Any]:
+    difference, interval, _ = paired_by_unit(first, second, units)
+    return {
+        "both": int((first & second).sum()),
+        "first_only": int((first & ~second).sum()),
+        "second_only": int((~first & second).sum()),
+        "neither": int((~first & ~second).sum()),
+        "difference": difference,
+        "interval": interval,
+    }
+
+
+def _parts(column: pd.Series, edges: Sequence[float] | None) -> Iterator[tuple[Any, Mask]]:
+    """The values of a parameter, or the parts of its range that the sweep's tables have, and which pairs have them."""
+    if column.dtype == "category":
+        yield from ((name, np.asarray(column == name)) for name in column.cat.categories)
+    elif edges is not None:
+        part = np.clip(np.searchsorted(edges, column, side="right") - 1, 0, len(edges) - 2)
+        yield from ((ends, part == k) for k, ends in enumerate(pairwise(edges)))
+    elif column.nunique() <= MOST_VALUES:
+        yield from ((float(f"{value:.6g}"), np.asarray(column == value)) for value in np.unique(column))
+
+
+def _rules(table: pd.DataFrame, seed: int) -> list[PairRule] | None:
+    """Where one side alone is right more often than elsewhere; None of too few pairs, or where nothing varies.
+
+    These are the rules of `explain`, whose wrong answers are the pairs that one side alone gets right.
+    """
+    if len(table) < FEWEST_ROWS or not table.attrs["units"]:
+        return None
+
+    def count(pairs: pd.DataFrame) -> CountOf:
+        low, high = interval_of(pairs)
+        return CountOf(count=int((~pairs["correct"]).sum()), total=len(pairs), interval=(1.0 - high, 1.0 - low))
+
+    return [
+        PairRule(
+            conditions=[one.row for one in rule.conditions], elsewhere=count(rule.elsewhere), **vars(count(rule.inside))
+        )
+        for rule in find_rules(*halves(table, seed), seeds.stream(seed, "compare")).told
+    ]
+
+
+def far_apart(first: Side, second: Side, most: int) -> list[int]:
+    """Return places of pairs that one side alone gets right, at most so many of each: first those of the first side,
+    where the margins are farthest apart first."""
+    right, other = first.right, second.right
+    apart = (second.rows["margin"] - first.rows["margin"]).fillna(0.0)
+    worse = (-apart[right & ~other]).sort_values(kind="stable").index[:most]
+    better = apart[~right & other].sort_values(kind="stable").index[:most]
+    return [*worse.tolist(), *better.tolist()]

@@ -1,0 +1,344 @@
+"""Cases of scenes: light, surfaces, meshes, places and views that break naive code."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+import torch
+
+from advsearch.attacks import PGD, Adam, Auto, Query, search
+from advsearch.controls.occlusion import sphere
+from advsearch.engine.gradients import smooth_loss
+from advsearch.errors import InputError
+from advsearch.questions.stability.answer import check, holds
+from advsearch.questions.stability.scene import (
+    ERROR,
+    REFERENCE_SPP,
+    SAME_PICTURE,
+    SPP,
+    ControlSettings,
+    Evaluator,
+    black_and_white,
+    checked,
+    compared,
+    dark,
+    grey_map,
+    inward,
+    mesh_of,
+    search_domain,
+    seen,
+    shown,
+    small,
+)
+from advsearch.questions.stability.suite import Outcome, case, cases
+from advsearch.scene.assets import EnvironmentAsset, ObjectAsset, normalised
+from advsearch.scene.description import describe
+from advsearch.scene.environments import import_environment
+from advsearch.scene.geometry import camera_to_world
+from advsearch.scene.importing.objects import import_object
+from advsearch.scene.mitsuba_backend.parts import Translation, translation
+from advsearch.scene.parts import ScenePart
+
+BRIGHT = 1e5
+PLATEAU_STEPS = 40
+"""Evaluations in which a search has to be off a plateau."""
+TEXTURE: ControlSettings = {"texture": {"resolution": 8}}
+FLASH = grey_map(0.3, BRIGHT)
+DARKNESS = grey_map(0.0)
+
+
+def exposed(control: str, low: float, high: float) -> dict[str, object]:
+    """A picture ten stops over or under, and its gradient there."""
+    controls = {control: {"exposure": [low, high]}, "texture": {"resolution": 8}}
+    return {"controls": controls, "u": {0: float(high > 0.0)}, "slow": control == "environment"}
+
+
+RIGHT = "Picture and gradient are finite; the gradient of the linear picture is right."
+LAMP = {"light": {"type": "point", "power": [0.0, 20.0], "x": 1.0, "y": 1.0, "z": 2.0}}
+BRIGHT_TEXEL = {"environment": {"exposure": [-1.0, 1.0]}, "texture": {"resolution": 16}}
+TURNED = {"environment": {"rotation": [0.0, 360.0]}}
+
+# fmt: off
+cases("radiometric", seen, [
+    ("hdri-texel-100000", "One texel of 100,000 leaves everything finite, and gradients are right.",
+     {"controls": BRIGHT_TEXEL, "environment": FLASH, "slow": True}),
+    ("hdri-texel-100000-denoised", "It is finite after the denoiser too, and the rotation has a gradient.",
+     {"controls": TURNED, "environment": FLASH, "denoise": "oidn", "u": [0.31], "compare": False,
+      "gradient": (1e-12, None), "slow": True}),
+    ("black-environment", "The picture is black, the gradient zero, and the search ends as stalled.",
+     {"controls": TEXTURE, "environment": DARKNESS, "compare": False, "evaluations": PLATEAU_STEPS,
+      "mean": (0.0, 0.0), "gradient": (0.0, 0.0), "ending": "stalled"}),
+    ("lamp-in-the-dark", "A lamp lights a scene that has no other light.",
+     {"controls": LAMP, "environment": DARKNESS, "u": [0.5], "mean": (0.01, None)}),
+    ("camera-exposure-up", RIGHT, exposed("camera", 9.0, 10.0)),
+    ("camera-exposure-down", RIGHT, exposed("camera", -10.0, -9.0)),
+    ("environment-exposure-up", RIGHT, exposed("environment", 9.0, 10.0)),
+    ("environment-exposure-down", RIGHT, exposed("environment", -10.0, -9.0)),
+])
+# fmt: on
+
+
+def refused_texel(value: float, as_file: bool) -> Outcome:
+    """A texel that is no light, in a file or in an array, has to be refused in a sentence."""
+    radiance = grey_map(0.3).radiance.copy()
+    radiance[4, 10] = value
+    try:
+        if as_file:
+            with tempfile.TemporaryDirectory() as folder:
+                path = Path(folder) / "bad.exr"
+                with OpenEXR.File({}, {"RGB": radiance}) as picture:
+                    picture.write(str(path))
+                import_environment(path)
+        else:
+            renderer = small(TEXTURE, environment=EnvironmentAsset("made", radiance))
+            shown(renderer, renderer.start, 0, 1)
+    except InputError as error:
+        counted = "texels" in str(error) and "\n" not in str(error)
+        return Outcome([holds("refused in a sentence that counts the texels", counted)], ending="refused")
+    return Outcome([holds("refused", False)], ending="rendered all the same")
+
+
+REFUSED = "The map is refused before anything is rendered."
+for word, value in (("negative", -1.0), ("infinite", math.inf), ("nan", math.nan)):
+    for place in ("file", "array"):
+        given = {"value": value, "as_file": place == "file"}
+        cases("radiometric", refused_texel, [(f"{word}-texel-{place}", REFUSED, given)])
+
+
+def plateau(low: float, high: float) -> Outcome:
+    """Start where the picture is white and nothing has a gradient; the way out is an exposure further down.
+
+    Args:
+        low, high: stops that are searched. Up to about 4 something in the picture is not white.
+    """
+    renderer = small({"camera": {"exposure": [low, high]}})
+    start, checks, endings, flat = torch.ones_like(renderer.start), [], [], 0
+    evaluate = Evaluator(renderer, lambda image: 0.9 - image.mean(), 2)
+    for policy in (PGD(), Adam(), Auto()):
+        domain = search_domain(renderer, start)
+        result = search(partial(map, evaluate), domain, policy, steps=PLATEAU_STEPS, seed=0, candidates=0)
+        flat += sum(record.gradient_norm == 0.0 for record in result.history)
+        checks.append(holds(f"{policy.name} finds a picture that is not white", result.best_objective > 0.0))
+        endings.append(f"{policy.name}: {result.ending.value}")
+    slope = evaluate(Query(start, 0, gradient=True)).gradient
+    assert slope is not None
+    at_first = check("gradient at the start", float(slope.abs().max()), 0.0, 0.0)
+    measured = {"evaluations without a gradient": float(flat)}
+    return Outcome([at_first, *checks], ending=", ".join(endings), measured=measured)
+
+
+AWAY = f"From a white picture without a gradient every policy gets away within {PLATEAU_STEPS} evaluations"
+# fmt: off
+cases("radiometric", plateau, [
+    ("saturated-plateau", f"{AWAY}.", {"low": -10.0, "high": 10.0}),
+    ("saturated-plateau-narrow-way-out", f"{AWAY}; the way out is a tenth of the range.", {"low": 1.0, "high": 10.0}),
+])
+# fmt: on
+
+
+# ---- surfaces -------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class GlassBall(ScenePart):
+    """A ball of clear glass, in object sizes; nothing of it varies."""
+
+    place: tuple[float, float, float]
+    radius: float
+
+
+@translation.register
+def _glass(part: GlassBall) -> Translation:
+    surface = {"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0}
+    ball = {"type": "sphere", "center": list(part.place), "radius": part.radius, "bsdf": surface}
+    return Translation({part.name: ball})
+
+
+def glass() -> GlassBall:
+    """A ball of clear glass between the mug and the camera, which covers part of it."""
+    x, y, z = (float(value) for value in camera_to_world(describe("mug"))[:3, 3] * 0.6 + np.array([0.0, 0.0, 0.2]))
+    return GlassBall("glass", (x, y, z), 0.3)
+
+
+def surface(searched: tuple[str, ...], slow: bool = True, **values: float) -> dict[str, object]:
+    """A surface with numbers at the ends of their range, and the derivative by some of them there."""
+    settings = {f"material.{name}": value for name, value in values.items()}
+    return {"controls": {"material": {name: [0.0, 1.0] for name in searched}}, "settings": settings, "slow": slow}
+
+
+# fmt: off
+cases("materials", seen, [
+    ("roughness-0", "Finite, and the gradient by the roughness is right, at the polished end.",
+     surface(("roughness",), slow=False, roughness=0.0)),
+    ("roughness-1", "Finite, and the gradient by the roughness is right, at the matt end.",
+     surface(("roughness",), roughness=1.0, metallic=1.0)),
+    ("metallic-1", "Finite, and the gradient has the right sign and size at a metallic of exactly 1.",
+     surface(("metallic",), metallic=1.0)),
+    ("perfect-mirror", "A metal of roughness 0 is finite, and both gradients are right.",
+     surface(("roughness", "metallic"), roughness=0.0, metallic=1.0)),
+])
+# fmt: on
+
+
+@case("materials", "clear-glass", slow=True)
+def clear_glass() -> Outcome:
+    """A texel behind clear glass has the right gradient, and nothing is NaN."""
+    controls: ControlSettings = {"texture": {"resolution": 8}, "environment": {"exposure": [-1.0, 1.0]}}
+    return seen(controls, parts=[glass()], beside={}, apart=(0.01, None))
+
+
+@case("materials", "texels-0-and-1")
+def texels_at_the_ends() -> Outcome:
+    """Texels at the ends of the range have a gradient, and the search moves them inwards only."""
+    controls = {"texture": {"resolution": 8, "epsilon": 0.2}}
+    renderer = small(controls, black_and_white)
+    raw, start = renderer.like(transfer="linear"), renderer.start
+    loss = smooth_loss(raw.formation.resolution)
+    slope = torch.stack([raw.gradient(loss, start, seed, REFERENCE_SPP)[1] for seed in range(8)]).mean(dim=0)
+    gradient, wanted = inward(renderer, slope, 1.0, 8, REFERENCE_SPP)
+    error = abs(gradient / wanted - 1.0)
+    best = search(
+        partial(map, Evaluator(renderer, loss, SPP)), search_domain(renderer), PGD(), steps=3, seed=0, candidates=0
+    ).best_u
+    return seen(controls, black_and_white, compare=False).also(
+        check("gradient error along a direction that points inwards", error, most=ERROR),
+        check("smallest texel of the answer", float(best.min()), least=0.0),
+        check("largest texel of the answer", float(best.max()), most=1.0),
+        check("texels that the search moved", float((best != start).sum()), least=1.0),
+        holds("the start has both 0 and 1", set(start.tolist()) == {0.0, 1.0}),
+        relative_error=error,
+    )
+
+
+# ---- meshes, places and views ---------------------------------------------------------------------------------------
+
+QUAD = [[0.0, -0.5, 0.0], [0.0, 0.5, 0.0], [0.0, 0.5, 1.0], [0.0, -0.5, 1.0]]
+"""A square that faces +x."""
+HALVES = [[0, 1, 2], [0, 2, 3]]
+SQUARE = checked(mesh_of(QUAD, HALVES))
+LINE = [[0.0, 0.0, 0.5], [0.0, 0.1, 0.5], [0.0, 0.2, 0.5]]
+DEGENERATE = checked(mesh_of(QUAD + LINE, [*HALVES, [0, 0, 1], [4, 5, 6], [4, 4, 4]]))
+TWICE = checked(mesh_of(QUAD + QUAD, [*HALVES, [4, 5, 6], [4, 6, 7]]))
+SLIVER = checked(mesh_of([*QUAD, [0.0, -0.5, 0.5], [0.0, 0.5, 0.5], [0.0, 0.5, 0.5 + 1e-6]], [*HALVES, [4, 5, 6]]))
+TRIANGLE = checked(mesh_of([[0.0, -0.5, 0.0], [0.0, 0.5, 0.0], [0.0, 0.0, 1.0]], [[0, 1, 2]]))
+FRONT = {"camera.azimuth": 0.0, "camera.elevation": 10.0}
+PAINTED: ControlSettings = {"texture": {"resolution": 8}, "pose": {"y": [-0.3, 0.3]}}
+SHIFT: ControlSettings = {"pose": {"x": [-0.3, 0.3]}}
+BARE = {"ground.size": 0.0}
+"""Settings without the ground, so that a dark object has an outline and nothing else."""
+
+
+def mesh(thing: ObjectAsset, beside: ObjectAsset | None = None) -> dict[str, object]:
+    """A mesh of our own, seen from the front: painted and shifted."""
+    like = {"beside": {"thing": beside, "settings": FRONT}} if beside else {}
+    return {"controls": PAINTED, "thing": thing, "settings": FRONT, "slow": True, **like}
+
+
+def box_in_a_file(scale: float = 1.0, shift: float = 0.0) -> ObjectAsset:
+    """A box as a file gives it, in some unit and at some distance from the file's origin."""
+    points = np.array([[x, y, z] for x in (-0.3, 0.3) for y in (-0.5, 0.5) for z in (0.0, 1.0)]) * scale + shift
+    corners = [[0, 4, 6, 2], [1, 3, 7, 5], [0, 1, 5, 4], [2, 6, 7, 3], [0, 2, 3, 1], [4, 5, 7, 6]]
+    lines = [f"v {x:.12g} {y:.12g} {z:.12g}" for x, y, z in points]
+    faces = [part for a, b, c, d in corners for part in ((a, b, c), (a, c, d))]
+    lines += ["f " + " ".join(str(1 + corner) for corner in face) for face in faces]
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "box.obj"
+        path.write_text("\n".join(lines) + "\n")
+        return import_object(path)
+
+
+def from_a_file(scale: float = 1.0, shift: float = 0.0) -> dict[str, object]:
+    """A box in a file, which has to look like the same box at home."""
+    thing = partial(box_in_a_file, scale, shift)
+    return {"controls": SHIFT, "thing": thing, "compare": False, "beside": {"thing": box_in_a_file}}
+
+
+def outline(controls: ControlSettings) -> dict[str, object]:
+    """The mug in black on a bare sky, so that only its outline moves."""
+    return {"controls": controls, "thing": dark, "settings": BARE, "u": [0.5]}
+
+
+FINITE = "Picture and gradient are finite."
+AWAY_FROM_IT = {"controls": {"pose": {"z": [-3.0, -2.0]}}, "settings": {"pose.x": 9e3}}
+# fmt: off
+cases("geometry", seen, [
+    ("degenerate-triangles", "Faces without area change neither the picture nor the gradient.",
+     mesh(DEGENERATE, SQUARE)),
+    ("sliver-triangles", "A triangle a million times as long as wide leaves everything finite and right.",
+     mesh(SLIVER)),
+    ("coincident-faces", "Two faces in one place look like one.", mesh(TWICE, SQUARE)),
+    ("one-triangle", "Finite, and both gradients are right.", mesh(TRIANGLE)),
+    ("scale-0.01", FINITE, {"controls": {"pose": {"scale": [0.01, 0.02]}}, "u": [0.0], "compare": False}),
+    ("scale-100", FINITE, {"controls": {"pose": {"scale": [50.0, 100.0]}}, "u": [1.0], "compare": False}),
+    ("file-in-units-of-0.01", "A file in other units gives the same picture.", from_a_file(0.01)),
+    ("file-in-units-of-100", "A file in other units gives the same picture.", from_a_file(100.0)),
+    ("file-10000-sizes-off", "A mesh that its file puts 10,000 sizes from the origin gives the same picture.",
+     from_a_file(shift=1e4)),
+    ("translation-10000", "The picture is that of the scene without the object, and the gradient is zero.",
+     {"controls": {"pose": {"y": [9e3, 1e4]}}, "u": [1.0], "gradient": (None, 1e-6), "beside": AWAY_FROM_IT}),
+    ("grazing-view", "Looking along the ground, the gradient by the elevation is right.",
+     outline({"camera": {"elevation": [-10.0, 10.0]}})),
+    ("near-plane", "With the camera inside the object, picture and gradient are finite.",
+     {"controls": {"camera": {"distance": [0.05, 0.2]}}, "u": [0.5], "compare": False}),
+    ("object-fills-the-frame", "Finite where nothing but the object is seen.",
+     {"controls": {"camera": {"distance": [0.5, 0.8], "fov": 10.0}}, "u": [0.5], "compare": False}),
+    ("object-leaves-the-frame", "Half outside, the gradient by the shift is right.",
+     outline({"pose": {"x": [0.0, 2.0]}})),
+])
+# fmt: on
+
+
+@case("geometry", "million-triangles", slow=True)
+def million() -> Outcome:
+    """Finite, right, and like the coarse mesh of the same shape."""
+    fine, rough = (normalised(sphere(*counts)) for counts in ((501, 1000), (64, 128)))
+    coarse, renderer = (small(SHIFT, checked(made)) for made in (rough, fine))
+    _, slope = renderer.gradient(smooth_loss(renderer.formation.resolution), renderer.start, 0, SPP)
+    apart = float((shown(renderer, renderer.start, 0, 64) - shown(coarse, coarse.start, 0, 64)).abs().mean())
+    return seen(TEXTURE, checked(fine), evaluations=2).also(
+        check("triangles", float(len(fine.faces)), least=1e6),
+        holds("the gradient by a shift is finite", bool(torch.isfinite(slope).all())),
+        check("mean difference from a sphere of 16,000", apart, most=SAME_PICTURE),
+    )
+
+
+@case("geometry", "gimbal-angles", slow=True)
+def gimbal() -> Outcome:
+    """At a pitch of 90 degrees the gradients by angles and by the rotation vector are right."""
+    angles = {"pose": {"yaw": [-90.0, 90.0], "pitch": [45.0, 135.0], "roll": [-90.0, 90.0], "on_ground": "no"}}
+    locked = small(angles, dark, settings=BARE)
+    yaw, roll = (shown(locked, torch.tensor(u)) for u in ([0.7, 0.5, 0.5], [0.5, 0.5, 0.3]))  # yaw 36 is roll -36 here
+    free = small({"pose": {"rotation": [-90.0, 90.0], "pitch": 90.0, "on_ground": "no"}}, dark, settings=BARE)
+    worst = max(row.excess for row in compared(free, free.start + 0.1, seeds=(3, 5)))
+    return seen(angles, dark, settings=BARE, u=[0.7, 0.5, 0.5], spp=2 * SPP).also(
+        check("mean difference of yaw 36 and roll -36", float((yaw - roll).abs().mean()), most=SAME_PICTURE),
+        check("gradient error of the rotation vector", worst, most=ERROR),
+    )
+
+
+def full_turn(controls: ControlSettings) -> Outcome:
+    """0 and 360 degrees are one place: one picture, one gradient, and a step across the seam goes on."""
+    renderer = small(controls)
+    zero, one = torch.zeros_like(renderer.start), torch.ones_like(renderer.start)
+    loss = smooth_loss(renderer.formation.resolution)
+    slopes = [renderer.gradient(loss, u, 0, SPP)[1] for u in (zero, one)]
+    apart = float((shown(renderer, zero) - shown(renderer, one)).abs().mean())
+    wrapped = float(search_domain(renderer).project(one + 0.01).max())
+    size = float(slopes[0].abs().max())
+    return seen(controls, u=[0.0], compare=False).also(
+        check("mean difference of the pictures", apart, most=SAME_PICTURE),
+        check("difference of the gradients", float((slopes[0] - slopes[1]).abs().max()) / size, most=0.05),
+        check("where a step of 0.01 past the end goes", wrapped, 0.0099, 0.0101),
+    )
+
+
+TURN = "0 and 360 degrees give one picture and one gradient, and a step goes on across the seam."
+for control, name in (("pose", "yaw"), ("camera", "azimuth"), ("environment", "rotation")):
+    controls: ControlSettings = {control: {name: [0.0, 360.0]}}
+    cases("geometry", full_turn, [(f"full-turn-{control}-{name}", TURN, {"controls": controls})])

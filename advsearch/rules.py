@@ -1,0 +1,305 @@
+"""Where a model is wrong, as rules: nodes of decision trees (Breiman et al. 1984) of one half of the rows, the best by
+weighted relative accuracy (Lavrac, Flach and Zupan 1999), made shorter where that costs nothing, one after the other
+(sequential covering; Friedman and Fisher 1999). The other half says whether a rule holds.
+
+The rows are a *table*, a pandas frame: a column for each factor, float64 or a category of names in alphabetical order;
+`correct`, whether the model was right; and `unit`, of what draw a row is: rows of one unit are not independent
+(`runs.units`). ``attrs["units"]`` has the unit of each factor, so its keys are the factors.
+"""
+
+from __future__ import annotations
+
+import importlib
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+
+from advsearch import seeds
+from advsearch.attacks.units import fewer_by_chance, per_unit, share_interval
+from advsearch.errors import InputError
+from advsearch.runs.results.base import ConditionRow
+
+Mask = npt.NDArray[np.bool_]
+
+FEWEST_ROWS = 100
+"""Rows of which one half can choose and the other can count."""
+MOST_RULES = 5
+DEPTH = 3
+"""Conditions of a rule, at most."""
+TREES = 24
+LEAST_SHARE, LEAST_ROWS, LEAST_UNITS = 0.01, 12, 3
+"""Of the rows that choose, a rule covers at least so many, and as many as so many units have."""
+KEPT = 0.97
+"""Share of its weighted relative accuracy that a rule keeps when a condition is left out."""
+PASSES, BOUNDS = 3, 250
+"""How often all bounds of a rule are moved, and to how many places (quantiles) of their factor."""
+CHANCE = 0.01
+"""Probability that any rule is told that is none. Rules are tested one after the other, each only where all before it
+were told, so that each may be tested at all of it (a fixed sequence: Maurer, Hothorn and Lehmacher 1995)."""
+MOST_NEEDED = 1_000_000
+"""Rows up to which it is said how many a rule would take."""
+LEAST_GAP = 0.1
+"""By how much more often the model is wrong under a rule than elsewhere, at least."""
+
+
+# ---- tables ---------------------------------------------------------------------------------------------------------
+
+
+def observed(rows: pd.DataFrame, names: Iterable[str]) -> pd.DataFrame:
+    """Return a sweep's rows (`runs.tables`) as a table of those of some parameters that vary and that all rows have;
+    an answer that was not judged is not right."""
+    table, units = dict[str, pd.Series](), dict[str, str]()
+    for name in names:
+        column, is_names = rows[name], rows[name].dtype == "category"
+        if is_names:
+            column = column.cat.set_categories(sorted(column.unique()))
+        if column.nunique() > 1 and not column.isna().any():
+            table[name], units[name] = column, "" if is_names else rows.attrs["units"][name]
+    found = pd.DataFrame({**table, "correct": rows["correct"] == 1, "unit": rows["unit"]})
+    found.attrs["units"] = units
+    return found
+
+
+def is_independent(table: pd.DataFrame) -> bool:
+    """Return whether each row is a unit."""
+    return bool(table["unit"].is_unique)
+
+
+def interval_of(table: pd.DataFrame) -> tuple[float, float]:
+    """Return the 95 % interval of the share of right answers, over units; 0 to 1 where there is no row."""
+    if table.empty:
+        return 0.0, 1.0
+    return share_interval(per_unit(table["correct"], table["unit"]), per_unit(np.ones(len(table)), table["unit"]))
+
+
+def halves(table: pd.DataFrame, seed: int) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Return two halves, drawn by a seed, each of whole units: one to choose on and one to count on."""
+    units, places = np.unique(table["unit"], return_inverse=True)
+    order = np.random.default_rng(seeds.stream(seed, "halves")).permutation(len(units))
+    chosen = np.isin(places, order[: len(units) // 2])
+    return table[chosen], table[~chosen]
+
+
+# ---- rules ----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class RuleCondition:
+    """A part of the values of one factor: over `low` and at most `high`, or some of its names."""
+
+    factor: str
+    unit: str = ""
+    low: float = -np.inf
+    high: float = np.inf
+    options: frozenset[str] | None = None
+
+    def holds(self, table: pd.DataFrame) -> Mask:
+        """Return in which rows (n,) it does."""
+        column = table[self.factor]
+        if self.options is not None:
+            return np.asarray(column.isin(self.options))
+        values = column.to_numpy()
+        return np.asarray((values > self.low) & (values <= self.high))
+
+    @property
+    def row(self) -> ConditionRow:
+        """It as answers have it."""
+        unit = f" {self.unit}" if self.unit not in ("", "1") else ""
+        names, over, at_most = sorted(self.options or ()), f"over {self.low:g}", f"at most {self.high:g}"
+        bounds = [text for text, end in ((over, self.low), (at_most, self.high)) if np.isfinite(end)]
+        return ConditionRow(
+            parameter=self.factor,
+            unit=self.unit,
+            over=self.low if np.isfinite(self.low) else None,
+            at_most=self.high if np.isfinite(self.high) else None,
+            options=names,
+            text=f"{self.factor} {' or '.join(names) if names else ' and '.join(bounds) + unit}",
+        )
+
+
+RuleConditions = tuple[RuleCondition, ...]
+"""All of which hold, at most one for each factor."""
+
+
+def covered(conditions: RuleConditions, table: pd.DataFrame) -> Mask:
+    """Return which rows (n,) lie under all conditions."""
+    mask = np.ones(len(table), dtype=bool)
+    for one in conditions:
+        mask &= one.holds(table)
+    return mask
+
+
+@dataclass(frozen=True, eq=False)
+class CountedRule:
+    """A rule, and the rows inside it and elsewhere, of those that did not choose it and that no rule before it
+    covers."""
+
+    conditions: RuleConditions
+    inside: pd.DataFrame
+    elsewhere: pd.DataFrame
+
+    @property
+    def gap(self) -> float:
+        """By how much more often the model is right elsewhere than under it."""
+        if self.inside.empty or self.elsewhere.empty:
+            return 0.0
+        return float(self.elsewhere["correct"].mean() - self.inside["correct"].mean())
+
+    @cached_property
+    def chance(self) -> float:
+        """The probability of so few right answers under it, or fewer, if they were spread by chance."""
+        return self._chance(1.0)
+
+    @property
+    def holds(self) -> bool:
+        """Whether it is told: rows that did not choose it show it, and more than chance would."""
+        return self.gap >= LEAST_GAP and self.chance <= CHANCE
+
+    def times_needed(self) -> float | None:
+        """Return how many times as many rows, of the same shares, would tell it; None where no number would."""
+        times, rows = 1.0, len(self.inside) + len(self.elsewhere)
+        while self.gap >= LEAST_GAP and rows * times <= MOST_NEEDED:
+            if self._chance(times) <= CHANCE:
+                return times
+            times *= 1.05
+        return None
+
+    def _chance(self, times: float) -> float:
+        """That of so many times as many units."""
+        units, right = (np.concatenate([self.inside[name], self.elsewhere[name]]) for name in ("unit", "correct"))
+        under = np.arange(len(units)) < len(self.inside)
+        k, a, r, b = (per_unit(one, units) for one in (under & right, under, ~under & right, ~under))
+        return fewer_by_chance(k, a, r, b, times)
+
+
+@dataclass(frozen=True)
+class FoundRules:
+    """The rules that are told, the weightiest first, and the best one after these, if there is one to try."""
+
+    told: list[CountedRule]
+    next: CountedRule | None
+
+
+def find_rules(choosing: pd.DataFrame, counting: pd.DataFrame, seed: int) -> FoundRules:
+    """Return the rules under which the model is wrong more often than elsewhere, chosen on some rows and counted on
+    others with the same factors."""
+    rules: list[CountedRule] = []
+    for number in range(MOST_RULES):
+        conditions = _best(choosing, seeds.stream(seed, "rules", number))
+        if not conditions:
+            return FoundRules(rules, None)
+        inside = covered(conditions, counting)
+        rule = CountedRule(conditions, counting[inside], counting[~inside])
+        if not rule.holds:
+            return FoundRules(rules, rule)
+        rules.append(rule)
+        choosing, counting = choosing[~covered(conditions, choosing)], rule.elsewhere
+    return FoundRules(rules, None)
+
+
+def _best(table: pd.DataFrame, seed: int) -> RuleConditions:
+    """The candidate of the largest weighted relative accuracy, as short as it can be; none where all are worthless."""
+    wrong = ~table["correct"].to_numpy()
+    least = max(LEAST_ROWS, round(LEAST_SHARE * len(table)))
+    if not is_independent(table):
+        least = max(least, round(LEAST_UNITS * len(table) / table["unit"].nunique()))
+    if len(table) < 2 * least or not 0 < int(wrong.sum()) < len(table):
+        return ()
+    excess = wrong - wrong.mean()
+
+    def weight(conditions: RuleConditions) -> float:
+        mask = covered(conditions, table)
+        return float(excess[mask].sum()) / len(table) if int(mask.sum()) >= least else -1.0
+
+    best = max(_candidates(table, least, seed), key=weight, default=())
+    reached = weight(best) if best else 0.0
+    if reached <= 0.0:
+        return ()
+    while len(best) > 1:
+        shorter = max((best[:k] + best[k + 1 :] for k in range(len(best))), key=weight)
+        left_out = int((covered(shorter, table) & ~covered(best, table)).sum())
+        # the standard error of what is lost, so that few rows choose few conditions
+        error = math.sqrt(left_out * float(table["correct"].to_numpy().var())) / len(table)
+        if reached - weight(shorter) > max((1.0 - KEPT) * reached, error):
+            break
+        best = shorter
+    for _ in range(PASSES):
+        for place in range(len(best)):
+            moved = [(*best[:place], one, *best[place + 1 :]) for one in _moved(best[place], table)]
+            best = max([best, *moved], key=weight)
+    return best
+
+
+def _moved(condition: RuleCondition, table: pd.DataFrame) -> Iterator[RuleCondition]:
+    """The condition with its bounds elsewhere: nodes of trees lie where the nodes above them left them."""
+    if condition.options is not None:
+        return
+    quantiles = np.quantile(table[condition.factor].to_numpy(), np.linspace(0.0, 1.0, BOUNDS + 1)[1:-1])
+    for at in dict.fromkeys(float(f"{one:.3g}") for one in quantiles):
+        if condition.low > -np.inf and at < condition.high:
+            yield replace(condition, low=at)
+        if condition.high < np.inf and at > condition.low:
+            yield replace(condition, high=at)
+
+
+def _candidates(table: pd.DataFrame, least: int, seed: int) -> Iterator[RuleConditions]:
+    """The nodes of one tree of all rows and of a random forest."""
+    one_tree = import_library("sklearn.tree").DecisionTreeClassifier
+    forest = import_library("sklearn.ensemble").RandomForestClassifier
+    columns: list[npt.NDArray[np.float64]] = []
+    splits: list[tuple[RuleCondition, str | None]] = []  # of each column: everything, and the name that it is 1 of
+    for factor, unit in table.attrs["units"].items():
+        column, whole = table[factor], RuleCondition(factor, unit)
+        if column.dtype != "category":
+            columns.append(column.to_numpy())
+            splits.append((whole, None))
+            continue
+        names = column.cat.categories.tolist()
+        columns += [(column == name).to_numpy(np.float64) for name in names]
+        splits += [(replace(whole, options=frozenset(names)), name) for name in names]
+    data, right = np.stack(columns, axis=1), table["correct"].to_numpy()
+    shape = {"max_depth": DEPTH, "min_samples_leaf": least}
+    alone = one_tree(**shape, random_state=seed % 2**32)
+    several = forest(TREES, **shape, max_features=0.6, random_state=seed % 2**32)
+    seen: set[RuleConditions] = {()}
+    for fitted in (alone.fit(data, right), *several.fit(data, right).estimators_):
+        for node in _nodes(fitted.tree_, splits):
+            conditions = tuple(node[factor] for factor in table.attrs["units"] if factor in node)
+            if conditions not in seen:
+                seen.add(conditions)
+                yield conditions
+
+
+def _nodes(tree: Any, splits: list[tuple[RuleCondition, str | None]]) -> Iterator[dict[str, RuleCondition]]:
+    """What holds at each node of a tree, by factor."""
+    open_nodes: list[tuple[int, dict[str, RuleCondition]]] = [(0, {})]
+    while open_nodes:
+        node, conditions = open_nodes.pop()
+        yield conditions
+        left, right = int(tree.children_left[node]), int(tree.children_right[node])
+        if left == right:
+            continue
+        whole, name = splits[tree.feature[node]]
+        before = conditions.get(whole.factor, whole)
+        if name is None or before.options is None:
+            at = float(f"{tree.threshold[node]:.3g}")  # as it is told
+            below, above = replace(before, high=min(before.high, at)), replace(before, low=max(before.low, at))
+        else:
+            below, above = (replace(before, options=one) for one in (before.options - {name}, before.options & {name}))
+        open_nodes += [(left, {**conditions, whole.factor: below}), (right, {**conditions, whole.factor: above})]
+
+
+def import_library(name: str) -> Any:
+    """Return a module of scikit-learn, such as ``sklearn.tree``."""
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise InputError(
+            "explain needs scikit-learn, which cannot be imported: pip install 'advsearch[explain]'"
+        ) from error

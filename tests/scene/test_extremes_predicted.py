@@ -1,0 +1,229 @@
+"""Pictures that a matrix of light transport, or light on surfaces, predicts, where scenes are at their ends."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from advsearch.engine.acceptance import ACCEPTED, Deviation, levels_off, view_of
+from advsearch.engine.gradients import smooth_loss
+from advsearch.questions.stability.answer import check, holds
+from advsearch.questions.stability.scene import (
+    REFERENCE_SPP,
+    ControlSettings,
+    Thing,
+    black_and_white,
+    grey_map,
+    inward,
+    shown,
+    small,
+)
+from advsearch.questions.stability.scenes import FLASH, TEXTURE, glass
+from advsearch.questions.stability.suite import Outcome
+from advsearch.scene.assets import EnvironmentAsset
+from advsearch.scene.surface.renderer import SurfaceRenderer, why_not
+from advsearch.scene.transport.lights import BasisRenderer
+from advsearch.scene.transport.matrix import LinearRenderer
+
+TRACED = 256
+"""Samples a pixel of the traced pictures, whose noise is the same before and after a change."""
+OFF = 0.15
+"""Root mean square error of a predicted change, as a share of the change: noise of the matrix, and light that meets the
+texture twice."""
+NIGHT = grey_map(0.0)
+
+
+def right(outcome: Outcome) -> None:
+    """Everything is finite, and every check holds."""
+    assert outcome.finite and [str(number) for number in outcome.checks if not number.ok] == []
+
+
+def predicted(
+    controls: ControlSettings = TEXTURE,
+    thing: Thing = "mug",
+    *,
+    epsilon: float = 0.1,
+    off: float = OFF,
+    **scene: object,
+) -> Outcome:
+    """Predict by a matrix how a picture changes where each number goes up or down by epsilon, by chance."""
+    renderer = small(controls, thing, **scene)  # type: ignore[arg-type]
+    linear, start = LinearRenderer(renderer, renderer.start, seed=1), renderer.start
+    signs = torch.randint(0, 2, start.shape, generator=torch.Generator().manual_seed(3)) * 2.0 - 1.0
+    u = (start + epsilon * signs).clamp(0.0, 1.0)
+    traced = shown(renderer, u, 5, TRACED) - shown(renderer, start, 5, TRACED)
+    with torch.no_grad():
+        change = linear(u) - linear(start)
+    _, slope = linear.renderer.gradient(lambda picture: picture.square().mean(), u, 0, 1)
+    size = float(traced.square().mean().sqrt())
+    error = float((change - traced).square().mean().sqrt()) / size if size else float(change.abs().max())
+    checks = [
+        check("error of the predicted change, as a share of it", error, most=off),
+        holds("the derivative is there where the picture changes", bool(slope.any()) == (size > 0.0)),
+    ]
+    finite = bool(torch.isfinite(change).all() and torch.isfinite(slope).all()) and linear.non_finite == 0
+    return Outcome(checks, finite, error, measured={"entries": float(linear.entries), "rms change": size})
+
+
+MIRROR = {"material.roughness": 0.0, "material.metallic": 1.0}
+AWAY = {"pose.x": 1e4}
+# fmt: off
+PREDICTED: list[tuple[str, str, dict[str, Any]]] = [
+    ("predicted-4-texels", "Changes of a texture of 4 texels are predicted.",
+     {"controls": {"texture": {"resolution": 2}}, "slow": True}),
+    ("predicted-4096-texels", "Changes of a texture of 4,096 texels are predicted.",
+     {"controls": {"texture": {"resolution": 64}}, "slow": True}),
+    ("predicted-epsilon-1", "Changes to white and black are predicted.",
+     {"controls": {"texture": {"resolution": 8, "epsilon": 1.0}}, "epsilon": 1.0, "off": 0.3, "slow": True}),
+    ("predicted-black-and-white", "Changes of a texture that is exactly 0 and 1 are predicted.",
+     {"thing": black_and_white, "epsilon": 0.2, "off": 0.3, "slow": True}),
+    ("predicted-mirror", "Changes of a mirror's tint are predicted.",
+     {"settings": MIRROR, "off": 0.35, "slow": True}),
+    ("predicted-out-of-sight", "A texture that nobody sees changes nothing.", {"settings": AWAY}),
+    ("predicted-without-light", "A texture that no light reaches changes nothing.", {"environment": NIGHT}),
+]
+# fmt: on
+
+
+@pytest.mark.parametrize(
+    ("name", "holds", "data"),
+    [pytest.param(*row, marks=[pytest.mark.slow] * row[2].pop("slow", False), id=row[0]) for row in PREDICTED],
+)
+def test_changes_are_predicted(name: str, holds: str, data: dict[str, Any]) -> None:
+    right(predicted(**data))
+
+
+def test_a_texture_behind_glass_is_predicted() -> None:
+    """Changes of a texture behind clear glass are predicted texel by texel."""
+    right(predicted({"texture": {"resolution": 32}}, parts=[glass()]))
+
+
+def test_a_lamp_that_goes_out_is_predicted() -> None:
+    """A lamp that goes out is predicted, to darkness."""
+    lamp: ControlSettings = {"light": {"power": [0.0, 12.0]}}
+    on, out = torch.ones(1), torch.zeros(1)
+    beside = small(lamp)
+    basis, alone = BasisRenderer(beside, on, seed=1), BasisRenderer(small(lamp, environment=NIGHT), on, seed=1)
+    traced = shown(beside, out, 5, TRACED) - shown(beside, on, 5, TRACED)
+    with torch.no_grad():
+        change, black = basis(out) - basis(on), alone(out)
+    _, slope = alone.renderer.gradient(lambda picture: picture.square().mean(), out, 0, 1)
+    error = float((change - traced).norm() / traced.norm())
+    finite = all(bool(torch.isfinite(values).all()) for values in (change, black, slope))
+    checks = [
+        check("error of the predicted change, as a share of it", error, most=OFF),
+        holds("without any light the picture is black", bool((black == 0.0).all())),
+    ]
+    right(Outcome(checks, finite, error))
+
+
+# ---- light on surfaces ----------------------------------------------------------------------------------------------
+
+LEVELS = 4.0
+"""Levels of 255 by which a predicted picture may be off, root mean square. Most of that are edges: four rays a
+pixel see them, and the pictures are 24 pixels wide."""
+PAINTED: ControlSettings = {"texture": {"resolution": 8}, "camera": {}}
+
+
+def lit(
+    controls: ControlSettings = PAINTED,
+    thing: Thing = "mug",
+    *,
+    levels: float = LEVELS,
+    slope: float | None = 0.15,
+    **scene: object,
+) -> Outcome:
+    """Compare a picture by light on surfaces with a traced one, and its derivative by the texture with differences.
+
+    Args:
+        levels: by which the picture may be off.
+        slope: relative error that the derivative may have, since light that meets the texture twice is left out of it;
+            None where the picture does not depend on the texture, and it has to be 0.
+    """
+    renderer = small(controls, thing, **scene)  # type: ignore[arg-type]
+    light, u = SurfaceRenderer(renderer, renderer.start, seed=1), renderer.start
+    with torch.no_grad():
+        picture = light(u)
+    (off,) = levels_off(renderer, [picture], u, 3, TRACED)
+    textured = torch.zeros(len(u))
+    for group in renderer.space.groups:
+        textured[group.coordinates] = float(group.control == "texture")
+    light.traced = renderer.like(transfer="linear")
+    gradient = light.renderer.gradient(smooth_loss(renderer.formation.resolution), u, 0, 1)[1] * textured
+    given, wanted = inward(renderer, gradient, textured, 1, 4 * REFERENCE_SPP)
+    error = abs(given / wanted - 1.0) if wanted else abs(given)
+    seen = (
+        check("largest derivative by a texel", float(gradient.abs().max()), 0.0, 0.0)
+        if slope is None
+        else check("error of the derivative by the texture", error, most=slope)
+    )
+    hidden = textured * (gradient == 0.0)
+    light.traced = renderer
+    with torch.no_grad():
+        unseen = float((light(u * (1.0 - hidden)) - picture).abs().max())
+    checks = [
+        holds("the picture is in [0, 1]", bool((picture >= 0.0).all() and (picture <= 1.0).all())),
+        check("levels of 255 off", off, most=levels),
+        seen,
+        check("largest change where texels without a derivative become black", unseen, 0.0, 0.0),
+    ]
+    finite = bool(torch.isfinite(picture).all() and torch.isfinite(gradient).all()) and light.non_finite == 0
+    measured = {"entries": float(light.entries), "derivative": wanted, "hidden numbers": float(hidden.sum())}
+    return Outcome(checks, finite, error, measured=measured)
+
+
+HALF = np.repeat(np.repeat(np.array([1.0, 0.0], np.float32), 16)[None, :, None], 3, axis=2).repeat(16, axis=0)
+INSIDE = {"texture": {"resolution": 8}, "camera": {"distance": [0.05, 0.2]}}
+GRAZING = {"texture": {"resolution": 8}, "camera": {"elevation": [-10.0, 10.0]}}
+# fmt: off
+LIT: list[tuple[str, str, dict[str, Any]]] = [
+    ("lit-grazing-view", "Looking along the ground, picture and derivative are right.", {"controls": GRAZING}),
+    ("lit-camera-inside", "From inside the mug, where much light has met the texture before, both are right.",
+     {"controls": INSIDE, "slope": 0.4}),
+    ("lit-4-texels", "A texture of 4 texels is predicted.",
+     {"controls": {"texture": {"resolution": 2}, "camera": {}}}),
+    ("lit-black-and-white", "Texels that are exactly 0 and 1 are predicted.", {"thing": black_and_white}),
+    ("lit-unseen-texels", "Texels that the view does not meet have a derivative of 0, and change nothing.", {}),
+    ("lit-map-half-black", "A map that is half black and half white is predicted.",
+     {"environment": EnvironmentAsset("half", HALF), "levels": 1.5 * LEVELS}),
+    ("lit-map-white", "A map that is white everywhere is predicted.", {"environment": grey_map(1.0)}),
+    ("lit-map-black", "The picture is black, the derivative 0.", {"environment": NIGHT, "slope": None, "levels": 1e-6}),
+    ("lit-sun", "A sun of one texel, 300,000 times as bright as the sky, casts the shadow that is traced.",
+     {"environment": FLASH, "levels": 1.5 * LEVELS}),
+    ("lit-out-of-sight", "A texture out of sight changes nothing.", {"settings": AWAY, "slope": None}),
+]
+# fmt: on
+
+
+@pytest.mark.parametrize(("name", "holds", "data"), LIT, ids=[row[0] for row in LIT])
+def test_pictures_and_derivatives_by_light_on_surfaces_are_right(name: str, holds: str, data: dict[str, Any]) -> None:
+    right(lit(**data))
+
+
+@pytest.mark.slow
+def test_a_mirror_is_too_far_off_and_the_comparison_says_so() -> None:
+    """A mirror is too far off, and the comparison says so."""
+    off = []
+    for settings in (MIRROR, {}):
+        renderer = small(PAINTED, settings=settings, denoise="oidn")
+        with torch.no_grad():
+            picture = SurfaceRenderer(renderer, renderer.start, seed=1)(renderer.start)
+        off.append(Deviation.of([view_of(renderer, picture, renderer.start, 3, 8, lambda *at: 0.0)]).share / ACCEPTED)
+    checks = [
+        check("of a mirror, levels off as a share of what is accepted", off[0], least=1.5),
+        check("of the mug as it is", off[1], most=1.0),
+    ]
+    right(Outcome(checks))
+
+
+def test_what_stands_behind_glass_is_refused() -> None:
+    """An object behind clear glass is refused in words."""
+    reason = why_not(small(PAINTED, parts=[glass()]), ["camera"])
+    checks = [
+        holds("it says that there is more in the scene", reason is not None and "more in the scene" in reason),
+        holds("without the glass it is not refused", why_not(small(PAINTED, denoise="oidn"), ["camera"]) is None),
+    ]
+    right(Outcome(checks))
