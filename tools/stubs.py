@@ -49,8 +49,7 @@ def text() -> str:
         if not isinstance(getattr(made, "__signature__", None), keywords._Signature):
             imports.add(f"from {made.__module__} import {name} as {name}")
             continue
-        inner, star = inspect.unwrap(made), False
-        lines: list[str] = []
+        inner, lines, star = inspect.unwrap(made), list[str](), False
         signature = made.__signature__
         hints = [str(signature.return_annotation).replace("loading.", "")]
         for one in signature.parameters.values():

@@ -206,11 +206,11 @@ def _objective_over(trials: Sequence[Judgement]) -> results.ObjectiveValues | No
 def _printability(problem: Problem, findings: Findings) -> results.Printability:
     """The print terms, and the margin of the answer beside that of the search without them, if both were verified."""
     space, domain = problem.searched_space, problem.domain
-
-    def terms(search: SearchResult) -> results.PrintTerms:
-        return print_terms(space, domain.project(search.best_u))
-
     cost = None
+
+    def terms(found: SearchResult) -> results.PrintTerms:
+        return print_terms(space, domain.project(found.best_u))
+
     verified, other, unprinted = findings.verification, findings.unprinted_verification, findings.unprinted
     if verified is not None and other is not None and unprinted is not None:
         ours, theirs = (verified_rate(one) for one in (verified, other))

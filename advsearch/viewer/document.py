@@ -126,7 +126,6 @@ def _policy(digests: Iterable[str], *, connects: bool) -> str:
     return f"default-src 'none'; img-src {images}; style-src 'unsafe-inline'{scripts}{connect}; base-uri 'none'"
 
 
-@cache
 def served_policy(*, own: bool) -> str:
     """Return the `Content-Security-Policy` that a server sends.
 

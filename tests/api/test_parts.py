@@ -14,7 +14,8 @@ from advsearch.api.studies import chains_of
 from advsearch.cluster import Done, Work, Workforce
 from advsearch.config import AttackConfig
 from advsearch.errors import ClusterError
-from advsearch.questions.attack.carry_out import attack_from_config
+from advsearch.question import Asked, answered
+from advsearch.questions.attack.several import curve
 from advsearch.questions.gap import GapConfig, gap
 from advsearch.runs.store import NAME, Store
 from advsearch.runs.summary import read_answer
@@ -102,9 +103,9 @@ def test_a_shared_curve_tries_no_epsilon_more_than_one_that_was_made_here(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     small = AttackConfig.of(SMALL, controls={"texture": {"resolution": 2}}, epsilon="0.02,0.01", average=0)
-    alone: Any = attack_from_config(small.model_copy(update={"run": str(tmp_path / "alone")}))
+    alone = answered(curve, Asked(small.model_copy(update={"run": str(tmp_path / "alone")})))
     elsewhere(monkeypatch)
-    shared: Any = attack_from_config(small.model_copy(update={"run": str(tmp_path / "shared"), "workers": 2}))
+    shared = answered(curve, Asked(small.model_copy(update={"run": str(tmp_path / "shared"), "workers": 2})))
     assert shared.parts == alone.parts and shared.curve == alone.curve
     for name in alone.parts:
         assert rows(tmp_path / "shared" / "parts" / name) == rows(tmp_path / "alone" / "parts" / name)

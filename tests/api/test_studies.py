@@ -22,8 +22,9 @@ from advsearch.cli.output import shown_text as region_text
 from advsearch.config import AttackConfig
 from advsearch.engine.transport import CleanMatrix
 from advsearch.errors import InputError, UnknownNameError
+from advsearch.question import Asked, answered
 from advsearch.questions.attack import carry_out as attacking
-from advsearch.questions.attack.carry_out import attack_from_config
+from advsearch.questions.attack.several import curve
 from advsearch.questions.gap import GapConfig, gap
 from advsearch.questions.region import growing, region
 from advsearch.questions.region.answer import RegionConfig
@@ -70,7 +71,7 @@ def summary_of(config: AttackConfig, run: str) -> AttackSummary:
 
 def test_a_curve_counts_robust_objects_at_each_epsilon(asked: list[AttackConfig]) -> None:
     config = AttackConfig(object="mug,bowl,vase,pan", epsilon="0.1,0.01,0.05", run="study")
-    summary: Any = attack_from_config(config)
+    summary = answered(curve, Asked(config))
     told = [(one.epsilon, one.robust, one.found, one.already_wrong) for one in summary.curve]
     assert told == [(0.01, 3, 0, 1), (0.05, 2, 1, 1), (0.1, 1, 2, 1)]
     low, high = summary.curve[1].interval
@@ -87,7 +88,7 @@ def test_a_curve_counts_robust_objects_at_each_epsilon(asked: list[AttackConfig]
 
 
 def test_a_label_for_several_objects_says_whose_own_it_is_not(asked: list[AttackConfig]) -> None:
-    summary: Any = attack_from_config(AttackConfig(object="mug,bowl", label="mug", run="curve"))
+    summary = answered(curve, Asked(AttackConfig(object="mug,bowl", label="mug", run="curve")))
     assert any("also for bowl (its own is 'bowl')" in text for text in summary.warnings)
 
 
@@ -103,7 +104,7 @@ def test_an_attack_on_several_objects_or_epsilons_is_a_curve(
 
 
 def test_several_objects_and_one_budget_make_one_row_each(asked: list[AttackConfig]) -> None:
-    summary: Any = attack_from_config(AttackConfig(object="mug,pan", run="study"))
+    summary = answered(curve, Asked(AttackConfig(object="mug,pan", run="study")))
     assert [row.ending for row in summary.table] == ["found", "budget spent"]
     assert [one.robust for one in summary.curve] == [1] and len(asked) == 2
 

@@ -18,7 +18,8 @@ import advsearch
 from advsearch.config import AttackConfig
 from advsearch.engine import acceptance
 from advsearch.engine import transport as searching
-from advsearch.questions.attack.carry_out import attack_from_config
+from advsearch.question import Asked, answered
+from advsearch.questions.attack.several import curve
 from advsearch.runs.summary import attack_of
 from advsearch.scene.mitsuba_backend.transport import Vertices
 from advsearch.scene.renderer import Renderer
@@ -217,7 +218,7 @@ def test_a_curve_over_epsilon_is_searched_with_one_matrix(monkeypatch: pytest.Mo
     monkeypatch.setattr(searching, "predicting", counted)
     settings: Any = {**SMALL, "baseline": False, "average": 0, "resolution": (SIZE, SIZE)}
     config = AttackConfig(object="mug", epsilon="0.002,0.004", run=str(tmp_path / "curve"), **settings)
-    found: Any = attack_from_config(config)
+    found = answered(curve, Asked(config))
     assert made == 1 and [one.robust for one in found.curve] == [1, 1]
     alone = advsearch.attack("mug", epsilon=0.004, run=tmp_path / "alone", **settings)
     shared = attack_of(tmp_path / "curve" / "parts" / found.parts[1])
