@@ -296,7 +296,7 @@ def test_a_judgement_needs_more_than_noise() -> None:
     turned = agreement(Estimate("x", -1.0, 0.06, 9, 1.0), sure)
     assert (turned.status, turned.bias, turned.noise) == ("biased", 2.0, 0.06)
     assert turned.doubt == pytest.approx(0.05, rel=1e-2)
-    assert turned.excess == 2.0 - turned.doubt
+    assert turned.doubt is not None and turned.excess == 2.0 - turned.doubt
     assert agreement(Estimate("x", 1.0, 0.5, 9, 1.0), sure).status == "noisy"
     unsure = Reference(0.1, 0.5, (0.6, 0.1), 8)
     assert agreement(Estimate("x", 0.4, 0.1, 9, 1.0), unsure).status == "reference unusable"

@@ -58,7 +58,14 @@ def test_an_exact_operation_is_differentiated_any_number_of_times(made: Any) -> 
     dense = torch.stack([operation(one).detach().flatten() for one in torch.eye(10, dtype=torch.float64)], dim=1)
     x = torch.from_numpy(np.random.default_rng(0).normal(size=10)).requires_grad_()
     found = []
-    for of in (lambda at: operation(at).flatten(), lambda at: dense @ at):
+
+    def by_operation(at: Tensor) -> Tensor:
+        return operation(at).flatten()  # type: ignore[no-any-return]
+
+    def by_matrix(at: Tensor) -> Tensor:
+        return dense @ at
+
+    for of in (by_operation, by_matrix):
         value, derivatives = of(x).pow(3).sum(), list[Tensor]()
         for _ in range(3):
             (slope,) = torch.autograd.grad(value, x, create_graph=True)

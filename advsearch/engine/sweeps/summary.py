@@ -75,7 +75,7 @@ class Answers:
     and whether it is wrong, its margin, NaN where that is no number, and what it is."""
 
     def __init__(self, total: int) -> None:
-        self.seen, self.right, self._wrong = np.zeros((3, total), dtype=bool)
+        self.seen, self.right, self._wrong = (np.zeros(total, dtype=bool) for _ in range(3))
         self.margin = np.full(total, np.nan)
         self._labels, self._names = np.zeros(total, np.uint32), dict[str, int]()
 
