@@ -75,7 +75,8 @@ class Answers:
     and whether it is wrong, its margin, NaN where that is no number, and what it is."""
 
     def __init__(self, total: int) -> None:
-        self.seen, self.right, self._wrong = (np.zeros(total, dtype=bool) for _ in range(3))
+        self.seen: npt.NDArray[np.bool_] = np.zeros(total, dtype=bool)
+        self.right, self._wrong = self.seen.copy(), self.seen.copy()
         self.margin = np.full(total, np.nan)
         self._labels, self._names = np.zeros(total, np.uint32), dict[str, int]()
 
