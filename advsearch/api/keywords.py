@@ -1,8 +1,8 @@
 """The settings of each question as keywords: what Python callers may write for them.
 
-A setting is declared in `advsearch/config/`: its default, its range, what it is. Here stands only what may be written
-for it in Python, which is more than the text of a file, for editors and type checkers (PEP 692). Signatures and
-docstrings are made from both (`asks`).
+A setting is declared once: its default, its range, what it is. In Python more may be written for it than the text of a
+file (`hint_of`). Signatures and docstrings are made from both (`asks`), and of these what type checkers read
+(`tools/stubs.py`).
 """
 
 from __future__ import annotations
@@ -13,10 +13,8 @@ import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from functools import wraps
-from pathlib import Path
-from typing import Any, Literal, TypedDict, TypeVar
+from typing import Any, TypeVar
 
-import numpy as np
 from torch import nn
 
 from advsearch.calls import check_types, unexpected
@@ -32,70 +30,6 @@ from advsearch.settings import Config, as_python, is_shallow, settings
 
 Names = str | Sequence[str]
 """Names in a list, or in a text with commas between them."""
-Named = str | Mapping[str, object]
-"""A name, or a mapping with a `name` and options."""
-
-
-class RunKeywords(TypedDict, total=False):
-    """Where a run is kept."""
-
-    run: str | Path | None
-    overwrite: bool
-
-
-class RenderedKeywords(TypedDict, total=False):
-    """Light, pictures and machine, of every question that renders."""
-
-    environment: Path | Names | None
-    set: Mapping[str, float | str | Sequence[float]] | None
-    exposure: float | None
-    resolution: int | str | tuple[int, int] | None
-    labels: Path | Names | None
-    prompt: Names | None
-    texture_resolution: int | None
-    denoise: Literal["oidn", "none"]
-    pixel_sampler: Literal["independent", "multijitter"]
-    seed: int
-    threads: int | None
-    deterministic: bool
-
-
-class PictureKeywords(RenderedKeywords, total=False):
-    """And scene, of every question about one."""
-
-    up: Literal["y", "z"] | None
-    camera: str | None
-    label: int | np.integer[Any] | Names | None
-
-
-class NamedKeywords(RunKeywords, total=False):
-    """What a question takes by name."""
-
-    task: Named
-    controls: loading.Controls
-
-
-class DerivativeKeywords(PictureKeywords, total=False):
-    """Of every question that differentiates a scene."""
-
-    spp: int | Literal["auto"] | None
-    epsilon: float | Mapping[str, float] | None
-    norm: Literal["linf", "l2"] | None
-    estimators: str | Mapping[str, str]
-    specialise: bool
-
-
-class SampledKeywords(PictureKeywords, total=False):
-    """Of what sweeps."""
-
-    spp: int | None
-    sampler: Literal["sobol", "random"]
-    batch: int
-    keep_pictures: Literal["all", "wrong", "none"]
-    specialise: bool
-    workers: int | None
-    cluster: str | None
-    overwrite: bool
 
 
 LOADED = (loading.Scene, Model, nn.Module)
@@ -133,18 +67,12 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 Made = TypeVar("Made", bound=Config)
 
 
-def asks(config: type[Config], keywords: type[Any] | None = None) -> Callable[[Function], Function]:
+def asks(config: type[Config]) -> Callable[[Function], Function]:
     """Give a function that takes settings as `**settings` the signature and the docstring that they come to.
 
     Every setting becomes a keyword with the default that it is declared with, and a line among the arguments. One that
     the function has of its own stays as it is there.
-
-    Args:
-        config: declares the settings.
-        keywords: says what may be written for them; None derives that from what they are.
     """
-    written = {} if keywords is None else keywords.__annotations__
-    hints = {name: hint.__forward_arg__ for name, hint in written.items()}
 
     def decorate(function: Function) -> Function:
         own = inspect.signature(function)
@@ -154,7 +82,7 @@ def asks(config: type[Config], keywords: type[Any] | None = None) -> Callable[[F
             name = one.field.removesuffix("_")
             if name in own.parameters or one.required:
                 continue
-            hint = hints.get(name) or hint_of(one.field, config.model_fields[one.field].annotation)
+            hint = hint_of(one.field, config.model_fields[one.field].annotation)
             added.append(inspect.Parameter(name, ONLY_BY_NAME, default=one.default, annotation=hint))
             lines.append(textwrap.fill(f"{name}: {one.text}", 110, subsequent_indent="    "))
         signature = _Signature([*plain, *added], return_annotation=own.return_annotation)
@@ -215,6 +143,10 @@ WRITTEN = {
 """What may be written for some settings beside what they become."""
 
 
+LISTED = (*SEVERAL, "prompt", "vary", "ways", "quantities", "samplers", "case", "group")
+"""Settings that may be a list of names."""
+
+
 def hint_of(field: str, kind: Any) -> str:
     """Return what Python callers may write for a setting that is declared as `kind`: for a text also a path, and for
     what may be several names a list."""
@@ -223,7 +155,7 @@ def hint_of(field: str, kind: Any) -> str:
         return WRITTEN[field]
     match = re.fullmatch(r"Optional\[(.*)\]", text)
     parts = [match[1], "None"] if match else re.split(r" \| (?![^\[]*\])", text)
-    wider = {"str": "Path | Names" if field in (*SEVERAL, "prompt", "vary", "ways") else "str | Path"}
+    wider = {"str": "Path | Names" if field in LISTED else "str | Path"}
     return " | ".join(re.sub(r"^dict\[.*", "Mapping[str, Any]", wider.get(one, one)) for one in parts)
 
 

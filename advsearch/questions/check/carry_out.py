@@ -6,13 +6,12 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from pydantic import TypeAdapter
-from typing_extensions import Unpack
 
 from advsearch import seeds
-from advsearch.api.keywords import DerivativeKeywords, NamedKeywords, asks, configured
+from advsearch.api.keywords import asks, configured
 from advsearch.controls import CONTROLS
 from advsearch.engine.attack_parts import LOADING, problem_from_config
 from advsearch.engine.gradients import FACTORS, attempts, derivatives, inside, smooth_loss
@@ -41,14 +40,6 @@ from advsearch.scene.description import DEFAULT_ENVIRONMENT
 from advsearch.scene.gradients import BY_ADJOINT, BY_DIFFERENCES
 from advsearch.scene.mitsuba_backend.material_adjoint import LIMITS
 
-
-class CheckKeywords(DerivativeKeywords, NamedKeywords, total=False):
-    objective: str | None
-    seconds: float | None
-    all: bool
-    loss: Literal["linear", "model", "both"]
-
-
 SCENES = (("mug", "studio"), ("bowl", "kitchen"), ("bottle", "noon"))
 """Bundled scenes that `check --all` goes through."""
 RAW_SPP = 16
@@ -65,13 +56,13 @@ Finding = CheckedRow | SearchPlan | PathLength | GainRow | TexelRow
 FINDINGS: TypeAdapter[list[Finding]] = TypeAdapter(list[Finding])
 
 
-@asks(CheckConfig, CheckKeywords)
+@asks(CheckConfig)
 def check(
     object: Scene | str | Path = "mug",
     model: AnyModel = "reference",
     *,
     progress: Watched = None,
-    **settings: Unpack[CheckKeywords],
+    **settings: Any,
 ) -> CheckResult:
     """Compare every gradient of a scene with differences, and plan a search over it (docs/gradients.md)."""
     config = configured(CheckConfig, object=object, model=model, **settings)

@@ -9,13 +9,12 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Literal, cast
+from typing import Any, cast
 
 import torch
-from typing_extensions import Unpack
 
 from advsearch import seeds, threads
-from advsearch.api.keywords import DerivativeKeywords, NamedKeywords, Names, asks, configured
+from advsearch.api.keywords import asks, configured
 from advsearch.cluster.worker import processor
 from advsearch.engine.attack_parts import LOADING, problem_from_config
 from advsearch.engine.gradients import Loss, inside, smooth_loss
@@ -52,17 +51,6 @@ from advsearch.scene.formation import next_count
 from advsearch.settings import split_names
 from advsearch.viewer.pages import keep_answer
 
-
-class PrecisionKeywords(DerivativeKeywords, NamedKeywords, total=False):
-    objective: str | None
-    quantities: Names
-    seconds: float
-    error: float
-    rounds: int
-    samplers: Names
-    loss: Literal["linear", "model"]
-
-
 SHARES = {"image": 0.6, "gradient": 0.4}
 """Of the time, by quantity; what one doesn't use is the others'."""
 REFERENCE_SHARE = 0.35
@@ -72,13 +60,13 @@ CONFIRM_SHARE, CONFIRM_LEAST, CONFIRM_MOST = 0.4, 4, 64
 count, and at most."""
 
 
-@asks(PrecisionConfig, PrecisionKeywords)
+@asks(PrecisionConfig)
 def precision(
     object: Scene | str | Path = "mug",
     model: AnyModel = "reference",
     *,
     progress: Watched = None,
-    **settings: Unpack[PrecisionKeywords],
+    **settings: Any,
 ) -> PrecisionResult:
     """Measure error against run time of a scene and its gradients (docs/precision.md)."""
     config = configured(PrecisionConfig, object=object, model=model, **settings)

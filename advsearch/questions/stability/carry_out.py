@@ -5,12 +5,11 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-
-from typing_extensions import Unpack
+from typing import Any
 
 import advsearch.questions.stability.scenes
 import advsearch.questions.stability.stiff  # noqa: F401  (both fill `CASES`)
-from advsearch.api.keywords import Names, RunKeywords, asks, configured
+from advsearch.api.keywords import asks, configured
 from advsearch.engine.record import Results, kept_rows
 from advsearch.errors import UnknownNameError
 from advsearch.progress import NullProgress, Progress, Watched, watcher
@@ -20,6 +19,7 @@ from advsearch.questions.stability.suite import CASES, Case
 from advsearch.runs.directory import RunDirectory
 
 
+<<<<<<< HEAD
 class StabilityKeywords(RunKeywords, total=False):
     case: Names | None
     group: Names | None
@@ -29,6 +29,11 @@ class StabilityKeywords(RunKeywords, total=False):
 @asks(StabilityConfig, StabilityKeywords)
 def stability(*, progress: Watched = None, **settings: Unpack[StabilityKeywords]) -> StabilityResult:
     """Try stiff and extreme scenes, and say whether each of them holds (docs/stability.md)."""
+=======
+@asks(StabilityConfig)
+def stability(*, progress: Watched = None, **settings: Any) -> StabilityResult:
+    """Try extreme scenes, objectives and arithmetic, and say whether each of them holds (docs/stability.md)."""
+>>>>>>> w-findings
     return stability_from_config(configured(StabilityConfig, **settings), progress=watcher(progress))
 
 
