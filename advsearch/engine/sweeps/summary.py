@@ -99,7 +99,7 @@ class Answers:
     def frequent(self) -> dict[str, int]:
         """How often each of the most frequent wrong answers was given, the most frequent first."""
         names = list(self._names)
-        answers = Counter(names[label] for label in self._labels[self._wrong])
+        answers = Counter(names[label] for label in self._labels[np.flatnonzero(self._wrong)])
         return dict(sorted(answers.most_common(MOST_ANSWERS), key=lambda one: (-one[1], one[0])))
 
     def beside(self, models: Sequence[str], units: Units) -> list[PairedRates]:

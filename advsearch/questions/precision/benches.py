@@ -314,7 +314,8 @@ class Gradients:
                 """Of each coordinate the derivative, extrapolated to a step of zero, and how far two steps differ."""
                 of = partial(reference, self._exact, self._loss, self._u, seed=noise, spp=spp, repeats=(1, 1))
                 rows = [(found.value, found.steps[0] - found.steps[1]) for found in map(of, along)]
-                return np.array(rows, dtype=np.float64).T
+                table: Array = np.array(rows, dtype=np.float64).T
+                return table
 
             spp = part_samples(partial(both, 0), budget.left, parts=3, counts=(16, 64, 256))
             parts = gather(partial(both, spp=spp), budget, on_done, seed)

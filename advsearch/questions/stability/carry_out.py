@@ -19,21 +19,9 @@ from advsearch.questions.stability.suite import CASES, Case
 from advsearch.runs.directory import RunDirectory
 
 
-<<<<<<< HEAD
-class StabilityKeywords(RunKeywords, total=False):
-    case: Names | None
-    group: Names | None
-    seconds: float | None
-
-
-@asks(StabilityConfig, StabilityKeywords)
-def stability(*, progress: Watched = None, **settings: Unpack[StabilityKeywords]) -> StabilityResult:
-    """Try stiff and extreme scenes, and say whether each of them holds (docs/stability.md)."""
-=======
 @asks(StabilityConfig)
 def stability(*, progress: Watched = None, **settings: Any) -> StabilityResult:
-    """Try extreme scenes, objectives and arithmetic, and say whether each of them holds (docs/stability.md)."""
->>>>>>> w-findings
+    """Try stiff and extreme scenes, and say whether each of them holds (docs/stability.md)."""
     return stability_from_config(configured(StabilityConfig, **settings), progress=watcher(progress))
 
 
