@@ -99,14 +99,15 @@ class Answers:
     def frequent(self) -> dict[str, int]:
         """How often each of the most frequent wrong answers was given, the most frequent first."""
         names = list(self._names)
-        answers = Counter(names[label] for label in self._labels[np.flatnonzero(self._wrong)])
+        answers = Counter(names[label] for label in self._labels[self._wrong])
         return dict(sorted(answers.most_common(MOST_ANSWERS), key=lambda one: (-one[1], one[0])))
 
     def beside(self, models: Sequence[str], units: Units) -> list[PairedRates]:
         """Return both rates of each model without and with an answer, of the pairs of which both are known: the second
         half of the configurations are the first with the answer."""
         halves = (2, -1, len(models))
-        found, seen = list[PairedRates](), self.seen.reshape(halves).all(axis=0)
+        found = list[PairedRates]()
+        seen: npt.NDArray[np.bool_] = np.logical_and(*self.seen.reshape(halves))
         for model, name in enumerate(models):
             known = np.flatnonzero(seen[:, model])
             before, after = self.right.reshape(halves)[:, known, model]
