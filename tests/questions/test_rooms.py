@@ -83,6 +83,6 @@ def test_the_question_of_the_docs_is_one_file(tmp_path: Path) -> None:
     assert "There are 2 files." in (tmp_path / "runs" / "kept" / "report.html").read_text()
     again = told("-m", "advsearch", "run", "runs/kept/run.yaml", "runs=first", "--json", "--run", "again")
     assert json.loads(again)["files"] == {"first": 1}
-    called = "import advsearch, inspect; print(inspect.signature(advsearch.count)); "
-    python = told("-c", f"{called} print(advsearch.count('first', run='third'), advsearch.load_run('third'))")
+    called = "import advsearch, inspect; from advsearch import count; print(inspect.signature(count)); "
+    python = told("-c", f"{called} print(count('first', run='third'), advsearch.load_run('third'))")
     assert "(runs: 'str | Path'" in python and python.count("files={'first': 1}") == 2
