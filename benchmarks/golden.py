@@ -339,7 +339,9 @@ def timeless(value: Any) -> Any:
 
 def passing(key: str) -> bool:
     """Whether a key is about time or place."""
-    return key in PLACES or any(word in key.lower().split(".")[-1].split("_") or key.endswith("seconds") for word in TIMES)
+    return key in PLACES or any(
+        word in key.lower().split(".")[-1].split("_") or key.endswith("seconds") for word in TIMES
+    )
 
 
 def differences(kept: Any, found: Any, place: str = "") -> Iterator[str]:

@@ -241,7 +241,7 @@ def test_several_epsilons_are_not_the_first_one(asked: Callable[..., Any], scene
         with pytest.raises(InputError, match=r"^epsilon: expected one, got 0\.[15], 0\.2.*; attack with each, or have"):
             asked(scene, epsilon=several)
     for one in (0.5, [0.5], np.float32(0.5), torch.tensor(0.5), np.array([0.5])):
-        assert asked(scene, epsilon=one).controls[0].epsilon == 0.5
+        assert asked(scene, epsilon=one).controls[0].chosen["epsilon"] == 0.5
 
 
 def test_what_an_attack_takes_beside_its_settings_is_read_as_they_are(asked: Callable[..., Any]) -> None:

@@ -32,7 +32,6 @@ POWERS: dict[str, Any] = {
     "junit": "precious",
     "sarif": "precious",
     "markdown": "precious",
-    "out": "precious",
     "add": "theirs",
     "update": True,
 }
