@@ -20,7 +20,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from queue import LifoQueue
+from queue import Empty, LifoQueue
 from typing import Any
 
 from advsearch.errors import InputError
@@ -146,6 +146,9 @@ class Clients:
         """End `serve`, and let the workers end."""
         self._closed.set()
         self._ended.wait()
+        with suppress(Empty):
+            while (job := self._ready.get_nowait()) is not None:  # behind `None` no worker comes to them
+                job[0].close()
         for _ in range(WORKERS):
             self._ready.put(None)
 

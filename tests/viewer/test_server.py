@@ -232,6 +232,25 @@ def test_those_who_say_nothing_do_not_fill_the_server(server: Dashboard, monkeyp
         assert ask(server, "/")[0].status == 200
 
 
+def test_who_waits_when_it_closes_is_hung_up_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No worker is there to serve one that has asked."""
+    monkeypatch.setattr("advsearch.viewer.clients.WORKERS", 0)
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        served = clients.Clients(listening, lambda connection, address: None, None)
+        thread = threading.Thread(target=served.serve)
+        thread.start()
+        with socket.create_connection(listening.getsockname()) as asking:
+            asking.sendall(b"GET / HTTP/1.0\r\n\r\n")
+            while served._ready.empty():
+                time.sleep(0.01)
+            served.close()
+            asking.settimeout(10.0)
+            with suppress(ConnectionResetError):  # what it has said was never read
+                assert asking.recv(1) == b""
+            assert served._ready.empty()
+        thread.join()
+
+
 @contextmanager
 def slow_clients(server: Dashboard, count: int, begun: bytes) -> Iterator[list[socket.socket]]:
     """Clients that have begun to ask, and go on with a letter now and then."""
