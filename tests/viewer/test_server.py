@@ -208,6 +208,7 @@ def test_beyond_this_machine_the_token_is_asked_for(run: Path) -> None:
 def test_a_thousand_at_once_are_answered(server: Dashboard) -> None:
     """All are connected and have asked before the first answer is read; the server has no more threads than before."""
     asked = f"GET /runs/first/pictures/0000/1.jpg HTTP/1.0\r\nHost: 127.0.0.1:{server.server_port}\r\n\r\n".encode()
+    assert ask(server, "/")[0].status == 200  # its threads have begun
     threads, counts = threading.active_count(), []
     with ExitStack() as stack:
         talks = [
