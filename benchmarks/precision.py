@@ -26,7 +26,7 @@ threads.configure()
 from advsearch.engine.attack_parts import problem_from_config  # noqa: E402
 from advsearch.engine.gradients import inside, smooth_loss  # noqa: E402
 from advsearch.questions.precision.answer import Recommended  # noqa: E402
-from advsearch.questions.precision.benches import Gradients, Pictures, TimeBudget, gradient_parts  # noqa: E402
+from advsearch.questions.precision.benches import GradientBench, PictureBench, TimeBudget, gradient_parts  # noqa: E402
 from advsearch.questions.precision.carry_out import precision_from_config  # noqa: E402
 from advsearch.questions.precision.rule import ReferenceValue, Setting, point_of  # noqa: E402
 from advsearch.questions.precision.settings import PrecisionConfig  # noqa: E402
@@ -151,13 +151,13 @@ def measured(config: PrecisionConfig, found: Recommended) -> tuple[float, bool]:
     bench: Any
     if found.quantity == "picture":
         samplers = dict.fromkeys(("multijitter", found.estimator.partition(" ")[0]))
-        bench = Pictures(renderer, problem.whole(problem.domain.start), lambda picture: 1.0, list(samplers))
+        bench = PictureBench(renderer, problem.whole(problem.domain.start), lambda picture: 1.0, list(samplers))
     else:
         renderer = renderer.like(denoiser="none", transfer="linear")
         renderer.plan = renderer.plan.at_a_pixel()
         part = next(one for one in gradient_parts(renderer.plan.groups, linear=True) if one.name == found.control)
         loss = smooth_loss(renderer.formation.resolution, config.seed)
-        bench = Gradients(renderer, loss, inside(renderer), part)
+        bench = GradientBench(renderer, loss, inside(renderer), part)
     bench.refer(budget, SEED, lambda: None)
     samples = [bench.measure(setting, SEED + number)[found.quantity] for number in range(REPEATS)]
     point = point_of(setting, samples, floor=bench.floor(setting, found.quantity))

@@ -67,7 +67,7 @@ class Named(Mapping[str, Tensor]):
         return len(self._each[0])
 
 
-class Asked:
+class ConfigurationInputs:
     """Gives what is asked for at N configurations (d,) of the whole space, which differ in nothing that is searched;
     `used` says whether anything was. The searched controls come first there."""
 

@@ -20,7 +20,7 @@ from advsearch.controls import Space
 from advsearch.described import Value
 from advsearch.engine.acceptance import ComparedView, view_of
 from advsearch.engine.judging import Described, KnownTruths, Looked, Metrics, judgements, mean_metrics
-from advsearch.engine.objective import Asked, domain_of
+from advsearch.engine.objective import ConfigurationInputs, domain_of
 from advsearch.models import Model
 from advsearch.runs.results.base import GroupDerivative, PlannedGradient
 from advsearch.scene.description import NO_MAP
@@ -211,9 +211,9 @@ class Problem:
             return self._truths.at(start)
         return self.task.truth(self.facts(lambda: self.space.describe(start), lambda: self.renderer.surfaces(start)))
 
-    def asked(self, *wholes: Tensor) -> Asked:
+    def asked(self, *wholes: Tensor) -> ConfigurationInputs:
         """Return what gives the objective more than pictures, at configurations of the whole space."""
-        return Asked(self.space, self.searched_space, wholes)
+        return ConfigurationInputs(self.space, self.searched_space, wholes)
 
     def describe(self, u: Tensor, draw: int | None = None) -> dict[str, Value]:
         """Say a configuration of the searched controls in named values with units, under the conditions of a draw, by
@@ -264,7 +264,7 @@ class Problem:
         lost = self.renderer.non_finite - before
         return replace(answer, non_finite=lost) if lost else answer
 
-    def _values(self, outputs: Output, pictures: Tensor, truth: Truth, asked: Asked) -> Tensor:
+    def _values(self, outputs: Output, pictures: Tensor, truth: Truth, asked: ConfigurationInputs) -> Tensor:
         """The objective of pictures (N, H, W, 3), (N,)."""
         if self.objective is None:
             raise RuntimeError("a sweep has no objective")

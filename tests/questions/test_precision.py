@@ -33,7 +33,7 @@ from advsearch.questions.precision.benches import (
     COUNTS,
     LEAST,
     MOST_PARTS,
-    Gradients,
+    GradientBench,
     TimeBudget,
     gather,
     gradient_parts,
@@ -488,7 +488,7 @@ def test_an_adjoint_is_compared_with_a_reference_by_an_adjoint_that_differences_
     renderer = renderer.like(transfer="linear")
     renderer.plan = renderer.plan.at_a_pixel()
     (part,) = gradient_parts(renderer.plan.groups, linear=True)
-    bench = Gradients(renderer, smooth_loss((24, 24)), renderer.start, part)
+    bench = GradientBench(renderer, smooth_loss((24, 24)), renderer.start, part)
     (row,) = bench.refer(TimeBudget(1.0), 0, lambda: None)
     assert (row.reference, row.control, row.quantity) == ("adjoint", "texture", "gradient") and row.error < 0.5
     numbers = bench.measure(next(one for one in bench.settings if one.spp == 256), 1)["gradient"]
@@ -597,7 +597,7 @@ def test_a_part_that_is_measured_is_kept_and_not_measured_again(
     kept = read_result(folder)
     assert kept.to_dict() == stopped.to_dict() and not finished(folder)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(measuring, "Pictures", lambda *_: pytest.fail("measured again"))
+        patch.setattr(measuring, "PictureBench", lambda *_: pytest.fail("measured again"))
         assert main(["resume", str(folder), "--json", "--quiet"]) == 0
     report = PrecisionResult.of(json.loads(capsys.readouterr().out))
     assert report.ending == "done" and finished(folder) and len(report.figures) == 2

@@ -155,7 +155,7 @@ FIRST, LATER = ("independent", "multijitter", "independent" + OIDN), 6.0
 """Lines that are measured first where time is short; the others count as so many times as dear."""
 
 
-class Pictures:
+class PictureBench:
     """Renders one configuration (d,) with every sampler, with some of them denoised too, and compares the pictures and
     the model's margin on them with references. Pictures with and without denoiser have the same, margins their own."""
 
@@ -280,7 +280,7 @@ def gradient_parts(groups: Sequence[Group], *, linear: bool) -> list[GradientPar
     return parts
 
 
-class Gradients:
+class GradientBench:
     """Takes gradients (d,) of one part of a space at u by every estimator and compares them with a reference, which is
     taken with a better sampler: differences at two steps where the coordinates are few, else the mean of an adjoint."""
 

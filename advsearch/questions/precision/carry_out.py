@@ -34,9 +34,9 @@ from advsearch.questions.precision.answer import (
 )
 from advsearch.questions.precision.benches import (
     OIDN,
+    GradientBench,
     GradientPart,
-    Gradients,
-    Pictures,
+    PictureBench,
     TimeBudget,
     gradient_parts,
     in_rounds,
@@ -184,12 +184,12 @@ class Measurement:
         problem = self._problem
         u = problem.whole(problem.domain.start)
         samplers = split_names(self._config.samplers)
-        bench = Pictures(problem.renderer, u, lambda picture: -problem.judge(picture, u).score, samplers)
+        bench = PictureBench(problem.renderer, u, lambda picture: -problem.judge(picture, u).score, samplers)
         return self._sitting("the picture", bench, budget)
 
     def _gradients(self, part: GradientPart, budget: TimeBudget) -> Sitting:
         renderer, title, begun = self._renderer, f"gradient of {part.name}", time.perf_counter()
-        bench = Gradients(renderer, self._loss, inside(renderer), part)
+        bench = GradientBench(renderer, self._loss, inside(renderer), part)
         sitting = self._sitting(title, bench, budget.share(1.0 - CONFIRM_SHARE * (1.0 - REFERENCE_SHARE)))
         chosen = recommended(sitting.points, [], self._config.error, self.round_up, self.or_steeper)[0]
         remark = bench.bias(self._seed) if budget.left > 0.0 else None
@@ -208,7 +208,7 @@ class Measurement:
         warnings, took = [remark] if remark else [], time.perf_counter() - begun
         return sitting.model_copy(update={"again": again, "warnings": warnings, "took": took})
 
-    def _sitting(self, title: str, bench: Pictures | Gradients, budget: TimeBudget) -> Sitting:
+    def _sitting(self, title: str, bench: PictureBench | GradientBench, budget: TimeBudget) -> Sitting:
         """Find references, and measure every setting in rounds."""
         begun, share = time.perf_counter(), budget.share(REFERENCE_SHARE)
         references = bench.refer(share, self._seed, self._stage(f"{title}: references", share))
