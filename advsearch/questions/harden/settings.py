@@ -4,7 +4,7 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import model_validator
 
-from advsearch.config.attack import STEPS, AttackConfig
+from advsearch.questions.attack.settings import STEPS, AttackConfig
 from advsearch.settings import setting, setting_as_in
 
 ALL = "all"
