@@ -34,7 +34,7 @@ from advsearch.errors import AdvsearchError, InputError
 from advsearch.models import ModelWarning
 from advsearch.progress import NullProgress
 from advsearch.questions.attack import carry_out as attacking
-from advsearch.questions.attack.answer import objective_text
+from advsearch.questions.attack.wording import objective_text
 from advsearch.questions.attack.parts import problem_from_config
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.region.answer import RegionConfig
