@@ -53,7 +53,7 @@ class ClaimAnswer(Fields):
     pictures: int = Field(0, description="that it took; absent if none")
     rate: JsonFloat | None = Field(
         None,
-        description="share of right answers, or of pictures that are as claimed; of two models the difference; absent of "
+        description="share of right answers, or of pictures as claimed; of two models the difference; absent of "
         "a search",
     )
     interval: Interval | None = Field(

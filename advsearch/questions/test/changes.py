@@ -20,7 +20,7 @@ def _brighter(picture: Tensor) -> Tensor:
 def _compressed(picture: Tensor) -> Tensor:
     file = io.BytesIO()
     Image.fromarray((picture * 255.0).round().byte().numpy()).save(file, "JPEG", quality=95)
-    return torch.from_numpy(np.array(Image.open(file))).to(picture) / 255.0
+    return torch.from_numpy(np.array(Image.open(file, formats=["JPEG"]))).to(picture) / 255.0
 
 
 CHANGED: dict[str, Callable[[Tensor], Tensor]] = {
