@@ -14,7 +14,8 @@ from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 
 
 def _brighter(picture: Tensor) -> Tensor:
-    return linear_to_srgb((srgb_to_linear(picture) * 2.0 ** (1.0 / 3.0)).clamp(max=1.0))
+    brighter: Tensor = linear_to_srgb(srgb_to_linear(picture) * 2.0 ** (1.0 / 3.0))
+    return brighter
 
 
 def _compressed(picture: Tensor) -> Tensor:
