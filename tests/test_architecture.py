@@ -103,7 +103,14 @@ BROUGHT_ALONG = {"drjit": "mitsuba", "typing_extensions": "pydantic"}
 """Imported, but pinned by another package on purpose: Mitsuba works with exactly one version of Dr.Jit, and types of
 pydantic's classes are written with its own typing_extensions."""
 
-OPTIONAL = {"pyarrow": "parquet", "textual_image": "terminal", "distributed": "dask", "dask": "dask", "ribs": "archive"}
+OPTIONAL = {
+    "pyarrow": "parquet",
+    "textual_image": "terminal",
+    "distributed": "dask",
+    "dask": "dask",
+    "ribs": "archive",
+    "shtab": "completion",
+}
 """Packages that only an extra brings, and which: imported inside a function that says what to do where it is not."""
 
 
