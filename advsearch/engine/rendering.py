@@ -12,8 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from advsearch import seeds
-from advsearch.config import SceneConfig
-from advsearch.config.scene import PICTURE_SPP, PICTURES
+from advsearch.config import PICTURE_SPP, PICTURES, SceneConfig
 from advsearch.controls import Space, compose
 from advsearch.controls.values import sentences
 from advsearch.described import Value
@@ -23,10 +22,10 @@ from advsearch.models import Model, load_model
 from advsearch.models.guards import plainly
 from advsearch.progress import Watched, watcher
 from advsearch.report.marks import contact_sheet, marked
-from advsearch.report.phrases import seen_text
+from advsearch.report.wording import seen_text
 from advsearch.runs.files import placed_by
 from advsearch.runs.images import png_bytes, write_exr, write_layers, write_png
-from advsearch.runs.results.base import Formation, MeshUp, RenderResult, ViewAnswers
+from advsearch.runs.results import Formation, MeshUp, RenderResult, ViewAnswers
 from advsearch.scene.description import OBJECT, SceneDescription
 from advsearch.scene.formation import SAMPLER, ImageFormation, to_8_bit
 from advsearch.scene.settings import ORBIT_CAMERA

@@ -49,11 +49,10 @@ from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.summary import attack_of
 from advsearch.questions.sweep.axes import Axis, on_grid, read_axes
 from advsearch.questions.sweep.drives import with_frames
-from advsearch.questions.sweep.job import Job, NamedScene, check_all, check_scenes
+from advsearch.questions.sweep.job import Job, NamedScene, Scenes, check_all, check_scenes
 from advsearch.questions.sweep.loop import carry_out
 from advsearch.questions.sweep.result import SweepResult
 from advsearch.questions.sweep.settings import SweepConfig
-from advsearch.questions.sweep.swept_scene import Scenes
 from advsearch.runs.directory import CONFIG, RunDirectory, begun, check_free, find_run, is_run, run_path
 from advsearch.runs.listing import finished
 from advsearch.runs.summary import read_answer

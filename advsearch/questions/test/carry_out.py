@@ -49,7 +49,7 @@ from advsearch.questions.test.settings import (
     suite_of,
 )
 from advsearch.runs.directory import RunDirectory
-from advsearch.runs.results.base import INTERRUPTED, OUT_OF_TIME
+from advsearch.runs.results import INTERRUPTED, OUT_OF_TIME
 from advsearch.runs.store import NAME as STORE
 from advsearch.runs.store import Store
 from advsearch.viewer.pages import keep_answer
