@@ -281,7 +281,7 @@ def render(
         progress.advance(1)
     assert formation is not None
     own = scene.description
-    warnings = (*(space.scene or own).notes, *sentences(space.moved), *untold, *remarks)
+    warnings = (*space.notes(own), *sentences(space.moved), *untold, *remarks)
     shown = replace(own, environment_spec=space.environment or own.environment_spec)
     return Rendering(shown, model.name, made.name, formation, spp, tuple(views), warnings)
 

@@ -297,7 +297,7 @@ def _job(
         for control in on_grid(drawn, axes, described):
             described = control.prepare(described) if control.kind == ENVIRONMENT else described
         warnings += described.notes
-    return Job(
+    job = Job(
         config=config,
         places=tuple(places),
         models=networks,
@@ -305,8 +305,10 @@ def _job(
         controls=drawn,
         axes=axes,
         aovs=aovs_of(config.aov),
-        warnings=tuple(dict.fromkeys(warnings)),
     )
+    for place in places:
+        warnings += job.space(place, job.sizes[0]).notes(place.scene.description)
+    return replace(job, warnings=tuple(dict.fromkeys(warnings)))
 
 
 def _places(config: SweepConfig) -> tuple[NamedScene, ...]:

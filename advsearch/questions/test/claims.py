@@ -273,7 +273,7 @@ class Trial:
         whole = AttackConfig.of(config)
         parts = parts_of(whole)
         problem = problem_of(whole, parts.scene, parts.loaded[0], differentiated=False)
-        self.warnings += [*parts.scene.description.notes, *parts.loaded[1]]
+        self.warnings += [*problem.space.notes(parts.scene.description), *parts.loaded[1]]
         return problem
 
     def _shared(self, config: SceneConfig) -> AttackConfig:
