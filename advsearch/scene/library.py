@@ -106,6 +106,10 @@ def load_object(name: str) -> ObjectAsset:
     try:
         facts = json.loads((folder / "object.json").read_text("utf-8"))
         mesh = replace(_mesh((folder / "mesh.ply").read_bytes()), materials=_materials(facts.get("faces", ())))
+        if (folder / "body.npz").is_file():
+            from advsearch.scene.people import Person, body_data  # torch takes seconds, and most have no body
+
+            mesh = replace(mesh, rig=Person(body_data()))
         material = Material(**facts["material"])
         finishes = {one: Material(**given) for one, given in facts.get("finishes", {}).items()}
         return ObjectAsset(
