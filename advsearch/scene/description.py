@@ -29,6 +29,7 @@ from advsearch.scene.importing.objects import import_object
 from advsearch.scene.importing.scenes import MITSUBA_FILE, ImportedScene, import_scene, split_node
 from advsearch.scene.parts import Lamp, MeshPart, PlacedCamera, PluginPart, ScenePart, mesh_part, plugins_in
 from advsearch.scene.settings import ORBIT_CAMERA
+from advsearch.scene.things import ThingPart, with_things
 
 DEFAULT_ENVIRONMENT = "studio"
 OBJECT = "object"
@@ -64,7 +65,8 @@ class SceneDescription:
         camera: name of the one in use; `ORBIT_CAMERA` for that of the settings.
         camera_model: intrinsics and distortion of the camera around the object; None for a pinhole.
         metered: exposure is metered; otherwise a radiance of 1 is the white of the picture, as Mitsuba shows it.
-        remarks: what a user should know of further files that controls have read.
+        remarks: what a user should know of further files that controls have read, and of things in each other.
+        things_spec: how the things beside the object were asked for.
     """
 
     object: ObjectAsset
@@ -83,6 +85,7 @@ class SceneDescription:
     camera_model: CameraModel | None = None
     metered: bool = True
     remarks: tuple[str, ...] = ()
+    things_spec: str = ""
 
     def with_part(self, part: ScenePart) -> SceneDescription:
         """Return the scene with one more part.
@@ -146,6 +149,11 @@ class SceneDescription:
     def around(self) -> Mapping[str, MeshPart]:
         """The meshes around the object by name, as they came."""
         return {one.name: one for one in self.parts if isinstance(one, MeshPart)}
+
+    @property
+    def things(self) -> Mapping[str, ThingPart]:
+        """The things beside the object by name, as they came."""
+        return {one.name: one for one in self.parts if isinstance(one, ThingPart)}
 
     @property
     def cut_out(self) -> bool:
@@ -285,6 +293,7 @@ def describe(
     given: settings.Given | None = None,
     up: str | None = None,
     plugins: Mapping[str, object] | None = None,
+    things: str | None = None,
 ) -> SceneDescription:
     """Find and read an object and an environment, bundled or from a file.
 
@@ -297,6 +306,7 @@ def describe(
         given: settings to fix, by name.
         up: "y" or "z", the up axis of a mesh file; None takes what its format or else its shape says.
         plugins: a Mitsuba scene as its loader takes it, in which `object_spec` is the id of a shape.
+        things: what stands beside the object (`advsearch.scene.things`).
 
     Raises:
         InputError: a name is unknown, a file cannot be used, or a setting is out of range.
@@ -331,6 +341,7 @@ def describe(
         camera=next(iter(around.cameras), ORBIT_CAMERA) if mitsuba and not orbits else ORBIT_CAMERA,
         metered=not mitsuba,
     )
+    described = with_things(described, things, lambda spec: _object(spec, None))
     check_meshes(described, values)
     idle = [name for name in given or {} if name.startswith("material.")]
     if described.object.surface is not None and idle:

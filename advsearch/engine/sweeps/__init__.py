@@ -168,7 +168,7 @@ class Job:
         return self.tasks[model].truth(self._facts(place, values, look))
 
     def _facts(self, place: NamedScene, values: Mapping[str, Value], look: Looked | None = None) -> Facts:
-        return facts_of(place.scene, place.object, self.config.label, lambda: values, look)
+        return facts_of(place.scene, place.object, self.config, lambda: values, look)
 
     def check_truths(self, place: NamedScene) -> None:
         for task, model in zip(self.tasks, self.models, strict=True):

@@ -49,7 +49,7 @@ class SweptScene:
                 description, space, size, config.denoise, config.seed, sampler=config.pixel_sampler
             )
             self.points[size] = job.points(space)
-        facts, spp, seed = partial(facts_of, place.scene, place.object, config.label), job.spp, config.seed
+        facts, spp, seed = partial(facts_of, place.scene, place.object, config), job.spp, config.seed
         self.problems = tuple(
             Problem(self.renderers[size], spaces[size], model, task, facts, None, spp, seed, metrics=job.metrics)
             for size, model, task in zip(job.sizes, job.models, job.tasks, strict=True)

@@ -220,12 +220,14 @@ def _scene(scene: Scene | str | Path | Mapping[str, Any], object: str | None, se
         check_not_of_scene({**settings, "object": object})
         return scene
     said = SceneConfig(**{"object": "mug", **{name: one for name, one in settings.items() if name in OF_SCENE}})
-    given = scene_settings(said)
+    rest: dict[str, Any] = {
+        "up": said.up, "settings": scene_settings(said), "camera": said.camera, "things": said.things
+    }  # fmt: skip
     if object is not None:
-        return load_scene(object, said.environment, scene=scene, up=said.up, settings=given, camera=said.camera)
+        return load_scene(object, said.environment, scene=scene, **rest)
     if isinstance(scene, Mapping):
         raise InputError("object: which shape of the scene is it? Give its id")
-    return load_scene(scene, said.environment, up=said.up, settings=given, camera=said.camera)
+    return load_scene(scene, said.environment, **rest)
 
 
 def _set_by(scene: Scene, exposure: float | None) -> dict[str, float | str]:
