@@ -18,13 +18,13 @@ from advsearch.rooms import made_question, made_questions
 __version__ = "0.1.0"
 
 _HOMES = {
-    "AttackResult": "advsearch.engine.attack_result",
+    "AttackResult": "advsearch.questions.attack.result",
     "Control": "advsearch.controls.base",
     "Model": "advsearch.models",
     "Policy": "advsearch.attacks",
     "Rendering": "advsearch.api.render",
     "Scene": "advsearch.engine.loading",
-    "SweepResult": "advsearch.engine.sweeps.summary",
+    "SweepResult": "advsearch.questions.sweep.result",
     "Task": "advsearch.tasks",
     "allow_code": "advsearch.registry",
     "check": "advsearch.questions.check.carry_out",

@@ -7,7 +7,7 @@ import json
 import os
 import tempfile
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -16,25 +16,26 @@ import numpy as np
 from torch import Tensor
 
 import advsearch
-from advsearch import rooms
-from advsearch.config import AttackConfig, SceneConfig, SweepConfig
+from advsearch.config import SceneConfig
 from advsearch.described import Value
-from advsearch.engine.attack_parts import SEARCHED_WITH, parts_in, problem_of_parts
 from advsearch.engine.loading import Scene
 from advsearch.engine.rendering import facts_about
-from advsearch.engine.sweeps import KIND
-from advsearch.engine.sweeps.swept_scene import Scenes
 from advsearch.engine.verifier import kept_answer
 from advsearch.errors import FileFormatError, InputError
 from advsearch.files import JsonObject
 from advsearch.models import find_label_set
 from advsearch.models.labels import names_nothing
 from advsearch.progress import Progress
+from advsearch.questions.attack.parts import SEARCHED_WITH, parts_in, problem_of_parts
+from advsearch.questions.attack.settings import AttackConfig
+from advsearch.questions.attack.summary import attack_of
+from advsearch.questions.sweep.carry_out import scenes_of
+from advsearch.questions.sweep.job import KIND
+from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.runs.directory import CONFIG, PARTS, find_run, is_run, only_here
 from advsearch.runs.files import placed_by, storage_errors, write_text
 from advsearch.runs.images import write_png
 from advsearch.runs.store import NAME, Row, Store
-from advsearch.runs.summary import attack_of
 from advsearch.scene.assets import Bools
 from advsearch.scene.description import OBJECT
 from advsearch.scene.outlines import SeenThing, seen_things
@@ -177,7 +178,6 @@ def _pictures(folder: Path, categories: Categories, every: bool, progress: Progr
 
 def _swept(folder: Path, categories: Categories, every: bool, progress: Progress) -> Iterator[Shown]:
     """The pictures of a sweep as its first model sees them."""
-    scenes_of: Callable[[SweepConfig], Scenes] = rooms.in_room("sweep", "carry_out", "scenes_of")
     scenes = scenes_of(SweepConfig.from_yaml(folder / CONFIG).model_copy(update={"metrics": {}}))
     job, rows = scenes.job, defaultdict[int, list[Row]](list)
     with Store(folder / NAME, read_only=True) as store:

@@ -55,6 +55,8 @@ GROUPS = {
         "export a run: its rows as a table, a texture for printing, a scene for Mitsuba or an object as glTF",
         "import": "advsearch.cli.imports:IMPORT "
         "show what advsearch reads from a mesh or scene file, as text or as a picture",
+        "completion": "advsearch.cli.completion:COMPLETION "
+        "print a script with which Tab finishes commands, flags and names in bash, zsh or tcsh",
         "import-3db": "advsearch.cli.imports:IMPORT_3DB turn a folder that 3DB wrote into a run",
     },
 }

@@ -170,7 +170,7 @@ def _threedb_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _import_threedb(args: argparse.Namespace) -> int:
-    from advsearch.engine.sweeps.summary import import_threedb  # takes seconds
+    from advsearch.questions.sweep.result import import_threedb  # takes seconds
 
     path = import_threedb(Path(args.folder), args.run, overwrite=args.overwrite)
     if args.json:

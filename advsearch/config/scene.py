@@ -126,6 +126,14 @@ class SceneConfig(Config):
         None, "scene", "which axis of an imported object points up",
         otherwise="as the format says, or else the axis along which it stands best",
     )
+    size: float | None = setting(
+        None, "scene", "how large the object is: its longest side; distances are then in metres",
+        "a number of metres from 1e-4 to 1e4", otherwise="as its file says: glTF is in metres", ge=1e-4, le=1e4,
+    )
+    unit: Literal["mm", "cm", "m", "in"] | None = setting(
+        None, "scene", "unit of the coordinates of the object's file, which says how large it is",
+        otherwise="as its file says: glTF is in metres",
+    )
     camera: str | None = setting(
         None, "scene",
         "which camera takes the picture: one of a scene file, or the one around the object with a lens of its own",
@@ -231,6 +239,8 @@ class SceneConfig(Config):
                 continue
             if len(names) > 1 and name not in self.several:
                 raise one_only(name, names)
+        if self.size is not None and len(self.objects) > 1:
+            raise InputError("size: it is the size of one object, and there are several; leave it out, or give `unit`")
         return self
 
     @property
@@ -406,3 +416,97 @@ class RenderConfig(SceneConfig):
         if not isinstance(text, str) or "\0" in text or Path(text).suffix.lower() not in PICTURES:
             raise ValueError("not a picture")
         return text
+
+
+LARGEST_EPSILON = 1e6
+"""No control has a distance of that size; far above it, its square is none in float32."""
+
+
+class DerivativeConfig(SceneConfig):
+    """What every command that differentiates a scene needs to know: budgets of the controls, and what is maximised."""
+
+    # fmt: off
+    clashes: ClassVar[tuple[Clash, ...]] = (
+        *SceneConfig.clashes,
+        Clash(
+            "epsilon", lambda one: one.epsilons and "epsilon" not in one.several,
+            "several make a curve, which only `advsearch attack` draws; give one",
+        ),
+    )
+
+    object: str = setting_as_in(SceneConfig, "object", default="mug")
+    epsilon: float | dict[str, float] | tuple[float, ...] | None = setting(
+        None, "search",
+        "how far a control may move from its start, in its own unit (for several controls CONTROL=NUMBER,...; in "
+        "`attack` also NUMBER,NUMBER,... for a curve)",
+        f"a number greater than 0 and at most {LARGEST_EPSILON:g}", otherwise="the control's own",
+    )
+    norm: Literal["linf", "l2"] | None = setting(
+        None, "search", "norm in which epsilon is measured", otherwise="the control's own"
+    )
+    estimators: dict[str, str] = setting(
+        dict, "search", "force a gradient estimator",
+        "NAME for all controls, or CONTROL=NAME or CONTROL.PARAMETER=NAME; `advsearch check` shows the names",
+        alias="estimator", flag="--estimator", metavar="NAME", form="choices",
+    )
+    objective: str | None = setting(
+        None, "search", "the objective that the search maximises", "the name of an objective",
+        otherwise="the task's own: margin",
+    )
+    specialise: bool = setting(
+        True, "search", "leave out what the scene and the search don't need", flag="--no-specialise",
+        switched="compute everything, also what this search does not need; `advsearch check` shows what is left out "
+        "otherwise",
+    )
+    # fmt: on
+
+    @field_validator("epsilon", mode="before")
+    @classmethod
+    def _epsilon_from_text(cls, value: Any) -> Any:
+        """Accept ``0.05``, ``0.01,0.02`` and ``texture=0.05,geometry=0.01``; numbers in range, and none twice."""
+        if isinstance(value, str):
+            parts = [part.strip() for part in value.split(",")]
+            if "=" in value:
+                pairs = [parse_assignment(part, "epsilon") for part in parts]
+                check_once((name for name, _ in pairs), "epsilon")
+                value = dict(pairs)
+            else:
+                value = tuple(parts)
+        if isinstance(value, (list, tuple)) and len(value) == 1:
+            value = value[0]
+        if isinstance(value, Mapping):
+            numbers = [_positive(one) for one in value.values()]
+        elif isinstance(value, (list, tuple)):
+            numbers = [_positive(one) for one in value]
+            check_once((f"{one:g}" for one in numbers), "epsilon")
+        else:
+            numbers = [1.0 if value is None else _positive(value)]
+        if not numbers:
+            raise ValueError("nothing is named")
+        return value
+
+    @property
+    def epsilons(self) -> tuple[float, ...]:
+        """The several epsilons of a curve; empty where there is one."""
+        return self.epsilon if isinstance(self.epsilon, tuple) else ()
+
+
+def _positive(value: Any) -> float:
+    try:
+        number = float("nan") if isinstance(value, bool) else float(value)
+    except (TypeError, OverflowError):
+        raise ValueError("not a number") from None
+    if not 1e-30 < number <= LARGEST_EPSILON:  # what is smaller has no square in float32
+        raise ValueError("out of range")
+    return number
+
+
+class TimedConfig(Config):
+    """A question that may run out of time."""
+
+    # fmt: off
+    seconds: float | None = setting(
+        None, "check",
+        "time after which no measurement is begun any more; `advsearch resume` goes on for as long again",
+        otherwise="no limit", unit="seconds", gt=0.0, le=1e9,
+    )

@@ -23,14 +23,13 @@ from advsearch.scene.assets import Doubles, ObjectAsset
 from advsearch.scene.geometry import middle, rotation, standing
 from advsearch.scene.importing.files import safe_name
 from advsearch.scene.parts import MeshPart, mesh_part
+from advsearch.scene.sizes import LARGEST, SMALLEST, doubts, sized
 
 if TYPE_CHECKING:
     from advsearch.scene.description import SceneDescription
 
 FARTHEST = 1000.0
 """How far from the object a thing may stand, metres."""
-LARGEST = 1000.0
-"""Longest side of a thing, metres."""
 MOST = 64
 """Things beside an object."""
 OPTIONS = ("heading", "size", "name", "label")
@@ -106,7 +105,7 @@ def _asked(part: str) -> AskedThing:
             raise UnknownNameError(f"option of things {part!r}:", name, OPTIONS)
     x, y = (_number(part, name, one, -FARTHEST, FARTHEST) for name, one in zip("xy", words, strict=False))
     heading = _number(part, "heading", options["heading"], -3600.0, 3600.0) if "heading" in options else 0.0
-    size = _number(part, "size", options["size"], 1e-3, LARGEST) if "size" in options else None
+    size = _number(part, "size", options["size"], SMALLEST, LARGEST) if "size" in options else None
     name = safe_name(Path(options.get("name") or what.strip().partition("#")[0]))
     return AskedThing(what.strip(), x, y, heading, size, name, options.get("label"))
 
@@ -138,23 +137,24 @@ def with_things(scene: SceneDescription, text: str | None, load: Callable[[str],
         return scene
     if scene.object.metres is None:
         raise InputError(
-            f"things: they stand in metres beside {scene.object_name}, whose size in metres is not known; say its size"
+            f"things: they stand in metres beside {scene.object_name}, whose size in metres is not known; say it: its "
+            "longest side, such as `size=0.1`"
         )
-    parts: list[ThingPart] = []
+    parts, remarks = list[ThingPart](), list[str]()
     for one in asked:
-        asset = load(one.what)
-        metres = one.size or asset.metres
-        if metres is None:
+        asset = sized(load(one.what), one.size, None)
+        if asset.metres is None:
             raise InputError(
                 f"things: the size of {one.what} in metres is not known; say it: "
                 f"{one.what}@{one.x:g},{one.y:g},size=METRES"
             )
         if one.name in {part.name for part in scene.parts}:
             raise InputError(f"things: something of the scene is called {one.name} already; add name=NAME to it")
-        part = mesh_part(one.name, asset, _pose(scene, asset, one, metres), asset.material)
-        parts.append(ThingPart(**{**vars(part), "label": one.label or asset.label}, metres=metres))
+        part = mesh_part(one.name, asset, _pose(scene, asset, one, asset.metres), asset.material)
+        parts.append(ThingPart(**{**vars(part), "label": one.label or asset.label}, metres=asset.metres))
+        remarks += [*asset.notes, *doubts(asset, asked=one.size is not None, laid=True)]
     scene = replace(scene, parts=(*scene.parts, *parts), things_spec=text or "")
-    return replace(scene, remarks=(*scene.remarks, *_meeting(scene)))
+    return replace(scene, remarks=(*scene.remarks, *remarks, *_meeting(scene)))
 
 
 def _pose(scene: SceneDescription, asset: ObjectAsset, asked: AskedThing, metres: float) -> Doubles:

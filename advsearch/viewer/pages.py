@@ -13,20 +13,16 @@ from pathlib import Path
 from typing import TypeVar
 
 from advsearch import rooms
-from advsearch.errors import FileFormatError, InputError
+from advsearch.errors import FileFormatError
 from advsearch.files import read_bytes
 from advsearch.report.markup import Html, element, join_html
 from advsearch.report.shown import AnswerPart, ShownAnswer, remarks_of, shown, subject_of
-from advsearch.runs.directory import OBJECT_FILE, PARTS, REPORT, RunDirectory
-from advsearch.runs.files import placed_by, write_bytes, write_text
+from advsearch.runs.directory import OBJECT_FILE, REPORT, RunDirectory
+from advsearch.runs.files import write_text
 from advsearch.runs.results.base import Result
-from advsearch.runs.results.sweep import SweepSummary
 from advsearch.runs.summary import read_result
 from advsearch.viewer import document
-from advsearch.viewer.columns import packed, read_columns
 from advsearch.viewer.parts import end_html, figures_of, links_html, part_html
-from advsearch.viewer.sweep_page import SweepSource, sweep_page_html, whole_page, write_sweep_page
-from advsearch.viewer.thumbnails import kept_pictures, path_of, read_thumbnail
 
 Answer = TypeVar("Answer", bound=Result)
 
@@ -72,16 +68,12 @@ def _header(data: bytes) -> dict[str, dict[str, object]]:
 def write_page(run: Path, result: Result) -> Path:
     """Write `report.html` into the folder of a run and return its path. Raises FileFormatError where other results of
     the run are damaged, StorageError where the page cannot be written."""
-    if isinstance(result, SweepSummary):
-        return write_sweep_page(run, result)
     return write_text(run / REPORT, page_of(run, result), durable=False)
 
 
 def page_of(run: Path, result: Result) -> str:
     """Return the page of a run, which needs no other file but those of its parts. Raises FileFormatError where other
     results of the run are damaged."""
-    if isinstance(result, SweepSummary):
-        return whole_page(run, result, read_columns(run))
     room = rooms.room(result.command)
     made: str | None = room.page(run, result) if room and room.page else None
     return made or shown_page(run, result, shown(result))
@@ -116,9 +108,6 @@ def shown_page(
     return document.document(title, header, main, data=data, scripts=scripts, footer=footer)
 
 
-INDEX = "index.html"
-
-
 def renewed(run: Path) -> Path:
     """Write the page of a run anew and return its path.
 
@@ -127,38 +116,3 @@ def renewed(run: Path) -> Path:
         StorageError: it cannot be written.
     """
     return write_page(run, read_result(run))
-
-
-def write_bundle(runs: Sequence[Path], folder: Path) -> Path:
-    """Write a folder with a page, the rows and the thumbnails of sweeps, or the page of another run; return the page.
-
-    Raises:
-        InputError: the folder is there and not empty, or runs of these commands have no common page.
-        FileFormatError: results are damaged.
-        StorageError: the folder cannot be written.
-    """
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise InputError(f"bundle: {folder} is there already and not empty; name another folder")
-    results = [(run, read_result(run)) for run in runs]
-    sweeps = [(run, result) for run, result in results if isinstance(result, SweepSummary)]
-    with placed_by("bundle"):
-        if len(results) == 1 and not sweeps:
-            run, result = results[0]
-            for page in sorted((run / PARTS).glob(f"*/{REPORT}")):  # made anew: what lies there may be anybody's
-                write_text(folder / page.relative_to(run), page_of(page.parent, read_result(page.parent)))
-            return write_text(folder / INDEX, page_of(run, result))
-        if len(sweeps) < len(results):
-            raise InputError("bundle: one run or several sweeps make a page; give one kind of them")
-        sources = [_copied(run, folder, number) for number, (run, _) in enumerate(sweeps)]
-        return write_text(folder / INDEX, sweep_page_html(sweeps, sources))
-
-
-def _copied(run: Path, folder: Path, number: int) -> SweepSource:
-    """Write rows and thumbnails of a sweep into the folder, and say where they are."""
-    rows, pictures = f"rows-{number}.bin", f"pictures-{number}"
-    write_bytes(folder / rows, packed(read_columns(run)))
-    kept = kept_pictures(run)
-    for one in kept.numbers if kept else ():
-        place = path_of(folder / pictures, one)
-        write_bytes(folder / pictures / place.parent.name / place.name, read_thumbnail(run, one))
-    return SweepSource(run.name, rows, pictures=kept, folder=pictures)

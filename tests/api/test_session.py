@@ -25,18 +25,20 @@ from torch import Tensor, nn
 
 import advsearch
 from advsearch.cli.main import main
-from advsearch.config import CONFIGS, AttackConfig, SweepConfig
+from advsearch.config import CONFIGS
 from advsearch.controls import Control
 from advsearch.controls.numbers import NumberControl
 from advsearch.controls.pose import PoseControl
 from advsearch.controls.texture import TextureControl
-from advsearch.engine.attack_parts import problem_from_config
 from advsearch.errors import AdvsearchError, InputError
 from advsearch.models import ModelWarning
 from advsearch.progress import NullProgress
 from advsearch.questions.attack import carry_out as attacking
+from advsearch.questions.attack.answer import objective_text
+from advsearch.questions.attack.parts import problem_from_config
+from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.region.answer import RegionConfig
-from advsearch.report.wording import objective_text
+from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.runs.directory import is_run
 from advsearch.runs.store import Store
 from advsearch.scene.settings import Parameter

@@ -29,13 +29,14 @@ from advsearch.cli.flags import with_flags
 from advsearch.cli.main import main
 from advsearch.cli.output import aligned, finish
 from advsearch.cli.output import shown_text as answer
-from advsearch.config import AttackConfig, SweepConfig
 from advsearch.controls.base import Choice
 from advsearch.described import Value
 from advsearch.errors import InputError, StorageError
 from advsearch.progress import BarProgress, LineProgress, NullProgress, Progress, watched
+from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.gap import GapConfig
 from advsearch.questions.region.answer import RegionConfig
+from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row
 from advsearch.scene.settings import Parameter

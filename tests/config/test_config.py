@@ -18,15 +18,16 @@ from hypothesis import strategies as st
 
 from advsearch.cli import flags
 from advsearch.cli.main import main
-from advsearch.config import CONFIGS, AttackConfig, RenderConfig, SweepConfig
-from advsearch.config.attack import TRIALS, TRIALS_OVER
+from advsearch.config import CONFIGS, RenderConfig
 from advsearch.config.scene import SceneConfig
 from advsearch.errors import FileFormatError, InputError, UnknownNameError
+from advsearch.questions.attack.settings import TRIALS, TRIALS_OVER, AttackConfig
 from advsearch.questions.check.settings import CheckConfig
 from advsearch.questions.gap import GapConfig
 from advsearch.questions.precision.settings import QUANTITIES, PrecisionConfig
 from advsearch.questions.region.answer import RegionConfig
 from advsearch.questions.stability.settings import StabilityConfig
+from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.questions.test.settings import SuiteConfig
 from advsearch.settings import Config, Setting, all_finite, parse_assignment, read_yaml, settings
 
@@ -35,6 +36,8 @@ WRONG: dict[str, tuple[Any, str]] = {
     "path": ("", "expected approach, pass, orbit, a .csv file, or two of them, the camera's and the object's, as in"),
     "environment": ([], "expected the name of an environment, a .hdr or .exr file, or none, got "),
     "up": ("x", "expected y or z, got x"),
+    "size": (0, "expected a number of metres from 1e-4 to 1e4, got 0"),
+    "unit": ("ft", "expected mm, cm, m or in, got ft"),
     "camera": (
         "",
         "expected a name that advsearch import lists, orbit, fisheye, equirectangular, or a camera file of OpenCV, "
@@ -96,7 +99,7 @@ WRONG: dict[str, tuple[Any, str]] = {
 }
 
 GIVEN: dict[str, Any] = {
-    "object": "mug.obj", "environment": "room.hdr", "up": "y", "camera": "front",
+    "object": "mug.obj", "environment": "room.hdr", "up": "y", "size": 4.9, "unit": "cm", "camera": "front",
     "set": {"camera.azimuth": 130.0, "camera.target": (0.0, 0.5, 1.0), "material": "felt"},
     "exposure": -1.5, "resolution": (96, 128), "model": "net.pt2,other.pt2", "ensemble": "mean",
     "labels": "labels.json", "prompt": "a photo of a {}", "task": "detection", "label": "coffee mug,cup",

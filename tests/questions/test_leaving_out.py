@@ -14,11 +14,11 @@ from covering import only
 from advsearch import attack, load_scene
 from advsearch.attacks import Query
 from advsearch.cli.output import shown_text as answer
-from advsearch.config import AttackConfig
 from advsearch.controls import CameraControl, LightControl, MaterialControl, TextureControl
-from advsearch.engine.attack_parts import problem_from_config
 from advsearch.engine.gradients import inside, smooth_loss
 from advsearch.engine.planning import BOUND, measured_bounces
+from advsearch.questions.attack.parts import problem_from_config
+from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.check.carry_out import check_from_config
 from advsearch.questions.check.saved import ALL, WHAT, measured_gains, resolved_texels
 from advsearch.questions.check.settings import CheckConfig

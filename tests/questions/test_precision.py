@@ -14,12 +14,12 @@ import pytest
 
 from advsearch.cli.main import main
 from advsearch.cli.output import shown_text as precision_text
-from advsearch.config import AttackConfig
-from advsearch.engine.attack_parts import problem_from_config
 from advsearch.engine.gradients import smooth_loss
 from advsearch.engine.loading import load_scene
 from advsearch.errors import InputError
 from advsearch.progress import NullProgress
+from advsearch.questions.attack.parts import problem_from_config
+from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.precision import carry_out as measuring
 from advsearch.questions.precision.answer import (
     WARM_UP,

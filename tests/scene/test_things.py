@@ -45,7 +45,7 @@ def test_every_thing_has_a_name_of_its_own() -> None:
         ("car@1,two", InputError, "y: expected a number from -1000 to 1000, got 'two'"),
         ("car@1,nan", InputError, "y: expected a number"),
         ("car@1,2,head=3", UnknownNameError, "Did you mean 'heading'"),
-        ("car@1,2,size=0", InputError, "size: expected a number from 0.001"),
+        ("car@1,2,size=0", InputError, "size: expected a number from 0.0001"),
         ("car@1,2; chair@3,3,name=car", InputError, "another thing of the scene is called car"),
         ("caar@1,2", UnknownNameError, "Did you mean 'car'"),
         ("mug@4,2", InputError, r"the size of mug in metres is not known; say it: mug@4,2,size=METRES"),

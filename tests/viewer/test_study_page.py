@@ -12,7 +12,7 @@ from samples import AVERAGE, CURVE, GAP, RECIPE, STABILITY, curve, gap, make_run
 from stored_sweeps import serving
 
 from advsearch.cli.main import main
-from advsearch.config import AttackConfig
+from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.recipe.answer import RecipeResult
 from advsearch.questions.stability.answer import StabilityResult
 from advsearch.report.shown import fields_shown

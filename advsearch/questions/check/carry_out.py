@@ -13,7 +13,6 @@ from pydantic import TypeAdapter
 from advsearch import seeds
 from advsearch.api.keywords import asks, configured
 from advsearch.controls import CONTROLS
-from advsearch.engine.attack_parts import LOADING, problem_from_config
 from advsearch.engine.gradients import FACTORS, attempts, derivatives, inside, smooth_loss
 from advsearch.engine.loading import Scene
 from advsearch.engine.naming import AnyModel, settings_alone
@@ -31,6 +30,7 @@ from advsearch.engine.planning import (
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Results, kept_rows
 from advsearch.progress import NullProgress, Progress, Watched, watcher
+from advsearch.questions.attack.parts import LOADING, problem_from_config
 from advsearch.questions.check.answer import CheckedRow, CheckResult, GainRow, SearchPlan, TexelRow
 from advsearch.questions.check.saved import MOST_GRADIENTS, measured_gains, resolved_texels
 from advsearch.questions.check.settings import CheckConfig

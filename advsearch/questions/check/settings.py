@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import ClassVar, Literal
 
-from advsearch.config.attack import DerivativeConfig, TimedConfig
-from advsearch.config.scene import SceneConfig
+from advsearch.config.scene import DerivativeConfig, SceneConfig, TimedConfig
 from advsearch.settings import Clash, setting, setting_as_in
 
 OF_ALL: Mapping[str, object] = {"object": "mug", "environment": None, "controls": {"texture": {}}, "set_": {}}

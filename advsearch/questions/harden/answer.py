@@ -12,8 +12,7 @@ from advsearch.report.figures import BLUE, RED, Figures, drawn
 from advsearch.report.markup import InNotebook
 from advsearch.report.phrases import percent
 from advsearch.report.shown import NO_PROOF, AnswerPart, Claim, Column, Extent, ShownAnswer, claim, share_text
-from advsearch.runs.results.attack import SharedWork
-from advsearch.runs.results.base import Fields, Interval, RunResult
+from advsearch.runs.results.base import Fields, Interval, RunResult, SharedWork
 
 
 class Share(Fields):

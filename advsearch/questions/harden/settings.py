@@ -4,7 +4,7 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import model_validator
 
-from advsearch.config.attack import STEPS, AttackConfig
+from advsearch.questions.attack.settings import STEPS, AttackConfig
 from advsearch.settings import setting, setting_as_in
 
 ALL = "all"
@@ -31,7 +31,7 @@ class HardenConfig(AttackConfig):
     several: ClassVar[tuple[str, ...]] = ("object", "environment")
     without: ClassVar[tuple[str, ...]] = (
         "smallest", "ensemble", "printable", "aov", "metrics", "log", "target", "minimise", "over", "draws", "path",
-        "average", "baseline", "seconds", "camera", "up", "label", "task", "measure", "estimators",
+        "average", "baseline", "seconds", "camera", "up", "size", "unit", "label", "task", "measure", "estimators",
         "things", "judge",
     )
 

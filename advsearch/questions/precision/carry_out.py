@@ -16,7 +16,6 @@ import torch
 from advsearch import seeds, threads
 from advsearch.api.keywords import asks, configured
 from advsearch.cluster.worker import processor
-from advsearch.engine.attack_parts import LOADING, problem_from_config
 from advsearch.engine.gradients import Loss, inside, smooth_loss
 from advsearch.engine.loading import Scene
 from advsearch.engine.naming import AnyModel
@@ -24,6 +23,7 @@ from advsearch.engine.problem import Problem
 from advsearch.engine.record import Results, kept_rows
 from advsearch.errors import InputError
 from advsearch.progress import NullProgress, Progress, Watched, watcher
+from advsearch.questions.attack.parts import LOADING, problem_from_config
 from advsearch.questions.precision.answer import (
     Machine,
     PrecisionPoint,

@@ -6,8 +6,7 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import field_validator
 
-from advsearch.config.attack import DerivativeConfig
-from advsearch.config.scene import SceneConfig
+from advsearch.config.scene import DerivativeConfig, SceneConfig
 from advsearch.settings import Clash, check_once, setting, setting_as_in, split_names
 
 QUANTITIES = ("image", "gradient")

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from advsearch.config.attack import TimedConfig
-from advsearch.config.scene import SceneConfig
+from advsearch.config.scene import SceneConfig, TimedConfig
 from advsearch.settings import Clash, Config, each_once, setting, setting_as_in, split_names, texts
 
 

@@ -6,11 +6,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 
-from advsearch.report import wording
-from advsearch.report.figures import figure_size, sweep_axes
-from advsearch.report.phrases import answer_text, beside_text, margin_text, percent
-from advsearch.report.shown import AnswerPart, Claim, Column, Extent, ShownAnswer, claim, extent_of, share_text
-from advsearch.report.sweeps import (
+from advsearch.questions.sweep.figures import figure_size, sweep_axes
+from advsearch.questions.sweep.summary import AxisRow, PairedRates, SweepSummary, WorstConfiguration
+from advsearch.questions.sweep.wording import (
     DRIVE_HEADS,
     difference_text,
     distance_axes,
@@ -22,8 +20,10 @@ from advsearch.report.sweeps import (
     surface_sentences,
     wrong_text,
 )
+from advsearch.report import wording
+from advsearch.report.phrases import answer_text, beside_text, margin_text, percent
+from advsearch.report.shown import AnswerPart, Claim, Column, Extent, ShownAnswer, claim, extent_of, share_text
 from advsearch.runs.results.base import INTERRUPTED
-from advsearch.runs.results.sweep import AxisRow, PairedRates, SweepSummary, WorstConfiguration
 from advsearch.settings import split_names
 
 READING = "How often it is right at each value, over all others, with the 95 % interval:"

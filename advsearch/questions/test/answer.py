@@ -13,14 +13,14 @@ from xml.etree import ElementTree
 from pydantic import Field
 
 from advsearch import __version__
-from advsearch.config.attack import AttackConfig
 from advsearch.config.scene import SceneConfig
+from advsearch.questions.attack.settings import AttackConfig
+from advsearch.questions.attack.summary import AttackSummary
 from advsearch.questions.test.settings import AnyClaim, NoWorseClaim, RightClaim
 from advsearch.report.markup import InNotebook
 from advsearch.report.phrases import percent, with_article
 from advsearch.report.shown import AnswerPart, Claim, Kind, Picture, ShownAnswer
 from advsearch.report.wording import count, interval_text, number_text, seconds_text, short_name
-from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.results.base import Fields, Interval, JsonFloat, RunResult
 
 HELD, UNDECIDED, FAILED = "held", "undecided", "failed"

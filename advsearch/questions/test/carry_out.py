@@ -10,12 +10,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from advsearch.config import AttackConfig, SceneConfig
-from advsearch.engine.attack_parts import check_from_config
+from advsearch.config import SceneConfig
 from advsearch.engine.record import Results
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.interrupts import interruptible
 from advsearch.progress import NullProgress, Progress
+from advsearch.questions.attack.parts import check_from_config
+from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.test.answer import (
     FAILED,
     NOT_TRIED,

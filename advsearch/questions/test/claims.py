@@ -12,18 +12,20 @@ from typing import Any
 import torch
 
 from advsearch import seeds
-from advsearch.api.studies import carry_out_part
 from advsearch.attacks import Evaluation
 from advsearch.attacks.evaluation import Query
 from advsearch.attacks.trials import ConfidenceSequence, clopper_pearson, draws_needed
-from advsearch.config import AttackConfig, SceneConfig
-from advsearch.engine.attack_parts import executor_for, parts_of, problem_of
+from advsearch.config import SceneConfig
 from advsearch.engine.journal import Journal, Shared, answering
 from advsearch.engine.problem import Problem
 from advsearch.engine.verifier import ladder_of
 from advsearch.errors import InputError
 from advsearch.files import JsonObject
 from advsearch.progress import Progress
+from advsearch.questions.attack.parts import executor_for, parts_of, problem_of
+from advsearch.questions.attack.settings import AttackConfig
+from advsearch.questions.attack.studies import carry_out_part
+from advsearch.questions.attack.summary import AttackSummary
 from advsearch.questions.test.answer import (
     FAILED,
     HELD,
@@ -39,7 +41,6 @@ from advsearch.questions.test.counterexamples import TRIALS, Counterexample, is_
 from advsearch.questions.test.settings import AnyClaim, DrawnConfig, NoWorseClaim, RightClaim
 from advsearch.report.wording import number_text
 from advsearch.runs.directory import IMAGES, PARTS, RunDirectory
-from advsearch.runs.results.attack import AttackSummary
 from advsearch.settings import split_names
 
 MANY = 4

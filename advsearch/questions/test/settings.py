@@ -12,9 +12,9 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
-from advsearch.config.attack import AttackConfig
 from advsearch.config.scene import SceneConfig
 from advsearch.errors import FileFormatError, InputError, resembling
+from advsearch.questions.attack.settings import AttackConfig
 from advsearch.settings import (
     Clash,
     Config,

@@ -385,3 +385,114 @@ class RenderResult(Result):
     up: MeshUp | None = Field(description="null for an object without a mesh file")
     views: list[ViewAnswers]
     warnings: list[str] = Field(description="sentences that a reader has to know")
+
+
+class DescribedValue(Fields):
+    """One value of a configuration, with its unit."""
+
+    value: int | float | str | list[float]
+    unit: str
+
+
+class ControlGroup(Fields):
+    """Trials of the clean scene: how many are right."""
+
+    correct: int
+    trials: int
+    rate: float
+    interval: Interval
+    not_a_number: int = Field(default=0, description="trials whose answer is NaN or infinity; absent without")
+
+
+class VerifiedRate(Fields):
+    """Trials with fresh seeds, and how many of them are a success."""
+
+    successes: int
+    trials: int = Field(description="that count: over conditions that vary, those whose clean scene is right")
+    rate: float
+    interval: Interval
+    spp: int = Field(description="samples a pixel")
+    labels: dict[str, int] = Field(description="answers of the successes, and how often each was given")
+    margin: JsonFloat = Field(description="mean over these trials, in logits; of a detector in log-odds")
+    not_a_number: int = Field(default=0, description="trials whose answer is NaN or infinity; absent without")
+    stopped: str | None = Field(
+        default=None,
+        description="why there are no more: `asked for` (as many as were) or `decided` (the verdict stands); absent of "
+        "trials that are no verdict",
+    )
+
+
+class AverageCase(Fields):
+    """Configurations drawn from the whole space and budget."""
+
+    configurations: int
+    correct: int = Field(description="how many the model got right")
+    accuracy: float
+    interval: Interval
+    margin: JsonFloat = Field(description="the mean, in logits")
+    worst_margin: JsonFloat = Field(description="the largest, in logits")
+
+
+class PredictionError(Fields):
+    """How far predicted pictures were from traced ones, at the last comparison."""
+
+    levels: JsonFloat = Field(description="of 255, over the object's pixels, root mean square")
+    logits: JsonFloat = Field(description="of the margin, the mean over the pictures that were compared")
+
+
+class BankOfConditions(Fields):
+    """The conditions that matrices were made for."""
+
+    made: int = Field(description="how many")
+    dropped: int = Field(description="of them made room for newer ones")
+    grown: int = Field(description="comparisons with unseen conditions after which there had to be more")
+    gap: float | None = Field(description="objective under them over that under unseen ones, at the last comparison")
+
+
+class LinearTransport(Fields):
+    """What predicted the pictures of the searches."""
+
+    used: bool
+    way: str | None = Field(
+        default=None, description="by what: `matrix`, `basis pictures` (of a sweep), or `surface light`"
+    )
+    reason: str | None = Field(
+        default=None,
+        description="why pictures were rendered, all or from some evaluation on, or not predicted by surface light",
+    )
+    conditions: BankOfConditions | None = Field(default=None, description="with `over`")
+    entries: int | None = Field(default=None, description="of the matrix")
+    bytes: int | None = Field(default=None, description="of its memory")
+    seconds: float | None = Field(default=None, description="that it and the comparisons took")
+    renewed: int | None = Field(default=None, description="how often it was made again")
+    error: PredictionError | None = Field(default=None, description="of the last comparison")
+
+
+class PrintTerms(Fields):
+    """How far colours are from what can be printed, without weights, summed over textures and patches."""
+
+    variation: float = Field(description="mean length of the step from a pixel to its neighbours, in sRGB")
+    off_print: float = Field(description="mean distance in sRGB from the nearest printable colour")
+
+
+class SharedWork(Fields):
+    """How the workers did that shared the work, in this sitting."""
+
+    most: int = Field(description="workers that were ready at once, at most")
+    lost: int = Field(description="that went away")
+    refused: int = Field(description="that could not do it")
+    retried: int = Field(description="batches that were given out again")
+    batches: int = Field(description="batches that came back")
+    busy: JsonFloat = Field(description="seconds that workers were at batches")
+    loading: JsonFloat = Field(description="seconds that they loaded scenes and models")
+    alive: JsonFloat = Field(description="seconds that they were there and ready")
+    utilisation: JsonFloat | None = Field(description="`busy` over `alive`")
+    machines: dict[str, dict[str, str]] = Field(description="what rows call by a name, where machines are not alike")
+
+    @classmethod
+    def of_facts(cls, facts: Any, machines: Mapping[str, Mapping[str, str]]) -> SharedWork | None:
+        """Return the fields from what an executor says; None where it says nothing."""
+        if facts is None:
+            return None
+        share = min(1.0, facts.busy / facts.alive) if facts.alive else None
+        return cls.model_validate({**vars(facts), "utilisation": share, "machines": machines})

@@ -248,7 +248,7 @@
       const parts = Boolean(edges) || seen.size > MOST_LEVELS;
       const level = new Uint16Array(data.length);
       let labels, place;
-      if (edges) { // the parts of the table in the terminal (engine/sweeps/points.py), ascending
+      if (edges) { // the parts of the table in the terminal (questions/sweep/points.py), ascending
         const inner = Float32Array.from(edges.slice(1, -1));
         labels = edges.slice(1).map((end, k) => `${short(edges[k])} to ${short(end)}`);
         place = (value) => inner.reduce((sum, edge) => sum + (value >= edge), 0);

@@ -26,10 +26,10 @@ from torch import Tensor
 import advsearch
 from advsearch.cli.main import main
 from advsearch.cluster import InProcess
-from advsearch.config import AttackConfig
 from advsearch.engine.problem import Problem
 from advsearch.errors import AdvsearchError
 from advsearch.questions.attack.carry_out import attack_once
+from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.report.evidence import claims_of
 from advsearch.questions.test import answer as words
 from advsearch.questions.test import claims

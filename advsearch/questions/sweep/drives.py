@@ -10,17 +10,17 @@ import numpy as np
 import numpy.typing as npt
 
 from advsearch.attacks.units import mean_interval
-from advsearch.config import SweepConfig
 from advsearch.controls import Control
 from advsearch.controls.path import PathControl
-from advsearch.engine.attack_result import evenly, write_drive
 from advsearch.engine.naming import given_to
-from advsearch.engine.sweeps import Job
-from advsearch.engine.sweeps.axes import Axis
-from advsearch.engine.sweeps.swept_scene import Scenes
+from advsearch.questions.attack.result import evenly, write_drive
+from advsearch.questions.sweep.axes import Axis
+from advsearch.questions.sweep.job import Job
+from advsearch.questions.sweep.settings import SweepConfig
+from advsearch.questions.sweep.summary import DriveRates, OverDrives
+from advsearch.questions.sweep.swept_scene import Scenes
 from advsearch.report.marks import marked
 from advsearch.runs.directory import RunDirectory
-from advsearch.runs.results.sweep import DriveRates, OverDrives
 from advsearch.runs.store import Row
 
 ANIMATED = 60

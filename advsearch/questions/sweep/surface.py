@@ -22,14 +22,14 @@ from advsearch.attacks.draws import batches
 from advsearch.attacks.trials import wilson
 from advsearch.engine.loading import framed, load_scene
 from advsearch.engine.record import judgement_of
-from advsearch.engine.sweeps import Job
-from advsearch.engine.sweeps.summary import rate
-from advsearch.engine.sweeps.swept_scene import SweptScene
 from advsearch.progress import Progress
-from advsearch.report.figures import MapView, SurfacePanel, surface_figure
+from advsearch.questions.sweep.figures import MapView, SurfacePanel, surface_figure
+from advsearch.questions.sweep.job import Job
+from advsearch.questions.sweep.result import rate
+from advsearch.questions.sweep.summary import SurfaceMap, SurfacePart, SurfaceTable
+from advsearch.questions.sweep.swept_scene import SweptScene
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.files import write_bytes
-from advsearch.runs.results.sweep import SurfaceMap, SurfacePart, SurfaceTable
 from advsearch.runs.store import Row
 from advsearch.scene.assets import ObjectAsset
 from advsearch.scene.description import OBJECT

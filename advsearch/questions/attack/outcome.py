@@ -10,30 +10,41 @@ from typing import Any, TypeVar
 from torch import Tensor
 
 from advsearch.attacks import Ending, SearchResult, Verification, count_right
-from advsearch.attacks.candidates import Bracket
+from advsearch.attacks.candidates import Bracket, FoundFailure
 from advsearch.attacks.rate_samples import MOST_TIMES, MOVED, OVER_LADDER
-from advsearch.config import AttackConfig
-from advsearch.engine.attack_result import (
+from advsearch.engine.journal import Journal
+from advsearch.engine.objective import domain_of, print_terms
+from advsearch.engine.problem import Problem
+from advsearch.engine.record import Findings, Stages, control_group, lost_remarks, mean_number, verified_rate
+from advsearch.engine.transport import remark
+from advsearch.questions.attack import summary as results
+from advsearch.questions.attack.result import (
     AttackResult,
     KeptPicture,
     answer_along,
+    save_trial,
     trial_to_show,
     write_artifacts,
     write_object,
     write_pictures,
 )
-from advsearch.engine.journal import Journal
-from advsearch.engine.objective import domain_of, print_terms
-from advsearch.engine.problem import Problem
-from advsearch.engine.record import Findings, Stages, control_group, lost_remarks, mean_number, verified_rate
-from advsearch.engine.stages import UNPRINTED
-from advsearch.engine.transport import remark
-from advsearch.engine.verifier import described_failures, write_failures
+from advsearch.questions.attack.settings import AttackConfig
+from advsearch.questions.attack.stages import UNPRINTED
+from advsearch.questions.attack.summary import AttackSummary, PicturedAnswer
 from advsearch.report.wording import number_text
+from advsearch.runs.directory import RunDirectory
 from advsearch.runs.files import write_bytes
-from advsearch.runs.results import attack as results
-from advsearch.runs.results.attack import AttackSummary, DescribedValue, VerifiedRate
-from advsearch.runs.results.base import Formation, MovedValue, VariedValue
+from advsearch.runs.results.base import (
+    AverageCase,
+    DescribedValue,
+    Formation,
+    LinearTransport,
+    MovedValue,
+    PrintTerms,
+    SharedWork,
+    VariedValue,
+    VerifiedRate,
+)
 from advsearch.runs.summary import write_answer
 from advsearch.tasks import Judgement
 from advsearch.tasks.base import mean
@@ -75,7 +86,7 @@ def summarise(
     summary = _summary(config, objective, problem, findings, clean, adversarial)
     drive = None if findings.interrupted else answer_along(problem, None if search is None else u, findings.spp, run)
     kept = {"run": None if run is None else str(run.path), "warnings": warnings, "drive": drive}
-    shared = results.SharedWork.of_facts(journal.traced.facts, journal.machines.known)
+    shared = SharedWork.of_facts(journal.traced.facts, journal.machines.known)
     summary = summary.model_copy(
         update={**kept, "shared": shared, "seconds": {**stages.seconds, "total": stages.total}}
     )
@@ -208,7 +219,7 @@ def _printability(problem: Problem, findings: Findings) -> results.Printability:
     space, domain = problem.searched_space, problem.domain
     cost = None
 
-    def terms(found: SearchResult) -> results.PrintTerms:
+    def terms(found: SearchResult) -> PrintTerms:
         return print_terms(space, domain.project(found.best_u))
 
     verified, other, unprinted = findings.verification, findings.unprinted_verification, findings.unprinted
@@ -284,11 +295,11 @@ def _conditions(problem: Problem) -> dict[str, VariedValue]:
     return found
 
 
-def transport_of(findings: Findings) -> results.LinearTransport:
+def transport_of(findings: Findings) -> LinearTransport:
     """Return what predicted the pictures of the searches, and how far it was off; or why nothing did."""
     transport = findings.transport
     if transport is None:
-        return results.LinearTransport(used=False, reason=findings.rendered_because or "nothing was searched")
+        return LinearTransport(used=False, reason=findings.rendered_because or "nothing was searched")
     said = transport.summary()
     return said.model_copy(update={"reason": said.reason or findings.surface_refused or None})
 
@@ -325,10 +336,10 @@ def _gradients(search: SearchResult) -> results.SearchGradients:
     )
 
 
-def _average(findings: Findings) -> results.AverageCase:
+def _average(findings: Findings) -> AverageCase:
     counted = count_right(findings.average, findings.spp)
     scores = [trial.score for trial in findings.average]
-    return results.AverageCase(
+    return AverageCase(
         configurations=counted.trials,
         correct=counted.successes,
         accuracy=counted.rate,
@@ -371,3 +382,61 @@ def _remarks(findings: Findings, problem: Problem, journal: Journal) -> list[str
     if not_finite := max(problem.renderer.non_finite, sum(searches)):  # what predicts pictures has no such count
         remarks.append(f"{not_finite} values of pictures or gradients were not finite and were set to 0.")
     return [*remarks, *lost_remarks(journal.lost), *journal.machines.remarks]
+
+
+def write_failures(run: RunDirectory, problem: Problem, findings: Findings) -> None:
+    """Write a picture of each failure that was tried, as the model saw it in its first trial."""
+    for number, checked in enumerate(findings.failures):
+        save_trial(run, problem, findings, (f"failure {number}", 0), _picture(number), checked.u)
+
+
+def described_failures(problem: Problem, findings: Findings) -> results.DifferentFailures | None:
+    """Return what a summary says of the different failures; None of a policy that looks for one."""
+    known = findings.search.failures if findings.search else None
+    if known is None:
+        return None
+    listed = [_described_failure(problem, findings, number, failure) for number, failure in enumerate(known.listed)]
+    return results.DifferentFailures(
+        over=[problem.domain.names[place] for place in known.over],
+        found=known.found,
+        seen=known.seen,
+        places=known.places,
+        share=None if known.share is None else results.FailingShare.of(known.share),
+        tried=len(findings.failures),
+        held=sum(one.ending is Ending.FOUND for one in findings.failures),
+        listed=listed,
+    )
+
+
+def _described_failure(
+    problem: Problem, findings: Findings, number: int, failure: FoundFailure
+) -> results.DifferentFailure:
+    checked = findings.failures[number] if number < len(findings.failures) else None
+    names, ranges, first = problem.domain.names, failure.ranges, checked.adversarial_trials[0] if checked else None
+    return results.DifferentFailure(
+        ranges={names[place]: _range(problem, failure.u, place, ends) for place, ends in ranges.items()},
+        configuration={name: DescribedValue.of(value) for name, value in problem.describe(failure.u).items()},
+        objective=failure.objective,
+        holds=None if checked is None else checked.ending is Ending.FOUND,
+        verified=None if checked is None else verified_rate(checked),
+        picture=None if checked is None else f"images/{_picture(number)}.png",
+        pictured=None if first is None else PicturedAnswer(**vars(first.answer), payload=first.payload, trial=0),
+    )
+
+
+def _picture(number: int) -> str:
+    return f"failure-{number:02d}"
+
+
+def _range(problem: Problem, u: Tensor, place: int, ends: tuple[float, float]) -> tuple[float, float] | str:
+    """Return both ends of one element of u in its parameter's unit, the option of a choice; in u where it is not told
+    by itself."""
+    block, said = problem.domain.block_of(place), list[float]()
+    for end in ends:
+        moved = u.clone()
+        moved[place] = u[place] if block.options else end
+        value = problem.describe(moved).get(block.name, {"value": end, "unit": "1"})["value"]
+        if isinstance(value, str):
+            return value
+        said.append(float(value) if block.size == 1 else end)
+    return min(said), max(said)

@@ -18,10 +18,10 @@ from advsearch.attacks import Query
 from advsearch.attacks.draws import Product
 from advsearch.engine.acceptance import CHECK_SPP, VIEWS, ComparedView, Deviation, compared, view_of
 from advsearch.engine.problem import Problem
-from advsearch.engine.sweeps.axes import Axis
-from advsearch.engine.sweeps.points import Points
 from advsearch.files import scaled
-from advsearch.runs.results.attack import LinearTransport, PredictionError
+from advsearch.questions.sweep.axes import Axis
+from advsearch.questions.sweep.points import Points
+from advsearch.runs.results.base import LinearTransport, PredictionError
 from advsearch.scene.assembly import ON_PICTURE
 from advsearch.scene.formation import to_8_bit
 from advsearch.scene.mitsuba_backend.surface import RAYS

@@ -15,15 +15,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from advsearch.errors import AdvsearchError
+from advsearch.errors import AdvsearchError, InputError
 from advsearch.files import JsonObject, JsonValue
-from advsearch.report import sweeps, wording
+from advsearch.questions.sweep import wording as sweeps
+from advsearch.questions.sweep.summary import SweepSummary
+from advsearch.report import wording
 from advsearch.report.markup import Html, element, join_html
 from advsearch.report.phrases import answer_text, beside_text, percent
 from advsearch.report.shown import shown
 from advsearch.runs import directory
-from advsearch.runs.files import write_bytes, write_text
-from advsearch.runs.results.sweep import SweepSummary
+from advsearch.runs.files import placed_by, write_bytes, write_text
 from advsearch.runs.summary import read_result
 from advsearch.settings import read_yaml
 from advsearch.viewer.columns import packed, read_columns
@@ -34,8 +35,9 @@ from advsearch.viewer.document import (
     remarks_html,
     subject_html,
 )
+from advsearch.viewer.pages import page_of
 from advsearch.viewer.parts import end_html, part_html
-from advsearch.viewer.thumbnails import Kept, kept_pictures
+from advsearch.viewer.thumbnails import Kept, kept_pictures, path_of, read_thumbnail
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -80,11 +82,12 @@ def write_sweep_page(run: Path, summary: SweepSummary) -> Path:
     """
     columns = read_columns(run)
     write_bytes(run / directory.COLUMNS, packed(columns), durable=False)
-    return write_text(run / directory.REPORT, whole_page(run, summary, columns), durable=False)
+    return write_text(run / directory.REPORT, page(run, summary, columns), durable=False)
 
 
-def whole_page(run: Path, summary: SweepSummary, columns: pd.DataFrame) -> str:
+def page(run: Path, summary: SweepSummary, columns: pd.DataFrame | None = None) -> str:
     """Return the page of a sweep that needs no other file, with its rows unless they are too many."""
+    columns = read_columns(run) if columns is None else columns
     rows = columns if len(columns) <= MOST_ROWS else None
     return sweep_page_html([(run, summary)], [SweepSource(run.name, rows, pictures=kept_pictures(run))])
 
@@ -248,3 +251,43 @@ def result_of(run: Path) -> SweepSummary | None:
         return None
     found = read_result(run)
     return found if isinstance(found, SweepSummary) else None
+
+
+INDEX = "index.html"
+
+
+def write_bundle(runs: Sequence[Path], folder: Path) -> Path:
+    """Write a folder with a page, the rows and the thumbnails of sweeps, or the page of another run; return the page.
+
+    Raises:
+        InputError: the folder is there and not empty, or runs of these commands have no common page.
+        FileFormatError: results are damaged.
+        StorageError: the folder cannot be written.
+    """
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise InputError(f"bundle: {folder} is there already and not empty; name another folder")
+    results = [(run, read_result(run)) for run in runs]
+    sweeps = [(run, result) for run, result in results if isinstance(result, SweepSummary)]
+    with placed_by("bundle"):
+        if len(results) == 1 and not sweeps:
+            run, result = results[0]
+            for page in sorted(
+                (run / directory.PARTS).glob(f"*/{directory.REPORT}")
+            ):  # made anew: what lies there may be anybody's
+                write_text(folder / page.relative_to(run), page_of(page.parent, read_result(page.parent)))
+            return write_text(folder / INDEX, page_of(run, result))
+        if len(sweeps) < len(results):
+            raise InputError("bundle: one run or several sweeps make a page; give one kind of them")
+        sources = [_copied(run, folder, number) for number, (run, _) in enumerate(sweeps)]
+        return write_text(folder / INDEX, sweep_page_html(sweeps, sources))
+
+
+def _copied(run: Path, folder: Path, number: int) -> SweepSource:
+    """Write rows and thumbnails of a sweep into the folder, and say where they are."""
+    rows, pictures = f"rows-{number}.bin", f"pictures-{number}"
+    write_bytes(folder / rows, packed(read_columns(run)))
+    kept = kept_pictures(run)
+    for one in kept.numbers if kept else ():
+        place = path_of(folder / pictures, one)
+        write_bytes(folder / pictures / place.parent.name / place.name, read_thumbnail(run, one))
+    return SweepSource(run.name, rows, pictures=kept, folder=pictures)

@@ -21,7 +21,7 @@ from advsearch.controls import Control, NumberControl, Parameter, Space
 from advsearch.controls.base import Value
 from advsearch.controls.ranges import Range
 from advsearch.controls.values import Fixed, OneOf, to_value
-from advsearch.engine.sweeps.axes import Axis
+from advsearch.questions.sweep.axes import Axis
 from advsearch.runs.results.base import VariedValue
 from advsearch.runs.units import Units
 from advsearch.scene.description import ENVIRONMENT

@@ -19,21 +19,22 @@ from PIL import Image
 
 from advsearch.attacks import clopper_pearson
 from advsearch.attacks.units import paired_by_unit, per_unit, share_interval
-from advsearch.engine.sweeps import KIND
 from advsearch.errors import FileFormatError
 from advsearch.pictures import FORMATS
-from advsearch.report.figures import new_axes, sweep_axes, sweep_figure
+from advsearch.questions.sweep.figures import sweep_axes, sweep_figure
+from advsearch.questions.sweep.job import KIND
+from advsearch.questions.sweep.page import write_sweep_page
+from advsearch.questions.sweep.summary import AxisRow, CountedAnswers, MapAxis, PairedRates, SweepMap, SweepSummary
+from advsearch.report.figures import new_axes
 from advsearch.report.markup import answer_html
 from advsearch.report.shown import shown
 from advsearch.runs import store
 from advsearch.runs.directory import RunDirectory, default_name
 from advsearch.runs.export import read_threedb
-from advsearch.runs.results.sweep import AxisRow, CountedAnswers, MapAxis, PairedRates, SweepMap, SweepSummary
 from advsearch.runs.tables import read_sweep, to_pandas
 from advsearch.runs.units import Units
 from advsearch.tasks import Judgement
 from advsearch.viewer import thumbnails
-from advsearch.viewer.sweep_page import write_sweep_page
 
 FINISHED, INTERRUPTED = "finished", "interrupted"
 

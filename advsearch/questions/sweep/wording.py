@@ -13,12 +13,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from advsearch.errors import InputError
+from advsearch.questions.sweep.summary import AxisRow, SweepSummary
 from advsearch.report.figures import BLUE, GREY
 from advsearch.report.wording import count, short_name
-from advsearch.runs.results.sweep import AxisRow, SweepSummary
 
 if TYPE_CHECKING:
-    from advsearch.runs.results.sweep import (
+    from advsearch.questions.sweep.summary import (
         CountedAnswers,
         DriveRates,
         OverDrives,

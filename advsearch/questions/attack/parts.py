@@ -20,8 +20,7 @@ from advsearch.attacks.objectives import OBJECTIVE_KINDS, asked_by, check_object
 from advsearch.attacks.policies import POLICIES
 from advsearch.cluster import Executor, Work
 from advsearch.cluster.dask_pool import executor_of
-from advsearch.config import AttackConfig, SceneConfig
-from advsearch.config.attack import OVER_NUMBERS, OVER_ONE, OVER_PREDICTED, OVER_RENDERED, STEPS
+from advsearch.config import SceneConfig
 from advsearch.config.scene import one_only
 from advsearch.controls import make_space
 from advsearch.controls.base import Control
@@ -36,6 +35,14 @@ from advsearch.errors import InputError
 from advsearch.models import Model
 from advsearch.options import as_setting
 from advsearch.progress import Progress
+from advsearch.questions.attack.settings import (
+    OVER_NUMBERS,
+    OVER_ONE,
+    OVER_PREDICTED,
+    OVER_RENDERED,
+    STEPS,
+    AttackConfig,
+)
 from advsearch.runs.directory import CONFIG
 from advsearch.runs.directory import only_here as only_python_has
 from advsearch.scene.formation import EVERYTHING, NOTHING, next_count

@@ -29,7 +29,6 @@ from advsearch.attacks import (
 from advsearch.attacks.candidates import ATTEMPTS, MOST_CHECKS, ROUNDS, confirmed, scaled, smallest
 from advsearch.attacks.evaluation import Query
 from advsearch.attacks.verification import OVER_LOOKS, TRIAL_LOOKS
-from advsearch.config import AttackConfig
 from advsearch.engine import planning, surface_light
 from advsearch.engine.bank import Bank
 from advsearch.engine.gradients import inside
@@ -39,8 +38,9 @@ from advsearch.engine.problem import Problem
 from advsearch.engine.record import Findings, Stages
 from advsearch.engine.surface_light import SurfaceLight
 from advsearch.engine.transport import CleanMatrix, PredictedSearch, Transport, reason_against, remark
-from advsearch.engine.verifier import Verifier, check_failures, ladder_of
+from advsearch.engine.verifier import Verifier, ladder_of
 from advsearch.interrupts import interruptible
+from advsearch.questions.attack.settings import AttackConfig
 from advsearch.report.wording import count
 from advsearch.scene.transport.matrix import TransportTooLargeError
 from advsearch.tasks import Judgement
@@ -467,3 +467,26 @@ def _rank(verification: Verification) -> tuple[bool, float, float]:
     mean = sum(scores) / len(scores)
     mean = mean if mean == mean else -math.inf
     return verification.ending is Ending.FOUND, verification.adversarial.rate, mean
+
+
+TRIED = 8
+"""Different failures that are tried, at most: the first of the list."""
+
+
+def check_failures(verifier: Verifier, found: SearchResult) -> None:
+    """Verify the first of the different failures that a search answers with, each for itself.
+
+    Each goes through the trials of the answer, with the seeds that the control group had, up to the first that decides
+    against it: what holds is found by the rule of the answer. Over conditions that vary one answer takes hundreds of
+    trials, and nothing is tried here.
+    """
+    problem, findings = verifier.problem, verifier.findings
+    known, rule = found.failures, problem.rule
+    if known is None or not known.listed or rule.conditional or rule.already_wrong(count_right(findings.clean, 1)):
+        return
+    tried = known.listed[:TRIED]
+    verifier.begin("checking different failures with fresh renders", len(tried) * verifier.count, at_most=True)
+    findings.failures = tuple(
+        verifier.verified(f"failure {number}", replace(found, best_u=failure.u), curtailed=True)
+        for number, failure in enumerate(tried)
+    )

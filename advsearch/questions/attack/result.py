@@ -18,7 +18,6 @@ from torch import Tensor
 from advsearch import seeds
 from advsearch.attacks import Ending, SearchResult
 from advsearch.controls.path import PathControl
-from advsearch.engine.attack_parts import AttackParts
 from advsearch.engine.loading import Scene, load_scene
 from advsearch.engine.naming import AnyModel, in_turn
 from advsearch.engine.objective import task_for
@@ -26,6 +25,8 @@ from advsearch.engine.problem import Problem
 from advsearch.engine.record import KEPT, Findings
 from advsearch.engine.rendering import Rendering, pictures_of, render
 from advsearch.errors import InputError
+from advsearch.questions.attack.parts import AttackParts
+from advsearch.questions.attack.summary import AnswerAlongDrive, AttackSummary
 from advsearch.registry import names_code
 from advsearch.report.figures import new_axes, search_axes
 from advsearch.report.marks import marked
@@ -34,7 +35,6 @@ from advsearch.report.shown import shown
 from advsearch.runs import images, store
 from advsearch.runs.directory import IMAGES, OBJECT_FILE, RunDirectory
 from advsearch.runs.files import write_bytes
-from advsearch.runs.results.attack import AnswerAlongDrive, AttackSummary
 from advsearch.scene.assets import Shape, simpler
 from advsearch.scene.description import OBJECT
 from advsearch.scene.formation import to_8_bit

@@ -1,30 +1,34 @@
-"""The result of `attack`: what `summary.json` holds of it."""
+"""The results of `attack`, as `summary.json` holds them: of one, of several objects or epsilons, of several models."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, ClassVar
+from pathlib import Path
+from typing import ClassVar
 
 from pydantic import Field
 
+from advsearch.report.markup import InNotebook
 from advsearch.runs.results.base import (
+    AverageCase,
     CleanScene,
+    ControlGroup,
+    DescribedValue,
     Fields,
     Formation,
     Interval,
     JsonFloat,
+    LinearTransport,
     Payload,
     PlannedGradient,
+    PrintTerms,
+    Result,
     SceneResult,
+    SharedWork,
+    StudyResult,
     VariedValue,
-)
-
-
-class DescribedValue(Fields):
-    """One value of a configuration, with its unit."""
-
-    value: int | float | str | list[float]
-    unit: str
+    VerifiedRate,
+)  # fmt: skip
+from advsearch.runs.summary import NAME, other_summary, read_result
 
 
 class FoundValue(DescribedValue):
@@ -47,39 +51,11 @@ class PicturedAnswer(Fields):
     )
 
 
-class ControlGroup(Fields):
-    """Trials of the clean scene: how many are right."""
-
-    correct: int
-    trials: int
-    rate: float
-    interval: Interval
-    not_a_number: int = Field(default=0, description="trials whose answer is NaN or infinity; absent without")
-
-
 class CleanAnswer(CleanScene, PicturedAnswer):
     """What the model says of the picture of the clean scene that is kept."""
 
     correct: bool = Field(description="whether that is right")
     control: ControlGroup | None = Field(description="trials of the clean scene, and in how many it is right")
-
-
-class VerifiedRate(Fields):
-    """Trials with fresh seeds, and how many of them are a success."""
-
-    successes: int
-    trials: int = Field(description="that count: over conditions that vary, those whose clean scene is right")
-    rate: float
-    interval: Interval
-    spp: int = Field(description="samples a pixel")
-    labels: dict[str, int] = Field(description="answers of the successes, and how often each was given")
-    margin: JsonFloat = Field(description="mean over these trials, in logits; of a detector in log-odds")
-    not_a_number: int = Field(default=0, description="trials whose answer is NaN or infinity; absent without")
-    stopped: str | None = Field(
-        default=None,
-        description="why there are no more: `asked for` (as many as were) or `decided` (the verdict stands); absent of "
-        "trials that are no verdict",
-    )
 
 
 class ObjectiveValues(Fields):
@@ -114,17 +90,6 @@ class BaselineSearch(Fields):
     policy: str
     renders: int
     verified: VerifiedRate | None
-
-
-class AverageCase(Fields):
-    """Configurations drawn from the whole space and budget."""
-
-    configurations: int
-    correct: int = Field(description="how many the model got right")
-    accuracy: float
-    interval: Interval
-    margin: JsonFloat = Field(description="the mean, in logits")
-    worst_margin: JsonFloat = Field(description="the largest, in logits")
 
 
 class SmallestEpsilon(Fields):
@@ -222,48 +187,6 @@ class NotFinite(Fields):
     gradient_elements: int
 
 
-class PredictionError(Fields):
-    """How far predicted pictures were from traced ones, at the last comparison."""
-
-    levels: JsonFloat = Field(description="of 255, over the object's pixels, root mean square")
-    logits: JsonFloat = Field(description="of the margin, the mean over the pictures that were compared")
-
-
-class BankOfConditions(Fields):
-    """The conditions that matrices were made for."""
-
-    made: int = Field(description="how many")
-    dropped: int = Field(description="of them made room for newer ones")
-    grown: int = Field(description="comparisons with unseen conditions after which there had to be more")
-    gap: float | None = Field(description="objective under them over that under unseen ones, at the last comparison")
-
-
-class LinearTransport(Fields):
-    """What predicted the pictures of the searches."""
-
-    used: bool
-    way: str | None = Field(
-        default=None, description="by what: `matrix`, `basis pictures` (of a sweep), or `surface light`"
-    )
-    reason: str | None = Field(
-        default=None,
-        description="why pictures were rendered, all or from some evaluation on, or not predicted by surface light",
-    )
-    conditions: BankOfConditions | None = Field(default=None, description="with `over`")
-    entries: int | None = Field(default=None, description="of the matrix")
-    bytes: int | None = Field(default=None, description="of its memory")
-    seconds: float | None = Field(default=None, description="that it and the comparisons took")
-    renewed: int | None = Field(default=None, description="how often it was made again")
-    error: PredictionError | None = Field(default=None, description="of the last comparison")
-
-
-class PrintTerms(Fields):
-    """How far colours are from what can be printed, without weights, summed over textures and patches."""
-
-    variation: float = Field(description="mean length of the step from a pixel to its neighbours, in sRGB")
-    off_print: float = Field(description="mean distance in sRGB from the nearest printable colour")
-
-
 class PrintCost(Fields):
     """What the terms of `printable` cost in margin: beside a search without them, of as many steps.
 
@@ -287,29 +210,6 @@ class Printability(Fields):
     cost: PrintCost | None = Field(
         default=None, description="what the terms cost in margin; null if nothing was verified, and in older runs"
     )
-
-
-class SharedWork(Fields):
-    """How the workers did that shared the work, in this sitting."""
-
-    most: int = Field(description="workers that were ready at once, at most")
-    lost: int = Field(description="that went away")
-    refused: int = Field(description="that could not do it")
-    retried: int = Field(description="batches that were given out again")
-    batches: int = Field(description="batches that came back")
-    busy: JsonFloat = Field(description="seconds that workers were at batches")
-    loading: JsonFloat = Field(description="seconds that they loaded scenes and models")
-    alive: JsonFloat = Field(description="seconds that they were there and ready")
-    utilisation: JsonFloat | None = Field(description="`busy` over `alive`")
-    machines: dict[str, dict[str, str]] = Field(description="what rows call by a name, where machines are not alike")
-
-    @classmethod
-    def of_facts(cls, facts: Any, machines: Mapping[str, Mapping[str, str]]) -> SharedWork | None:
-        """Return the fields from what an executor says; None where it says nothing."""
-        if facts is None:
-            return None
-        share = min(1.0, facts.busy / facts.alive) if facts.alive else None
-        return cls.model_validate({**vars(facts), "utilisation": share, "machines": machines})
 
 
 class AttackSummary(SceneResult):
@@ -373,3 +273,103 @@ class AttackSummary(SceneResult):
         if self.verified is None:
             return f"{self.adversarial.label}, unverified" if self.goes_on and self.adversarial else ""
         return f"{self.verified.successes}/{self.verified.trials}"
+
+
+EpsilonBudget = float | None | dict[str, float | None]
+
+
+class ObjectRow(Fields):
+    """What the attacks on one object found, at the largest epsilon that was tried."""
+
+    object: str
+    clean: ControlGroup | None
+    ending: str | None = None
+    epsilon: EpsilonBudget = Field(default=None, description="of the last attack")
+    flips_at: EpsilonBudget = Field(description="the least epsilon at which an answer was found; null: at none")
+    verified: VerifiedRate | None = None
+    margin: JsonFloat | None = Field(default=None, description="mean of the trials, in logits")
+    run: str | None = None
+    tried: float | None = Field(default=None, description="the largest epsilon that was tried")
+    renders: dict[str, int] | None = Field(
+        default=None, description="pictures by kind, of the attacks at all epsilons together; null in older runs"
+    )
+
+
+class CurvePoint(Fields):
+    """How many objects are still recognised at an epsilon."""
+
+    epsilon: float | None
+    objects: int = Field(description="of which something is known there")
+    robust: int
+    found: int
+    already_wrong: int
+    accuracy: float | None
+    interval: Interval
+
+
+class CurveResult(InNotebook, StudyResult):
+    """Robust accuracy against epsilon, over objects."""
+
+    command: ClassVar[str] = "attack"
+    tabular: ClassVar[str] = "curve"
+
+    epsilons: list[float | None] = Field(description="those that were tried; null: the own of each control")
+    table: list[ObjectRow]
+    curve: list[CurvePoint]
+
+
+class MatrixModel(Fields):
+    """One of the models, and what it says of the clean scene in the pictures of all trials."""
+
+    model: str
+    labels: list[str] = Field(description="the names that count as right")
+    input_size: tuple[int, int] = Field(description="of the pictures that it is shown, [height, width] in pixels")
+    spp: int = Field(description="samples a pixel")
+    clean: ControlGroup
+
+
+class MatrixCell(Fields):
+    """One answer, tried on one model."""
+
+    model: str = Field(description="that it is tried on")
+    ending: str = Field(description="`found` where it is verified on this model, as for an attack")
+    verified: VerifiedRate
+
+
+class MatrixRow(Fields):
+    """One answer, and what it does to each model."""
+
+    attacked: str = Field(description="the model that it was searched on; `all` for an ensemble")
+    ending: str = Field(description="of the search and its own verification")
+    run: str | None
+    renders: dict[str, int] = Field(description="of the search and its own verification")
+    tested: list[MatrixCell] = Field(description="on each model; empty where nothing was searched")
+
+
+class MatrixResult(InNotebook, StudyResult):
+    """Answers that were searched on each of several models, or on all of them together, tried on each."""
+
+    command: ClassVar[str] = "attack"
+
+    models: list[str] = Field(description="as they were asked for")
+    ensemble: str | None = Field(description="how objectives were put together; null: each model by itself")
+    tested: list[MatrixModel] = Field(description="the models that answers were tried on; empty where none was")
+    table: list[MatrixRow]
+
+    @property
+    def brief(self) -> str:
+        """How many answers hold on models that they were not searched on."""
+        others = [cell for row in self.table for cell in row.tested if cell.model != row.attacked]
+        return f"{sum(cell.ending == 'found' for cell in others)} of {len(others)} transfer" if others else ""
+
+
+BY_FIELD: dict[str, type[Result]] = {"models": MatrixResult, "curve": CurveResult}
+"""Other results of the command, by a field that they alone have."""
+
+
+def attack_of(folder: Path) -> AttackSummary:
+    """Return the result of the attack in `folder`; errors as for `read_result`."""
+    result = read_result(folder)
+    if not isinstance(result, AttackSummary):
+        raise other_summary(folder / NAME, f"that of {result.command}")
+    return result

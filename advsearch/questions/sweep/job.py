@@ -11,17 +11,17 @@ from torch import Tensor
 
 from advsearch.attacks import Query
 from advsearch.attacks.draws import Seeds
-from advsearch.config import SweepConfig
 from advsearch.controls import Control, Space, make_control, make_space
 from advsearch.described import Value
 from advsearch.engine.journal import Sent
 from advsearch.engine.judging import Looked, Metrics, check_truth, facts_of
 from advsearch.engine.loading import Scene, framed
 from advsearch.engine.objective import domain_of
-from advsearch.engine.sweeps.axes import Axis, on_grid
-from advsearch.engine.sweeps.points import Drawn, Points
 from advsearch.errors import InputError
 from advsearch.models import Model
+from advsearch.questions.sweep.axes import Axis, on_grid
+from advsearch.questions.sweep.points import Drawn, Points
+from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.scene.description import ENVIRONMENT
 from advsearch.scene.formation import next_count
 from advsearch.tasks import Facts, Task

@@ -6,15 +6,18 @@ from typing import Annotated, ClassVar
 
 from pydantic import Field
 
-from advsearch.runs.results.attack import DescribedValue, LinearTransport, SharedWork, VerifiedRate
 from advsearch.runs.results.base import (
+    DescribedValue,
     Fields,
     Formation,
     Interval,
     JsonFloat,
+    LinearTransport,
     Payload,
     RunResult,
+    SharedWork,
     VariedValue,
+    VerifiedRate,
     as_fact,
     having,
 )

@@ -8,9 +8,9 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import field_validator
 
-from advsearch.config.attack import FEWEST_TRIALS, AttackConfig, DerivativeConfig
-from advsearch.config.scene import ControlsByName, RenderConfig, SceneConfig
+from advsearch.config.scene import ControlsByName, DerivativeConfig, RenderConfig, SceneConfig
 from advsearch.files import MESHES, either
+from advsearch.questions.attack.settings import FEWEST_TRIALS, AttackConfig
 from advsearch.settings import Clash, number_or_text, setting, setting_as_in, split_names
 
 Grid = dict[str, object]

@@ -17,14 +17,19 @@ from advsearch.attacks import Evaluation, Query
 from advsearch.attacks.draws import batches
 from advsearch.attacks.units import most_shown
 from advsearch.cluster import Executor, InProcess
-from advsearch.engine.attack_result import save_marked
 from advsearch.engine.journal import Journal, Sent, Shared, answering, finite, lost, other_answers, same
 from advsearch.engine.loading import framed
 from advsearch.engine.record import LOST, Stages, judgement_of, lost_remarks
-from advsearch.engine.sweeps import KIND, Job, check_all
-from advsearch.engine.sweeps.drives import Drives, time_axis
-from advsearch.engine.sweeps.predicting import combined
-from advsearch.engine.sweeps.summary import (
+from advsearch.interrupts import interruptible
+from advsearch.progress import Progress
+from advsearch.questions.attack.result import save_marked
+from advsearch.questions.sweep import summary as results
+from advsearch.questions.sweep.drives import Drives, time_axis
+from advsearch.questions.sweep.figures import sweep_figure
+from advsearch.questions.sweep.job import KIND, Job, check_all
+from advsearch.questions.sweep.page import write_sweep_page
+from advsearch.questions.sweep.predicting import combined
+from advsearch.questions.sweep.result import (
     FINISHED,
     INTERRUPTED,
     Answers,
@@ -33,25 +38,19 @@ from advsearch.engine.sweeps.summary import (
     counted_by_unit,
     map_over,
 )
-from advsearch.engine.sweeps.surface import map_surface
-from advsearch.engine.sweeps.swept_scene import Scenes, check_worst
-from advsearch.interrupts import interruptible
-from advsearch.progress import Progress
-from advsearch.report.figures import sweep_figure
+from advsearch.questions.sweep.summary import WorstConfiguration, WorstVerified
+from advsearch.questions.sweep.surface import map_surface
+from advsearch.questions.sweep.swept_scene import Scenes, check_worst
 from advsearch.report.wording import count
 from advsearch.runs.directory import AOV_FOLDER, RunDirectory
 from advsearch.runs.files import write_bytes
 from advsearch.runs.images import write_layers
-from advsearch.runs.results import sweep as results
-from advsearch.runs.results.attack import DescribedValue, LinearTransport, SharedWork
-from advsearch.runs.results.base import Formation
-from advsearch.runs.results.sweep import WorstConfiguration, WorstVerified
+from advsearch.runs.results.base import DescribedValue, Formation, LinearTransport, SharedWork
 from advsearch.runs.store import Row
 from advsearch.runs.tables import EDGES
 from advsearch.runs.units import NOTE
 from advsearch.tasks import Judgement
 from advsearch.viewer import thumbnails
-from advsearch.viewer.sweep_page import write_sweep_page
 
 NOT_FINITE = "pictures not finite"
 """The note under which the store keeps that there were some."""

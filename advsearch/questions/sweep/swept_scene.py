@@ -14,18 +14,18 @@ from torch import Tensor
 
 from advsearch import seeds
 from advsearch.attacks import Evaluation, Query, Trials, run_trials
-from advsearch.config import SweepConfig
 from advsearch.engine.journal import Journal, Shared
 from advsearch.engine.judging import facts_of
 from advsearch.engine.loading import framed, make_renderer
 from advsearch.engine.problem import Prepared, Problem
 from advsearch.engine.record import Stages, rate_of
-from advsearch.engine.sweeps import Job
-from advsearch.engine.sweeps.points import Points
-from advsearch.engine.sweeps.predicting import PredictedSweep, SweptPicture
 from advsearch.engine.verifier import Verifier, ladder_of
+from advsearch.questions.sweep.job import Job
+from advsearch.questions.sweep.points import Points
+from advsearch.questions.sweep.predicting import PredictedSweep, SweptPicture
+from advsearch.questions.sweep.settings import SweepConfig
+from advsearch.questions.sweep.summary import WorstVerified
 from advsearch.runs.directory import RunDirectory
-from advsearch.runs.results.sweep import WorstVerified
 from advsearch.scene.description import OBJECT
 from advsearch.scene.formation import to_8_bit
 from advsearch.scene.renderer import Renderer
