@@ -61,9 +61,13 @@ def things_as_text(things: object) -> str | None:
     anywhere.
 
     Raises:
-        ValueError: it is something else.
+        InputError: it is something else.
     """
     listed = things if isinstance(things, (list, tuple)) else [] if things is None else [things]
+    if not all(isinstance(one, (str, Mapping)) for one in listed):
+        raise InputError(
+            f"things: expected a text such as 'car@12,3.5', a mapping or a list of these, got {things!r:.80}"
+        )
     parts = [part for one in listed for part in (_thing_as_text(one) if isinstance(one, Mapping) else one).split(";")]
     named = []
     for part in filter(None, map(str.strip, parts)):

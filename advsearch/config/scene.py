@@ -301,10 +301,7 @@ class SceneConfig(Config):
     @field_validator("things", mode="before")
     @classmethod
     def _things_as_text(cls, value: Any) -> Any:
-        try:
-            return things_as_text(value)
-        except (AttributeError, OSError):
-            raise ValueError("no things") from None
+        return things_as_text(value)
 
     @field_validator("prompt", mode="before")
     @classmethod
