@@ -46,7 +46,7 @@ from sweep import ConstantRenderer, resident  # noqa: E402
 from advsearch.attacks import Evaluation  # noqa: E402
 from advsearch.engine.journal import Sent  # noqa: E402
 from advsearch.progress import NullProgress  # noqa: E402
-from advsearch.questions.sweep import swept_scene  # noqa: E402
+from advsearch.questions.sweep import job as swept_scene  # noqa: E402
 from advsearch.questions.sweep.carry_out import job_of  # noqa: E402
 from advsearch.questions.sweep.job import KIND  # noqa: E402
 from advsearch.questions.sweep.loop import Sweep  # noqa: E402

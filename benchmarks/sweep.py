@@ -32,7 +32,7 @@ from advsearch.controls import Space  # noqa: E402
 from advsearch.engine.loading import as_controls, framed, load_scene  # noqa: E402
 from advsearch.models import load_model  # noqa: E402
 from advsearch.progress import NullProgress  # noqa: E402
-from advsearch.questions.sweep import swept_scene  # noqa: E402
+from advsearch.questions.sweep import job as swept_scene  # noqa: E402
 from advsearch.questions.sweep.axes import read_axes  # noqa: E402
 from advsearch.questions.sweep.job import Job, NamedScene  # noqa: E402
 from advsearch.questions.sweep.loop import Sweep  # noqa: E402

@@ -38,7 +38,7 @@ from advsearch.questions.replay.answer import ReplayResult
 from advsearch.questions.stability.answer import CaseRow
 from advsearch.questions.sweep.summary import SweepSummary
 from advsearch.questions.test.answer import SuiteResult
-from advsearch.runs.results.base import (
+from advsearch.runs.results import (
     CleanScene,
     Fields,
     Formation,

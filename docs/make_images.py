@@ -17,7 +17,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from advsearch.cli.output import shown_text as answer
 from advsearch.questions.attack.summary import AttackSummary, PicturedAnswer, attack_of
-from advsearch.report.phrases import CLASSIFICATION, answer_text
+from advsearch.report.wording import CLASSIFICATION, answer_text
 from advsearch.runs.directory import default_name
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -43,8 +43,8 @@ from advsearch.questions.recipe.description import planned, read_recipe
 from advsearch.questions.recipe.description import recipe_names as recipes
 from advsearch.questions.recipe.settings import RecipeConfig
 from advsearch.questions.replay.answer import WAYS, ReplayConfig
+from advsearch.questions.stability.answer import StabilityConfig
 from advsearch.questions.stability.carry_out import chosen
-from advsearch.questions.stability.settings import StabilityConfig
 from advsearch.questions.sweep.axes import read_axes
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.questions.test.settings import SuiteConfig, read_suite

@@ -23,7 +23,7 @@ from advsearch.questions.attack.parts import problem_from_config
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.sweep.axes import on_grid, read_axes
 from advsearch.questions.sweep.points import Points
-from advsearch.runs.results.base import plain
+from advsearch.runs.results import plain
 from advsearch.scene.description import describe
 from advsearch.scene.formation import to_8_bit
 from advsearch.tasks import Classification

@@ -20,9 +20,9 @@ from advsearch.cli.output import shown_text as check_text
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Findings, Stages
 from advsearch.questions.attack.settings import AttackConfig
+from advsearch.questions.check.answer import CheckConfig
 from advsearch.questions.check.carry_out import check_from_config
-from advsearch.questions.check.settings import CheckConfig
-from advsearch.questions.precision.settings import PrecisionConfig
+from advsearch.questions.precision.answer import PrecisionConfig
 from advsearch.questions.region import growing as region
 from advsearch.questions.region.answer import RegionConfig
 from advsearch.questions.sweep.carry_out import sweep_from_config

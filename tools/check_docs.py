@@ -27,7 +27,7 @@ from advsearch.attacks.objectives import OBJECTIVE_KINDS
 from advsearch.attacks.policies import pgd
 from advsearch.attacks.verification import WORST_CASE
 from advsearch.cli.commands import COMMANDS
-from advsearch.cli.names import REGISTRIES
+from advsearch.cli.show import REGISTRIES
 from advsearch.controls import CONTROLS, texture
 from advsearch.files import MESHES
 from advsearch.models import loading, reference
@@ -41,7 +41,7 @@ from advsearch.questions.region.answer import RegionConfig
 from advsearch.questions.sweep.summary import SweepSummary
 from advsearch.questions.test import counterexamples as tested
 from advsearch.runs import directory, export, store
-from advsearch.runs.results.base import RenderResult, Result
+from advsearch.runs.results import RenderResult, Result
 from advsearch.scene import environments, exposure, library
 from advsearch.scene.geometry import FRAME_FILL
 from advsearch.scene.importing.pictures import TEXTURE_LIMIT

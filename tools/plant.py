@@ -301,7 +301,7 @@ FAULTS = (
         "advsearch/questions/attack/settings.py",
         "TRIALS_OVER if self.over else TRIALS",
         "TRIALS if self.over else TRIALS_OVER",
-        ("tests/config/test_config.py",),
+        ("tests/test_config.py",),
     ),
     Fault(
         "explain: a rule is counted on the rows that chose it",

@@ -35,7 +35,7 @@ from advsearch.questions.sweep.summary import SweepSummary
 from advsearch.registry import allow_named, names_code
 from advsearch.runs.directory import ARTIFACTS, IMAGES, find_run
 from advsearch.runs.images import read_png
-from advsearch.runs.results.base import RenderResult, Result
+from advsearch.runs.results import RenderResult, Result
 from advsearch.runs.summary import read_answer, read_result
 from advsearch.scene.importing.files import LARGEST_FILE
 from advsearch.scene.importing.hdr import read_exr

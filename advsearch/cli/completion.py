@@ -6,9 +6,8 @@ import argparse
 from typing import Any
 
 from advsearch.cli import output
-from advsearch.cli.commands import COMMANDS
-from advsearch.cli.names import REGISTRIES, list_names
-from advsearch.cli.question import Command
+from advsearch.cli.commands import COMMANDS, Command
+from advsearch.cli.show import REGISTRIES, list_names
 from advsearch.errors import InputError
 
 NAMED = {

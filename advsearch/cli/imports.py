@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import advsearch
 from advsearch.cli import output
+from advsearch.cli.commands import Command
 from advsearch.cli.output import at_work
-from advsearch.cli.question import Command
 from advsearch.errors import InputError
 from advsearch.files import MESHES, either
 from advsearch.runs.summary import read_result

@@ -27,7 +27,7 @@ from advsearch.files import JsonObject
 from advsearch.models import Model
 from advsearch.options import check_takes
 from advsearch.registry import check_import, current_directory_importable
-from advsearch.report.phrases import seen_text
+from advsearch.report.wording import seen_text
 from advsearch.runs.export import AFTER, OWN
 from advsearch.scene.description import OBJECT
 from advsearch.scene.renderer import Renderer

@@ -22,7 +22,7 @@ from advsearch.engine.acceptance import ComparedView, view_of
 from advsearch.engine.judging import Described, KnownTruths, Looked, Metrics, judgements, mean_metrics, with_things
 from advsearch.engine.objective import ConfigurationInputs, domain_of
 from advsearch.models import Model
-from advsearch.runs.results.base import GroupDerivative, PlannedGradient
+from advsearch.runs.results import GroupDerivative, PlannedGradient
 from advsearch.scene.description import NO_MAP
 from advsearch.scene.formation import to_8_bit
 from advsearch.scene.gradients import GradientPlan, Group

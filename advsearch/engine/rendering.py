@@ -12,8 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from advsearch import seeds
-from advsearch.config import SceneConfig
-from advsearch.config.scene import PICTURE_SPP, PICTURES
+from advsearch.config import PICTURE_SPP, PICTURES, SceneConfig
 from advsearch.controls import Space, compose
 from advsearch.controls.values import sentences
 from advsearch.described import Value
@@ -24,10 +23,10 @@ from advsearch.models import Model, load_model
 from advsearch.models.guards import plainly
 from advsearch.progress import Watched, watcher
 from advsearch.report.marks import contact_sheet, marked
-from advsearch.report.phrases import seen_text
+from advsearch.report.wording import seen_text
 from advsearch.runs.files import placed_by
 from advsearch.runs.images import png_bytes, write_exr, write_layers, write_png
-from advsearch.runs.results.base import Formation, MeshUp, RenderResult, ViewAnswers
+from advsearch.runs.results import Formation, MeshUp, RenderResult, ViewAnswers
 from advsearch.scene.description import OBJECT, SceneDescription
 from advsearch.scene.formation import SAMPLER, ImageFormation, to_8_bit
 from advsearch.scene.outlines import seen_things
@@ -295,7 +294,7 @@ def render(
         progress.advance(1)
     assert formation is not None
     own = scene.description
-    warnings = (*(space.scene or own).notes, *sentences(space.moved), *untold, *remarks)
+    warnings = (*space.notes(own), *sentences(space.moved), *untold, *remarks)
     shown = replace(own, environment_spec=space.environment or own.environment_spec)
     return Rendering(shown, model.name, made.name, formation, spp, tuple(views), warnings)
 
@@ -362,7 +361,7 @@ def sight_of(surfaces: Surfaces, mesh: str = OBJECT) -> Sight:
 
 def things_seen(renderer: Renderer, u: Tensor) -> JsonObject | None:
     """Return what the picture of a configuration (d,) shows of the object and each thing beside it, by name; None
-    where nothing stands beside it. See `runs.results.base.ThingSeen`."""
+    where nothing stands beside it. See `runs.results.ThingSeen`."""
     description = renderer.scene.made[0]
     if not description.things:
         return None

@@ -26,7 +26,7 @@ from advsearch.attacks.evaluation import Query, most_at_once
 from advsearch.attacks.rate_samples import CONDITIONS, OVER_LADDER, affordable, choose_rate_spp
 from advsearch.attacks.trials import LADDER, margins_of, most_samples
 from advsearch.cluster import Executor
-from advsearch.config.scene import SceneConfig
+from advsearch.config import SceneConfig
 from advsearch.engine.journal import Journal, Shared
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import KEPT, Findings, Stages

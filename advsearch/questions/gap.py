@@ -7,15 +7,15 @@ from typing import Any, ClassVar
 
 from pydantic import Field
 
-from advsearch.config.scene import SceneConfig
+from advsearch.config import SceneConfig
 from advsearch.question import Asked, question
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.report import wording
 from advsearch.report.figures import BLUE, GREY, RED
 from advsearch.report.markup import InNotebook
-from advsearch.report.phrases import margin_text, percent
 from advsearch.report.shown import AnswerPart, Claim, Column, ShownAnswer, average_claim, case_claim, searches_text
-from advsearch.runs.results.base import AverageCase, Fields, JsonFloat, StudyResult, VerifiedRate
+from advsearch.report.wording import margin_text, percent
+from advsearch.runs.results import AverageCase, Fields, JsonFloat, StudyResult, VerifiedRate
 from advsearch.settings import setting_as_in
 
 NOTE = (

@@ -1,16 +1,242 @@
-"""A summary (docs/answers.md) in plain words, for the final table and the report alike."""
+"""Numbers and results in plain words, and what a task's answers are called in sentences and tables, by its name."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import PurePath
 from typing import TYPE_CHECKING, Any
 
-from advsearch.report import phrases
+from advsearch.described import NOT_A_NUMBER
 from advsearch.settings import split_names
 
 if TYPE_CHECKING:
-    from advsearch.runs.results.base import ConditionRow, Formation, Interval, SharedWork, VerifiedRate
+    from advsearch.runs.results import ConditionRow, Formation, Interval, SharedWork, VerifiedRate
+
+
+CLASSIFICATION, DETECTION, SEGMENTATION = "classification", "detection", "segmentation"
+DEPTH, SIMILARITY = "depth", "similarity"
+"""Tasks whose answers have words of their own; others are quoted."""
+
+_MARGINS = {
+    CLASSIFICATION: "how far the wrong answer leads the right one, in logits",
+    DETECTION: "how far the best right box is under the score that counts, in log-odds; over 0 where none is found",
+    SEGMENTATION: "the lead of wrong classes at the pixel that decides, in logits; over 0 where too few are right",
+    DEPTH: "the logarithm of the factor by which the object's distance is off, less that of the tolerance",
+    SIMILARITY: "how far the nearest wrong name leads the right one, in logits",
+}
+_MARKS = {
+    DETECTION: "Blue is the true box, orange what the model finds with a score that counts.",
+    SEGMENTATION: "Blue is the true outline, orange the pixels to which the model gives a right class.",
+    DEPTH: "Blue is the true outline, orange the object's pixels whose distance is right. Beside it is the inverse of "
+    "the true distance, and of the model's: light is near.",
+}
+_WANTED = {
+    "mislabel": "makes the model take {} for something else",
+    "displace": "makes the model see {} elsewhere",
+    "create": "makes the model see beside {} what is not there",
+    "nearer": "makes the model judge {} nearer than it is",
+    "farther": "makes the model judge {} farther than it is",
+    "gone": "makes the model judge {} to be as far as what is behind it",
+}
+SUCCESS_ABOVE_ZERO = ("margin", "score", "vanish", *_WANTED)
+"""Objectives that are over 0 exactly where an answer is what is sought."""
+
+_UNITS = {
+    "logits": ("margin", "log_odds", "pixel_margin"),
+    "logarithm of a factor": ("nearer", "farther", "gone"),
+    "log-odds": ("vanish", "mislabel", "displace", "create"),
+    "nats": ("cross_entropy",),
+    "lengths of the clean features": ("feature_distance",),
+    "1 - cosine": ("distance",),
+    "those of the tasks": ("each",),
+}
+
+MOST_DECIMALS = 4
+"""Of a percentage."""
+PROBABILITY_DECIMALS = 1
+"""Of a probability that a model gives."""
+
+WHOLE = ("background", "itself", "something else")
+"""Answers without an article."""
+
+_NONE, _ELSEWHERE = "no ", " elsewhere"
+
+_DOING = {"calls": "calling", "finds": "finding", "sees": "seeing", "takes": "taking", "judges": "judging"}
+_DOING |= {"answers": "answering"}
+
+
+Said = Any
+"""An answer of a model: `advsearch.tasks.Answer`, or what a result holds of one."""
+
+
+def percent(share: float | None, most: int = MOST_DECIMALS) -> str:
+    """Return ``83 %`` for 0.83. 100 and 0 are said only of exactly 1 and 0."""
+    return "unknown" if share is None else f"{percent_number(float(share), most)} %"
+
+
+def percent_number(share: float, most: int = MOST_DECIMALS) -> str:
+    """Return ``83`` for 0.83, ``4.6`` for 0.0459, ``0.02`` for 0.000211 and ``99.98`` for 0.99979.
+
+    Within five of 0 or 100 it has one decimal, and nearer to them as many, `most` at most, as show how far it is away.
+    """
+    value = 100.0 * share
+    away = min(value, 100.0 - value)
+    if away >= 5.0 or away <= 0.0:
+        return f"{value:.0f}"
+    decimals = min(max(1, -math.floor(math.log10(away))), most)
+    text = f"{value:.{decimals}f}".rstrip("0").rstrip(".")
+    if text not in ("0", "100"):
+        return text
+    least = 10.0**-decimals
+    return f"under {least:.{decimals}f}" if text == "0" else f"over {100.0 - least:.{decimals}f}"
+
+
+def share_of_text(count: int, total: int, interval: tuple[float, float]) -> str:
+    """Return a share with its interval and what it is of: ``12 % (9 to 16) of 340``."""
+    if not total:
+        return "none of 0"
+    low, high = map(percent_number, interval)
+    return f"{percent(count / total)} ({low} to {high}) of {total:,}"
+
+
+def with_article(name: str) -> str:
+    """Return ``a mug``, ``an iron``."""
+    return f"{'an' if name[:1].lower() in 'aeiou' else 'a'} {name}"
+
+
+def beside_text(answer: str, pair: Any) -> str:
+    """Return what a model does without and with the answer of a run (`PairedRates`), in sentences."""
+    sides = [
+        f"{one.correct} of {one.configurations} ({percent(one.accuracy)}, 95 % interval "
+        f"{percent_number(one.interval[0])}-{percent_number(one.interval[1])} %)"
+        for one in (pair.clean, pair.answer)
+    ]
+    low, high = (100.0 * end for end in pair.interval)
+    ends = f"{-high:.0f} to {-low:.0f}" if pair.difference < 0 else f"{low:.0f} to {high:.0f}"
+    shown = "" if low > 0.0 or high < 0.0 else "; that there is a difference is not shown"
+    return (
+        f"{pair.model} is right in {sides[0]} of the clean scene, and in {sides[1]} with the answer of {answer}: "
+        f"{abs(100.0 * pair.difference):.0f} points {'fewer' if pair.difference < 0 else 'more'} (95 % interval of "
+        f"pairs {ends}){shown}. Right in the clean one alone are {pair.clean_only} pairs, with the answer alone "
+        f"{pair.answer_only}."
+    )
+
+
+def margin_text(task: str) -> str:
+    """Return what the margin of a task is, as a clause."""
+    return _MARGINS.get(task, "over 0 where the answer is wrong")
+
+
+def is_command(text: str) -> bool:
+    """Whether what a result says of asking the same again is a command; otherwise it says why there is none."""
+    return not text or text.startswith("advsearch ")
+
+
+def objective_label(objective: str) -> str:
+    """Return an objective with its unit, for an axis: ``margin [logits]``."""
+    return next((f"{objective} [{unit}]" for unit, names in _UNITS.items() if objective in names), objective)
+
+
+def marks_text(task: str) -> str:
+    """Return what is drawn into the pictures of a task's answers, in a sentence."""
+    return _MARKS.get(task, "Blue is true of the scene, orange is the model's answer.")
+
+
+def wanted(objective: str, thing: str) -> str:
+    """Return what a search with an objective looks for, as a clause: "makes the model miss this mug"."""
+    return _WANTED.get(objective, "makes the model miss {}").format(thing)
+
+
+def answer_cells(task: str, answer: Said) -> list[str]:
+    """Return an answer and its number, for a table: ``["vase", "84 %"]``, ``["no cup found", "best score of cup
+    0.12"]``.
+    """
+    label, share = answer.label, answer.probability
+    if share is None:
+        return [label, ""]
+    if task == SIMILARITY:
+        return [label, _similar(percent(share, PROBABILITY_DECIMALS), getattr(answer, "payload", None))]
+    if task == DETECTION:
+        if label.startswith(_NONE):
+            return [f"{label} found", f"best score of {label.removeprefix(_NONE)} {share:.2f}"]
+        return [label, f"score {share:.2f}"]
+    return [label, f"accuracy {percent(share)}" if task == SEGMENTATION else percent(share, PROBABILITY_DECIMALS)]
+
+
+def answer_text(task: str, answer: Said) -> str:
+    """Return an answer on one line: ``vase, 91 %``, ``no cup found (best score of cup 0.12)``."""
+    label, number = answer_cells(task, answer)
+    if task == SEGMENTATION and number and label.startswith(_NONE):
+        return f"{label} found, accuracy over the object's pixels {percent(answer.probability)}"
+    if task == SEGMENTATION and number:
+        return f"accuracy over the object's pixels {percent(answer.probability)}, most often {label}"
+    if task == DETECTION and number:
+        return f"{label} ({number})"
+    return f"{label}, {number}" if number else label
+
+
+SEEN = ("seen", "box", "distance")
+"""Heads of `things_rows`, behind the name."""
+
+
+def things_rows(things: Mapping[str, Any]) -> list[list[str]]:
+    """Return what is seen of each thing, for a table, from its name to `runs.results.ThingSeen` as a mapping."""
+    rows = []
+    for name, one in things.items():
+        share = "nothing" if one["box"] is None else "in part" if one["share"] is None else percent(one["share"])
+        box = "" if one["box"] is None else ", ".join(map(str, one["box"]))
+        rows.append([name, share, box, "" if one["distance"] is None else f"{one['distance']:.1f} m"])
+    return rows
+
+
+def seen_cells(task: str, answer: Said) -> list[str]:
+    """Return one of the answers to a whole picture, for a table: ``["cup", "score 0.77"]``, ``["mug", "91 %"]``."""
+    if answer.probability is None:
+        return [answer.label, ""]
+    if task == DETECTION:
+        return [answer.label, f"score {answer.probability:.2f}"]
+    share = percent(answer.probability, PROBABILITY_DECIMALS)
+    return [answer.label, f"{share} of the picture" if task == SEGMENTATION else share]
+
+
+def seen_text(task: str, answer: Said) -> str:
+    """Return the same on one line: ``cup (score 0.77)``, ``mug 91 %``."""
+    label, number = seen_cells(task, answer)
+    return f"{label} ({number})" if task == DETECTION and number else f"{label} {number}".rstrip()
+
+
+def calls(task: str, thing: str, label: str) -> str:
+    """Return what a model does to a thing, as a clause: ``calls this mug a vase``, ``finds no cup``."""
+    if label == NOT_A_NUMBER:
+        return f"answers nothing for {thing}, for its answer is not a number"
+    if task in (SEGMENTATION, DETECTION) and label.startswith(_NONE):
+        return f"finds {label}"
+    if task == DETECTION and label.endswith(_ELSEWHERE):
+        return f"sees {with_article(label.removesuffix(_ELSEWHERE))} where there is none"
+    if task == CLASSIFICATION:
+        return f"calls {thing} {with_article(label)}"
+    if task == DEPTH:
+        return f"judges {thing} {label}"
+    if task in (DETECTION, SEGMENTATION, SIMILARITY):
+        return f"takes {thing} for {label if label in WHOLE and task != DETECTION else with_article(label)}"
+    return f'answers "{label}" for {thing}'
+
+
+def calling(task: str, label: str) -> str:
+    """Return the same of a thing that was named already: ``calling it a vase``, ``finding no cup``."""
+    verb, _, rest = calls(task, "it", label).partition(" ")
+    return f"{_DOING[verb]} {rest.removesuffix(' for it')}"
+
+
+def _similar(share: str, kept: Any) -> str:
+    """Return how sure an answer of similarity is, and where the right one stands or how like the clean one it is."""
+    if not isinstance(kept, dict) or "cosine" not in kept:
+        return share
+    if "rank" not in kept:
+        return f"cosine {kept['cosine']:.2f}"
+    return f"{share}, right one at rank {kept['rank']} of {kept['references']}" if kept["rank"] > 1 else share
+
 
 NO_INTERVAL = "no interval"
 
@@ -41,7 +267,7 @@ def short_names(text: str) -> str:
 
 def interval_text(interval: Interval | None) -> str:
     """Return ``83-100 %`` for the interval of a rate."""
-    return f"{phrases.percent_number(interval[0])}-{phrases.percent_number(interval[1])} %" if interval else NO_INTERVAL
+    return f"{percent_number(interval[0])}-{percent_number(interval[1])} %" if interval else NO_INTERVAL
 
 
 def rate_text(rated: VerifiedRate) -> str:
@@ -87,7 +313,7 @@ def workers_text(shared: SharedWork | None) -> str:
         return ""
     told = [f"{shared.most} at most"]
     if shared.utilisation is not None:
-        told.append(f"busy {phrases.percent(shared.utilisation)} of {seconds_text(shared.alive)}")
+        told.append(f"busy {percent(shared.utilisation)} of {seconds_text(shared.alive)}")
     told.append(f"loading took {seconds_text(shared.loading)}")
     counts = {"lost": shared.lost, "refused": shared.refused, "given out again": shared.retried}
     return ", ".join([*told, *(f"{number} {what}" for what, number in counts.items() if number)])

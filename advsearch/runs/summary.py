@@ -22,8 +22,7 @@ from pydantic import ValidationError
 from advsearch.errors import FileFormatError
 from advsearch.files import opened_for, parse_json, read_bytes, read_text, split_paths
 from advsearch.runs.files import write_bytes, write_text
-from advsearch.runs.results import kind_of
-from advsearch.runs.results.base import Result
+from advsearch.runs.results import Result, kind_of
 from advsearch.settings.configuration import FILES
 
 NAME = "summary.json"

@@ -120,6 +120,9 @@ KERBS = (-2.3, 5.8)
 """Where the road ends on the right and on the left."""
 EDGES = (-10.0, 13.6)
 """Where the pavements end: a multiple of their slabs."""
+EYE, FRONTS, STREET_ENDS = 1.5, (-12.0, 15.6), 170.0
+"""Of the streets' maps: the height above the road that they are seen from, where the fronts of the houses stand on the
+right and on the left, and how far the street goes on."""
 PERIOD = 12.0
 """The pattern repeats along the road."""
 LENGTH = 120.0

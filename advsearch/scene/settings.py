@@ -194,6 +194,15 @@ GROUND = (
         f"{PHOTOGRAPHED_FROM:g}, or 1.6 m",
         "Height above the floor from which the photograph was taken; in metres where the object's size is known.",
     ),
+    Parameter(
+        "radius",
+        (),
+        "object sizes",
+        1e-3,
+        1e5,
+        "5 heights",
+        "How far from the photograph's camera its floor is empty; in metres where the object's size is known.",
+    ),
 )
 MATERIAL = (
     _surface("roughness", "Roughness of the surface: 0 is polished, 1 is matt.", (0.1, 1.0)),

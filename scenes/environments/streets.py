@@ -12,15 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from advsearch.scene.grounds import WETNESS, reflectance
+from advsearch.scene.grounds import EYE, FRONTS, WETNESS, reflectance
+from advsearch.scene.grounds import STREET_ENDS as END
 
 from .panorama import Array, EnvironmentFamily
 
 Bools = npt.NDArray[np.bool_]
 
-EYE = 1.5
-FRONTS = (-12.0, 15.6)  # y of the fronts of the houses
-END = 170.0  # the street is closed by trees there
 WALLS = np.array(
     [
         (0.42, 0.30, 0.22), (0.55, 0.50, 0.42), (0.36, 0.17, 0.12), (0.48, 0.44, 0.40), (0.60, 0.52, 0.36),

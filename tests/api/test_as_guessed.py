@@ -31,7 +31,7 @@ from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.gap import GapResult
 from advsearch.questions.region.answer import RegionResult
 from advsearch.questions.sweep.result import SweepResult
-from advsearch.runs.results.base import Result
+from advsearch.runs.results import Result
 
 SIDE = 16
 PICTURE: dict[str, Any] = {"resolution": SIDE, "spp": 1, "denoise": "none", "threads": 1}

@@ -23,7 +23,7 @@ from samples import ATTACK, AVERAGE, BRACKET, EASIER, SUMMARY, TARGET, make_run,
 
 import advsearch
 from advsearch import __version__
-from advsearch.cli import names
+from advsearch.cli import show as names
 from advsearch.cli.commands import COMMANDS, help_of
 from advsearch.cli.flags import with_flags
 from advsearch.cli.main import main

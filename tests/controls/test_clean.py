@@ -19,7 +19,7 @@ from advsearch.errors import InputError
 from advsearch.progress import NullProgress
 from advsearch.questions.sweep.carry_out import sweep_from_config
 from advsearch.questions.sweep.settings import SweepConfig
-from advsearch.runs.results.base import plain
+from advsearch.runs.results import plain
 from advsearch.scene.assets import EnvironmentAsset
 from advsearch.scene.description import DEFAULT_ENVIRONMENT, SceneDescription, describe
 

@@ -20,15 +20,15 @@ from advsearch.cli.output import shown_text as answer
 from advsearch.engine.journal import answering
 from advsearch.errors import InputError
 from advsearch.progress import NullProgress
-from advsearch.questions.sweep import swept_scene
+from advsearch.questions.sweep import job as swept_scene
 from advsearch.questions.sweep.answer import claims
+from advsearch.questions.sweep.answer import over_drives as told_over
 from advsearch.questions.sweep.carry_out import job_of
 from advsearch.questions.sweep.drives import longest, over_drives
+from advsearch.questions.sweep.job import Scenes
 from advsearch.questions.sweep.loop import Sweep
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.questions.sweep.summary import DriveRates
-from advsearch.questions.sweep.swept_scene import Scenes
-from advsearch.questions.sweep.wording import over_drives as told_over
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.tables import read_sweep
 

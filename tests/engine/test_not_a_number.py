@@ -17,8 +17,7 @@ from advsearch.engine.record import control_group, judgement_of, rate_of, trial_
 from advsearch.errors import InputError
 from advsearch.questions.attack import wording
 from advsearch.questions.attack.summary import AttackSummary
-from advsearch.report.phrases import answer_cells, calls
-from advsearch.report.wording import tally
+from advsearch.report.wording import answer_cells, calls, tally
 from advsearch.tasks import Answer, Judgement
 
 NOTHING = Judgement.of(math.nan, math.nan, Answer("tench", 0, math.nan))

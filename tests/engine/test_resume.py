@@ -27,8 +27,8 @@ from advsearch.engine.record import Stages
 from advsearch.errors import FileFormatError, InputError, RunExistsError
 from advsearch.progress import NullProgress
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.check.settings import CheckConfig
-from advsearch.questions.stability.settings import StabilityConfig
+from advsearch.questions.check.answer import CheckConfig
+from advsearch.questions.stability.answer import StabilityConfig
 from advsearch.runs import files
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.listing import can_resume

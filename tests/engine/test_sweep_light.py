@@ -13,9 +13,9 @@ from advsearch.attacks.draws import Product
 from advsearch.engine import acceptance
 from advsearch.engine.acceptance import Deviation
 from advsearch.questions.sweep import predicting
+from advsearch.questions.sweep.job import SweptScene
 from advsearch.questions.sweep.predicting import Groups, combined
-from advsearch.questions.sweep.swept_scene import SweptScene
-from advsearch.runs.results.base import LinearTransport, PredictionError
+from advsearch.runs.results import LinearTransport, PredictionError
 
 SMALL: dict[str, Any] = {"resolution": 48, "trials": 0}
 GRID = {"camera.exposure": [-10, -1, 6], "light.power": "0:6:8"}

@@ -20,12 +20,12 @@ from advsearch.engine.journal import answering
 from advsearch.progress import NullProgress
 from advsearch.questions.sweep import predicting
 from advsearch.questions.sweep.carry_out import job_of
+from advsearch.questions.sweep.job import Scenes, SweptScene
 from advsearch.questions.sweep.loop import Sweep
 from advsearch.questions.sweep.predicting import Groups
 from advsearch.questions.sweep.settings import SweepConfig
-from advsearch.questions.sweep.swept_scene import Scenes, SweptScene
 from advsearch.runs.directory import RunDirectory
-from advsearch.runs.results.base import LinearTransport
+from advsearch.runs.results import LinearTransport
 from advsearch.scene.surface import arrangement, texels
 from advsearch.scene.surface.renderer import SurfaceRenderer
 

@@ -13,9 +13,9 @@ from stored_sweeps import make_sweep
 
 from advsearch.attacks.trials import clopper_pearson
 from advsearch.errors import InputError
+from advsearch.questions.sweep.answer import distance_of, distance_sentence, seen_from
 from advsearch.questions.sweep.page import SweepSource, sweep_page_html
 from advsearch.questions.sweep.summary import AxisRow
-from advsearch.questions.sweep.wording import distance_of, distance_sentence, seen_from
 
 DISTANCES = (5.0, 10.0, 20.0, 40.0, 80.0)
 

@@ -37,7 +37,7 @@ from advsearch.runs.directory import RunDirectory, default_name, find_run, run_p
 from advsearch.runs.export import FORMATS, write_rows
 from advsearch.runs.files import PART, VERSION, RunLock, replacing, write_bytes, write_text
 from advsearch.runs.listing import finished, listed_runs
-from advsearch.runs.results.base import Result, plain
+from advsearch.runs.results import Result, plain
 from advsearch.runs.store import Row, Store
 from advsearch.runs.summary import read_result
 

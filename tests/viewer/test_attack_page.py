@@ -35,14 +35,12 @@ from advsearch.errors import FileFormatError
 from advsearch.questions.attack import wording
 from advsearch.report.figures import search_axes
 from advsearch.report.markup import NARROW, WIDE, Html, element, figure_of_answer, join_html, study_chart
-from advsearch.report.phrases import objective_label, percent
 from advsearch.report.shown import shown
-from advsearch.report.wording import interval_text, seconds_text
+from advsearch.report.wording import interval_text, objective_label, percent, seconds_text
 from advsearch.runs.directory import OBJECT_FILE
 from advsearch.runs.images import read_png
 from advsearch.viewer.document import asset
-from advsearch.viewer.pages import LARGEST, object_part, read_object
-from advsearch.viewer.parts import LARGE_PICTURE, SMALLER_SIDE
+from advsearch.viewer.pages import LARGE_PICTURE, LARGEST, SMALLER_SIDE, object_part, read_object
 
 VOID = {"meta", "img", "br", "hr", "link"}
 

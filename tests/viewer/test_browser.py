@@ -43,9 +43,9 @@ from advsearch.questions.recipe.answer import RecipeResult
 from advsearch.questions.replay.answer import ReplayResult
 from advsearch.questions.stability.answer import StabilityResult
 from advsearch.questions.sweep.page import write_bundle
-from advsearch.report.phrases import answer_text, percent_number
+from advsearch.report.wording import answer_text, percent_number
 from advsearch.runs.directory import RunDirectory
-from advsearch.runs.results.base import Result
+from advsearch.runs.results import Result
 from advsearch.runs.store import Row, Store, Told
 from advsearch.tasks import Answer
 from advsearch.viewer import thumbnails

@@ -17,7 +17,7 @@ from advsearch.questions.recipe.answer import RecipeResult
 from advsearch.questions.stability.answer import StabilityResult
 from advsearch.report.shown import fields_shown
 from advsearch.runs.directory import RunDirectory
-from advsearch.runs.results.base import Result, StudyResult
+from advsearch.runs.results import Result, StudyResult
 from advsearch.viewer.document import heading
 from advsearch.viewer.pages import shown_page, write_page
 

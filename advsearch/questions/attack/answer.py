@@ -18,7 +18,6 @@ from advsearch.questions.attack.summary import (
     MatrixResult,
 )
 from advsearch.report.figures import BLUE
-from advsearch.report.phrases import answer_cells, margin_text, percent
 from advsearch.report.shown import (
     ENDED,
     NO_PROOF,
@@ -36,8 +35,18 @@ from advsearch.report.shown import (
     searches_text,
     share_text,
 )
-from advsearch.report.wording import count, interval_text, no_numbers, number_text, short_name, tally
-from advsearch.runs.results.base import ControlGroup, VerifiedRate
+from advsearch.report.wording import (
+    answer_cells,
+    count,
+    interval_text,
+    margin_text,
+    no_numbers,
+    number_text,
+    percent,
+    short_name,
+    tally,
+)
+from advsearch.runs.results import ControlGroup, VerifiedRate
 
 NOT_VERIFIED = ("not verified", "")
 """Cells of what was not rendered afresh."""

@@ -230,8 +230,7 @@ def _carry_out(job: AttackParts, progress: Progress, resumed: str | Path | None 
         stages = Stages(progress)
         stages.begin("setup", PREPARING)
         problem = problem_on(job)
-        own = job.scene.description
-        warnings = [*(problem.space.scene or own).notes, *job.loaded[1], *sentences(problem.space.moved)]
+        warnings = [*problem.space.notes(job.scene.description), *job.loaded[1], *sentences(problem.space.moved)]
         for text in warnings:
             progress.message(text)
         policy = _policy(job, problem)

@@ -34,7 +34,7 @@ from advsearch.questions.attack.summary import AttackSummary, PicturedAnswer
 from advsearch.report.wording import number_text
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.files import write_bytes
-from advsearch.runs.results.base import (
+from advsearch.runs.results import (
     AverageCase,
     DescribedValue,
     Formation,

@@ -19,11 +19,18 @@ from advsearch.questions.attack import wording
 from advsearch.questions.attack.answer import answered_text, failures_part, failures_text, range_text, shown
 from advsearch.questions.attack.summary import AttackSummary, FoundValue, PicturedAnswer
 from advsearch.report.figures import search_axes
-from advsearch.report.phrases import SUCCESS_ABOVE_ZERO, answer_text, marks_text, objective_label
 from advsearch.report.shown import AnswerPart, Picture
-from advsearch.report.wording import formation_text, number_text, seconds_text
+from advsearch.report.wording import (
+    SUCCESS_ABOVE_ZERO,
+    answer_text,
+    formation_text,
+    marks_text,
+    number_text,
+    objective_label,
+    seconds_text,
+)
 from advsearch.runs import directory, images, store
-from advsearch.runs.results.base import Result
+from advsearch.runs.results import Result
 from advsearch.viewer.document import data_script, data_url
 from advsearch.viewer.pages import object_data, object_part, read_object, shown_page
 

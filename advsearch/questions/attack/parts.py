@@ -20,8 +20,7 @@ from advsearch.attacks.objectives import OBJECTIVE_KINDS, asked_by, check_object
 from advsearch.attacks.policies import POLICIES
 from advsearch.cluster import Executor, Work
 from advsearch.cluster.dask_pool import executor_of
-from advsearch.config import SceneConfig
-from advsearch.config.scene import one_only
+from advsearch.config import SceneConfig, one_only
 from advsearch.controls import make_space
 from advsearch.controls.base import Control
 from advsearch.controls.values import by_distribution, sentences

@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import JsonValue, model_validator
 
-from advsearch.config.scene import ControlsByName, DerivativeConfig, RenderConfig, SceneConfig, name_in, read_named
+from advsearch.config import ControlsByName, DerivativeConfig, RenderConfig, SceneConfig, name_in, read_named
 from advsearch.files import JsonObject
 from advsearch.settings import Clash, power, setting, setting_as_in, split_names
 

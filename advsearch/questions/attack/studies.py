@@ -53,7 +53,7 @@ from advsearch.runs import files
 from advsearch.runs.directory import CONFIG, PARTS, default_name, is_run
 from advsearch.runs.files import PART, storage_errors, write_bytes
 from advsearch.runs.listing import finished
-from advsearch.runs.results.base import INTERRUPTED, Result
+from advsearch.runs.results import INTERRUPTED, Result
 from advsearch.runs.summary import read_answer, read_result
 from advsearch.scene.library import list_objects, load_object
 from advsearch.settings import FILES, Config

@@ -8,7 +8,7 @@ from typing import ClassVar
 from pydantic import Field
 
 from advsearch.report.markup import InNotebook
-from advsearch.runs.results.base import (
+from advsearch.runs.results import (
     AverageCase,
     CleanScene,
     ControlGroup,

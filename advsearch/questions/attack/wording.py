@@ -8,9 +8,20 @@ from pathlib import PurePath
 from typing import Any
 
 from advsearch.questions.attack.summary import AttackSummary
-from advsearch.report import phrases
-from advsearch.report.wording import count, number_text, rate_text, seconds_text
-from advsearch.runs.results.base import PrintTerms, VerifiedRate
+from advsearch.report.wording import (
+    CLASSIFICATION,
+    SUCCESS_ABOVE_ZERO,
+    calling,
+    calls,
+    count,
+    margin_text,
+    number_text,
+    rate_text,
+    seconds_text,
+    wanted,
+    with_article,
+)
+from advsearch.runs.results import PrintTerms, VerifiedRate
 
 PATH = "path"
 """The control whose conditions are moments."""
@@ -33,10 +44,10 @@ def attack_verdict(summary: AttackSummary) -> str:
     ending, verified = summary.ending, summary.verified
     thing = f"this {noun(summary)}"
     if ending == "already wrong":
-        wrong = phrases.calls(summary.task, thing, summary.clean.label)
+        wrong = calls(summary.task, thing, summary.clean.label)
         return f"The model already {wrong}: nothing was changed and nothing counts as found."
     if verified is None and ending == "interrupted" and summary.adversarial:
-        says = phrases.calls(summary.task, thing, summary.adversarial.label)
+        says = calls(summary.task, thing, summary.adversarial.label)
         return f"Interrupted after {count(summary.steps, 'step')}. The answer so far is not verified: the model {says}."
     if verified is None:
         return f"{ending[:1].upper()}{ending[1:]} after {count(summary.steps, 'step')}; nothing is verified."
@@ -73,7 +84,7 @@ def remarks(summary: AttackSummary) -> list[str]:
         said.append(
             "The random search beside it found a worse configuration than the policy did "
             f"({own.successes} of {own.trials} with a margin of {own.margin:.2f}); that of the random search is the "
-            f"answer. The margin is {phrases.margin_text(summary.task)}."
+            f"answer. The margin is {margin_text(summary.task)}."
         )
     else:
         said += _against_random(summary)
@@ -105,7 +116,7 @@ def goal_text(summary: AttackSummary) -> str:
 def objective_text(summary: AttackSummary) -> str:
     """Return what came of an objective that is no margin, over the trials; empty where there is nothing to say."""
     tried = summary.tried_objective
-    if tried is None or summary.objective in phrases.SUCCESS_ABOVE_ZERO:
+    if tried is None or summary.objective in SUCCESS_ABOVE_ZERO:
         return ""
     parts = [
         f"{name} {one.mean:.3g} (from {one.low:.3g} to {one.high:.3g})"
@@ -199,14 +210,14 @@ def _how_it_errs(summary: AttackSummary, verified: VerifiedRate, thing: str) -> 
         return f"The model recognises {thing}, more surely than in the clean scene,"
     answers = verified.labels
     if len(answers) == 1:
-        return f"The model {phrases.calls(summary.task, thing, next(iter(answers)))}"
+        return f"The model {calls(summary.task, thing, next(iter(answers)))}"
     if answers:
         most = max(answers, key=lambda label: answers[label])
         what = "takes {} for one of the targets" if summary.target else "is wrong about {}"
-        return f"The model {what.format(thing)}, most often {phrases.calling(summary.task, most)},"
-    if summary.task != phrases.CLASSIFICATION:
+        return f"The model {what.format(thing)}, most often {calling(summary.task, most)},"
+    if summary.task != CLASSIFICATION:
         return f"The model is wrong about {thing}"
-    called = phrases.with_article(summary.adversarial.label) if summary.adversarial else "something else"
+    called = with_article(summary.adversarial.label) if summary.adversarial else "something else"
     return f"The model takes {thing} for something else ({called})"
 
 
@@ -214,7 +225,7 @@ def _claim(summary: AttackSummary, thing: str) -> str:
     """Return what a trial counts as, as a clause: "the model is wrong about this mug"."""
     if summary.minimises:
         return f"the model recognises {thing}, more surely than in the clean scene,"
-    if summary.target and summary.task == phrases.CLASSIFICATION:
+    if summary.target and summary.task == CLASSIFICATION:
         return f"the model calls {thing} {_a_target(summary)}"
     if summary.target:
         return f"the model answers {' or '.join(summary.target)}"
@@ -225,15 +236,11 @@ def _wanted(summary: AttackSummary, thing: str) -> str:
     """Return what was looked for, as a clause: "makes the model miss this mug"."""
     if summary.minimises:
         return f"makes {thing} easier to recognise"
-    return (
-        f"makes the model call {thing} {_a_target(summary)}"
-        if summary.target
-        else phrases.wanted(summary.objective, thing)
-    )
+    return f"makes the model call {thing} {_a_target(summary)}" if summary.target else wanted(summary.objective, thing)
 
 
 def _a_target(summary: AttackSummary) -> str:
-    return " or ".join(phrases.with_article(name) for name in summary.target or ())
+    return " or ".join(with_article(name) for name in summary.target or ())
 
 
 def _against_random(summary: AttackSummary) -> list[str]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from pydantic import ValidatorFunctionWrapHandler, field_validator, model_validator
 
-from advsearch.config.scene import SceneConfig
+from advsearch.config import SceneConfig
 from advsearch.errors import InputError
 from advsearch.question import Asked, question
 from advsearch.questions.compare.answer import ComparedPair, ComparedSide, CompareResult
@@ -16,7 +16,7 @@ from advsearch.questions.compare.answer import claims as claims
 from advsearch.questions.compare.answer import shown as shown
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.runs.directory import PARTS, find_run
-from advsearch.runs.results.base import INTERRUPTED
+from advsearch.runs.results import INTERRUPTED
 from advsearch.settings import each_once, setting, setting_as_in, settings, split_names, texts
 
 if TYPE_CHECKING:

@@ -24,9 +24,9 @@ from advsearch.errors import FileFormatError, InputError, ModelError
 from advsearch.question import Asked
 from advsearch.questions.compare.answer import ComparedPair, CountOf, PairPart, PairPicture, PairRule
 from advsearch.questions.sweep.carry_out import scenes_of
+from advsearch.questions.sweep.job import Scenes
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.questions.sweep.summary import SweepSummary
-from advsearch.questions.sweep.swept_scene import Scenes
 from advsearch.report.wording import short_names
 from advsearch.rules import FEWEST_ROWS, find_rules, halves, interval_of, observed
 from advsearch.runs.directory import CONFIG

@@ -57,7 +57,7 @@ from advsearch.questions.harden.training import (
 )
 from advsearch.runs.directory import ARTIFACTS, IMAGES, RunDirectory, is_run, run_path
 from advsearch.runs.files import write_bytes
-from advsearch.runs.results.base import INTERRUPTED, SharedWork
+from advsearch.runs.results import INTERRUPTED, SharedWork
 from advsearch.runs.store import Row
 from advsearch.tasks import make_task
 from advsearch.viewer.pages import keep_answer

@@ -30,7 +30,7 @@ from advsearch.questions.attack.parts import problem_of
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.harden.lessons import Lesson, has_matrix, lessons, plain_lessons
 from advsearch.questions.harden.settings import ALL, HardenConfig
-from advsearch.runs.results.base import INTERRUPTED
+from advsearch.runs.results import INTERRUPTED
 from advsearch.scene.assets import ObjectAsset
 from advsearch.scene.formation import levels_of
 from advsearch.scene.library import list_environments

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 
 from advsearch.api.keywords import asks, configured
-from advsearch.config.scene import DEFAULT_ENVIRONMENT, SceneConfig, name_in
+from advsearch.config import DEFAULT_ENVIRONMENT, SceneConfig, name_in
 from advsearch.controls import CONTROLS
 from advsearch.errors import InputError
 from advsearch.progress import NullProgress, Progress, Watched, watcher
@@ -39,10 +39,10 @@ from advsearch.questions.recipe.table import TRIAL, TRIALS, WORKERS, Table, read
 from advsearch.questions.sweep.carry_out import scenes_of
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.questions.sweep.summary import SweepSummary
-from advsearch.report.phrases import DETECTION
+from advsearch.report.wording import DETECTION
 from advsearch.runs.directory import IMAGES, PARTS, RunDirectory
 from advsearch.runs.files import write_bytes
-from advsearch.runs.results.base import INTERRUPTED
+from advsearch.runs.results import INTERRUPTED
 from advsearch.runs.store import NAME as STORE
 from advsearch.runs.store import Store
 from advsearch.runs.summary import NAME as SUMMARY

@@ -20,9 +20,8 @@ from advsearch.questions.attack.summary import AttackSummary
 from advsearch.questions.recipe.answer import Cell
 from advsearch.questions.sweep.summary import SurfaceMap, SweepSummary
 from advsearch.report.figures import BLUE, GREY, RED
-from advsearch.report.phrases import percent
-from advsearch.report.wording import figure_value, interval_text
-from advsearch.runs.results.base import Interval
+from advsearch.report.wording import figure_value, interval_text, percent
+from advsearch.runs.results import Interval
 from advsearch.runs.store import NAME, Store
 from advsearch.runs.units import units_of
 

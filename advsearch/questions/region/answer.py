@@ -7,12 +7,12 @@ from typing import Annotated, ClassVar
 
 from pydantic import Field
 
-from advsearch.config.scene import DerivativeConfig, SceneConfig
+from advsearch.config import DerivativeConfig, SceneConfig
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.report.markup import InNotebook
-from advsearch.report.phrases import percent
 from advsearch.report.shown import AnswerPart, Claim, Column, Extent, ShownAnswer, claim, share_text
-from advsearch.runs.results.base import (
+from advsearch.report.wording import percent
+from advsearch.runs.results import (
     CleanScene,
     Fields,
     Formation,

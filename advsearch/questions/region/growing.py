@@ -28,7 +28,7 @@ from advsearch.questions.sweep.predicting import pays_from
 from advsearch.report.figures import MARGIN, Figures, axis_title, figure_of, heat
 from advsearch.runs.directory import CONFIG, RunDirectory, find_run
 from advsearch.runs.files import write_bytes
-from advsearch.runs.results.base import CleanScene, Formation, MovedValue
+from advsearch.runs.results import CleanScene, Formation, MovedValue
 from advsearch.runs.summary import read_answer
 from advsearch.scene.surface import renderer as surface_renderer
 from advsearch.scene.surface.arrangement import CAMERAS, FREE

@@ -20,7 +20,7 @@ from advsearch.questions.sweep.summary import SweepSummary
 from advsearch.report import wording
 from advsearch.report.shown import Claim, Extent, claim, nothing_claimed, share_text
 from advsearch.runs.directory import CONFIG, IMAGES, PARTS, find_run, is_run, typed_name
-from advsearch.runs.results.base import Result, VariedValue
+from advsearch.runs.results import Result, VariedValue
 from advsearch.runs.store import NAME as STORE
 from advsearch.runs.store import Store
 from advsearch.runs.summary import MADE_WITH, read_result

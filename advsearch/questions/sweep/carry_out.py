@@ -49,11 +49,10 @@ from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.summary import attack_of
 from advsearch.questions.sweep.axes import Axis, on_grid, read_axes
 from advsearch.questions.sweep.drives import with_frames
-from advsearch.questions.sweep.job import Job, NamedScene, check_all, check_scenes
+from advsearch.questions.sweep.job import Job, NamedScene, Scenes, check_all, check_scenes
 from advsearch.questions.sweep.loop import carry_out
 from advsearch.questions.sweep.result import SweepResult
 from advsearch.questions.sweep.settings import SweepConfig
-from advsearch.questions.sweep.swept_scene import Scenes
 from advsearch.runs.directory import CONFIG, RunDirectory, begun, check_free, find_run, is_run, run_path
 from advsearch.runs.listing import finished
 from advsearch.runs.summary import read_answer
@@ -302,7 +301,7 @@ def _job(
         for control in on_grid(drawn, axes, described):
             described = control.prepare(described) if control.kind == ENVIRONMENT else described
         warnings += described.notes
-    return Job(
+    job = Job(
         config=config,
         places=tuple(places),
         models=networks,
@@ -310,8 +309,10 @@ def _job(
         controls=drawn,
         axes=axes,
         aovs=aovs_of(config.aov),
-        warnings=tuple(dict.fromkeys(warnings)),
     )
+    for place in places:
+        warnings += job.space(place, job.sizes[0]).notes(place.scene.description)
+    return replace(job, warnings=tuple(dict.fromkeys(warnings)))
 
 
 def _places(config: SweepConfig) -> tuple[NamedScene, ...]:

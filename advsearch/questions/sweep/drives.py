@@ -15,10 +15,9 @@ from advsearch.controls.path import PathControl
 from advsearch.engine.naming import given_to
 from advsearch.questions.attack.result import evenly, write_drive
 from advsearch.questions.sweep.axes import Axis
-from advsearch.questions.sweep.job import Job
+from advsearch.questions.sweep.job import Job, Scenes
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.questions.sweep.summary import DriveRates, OverDrives
-from advsearch.questions.sweep.swept_scene import Scenes
 from advsearch.report.marks import marked
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row

@@ -26,7 +26,7 @@ from advsearch.questions.attack.result import save_marked
 from advsearch.questions.sweep import summary as results
 from advsearch.questions.sweep.drives import Drives, time_axis
 from advsearch.questions.sweep.figures import sweep_figure
-from advsearch.questions.sweep.job import KIND, Job, check_all
+from advsearch.questions.sweep.job import KIND, Job, Scenes, check_all, check_worst
 from advsearch.questions.sweep.page import write_sweep_page
 from advsearch.questions.sweep.predicting import combined
 from advsearch.questions.sweep.result import (
@@ -40,12 +40,11 @@ from advsearch.questions.sweep.result import (
 )
 from advsearch.questions.sweep.summary import WorstConfiguration, WorstVerified
 from advsearch.questions.sweep.surface import map_surface
-from advsearch.questions.sweep.swept_scene import Scenes, check_worst
 from advsearch.report.wording import count
 from advsearch.runs.directory import AOV_FOLDER, RunDirectory
 from advsearch.runs.files import write_bytes
 from advsearch.runs.images import write_layers
-from advsearch.runs.results.base import DescribedValue, Formation, LinearTransport, SharedWork
+from advsearch.runs.results import DescribedValue, Formation, LinearTransport, SharedWork
 from advsearch.runs.store import Row
 from advsearch.runs.tables import EDGES
 from advsearch.runs.units import NOTE

@@ -17,12 +17,12 @@ from typing import TYPE_CHECKING
 
 from advsearch.errors import AdvsearchError, InputError
 from advsearch.files import JsonObject, JsonValue
-from advsearch.questions.sweep import wording as sweeps
+from advsearch.questions.sweep import answer as sweeps
 from advsearch.questions.sweep.summary import SweepSummary
 from advsearch.report import wording
 from advsearch.report.markup import Html, element, join_html
-from advsearch.report.phrases import answer_text, beside_text, percent
 from advsearch.report.shown import shown
+from advsearch.report.wording import answer_text, beside_text, percent
 from advsearch.runs import directory
 from advsearch.runs.files import placed_by, write_bytes, write_text
 from advsearch.runs.summary import read_result
@@ -35,8 +35,7 @@ from advsearch.viewer.document import (
     remarks_html,
     subject_html,
 )
-from advsearch.viewer.pages import page_of
-from advsearch.viewer.parts import end_html, part_html
+from advsearch.viewer.pages import end_html, page_of, part_html
 from advsearch.viewer.thumbnails import Kept, kept_pictures, path_of, read_thumbnail
 
 if TYPE_CHECKING:

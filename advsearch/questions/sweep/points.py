@@ -22,7 +22,7 @@ from advsearch.controls.base import Value
 from advsearch.controls.ranges import Range
 from advsearch.controls.values import Fixed, OneOf, to_value
 from advsearch.questions.sweep.axes import Axis
-from advsearch.runs.results.base import VariedValue
+from advsearch.runs.results import VariedValue
 from advsearch.runs.units import Units
 from advsearch.scene.description import ENVIRONMENT
 

@@ -21,7 +21,7 @@ from advsearch.engine.problem import Problem
 from advsearch.files import scaled
 from advsearch.questions.sweep.axes import Axis
 from advsearch.questions.sweep.points import Points
-from advsearch.runs.results.base import LinearTransport, PredictionError
+from advsearch.runs.results import LinearTransport, PredictionError
 from advsearch.scene.assembly import ON_PICTURE
 from advsearch.scene.formation import to_8_bit
 from advsearch.scene.mitsuba_backend.surface import RAYS

@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import field_validator
 
-from advsearch.config.scene import ControlsByName, DerivativeConfig, RenderConfig, SceneConfig
+from advsearch.config import ControlsByName, DerivativeConfig, RenderConfig, SceneConfig
 from advsearch.files import MESHES, either
 from advsearch.questions.attack.settings import FEWEST_TRIALS, AttackConfig
 from advsearch.settings import Clash, number_or_text, setting, setting_as_in, split_names

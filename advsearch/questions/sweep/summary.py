@@ -6,7 +6,7 @@ from typing import Annotated, ClassVar
 
 from pydantic import Field
 
-from advsearch.runs.results.base import (
+from advsearch.runs.results import (
     DescribedValue,
     Fields,
     Formation,

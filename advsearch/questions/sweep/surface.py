@@ -24,10 +24,9 @@ from advsearch.engine.loading import framed, load_scene
 from advsearch.engine.record import judgement_of
 from advsearch.progress import Progress
 from advsearch.questions.sweep.figures import MapView, SurfacePanel, surface_figure
-from advsearch.questions.sweep.job import Job
+from advsearch.questions.sweep.job import Job, SweptScene
 from advsearch.questions.sweep.result import rate
 from advsearch.questions.sweep.summary import SurfaceMap, SurfacePart, SurfaceTable
-from advsearch.questions.sweep.swept_scene import SweptScene
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.files import write_bytes
 from advsearch.runs.store import Row

@@ -40,7 +40,7 @@
 
   // ---- numbers -----------------------------------------------------------------------------------------------------
 
-  // As `percent_number` in advsearch/report/phrases.py.
+  // As `percent_number` in advsearch/report/wording.py.
   function percentNumber(share, most = 4) {
     const value = 100 * share, away = Math.min(value, 100 - value);
     if (away >= 5 || away <= 0) return String(Math.round(value));

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, JsonValue
 from pydantic.fields import ComputedFieldInfo, FieldInfo
 
+from advsearch import rooms
 from advsearch.files import JsonObject
 
 if TYPE_CHECKING:
@@ -496,3 +497,12 @@ class SharedWork(Fields):
             return None
         share = min(1.0, facts.busy / facts.alive) if facts.alive else None
         return cls.model_validate({**vars(facts), "utilisation": share, "machines": machines})
+
+
+def kind_of(values: JsonObject) -> type[Result] | None:
+    """Return the result that the values of a `summary.json` are of; None if there is none of that command."""
+    room = rooms.room(str(values.get("command")))
+    if room is None:
+        return None
+    kind: type[Result] | None = next((kind for name, kind in room.others.items() if name in values), room.result)
+    return kind

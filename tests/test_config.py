@@ -18,15 +18,14 @@ from hypothesis import strategies as st
 
 from advsearch.cli import flags
 from advsearch.cli.main import main
-from advsearch.config import CONFIGS, RenderConfig
-from advsearch.config.scene import SceneConfig
+from advsearch.config import CONFIGS, RenderConfig, SceneConfig
 from advsearch.errors import FileFormatError, InputError, UnknownNameError
 from advsearch.questions.attack.settings import TRIALS, TRIALS_OVER, AttackConfig
-from advsearch.questions.check.settings import CheckConfig
+from advsearch.questions.check.answer import CheckConfig
 from advsearch.questions.gap import GapConfig
-from advsearch.questions.precision.settings import QUANTITIES, PrecisionConfig
+from advsearch.questions.precision.answer import QUANTITIES, PrecisionConfig
 from advsearch.questions.region.answer import RegionConfig
-from advsearch.questions.stability.settings import StabilityConfig
+from advsearch.questions.stability.answer import StabilityConfig
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.questions.test.settings import SuiteConfig
 from advsearch.settings import Config, Setting, all_finite, parse_assignment, read_yaml, settings

@@ -1,18 +1,21 @@
-"""What every command over a scene and a model needs to know, and what `render` does.
+"""The typed description of a run: what YAML files, flags and Python calls all become.
 
-Some settings are a name, or a name with options: a policy, a task.
+Each setting states its flag, unit, range and default once; the command line's help and the docs are made from that
+(`settings`). Here is what many commands need to know, and what `render` does; the rest is with each question. Names of
+objects, controls, policies and the rest are checked by whoever looks them up, so that settings stay light.
 """
 
 from __future__ import annotations
 
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 from pydantic import JsonValue, field_validator, model_validator
 
+from advsearch import rooms
 from advsearch.errors import InputError
 from advsearch.files import MESHES, either
 from advsearch.options import JOINED, by_key, things_as_text
@@ -507,3 +510,29 @@ class TimedConfig(Config):
         "time after which no measurement is begun any more; `advsearch resume` goes on for as long again",
         otherwise="no limit", unit="seconds", gt=0.0, le=1e9,
     )
+
+
+FIRST = ("attack", "render", "sweep")
+"""The commands that the docs show first."""
+
+
+class _Configs(Mapping[str, type[Config]]):
+    def __iter__(self) -> Iterator[str]:
+        there = [name for name in FIRST if name in ("render", *rooms.rooms())]
+        return iter(
+            (*there, *(one for one in rooms.rooms() if one not in FIRST and rooms.Room(one).config is not None))
+        )
+
+    def __len__(self) -> int:
+        return len(list(iter(self)))
+
+    def __getitem__(self, name: str) -> type[Config]:
+        config: type[Config] | None = RenderConfig if name == "render" else getattr(rooms.room(name), "config", None)
+        if config is None:
+            raise KeyError(name)
+        return config
+
+
+CONFIGS: Mapping[str, type[Config]] = _Configs()
+"""What the settings of each command are, in the order in which the docs show them; those of a question are read when
+somebody first asks for them."""
