@@ -18,7 +18,7 @@ from pydantic import JsonValue, field_validator, model_validator
 from advsearch import rooms
 from advsearch.errors import InputError
 from advsearch.files import MESHES, either
-from advsearch.options import JOINED, by_key
+from advsearch.options import JOINED, by_key, things_as_text
 from advsearch.settings import (
     Clash,
     Config,
@@ -148,6 +148,15 @@ class SceneConfig(Config):
         dict, "scene", "fix a parameter of the scene, such as camera.azimuth=130; may be repeated",
         "PARAMETER=VALUE with a finite number, a name or a list of numbers", alias="set", flag="--set",
         metavar="PARAMETER=VALUE", form="assignments",
+    )
+    things: str | None = setting(
+        None, "scene", "what stands beside the object, in metres from it: x forwards, y to its left",
+        "OBJECT@X,Y with heading=DEGREES, size=METRES, name=NAME or label=LABEL after it, several with ; between them",
+        flag="--with", otherwise="nothing",
+    )
+    judge: str = setting(
+        "object", "model", "which thing the answers are judged by", "object, the name of a thing beside it, or all",
+        min_length=1,
     )
     exposure: float = setting(
         0.0, "scene", "brightness, relative to the metered exposure", unit="stops", ge=-10.0, le=10.0
@@ -291,6 +300,11 @@ class SceneConfig(Config):
         if listed and any("," in str(one) for one in value):
             raise ValueError("a name that would be two; a file can have it")
         return as_text(value, several=info.field_name in SEVERAL)
+
+    @field_validator("things", mode="before")
+    @classmethod
+    def _things_as_text(cls, value: Any) -> Any:
+        return things_as_text(value)
 
     @field_validator("prompt", mode="before")
     @classmethod

@@ -36,6 +36,8 @@ WRONG: dict[str, tuple[Any, str]] = {
     "environment": ([], "expected the name of an environment, a .hdr or .exr file, or none, got "),
     "up": ("x", "expected y or z, got x"),
     "size": (0, "expected a number of metres from 1e-4 to 1e4, got 0"),
+    "things": (3, "expected a text such as 'car@12,3.5', a mapping or a list of these, got 3"),
+    "judge": ("", "expected object, the name of a thing beside it, or all, got ''"),
     "unit": ("ft", "expected mm, cm, m or in, got ft"),
     "camera": (
         "",
@@ -99,6 +101,7 @@ WRONG: dict[str, tuple[Any, str]] = {
 
 GIVEN: dict[str, Any] = {
     "object": "mug.obj", "environment": "room.hdr", "up": "y", "size": 4.9, "unit": "cm", "camera": "front",
+    "things": "car@1,2", "judge": "car",
     "set": {"camera.azimuth": 130.0, "camera.target": (0.0, 0.5, 1.0), "material": "felt"},
     "exposure": -1.5, "resolution": (96, 128), "model": "net.pt2,other.pt2", "ensemble": "mean",
     "labels": "labels.json", "prompt": "a photo of a {}", "task": "detection", "label": "coffee mug,cup",

@@ -153,6 +153,7 @@ def render_from_config(config: RenderConfig, *, progress: Progress | None = None
         model,
         task=task,
         label=config.label,
+        judge=config.judge,
         controls=controls,
         around=config.around,
         spp=config.spp,

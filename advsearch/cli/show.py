@@ -21,7 +21,7 @@ from advsearch.errors import InputError, UnknownNameError
 from advsearch.files import JsonValue
 from advsearch.options import declared_options, default_of, type_of
 from advsearch.registry import allow_named
-from advsearch.report.wording import count, interval_text, seen_cells, seen_text
+from advsearch.report.wording import SEEN, count, interval_text, seen_cells, seen_text, things_rows
 from advsearch.rooms import there
 from advsearch.runs.directory import IMAGES, find_run
 from advsearch.runs.listing import Listed, listed_run
@@ -284,7 +284,14 @@ def render_text(result: RenderResult) -> str:
     lines += [""]
     if len(result.views) == 1:
         rows = [seen_cells(result.task, one) for one in result.views[0].answers]
-        return "\n".join([*lines, f"Model {result.model} sees", output.aligned(rows)])
+        lines += [f"Model {result.model} sees", output.aligned(rows)]
+        if (things := result.views[0].things) is not None:
+            lines += [
+                "",
+                "In the picture",
+                output.aligned([["", *SEEN], *things_rows({k: vars(one) for k, one in things.items()})]),
+            ]
+        return "\n".join(lines)
     rows = [["azimuth", f"model {result.model} sees"]]
     for view in result.views:
         rows.append([f"{view.azimuth:g}", "; ".join(seen_text(result.task, one) for one in view.answers)])

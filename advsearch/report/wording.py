@@ -176,6 +176,20 @@ def answer_text(task: str, answer: Said) -> str:
     return f"{label}, {number}" if number else label
 
 
+SEEN = ("seen", "box", "distance")
+"""Heads of `things_rows`, behind the name."""
+
+
+def things_rows(things: Mapping[str, Any]) -> list[list[str]]:
+    """Return what is seen of each thing, for a table, from its name to `runs.results.ThingSeen` as a mapping."""
+    rows = []
+    for name, one in things.items():
+        share = "nothing" if one["box"] is None else "in part" if one["share"] is None else percent(one["share"])
+        box = "" if one["box"] is None else ", ".join(map(str, one["box"]))
+        rows.append([name, share, box, "" if one["distance"] is None else f"{one['distance']:.1f} m"])
+    return rows
+
+
 def seen_cells(task: str, answer: Said) -> list[str]:
     """Return one of the answers to a whole picture, for a table: ``["cup", "score 0.77"]``, ``["mug", "91 %"]``."""
     if answer.probability is None:

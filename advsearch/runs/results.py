@@ -334,11 +334,30 @@ class ClassAnswer(Fields):
     probability: float | None = Field(description="null where the model gives none")
 
 
+class ThingSeen(Fields):
+    """What a picture shows of the object, or of a thing beside it."""
+
+    label: str | None = Field(description="what a model should call it")
+    box: tuple[int, int, int, int] | None = Field(
+        description="the smallest round what is seen of it, [x0, y0, x1, y1] in pixels; null where nothing is"
+    )
+    pixels: int = Field(description="in which it is what is seen first")
+    share: float | None = Field(
+        description="of all that there would be of it if nothing stood before it and the picture went on, 0 to 1; null "
+        "where it is not known"
+    )
+    truncated: bool | None = Field(description="whether it goes on beyond the picture; null where it is not known")
+    distance: float | None = Field(description="of the nearest point that is seen from the camera, metres")
+
+
 class ViewAnswers(Fields):
     """What the model says of one view."""
 
     azimuth: float = Field(description="of the camera, degrees")
     answers: list[ClassAnswer] = Field(description="the likeliest first")
+    things: dict[str, ThingSeen] | None = Field(
+        default=None, description="what is seen of `object` and of each thing beside it; absent without any"
+    )
 
 
 class MeshUp(Fields):

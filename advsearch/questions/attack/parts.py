@@ -46,8 +46,10 @@ from advsearch.runs.directory import CONFIG
 from advsearch.runs.directory import only_here as only_python_has
 from advsearch.scene.formation import EVERYTHING, NOTHING, next_count
 from advsearch.scene.surfaces import aovs_of
+from advsearch.scene.things import ALL
 from advsearch.settings import FILES
 from advsearch.tasks import AnyTask, Facts, Task, make_task
+from advsearch.tasks.each_thing import each_thing
 from advsearch.tasks.together import Together, together
 
 LOADING = "loading the scene and the model"
@@ -223,7 +225,7 @@ def _task(job: AttackParts, *, shows: bool = True) -> tuple[Task, Callable[[Desc
     config, (model, _) = job.config, job.loaded
     asked = job.task.seeking(job.objective) if isinstance(job.objective, str) else job.task
     task = task_for(asked, model).on(model, target=config.target, minimise=config.minimise)
-    facts = partial(facts_of, job.scene, config.object, config.label)
+    facts = partial(facts_of, job.scene, config.object, config)
     alone = zip(task.tasks, task.models, strict=True) if isinstance(task, Together) else [(task, model)]
     tasks = list[Task]()
     for one, network in alone:
@@ -232,7 +234,7 @@ def _task(job: AttackParts, *, shows: bool = True) -> tuple[Task, Callable[[Desc
         tasks.append(shown(one, network, [job.scene], config) if shows else one)
         job.loaded[1].extend(remark for remark in tasks[-1].remarks if remark not in job.loaded[1])
     task = replace(task, tasks=tuple(tasks)) if isinstance(task, Together) else tasks[0]
-    return task, facts
+    return each_thing(task) if config.judge == ALL else task, facts
 
 
 def search_size(config: AttackConfig, problem: Problem) -> tuple[int, int]:

@@ -32,6 +32,7 @@ class HardenConfig(AttackConfig):
     without: ClassVar[tuple[str, ...]] = (
         "smallest", "ensemble", "printable", "aov", "metrics", "log", "target", "minimise", "over", "draws", "path",
         "average", "baseline", "seconds", "camera", "up", "size", "unit", "label", "task", "measure", "estimators",
+        "things", "judge",
     )
 
     object: str = setting_as_in(

@@ -58,10 +58,12 @@ from advsearch.runs.listing import finished
 from advsearch.runs.summary import read_answer
 from advsearch.scene.description import ENVIRONMENT
 from advsearch.scene.surfaces import aovs_of
+from advsearch.scene.things import ALL
 from advsearch.settings import split_names
 from advsearch.tasks import AnyTask, OwnTask, Task, function_of, make_task
+from advsearch.tasks.each_thing import each_thing
 
-OF_A_SCENE = ("object", "environment", "up", "size", "unit", "camera", "set_", "exposure")
+OF_A_SCENE = ("object", "environment", "up", "size", "unit", "camera", "things", "set_", "exposure")
 """Settings that a scene of the caller's own has."""
 
 ANSWERING = "advsearch.questions.sweep.carry_out:sweep_answers"
@@ -243,6 +245,7 @@ def _described(places: Sequence[NamedScene]) -> dict[str, object]:
         "size": first.size if len(places) == 1 else None,
         "unit": first.unit,
         "camera": named_camera(first),
+        "things": first.things_spec or None,
         "set": first.given_values if len(places) == 1 else {},
     }
 
@@ -290,6 +293,7 @@ def _job(
     scenes = [place.scene for place in places]
     tasks = tuple(shown(made.on(network), network, scenes, config) for network in networks)
     warnings += [remark for task in tasks for remark in task.remarks]
+    tasks = tuple(map(each_thing, tasks)) if config.judge == ALL else tasks
     own = {place.object: place.scene.description.object.label for place in places}
     warnings += one_label_for_several(networks, config.label, own)
     for place in places:

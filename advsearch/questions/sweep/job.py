@@ -178,7 +178,7 @@ class Job:
         return self.tasks[model].truth(self._facts(place, values, look))
 
     def _facts(self, place: NamedScene, values: Mapping[str, Value], look: Looked | None = None) -> Facts:
-        return facts_of(place.scene, place.object, self.config.label, lambda: values, look)
+        return facts_of(place.scene, place.object, self.config, lambda: values, look)
 
     def check_truths(self, place: NamedScene) -> None:
         for task, model in zip(self.tasks, self.models, strict=True):
@@ -266,7 +266,7 @@ class SweptScene:
                 description, space, size, config.denoise, config.seed, sampler=config.pixel_sampler
             )
             self.points[size] = job.points(space)
-        facts, spp, seed = partial(facts_of, place.scene, place.object, config.label), job.spp, config.seed
+        facts, spp, seed = partial(facts_of, place.scene, place.object, config), job.spp, config.seed
         self.problems = tuple(
             Problem(self.renderers[size], spaces[size], model, task, facts, None, spp, seed, metrics=job.metrics)
             for size, model, task in zip(job.sizes, job.models, job.tasks, strict=True)
