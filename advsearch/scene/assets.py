@@ -193,6 +193,7 @@ class EnvironmentAsset:
         photographed: it shows the floor of a real place: the ground that things stand on is that floor by itself.
         ground: the kind of ground that belongs to it by itself (`advsearch.scene.settings.GROUND_KINDS`); None for the
             usual one.
+        candelas: luminance of a radiance of 1, cd/m2; None where the map's brightness means nothing.
 
     Raises:
         InputError: a texel is negative, NaN or infinite.
@@ -204,6 +205,7 @@ class EnvironmentAsset:
     warnings: tuple[str, ...] = ()
     photographed: bool = False
     ground: str | None = None
+    candelas: float | None = None
 
     def __post_init__(self) -> None:
         bad = ~(np.isfinite(self.radiance) & (self.radiance >= 0.0)).all(axis=2)
