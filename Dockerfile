@@ -1,6 +1,6 @@
 # advsearch with libLLVM inside:
 #   docker build -t advsearch .
-#   docker run --rm -v "$PWD/runs:/work/runs" advsearch attack --object mug --control texture
+#   docker run --rm -v "$PWD/runs:/home/advsearch/runs" advsearch attack --object mug --control texture
 # pip takes torch's CUDA build here, gigabytes that are of no use. PyTorch's "Get started" page names an index of CPU
 # wheels: docker build --build-arg TORCH_INDEX=ITS-ADDRESS -t advsearch .
 FROM python:3.12-slim-bookworm
@@ -18,8 +18,8 @@ RUN pip install --no-cache-dir ${TORCH_INDEX:+--extra-index-url "$TORCH_INDEX"} 
     -c /advsearch/constraints.txt '/advsearch[dask,explain,parquet]' \
     && advsearch doctor
 
-RUN useradd --create-home --uid 1000 advsearch && mkdir /work && chown advsearch /work
+RUN useradd --create-home --uid 1000 advsearch
 USER advsearch
-WORKDIR /work
+WORKDIR /home/advsearch
 ENTRYPOINT ["advsearch"]
 CMD ["--help"]

@@ -129,6 +129,14 @@ class SceneConfig(Config):
         None, "scene", "which axis of an imported object points up",
         otherwise="as the format says, or else the axis along which it stands best",
     )
+    size: float | None = setting(
+        None, "scene", "how large the object is: its longest side; distances are then in metres",
+        "a number of metres from 1e-4 to 1e4", otherwise="as its file says: glTF is in metres", ge=1e-4, le=1e4,
+    )
+    unit: Literal["mm", "cm", "m", "in"] | None = setting(
+        None, "scene", "unit of the coordinates of the object's file, which says how large it is",
+        otherwise="as its file says: glTF is in metres",
+    )
     camera: str | None = setting(
         None, "scene",
         "which camera takes the picture: one of a scene file, or the one around the object with a lens of its own",
@@ -225,6 +233,8 @@ class SceneConfig(Config):
                 continue
             if len(names) > 1 and name not in self.several:
                 raise one_only(name, names)
+        if self.size is not None and len(self.objects) > 1:
+            raise InputError("size: it is the size of one object, and there are several; leave it out, or give `unit`")
         return self
 
     @property

@@ -35,6 +35,8 @@ WRONG: dict[str, tuple[Any, str]] = {
     "path": ("", "expected approach, pass, orbit, a .csv file, or two of them, the camera's and the object's, as in"),
     "environment": ([], "expected the name of an environment, a .hdr or .exr file, or none, got "),
     "up": ("x", "expected y or z, got x"),
+    "size": (0, "expected a number of metres from 1e-4 to 1e4, got 0"),
+    "unit": ("ft", "expected mm, cm, m or in, got ft"),
     "camera": (
         "",
         "expected a name that advsearch import lists, orbit, fisheye, equirectangular, or a camera file of OpenCV, "
@@ -96,7 +98,7 @@ WRONG: dict[str, tuple[Any, str]] = {
 }
 
 GIVEN: dict[str, Any] = {
-    "object": "mug.obj", "environment": "room.hdr", "up": "y", "camera": "front",
+    "object": "mug.obj", "environment": "room.hdr", "up": "y", "size": 4.9, "unit": "cm", "camera": "front",
     "set": {"camera.azimuth": 130.0, "camera.target": (0.0, 0.5, 1.0), "material": "felt"},
     "exposure": -1.5, "resolution": (96, 128), "model": "net.pt2,other.pt2", "ensemble": "mean",
     "labels": "labels.json", "prompt": "a photo of a {}", "task": "detection", "label": "coffee mug,cup",

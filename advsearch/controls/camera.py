@@ -49,7 +49,7 @@ class CameraControl(NumberControl):
         moving(ORBIT, "shift_x", "picture widths", -2.0, 2.0, 0.0, "Shift of the picture to the right."),
         moving(ORBIT, "shift_y", "picture heights", -2.0, 2.0, 0.0, "Shift of the picture downwards."),
         _lens("aperture", 0.0, 10.0, 0.0, "Radius of the lens; 0 is a pinhole."),
-        _lens("focus", 0.01, 1e4, "the object's middle", "Distance in focus.", log=True),
+        _lens("focus", 1e-4, 1e5, "the object's middle", "Distance in focus.", log=True),
         *map(_coefficient, COEFFICIENTS),
         CAMERA[-1],
     )

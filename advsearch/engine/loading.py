@@ -152,6 +152,8 @@ def load_scene(
     *,
     scene: str | Path | Mapping[str, object] | None = None,
     up: str | None = None,
+    size: float | None = None,
+    unit: str | None = None,
     settings: Given | None = None,
     camera: str | None = None,
     texture: Texture | None = None,
@@ -164,6 +166,10 @@ def load_scene(
         scene: the file or, of Mitsuba, the dictionary (`mi.cornell_box()`) in which `object` is a node or the id of a
             shape; a file may as well be written before it: "scene.glb#chair", "box.xml#large-box".
         up: the up axis of a mesh file, "y" or "z"; by default what its format or else its shape says.
+        size: of the object, its longest side in metres, 1e-4 to 1e4. Distances of the camera, paths of files and the
+            height of a photograph are in metres where the size of the object is known, and in object sizes elsewhere.
+        unit: of the coordinates of the object's file, "mm", "cm", "m" or "in", which gives it its size; by default
+            glTF is in metres, and of other files it is not known.
         settings: parameters to fix, e.g. ``{"camera.azimuth": 130.0}``. The size of a picture belongs to none of them
             but to what makes it: `resolution` of `attack`, `sweep`, `render` and `Scene.renderer`.
         camera: a camera file (docs/cameras.md), "fisheye" or "equirectangular", whose lens the camera
@@ -174,15 +180,20 @@ def load_scene(
     Raises:
         InputError: a name is unknown, a file cannot be used, or a value is out of range.
     """
-    settings = None if settings is None else as_python(settings)
+    said: dict[str, Any] = {
+        "given": None if settings is None else as_python(settings),
+        "up": up,
+        "size": size,
+        "unit": unit,
+    }
     if scene is None:
-        described = describe(object, environment, given=settings, up=up)
+        described = describe(object, environment, **said)
     elif not isinstance(object, str):
         raise InputError(f"object: expected the name of a node or shape of the scene, got {object!r}")
     elif isinstance(scene, Mapping):
-        described = describe(object, environment, given=settings, up=up, plugins=scene)
+        described = describe(object, environment, **said, plugins=scene)
     else:
-        described = describe(f"{scene}#{object}", environment, given=settings, up=up)
+        described = describe(f"{scene}#{object}", environment, **said)
     only_here = isinstance(scene, Mapping) or not all(
         one is None or isinstance(one, (str, Path)) for one in (object, environment)
     )
@@ -213,6 +224,8 @@ def scene_as_settings(scene: Scene) -> dict[str, Any]:
         "object": described.object_name,
         "environment": described.environment_name,
         "up": described.up,
+        "size": described.size,
+        "unit": described.unit,
         "camera": named_camera(described),
         "set": described.given_values,
     }

@@ -131,8 +131,9 @@ class ObjectAsset(Shape):
         up: the axis of the file that was taken for up; None for what comes from no file.
         finishes: of an object of several materials, what each of `mesh.materials` is like beside its base colour; what
             none of them covers is like `material`.
-        metres: its largest extent in metres, where it has a size of its own; then distances of the camera are in
-            metres. None where distances are in object sizes.
+        metres: its largest extent in metres, where that is known; then distances of the camera are in metres. None
+            where distances are in object sizes. See `advsearch.scene.sizes`.
+        extent: its largest extent in the coordinates of its file; None for what comes from no file.
     """
 
     source: str = ""
@@ -140,6 +141,7 @@ class ObjectAsset(Shape):
     up: UpAxis | None = None
     finishes: Mapping[str, Material] = field(default_factory=dict)
     metres: float | None = None
+    extent: float | None = None
 
     @property
     def notes(self) -> tuple[str, ...]:

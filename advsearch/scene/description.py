@@ -1,8 +1,8 @@
 """A scene as data: meshes, of which one is the object, lamps, an environment and the settings; nothing of Mitsuba.
 
 Conventions: z up, right-handed, lengths in object sizes (the object's largest extent is 1 before `pose.scale`), angles
-in degrees. `camera.distance` and `camera.focus` are in metres where the object has a size in metres. The camera at
-azimuth 0 and elevation 0 looks from +x towards the object.
+in degrees. What `advsearch.scene.sizes.IN_METRES` names is in metres where the object has a size in metres. The camera
+at azimuth 0 and elevation 0 looks from +x towards the object.
 """
 
 from __future__ import annotations
@@ -24,11 +24,12 @@ from advsearch.scene.camera_files import read_camera
 from advsearch.scene.camera_model import CameraModel, bundled
 from advsearch.scene.exposure import metered_gain
 from advsearch.scene.geometry import moved_part, object_to_world
-from advsearch.scene.grounds import Photograph, on_its_ground, photograph_of
+from advsearch.scene.grounds import Photograph, on_its_ground, paved, photograph_of
 from advsearch.scene.importing.objects import import_object
 from advsearch.scene.importing.scenes import MITSUBA_FILE, ImportedScene, import_scene, split_node
 from advsearch.scene.parts import Lamp, MeshPart, PlacedCamera, PluginPart, ScenePart, mesh_part, plugins_in
 from advsearch.scene.settings import ORBIT_CAMERA
+from advsearch.scene.sizes import TRIPOD, doubts, sized
 
 DEFAULT_ENVIRONMENT = "studio"
 OBJECT = "object"
@@ -55,6 +56,8 @@ class SceneDescription:
         object_spec: how the object was asked for: a bundled name, a path, or an asset's own name.
         environment_spec: how the environment was asked for, likewise.
         up: the up axis that was given for a mesh file, or None.
+        size: the object's longest side in metres that was given, or None.
+        unit: of the object's file, that was given (`advsearch.scene.sizes.UNITS`), or None.
         given: what was asked for: names of settings, and "environment".
         parts: what is in the scene beside the object, the environment and the ground: further meshes, lamps, haze.
         thin_lens: the camera has an aperture and a focus distance.
@@ -73,6 +76,8 @@ class SceneDescription:
     object_spec: str = ""
     environment_spec: str = ""
     up: str | None = None
+    size: float | None = None
+    unit: str | None = None
     given: frozenset[str] = frozenset()
     parts: tuple[ScenePart, ...] = ()
     thin_lens: bool = False
@@ -181,8 +186,8 @@ class SceneDescription:
 
     @property
     def metres(self) -> float:
-        """What distances of the camera are to be divided by to be in object sizes: the object's size in metres; 1 where
-        it has none."""
+        """What lengths in metres are to be divided by to be in object sizes, the scene's own unit: the object's size in
+        metres; 1 where it has none."""
         return self.object.metres or 1.0
 
     @property
@@ -200,7 +205,8 @@ class SceneDescription:
         """What a user should know of how object and environment were read, and what controls name."""
         lit = () if self.environment is None else self.environment.warnings
         seen = () if self.camera_model is None else self.camera_model.notes
-        return tuple(dict.fromkeys((*self.object.notes, *lit, *seen, *self.remarks)))
+        size = doubts(self.object, asked=self.size is not None, laid=paved(self))
+        return tuple(dict.fromkeys((*self.object.notes, *size, *lit, *seen, *self.remarks)))
 
     @property
     def bundled_environment(self) -> str | None:
@@ -260,7 +266,15 @@ class SceneDescription:
             return None
         if kind is not None and settings.GROUND_KINDS[int(kind)] != settings.PHOTOGRAPH:
             return None
-        return photograph_of(own, self.number("ground.height"), self.number("environment.rotation"))
+        return photograph_of(own, self.capture_height, self.number("environment.rotation"))
+
+    @property
+    def capture_height(self) -> float:
+        """Height above the floor from which the environment's photograph was taken, object sizes."""
+        height = self.values.get("ground.height")
+        if height is None:
+            return settings.PHOTOGRAPHED_FROM if self.object.metres is None else TRIPOD / self.metres
+        return height / self.metres
 
     @property
     def ground_color(self) -> tuple[float, ...]:
@@ -284,6 +298,8 @@ def describe(
     *,
     given: settings.Given | None = None,
     up: str | None = None,
+    size: float | None = None,
+    unit: str | None = None,
     plugins: Mapping[str, object] | None = None,
 ) -> SceneDescription:
     """Find and read an object and an environment, bundled or from a file.
@@ -296,6 +312,9 @@ def describe(
             for the default.
         given: settings to fix, by name.
         up: "y" or "z", the up axis of a mesh file; None takes what its format or else its shape says.
+        size: of the object, its longest side in metres.
+        unit: of the coordinates of its file, one of `advsearch.scene.sizes.UNITS`; without both its size is what its
+            format says.
         plugins: a Mitsuba scene as its loader takes it, in which `object_spec` is the id of a shape.
 
     Raises:
@@ -308,6 +327,7 @@ def describe(
         around = _mitsuba(Path(str(file)) if plugins is None else plugins, node or str(object_spec), up)
     else:
         around = ImportedScene(_object(object_spec, up)) if node is None else _scene(Path(str(file)), node, up)
+    around = replace(around, object=sized(around.object, size, unit))
     shining = (isinstance(part, Lamp) or (isinstance(part, PluginPart) and part.shines) for part in around.surroundings)
     alone = any(shining) or (mitsuba and around.object.emission is not None)
     lit_by = environment_spec or (NO_MAP if alone else DEFAULT_ENVIRONMENT)
@@ -325,6 +345,8 @@ def describe(
         _spec(object_spec),
         _spec(lit_by),
         up,
+        size,
+        unit,
         given=frozenset((*(given or {}), *asked)),
         parts=around.surroundings,
         cameras=around.cameras,

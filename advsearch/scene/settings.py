@@ -137,10 +137,10 @@ CAMERA = (
     _camera(
         "distance",
         "object sizes",
-        0.05,
-        1000.0,
+        1e-4,
+        1e5,
         "fits the object",
-        "Distance to the object's middle; in metres where the object has a size.",
+        "Distance to the object's middle; in metres where the object's size is known.",
         (0.8, 1.5),
         log=True,
     ),
@@ -168,6 +168,8 @@ ENVIRONMENT = (
 )
 GROUND_KINDS = TABLE, PHOTOGRAPH, DRY_ROAD, WET_ROAD = "table", "photograph", "road", "wet-road"
 ROADS = (DRY_ROAD, WET_ROAD)
+PHOTOGRAPHED_FROM = 3.0
+"""Height above the floor from which a photograph is taken of an object whose size is not known, object sizes."""
 TABLE_SETTINGS = ("ground.size", *(f"ground.{channel}" for channel in CHANNELS))
 """Settings that only a table has."""
 GROUND = (
@@ -184,7 +186,13 @@ GROUND = (
     Parameter("size", (), "object sizes", 0.0, 1000.0, 3.0, "Side of the table; 0 leaves the ground out."),
     *colors("of the table.", defaults=(0.55, 0.45, 0.37), estimators=("differences",)),
     Parameter(
-        "height", (), "object sizes", 0.1, 1000.0, 3.0, "Height above the floor from which the photograph was taken."
+        "height",
+        (),
+        "object sizes",
+        1e-3,
+        1000.0,
+        f"{PHOTOGRAPHED_FROM:g}, or 1.6 m",
+        "Height above the floor from which the photograph was taken; in metres where the object's size is known.",
     ),
 )
 MATERIAL = (

@@ -28,8 +28,8 @@ from advsearch.engine.naming import (
     check_not_spread,
     exists_here,
     model_name,
-    scene_settings,
     several,
+    told_of_scene,
 )
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Stages
@@ -207,12 +207,12 @@ def _scene(scene: Scene | str | Path | Mapping[str, Any], object: str | None, se
         check_not_of_scene({**settings, "object": object})
         return scene
     said = SceneConfig(**{"object": "mug", **{name: one for name, one in settings.items() if name in OF_SCENE}})
-    given = scene_settings(said)
+    given = told_of_scene(said)
     if object is not None:
-        return load_scene(object, said.environment, scene=scene, up=said.up, settings=given, camera=said.camera)
+        return load_scene(object, said.environment, scene=scene, **given)
     if isinstance(scene, Mapping):
         raise InputError("object: which shape of the scene is it? Give its id")
-    return load_scene(scene, said.environment, up=said.up, settings=given, camera=said.camera)
+    return load_scene(scene, said.environment, **given)
 
 
 def _set_by(scene: Scene, exposure: float | None) -> dict[str, float | str]:

@@ -41,7 +41,10 @@ DRAWS = ("grid", "controls", "samples", "sampler", "seed")
 OF_THE_SIDE = ("object", "model", "answer")
 """What may tell sides apart, as rows have it."""
 
-FOLLOWS = (*DRAWS, "label", "labels", "prompt", "up", "batch", "keep_pictures", "trials", "verify_spp", "specialise")
+FOLLOWS = (
+    *(*DRAWS, "label", "labels", "prompt", "up", "size", "unit", "batch", "keep_pictures", "trials", "verify_spp"),
+    "specialise",
+)
 """Settings that do not tell sweeps apart: of draws, along with object and model, or of no answer."""
 
 TOLERANCE = 1e-4

@@ -31,7 +31,7 @@ class HardenConfig(AttackConfig):
     several: ClassVar[tuple[str, ...]] = ("object", "environment")
     without: ClassVar[tuple[str, ...]] = (
         "smallest", "ensemble", "printable", "aov", "metrics", "log", "target", "minimise", "over", "draws", "path",
-        "average", "baseline", "seconds", "camera", "up", "label", "task", "measure", "estimators",
+        "average", "baseline", "seconds", "camera", "up", "size", "unit", "label", "task", "measure", "estimators",
     )
 
     object: str = setting_as_in(

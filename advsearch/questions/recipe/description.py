@@ -227,7 +227,7 @@ def check_powers(recipe: Recipe, config: RecipeConfig) -> None:
 def made_of(recipe: Recipe, config: RecipeConfig) -> Recipe:
     """Return the recipe as it was asked for: quick or not, with the objects, environments and models of `config`."""
     chosen = recipe.made_quick() if config.quick else recipe
-    names = ("object", "environment", "model", "labels", "prompt", "task", "up", "resolution")
+    names = ("object", "environment", "model", "labels", "prompt", "task", "up", "size", "unit", "resolution")
     given = {name: value for name in names if (value := getattr(config, name)) is not None}
     settings: Settings = {**chosen.settings, **given}
     if "object" not in settings:

@@ -43,6 +43,8 @@ class RecipeConfig(Config):
         expects="names of environments or .hdr or .exr files",
     )
     up: Literal["y", "z"] | None = setting_as_in(SceneConfig, "up")
+    size: float | None = setting_as_in(SceneConfig, "size")
+    unit: Literal["mm", "cm", "m", "in"] | None = setting_as_in(SceneConfig, "unit")
     resolution: tuple[int, int] | None = setting_as_in(
         SceneConfig, "resolution", otherwise="what the recipe says, or what the model takes"
     )

@@ -61,7 +61,7 @@ from advsearch.scene.surfaces import aovs_of
 from advsearch.settings import split_names
 from advsearch.tasks import AnyTask, OwnTask, Task, function_of, make_task
 
-OF_A_SCENE = ("object", "environment", "up", "camera", "set_", "exposure")
+OF_A_SCENE = ("object", "environment", "up", "size", "unit", "camera", "set_", "exposure")
 """Settings that a scene of the caller's own has."""
 
 ANSWERING = "advsearch.questions.sweep.carry_out:sweep_answers"
@@ -240,6 +240,8 @@ def _described(places: Sequence[NamedScene]) -> dict[str, object]:
         "object": ",".join(dict.fromkeys(place.object for place in places)),
         "environment": ",".join(dict.fromkeys(place.environment for place in places)),
         "up": first.up,
+        "size": first.size if len(places) == 1 else None,
+        "unit": first.unit,
         "camera": named_camera(first),
         "set": first.given_values if len(places) == 1 else {},
     }

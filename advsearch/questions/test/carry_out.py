@@ -28,7 +28,8 @@ from advsearch.questions.test.answer import (
     statement,
     verdict,
 )
-from advsearch.questions.test.claims import Trial, check_pictures
+from advsearch.questions.test.changes import OTHER_SCENE
+from advsearch.questions.test.claims import Trial, check_pictures, with_scene
 from advsearch.questions.test.counterexamples import (
     Counterexample,
     add,
@@ -39,6 +40,7 @@ from advsearch.questions.test.counterexamples import (
 )
 from advsearch.questions.test.settings import (
     COUNTEREXAMPLES,
+    MustChangeClaim,
     NotBrokenClaim,
     NoWorseClaim,
     Suite,
@@ -268,6 +270,8 @@ def _check(planned: Sequence[PlannedClaim], suite: Suite) -> list[str]:
         wanted = [whole]
         if isinstance(claim, NoWorseClaim):
             wanted.append(whole.model_copy(update={"model": claim.than}))
+        if isinstance(claim, MustChangeClaim) and claim.when in OTHER_SCENE:
+            wanted.append(AttackConfig.of(with_scene(whole, claim)))
         for config in wanted:
             if config not in known:
                 try:
