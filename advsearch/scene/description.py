@@ -409,7 +409,7 @@ def check_ground(given: settings.Given, lit_by: str | Path | EnvironmentAsset) -
         InputError: there is no photograph, or a table is described beside it.
     """
     kind = given.get("ground.kind")
-    if kind not in (settings.PHOTOGRAPH, *settings.ROADS):
+    if kind not in (settings.PHOTOGRAPH, *settings.ROADS, *settings.AVENUES):
         return
     if lit_by == NO_MAP and kind == settings.PHOTOGRAPH:
         raise InputError(
