@@ -13,6 +13,7 @@ import advsearch
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.options import things_as_text
 from advsearch.scene import library
+from advsearch.scene.geometry import standing
 from advsearch.scene.outlines import seen_things
 from advsearch.scene.surface.renderer import why_not
 from advsearch.scene.things import AskedThing, asked_things, overlapping
@@ -182,3 +183,9 @@ def test_light_on_surfaces_refuses_things_by_its_own_rule() -> None:
 
     assert reason(None) is None
     assert "more in the scene than the object" in str(reason("bowl@0.2,0.1,size=0.15"))
+
+
+def test_a_thing_on_the_pavement_stands_on_it() -> None:
+    description = advsearch.load_scene("car", "avenue", things="chair@0,-4,size=1; stop-sign@9,0.5").description
+    low = {name: standing(part)[:, 2].min() * description.metres for name, part in description.things.items()}
+    assert low == {"chair": pytest.approx(0.12, abs=1e-4), "stop-sign": pytest.approx(0.0, abs=1e-4)}
