@@ -136,6 +136,7 @@ def _summary(
     return AttackSummary(
         run=None,
         object=config.object,
+        judge=config.judge,
         model=problem.model.name,
         task=task.title,
         environment=problem.environment,

@@ -92,8 +92,11 @@ def remarks(summary: AttackSummary) -> list[str]:
 
 
 def noun(summary: AttackSummary) -> str:
-    """Return what the object is called: ``wine glass`` for ``wine-glass`` and ``mug`` for ``data/mug.obj``."""
-    return PurePath(summary.object).stem.replace("-", " ").replace("_", " ")
+    """Return what the object, or the thing beside it that is judged, is called: ``wine glass`` for ``wine-glass`` and
+    ``mug`` for ``data/mug.obj``."""
+    called = PurePath(summary.object).stem if summary.judge in ("object", "all") else summary.judge
+    every = " or a thing beside it" if summary.judge == "all" else ""
+    return called.replace("-", " ").replace("_", " ") + every
 
 
 def title(summary: AttackSummary) -> str:
