@@ -6,7 +6,6 @@ from advsearch.api.render import load_model as load_model
 from advsearch.api.render import load_run as load_run
 from advsearch.attacks.evaluation import Policy as Policy
 from advsearch.controls.base import Control as Control
-from advsearch.engine.attack_result import AttackResult as AttackResult
 from advsearch.engine.judging import Metric
 from advsearch.engine.loading import Controls
 from advsearch.engine.loading import Scene as Scene
@@ -14,9 +13,9 @@ from advsearch.engine.loading import load_scene as load_scene
 from advsearch.engine.naming import AnyModel
 from advsearch.engine.rendering import Rendering as Rendering
 from advsearch.engine.rendering import render as render
-from advsearch.engine.sweeps.summary import SweepResult as SweepResult
 from advsearch.models.model import Model as Model
 from advsearch.progress import Watched
+from advsearch.questions.attack.result import AttackResult as AttackResult
 from advsearch.questions.check.answer import CheckResult
 from advsearch.questions.compare.answer import CompareResult
 from advsearch.questions.explain.answer import ExplainResult
@@ -31,6 +30,7 @@ from advsearch.questions.region.answer import RegionResult
 from advsearch.questions.replay.answer import ReplayResult
 from advsearch.questions.stability.answer import StabilityResult
 from advsearch.questions.sweep.carry_out import AnyScene
+from advsearch.questions.sweep.result import SweepResult as SweepResult
 from advsearch.registry import allow_code as allow_code
 from advsearch.tasks import AnyTask
 from advsearch.tasks.base import Task as Task
@@ -67,6 +67,8 @@ def attack(
     unit: Literal['mm', 'cm', 'm', 'in'] | None = ...,
     camera: str | Path | None = ...,
     set: Mapping[str, float | str | Sequence[float]] | None = ...,
+    things: str | Path | None = ...,
+    judge: str | Path = ...,
     exposure: float = ...,
     resolution: int | str | tuple[int, int] | None = ...,
     labels: Path | Names | None = ...,
@@ -115,6 +117,8 @@ def check(
     unit: Literal['mm', 'cm', 'm', 'in'] | None = ...,
     camera: str | Path | None = ...,
     set: Mapping[str, float | str | Sequence[float]] | None = ...,
+    things: str | Path | None = ...,
+    judge: str | Path = ...,
     exposure: float = ...,
     resolution: int | str | tuple[int, int] | None = ...,
     labels: Path | Names | None = ...,
@@ -152,6 +156,8 @@ def compare(
     unit: Literal['mm', 'cm', 'm', 'in'] | None = ...,
     camera: str | Path | None = ...,
     set: Mapping[str, float | str | Sequence[float]] | None = ...,
+    things: str | Path | None = ...,
+    judge: str | Path = ...,
     exposure: float = ...,
     resolution: int | str | tuple[int, int] | None = ...,
     labels: Path | Names | None = ...,
@@ -204,6 +210,8 @@ def gap(
     unit: Literal['mm', 'cm', 'm', 'in'] | None = ...,
     camera: str | Path | None = ...,
     set: Mapping[str, float | str | Sequence[float]] | None = ...,
+    things: str | Path | None = ...,
+    judge: str | Path = ...,
     exposure: float = ...,
     resolution: int | str | tuple[int, int] | None = ...,
     labels: Path | Names | None = ...,
@@ -300,6 +308,8 @@ def precision(
     unit: Literal['mm', 'cm', 'm', 'in'] | None = ...,
     camera: str | Path | None = ...,
     set: Mapping[str, float | str | Sequence[float]] | None = ...,
+    things: str | Path | None = ...,
+    judge: str | Path = ...,
     exposure: float = ...,
     resolution: int | str | tuple[int, int] | None = ...,
     labels: Path | Names | None = ...,
@@ -364,6 +374,8 @@ def region(
     unit: Literal['mm', 'cm', 'm', 'in'] | None = ...,
     camera: str | Path | None = ...,
     set: Mapping[str, float | str | Sequence[float]] | None = ...,
+    things: str | Path | None = ...,
+    judge: str | Path = ...,
     exposure: float = ...,
     resolution: int | str | tuple[int, int] | None = ...,
     labels: Path | Names | None = ...,
@@ -427,6 +439,8 @@ def sweep(
     unit: Literal['mm', 'cm', 'm', 'in'] | None = ...,
     camera: str | Path | None = ...,
     set: Mapping[str, float | str | Sequence[float]] | None = ...,
+    things: str | Path | None = ...,
+    judge: str | Path = ...,
     exposure: float = ...,
     resolution: int | str | tuple[int, int] | None = ...,
     labels: Path | Names | None = ...,

@@ -25,7 +25,7 @@ from advsearch.report.markup import figure_of_answer
 from advsearch.report.shown import shown
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.files import write_bytes
-from advsearch.runs.results.base import INTERRUPTED, Result
+from advsearch.runs.results import INTERRUPTED, Result
 from advsearch.settings import Config
 from advsearch.viewer.pages import keep_answer
 
@@ -109,6 +109,8 @@ class Question(Generic[Answer]):
     expected: tuple[Any, ...] | None
     brought: Callable[[Path, Mapping[str, Any]], dict[str, Any]] | None
     called: str
+    more: str
+    short: Callable[[Any], bool]
 
     def from_config(
         self, config: Any, *, progress: Progress | None = None, resumed: Path | None = None, **more: Any
@@ -163,6 +165,8 @@ def question(
     expected: tuple[Any, ...] | None = None,
     brought: Callable[[Path, Mapping[str, Any]], dict[str, Any]] | None = None,
     called: str = "",
+    more: str = "",
+    short: Callable[[Any], bool] = lambda result: False,
 ) -> Callable[[Callable[..., Answer]], Question[Answer]]:
     """Make a question of a function ``(asked: Asked[NameConfig]) -> NameResult``, called as its command.
 
@@ -174,6 +178,8 @@ def question(
             as further fields of `cli.question.Positional`, what the help adds, and whether there may be several.
         brought: returns settings that the `run.yaml` of that run brings, by what was typed.
         called: ``module:function`` that Python calls, where more can be given there than settings.
+        more: what its help says after what it does.
+        short: whether a result falls short of what was checked, which ends the command with status 3.
     """
 
     def decorate(answer: Callable[..., Answer]) -> Question[Answer]:
@@ -181,6 +187,6 @@ def question(
         first, result = next(iter(inspect.signature(answer).parameters)), hints["return"]
         result = (*get_args(result), result)[0]  # the first of several kinds
         (config,) = get_args(hints[first])
-        return Question(answer, config, result, examples, place, about, expected, brought, called)
+        return Question(answer, config, result, examples, place, about, expected, brought, called, more, short)
 
     return decorate

@@ -13,16 +13,16 @@ import numpy as np
 import pandas as pd
 from samples import sweep
 
-from advsearch.config import SweepConfig
 from advsearch.described import Value
 from advsearch.files import JsonValue
 from advsearch.questions.photographs.answer import PhotoTaker
+from advsearch.questions.sweep.page import write_sweep_page
+from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.rules import observed
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row
 from advsearch.viewer import thumbnails
 from advsearch.viewer.server import Dashboard
-from advsearch.viewer.sweep_page import write_sweep_page
 
 YAWS, ELEVATIONS, ENVIRONMENTS = (0.0, 45.0, 90.0), (10.0, 40.0), ("noon", "studio")
 

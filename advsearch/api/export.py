@@ -19,22 +19,22 @@ from torch import Tensor
 
 import advsearch
 from advsearch import seeds
-from advsearch.config import AttackConfig
 from advsearch.controls.base import Control
 from advsearch.controls.patch import enlarged
 from advsearch.controls.space import file_name
 from advsearch.controls.texture import TextureControl
-from advsearch.engine.attack_parts import judged_alone, problem_from_config
 from advsearch.engine.loading import Scene, as_controls, load_scene
 from advsearch.engine.problem import Problem
 from advsearch.engine.verifier import kept_answer
 from advsearch.errors import FileFormatError, InputError
+from advsearch.questions.attack.parts import judged_alone, problem_from_config
+from advsearch.questions.attack.settings import AttackConfig
+from advsearch.questions.attack.summary import AttackSummary, attack_of
 from advsearch.report.sheets import Mask, Piece
 from advsearch.runs.directory import ARTIFACTS, CONFIG, find_run
 from advsearch.runs.files import placed_by, storage_errors, write_bytes, write_text
 from advsearch.runs.images import read_png, to_8bit
-from advsearch.runs.results.attack import AttackSummary
-from advsearch.runs.summary import attack_of, read_result
+from advsearch.runs.summary import read_result
 from advsearch.scene.assembly import ON_PICTURE
 from advsearch.scene.assets import Floats, Ints, Mesh
 from advsearch.scene.description import NO_MAP, OBJECT

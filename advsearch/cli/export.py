@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from advsearch.cli import output
+from advsearch.cli.commands import Command
 from advsearch.cli.output import at_work, output_errors
-from advsearch.cli.question import Command
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.runs.directory import PARTS, find_run
 from advsearch.runs.export import FORMATS, write_rows, write_threedb

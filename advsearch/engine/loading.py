@@ -19,7 +19,7 @@ from advsearch.controls import CONTROLS, Control, Space, gathered, make_control,
 from advsearch.distributions import OwnQuantiles, as_setting
 from advsearch.errors import InputError
 from advsearch.models.guards import plainly
-from advsearch.options import told
+from advsearch.options import things_as_text, told
 from advsearch.registry import names_code
 from advsearch.scene import settings
 from advsearch.scene.assembly import Motion
@@ -159,6 +159,7 @@ def load_scene(
     settings: Given | None = None,
     camera: str | None = None,
     texture: Texture | None = None,
+    things: str | Mapping[str, object] | Sequence[str | Mapping[str, object]] | None = None,
 ) -> Scene:
     """Load a scene.
 
@@ -179,6 +180,9 @@ def load_scene(
             file; "orbit" or None for a pinhole.
         texture: of the object in place of its own: a picture file, or (h, w, 3) sRGB in [0, 1] or of 8 bits, row 0 on
             top; `result.artifacts["texture"]`, say.
+        things: what stands beside the object, in metres from it, x forwards and y to its left: a text such as
+            "car@12,3.5,heading=180; person@6,-2", or a list of such texts or of mappings, {"object": "car", "x": 12,
+            "y": 3.5, "heading": 180}; `size` (metres), `name` and `label` may be said too.
 
     Raises:
         InputError: a name is unknown, a file cannot be used, or a value is out of range.
@@ -188,6 +192,7 @@ def load_scene(
         "up": up,
         "size": size,
         "unit": unit,
+        "things": things_as_text(things),
     }
     if scene is None:
         described = describe(object, environment, **said)
@@ -230,6 +235,7 @@ def scene_as_settings(scene: Scene) -> dict[str, Any]:
         "size": described.size,
         "unit": described.unit,
         "camera": named_camera(described),
+        "things": described.things_spec or None,
         "set": described.given_values,
     }
 

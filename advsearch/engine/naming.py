@@ -35,7 +35,7 @@ def scene_of(config: SceneConfig, name: str | None = None, environment: str | No
 
 def told_of_scene(config: SceneConfig) -> dict[str, Any]:
     """Return what `load_scene` is told beside object and environment."""
-    said = {name: getattr(config, name) for name in ("up", "size", "unit", "camera")}
+    said = {name: getattr(config, name) for name in ("up", "size", "unit", "camera", "things")}
     return {**said, "settings": scene_settings(config)}
 
 
@@ -114,7 +114,7 @@ def different(names: Sequence[str], setting: str) -> Sequence[str]:
     return names
 
 
-OF_SCENE = ("set", "environment", "up", "size", "unit", "camera", "exposure", "object")
+OF_SCENE = ("set", "environment", "up", "size", "unit", "camera", "things", "exposure", "object")
 
 
 def check_not_of_scene(settings: Mapping[str, object]) -> None:

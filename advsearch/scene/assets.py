@@ -7,11 +7,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from advsearch.errors import InputError
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from advsearch.described import Value
+    from advsearch.scene.settings import Parameter
 
 Floats = npt.NDArray[np.float32]
 Doubles = npt.NDArray[np.float64]
@@ -20,6 +27,27 @@ Bools = npt.NDArray[np.bool_]
 
 SLACK = 1e-3
 """How far texture coordinates of a texture that does not repeat may lie beyond its edges."""
+
+
+class Rig(Protocol):
+    """What moves the vertices of a mesh: joints, shapes of a body, clips.
+
+    Attributes:
+        parameters: what can be asked for, each a number.
+        defaults: what the mesh has where nothing is said, by name.
+    """
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]: ...
+
+    @property
+    def defaults(self) -> Mapping[str, float]: ...
+
+    def offsets(self, values: Mapping[str, Tensor]) -> Tensor:
+        """Return how far each vertex goes from the mesh's own, (V, 3) in its units; differentiable."""
+
+    def measured(self, values: Mapping[str, Tensor]) -> Mapping[str, Value]:
+        """Return what else is worth storing, by name."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +63,7 @@ class Mesh:
         attributes: of meshes of Mitsuba scenes, further numbers, (V, n) or (F, n) float32, by Mitsuba's names, which
             begin with "vertex_" or "face_".
         materials: the faces (N,) int64 of each material that its file names, by that name; each face is in one at most.
+        rig: what moves its vertices, for the control `body`; None for what has no joints.
     """
 
     vertices: Floats
@@ -43,6 +72,7 @@ class Mesh:
     uvs: Floats
     attributes: Mapping[str, Floats] = field(default_factory=dict)
     materials: Mapping[str, Ints] = field(default_factory=dict)
+    rig: Rig | None = None
 
     @property
     def repeats(self) -> bool:
@@ -163,6 +193,7 @@ class EnvironmentAsset:
         photographed: it shows the floor of a real place: the ground that things stand on is that floor by itself.
         ground: the kind of ground that belongs to it by itself (`advsearch.scene.settings.GROUND_KINDS`); None for the
             usual one.
+        candelas: luminance of a radiance of 1, cd/m2; None where the map's brightness means nothing.
 
     Raises:
         InputError: a texel is negative, NaN or infinite.
@@ -174,6 +205,7 @@ class EnvironmentAsset:
     warnings: tuple[str, ...] = ()
     photographed: bool = False
     ground: str | None = None
+    candelas: float | None = None
 
     def __post_init__(self) -> None:
         bad = ~(np.isfinite(self.radiance) & (self.radiance >= 0.0)).all(axis=2)

@@ -32,6 +32,7 @@ from advsearch.scene.importing.scenes import MITSUBA_FILE, ImportedScene, import
 from advsearch.scene.parts import Lamp, MeshPart, PlacedCamera, PluginPart, ScenePart, mesh_part, plugins_in
 from advsearch.scene.settings import ORBIT_CAMERA
 from advsearch.scene.sizes import TRIPOD, doubts, on_roads, sized
+from advsearch.scene.things import ThingPart, with_things
 
 DEFAULT_ENVIRONMENT = "studio"
 OBJECT = "object"
@@ -70,7 +71,8 @@ class SceneDescription:
         preset: name of the mounted camera that it is (`advsearch.scene.camera_presets`); "" for none.
         camera_model: intrinsics and distortion of the camera around the object; None for a pinhole.
         metered: exposure is metered; otherwise a radiance of 1 is the white of the picture, as Mitsuba shows it.
-        remarks: what a user should know of further files that controls have read.
+        remarks: what a user should know of further files that controls have read, and of things in each other.
+        things_spec: how the things beside the object were asked for.
     """
 
     object: ObjectAsset
@@ -92,6 +94,7 @@ class SceneDescription:
     camera_model: CameraModel | None = None
     metered: bool = True
     remarks: tuple[str, ...] = ()
+    things_spec: str = ""
 
     def with_part(self, part: ScenePart) -> SceneDescription:
         """Return the scene with one more part.
@@ -184,6 +187,11 @@ class SceneDescription:
     def around(self) -> Mapping[str, MeshPart]:
         """The meshes around the object by name, as they came."""
         return {one.name: one for one in self.parts if isinstance(one, MeshPart)}
+
+    @property
+    def things(self) -> Mapping[str, ThingPart]:
+        """The things beside the object by name, as they came."""
+        return {one.name: one for one in self.parts if isinstance(one, ThingPart)}
 
     @property
     def cut_out(self) -> bool:
@@ -339,6 +347,7 @@ def describe(
     size: float | None = None,
     unit: str | None = None,
     plugins: Mapping[str, object] | None = None,
+    things: str | None = None,
 ) -> SceneDescription:
     """Find and read an object and an environment, bundled or from a file.
 
@@ -354,6 +363,7 @@ def describe(
         unit: of the coordinates of its file, one of `advsearch.scene.sizes.UNITS`; without both its size is what its
             format says.
         plugins: a Mitsuba scene as its loader takes it, in which `object_spec` is the id of a shape.
+        things: what stands beside the object (`advsearch.scene.things`).
 
     Raises:
         InputError: a name is unknown, a file cannot be used, or a setting is out of range.
@@ -391,6 +401,7 @@ def describe(
         camera=next(iter(around.cameras), ORBIT_CAMERA) if mitsuba and not orbits else ORBIT_CAMERA,
         metered=not mitsuba,
     )
+    described = with_things(described, things, lambda spec: _object(spec, None))
     check_meshes(described, values)
     idle = [name for name in given or {} if name.startswith("material.")]
     if described.object.surface is not None and idle:
@@ -436,7 +447,7 @@ def check_ground(given: settings.Given, lit_by: str | Path | EnvironmentAsset) -
         InputError: there is no photograph, or a table is described beside it.
     """
     kind = given.get("ground.kind")
-    if kind not in (settings.PHOTOGRAPH, *settings.ROADS):
+    if kind not in (settings.PHOTOGRAPH, *settings.ROADS, *settings.AVENUES):
         return
     if lit_by == NO_MAP and kind == settings.PHOTOGRAPH:
         raise InputError(

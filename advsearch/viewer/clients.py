@@ -19,6 +19,7 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from http import HTTPStatus
 from pathlib import Path
 from queue import Empty, LifoQueue
 from typing import Any
@@ -43,6 +44,14 @@ GRACE = 1.0
 
 TICK = 0.05
 """Seconds between two looks at the clock."""
+
+
+class Refused(Exception):
+    """A request that is not answered as asked."""
+
+    def __init__(self, status: HTTPStatus, text: str) -> None:
+        super().__init__(text)
+        self.status = status
 
 
 DAYS = 7

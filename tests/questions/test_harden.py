@@ -15,14 +15,14 @@ import advsearch
 from advsearch.attacks import make_policy
 from advsearch.cli.main import main
 from advsearch.cli.output import shown_text as answer
-from advsearch.config import AttackConfig
-from advsearch.engine.attack_parts import executor_for, problem_of
 from advsearch.engine.loading import Scene
 from advsearch.engine.surface_light import reason_against
 from advsearch.errors import InputError, ModelError
 from advsearch.models import Model
 from advsearch.models.reference import Trainable, load
 from advsearch.progress import NullProgress
+from advsearch.questions.attack.parts import executor_for, problem_of
+from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.harden import carry_out as hardening
 from advsearch.questions.harden import scenes as harden_scenes
 from advsearch.questions.harden.lessons import Lesson, RenderedLesson, TextureLesson

@@ -12,13 +12,15 @@ import numpy as np
 import pytest
 
 import advsearch
-from advsearch.api import carry_out, studies
+from advsearch.api import carry_out
 from advsearch.attacks import clopper_pearson, make_policy
 from advsearch.cli.main import main
-from advsearch.config import AttackConfig, SweepConfig
-from advsearch.engine.attack_parts import parts_of, problem_of_parts
 from advsearch.engine.surface_light import reason_against
 from advsearch.errors import AdvsearchError, FileFormatError, InputError, UnknownNameError
+from advsearch.questions.attack import studies
+from advsearch.questions.attack.parts import parts_of, problem_of_parts
+from advsearch.questions.attack.settings import AttackConfig
+from advsearch.questions.attack.summary import AnswerDistribution, FoundValue
 from advsearch.questions.recipe import carry_out as carrying_out
 from advsearch.questions.recipe.answer import RecipeFigure, RecipeResult, told_once
 from advsearch.questions.recipe.description import Recipe, planned, read_recipe, recipe_names, titles
@@ -27,9 +29,9 @@ from advsearch.questions.recipe.given import CuesOptions, fitting, predicted
 from advsearch.questions.recipe.settings import RecipeConfig
 from advsearch.questions.recipe.table import MadeFigure, Table, Tally
 from advsearch.questions.recipe.ternary import all_triangles, triangle_of
+from advsearch.questions.sweep.settings import SweepConfig
+from advsearch.questions.sweep.summary import SurfaceMap
 from advsearch.runs.images import write_png
-from advsearch.runs.results.attack import AnswerDistribution, FoundValue
-from advsearch.runs.results.sweep import SurfaceMap
 from advsearch.runs.summary import read_result
 
 SCENES = Path(__file__).resolve().parents[2] / "advsearch/bundled/data/environments"

@@ -16,9 +16,9 @@ from advsearch.scene import library
 from advsearch.scene.description import SceneDescription, describe
 from advsearch.scene.geometry import camera_to_world
 from advsearch.scene.glb import glb, posed
-from advsearch.scene.grounds import ROAD
 from advsearch.scene.importing.objects import import_object
 from advsearch.scene.importing.scenes import import_scene
+from advsearch.scene.places.road import ROAD
 
 
 def box(folder: Path, name: str, longest: float) -> Path:

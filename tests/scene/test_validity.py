@@ -12,8 +12,8 @@ from advsearch.controls import make_control, make_space
 from advsearch.engine.loading import Scene, framed, load_scene
 from advsearch.scene.assets import EnvironmentAsset
 from advsearch.scene.description import SceneDescription, describe
-from advsearch.scene.grounds import EDGES, EYE, LENGTH
 from advsearch.scene.library import load_environment
+from advsearch.scene.places.road import EDGES, EYE, LENGTH
 from advsearch.scene.validity import Surroundings, View, past, surroundings_of, valid, view_of
 
 SIDE = 96

@@ -6,6 +6,7 @@ from .cars import CAR
 from .family import Instance, ObjectFamily
 from .furniture import CHAIR, LAMP
 from .kitchen import FRYING_PAN, TEAPOT
+from .people import PERSON
 from .signs import STOP_SIGN
 from .things import BALL, BANANA, BOOK
 from .tools import DUMBBELL, HAMMER
@@ -32,7 +33,7 @@ HOUSEHOLD: dict[str, ObjectFamily] = {
 }
 """What the reference model is trained on."""
 
-STREET: dict[str, ObjectFamily] = {family.name: family for family in (CAR, STOP_SIGN)}
+STREET: dict[str, ObjectFamily] = {family.name: family for family in (CAR, STOP_SIGN, PERSON)}
 
 OBJECTS: dict[str, ObjectFamily] = HOUSEHOLD | STREET
 

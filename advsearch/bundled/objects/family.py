@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import numpy.typing as npt
 
-from advsearch.scene.assets import Material, ObjectAsset
+from advsearch.scene.assets import Material, ObjectAsset, Rig
 from advsearch.scene.library import BUNDLED_OBJECT, finished
 
 from .atlas import SIZE, joined, pack, painted
@@ -27,6 +27,7 @@ class Instance:
         material: the other surface parameters.
         detail: texels along an edge relative to the rest of the object, by tag, for parts that are hardly seen.
         finishes: of an object of several materials, what each tag is like; its tags are then names of materials.
+        rig: what moves the vertices of all patches, in the order of the patches.
     """
 
     patches: Sequence[Patch]
@@ -34,6 +35,7 @@ class Instance:
     material: Material
     detail: Mapping[str, float] = field(default_factory=dict)
     finishes: Mapping[str, Material] = field(default_factory=dict)
+    rig: Rig | None = None
 
     def charts(self) -> list[tuple[float, float]]:
         """Return the width and height that every patch asks of the atlas."""
@@ -76,7 +78,7 @@ class ObjectFamily:
         slots = pack(instance.charts(), self.texels)
         mesh = joined(instance.patches, slots, self.texels)
         if instance.finishes:
-            mesh = replace(mesh, materials=_by_tag(instance.patches))
+            mesh = replace(mesh, materials=_by_tag(instance.patches), rig=instance.rig)
         extent = np.ptp(np.concatenate([one.vertices for one in instance.patches]), axis=0).max()
         return ObjectAsset(
             name=self.name,

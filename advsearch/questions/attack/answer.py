@@ -1,16 +1,23 @@
-"""The results of `attack`: of one (`advsearch/runs/results/attack.py`), of several epsilons, and of several models."""
+"""What is shown and claimed of the results of `attack`: of one, of several epsilons, and of several models."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any
 
-from pydantic import Field
-
-from advsearch.report import wording
+from advsearch.questions.attack import wording
+from advsearch.questions.attack.summary import (
+    AttackSummary,
+    CurvePoint,
+    CurveResult,
+    DifferentFailure,
+    DifferentFailures,
+    EpsilonBudget,
+    FailingShare,
+    MatrixCell,
+    MatrixResult,
+)
 from advsearch.report.figures import BLUE
-from advsearch.report.markup import InNotebook
-from advsearch.report.phrases import answer_cells, margin_text, percent
 from advsearch.report.shown import (
     ENDED,
     NO_PROOF,
@@ -28,108 +35,18 @@ from advsearch.report.shown import (
     searches_text,
     share_text,
 )
-from advsearch.report.wording import count, interval_text, number_text, short_name
-from advsearch.runs.results.attack import (
-    AttackSummary,
-    ControlGroup,
-    DifferentFailure,
-    DifferentFailures,
-    FailingShare,
-    VerifiedRate,
+from advsearch.report.wording import (
+    answer_cells,
+    count,
+    interval_text,
+    margin_text,
+    no_numbers,
+    number_text,
+    percent,
+    short_name,
+    tally,
 )
-from advsearch.runs.results.base import Fields, Interval, JsonFloat, Result, StudyResult
-
-EpsilonBudget = float | None | dict[str, float | None]
-
-
-class ObjectRow(Fields):
-    """What the attacks on one object found, at the largest epsilon that was tried."""
-
-    object: str
-    clean: ControlGroup | None
-    ending: str | None = None
-    epsilon: EpsilonBudget = Field(default=None, description="of the last attack")
-    flips_at: EpsilonBudget = Field(description="the least epsilon at which an answer was found; null: at none")
-    verified: VerifiedRate | None = None
-    margin: JsonFloat | None = Field(default=None, description="mean of the trials, in logits")
-    run: str | None = None
-    tried: float | None = Field(default=None, description="the largest epsilon that was tried")
-    renders: dict[str, int] | None = Field(
-        default=None, description="pictures by kind, of the attacks at all epsilons together; null in older runs"
-    )
-
-
-class CurvePoint(Fields):
-    """How many objects are still recognised at an epsilon."""
-
-    epsilon: float | None
-    objects: int = Field(description="of which something is known there")
-    robust: int
-    found: int
-    already_wrong: int
-    accuracy: float | None
-    interval: Interval
-
-
-class CurveResult(InNotebook, StudyResult):
-    """Robust accuracy against epsilon, over objects."""
-
-    command: ClassVar[str] = "attack"
-    tabular: ClassVar[str] = "curve"
-
-    epsilons: list[float | None] = Field(description="those that were tried; null: the own of each control")
-    table: list[ObjectRow]
-    curve: list[CurvePoint]
-
-
-class MatrixModel(Fields):
-    """One of the models, and what it says of the clean scene in the pictures of all trials."""
-
-    model: str
-    labels: list[str] = Field(description="the names that count as right")
-    input_size: tuple[int, int] = Field(description="of the pictures that it is shown, [height, width] in pixels")
-    spp: int = Field(description="samples a pixel")
-    clean: ControlGroup
-
-
-class MatrixCell(Fields):
-    """One answer, tried on one model."""
-
-    model: str = Field(description="that it is tried on")
-    ending: str = Field(description="`found` where it is verified on this model, as for an attack")
-    verified: VerifiedRate
-
-
-class MatrixRow(Fields):
-    """One answer, and what it does to each model."""
-
-    attacked: str = Field(description="the model that it was searched on; `all` for an ensemble")
-    ending: str = Field(description="of the search and its own verification")
-    run: str | None
-    renders: dict[str, int] = Field(description="of the search and its own verification")
-    tested: list[MatrixCell] = Field(description="on each model; empty where nothing was searched")
-
-
-class MatrixResult(InNotebook, StudyResult):
-    """Answers that were searched on each of several models, or on all of them together, tried on each."""
-
-    command: ClassVar[str] = "attack"
-
-    models: list[str] = Field(description="as they were asked for")
-    ensemble: str | None = Field(description="how objectives were put together; null: each model by itself")
-    tested: list[MatrixModel] = Field(description="the models that answers were tried on; empty where none was")
-    table: list[MatrixRow]
-
-    @property
-    def brief(self) -> str:
-        """How many answers hold on models that they were not searched on."""
-        others = [cell for row in self.table for cell in row.tested if cell.model != row.attacked]
-        return f"{sum(cell.ending == 'found' for cell in others)} of {len(others)} transfer" if others else ""
-
-
-BY_FIELD: dict[str, type[Result]] = {"models": MatrixResult, "curve": CurveResult}
-"""Other results of the command, by a field that they alone have."""
-
+from advsearch.runs.results import ControlGroup, VerifiedRate
 
 NOT_VERIFIED = ("not verified", "")
 """Cells of what was not rendered afresh."""
@@ -173,7 +90,7 @@ def _rates(summary: AttackSummary) -> list[list[str]]:
         pictures = f"{summary.baseline.renders} pictures"
         rows.append(["random search", pictures, "", *_verified(success, summary.baseline.verified)])
     if average:
-        rate = [wording.tally("right", average.correct, average.configurations), interval_text(average.interval)]
+        rate = [tally("right", average.correct, average.configurations), interval_text(average.interval)]
         rows.append(["average case", count(average.configurations, "configuration"), "", *rate])
     return rows
 
@@ -183,7 +100,7 @@ def _verified(what: str, rated: VerifiedRate | None) -> Sequence[str]:
 
 
 def _rate(what: str, number: int, rated: VerifiedRate | ControlGroup) -> Sequence[str]:
-    return [wording.tally(what, number, rated.trials, rated.not_a_number), interval_text(rated.interval)]
+    return [tally(what, number, rated.trials, rated.not_a_number), interval_text(rated.interval)]
 
 
 def _facts(summary: AttackSummary) -> dict[str, str]:
@@ -197,7 +114,7 @@ def _facts(summary: AttackSummary) -> dict[str, str]:
         "along the drive": wording.drive_text(summary),
         "smallest": wording.smallest_text(summary),
         "failures": failures_text(summary.failures) if summary.failures else "",
-        "search": f"{summary.policy}, {wording.count(summary.steps, 'step')}: {summary.ending}",
+        "search": f"{summary.policy}, {count(summary.steps, 'step')}: {summary.ending}",
         "renders": wording.renders_text(summary),
         "environment": "",
         "seed": "",
@@ -340,7 +257,7 @@ def plain_epsilon(value: EpsilonBudget) -> str:
     """Return an epsilon as text, by control where there are more; empty of none."""
     if isinstance(value, dict):
         return ",".join(f"{name}={plain_epsilon(one)}" for name, one in value.items())
-    return "" if value is None else wording.number_text(value)
+    return "" if value is None else number_text(value)
 
 
 def _draw_curve(answer: CurveResult, axes: Any) -> None:
@@ -385,7 +302,7 @@ def _shown_matrix(result: MatrixResult) -> ShownAnswer:
     """The matrix, with a row for the clean scene; the stronger a cell's colour, the more successes."""
     heads = ["attacked on", "ending", *(f"tested on {short_name(one.model)}" for one in result.tested)]
     clean = [one.clean for one in result.tested]
-    counts = [f"right {one.correct}/{one.trials}{wording.no_numbers(one.not_a_number)}" for one in clean]
+    counts = [f"right {one.correct}/{one.trials}{no_numbers(one.not_a_number)}" for one in clean]
     right = [f"{text}, {interval_text(one.interval)}" for text, one in zip(counts, clean, strict=True)]
     rows = [["clean scene", "", *right]] if clean else []
     before = len(rows)
@@ -433,8 +350,8 @@ def _said_of_matrix(result: MatrixResult) -> str:
 def _cell(cell: MatrixCell) -> str:
     rated = cell.verified
     mark = " *" if cell.ending == "found" else " (wrong already)" if cell.ending == "already wrong" else ""
-    rate = f"{rated.successes}/{rated.trials}{wording.no_numbers(rated.not_a_number)}"
-    return f"{rate}, {wording.interval_text(rated.interval)}{mark}"
+    rate = f"{rated.successes}/{rated.trials}{no_numbers(rated.not_a_number)}"
+    return f"{rate}, {interval_text(rated.interval)}{mark}"
 
 
 def _draw_matrix(answer: MatrixResult, axes: Any) -> None:

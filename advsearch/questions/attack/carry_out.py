@@ -15,22 +15,8 @@ from advsearch.api.keywords import asks
 from advsearch.attacks import Policy, make_policy
 from advsearch.attacks.objectives import OBJECTIVE_KINDS
 from advsearch.cluster import Call
-from advsearch.config import AttackConfig, SceneConfig
+from advsearch.config import SceneConfig
 from advsearch.controls.values import sentences
-from advsearch.engine.attack_parts import (
-    LOADING,
-    AttackParts,
-    controls_given,
-    executor_for,
-    is_named,
-    models_as_one,
-    parts_given,
-    parts_of,
-    problem_on,
-    task_and_objective,
-    with_derivatives,
-)
-from advsearch.engine.attack_result import AttackResult
 from advsearch.engine.journal import Journal, Shared, answering, check_made_of
 from advsearch.engine.judging import Metric, check_shared, load_metrics, metrics_as_settings
 from advsearch.engine.judging import only_here as metrics_only_here
@@ -45,19 +31,31 @@ from advsearch.engine.naming import (
     several,
     told_of_scene,
 )
-from advsearch.engine.outcome import summarise
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Stages
-from advsearch.engine.stages import Attack
 from advsearch.engine.transport import CleanMatrix
 from advsearch.errors import InputError
 from advsearch.files import JsonObject
 from advsearch.models import Model
 from advsearch.options import as_setting, told
 from advsearch.progress import NullProgress, Progress, Watched, watcher
-from advsearch.question import Asked, answered
-from advsearch.questions.attack.answer import CurveResult, MatrixResult
-from advsearch.questions.attack.several import curve, matrix
+from advsearch.questions.attack.outcome import summarise
+from advsearch.questions.attack.parts import (
+    LOADING,
+    AttackParts,
+    controls_given,
+    executor_for,
+    is_named,
+    models_as_one,
+    parts_given,
+    parts_of,
+    problem_on,
+    task_and_objective,
+    with_derivatives,
+)
+from advsearch.questions.attack.result import AttackResult
+from advsearch.questions.attack.settings import AttackConfig
+from advsearch.questions.attack.stages import Attack
 from advsearch.report.wording import count
 from advsearch.runs.directory import RunDirectory, begun, check_free, is_run, run_path
 from advsearch.tasks import AnyTask, OwnTask, Task, function_of, make_task
@@ -164,17 +162,6 @@ def attack(
         return _carry_out(job, watcher(progress), folder)
 
 
-def attack_from_config(
-    config: AttackConfig, *, progress: Progress | None = None, resumed: Path | None = None
-) -> AttackResult | CurveResult | MatrixResult:
-    """Do what a configuration describes: one attack, a curve or a matrix of several; see `attack`."""
-    if config.is_matrix:
-        return answered(matrix, Asked(config, progress, resumed))
-    if config.is_curve:
-        return answered(curve, Asked(config, progress, resumed))
-    return attack_once(config, progress=progress, resumed=resumed)
-
-
 def attack_once(
     config: AttackConfig,
     *,
@@ -182,7 +169,7 @@ def attack_once(
     resumed: Path | None = None,
     clean: CleanMatrix | None = None,
 ) -> AttackResult:
-    """Attack one object with one epsilon, in a run directory; arguments and errors as for `attack_from_config`.
+    """Attack one object with one epsilon, in a run directory; otherwise as `attack`.
 
     `clean` is shared with attacks whose configurations differ in epsilon alone.
     """
@@ -198,7 +185,7 @@ def attack_on(config: AttackConfig, scene: Scene, model: Model) -> AttackResult:
     """Attack a model on a scene that are there, in place of those that the configuration names; nothing is kept.
 
     Raises:
-        InputError: as for `attack_from_config`.
+        InputError: as for `attack`.
     """
     return _carry_out(parts_given(config, scene, model), NullProgress())
 

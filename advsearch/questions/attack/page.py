@@ -15,15 +15,22 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageSequence
 
+from advsearch.questions.attack import wording
 from advsearch.questions.attack.answer import answered_text, failures_part, failures_text, range_text, shown
-from advsearch.questions.attack.method import PLAN_HEADS, method_facts, plan_rows, plan_text
-from advsearch.report import wording
+from advsearch.questions.attack.summary import AttackSummary, FoundValue, PicturedAnswer
 from advsearch.report.figures import search_axes
-from advsearch.report.phrases import SUCCESS_ABOVE_ZERO, answer_text, marks_text, objective_label
 from advsearch.report.shown import AnswerPart, Picture
+from advsearch.report.wording import (
+    SUCCESS_ABOVE_ZERO,
+    answer_text,
+    formation_text,
+    marks_text,
+    number_text,
+    objective_label,
+    seconds_text,
+)
 from advsearch.runs import directory, images, store
-from advsearch.runs.results.attack import AttackSummary, FoundValue, PicturedAnswer
-from advsearch.runs.results.base import Result
+from advsearch.runs.results import Result
 from advsearch.viewer.document import data_script, data_url
 from advsearch.viewer.pages import object_data, object_part, read_object, shown_page
 
@@ -55,15 +62,15 @@ def page(run: Path, result: Result) -> str | None:
         *_failures(result),
         _rates(result, given.sections[0]),
         _curve(result, curves),
-        AnswerPart("How the search worked", rows=_named(method_facts(result)), folded=True),
-        AnswerPart(plan_text(result), heads=PLAN_HEADS, rows=plan_rows(result), folded=True),
+        AnswerPart("How the search worked", rows=_named(wording.method_facts(result)), folded=True),
+        AnswerPart(wording.plan_text(result), heads=wording.PLAN_HEADS, rows=wording.plan_rows(result), folded=True),
     ]
     seconds = result.seconds
-    parts = ", ".join(f"{name} {wording.seconds_text(value)}" for name, value in seconds.items() if name != "total")
+    parts = ", ".join(f"{name} {seconds_text(value)}" for name, value in seconds.items() if name != "total")
     facts = {
         **given.facts,
-        "time": wording.seconds_text(seconds["total"]) + (f" ({parts})" if parts else ""),
-        "image formation": wording.formation_text(result.image_formation),
+        "time": seconds_text(seconds["total"]) + (f" ({parts})" if parts else ""),
+        "image formation": formation_text(result.image_formation),
         "environment": result.environment,
         "seed": str(result.seed),
     }
@@ -128,7 +135,7 @@ def _changes(summary: AttackSummary) -> AnswerPart:
     """The answer in a few values, each beside its range where it has one, from the clean value to the one found."""
     found = summary.configuration or {}
     rows = [
-        [name, "" if one.clean is None else wording.number_text(one.clean), _value_text(one), _range_text(one)]
+        [name, "" if one.clean is None else number_text(one.clean), _value_text(one), _range_text(one)]
         for name, one in found.items()
     ]
     heads = ("parameter", "clean", "adversarial", "in its range")
@@ -144,14 +151,14 @@ def _changes(summary: AttackSummary) -> AnswerPart:
 def _value_text(one: FoundValue) -> str:
     values = one.value if isinstance(one.value, list) else [one.value]
     unit = "" if one.unit in ("", "1", "name") else f" {one.unit}"
-    return ", ".join(map(wording.number_text, values)) + unit
+    return ", ".join(map(number_text, values)) + unit
 
 
 def _range_text(one: FoundValue) -> str:
     if one.low is None or one.high is None or not isinstance(one.value, (int, float)):
         return ""
     stopped = min(one.value - one.low, one.high - one.value) <= AT_THE_END * (one.high - one.low)
-    said = f"{wording.number_text(one.low)} to {wording.number_text(one.high)}"
+    said = f"{number_text(one.low)} to {number_text(one.high)}"
     return f"{said}, at its end" if stopped else said
 
 

@@ -1,6 +1,6 @@
 """`advsearch harden`: train a copy of a model on its worst cases, and measure what came of it."""
 
-from advsearch.cli.question import QuestionCommand
+from advsearch.cli.commands import QuestionCommand
 
 HELP = "train a copy of a model on its worst cases, and measure it before and after on scenes that training never saw"
 EXAMPLES = (

@@ -10,10 +10,9 @@ from pydantic import Field
 from advsearch.report import wording
 from advsearch.report.figures import BLUE, RED, Figures, drawn
 from advsearch.report.markup import InNotebook
-from advsearch.report.phrases import percent
 from advsearch.report.shown import NO_PROOF, AnswerPart, Claim, Column, Extent, ShownAnswer, claim, share_text
-from advsearch.runs.results.attack import SharedWork
-from advsearch.runs.results.base import Fields, Interval, RunResult
+from advsearch.report.wording import percent
+from advsearch.runs.results import Fields, Interval, RunResult, SharedWork
 
 
 class Share(Fields):

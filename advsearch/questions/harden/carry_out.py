@@ -18,7 +18,6 @@ from advsearch import seeds
 from advsearch.api.keywords import asks, configured
 from advsearch.attacks import clopper_pearson
 from advsearch.cluster import Executor, InProcess
-from advsearch.engine.attack_parts import LOADING, executor_for
 from advsearch.engine.journal import check_made_of
 from advsearch.engine.naming import AnyModel, check_not_spread, check_run_settings, load_models, model_name
 from advsearch.errors import ClusterError, InputError, ModelError
@@ -26,6 +25,7 @@ from advsearch.interrupts import interruptible
 from advsearch.models.reference import trainable
 from advsearch.models.source import split_weights
 from advsearch.progress import NullProgress, Progress, Watched, watcher
+from advsearch.questions.attack.parts import LOADING, executor_for
 from advsearch.questions.harden.answer import HardenedControl, HardenResult, Share, SplitSide, hardened_figure
 from advsearch.questions.harden.lessons import FOLDER, Lesson
 from advsearch.questions.harden.scenes import (
@@ -57,8 +57,7 @@ from advsearch.questions.harden.training import (
 )
 from advsearch.runs.directory import ARTIFACTS, IMAGES, RunDirectory, is_run, run_path
 from advsearch.runs.files import write_bytes
-from advsearch.runs.results.attack import SharedWork
-from advsearch.runs.results.base import INTERRUPTED
+from advsearch.runs.results import INTERRUPTED, SharedWork
 from advsearch.runs.store import Row
 from advsearch.tasks import make_task
 from advsearch.viewer.pages import keep_answer

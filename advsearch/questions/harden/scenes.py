@@ -18,8 +18,6 @@ from advsearch.attacks.verification import WORST_CASE
 from advsearch.bundled.changed_light import varied, white_light_changed
 from advsearch.bundled.objects import OBJECTS
 from advsearch.cluster import Call
-from advsearch.config import AttackConfig
-from advsearch.engine.attack_parts import problem_of
 from advsearch.engine.loading import Scene, load_scene
 from advsearch.engine.naming import RUN_SETTINGS, load_models, scene_settings, settings_alone
 from advsearch.engine.problem import Problem
@@ -28,9 +26,11 @@ from advsearch.files import JsonObject
 from advsearch.models import Model
 from advsearch.models.reference import trainable
 from advsearch.questions.attack.carry_out import attack_on
+from advsearch.questions.attack.parts import problem_of
+from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.harden.lessons import Lesson, has_matrix, lessons, plain_lessons
 from advsearch.questions.harden.settings import ALL, HardenConfig
-from advsearch.runs.results.base import INTERRUPTED
+from advsearch.runs.results import INTERRUPTED
 from advsearch.scene.assets import ObjectAsset
 from advsearch.scene.formation import levels_of
 from advsearch.scene.library import list_environments

@@ -4,7 +4,7 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import model_validator
 
-from advsearch.config.attack import STEPS, AttackConfig
+from advsearch.questions.attack.settings import STEPS, AttackConfig
 from advsearch.settings import setting, setting_as_in
 
 ALL = "all"
@@ -32,6 +32,7 @@ class HardenConfig(AttackConfig):
     without: ClassVar[tuple[str, ...]] = (
         "smallest", "ensemble", "printable", "aov", "metrics", "log", "target", "minimise", "over", "draws", "path",
         "average", "baseline", "seconds", "camera", "up", "size", "unit", "label", "task", "measure", "estimators",
+        "things", "judge",
     )
 
     object: str = setting_as_in(

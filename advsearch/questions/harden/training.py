@@ -40,7 +40,7 @@ from advsearch.questions.harden.lessons import (
 )
 from advsearch.questions.harden.scenes import TRAINING, VALIDATION
 from advsearch.questions.harden.settings import HardenConfig
-from advsearch.report.phrases import percent
+from advsearch.report.wording import percent
 from advsearch.runs.directory import ARTIFACTS, RunDirectory
 from advsearch.runs.files import write_bytes
 

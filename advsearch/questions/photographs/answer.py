@@ -27,11 +27,11 @@ from pydantic import Field
 from advsearch.errors import InputError
 from advsearch.report import wording
 from advsearch.report.markup import Html, element, join_html
-from advsearch.report.phrases import percent
+from advsearch.report.wording import percent
 from advsearch.runs.directory import IMAGES
-from advsearch.runs.results.base import Fields, Interval
+from advsearch.runs.results import Fields, Interval
+from advsearch.viewer.clients import Refused
 from advsearch.viewer.document import data_script, document, in_address, study_table
-from advsearch.viewer.server import Refused
 from advsearch.viewer.thumbnails import kept_file, kept_pictures
 
 PHOTO, LOOSE_PHOTO = "photo", "loose photo"

@@ -17,9 +17,7 @@ from PIL import Image
 from advsearch import seeds
 from advsearch.attacks import clopper_pearson
 from advsearch.calls import helped
-from advsearch.config import AttackConfig, SweepConfig
 from advsearch.described import Value
-from advsearch.engine.attack_parts import judged_alone, problem_from_config
 from advsearch.engine.judging import judgements
 from advsearch.engine.naming import in_turn
 from advsearch.engine.record import judged
@@ -27,6 +25,8 @@ from advsearch.engine.verifier import kept_answer
 from advsearch.errors import FileFormatError, InputError
 from advsearch.files import JsonObject, read_bytes
 from advsearch.models import Model
+from advsearch.questions.attack.parts import judged_alone, problem_from_config
+from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.photographs.answer import (
     FOLDER,
     LARGEST,
@@ -38,6 +38,7 @@ from advsearch.questions.photographs.answer import (
     sound_photo,
 )
 from advsearch.questions.sweep.carry_out import scenes_of
+from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.runs.directory import CONFIG, IMAGES, RunDirectory, find_run
 from advsearch.runs.files import write_bytes
 from advsearch.runs.store import NAME, Row, Store

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from advsearch.cli import output
-from advsearch.cli.question import Positional, QuestionCommand
+from advsearch.cli.commands import Positional, QuestionCommand
 
 HELP = "run a whole experiment that a recipe describes, and write a page of figures"
 EXAMPLES = (

@@ -10,10 +10,9 @@ from typing import ClassVar
 from pydantic import Field
 
 from advsearch.report.markup import InNotebook
-from advsearch.report.phrases import percent
 from advsearch.report.shown import AnswerPart, Column, ShownAnswer
-from advsearch.report.wording import count, short_name
-from advsearch.runs.results.base import Fields, RunResult
+from advsearch.report.wording import count, percent, short_name
+from advsearch.runs.results import Fields, RunResult
 
 Cell = str | int | float | None
 

@@ -12,13 +12,14 @@ from typing import Any
 import torch
 
 from advsearch.api.keywords import asks, configured
-from advsearch.api.studies import carry_out_part
-from advsearch.config import AttackConfig, SweepConfig
-from advsearch.config.scene import DEFAULT_ENVIRONMENT, SceneConfig, name_in
+from advsearch.config import DEFAULT_ENVIRONMENT, SceneConfig, name_in
 from advsearch.controls import CONTROLS
-from advsearch.engine.attack_parts import check_from_config
 from advsearch.errors import InputError
 from advsearch.progress import NullProgress, Progress, Watched, watcher
+from advsearch.questions.attack.parts import check_from_config
+from advsearch.questions.attack.settings import AttackConfig
+from advsearch.questions.attack.studies import carry_out_part
+from advsearch.questions.attack.summary import AnswerDistribution, AttackSummary, FoundValue, attack_of
 from advsearch.questions.photographs.answer import LOOSE_PHOTO, PHOTO
 from advsearch.questions.photographs.carry_out import Photographs, photographs_in
 from advsearch.questions.recipe.answer import PHOTOGRAPHS, RecipeFigure, RecipePart, RecipeResult
@@ -36,16 +37,16 @@ from advsearch.questions.recipe.figures import ANY, check_figures, files_of, mak
 from advsearch.questions.recipe.settings import RecipeConfig
 from advsearch.questions.recipe.table import TRIAL, TRIALS, WORKERS, Table, read_rows
 from advsearch.questions.sweep.carry_out import scenes_of
-from advsearch.report.phrases import DETECTION
+from advsearch.questions.sweep.settings import SweepConfig
+from advsearch.questions.sweep.summary import SweepSummary
+from advsearch.report.wording import DETECTION
 from advsearch.runs.directory import IMAGES, PARTS, RunDirectory
 from advsearch.runs.files import write_bytes
-from advsearch.runs.results.attack import AnswerDistribution, AttackSummary, FoundValue
-from advsearch.runs.results.base import INTERRUPTED
-from advsearch.runs.results.sweep import SweepSummary
+from advsearch.runs.results import INTERRUPTED
 from advsearch.runs.store import NAME as STORE
 from advsearch.runs.store import Store
 from advsearch.runs.summary import NAME as SUMMARY
-from advsearch.runs.summary import attack_of, read_result
+from advsearch.runs.summary import read_result
 from advsearch.threads import cores
 from advsearch.viewer.pages import keep_answer
 

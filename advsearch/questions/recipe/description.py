@@ -16,8 +16,7 @@ from typing import Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from advsearch import seeds
-from advsearch.config import CONFIGS
-from advsearch.config.scene import DEFAULT_ENVIRONMENT, SceneConfig
+from advsearch.config import CONFIGS, DEFAULT_ENVIRONMENT, SceneConfig
 from advsearch.errors import FileFormatError, InputError, UnknownNameError
 from advsearch.questions.recipe.answer import PHOTOGRAPHS
 from advsearch.questions.recipe.settings import RecipeConfig

@@ -22,7 +22,7 @@ from advsearch.questions.recipe.table import (
     plural,
 )
 from advsearch.report.figures import BLUE, GREY, RED
-from advsearch.report.phrases import percent
+from advsearch.report.wording import percent
 
 LETTERS = 85
 """Letters that a bar of the whole width has room for."""

@@ -22,10 +22,9 @@ from advsearch.questions.recipe.table import (
     Tally,
     draw_bars,
 )
+from advsearch.questions.sweep.answer import surface_sentences
 from advsearch.report.figures import BLUE
-from advsearch.report.phrases import percent
-from advsearch.report.sweeps import surface_sentences
-from advsearch.report.wording import count, short_name
+from advsearch.report.wording import count, percent, short_name
 from advsearch.runs.directory import IMAGES, PARTS
 
 NO_PHOTOGRAPHS = (

@@ -5,7 +5,7 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import JsonValue, field_validator
 
-from advsearch.config.scene import SceneConfig, read_joined
+from advsearch.config import SceneConfig, read_joined
 from advsearch.files import MESHES, either
 from advsearch.settings import Clash, Config, setting, setting_as_in, split_names
 

@@ -16,13 +16,12 @@ from pydantic import BaseModel, ConfigDict, Field
 from advsearch.attacks.trials import CONFIDENCE
 from advsearch.attacks.units import per_unit, share_interval
 from advsearch.errors import InputError
+from advsearch.questions.attack.summary import AttackSummary
 from advsearch.questions.recipe.answer import Cell
+from advsearch.questions.sweep.summary import SurfaceMap, SweepSummary
 from advsearch.report.figures import BLUE, GREY, RED
-from advsearch.report.phrases import percent
-from advsearch.report.wording import figure_value, interval_text
-from advsearch.runs.results.attack import AttackSummary
-from advsearch.runs.results.base import Interval
-from advsearch.runs.results.sweep import SurfaceMap, SweepSummary
+from advsearch.report.wording import figure_value, interval_text, percent
+from advsearch.runs.results import Interval
 from advsearch.runs.store import NAME, Store
 from advsearch.runs.units import units_of
 
@@ -61,7 +60,7 @@ def read_rows(
     outer = {"object": summary.object, "environment": summary.environment, MODEL: summary.model}
     rows, units = list[dict[str, Any]](), dict[str, str]()
     with Store(folder / NAME, read_only=True) as store:
-        drawn = units_of(store, summary) if isinstance(summary, SweepSummary) else None
+        drawn = units_of(store) if isinstance(summary, SweepSummary) else None
         # without draws, samples of a point differ by noise alone
         alike = summary.samples if isinstance(summary, SweepSummary) and summary.sampler is None else 1
         for row in store.rows():

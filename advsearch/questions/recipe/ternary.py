@@ -24,7 +24,7 @@ from advsearch.questions.recipe.table import (
     extremes,
     most_frequent,
 )
-from advsearch.report.phrases import percent
+from advsearch.report.wording import percent
 
 Doubles = npt.NDArray[np.float64]
 Shares = tuple[float, float, float]

@@ -1,0 +1,261 @@
+"""People: a dressed body with phenotype and joints, evaluated in torch, so that gradients reach every number.
+
+    points = mean + sum_r c_r(gender, age, weight, height) b_r          a few shapes (MakeHuman's, CC0)
+    posed  = sum_j w_j (A_j Z_j (p - h_j) + t_j)                        linear blend skinning, joint j at h_j
+
+Z_j brings the arms of MakeHuman's rest pose down and the legs together: there all angles are 0. A_j are the joints'
+turns about the body's own axes (x ahead, y to its left, z up), from the pelvis outwards. The lowest point stands on the
+ground. `scenes/person.py` makes the data.
+
+Walking adds a gait's mean angles over its cycle, as measured of adults (Winter 1991, "The Biomechanics and Motor
+Control of Human Gait", chapter 2), rounded, by a Fourier series.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping
+from functools import lru_cache, partial
+from importlib import resources
+from types import MappingProxyType
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from advsearch.described import Value
+from advsearch.scene.settings import GEOMETRIC, Parameter, moving
+
+AGES = (10.0, 25.0, 90.0)
+"""Years of MakeHuman's child, young and old."""
+_of_body = partial(moving, GEOMETRIC)
+
+
+def _angle(name: str, low: float, high: float, text: str) -> Parameter:
+    return _of_body(name, "degrees", low, high, 0.0, text)
+
+
+PHENOTYPE = (
+    _of_body("height", "metres", 1.0, 2.1, 1.7, "Height without shoes and hair.", (1.5, 1.95)),
+    _of_body("weight", "1", 0.0, 1.0, 0.5, "0 is thin, 0.5 average, 1 heavy; `body.mass` says kilograms.", (0.2, 0.8)),
+    _of_body("age", "years", 10.0, 90.0, 35.0, "Age; children are smaller by `height` only.", (18.0, 75.0)),
+    _of_body("gender", "1", 0.0, 1.0, 1.0, "0 is a woman, 1 a man, between them a mixture.", (0.0, 1.0)),
+)
+WALK = (
+    _of_body("walk", "degrees", -3600.0, 3600.0, 0.0, "Phase of a walk: the left heel strikes at 0, the right at 180.",
+             (0.0, 360.0), periodic=True),
+    _of_body("stride", "1", 0.0, 1.3, 0.0, "How far the walk swings: 0 stands, 1 is an ordinary step.", (0.0, 1.0)),
+)  # fmt: skip
+SPINE = (
+    _angle("spine", -20.0, 60.0, "Bend of the back, ahead."),
+    _angle("spine_side", -25.0, 25.0, "Bend of the back to the left."),
+    _angle("spine_turn", -35.0, 35.0, "Turn of the chest to the left."),
+    _angle("neck", -45.0, 45.0, "Nod of the head, ahead."),
+    _angle("neck_turn", -70.0, 70.0, "Turn of the head to the left."),
+)
+LIMBS = (
+    ("shoulder", -50.0, 170.0, "arm, raised ahead"),
+    ("shoulder_out", -5.0, 160.0, "arm, raised to the side"),
+    ("shoulder_turn", -60.0, 80.0, "arm, turned inwards about itself"),
+    ("elbow", 0.0, 145.0, "forearm, bent"),
+    ("hip", -15.0, 110.0, "thigh, raised ahead"),
+    ("hip_out", -10.0, 40.0, "thigh, to the side"),
+    ("knee", 0.0, 130.0, "calf, bent"),
+    ("ankle", -35.0, 20.0, "foot, its toes up"),
+)
+"""Joints that are there twice, with their limits in degrees."""
+PARAMETERS = (
+    *PHENOTYPE,
+    *WALK,
+    *SPINE,
+    *(
+        _angle(f"{side}_{name}", low, high, f"{side.capitalize()} {text}.")
+        for side in ("left", "right")
+        for name, low, high, text in LIMBS
+    ),
+)
+"""Everything that a person can be asked for."""
+
+GAIT = {
+    "hip": (30, 24, 16, 6, -3, -10, -6, 10, 25, 31),
+    "knee": (4, 16, 15, 8, 4, 10, 36, 60, 50, 15),
+    "ankle": (0, -5, 3, 7, 10, 7, -15, -10, 0, 2),
+    "shoulder": (-20, -17, -8, 4, 14, 18, 15, 6, -6, -16),
+    "elbow": (8, 10, 15, 22, 27, 30, 27, 22, 15, 10),
+}
+"""Mean angles in degrees at each tenth of a cycle from the heel strike of the same side."""
+STRAIGHT = {
+    "upperarm": ("lowerarm", (0.02, 0.15, -1.0)), "lowerarm": ("hand", (0.16, 0.05, -1.0)),
+    "thigh": ("calf", (0.0, 0.03, -1.0)), "calf": ("foot", (-0.03, 0.0, -1.0)),
+}  # fmt: skip
+"""Where a bone points with all angles 0, on the left side, and the joint at its end."""
+
+
+class Person:
+    """A dressed body, as `scenes/person.py` has sewn it.
+
+    Attributes:
+        parameters: what can be asked for.
+        defaults: what this one has where nothing is said.
+        size: its largest extent in metres at its defaults.
+        data: the arrays of body.npz.
+    """
+
+    parameters = PARAMETERS
+
+    def __init__(self, data: Mapping[str, np.ndarray], defaults: Mapping[str, float] = MappingProxyType({})) -> None:
+        self.data, self.defaults = data, {one.name: float(one.default) for one in PARAMETERS} | dict(defaults)
+        self._bones = [str(bone) for bone in data["bones"]]
+        self._parents = [int(parent) for parent in data["parents"]]
+        self._held = {
+            "mean": torch.from_numpy(data["mean"].astype(np.float32) * 1e-4),
+            "basis": torch.from_numpy(data["basis"].astype(np.float32)),
+            "weights": torch.from_numpy(data["weights"] / data["weights"].sum(axis=1, keepdims=True, dtype=np.float32)),
+            "index": torch.from_numpy(data["index"].astype(np.int64)),
+        } | {name: torch.from_numpy(data[name]) for name in ("shares", "stature", "mass")}
+        self.standing = self.posed({})
+        self.size = float((self.standing.amax(dim=0) - self.standing.amin(dim=0)).max())
+
+    def offsets(self, values: Mapping[str, Tensor]) -> Tensor:
+        """Return how far each vertex (V, 3) goes from the defaults, in sizes; values as `posed` has them."""
+        posed = self.posed(values)
+        return (posed - self.standing.to(posed.device)) / self.size
+
+    def posed(self, values: Mapping[str, Tensor]) -> Tensor:
+        """Return the vertices (V, 3) in metres, the pelvis above the origin and the lowest on z = 0.
+
+        Args:
+            values: numbers by the names of `PARAMETERS`, without dimensions; its own default where one is missing.
+        """
+        number = self._numbers(values)
+        device = number["height"].device
+        mixed, factor = self._phenotype(number)
+        shares = torch.einsum("gawh,gawhr->r", mixed, self._on("shares", device))
+        points = self._on("mean", device) + torch.einsum("r,rpc->pc", shares, self._on("basis", device))
+        joints, points = points[-len(self._bones) :], points[: -len(self._bones)]
+        turns, shifts = self._skeleton(joints, walked(number))
+        weights = self._on("weights", device)
+        moved = torch.einsum("pj,jk->pk", weights, torch.cat([turns.reshape(-1, 9), shifts], dim=1))
+        posed = torch.einsum("pik,pk->pi", moved[:, :9].reshape(-1, 3, 3), points) + moved[:, 9:]
+        pelvis = shifts[0] + turns[0] @ joints[0]
+        floor = torch.cat([pelvis[:2], posed[:, 2].amin()[None]])
+        return (factor * (posed - floor)).index_select(0, self._on("index", device))
+
+    def measured(self, values: Mapping[str, Tensor]) -> Mapping[str, Value]:
+        """Return its mass without clothes, between those of MakeHuman's extremes."""
+        mixed, factor = self._phenotype(self._numbers(values))
+        return {"mass": {"value": float((mixed * self._on("mass", mixed.device)).sum() * factor**3), "unit": "kg"}}
+
+    def _numbers(self, values: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        some = next(iter(values.values()), torch.zeros(()))
+        return {name: values.get(name, some.new_tensor(default)) for name, default in self.defaults.items()}
+
+    def _on(self, name: str, device: torch.device) -> Tensor:
+        return self._held[name].to(device)
+
+    def _phenotype(self, number: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
+        """How much of each extreme (G, A, W, H) there is, and the factor that is left to the height asked for."""
+        gender = torch.stack([1.0 - number["gender"], number["gender"]])
+        age = hats(number["age"], number["age"].new_tensor(AGES))
+        weight = hats(number["weight"], number["weight"].new_tensor([0.0, 0.5, 1.0]))
+        mixed = torch.einsum("g,a,w->gaw", gender, age, weight)
+        statures = torch.einsum("gaw,gawh->h", mixed, self._on("stature", mixed.device))
+        asked = number["height"]
+        height = hats(torch.minimum(torch.maximum(asked, statures[0]), statures[2]), statures)
+        return mixed[..., None] * height, asked / (height * statures).sum()
+
+    def _skeleton(self, joints: Tensor, angle: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
+        """Turn (J, 3, 3) and shift (J, 3) of each bone: p goes to `turn @ p + shift`."""
+        straight, own = self._straightened(joints), turned(angle)
+        same = torch.eye(3, device=joints.device, dtype=joints.dtype)
+        about, turns, places = list[Tensor](), list[Tensor](), list[Tensor]()
+        for number, (bone, parent) in enumerate(zip(self._bones, self._parents, strict=True)):
+            turn = own.get(bone, same)
+            about.append(turn if parent < 0 else about[parent] @ turn)
+            turns.append(about[-1] @ straight.get(bone, same))
+            reach = joints[number] - joints[parent]
+            places.append(joints[number] if parent < 0 else places[parent] + turns[parent] @ reach)
+        stacked = torch.stack(turns)
+        return stacked, torch.stack(places) - torch.einsum("jik,jk->ji", stacked, joints)
+
+    def _straightened(self, joints: Tensor) -> dict[str, Tensor]:
+        """The turn of each bone that has a direction where all angles are 0."""
+        found = {}
+        for side, sign in (("l", 1.0), ("r", -1.0)):
+            for bone, (end, (x, y, z)) in STRAIGHT.items():
+                begin, stop = (joints[self._bones.index(f"{one}_{side}")] for one in (bone, end))
+                found[f"{bone}_{side}"] = least_turn(stop - begin, joints.new_tensor([x, sign * y, z]))
+            found[f"hand_{side}"] = about("z", joints.new_tensor(sign * 60.0)) @ found[f"lowerarm_{side}"]
+        return found
+
+
+@lru_cache(maxsize=1)
+def body_data() -> Mapping[str, np.ndarray]:
+    """Return the arrays of the bundled body."""
+    content = (resources.files("advsearch.bundled") / "data/objects/person/body.npz").read_bytes()
+    with np.load(io.BytesIO(content), allow_pickle=False) as file:
+        return dict(file)
+
+
+def hats(value: Tensor, at: Tensor) -> Tensor:
+    """Return how much of each of some rising places (n,) a number has, by linear interpolation between them; its sum is
+    1 from the first place to the last."""
+    share = ((value - at[:-1]) / (at[1:] - at[:-1])).clamp(0.0, 1.0)
+    one = torch.ones_like(share[:1])
+    return torch.cat([one, share]) - torch.cat([share, torch.zeros_like(one)])
+
+
+def walked(number: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return the angles with those of the walk added, within each joint's limits."""
+    angle = dict(number)
+    phase, stride = torch.deg2rad(number["walk"]), number["stride"]
+    for side, begin in (("left", 0.0), ("right", np.pi)):
+        for joint, tenths in GAIT.items():
+            waves = np.fft.rfft(tenths)[:5] / len(tenths)
+            swing = phase.new_tensor(float(waves[0].real))
+            for order, wave in enumerate(waves[1:], 1):
+                at = order * (phase + begin)
+                swing = swing + 2.0 * (float(wave.real) * torch.cos(at) - float(wave.imag) * torch.sin(at))
+            angle[f"{side}_{joint}"] = angle[f"{side}_{joint}"] + stride * swing
+    angle["spine_turn"] = angle["spine_turn"] + stride * 5.0 * torch.cos(phase)
+    limits = {one.name: (one.low, one.high) for one in PARAMETERS if one.unit == "degrees" and not one.periodic}
+    return {name: value.clamp(*limits[name]) if name in limits else value for name, value in angle.items()}
+
+
+def turned(angle: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return each bone's own turn (3, 3) of joint angles in degrees."""
+    spine, side, turn = (angle[name] / 3.0 for name in ("spine", "spine_side", "spine_turn"))
+    bend = about("y", spine) @ about("x", -side) @ about("z", turn)
+    nod = about("z", angle["neck_turn"] / 2.0) @ about("y", angle["neck"] / 2.0)
+    found = {"spine_01": bend, "spine_02": bend, "spine_03": bend, "neck_01": nod, "head": nod}
+    for name, left in (("left", 1.0), ("right", -1.0)):
+        one = {joint: angle[f"{name}_{joint}"] for joint, *_ in LIMBS}
+        end = name[0]
+        raised = about("x", left * one["shoulder_out"]) @ about("y", -one["shoulder"])
+        found[f"upperarm_{end}"] = raised @ about("z", -left * one["shoulder_turn"])
+        found[f"lowerarm_{end}"] = about("y", -one["elbow"])
+        found[f"thigh_{end}"] = about("x", left * one["hip_out"]) @ about("y", -one["hip"])
+        found[f"calf_{end}"] = about("y", one["knee"])
+        found[f"foot_{end}"] = about("y", -one["ankle"])
+    return found
+
+
+def about(axis: str, degrees: Tensor) -> Tensor:
+    """Return the turn (3, 3) about an axis of the body, right-handed."""
+    c, s = torch.cos(torch.deg2rad(degrees)), torch.sin(torch.deg2rad(degrees))
+    zero, one = torch.zeros_like(c), torch.ones_like(c)
+    rows = {
+        "x": (one, zero, zero, zero, c, -s, zero, s, c),
+        "y": (c, zero, s, zero, one, zero, -s, zero, c),
+        "z": (c, -s, zero, s, c, zero, zero, zero, one),
+    }
+    return torch.stack(rows[axis]).reshape(3, 3)
+
+
+def least_turn(begin: Tensor, end: Tensor) -> Tensor:
+    """Return the smallest turn (3, 3) from one direction to another, that is not opposite: `I + V + V^2 / (1 + c)`."""
+    a, b = begin / begin.norm(), end / end.norm()
+    x, y, z = torch.linalg.cross(a, b)
+    zero = torch.zeros_like(x)
+    skew = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
+    return torch.eye(3).to(a) + skew + skew @ skew / (1.0 + a @ b)
