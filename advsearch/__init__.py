@@ -28,13 +28,11 @@ _HOMES = {
     "Task": "advsearch.tasks",
     "allow_code": "advsearch.registry",
     "check": "advsearch.questions.check.carry_out",
-    "harden": "advsearch.questions.harden.carry_out",
     "load_model": "advsearch.api.render",
     "load_run": "advsearch.api.render",
     "load_scene": "advsearch.engine.loading",
     "photo_agreement": "advsearch.questions.photographs.carry_out",
     "precision": "advsearch.questions.precision.carry_out",
-    "recipe": "advsearch.questions.recipe.carry_out",
     "render": "advsearch.api.render",
     "stability": "advsearch.questions.stability.carry_out",
 }

@@ -75,7 +75,10 @@ def found(name: str) -> Any:
         return getattr(importlib.import_module(place), attribute)
     if made := made_question(name):
         unflagged = Positional(*made.expected) if made.expected else None
-        return QuestionCommand(name, about=made.about, place=unflagged, examples=made.examples, brought=made.brought)
+        about, brought, examples = made.about, made.brought, made.examples
+        return QuestionCommand(
+            name, about=about, place=unflagged, brought=brought, listed=made.listed, examples=examples
+        )
     module = importlib.import_module(f"{ROOM}{name}")
     return getattr(module, "COMMAND", module)
 

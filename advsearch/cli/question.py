@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -56,6 +57,7 @@ class QuestionCommand:
             these name.
         place: how that setting is given without its flag.
         brought: returns the settings that the `run.yaml` of the run that it is about brings, by what was typed.
+        listed: where the function is that returns what it may be about, with a line about each, which `list` prints.
         more, examples: as of `Command`.
     """
 
@@ -65,6 +67,7 @@ class QuestionCommand:
     about: str = ""
     place: Positional | None = None
     brought: Callable[[Path, Mapping[str, Any]], dict[str, Any]] | None = None
+    listed: str = ""
     more: str = ""
     examples: tuple[str, ...] = ()
 
@@ -90,6 +93,15 @@ class QuestionCommand:
     def run(self, args: argparse.Namespace) -> int:
         """Ask what the arguments say. Raises InputError where what it is about is missing."""
         named = getattr(args, self.about, None)
+        if self.listed and named == "list":
+            module, _, function = self.listed.partition(":")
+            lines = getattr(import_module(module), function)()
+            if args.json:
+                listed = [{"name": name, "title": text} for name, text in lines.items()]
+                output.print_json({"schema": 1, f"{self.name}s": listed})
+            else:
+                print(output.aligned([[name, text] for name, text in lines.items()]))
+            return 0
         if self.place and named in (None, []):
             command = f"advsearch {self.name}"
             raise InputError(f"{command}: expected {self.place.expected}; see {command} --help")
