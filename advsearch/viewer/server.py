@@ -356,8 +356,8 @@ class _Handler(BaseHTTPRequestHandler):
         return _own(page, "../../../", ("../", name))
 
     def _take(self, _query: Query, name: str, rendering: str) -> Served:
-        _photographs("check_sender")(self.headers, self.server.key(name))
-        return Served(*_photographs("take")(self.server.photographs, self.server.run(name), rendering, self._body))
+        server, run, key = self.server, self.server.run(name), self.server.key(name)
+        return Served(*_photographs("take")(server.photographs, run, rendering, self.headers, key, self._body))
 
     def _body(self) -> bytes:
         self.server.clients.wait_for(SENDING)
@@ -366,10 +366,10 @@ class _Handler(BaseHTTPRequestHandler):
         return data
 
     def _rendering(self, _query: Query, name: str, rendering: str) -> Served:
-        return Served(*_photographs("rendering_picture")(self.server.run(name), rendering))
+        return Served(*_photographs("picture")("rendering", self.server.run(name), rendering))
 
     def _photo(self, _query: Query, name: str, photo: str) -> Served:
-        return Served(*_photographs("photo")(self.server.run(name), photo))
+        return Served(*_photographs("picture")("photo", self.server.run(name), photo))
 
 
 Query = Mapping[str, list[str]]

@@ -210,7 +210,7 @@ def shown(result: HardenResult) -> ShownAnswer:
     shares = shares_of(result)
 
     def draw(axes: Any) -> None:
-        bars = {name: [share and share.drawn for share in both] for name, both in shares.items()}
+        bars = {name: [None if share is None else share.drawn for share in both] for name, both in shares.items()}
         draw_shares(axes, bars, ("before", "after"), (RED, BLUE))
         axes.set(xlabel="share that is right, with 95 % interval")
         axes.set_title(f"Held-out scenes: {wording.short_name(result.model)}")
