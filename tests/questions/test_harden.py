@@ -53,8 +53,8 @@ def attacks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[tuple[str, 
 
     monkeypatch.setattr(harden_scenes, "attacked", attacked)
     monkeypatch.setattr(harden_scenes, "CLEAN_SCENES", 1)
-    monkeypatch.setattr(hardening, "PLAIN_SCENES", 1)
-    monkeypatch.setattr(hardening, "RENDERED_SCENES", 2)
+    monkeypatch.setattr(hardening.answer, "PLAIN_SCENES", 1)
+    monkeypatch.setattr(hardening.answer, "RENDERED_SCENES", 2)
     return done
 
 

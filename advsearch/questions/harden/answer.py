@@ -104,7 +104,6 @@ class HardenConfig(AttackConfig):
 
     @property
     def title(self) -> tuple[str, ...]:
-        """The command and the controls."""
         return self.command, *self.controls
 
 

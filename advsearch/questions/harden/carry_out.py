@@ -5,9 +5,7 @@ from __future__ import annotations
 
 import gc
 import json
-import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -20,32 +18,17 @@ from advsearch.cluster import Executor, InProcess
 from advsearch.engine.attack_parts import LOADING, executor_for
 from advsearch.engine.journal import check_made_of
 from advsearch.engine.naming import AnyModel, check_not_spread, check_run_settings, load_models, model_name
+from advsearch.engine.record import Stages
 from advsearch.errors import ClusterError, InputError, ModelError
 from advsearch.models.reference import trainable
 from advsearch.models.source import split_weights
 from advsearch.progress import Progress, Watched, watcher
 from advsearch.question import Asked
-from advsearch.questions.harden import scenes
-from advsearch.questions.harden.answer import (
-    PLAIN_SCENES,
-    RENDERED_SCENES,
-    HardenConfig,
-    HardenedControl,
-    HardenResult,
-    Share,
-    SplitSide,
-)
+from advsearch.questions.harden import answer, scenes, training
+from advsearch.questions.harden.answer import HardenConfig, HardenResult, Share
 from advsearch.questions.harden.lessons import FOLDER, Lesson
 from advsearch.questions.harden.scenes import FURTHER, HELD_OUT, ROBUST, TRAINING, VALIDATION, SceneWork, Wanted
-from advsearch.questions.harden.training import (
-    VALIDATION_VIEWS,
-    WEIGHTS,
-    Course,
-    Examples,
-    MakeOptimiser,
-    TrainingRounds,
-    right_share,
-)
+from advsearch.questions.harden.training import WEIGHTS, Course, Examples, MakeOptimiser
 from advsearch.rooms import made_question
 from advsearch.runs.directory import ARTIFACTS, RunDirectory, is_run, run_path
 from advsearch.runs.results.attack import SharedWork
@@ -140,48 +123,40 @@ class Hardening:
 
     def __init__(self, run: RunDirectory, course: Course, work: SceneWork, progress: Progress) -> None:
         self.run, self.course, self.scenes, self.progress, self.config = run, course, work, progress, work.config
-        self.rounds = TrainingRounds(run, course, self.drawn, progress)
+        self.rounds = training.TrainingRounds(run, course, self.drawn, progress)
         self.wrong = {(row.kind, row.step): bool(row.success) for row in run.store.rows()}
         self.clean: dict[str, Share] = {}
-        self.seconds: dict[str, float] = {}
+        self.stages = Stages(progress)
         self._executor: Executor = InProcess(work)
-        searched, self.further = self.config.scenes * self.config.rounds, PLAIN_SCENES
-        if work.rendered:
-            self.further = RENDERED_SCENES
+        self.further = answer.RENDERED_SCENES if work.rendered else answer.PLAIN_SCENES
+        searched = self.config.scenes * self.config.rounds
         held = scenes.CLEAN_SCENES * self.config.measured  # of which a part is attacked
-        self.counts = {TRAINING: searched, FURTHER: self.further * searched, VALIDATION: self.rounds.judged,
-                       HELD_OUT: held}  # fmt: skip
+        self.counts = {TRAINING: searched, FURTHER: self.further * searched, VALIDATION: self.rounds.judged}
+        self.counts[HELD_OUT] = held
 
     def carry_out(self, executor: Executor) -> None:
         """Measure, train, and measure again; the executor does what there is to do with scenes."""
-        self._executor, sides = executor, self.scenes.splits
+        self._executor, sides, stages = executor, self.scenes.splits, self.stages
         scenes.check_disjoint(sides[HELD_OUT], [sides[name] for name in (TRAINING, FURTHER, VALIDATION)])
         gc.freeze()  # as of `scenes_of`
         try:
-            with self._timed("measurement"):
-                self._measure("before", "attacking the model as it is")
-                self._measure("stronger_before", "attacking it with a stronger search", known="before")
-            with self._timed("training"):
-                self.rounds.carry_out()
-            with self._timed("measurement"):
-                weights = (self.run.path / ARTIFACTS / WEIGHTS).read_bytes()
-                self._measure("after", "attacking the hardened model", weights)
-                self._measure("stronger", "attacking it with a stronger search", weights, known="after")
-                wanted = [scenes.Looking(number) for number in range(self.counts[HELD_OUT])]
-                self.progress.stage("looking at plain pictures of held-out scenes", len(wanted))
-                seen = [lesson for _, some in self._each(wanted) for lesson in some]
-                for which, model in (("before", self.scenes.model), ("after", self.course.student.model)):
-                    self.clean[which] = _share(round(right_share(model, seen, "plain") * len(seen)), len(seen))
+            stages.begin("measurement", "attacking the model as it is")
+            self._measure("before", "attacking the model as it is")
+            self._measure("stronger_before", "attacking it with a stronger search", known="before")
+            stages.begin("training", "training")
+            self.rounds.carry_out()
+            weights = (self.run.path / ARTIFACTS / WEIGHTS).read_bytes()
+            stages.begin("measurement", "attacking the hardened model")
+            self._measure("after", "attacking the hardened model", weights)
+            self._measure("stronger", "attacking it with a stronger search", weights, known="after")
+            wanted = [scenes.Looking(number) for number in range(self.counts[HELD_OUT])]
+            self.progress.stage("looking at plain pictures of held-out scenes", len(wanted))
+            seen = [lesson for _, some in self._each(wanted) for lesson in some]
+            for which, model in (("before", self.scenes.model), ("after", self.course.student.model)):
+                self.clean[which] = _share(round(training.right_share(model, seen, "plain") * len(seen)), len(seen))
         finally:
+            stages.end()
             gc.unfreeze()
-
-    @contextmanager
-    def _timed(self, part: str) -> Iterator[None]:
-        begun = time.perf_counter()
-        try:
-            yield
-        finally:
-            self.seconds[part] = self.seconds.get(part, 0.0) + time.perf_counter() - begun
 
     def _each(self, wanted: Sequence[Wanted]) -> Iterator[tuple[int, Any]]:
         """Have done what is wanted of scenes; yield the place of each and what came of it, in any order."""
@@ -261,20 +236,25 @@ class Hardening:
         for control in names:
             shares = {which: self._robust(which, [control]) for which in MEASUREMENTS}
             if None not in shares.values():
-                table.append(HardenedControl.of({"control": control, **shares}))
+                table.append(answer.HardenedControl.of({"control": control, **shares}))
         if done and self.rounds.best == 0:
             warnings = [*warnings, "No round kept the clean accuracy, so the weights are the model's own."]
-        weights, training = self.run.path / ARTIFACTS / WEIGHTS, self.scenes.splits[TRAINING]
-        views = {TRAINING: config.views, FURTHER: 1, VALIDATION: VALIDATION_VIEWS, HELD_OUT: scenes.CLEAN_VIEWS}
+        weights, taught = self.run.path / ARTIFACTS / WEIGHTS, self.scenes.splits[TRAINING]
+        views = {
+            TRAINING: config.views,
+            FURTHER: 1,
+            VALIDATION: training.VALIDATION_VIEWS,
+            HELD_OUT: scenes.CLEAN_VIEWS,
+        }
         split = {
-            name: SplitSide.of({**vars(side), "scenes": self.counts[name], "views": views[name]})
+            name: answer.SplitSide.of({**vars(side), "scenes": self.counts[name], "views": views[name]})
             for name, side in self.scenes.splits.items()
         }
         facts, (name, _) = self._executor.facts, split_weights(config.model)
         return asked.result(
             HardenResult,
-            environment=",".join(training.environments),
-            objects=list(training.objects),
+            environment=",".join(taught.environments),
+            objects=list(taught.objects),
             before=self._robust("before", names),
             after=self._robust("after", names),
             clean_before=self.clean.get("before"),
@@ -292,7 +272,7 @@ class Hardening:
             pictures=str(self.run.path / ARTIFACTS / FOLDER) if done else None,
             shared=SharedWork.of_facts(facts, facts.machines if facts else {}),
             warnings=warnings,
-            seconds=self.seconds,
+            seconds=self.stages.seconds,
         )
 
 

@@ -174,13 +174,13 @@ class SceneWork:
 
     @cached_property
     def linear(self) -> tuple[str, ...]:
-        """The controls whose pictures a matrix of light transport says; the others are rendered."""
-        return tuple(one for one in self.config.controls if self._has_matrix(one))
+        """The controls whose pictures a matrix of light transport says."""
+        return tuple(control for control in self.config.controls if self._has_matrix(control))
 
-    @cached_property
+    @property
     def rendered(self) -> tuple[str, ...]:
-        """The controls whose pictures no matrix says."""
-        return tuple(one for one in self.config.controls if one not in self.linear)
+        """The other controls."""
+        return tuple(control for control in self.config.controls if control not in self.linear)
 
     @cached_property
     def beside(self) -> tuple[str, ...]:
@@ -312,8 +312,7 @@ def check_disjoint(held: Split, taught: Sequence[Split]) -> None:
     """Refuse, by an InputError that names it, to measure what is trained on: one of the training's environments, or one
     of its files.
 
-    Of each bundled object the first instance is looked at; all others are checked when they are drawn, by
-    `check_unmeasured`: to make them takes minutes.
+    Of each bundled object the first instance is looked at; all others, which take minutes, when they are drawn.
     """
     both = sorted({name for split in taught for name in split.environments} & set(held.environments))
     if both:
@@ -325,7 +324,6 @@ def check_disjoint(held: Split, taught: Sequence[Split]) -> None:
 
 
 def check_unmeasured(asset: ObjectAsset, measured: Set[str]) -> None:
-    """Refuse, by an InputError that names it, to train on an object whose fingerprint is among those of what is
-    measured."""
+    """Refuse, by an InputError, to train on an object whose fingerprint is among those of what is measured."""
     if fingerprint(asset) in measured:
         raise InputError(f"held_out: {asset.name} is an object of the training too; name others")

@@ -46,11 +46,8 @@ DoneRun = tuple[PlannedRun, AttackSummary | SweepSummary]
 
 
 def carried_out(asked: Asked[RecipeConfig]) -> RecipeResult:
-    """Carry out the recipe that a configuration names; parts that are done are not done again.
-
-    Raises:
-        InputError: the recipe has a part or a figure that does not work; nothing is written where that is seen before.
-    """
+    """Carry out the recipe that a configuration names; parts that are done are not done again. An InputError where a
+    part or a figure does not work; nothing is written where that is seen before."""
     config, resumed, noted = asked.config, asked.resumed, None
     if config.photographs is not None and not Path(config.photographs).is_dir():
         raise InputError(f"photographs: expected a folder, got {config.photographs}")
@@ -75,16 +72,12 @@ def carried_out(asked: Asked[RecipeConfig]) -> RecipeResult:
     controls = [name for run, _ in done for name in run.config.controls]
     warnings += [text for _, result in done for text in getattr(result, "warnings", ())]
     parts = [
-        RecipePart(
-            name=run.name,
-            part=run.part,
-            command=run.config.command,
-            object=run.config.object,
-            ending=result.ending,
-            renders=sum(result.renders.values()),
-        )
+        RecipePart.of({
+            **vars(run), "command": run.config.command, "object": run.config.object, "ending": result.ending,
+            "renders": sum(result.renders.values()),
+        })
         for run, result in done
-    ]
+    ]  # fmt: skip
     result = asked.result(
         RecipeResult,
         recipe=config.recipe,
@@ -107,8 +100,7 @@ def carried_out(asked: Asked[RecipeConfig]) -> RecipeResult:
 def check_described(recipe: Recipe, config: RecipeConfig) -> None:
     """Read everything that a recipe says, so that an InputError tells what is wrong before anything is rendered."""
     if config.photographs is not None:
-        wanted = _photographed(recipe, planned(recipe, config))
-        if not wanted:
+        if not (wanted := _photographed(recipe, planned(recipe, config))):
             raise InputError(
                 f"photographs: {config.recipe} keeps no pictures to compare them with; recipe realism does"
             )
@@ -208,8 +200,7 @@ def around(config: SceneConfig, answer: AnswerDistribution, searched: Mapping[st
 
 
 def _take(folder: Path, wanted: Sequence[PlannedRun], run: RunDirectory) -> list[str]:
-    """Take the photographs in a folder into the runs that are compared with some; return what is missing. An InputError
-    where there are none at all, or one cannot be read."""
+    """Take the photographs in a folder into the runs that are compared with some; return what is missing."""
     photographs, missing = Photographs(), list[str]()
     for each in wanted:
         inside = folder / Path(each.config.object).stem

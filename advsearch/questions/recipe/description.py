@@ -43,13 +43,9 @@ class _Described(BaseModel):
 
 
 class Part(_Described):
-    """Runs of one command, one for each object.
-
-    Attributes:
-        settings: of that command, over those that all parts have.
-        around: a part whose searches answer with distributions: what this one draws is drawn from those.
-        drawn_as: a part with the same ranges: this one draws the very configurations that that one does.
-    """
+    """Runs of one command, one for each object, with settings over those that all parts have. What it draws is drawn
+    from the distributions that the searches of the part `around` answer with; or it draws the very configurations that
+    the part `drawn_as` does, which has the same ranges."""
 
     command: Literal["attack", "sweep"]
     settings: Settings = Field(default_factory=dict)
@@ -74,17 +70,9 @@ class Changes(_Described):
 
 
 class Recipe(_Described):
-    """What a recipe's file says.
-
-    Attributes:
-        title: the question, in one line.
-        about: what is done for an answer, and whose experiment it is.
-        settings: of all parts; what the command line says of objects, environments and models goes over them.
-        parts: by name, in the order in which they are carried out.
-        figures: each with a `figure`, its kind, and options (`advsearch.questions.recipe.figures`).
-        groups: names of groups, each with the names of objects in it.
-        quick: what is different when it should be quick.
-    """
+    """What a recipe's file says (docs/recipes.md): its question, what is done for an answer and whose experiment it
+    is, settings of all parts, parts in the order in which they are carried out, figures with a `figure`, their kind,
+    and options, groups of objects by name, and what is different when it should be quick."""
 
     title: Annotated[str, Field(min_length=1, max_length=200)]
     about: Annotated[str, Field(max_length=2000)] = ""
@@ -146,12 +134,8 @@ def recipe_yaml(name: str) -> str:
 
 
 def read_recipe(name: str) -> Recipe:
-    """Return a bundled recipe by its name, or that of a YAML file: it has a suffix, or a folder before it.
-
-    Raises:
-        UnknownNameError: there is no such recipe.
-        FileFormatError: the file is missing, no YAML, or as for `recipe_of`.
-    """
+    """Return a bundled recipe by its name, or that of a YAML file: it has a suffix, or a folder before it. An
+    UnknownNameError or a FileFormatError where there is none, or as for `recipe_of`."""
     if is_file_name(name):
         return recipe_of(read_yaml(name), name)
     recipe_yaml(name)
@@ -189,13 +173,8 @@ class PlannedRun:
 
 
 def planned(recipe: Recipe, config: RecipeConfig) -> list[PlannedRun]:
-    """Return the runs of a recipe in the order in which they are carried out.
-
-    A run is about one object. Where a part's command takes one environment or one model only, it has a run for each.
-
-    Raises:
-        InputError: a part has a setting that its command has not, or too many runs; the message names the part.
-    """
+    """Return the runs of a recipe in the order in which they are carried out; an InputError names a part with a setting
+    that its command has not. A run is about one object; a search, about one environment and one model, too."""
     chosen = made_of(recipe, config)
     runs = [run for name in chosen.parts for run in _runs(chosen, name, config)]
     if len(runs) > MOST_RUNS:

@@ -10,9 +10,8 @@ from pydantic import ValidationError
 
 from advsearch.errors import FileFormatError, InputError, UnknownNameError
 from advsearch.questions.recipe import frame, given, rates
-from advsearch.questions.recipe.description import Recipe
+from advsearch.questions.recipe.description import PHOTOGRAPHS, Recipe
 from advsearch.questions.recipe.frame import MadeFigure, Options, Rows
-from advsearch.questions.recipe.rates import PHOTOGRAPHS
 from advsearch.report.figures import Figures, drawn
 
 FIGURES: Mapping[str, tuple[type[Options], Any]] = {
@@ -40,8 +39,8 @@ ANY = "*"
 
 
 def read_options(described: Mapping[str, object], where: str) -> tuple[str, Options]:
-    """Return the kind of a figure and its options, as they stand in the recipe `where`, with its kind as `figure`; an
-    UnknownNameError or a FileFormatError where there is none of that kind, or such an option."""
+    """Return the kind of a figure and its options, as they stand in the recipe `where`; an UnknownNameError or a
+    FileFormatError where there is none of that kind, or such an option."""
     kind = str(described.get("figure", ""))
     if kind not in FIGURES:
         raise UnknownNameError("figure", kind, FIGURES, f"It stands in {where}.")
@@ -59,13 +58,10 @@ def make(rows: Rows, kind: str, options: Options) -> Iterator[MadeFigure]:
     parts, made = rows[frame.PART], FIGURES[kind][1]
     shown = rows[parts.isin(options.parts) if options.parts else parts != PHOTOGRAPHS]
     together = kind in TOGETHER or frame.MODEL in vars(options).values() or frame.MODEL not in shown
-    models = {} if together else frame.by(shown, frame.MODEL)
-    if len(models) < 2:
-        yield made(shown, options)
-        return
+    models = {"": shown} if together else frame.by(shown, frame.MODEL)
     for name, some in models.items():
         figure = made(some, options)
-        yield replace(figure, title=f"{figure.title}: {name}")
+        yield figure if len(models) == 1 else replace(figure, title=f"{figure.title}: {name}")
 
 
 def files_of(made: MadeFigure) -> Figures:
@@ -79,13 +75,8 @@ def files_of(made: MadeFigure) -> Figures:
 
 
 def check_figures(recipe: Recipe, columns: Mapping[str, Collection[str]], where: str) -> None:
-    """Refuse a figure of a part or of a column that there is not. `columns` are the parameters that the rows of each
-    part will have, and `where` is the recipe.
-
-    Raises:
-        UnknownNameError: a figure names one; the message says which figure.
-        InputError: a part that it shows has not the column that others have.
-    """
+    """Refuse, by an InputError, a figure of a part or of a column that there is not. `columns` are the parameters that
+    the rows of each part will have, and `where` is the recipe."""
     known = {*OUTER, *([frame.GROUP] if recipe.groups else [])}
     for number, described in enumerate(recipe.figures, start=1):
         kind, options = read_options(described, where)

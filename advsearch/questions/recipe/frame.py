@@ -103,8 +103,7 @@ def numbers(rows: Rows, name: str) -> Any:
 
 def unit_of(rows: Rows, name: str) -> str:
     """Return the unit of a column as it stands behind a number: a space and the unit, or nothing."""
-    unit = rows.attrs.get("units", {}).get(name, "")
-    return f" {unit}" if unit not in ("", "1", "name") else ""
+    return "" if (unit := rows.attrs["units"].get(name, "")) in ("", "1", "name") else f" {unit}"
 
 
 def by(rows: Rows, name: str) -> dict[str, Rows]:
@@ -139,12 +138,10 @@ class Tally:
 
     @property
     def cells(self) -> list[Cell]:
-        """How many are counted, and the values of `COUNT`."""
         return [self.times, self.total, self.share, *(self.interval() or (None, None))]
 
     @property
     def drawn(self) -> tuple[float, Interval] | None:
-        """The share and its interval; None where there are no rows."""
         return None if self.share is None else (self.share, self.interval() or (0.0, 1.0))
 
     def interval(self, among: int = 1) -> Interval | None:
@@ -166,8 +163,7 @@ def extremes(counts: Sequence[Tally], worst: str, best: str, thing: str, verb: s
     """Return which of several has the lowest share and which the highest, and whether that is more than chance.
 
     The two were chosen among k for being extreme, so that they are compared by intervals of confidence 1 - 0.05 / k,
-    which hold for all k together. Where these overlap, no difference is shown. They are called, say, "Hardest" and
-    "easiest", several of them "environments", and `verb` is what is counted.
+    which hold for all k together. Where these overlap, no difference is shown. `verb` is what is counted.
     """
     known = [count for count in counts if count.total]
     if len(known) < 2:

@@ -219,7 +219,12 @@ def ternary(rows: Rows, options: TernaryOptions) -> MadeFigure:
         panels[answer] = [float(some.mean()) if len(some) else None for some in known]
         if not by_lead:
             by_most = [Tally.over(name, rows[most == k], flags[most == k]) for k, name in enumerate(names)]
-            text += _told_shares(answer, times / len(rows), by_most)
+            whose = f"{answer}, {percent(times / len(rows))} of all answers, is"
+            if len({tally.share for tally in by_most if tally.total}) == 1:
+                text.append(f"{whose} given as often whatever most of the mixture is: no difference is shown.")
+            else:
+                least, most_often = f"{whose} rarest where most of the mixture", "most frequent where most of it"
+                text += frame.extremes(by_most, least, most_often, "ingredients", "given")
             table += [[answer, tally.name, *tally.cells] for tally in by_most]
     heads = ["answer", "where most is", "given in", *frame.COUNT]
     if by_lead:
@@ -268,15 +273,6 @@ def all_triangles(side: int) -> dict[Triangle, tuple[Shares, Shares, Shares]]:
         if a + b < side - 1:
             found[a, b, True] = at(a + 1, b + 1), at(a, b + 1), at(a + 1, b)
     return found
-
-
-def _told_shares(answer: str, share: float, by_most: Sequence[Tally]) -> list[str]:
-    whose = f"{answer}, {percent(share)} of all answers, is"
-    known = [tally for tally in by_most if tally.total]
-    if len({tally.share for tally in known}) == 1:
-        return [f"{whose} given as often whatever most of the mixture is: no difference is shown."]
-    least = f"{whose} rarest where most of the mixture"
-    return frame.extremes(known, least, "most frequent where most of it", "ingredients", "given")
 
 
 def _told_leads(leads: Mapping[str, Doubles]) -> str:

@@ -14,6 +14,7 @@ from pydantic import Field
 
 from advsearch.errors import InputError
 from advsearch.questions.recipe import frame
+from advsearch.questions.recipe.description import PHOTOGRAPHS
 from advsearch.questions.recipe.frame import MadeFigure, Options, Rows, Tally
 from advsearch.report.figures import BLUE, MARKS, SERIES, draw_shares
 from advsearch.report.phrases import percent
@@ -21,11 +22,8 @@ from advsearch.report.sweeps import surface_sentences
 from advsearch.report.wording import count, figure_value, short_name
 from advsearch.runs.directory import IMAGES, PARTS
 
-PHOTOGRAPHS = "photographs"
-"""The part that photographs are of."""
-
-BINS = 12
-"""Parts of a range where lines are drawn along it."""
+BINS, FITTING = 12, 4
+"""Parts of a range where lines are drawn along it, and letters that stand level under a column."""
 
 Cells = Mapping[str, Sequence[Tally]]
 """Counts by the name of a row, one of each series."""
@@ -47,12 +45,10 @@ class RatesOptions(Options):
 
     @property
     def parts(self) -> tuple[str, ...]:
-        """With the part beside them, where parts are named."""
         return (*self.of, *([self.beside] if self.beside and self.of else []))
 
     @property
     def what(self) -> str:
-        """What numbers are of."""
         return self.by if self.away_from is None else f"the distance of {self.by} from {figure_value(self.away_from)}"
 
 
@@ -77,16 +73,18 @@ def rates(rows: Rows, options: RatesOptions) -> MadeFigure:
     if form == "bars" and middles is None and not is_numeric_dtype(frame.column(rows, options.by)):
         cells = dict(sorted(cells.items(), key=lambda item: -(item[1][0].share or 0.0)))
     series, totals = [called(name) for name in lines], counts("all", rows)
-    of_series = [_named(name, second or "") for name in series]
+    # a number says what it is of: "severity 3"
+    of_series = [
+        f"{frame.bare(second or '')} {name}" if name[:1] in "-0123456789" and name else name for name in series
+    ]
     thing = frame.plural(options.by) + (f" and {frame.plural(second)}" if second else "")
     apart = {called(options.beside): counts("", beside)} if options.beside and len(beside) else {}
     text = list[str]()
     if form == "map":
-        pairs = [
-            tally.called(f"{row} with {name}")
-            for row, each in cells.items()
-            for name, tally in zip(of_series, each, strict=True)
+        tallies = [
+            (row, name, tally) for row, each in cells.items() for name, tally in zip(of_series, each, strict=True)
         ]
+        pairs = [tally.called(f"{row} with {name}") for row, name, tally in tallies]
         text += frame.extremes(pairs, "The lowest pair", "the highest", f"pairs of {thing}", verb)
     else:
         where = f" where {options.what}" if middles else ""
@@ -97,22 +95,21 @@ def rates(rows: Rows, options: RatesOptions) -> MadeFigure:
                 text += frame.extremes(along, f"{worst}{where}", f"highest{where}", frame.plural(options.by), verb)
     if second and len(series) > 1:  # in one text, so that figures by other columns do not repeat it
         overall = [tally.called(f"that of {name}") for name, tally in zip(of_series, totals, strict=True)]
-        text.append(
-            " ".join(frame.extremes(overall, "Over all, the lowest share", "the highest", frame.plural(second), verb))
-        )
-    if options.wrong and second == frame.MODEL:
-        text += _relative(cells, series)
+        of_all = frame.extremes(overall, "Over all, the lowest share", "the highest", frame.plural(second), verb)
+        text.append(" ".join(of_all))
+    for number, name in enumerate(series[1:] if options.wrong and second == frame.MODEL else (), start=1):
+        # the mean over rows of each model's errors over those of the first; rows without any of that are left out
+        if ratios := [(each[number].share or 0.0) / each[0].share for each in cells.values() if each[0].share]:
+            mean = 100.0 * sum(ratios) / len(ratios)
+            text.append(f"Relative to {series[0]}, in AlexNet's place, the mCE of {name} is {mean:.0f} %.")
     for name, alone in apart.items():
         for line, tally, total in zip(series, alone, totals, strict=True):
             more = "is shown" if tally.below(total) or total.below(tally) else "is not shown"
             whose = f"{line}, " if len(series) > 1 else ""
             text.append(f"{whose}{name}: {tally.told(verb)}; the others: {total.told(verb)}. A difference {more}.")
     every = {**apart, **cells, **({"all": totals} if second else {})}
-    table = [
-        [name, *([line] if second else []), *tally.cells]
-        for name, each in every.items()
-        for line, tally in zip(series, each, strict=True)
-    ]
+    counted = [(name, line, tally) for name, each in every.items() for line, tally in zip(series, each, strict=True)]
+    table = [[name, *([line] if second else []), *tally.cells] for name, line, tally in counted]
 
     def draw(figure: Any) -> None:
         axes, label = figure.subplots(), f"{verb}, share"
@@ -122,11 +119,11 @@ def rates(rows: Rows, options: RatesOptions) -> MadeFigure:
         elif form == "lines":
             _draw_lines(axes, cells, series, middles or range(len(cells)))
             unit = frame.unit_of(rows, options.by)
-            axes.set(
-                xlabel=f"{options.what} [{unit[1:]}]" if unit else options.what, ylabel=f"{label} with 95 % interval"
-            )
+            across = f"{options.what} [{unit[1:]}]" if unit else options.what
+            axes.set(xlabel=across, ylabel=f"{label} with 95 % interval")
         else:
-            _draw_bars(axes, {**apart, **cells}, series)
+            shares = {name: [tally.drawn for tally in each] for name, each in {**apart, **cells}.items()}
+            draw_shares(axes, shares, series)
             axes.set(xlabel=f"{label} with 95 % interval")
         if len(series) > 1 and form != "map":
             figure.legend(loc="outside lower center", ncols=min(len(series), 3))
@@ -158,25 +155,6 @@ def _groups(rows: Rows, options: RatesOptions) -> tuple[Mapping[str, Rows], list
     return {name: rows[places == place] for place, name in enumerate(named)}, [(a + b) / 2 for a, b in ends]
 
 
-def _named(value: str, name: str) -> str:
-    """A number says what it is of: ``severity 3``."""
-    return f"{frame.bare(name)} {value}" if value[:1].isdigit() or value[:1] == "-" else value
-
-
-def _relative(cells: Cells, series: Sequence[str]) -> list[str]:
-    """The mean over rows of each model's errors over those of the first; rows without any of that are left out."""
-    text = []
-    for number, name in enumerate(series[1:], start=1):
-        if ratios := [(each[number].share or 0.0) / each[0].share for each in cells.values() if each[0].share]:
-            mean = 100.0 * sum(ratios) / len(ratios)
-            text.append(f"Relative to {series[0]}, in AlexNet's place, the mCE of {name} is {mean:.0f} %.")
-    return text
-
-
-def _draw_bars(axes: Any, cells: Cells, series: Sequence[str]) -> None:
-    draw_shares(axes, {name: [tally.drawn for tally in each] for name, each in cells.items()}, series)
-
-
 def _draw_map(axes: Any, cells: Cells, series: Sequence[str], label: str) -> None:
     shares = [[math.nan if tally.share is None else tally.share for tally in each] for each in cells.values()]
     image = axes.imshow(shares, cmap="RdBu", vmin=0.0, vmax=1.0, aspect="auto")
@@ -184,12 +162,8 @@ def _draw_map(axes: Any, cells: Cells, series: Sequence[str], label: str) -> Non
         if not math.isnan(share):
             colour = "white" if abs(share - 0.5) > 0.3 else "black"
             axes.text(across, up, f"{100 * share:.0f}", ha="center", va="center", color=colour, fontsize=7.5)
-    longest = max(map(len, series))  # four letters stand level under a column
-    axes.set_xticks(
-        range(len(series)),
-        series,
-        **({"rotation": 35, "ha": "right", "rotation_mode": "anchor"} if longest > 4 else {}),
-    )
+    turned = {"rotation": 35, "ha": "right", "rotation_mode": "anchor"}
+    axes.set_xticks(range(len(series)), series, **(turned if max(map(len, series)) > FITTING else {}))
     axes.set_yticks(range(len(cells)), list(cells))
     axes.figure.colorbar(image, ax=axes, label=f"{label} [%]", format=lambda share, _: f"{100 * share:.0f}")
 
@@ -222,7 +196,6 @@ class AgreementOptions(Options):
 
     @property
     def parts(self) -> tuple[str, ...]:
-        """Those, and photographs."""
         return (*self.of, PHOTOGRAPHS)
 
 
@@ -267,7 +240,8 @@ def agreement(rows: Rows, options: AgreementOptions) -> MadeFigure:
 
     def draw(figure: Any) -> None:
         axes = figure.subplots()
-        _draw_bars(axes, bars, series)
+        shares = {name: [tally.drawn for tally in each] for name, each in bars.items()}
+        draw_shares(axes, shares, series)
         axes.set(xlabel="share that agrees, with 95 % interval")
         figure.legend(loc="outside lower center", ncols=1)
 
@@ -278,7 +252,6 @@ def agreement(rows: Rows, options: AgreementOptions) -> MadeFigure:
 
 
 def _where(right: bool, pairs: Rows) -> str:
-    """How often the model is right, or wrong, about the other picture where it is so about the rendering."""
     verb, some = "right" if right else "wrong", pairs[pairs["correct rendered"] == right]
     if some.empty:
         return f"It is {verb} about none of the renderings."
