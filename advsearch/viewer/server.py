@@ -58,6 +58,9 @@ LARGEST, LARGEST_PAGE = 1 << 30, 1 << 28
 SENDING = 60.0
 """Seconds in which a photograph has to have come."""
 
+LARGEST_SENT = 16 << 20
+"""Bytes of what is sent, at most."""
+
 FAULT = "this page could not be made, which is a fault of advsearch"
 
 BACKLOG = 4096
@@ -360,9 +363,17 @@ class _Handler(BaseHTTPRequestHandler):
         return Served(*_photographs("take")(server.photographs, run, rendering, self.headers, key, self._body))
 
     def _body(self) -> bytes:
+        """What was sent along; nothing is read of what says that it is larger than `LARGEST_SENT`."""
+        length = self.headers.get("Content-Length", "")
+        if not re.fullmatch(r"[0-9]{1,15}", length):
+            raise Refused(HTTPStatus.LENGTH_REQUIRED, "its length is missing")
+        if int(length) > LARGEST_SENT:
+            raise Refused(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"more than {LARGEST_SENT >> 20} MB")
         self.server.clients.wait_for(SENDING)
-        data: bytes = _photographs("request_body")(self.headers, self.rfile)
+        data = self.rfile.read(int(length))
         self.server.clients.wait_for(None)
+        if len(data) < int(length):
+            raise Refused(HTTPStatus.BAD_REQUEST, "a part of it did not come")
         return data
 
     def _rendering(self, _query: Query, name: str, rendering: str) -> Served:

@@ -17,9 +17,7 @@ from advsearch.runs.results.attack import SharedWork
 from advsearch.runs.results.base import Fields, Interval, RunResult
 from advsearch.settings import setting, setting_as_in
 
-ALL = "all"
-"""The objects of a command that takes all bundled ones."""
-
+ALL = "all"  # the objects of a command that takes all bundled ones
 PLAIN_SCENES, RENDERED_SCENES = 6, 15
 """Scenes that come with each one of the training, of which nothing is drawn but one view: plain ones, where nothing is
 rendered, or such as are rendered. What is learned is lost on other scenes where there are few, and so is clean

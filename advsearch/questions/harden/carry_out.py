@@ -35,8 +35,7 @@ from advsearch.runs.results.attack import SharedWork
 from advsearch.runs.store import Row
 from advsearch.tasks import make_task
 
-MEANS = "means"
-"""The note of what a training has from Python."""
+MEANS = "means"  # the note of what a training has from Python
 MEASUREMENTS = ("before", "stronger_before", "after", "stronger")
 """What is measured over each control, by its name in the table."""
 SHARED, MOVED = 0.25, 0.5

@@ -38,10 +38,8 @@ from advsearch.scene.transport.matrix import LinearRenderer
 SPP, MATRIX_SPP, DEPTH = 2, 4, 4
 """Samples a pixel of a lesson's pictures, and of a matrix of light transport; segments of the longest path: many
 lessons with some noise teach more than few without."""
-STEP = 0.5
-"""A step of an adversarial texture, as a share of its budget."""
-TOGETHER = 32
-"""Pictures that a model is asked about at once."""
+STEP = 0.5  # a step of an adversarial texture, as a share of its budget
+TOGETHER = 32  # pictures that a model is asked about at once
 
 
 @dataclass(eq=False)
@@ -128,12 +126,9 @@ def has_matrix(problem: Problem) -> bool:
 
 
 def lessons(problem: Problem, views: int, seed: int, *, tries: int | None = None, shared: bool = False) -> list[Lesson]:
-    """Draw lessons from so many views of one scene, each with conditions of its own, drawn by chance.
-
-    Where no matrix says the pictures, `tries` configurations are rendered beside each view as it is (see `tried`); None
-    for two renders of a view: one of the controls moved, and all of them. Views that are `shared` have one adversarial
-    texture.
-    """
+    """Draw lessons from so many views of one scene, each with conditions of its own, drawn by chance. Where no matrix
+    says the pictures, `tries` configurations are rendered beside each view as it is (see `tried`); None for two renders
+    of a view: one of the controls moved, and all of them. Views that are `shared` have one adversarial texture."""
 
     def begun(seed: int) -> Disguise:
         return Disguise(problem.domain.sample(torch.Generator().manual_seed(seed), extreme=True)[0])
@@ -166,10 +161,8 @@ def lessons(problem: Problem, views: int, seed: int, *, tries: int | None = None
 
 def tried(domain: Domain, generator: torch.Generator, count: int) -> Tensor:
     """Draw configurations (count, d) at random. In half of them each number is moved to the nearer end of its range by
-    chance, as searches end where several numbers are. Choices, and numbers that are periodic, have no ends.
-
-    Of several controls each moves alone in turn, then all of them at once.
-    """
+    chance, as searches end where several numbers are. Choices, and numbers that are periodic, have no ends. Of several
+    controls each moves alone in turn, then all of them at once."""
     drawn = domain.sample(generator, count)
     at_ends = (torch.rand(drawn.shape, generator=generator) < 0.5) & (torch.rand(count, 1, generator=generator) < 0.5)
     owners = [block.name.rpartition(".")[0] for block, _ in domain.parts()]
@@ -252,11 +245,9 @@ def save_pictures(folder: Path, number: int, chosen: Sequence[Lesson], labels: S
 
 
 def write_archive(folder: Path, archive: Path) -> int:
-    """Write the pictures of a data set as a WebDataset and return how many there are.
-
-    Of each there is a ``.png``, a ``.cls`` with the index of its class and a ``.json`` with that and the kind of
-    picture. Members have no time and no owner, so that equal pictures make equal files.
-    """
+    """Write the pictures of a data set as a WebDataset and return how many there are: of each a ``.png``, a ``.cls``
+    with the index of its class and a ``.json`` with that and the kind of picture. Members have no time and no owner, so
+    that equal pictures make equal files."""
     pictures = sorted(folder.glob("*/*.png"))
     with replacing(archive) as part, tarfile.open(part, "w") as tar:
         for path in pictures:

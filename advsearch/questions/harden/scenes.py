@@ -43,8 +43,7 @@ TRAINING, FURTHER, VALIDATION, HELD_OUT = "training", "further training", "valid
 """The splits: what the weights are fitted to (the second mostly as it is), what chooses among them, and what is
 measured in the end."""
 
-ROBUST = "robust"
-"""Of a scene in which nothing was found; otherwise there is an ending."""
+ROBUST = "robust"  # of a scene in which nothing was found; otherwise there is an ending
 
 OVER: dict[str, dict[str, object]] = {
     "camera": {"azimuth": [0.0, 360.0], "elevation": [8.0, 55.0], "roll": [-6.0, 6.0]},
@@ -52,8 +51,7 @@ OVER: dict[str, dict[str, object]] = {
 }
 """What varies by chance from view to view, unless it is searched."""
 
-TRIES_TO_CHOOSE = 6
-"""Random configurations of a view that is rendered to choose weights by, of which the worst counts."""
+TRIES_TO_CHOOSE = 6  # random configurations of a view that is rendered to choose weights by, of which the worst counts
 CLEAN_SCENES, CLEAN_VIEWS = 4, 2
 """Held-out scenes whose plain pictures are looked at, for each one that is attacked, and the views of each."""
 CLEAN_SPP = 16
@@ -239,9 +237,7 @@ def attacked(config: AttackConfig, scene: Scene, model: Model) -> str:
     return ROBUST if steady else "unsteady"
 
 
-ELEVATION = (8.0, 55.0)
-FIELD = (25.0, 45.0)
-GROUND = (0.1, 0.9)
+ELEVATION, FIELD, GROUND = (8.0, 55.0), (25.0, 45.0), (0.1, 0.9)
 """Ranges from which scenes draw the camera's elevation and field of view in degrees, and the ground's colour (sRGB)."""
 
 
@@ -258,34 +254,28 @@ class Split:
 
     def scene(self, number: int, given: Given | None = None) -> tuple[str, Scene]:
         """Return the scene with this number, from 0, and the name of its object; the objects take turns. Parameters
-        that are given are fixed.
-
-        An object in a file that brings no label is called as the file: ``coffee-mug.glb`` is a "coffee mug".
+        that are given are fixed. An object in a file without a label is called as it: ``coffee-mug.glb``, "coffee mug".
         """
         name, rng = self.objects[number % len(self.objects)], self._draws(number)
         made = OBJECTS[name].generate(rng) if name in OBJECTS else Path(name)
         environment = self.environments[int(rng.integers(len(self.environments)))]
         ground = np.clip(rng.uniform(*GROUND) + rng.normal(0.0, 0.05, 3), 0.02, 0.98)
-        drawn = {
-            "camera.azimuth": rng.uniform(0.0, 360.0),
-            "camera.elevation": rng.uniform(*ELEVATION),
-            "camera.fov": rng.uniform(*FIELD),
-            "environment.rotation": rng.uniform(0.0, 360.0),
-            **dict(zip(("ground.red", "ground.green", "ground.blue"), ground, strict=True)),
+        names = ("camera.azimuth", "camera.elevation", "camera.fov", "environment.rotation")
+        ends = ((0.0, 360.0), ELEVATION, FIELD, (0.0, 360.0))
+        drawn = {name: rng.uniform(*both) for name, both in zip(names, ends, strict=True)}
+        drawn |= {
+            f"ground.{channel}": float(level) for channel, level in zip(("red", "green", "blue"), ground, strict=True)
         }
-        settings = {**{key: float(value) for key, value in drawn.items()}, **(given or {})}
-        scene = load_scene(made, environment, settings=settings)
+        scene = load_scene(made, environment, settings={**drawn, **(given or {})})
         own = scene.description
         if self.varied and own.environment is not None:
             own = replace(own, environment=white_light_changed(varied(own.environment, rng), rng))
-            scene = Scene(own)
         if own.object.label is None:
             label = Path(name).stem.replace("-", " ").replace("_", " ")
-            scene = Scene(replace(own, object=replace(own.object, label=label)))
-        return name, scene
+            own = replace(own, object=replace(own.object, label=label))
+        return name, scene if own is scene.description else Scene(own)
 
     def _draws(self, number: int) -> np.random.Generator:
-        """What a scene is drawn from, its object first."""
         return np.random.default_rng([seeds.stream(self.seed, f"{self.name} scene", number)])
 
     def assets(self, count: int) -> Iterator[ObjectAsset]:
@@ -309,11 +299,8 @@ def fingerprint(asset: ObjectAsset) -> str:
 
 
 def check_disjoint(held: Split, taught: Sequence[Split]) -> None:
-    """Refuse, by an InputError that names it, to measure what is trained on: one of the training's environments, or one
-    of its files.
-
-    Of each bundled object the first instance is looked at; all others, which take minutes, when they are drawn.
-    """
+    """Refuse, by an InputError, to measure what is trained on: one of the training's environments, or of its files. Of
+    each bundled object the first instance is looked at; all others, which take minutes, when they are drawn."""
     both = sorted({name for split in taught for name in split.environments} & set(held.environments))
     if both:
         raise InputError(f"held_out_environment: {', '.join(both)} is an environment of the training too; name others")

@@ -30,19 +30,13 @@ from advsearch.report.phrases import percent
 from advsearch.runs.directory import ARTIFACTS, RunDirectory
 from advsearch.runs.files import write_bytes
 
-BATCH, PART = 24, 6
-"""Lessons of a step, and those of it that one thread works at."""
-WEIGHT_DECAY = 0.02
-LARGEST_GRADIENT_NORM = 2.0
-WARM_UP = 0.1
-AVERAGE = 0.98
-"""Weight of the past in the average of the weights, per step."""
-HELD_BACK_STEPS = 8
-"""Steps of the textures that weights are judged on, from where a search begins."""
+BATCH, PART = 24, 6  # lessons of a step, and those of it that one thread works at
+WEIGHT_DECAY, LARGEST_GRADIENT_NORM, WARM_UP, AVERAGE = 0.02, 2.0, 0.1, 0.98
+"""`AVERAGE` is the weight of the past in the average of the weights, per step."""
+HELD_BACK_STEPS = 8  # steps of the textures that weights are judged on, from where a search begins
 AUGMENTATION = Augmentation(smallest_crop=0.75, largest_crop=1.15, turn=15.0, cutout=0.0)
 """What happens to pictures while they are trained on; the search for worse ones sees the same."""
-KEEP = 1.0
-"""Weight of the given model's answers to plain pictures, beside that of the right ones."""
+KEEP = 1.0  # weight of the given model's answers to plain pictures, beside that of the right ones
 MIXED, MIXING = 0.5, 0.4
 """Share of the parts that mix pictures, and both parameters of the beta distribution that their weights come from."""
 
@@ -53,15 +47,9 @@ MakeOptimiser = Callable[[Sequence[nn.Parameter]], torch.optim.Optimizer]
 
 @dataclass
 class Course:
-    """A training.
-
-    Attributes:
-        student: what is trained.
-        given: the model as it was given; its answers to plain pictures are kept.
-        config: what was asked for; of an optimiser of the user's, its own learning rate counts.
-        optimiser: makes one of the parameters; None for AdamW.
-        beside: further examples; a batch of them is taken with each step, from the start again when they end.
-    """
+    """A training of a student, which keeps the answers to plain pictures of the model as it was given. `optimiser`
+    makes one of the parameters, whose own learning rate counts; None for AdamW. Of the examples `beside` a batch is
+    taken with each step, from the start again when they end."""
 
     student: Trainable
     given: Model
@@ -228,8 +216,7 @@ def right_share(model: Model, chosen: Sequence[Lesson], which: str) -> float:
 WEIGHTS = "hardened.safetensors"
 ROUND = "round-{:03d}.safetensors"
 ROUNDS = "rounds"
-FIRST_STEPS = 4
-"""Steps of each texture before a training."""
+FIRST_STEPS = 4  # steps of each texture before a training
 VALIDATION_VIEWS, JUDGED = 2, 168
 PARTS = (1.0, 0.85, 0.7, 0.55, 0.4, 0.25)
 """Of the way from the weights that were given to the trained ones, which are judged."""
@@ -297,11 +284,9 @@ class TrainingRounds:
         learned = {name: weight.clone() for name, weight in student.net.state_dict().items()}
 
         def take(part: float) -> None:
-            mixed = {
-                name: torch.lerp(given[name], weight, part) if weight.is_floating_point() else weight
-                for name, weight in learned.items()
-            }
-            student.net.load_state_dict(mixed)
+            mixed = {name: torch.lerp(given[name], weight, part) for name, weight in learned.items()
+                     if weight.is_floating_point()}  # fmt: skip
+            student.net.load_state_dict({**learned, **mixed})
 
         for part in PARTS:
             take(part)

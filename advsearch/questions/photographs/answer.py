@@ -10,16 +10,14 @@ page lays a rendering, translucent or its edges, over the camera's picture, afte
 from __future__ import annotations
 
 import hmac
-import importlib
 import io
 import json
 import re
 from collections.abc import Callable, Sequence
 from email.message import Message
 from http import HTTPStatus
-from io import BufferedIOBase
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from PIL import Image, ImageOps
 from pydantic import Field
@@ -30,15 +28,15 @@ from advsearch.report.markup import Html, element, join_html
 from advsearch.report.phrases import percent
 from advsearch.runs.directory import IMAGES
 from advsearch.runs.results.base import Fields, Interval
+from advsearch.viewer.clients import NO_QR, qr_code
 from advsearch.viewer.document import data_script, document, in_address, study_table
-from advsearch.viewer.server import Refused
+from advsearch.viewer.server import LARGEST_SENT, Refused
 from advsearch.viewer.thumbnails import kept_file, kept_pictures
 
 PHOTO, LOOSE_PHOTO = "photo", "loose photo"
 """Kinds of rows in a run's store: photographs that were aligned with a rendering, and ones that were with none."""
 
-FOLDER = "photos"
-"""Where photographs are, in `images/` of the run."""
+FOLDER = "photos"  # where photographs are, in `images/` of the run
 
 
 class PhotographedRendering(Fields):
@@ -71,20 +69,12 @@ class PhotoAgreement(Fields):
     renderings: list[PhotographedRendering]
 
 
-LARGEST, MOST_PIXELS = 16 << 20, 50_000_000
-"""Bytes of a photograph's file, and its pixels before it is made smaller; the largest phones take 50 million."""
-
-SIDE, QUALITY = 1024, 95
-"""Longest side in pixels of a photograph that is kept, and of its JPEG file from 1 to 95."""
-
+MOST_PIXELS = 50_000_000  # of a photograph before it is made smaller; the largest phones take 50 million
+SIDE, QUALITY = 1024, 95  # longest side in pixels of a photograph that is kept, and of its JPEG file from 1 to 95
 _NAME = re.compile(r"[0-9]{1,12}|clean|adversarial|verification-[0-9]{2}")
 _PHOTO = re.compile(rf"(?:{_NAME.pattern})-[0-9]{{4,9}}\.jpg")
 
-NO_QR = "pip install segno"
-"""What to type where there is nothing to draw a code with."""
-
-KEY = "X-Advsearch-Key"
-"""The header with which this server's page sends a photograph; another page could not send it."""
+KEY = "X-Advsearch-Key"  # the header with which this server's page sends a photograph; another page could not send it
 
 
 def rendering_file(run: Path, name: str) -> Path:
@@ -114,17 +104,10 @@ def photo_file(run: Path, name: str) -> Path:
 
 
 def sound_photo(data: bytes, shape: tuple[int, int]) -> bytes:
-    """Return a photograph as a JPEG of at most `SIDE` pixels a side, its middle cut to a shape.
-
-    Args:
-        data: the file as it was sent: JPEG, PNG or WebP.
-        shape: (width, height) of the rendering; their ratio counts.
-
-    Raises:
-        InputError: it is too large, or no such picture.
-    """
-    if len(data) > LARGEST:
-        raise InputError(f"photo: expected at most {LARGEST >> 20} MB, got more; send a smaller one")
+    """Return a photograph, sent as JPEG, PNG or WebP, as a JPEG of at most `SIDE` pixels a side, its middle cut to the
+    ratio of a shape (width, height). An InputError where it is too large, or no such picture."""
+    if len(data) > LARGEST_SENT:
+        raise InputError(f"photo: expected at most {LARGEST_SENT >> 20} MB, got more; send a smaller one")
     try:
         with Image.open(io.BytesIO(data), formats=("JPEG", "PNG", "WEBP")) as image:
             if image.width * image.height > MOST_PIXELS:
@@ -161,7 +144,7 @@ def align_page(run: str, renderings: Sequence[str], table: PhotoAgreement, key: 
     )  # fmt: skip
     code = None
     if elsewhere is not None:
-        made = _code(elsewhere)
+        made = qr_code(elsewhere)
         svg = made and Html(made.svg_inline(omitsize=True, light="#fff", title="QR code of the address below"))
         code = element(
             "details", element("summary", "Open this page on a phone"),
@@ -179,22 +162,6 @@ def align_page(run: str, renderings: Sequence[str], table: PhotoAgreement, key: 
     data = [data_script({"key": key, "names": list(renderings[:1])}, "photographing")] if renderings else []
     scripts = ("make.js", "align.js") if renderings else ()
     return document(f"{run}, photographs", header, main, data=data, scripts=scripts, connects=True)
-
-
-def qr_text(address: str) -> str | None:
-    """Return an address as a QR code for a terminal; None where segno is not installed."""
-    made, text = _code(address), io.StringIO()
-    if made is not None:
-        made.terminal(out=text, compact=True)
-    return text.getvalue() or None
-
-
-def _code(address: str) -> Any:
-    """A QR code of an address; None where segno is not installed."""
-    try:
-        return importlib.import_module("segno").make(address, error="m", micro=False)
-    except ImportError:
-        return None
 
 
 def table_html(table: PhotoAgreement) -> Html:
@@ -238,17 +205,7 @@ def table_html(table: PhotoAgreement) -> Html:
 # ---- what the server answers ----------------------------------------------------------------------------------------
 
 
-class PhotoTaker(Protocol):
-    """Takes photographs in; `Photographs` does."""
-
-    def add(self, run: Path, rendering: str, data: bytes) -> PhotoAgreement:
-        """Judge and keep a photograph, and return the run's table; InputError says why it can't."""
-
-    def agreement(self, run: Path) -> PhotoAgreement:
-        """Return the run's table."""
-
-
-def photographs_html(taker: PhotoTaker | None, run: Path, name: str, key: str, elsewhere: str | None) -> str:
+def photographs_html(taker: Any, run: Path, name: str, key: str, elsewhere: str | None) -> str:
     """Return the page of a run's photographs; arguments as for `align_page`."""
     return align_page(name, rendering_names(run), _there(taker).agreement(run), key, elsewhere)
 
@@ -259,9 +216,7 @@ def picture(find: str, run: Path, name: str) -> tuple[str, bytes]:
     return "image/png" if file.suffix == ".png" else "image/jpeg", file.read_bytes()
 
 
-def take(
-    taker: PhotoTaker | None, run: Path, name: str, headers: Message, key: str, data: Callable[[], bytes]
-) -> tuple[str, bytes]:
+def take(taker: Any, run: Path, name: str, headers: Message, key: str, data: Callable[[], bytes]) -> tuple[str, bytes]:
     """Take a photograph of a rendering in, from this server's own page: another one has no origin, or not the key.
     `data` reads what was sent, once there is something to compare it with. It is refused where there is no such
     rendering, or it is no photograph."""
@@ -277,21 +232,7 @@ def take(
     return "application/json", json.dumps({"table": str(table_html(table))}).encode()
 
 
-def request_body(headers: Message, stream: BufferedIOBase) -> bytes:
-    """Return what was sent along; nothing is read of what says that it is larger than `LARGEST`. It is refused where it
-    is too large, says no length, or does not come."""
-    length = headers.get("Content-Length", "")
-    if not re.fullmatch(r"[0-9]{1,15}", length):
-        raise Refused(HTTPStatus.LENGTH_REQUIRED, "its length is missing")
-    if int(length) > LARGEST:
-        raise Refused(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"more than {LARGEST >> 20} MB")
-    data = stream.read(int(length))
-    if len(data) < int(length):
-        raise Refused(HTTPStatus.BAD_REQUEST, "a part of it did not come")
-    return data
-
-
-def _there(taker: PhotoTaker | None) -> PhotoTaker:
+def _there(taker: Any) -> Any:
     if taker is None:
         raise Refused(HTTPStatus.NOT_FOUND, "this server takes no photographs; advsearch dashboard does")
     return taker

@@ -38,10 +38,9 @@ from advsearch.settings import read_yaml
 from advsearch.tasks import AnyTask, Judgement, Task, make_task
 from advsearch.tasks.base import Truth
 from advsearch.tasks.together import Together
+from advsearch.viewer.server import LARGEST_SENT
 
-SUFFIXES = (".jpg", ".jpeg", ".png", ".webp")
-"""Of the files in a folder that are photographs."""
-
+SUFFIXES = (".jpg", ".jpeg", ".png", ".webp")  # of the files in a folder that are photographs
 _ALIGNED = re.compile(r"rendering-([0-9]{1,12})(?:-.*)?")
 """The name of a file with a photograph that was aligned with a rendering."""
 
@@ -107,11 +106,8 @@ def _photo_of(row: Row) -> JsonObject:
 
 
 def photographs_in(folder: Path, task: AnyTask) -> list[Path]:
-    """Return the files in a folder that are photographs by their names; none where there is no such folder.
-
-    Raises:
-        InputError: the task asks where the object is, and one of them was aligned with no rendering.
-    """
+    """Return the files in a folder that are photographs by their names; none where there is no such folder. An
+    InputError where the task asks where the object is, and one of them was aligned with no rendering."""
     files = sorted(folder.iterdir()) if folder.is_dir() else []
     photographs = [file for file in files if file.suffix.lower() in SUFFIXES and file.is_file()]
     loose = [file for file in photographs if not _ALIGNED.fullmatch(file.stem)]
@@ -132,27 +128,19 @@ class Photographs:
 
     def add(self, run: Path, rendering: str, data: bytes) -> PhotoAgreement:
         """Judge a photograph by the models and the task of a run, keep both beside the rendering that it was aligned
-        with, and return the table.
-
-        Raises:
-            InputError: there is no such rendering, it is no photograph, another process works on the run, or its scene
-                is another one now.
-        """
+        with, and return the table. An InputError where there is no such rendering, it is no photograph, another process
+        works on the run, or its scene is another one now."""
         self._thread.submit(self._add, run, rendering, data, "").result()
         return photo_agreement(run)
 
     def add_files(self, run: Path, files: Sequence[Path]) -> None:
-        """Judge the photographs among some files that the run, of a sweep of one object, does not have yet, by their
-        names.
-
+        """Judge the photographs in some files that the run, a sweep of one object, does not have yet, by their names.
         A file ``rendering-12.jpg``, or ``rendering-12-`` and anything, was aligned with the rendering 12. All others
-        show the object as it stood by chance: they are judged, but are compared with no single rendering. Errors are
-        those of `add`.
-        """
+        show the object as it stood by chance: they are judged, but are compared with no single rendering."""
         with Store(run / NAME, read_only=True) as store:
             known = {_photo_of(row).get("source") for kind in (PHOTO, LOOSE_PHOTO) for row in store.rows(kind)}
         for file in (file for file in files if file.name not in known):
-            aligned, data = _ALIGNED.fullmatch(file.stem), read_bytes(file, "a photograph", answer.LARGEST)
+            aligned, data = _ALIGNED.fullmatch(file.stem), read_bytes(file, "a photograph", LARGEST_SENT)
             try:
                 self._thread.submit(self._add, run, aligned and aligned[1], data, file.name).result()
             except InputError as error:

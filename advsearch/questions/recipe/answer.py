@@ -20,9 +20,7 @@ from advsearch.settings import Clash, Config, setting, setting_as_in, split_name
 
 Cell = str | int | float | None
 
-ALL_OBJECTS = "*"
-"""Under this a label stands that is right for every object without one of its own."""
-
+ALL_OBJECTS = "*"  # under this a label stands that is right for every object without one of its own
 NAMED = "what the recipe names"
 
 
@@ -116,8 +114,7 @@ class RecipeConfig(Config):
         return self.label.get(name) or self.label.get(Path(name).stem) or self.label.get(ALL_OBJECTS)
 
 
-SHARES = ("share", "low", "high")
-"""Columns of a figure's numbers that are a share and the ends of its 95 % interval."""
+SHARES = ("share", "low", "high")  # columns of a figure's numbers that are a share and the ends of its 95 % interval
 
 
 class RecipePart(Fields):

@@ -39,9 +39,7 @@ from advsearch.threads import cores
 
 TURN = 360.0
 
-NOTE = "recipe"
-"""Under which a run's store keeps the recipe, so that it goes on as it began."""
-
+NOTE = "recipe"  # under which a run's store keeps the recipe, so that it goes on as it began
 DoneRun = tuple[PlannedRun, AttackSummary | SweepSummary]
 
 
@@ -179,11 +177,8 @@ def _carried_out(runs: Sequence[PlannedRun], asked: Asked[RecipeConfig]) -> tupl
 
 def around(config: SceneConfig, answer: AnswerDistribution, searched: Mapping[str, FoundValue]) -> SceneConfig:
     """Draw evenly from the distribution that a search answers with, over the ranges that it searched: mean and
-    deviation are the same.
-
-    An even distribution of deviation s is sqrt(12) s wide. The ranges end where the search's did; angles that go all
-    the way round may pass that end, and take the whole turn at most.
-    """
+    deviation are the same. An even distribution of deviation s is sqrt(12) s wide. The ranges end where the search's
+    did; angles that go all the way round may pass that end, and take the whole turn at most."""
     controls: dict[str, dict[str, object]] = {}
     for (name, mean), deviation in zip(answer.mean.items(), answer.deviation, strict=True):
         control, _, parameter = name.partition(".")

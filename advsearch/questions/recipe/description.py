@@ -25,9 +25,7 @@ from advsearch.settings import read_yaml, split_names
 from advsearch.settings.configuration import PLACE, SettingsError
 from advsearch.settings.values import merged
 
-PHOTOGRAPHS = "photographs"
-"""The part that photographs are of."""
-
+PHOTOGRAPHS = "photographs"  # the part that photographs are of
 OF_THE_COMMAND = (*PLACE, "seed", "threads", "deterministic")
 """Settings that are said with the command and not in its file."""
 
@@ -154,11 +152,15 @@ def recipe_of(data: Mapping[str, object], where: str) -> Recipe:
     try:
         return Recipe(**{name: value for name, value in data.items() if name not in ("schema", "command")})
     except ValidationError as error:
-        first = error.errors(include_url=False, include_input=False)[0]
-        what, text = ".".join(map(str, first["loc"]))[:80], first["msg"].removeprefix("Value error, ")[:200]
-        raise FileFormatError(f"{where}: {what}: {text}; advsearch show recipe backgrounds prints one") from None
+        raise FileFormatError(f"{where}: {first_of(error)}; advsearch show recipe backgrounds prints one") from None
     except (RecursionError, TypeError) as error:
         raise FileFormatError(f"{where}: expected a recipe, got {type(error).__name__}") from None
+
+
+def first_of(error: ValidationError) -> str:
+    """Return what is wrong first, and where: ``parts.a.shell: Extra inputs are not permitted``."""
+    first = error.errors(include_url=False, include_input=False)[0]
+    return f"{'.'.join(map(str, first['loc']))[:80]}: {first['msg'].removeprefix('Value error, ')[:200]}"
 
 
 @dataclass(frozen=True)

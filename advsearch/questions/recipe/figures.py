@@ -10,7 +10,7 @@ from pydantic import ValidationError
 
 from advsearch.errors import FileFormatError, InputError, UnknownNameError
 from advsearch.questions.recipe import frame, given, rates
-from advsearch.questions.recipe.description import PHOTOGRAPHS, Recipe
+from advsearch.questions.recipe.description import PHOTOGRAPHS, Recipe, first_of
 from advsearch.questions.recipe.frame import MadeFigure, Options, Rows
 from advsearch.report.figures import Figures, drawn
 
@@ -28,14 +28,9 @@ FIGURES: Mapping[str, tuple[type[Options], Any]] = {
 TOGETHER = ("agreement", "scaling", "surface")
 """Kinds that tell several models apart by themselves; of the others each model has one."""
 
-NAMING = ("by", "series", "texture", "shape", "shares")
-"""Options of figures that name columns."""
-
-OUTER = ("object", "environment", frame.MODEL, frame.ANSWER, frame.PART)
-"""Columns of every recipe."""
-
-ANY = "*"
-"""Stands for the parameters of a control that does not say beforehand which it has."""
+NAMING = ("by", "series", "texture", "shape", "shares")  # options of figures that name columns
+OUTER = ("object", "environment", frame.MODEL, frame.ANSWER, frame.PART)  # columns of every recipe
+ANY = "*"  # stands for the parameters of a control that does not say beforehand which it has
 
 
 def read_options(described: Mapping[str, object], where: str) -> tuple[str, Options]:
@@ -47,9 +42,7 @@ def read_options(described: Mapping[str, object], where: str) -> tuple[str, Opti
     try:
         return kind, FIGURES[kind][0](**{name: value for name, value in described.items() if name != "figure"})
     except ValidationError as error:
-        first = error.errors(include_url=False, include_input=False)[0]
-        what = ".".join(map(str, first["loc"]))[:80]
-        raise FileFormatError(f"{where}: figures: {kind}: {what}: {first['msg'][:200]}; see docs/recipes.md") from None
+        raise FileFormatError(f"{where}: figures: {kind}: {first_of(error)}; see docs/recipes.md") from None
 
 
 def make(rows: Rows, kind: str, options: Options) -> Iterator[MadeFigure]:

@@ -34,9 +34,7 @@ CLEAN = dict.fromkeys(("first control", "control"), "clean scene")
 TRIALS = {**CLEAN, "verification": "answer", "baseline verification": "random search"}
 """The rows of an attack that are in the frame, and what figures call them."""
 
-COUNT = ["of", "share", "low", "high"]
-"""Columns of a count behind the one of what is counted."""
-
+COUNT = ["of", "share", "low", "high"]  # columns of a count behind the one of what is counted
 Cell = str | int | float | None
 Numbers = npt.NDArray[np.float64]
 Rows = Any  # pd.DataFrame, which has no types
@@ -45,18 +43,16 @@ Rows = Any  # pd.DataFrame, which has no types
 def read_rows(
     part: str, folder: Path, summary: AttackSummary | SweepSummary, seed: int, kinds: Sequence[str], **more: Cell
 ) -> tuple[list[dict[str, Any]], dict[str, str]]:
-    """Return the answers of some kinds that a run has stored, and the units of their parameters.
-
-    Each has what it shows (`object`, `environment`, `model`, and parameters), what was said of it (`answer`,
-    `correct`, `margin`), the `time` when it was stored, seconds since 1970, and the `unit` of what it shares with rows
-    that are not independent of it: draws of one seed are the same ones, also in another part.
-    """
+    """Return the answers of some kinds that a run has stored, and the units of their parameters. Each has what it shows
+    (`object`, `environment`, `model`, and parameters), what was said of it (`answer`, `correct`, `margin`), the `time`
+    when it was stored, seconds since 1970, and the `unit` of what it shares with rows that are not independent of it:
+    draws of one seed are the same ones, also in another part."""
     rows, units = list[dict[str, Any]](), dict[str, str]()
     with Store(folder / NAME, read_only=True) as store:
-        swept = isinstance(summary, SweepSummary)
-        drawn = units_of(store, summary) if isinstance(summary, SweepSummary) else None
-        # without draws, samples of a point differ by noise alone
-        alike = summary.samples if isinstance(summary, SweepSummary) and summary.sampler is None else 1
+        drawn, alike = None, 1
+        if swept := isinstance(summary, SweepSummary):
+            # without draws, samples of a point differ by noise alone
+            drawn, alike = units_of(store, summary), 1 if summary.sampler is not None else summary.samples
         for row in store.rows():
             if row.kind not in kinds:
                 continue
@@ -160,11 +156,9 @@ class Tally:
 
 
 def extremes(counts: Sequence[Tally], worst: str, best: str, thing: str, verb: str = "right") -> list[str]:
-    """Return which of several has the lowest share and which the highest, and whether that is more than chance.
-
-    The two were chosen among k for being extreme, so that they are compared by intervals of confidence 1 - 0.05 / k,
-    which hold for all k together. Where these overlap, no difference is shown. `verb` is what is counted.
-    """
+    """Return which of several has the lowest share and which the highest, and whether that is more than chance: the two
+    were chosen among k for being extreme, so that they are compared by intervals of confidence 1 - 0.05 / k, which hold
+    for all k together. Where these overlap, no difference is shown. `verb` is what is counted."""
     known = [count for count in counts if count.total]
     if len(known) < 2:
         return [f"{count.name}: {count.told(verb)}." for count in known]

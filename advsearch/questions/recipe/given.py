@@ -22,8 +22,7 @@ from advsearch.questions.recipe.frame import MadeFigure, Options, Rows, Tally
 from advsearch.report.figures import BLUE, GREY, RED
 from advsearch.report.phrases import percent
 
-LETTERS, FEWEST_LETTERS = 85, 4
-"""Letters that a bar of the whole width has room for, and of a name that is cut short."""
+LETTERS, FEWEST_LETTERS = 85, 4  # letters that a bar of the whole width has room for, and of a name that is cut short
 
 
 class AnswersOptions(Options):
@@ -77,11 +76,8 @@ def fitting(name: str, share: float) -> str:
 
 # ---- shape and texture ----------------------------------------------------------------------------------------------
 
-SEED, RESAMPLES = 0, 2000
-"""Of the answers that predict, and of the bootstrap."""
-
-FEWEST_PAIRS = 4
-"""Pairs of object and texture: two of each."""
+SEED, RESAMPLES = 0, 2000  # of the answers that predict, and of the bootstrap
+FEWEST_PAIRS = 4  # pairs of object and texture: two of each
 
 
 class CuesOptions(Options):
@@ -130,9 +126,8 @@ def cues(rows: Rows, options: CuesOptions) -> MadeFigure:
 
 def predicted(rows: Rows, options: CuesOptions) -> list[tuple[int, int, int]]:
     """Predict the answers about each object with each texture by those about it with others, and with others by it;
-    return of each pair how many answers there are, and how many of these the shape and the texture predict.
-
-    Each cue predicts the most frequent one of as many answers: those about the same object with other textures, and
+    return of each pair how many answers there are, and how many of these the shape and the texture predict. Each cue
+    predicts the most frequent one of as many answers: those about the same object with other textures, and
     about the same texture on other objects, drawn so that both are as many as the fewer are. None of the predicted
     answers is among them, so that a model which answers by neither cue is predicted as well by both.
     """
@@ -179,9 +174,7 @@ def _which(pairs: Sequence[tuple[int, int, int]]) -> str:
 
 Doubles = npt.NDArray[np.float64]
 Shares = tuple[float, float, float]
-Triangle = tuple[int, int, bool]
-"""How far along the first and the second share it is, and whether it points down."""
-
+Triangle = tuple[int, int, bool]  # how far along the first and the second share it is, and whether it points down
 MEANINGLESS = (
     "The answer is {} in every picture, so that shares of answers tell nothing. Colours are how far the right answer "
     "leads the best wrong one: the margin with its sign turned, in logits for a classifier."

@@ -22,11 +22,8 @@ from advsearch.report.sweeps import surface_sentences
 from advsearch.report.wording import count, figure_value, short_name
 from advsearch.runs.directory import IMAGES, PARTS
 
-BINS, FITTING = 12, 4
-"""Parts of a range where lines are drawn along it, and letters that stand level under a column."""
-
-Cells = Mapping[str, Sequence[Tally]]
-"""Counts by the name of a row, one of each series."""
+BINS, FITTING = 12, 4  # parts of a range where lines are drawn along it, and letters that stand level under a column
+Cells = Mapping[str, Sequence[Tally]]  # counts by the name of a row, one of each series
 
 
 class RatesOptions(Options):
