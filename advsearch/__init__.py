@@ -27,12 +27,10 @@ _HOMES = {
     "SweepResult": "advsearch.questions.sweep.result",
     "Task": "advsearch.tasks",
     "allow_code": "advsearch.registry",
-    "harden": "advsearch.questions.harden.carry_out",
     "load_model": "advsearch.api.render",
     "load_run": "advsearch.api.render",
     "load_scene": "advsearch.engine.loading",
     "photo_agreement": "advsearch.questions.photographs.carry_out",
-    "recipe": "advsearch.questions.recipe.carry_out",
     "render": "advsearch.api.render",
 }
 """The public names, and the module of each; besides, every question that

@@ -38,10 +38,10 @@ from advsearch.files import MESHES
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.compare import CompareConfig
 from advsearch.questions.explain import ExplainConfig
-from advsearch.questions.harden.settings import ALL, HardenConfig
+from advsearch.questions.harden.answer import ALL, HardenConfig
+from advsearch.questions.recipe.answer import RecipeConfig
 from advsearch.questions.recipe.description import planned, read_recipe
 from advsearch.questions.recipe.description import recipe_names as recipes
-from advsearch.questions.recipe.settings import RecipeConfig
 from advsearch.questions.replay.answer import WAYS, ReplayConfig
 from advsearch.questions.stability.answer import StabilityConfig
 from advsearch.questions.stability.carry_out import chosen

@@ -319,7 +319,7 @@ FAULTS = (
     ),
     Fault(
         "recipes: right and wrong are mixed up",
-        "advsearch/questions/recipe/of_runs.py",
+        "advsearch/questions/recipe/rates.py",
         "for a in (True, False) for b in (True, False)]",
         "for b in (True, False) for a in (True, False)]",
         ("tests/questions/test_recipe.py",),

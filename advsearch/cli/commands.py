@@ -65,6 +65,7 @@ class QuestionCommand:
             these name.
         place: how that setting is given without its flag.
         brought: returns the settings that the `run.yaml` of the run that it is about brings, by what was typed.
+        listed: where the function is that returns what it may be about, with a line about each, which `list` prints.
         more, examples: as of `Command`.
     """
 
@@ -74,6 +75,7 @@ class QuestionCommand:
     about: str = ""
     place: Positional | None = None
     brought: Callable[[Path, Mapping[str, Any]], dict[str, Any]] | None = None
+    listed: str = ""
     more: str = ""
     examples: tuple[str, ...] = ()
 
@@ -99,6 +101,15 @@ class QuestionCommand:
     def run(self, args: argparse.Namespace) -> int:
         """Ask what the arguments say. Raises InputError where what it is about is missing."""
         named = getattr(args, self.about, None)
+        if self.listed and named == "list":
+            module, _, function = self.listed.partition(":")
+            lines = getattr(importlib.import_module(module), function)()
+            if args.json:
+                listed = [{"name": name, "title": text} for name, text in lines.items()]
+                output.print_json({"schema": 1, f"{self.name}s": listed})
+            else:
+                print(output.aligned([[name, text] for name, text in lines.items()]))
+            return 0
         if self.place and named in (None, []):
             command = f"advsearch {self.name}"
             raise InputError(f"{command}: expected {self.place.expected}; see {command} --help")
@@ -208,8 +219,8 @@ def found(name: str) -> Any:
     if made := made_question(name):
         unflagged = Positional(*made.expected) if made.expected else None
         return QuestionCommand(
-            name, short=made.short, about=made.about, place=unflagged, brought=made.brought, more=made.more,
-            examples=made.examples,
+            name, short=made.short, about=made.about, place=unflagged, brought=made.brought, listed=made.listed,
+            more=made.more, examples=made.examples,
         )  # fmt: skip
     module = importlib.import_module(f"{ROOM}{name}")
     return getattr(module, "COMMAND", module)

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING
 from advsearch.cli import output
 from advsearch.cli.commands import Command
 from advsearch.errors import InputError
-from advsearch.questions.photographs.answer import NO_QR, qr_text
 from advsearch.questions.sweep.page import write_bundle
 from advsearch.runs.directory import find_run
+from advsearch.viewer.clients import NO_QR, qr_text
 from advsearch.viewer.pages import renewed
 from advsearch.viewer.server import Dashboard
 

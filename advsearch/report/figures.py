@@ -76,6 +76,31 @@ def drawn(
     return files
 
 
+SERIES = (BLUE, RED, "#1f7a45", "#b4540a", "#6b3fa0", GREY)
+MARKS = "os^DvP"
+"""What tells series apart."""
+
+
+def draw_shares(
+    axes: Any,
+    rows: Mapping[str, Sequence[tuple[float, Sequence[float]] | None]],
+    series: Sequence[str],
+    colours: Sequence[str] = SERIES,
+) -> None:
+    """Draw a row for each name, in which a dot with its interval is the share of each of the series; None is none."""
+    for number, label in enumerate(series):
+        colour, mark = colours[number % len(colours)], MARKS[number % len(MARKS)]
+        for row, shares in enumerate(rows.values()):
+            place = row + (number - (len(series) - 1) / 2) * min(0.22, 0.8 / len(series))
+            if (drawn := shares[number]) is not None:
+                axes.plot(drawn[1], [place] * 2, color=colour, alpha=0.45, linewidth=3)
+                axes.plot(drawn[0], place, mark, color=colour, ms=5, label=label)
+                label = "_"  # a series has one line in the legend
+    axes.set_yticks(range(len(rows)), list(rows))
+    axes.set(xlim=(-0.03, 1.03), ylim=(len(rows) - 0.4, -0.6))
+    axes.grid(True, axis="x")
+
+
 def search_axes(
     objectives: Mapping[str, Sequence[float | None]], meaning: str, axes: Any, zero_means: str = ""
 ) -> None:

@@ -32,7 +32,17 @@ from advsearch.questions.sweep.page import SweepSource, result_of, sweep_page_ht
 from advsearch.report.markup import element, join_html
 from advsearch.runs import files, listing
 from advsearch.runs.directory import COLUMNS, HOME, PARTS, REPORT, check_links, is_run
-from advsearch.viewer.clients import PATIENCE, SLOWEST, TICK, Clients, Refused, https_context, is_address, reachable
+from advsearch.viewer.clients import (
+    LARGEST_SENT,
+    PATIENCE,
+    SLOWEST,
+    TICK,
+    Clients,
+    Refused,
+    https_context,
+    is_address,
+    reachable,
+)  # fmt: skip
 from advsearch.viewer.columns import packed, read_columns
 from advsearch.viewer.dashboard import START, following_page, is_under_way, list_page, progress_json
 from advsearch.viewer.document import has_other_scripts, in_address, served_policy
@@ -89,7 +99,7 @@ class Dashboard(HTTPServer):
         port: int = 0,
         *,
         https: bool = False,
-        photographs: photos.PhotoTaker | None = None,
+        photographs: object | None = None,
     ) -> None:
         self._given: dict[str, Path] = {}
         for path in runs:
@@ -347,20 +357,28 @@ class _Handler(BaseHTTPRequestHandler):
         return _own(page, "../../../", ("../", name))
 
     def _take(self, _query: Query, name: str, rendering: str) -> Served:
-        photos.check_sender(self.headers, self.server.key(name))
-        return Served(*photos.take(self.server.photographs, self.server.run(name), rendering, self._body))
+        server, run, key = self.server, self.server.run(name), self.server.key(name)
+        return Served(*photos.take(server.photographs, run, rendering, self.headers, key, self._body))
 
     def _body(self) -> bytes:
+        """What was sent along; nothing is read of what says that it is larger than `LARGEST_SENT`."""
+        length = self.headers.get("Content-Length", "")
+        if not re.fullmatch(r"[0-9]{1,15}", length):
+            raise Refused(HTTPStatus.LENGTH_REQUIRED, "its length is missing")
+        if int(length) > LARGEST_SENT:
+            raise Refused(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"more than {LARGEST_SENT >> 20} MB")
         self.server.clients.wait_for(SENDING)
-        data: bytes = photos.request_body(self.headers, self.rfile)
+        data = self.rfile.read(int(length))
         self.server.clients.wait_for(None)
+        if len(data) < int(length):
+            raise Refused(HTTPStatus.BAD_REQUEST, "a part of it did not come")
         return data
 
     def _rendering(self, _query: Query, name: str, rendering: str) -> Served:
-        return Served(*photos.rendering_picture(self.server.run(name), rendering))
+        return Served(*photos.picture("rendering", self.server.run(name), rendering))
 
     def _photo(self, _query: Query, name: str, photo: str) -> Served:
-        return Served(*photos.photo(self.server.run(name), photo))
+        return Served(*photos.picture("photo", self.server.run(name), photo))
 
 
 Query = Mapping[str, list[str]]

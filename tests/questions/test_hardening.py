@@ -28,7 +28,7 @@ from advsearch.models.reference import Trainable, trainable
 from advsearch.progress import NullProgress
 from advsearch.questions.attack.parts import problem_of
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.harden.answer import TrainingRound
+from advsearch.questions.harden.answer import HardenConfig, TrainingRound
 from advsearch.questions.harden.lessons import (
     Disguise,
     Lesson,
@@ -49,7 +49,6 @@ from advsearch.questions.harden.scenes import (
     check_unmeasured,
     fingerprint,
 )
-from advsearch.questions.harden.settings import HardenConfig
 from advsearch.questions.harden.training import Course, Gradients, Score, TrainingRounds, score
 from advsearch.scene.formation import levels_of, to_8_bit
 from advsearch.scene.library import load_environment
