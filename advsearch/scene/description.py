@@ -402,13 +402,13 @@ def describe(
         camera=next(iter(around.cameras), ORBIT_CAMERA) if mitsuba and not orbits else ORBIT_CAMERA,
         metered=not mitsuba,
     )
-    described = with_things(described, things, lambda spec: _object(spec, None))
+    described = with_things(on_its_ground(described), things, lambda spec: _object(spec, None))
     check_meshes(described, values)
     idle = [name for name in given or {} if name.startswith("material.")]
     if described.object.surface is not None and idle:
         whose = "several materials" if described.object.finishes else "a surface of Mitsuba's own"
         raise InputError(f"`set` {idle[0]}: the object has {whose}, without it; leave it out")
-    return on_its_ground(described)
+    return described
 
 
 def check_meshes(scene: SceneDescription, names: Iterable[str]) -> None:

@@ -35,7 +35,9 @@ MOST = 64
 OPTIONS = ("heading", "size", "name", "label")
 ALL = "all"
 """What stands for the object and every thing beside it."""
-TAKEN = ("object", "environment", "ground", "camera", "road", ALL)
+ROAD = "road"
+"""The mesh that they stand on, where there is one (`advsearch.scene.grounds`)."""
+TAKEN = ("object", "environment", "ground", "camera", ROAD, ALL)
 """What a thing can't be called."""
 
 
@@ -164,9 +166,25 @@ def _pose(scene: SceneDescription, asset: ObjectAsset, asked: AskedThing, metres
     foot = np.array([*(low[:2] + high[:2]) / 2.0, low[2]])
     matrix = np.eye(4)
     matrix[:3, :3] = linear
-    matrix[:3, 3] = np.array([asked.x, asked.y, 0.0]) / scene.metres - linear @ foot
-    matrix[:2, 3] += middle(scene)[:2]
+    place = middle(scene)[:2] + np.array([asked.x, asked.y]) / scene.metres
+    matrix[:3, 3] = np.array([*place, ground_height(scene, place)]) - linear @ foot
     return matrix
+
+
+def ground_height(scene: SceneDescription, place: Doubles) -> float:
+    """Return how high the ground lies at a place (2,), object sizes: that of the road, with its pavements, or 0."""
+    heights = [0.0]
+    for part in (one for name, one in scene.around.items() if name == ROAD):
+        a, b, c = np.moveaxis(standing(part)[part.mesh.faces.astype(np.int64)], 1, 0)
+        sides = [
+            (end[:, 0] - begin[:, 0]) * (place[1] - begin[:, 1]) - (end[:, 1] - begin[:, 1]) * (place[0] - begin[:, 0])
+            for begin, end in ((b, c), (c, a), (a, b))
+        ]
+        whole = sides[0] + sides[1] + sides[2]
+        shares = np.stack(sides) / np.where(np.abs(whole) > 1e-12, whole, np.nan)
+        under = (shares >= 0.0).all(axis=0)
+        heights += (shares * [a[:, 2], b[:, 2], c[:, 2]]).sum(axis=0)[under].tolist()
+    return max(heights)
 
 
 def _meeting(scene: SceneDescription) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +31,7 @@ class Half(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         right = torch.zeros_like(x[:, 0])
         right[:, :, x.shape[3] // 2 + 3 :] = 1.0
-        return torch.stack([5.0 - 10.0 * right, 10.0 * right - 5.0], dim=1) + 0.0 * x[:, :2]
+        return torch.stack([5.0 - 10.0 * right, 10.0 * right - 5.0], dim=1) + 0.1 * x[:, :2]
 
 
 def model() -> Any:
@@ -45,7 +46,7 @@ def test_rows_have_the_truth_of_each_thing_and_tasks_judge_what_is_asked(judge: 
     )  # fmt: skip
     rows = found.rows()
     payload = rows["payload"].iloc[0]
-    payload = __import__("json").loads(payload) if isinstance(payload, str) else payload
+    payload = json.loads(payload) if isinstance(payload, str) else payload
     things = payload["things"]
     assert list(things) == ["object", "stop-sign"] and things["stop-sign"]["label"] == "stop sign"
     x0, y0, x1, y1 = things["stop-sign"]["box"]

@@ -7,13 +7,17 @@ import math
 import numpy as np
 import pytest
 import torch
+from scipy import ndimage
 
 import advsearch
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.options import things_as_text
 from advsearch.scene import library
+from advsearch.scene.geometry import standing
 from advsearch.scene.outlines import seen_things
+from advsearch.scene.surface.renderer import why_not
 from advsearch.scene.things import AskedThing, asked_things, overlapping
+from advsearch.scene.transport.matrix import LinearRenderer
 
 pytestmark = pytest.mark.usefixtures("two_threads")
 
@@ -153,3 +157,35 @@ def test_the_settings_of_a_scene_name_its_things() -> None:
     assert not np.allclose(moved.meshes["chair"].to_world, scene.description.meshes["chair"].to_world)
     with pytest.raises(UnknownNameError, match="mesh around the object"):
         scene.with_settings({"pose:char.yaw": 90.0})
+
+
+def test_a_matrix_of_transport_knows_what_stands_beside() -> None:
+    """What hides the object and shades it is in the matrix; a predicted change of its paint is the traced one."""
+    scene = advsearch.load_scene("car", "street", settings=VIEW, things="stop-sign@3,0.6,size=1.6; chair@-2,2,size=1")
+    renderer = scene.renderer({"texture": {"resolution": 32}}, resolution=48)
+    predicted = LinearRenderer(renderer, renderer.start, seed=1)
+    darker = (renderer.start - 0.2).clamp(0.0, 1.0)
+    with torch.no_grad():
+        after, before = (renderer(one, seed=11, spp=64) for one in (darker, renderer.start))
+        change = predicted(darker) - predicted(renderer.start)
+    hiding = next(one.mask for one in seen_things(renderer, renderer.start) if one.name == "stop-sign")
+    assert float(((change - (after - before)) ** 2).mean().sqrt()) < 0.15 * float(
+        (after - before).square().mean().sqrt()
+    )
+    inside = torch.from_numpy(ndimage.binary_erosion(hiding))
+    assert inside.any() and float(change[inside].abs().mean()) < 0.01  # light from the paint, and no paint itself
+
+
+def test_light_on_surfaces_refuses_things_by_its_own_rule() -> None:
+    def reason(things: str | None) -> str | None:
+        scene = advsearch.load_scene("mug", size=0.1, things=things)
+        return why_not(scene.renderer({"camera": {}}, resolution=16, denoise="oidn"), ["camera"])
+
+    assert reason(None) is None
+    assert "more in the scene than the object" in str(reason("bowl@0.2,0.1,size=0.15"))
+
+
+def test_a_thing_on_the_pavement_stands_on_it() -> None:
+    description = advsearch.load_scene("car", "avenue", things="chair@0,-4,size=1; stop-sign@9,0.5").description
+    low = {name: standing(part)[:, 2].min() * description.metres for name, part in description.things.items()}
+    assert low == {"chair": pytest.approx(0.12, abs=1e-4), "stop-sign": pytest.approx(0.0, abs=1e-4)}

@@ -222,6 +222,9 @@ class AttackSummary(SceneResult):
     epsilon: float | dict[str, float | None] | None = Field(description="the budget; by control where there are more")
     norm: str | dict[str, str] = Field(description="in which the budget is measured; by control as above")
     label_set: list[str] = Field(description="the names that count as right")
+    judge: str = Field(
+        default="object", description="the thing whose answers count: object, the name of one beside it, or all"
+    )
     goal: str = Field(description="`a wrong answer`, `a target answer` or `a right answer`: what counts as success")
     target: list[str] | None = Field(description="the targets' names")
     over: list[str] = Field(description="the controls that varied by chance")
