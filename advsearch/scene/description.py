@@ -151,13 +151,14 @@ class SceneDescription:
         azimuth = preset.azimuth
         if azimuth is not None and on_roads(self.object):
             azimuth += 180.0
-        own = {"height": height, "fov": preset.fov, "azimuth": azimuth}
-        values = {f"camera.{one}": value for one, value in own.items() if value is not None}
-        if "camera.elevation" in self.given:
-            del values["camera.height"]
+        own = {"camera.fov": preset.fov}
+        if "camera.elevation" not in self.given:
+            own["camera.height"] = height
+        if azimuth is not None:
+            own["camera.azimuth"] = azimuth
         if on_table:
-            values["ground.size"] = TABLE_SIDE / self.metres
-        values = {**self.values, **{one: value for one, value in values.items() if one not in self.given}}
+            own["ground.size"] = TABLE_SIDE / self.metres
+        values = {**self.values, **{one: value for one, value in own.items() if one not in self.given}}
         seen = replace(self, camera=ORBIT_CAMERA, camera_model=None, preset=name, values=values)
         if "camera.distance" in self.given:
             return seen
