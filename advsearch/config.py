@@ -139,9 +139,10 @@ class SceneConfig(Config):
     )
     camera: str | None = setting(
         None, "scene",
-        "which camera takes the picture: one of a scene file, or the one around the object with a lens of its own",
-        "a name that advsearch import lists, orbit, fisheye, equirectangular, or a camera file of OpenCV, Kalibr, ROS, "
-        "COLMAP or nerfstudio",
+        "which camera takes the picture: one of a scene file, or the one around the object, mounted somewhere or with "
+        "a lens of its own",
+        "a name that advsearch import lists, orbit, dashcam, robot, fisheye, equirectangular, or a camera file of "
+        "OpenCV, Kalibr, ROS, COLMAP or nerfstudio",
         metavar="NAME", otherwise="orbit, the pinhole around the object that camera.* describes", min_length=1,
     )
     set_: dict[str, float | str | tuple[float, ...]] = setting(

@@ -41,8 +41,8 @@ WRONG: dict[str, tuple[Any, str]] = {
     "unit": ("ft", "expected mm, cm, m or in, got ft"),
     "camera": (
         "",
-        "expected a name that advsearch import lists, orbit, fisheye, equirectangular, or a camera file of OpenCV, "
-        "Kalibr, ROS, COLMAP or nerfstudio, got ''",
+        "expected a name that advsearch import lists, orbit, dashcam, robot, fisheye, equirectangular, or a camera "
+        "file of OpenCV, Kalibr, ROS, COLMAP or nerfstudio, got ''",
     ),
     "set_": ({"camera.azimuth": math.nan}, "got camera.azimuth=nan"),
     "exposure": (99, "expected a number from -10 to 10, got 99"),

@@ -141,6 +141,8 @@ class Scene:
         if own.camera_model is not None:
             own.camera_model.check_given(given)
         values = {**own.values, **{name: resolved[name] for name in given}}
+        if "camera.elevation" in given:
+            values["camera.height"] = None
         return Scene(on_its_ground(replace(own, values=values, given=own.given | set(given))), self.only_here)
 
 
@@ -173,8 +175,9 @@ def load_scene(
             glTF is in metres, and of other files it is not known.
         settings: parameters to fix, e.g. ``{"camera.azimuth": 130.0}``. The size of a picture belongs to none of them
             but to what makes it: `resolution` of `attack`, `sweep`, `render` and `Scene.renderer`.
-        camera: a camera file (docs/cameras.md), "fisheye" or "equirectangular", whose lens the camera
-            around the object then has; the name of a camera of a scene file; "orbit" or None for a pinhole.
+        camera: a camera file (docs/cameras.md), "fisheye" or "equirectangular", whose lens the camera around the object
+            then has; "dashcam" or "robot", mounted at its height above the ground; the name of a camera of a scene
+            file; "orbit" or None for a pinhole.
         texture: of the object in place of its own: a picture file, or (h, w, 3) sRGB in [0, 1] or of 8 bits, row 0 on
             top; `result.artifacts["texture"]`, say.
         things: what stands beside the object, in metres from it, x forwards and y to its left: a text such as
@@ -239,6 +242,8 @@ def scene_as_settings(scene: Scene) -> dict[str, Any]:
 
 def named_camera(description: SceneDescription) -> str | None:
     """Return the camera in use, as `load_scene` takes it; None for the pinhole around the object."""
+    if description.preset:
+        return description.preset
     if description.camera_model is not None and description.camera_model.name:
         return description.camera_model.name
     return None if description.camera == ORBIT_CAMERA else description.camera

@@ -15,6 +15,7 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.files import reading
@@ -22,14 +23,15 @@ from advsearch.scene import environments, library, settings
 from advsearch.scene.assets import Doubles, EnvironmentAsset, Material, ObjectAsset
 from advsearch.scene.camera_files import read_camera
 from advsearch.scene.camera_model import CameraModel, bundled
+from advsearch.scene.camera_presets import ON_TABLES, PRESETS, TABLE, TABLE_SIDE
 from advsearch.scene.exposure import metered_gain
-from advsearch.scene.geometry import moved_part, object_to_world
+from advsearch.scene.geometry import framing_distance, moved_part, object_to_world
 from advsearch.scene.grounds import Photograph, on_its_ground, paved, photograph_of
 from advsearch.scene.importing.objects import import_object
 from advsearch.scene.importing.scenes import MITSUBA_FILE, ImportedScene, import_scene, split_node
 from advsearch.scene.parts import Lamp, MeshPart, PlacedCamera, PluginPart, ScenePart, mesh_part, plugins_in
 from advsearch.scene.settings import ORBIT_CAMERA
-from advsearch.scene.sizes import TRIPOD, doubts, sized
+from advsearch.scene.sizes import TRIPOD, doubts, on_roads, sized
 from advsearch.scene.things import ThingPart, with_things
 
 DEFAULT_ENVIRONMENT = "studio"
@@ -66,6 +68,7 @@ class SceneDescription:
         aspect: width over height of the picture.
         cameras: those with poses of their own, by name.
         camera: name of the one in use; `ORBIT_CAMERA` for that of the settings.
+        preset: name of the mounted camera that it is (`advsearch.scene.camera_presets`); "" for none.
         camera_model: intrinsics and distortion of the camera around the object; None for a pinhole.
         metered: exposure is metered; otherwise a radiance of 1 is the white of the picture, as Mitsuba shows it.
         remarks: what a user should know of further files that controls have read, and of things in each other.
@@ -87,6 +90,7 @@ class SceneDescription:
     aspect: float = 1.0
     cameras: Mapping[str, PlacedCamera] = field(default_factory=dict)
     camera: str = ORBIT_CAMERA
+    preset: str = ""
     camera_model: CameraModel | None = None
     metered: bool = True
     remarks: tuple[str, ...] = ()
@@ -115,13 +119,16 @@ class SceneDescription:
         """Return the scene as one of its cameras sees it, or as the camera around the object does with another lens.
 
         Args:
-            camera: name of a camera of the scene, a path to a camera file, or the name of a bundled camera model.
+            camera: name of a camera of the scene, a path to a camera file, the name of a bundled camera model, or that
+                of a mounted camera.
 
         Raises:
             UnknownNameError: it has no such camera.
             InputError: a setting of the camera around the object was given, and another is to see it; or a file cannot
                 be used.
         """
+        if camera in PRESETS and camera not in self.cameras:
+            return self._mounted(camera)
         if camera not in (ORBIT_CAMERA, *self.cameras):
             return self._with_model(camera)
         idle = sorted(name for name in self.given if name.startswith("camera.") and name != "camera.exposure")
@@ -132,6 +139,32 @@ class SceneDescription:
             )
         return replace(self, camera=camera, camera_model=None)
 
+    def _mounted(self, name: str) -> SceneDescription:
+        preset = PRESETS[name]
+        if self.object.metres is None:
+            raise InputError(
+                f"`camera={name}` is {preset.height:g} m high, and how large {self.object.name} is is not known; give "
+                "its longest side in metres, such as `size=0.1`"
+            )
+        on_table = self.on_table and self.object.metres <= ON_TABLES
+        height = preset.height - (TABLE if on_table else 0.0)
+        azimuth = preset.azimuth
+        if azimuth is not None and on_roads(self.object):
+            azimuth += 180.0
+        own = {"height": height, "fov": preset.fov, "azimuth": azimuth}
+        values = {f"camera.{one}": value for one, value in own.items() if value is not None}
+        if "camera.elevation" in self.given:
+            del values["camera.height"]
+        if on_table:
+            values["ground.size"] = TABLE_SIDE / self.metres
+        values = {**self.values, **{one: value for one, value in values.items() if one not in self.given}}
+        seen = replace(self, camera=ORBIT_CAMERA, camera_model=None, preset=name, values=values)
+        if "camera.distance" in self.given:
+            return seen
+        fov = torch.tensor(seen.number("camera.fov"), dtype=torch.float64)
+        fitted = float(framing_distance(seen, fov, seen.aspect)) * seen.metres
+        return seen.with_values(camera__distance=max(preset.distance, fitted))
+
     def _with_model(self, name: str) -> SceneDescription:
         if is_path(name):
             with reading(name.partition("#")[0]):
@@ -139,7 +172,7 @@ class SceneDescription:
         elif name in bundled():
             model = bundled()[name]
         else:
-            known = (ORBIT_CAMERA, *self.cameras, *bundled())
+            known = (ORBIT_CAMERA, *self.cameras, *bundled(), *PRESETS)
             raise UnknownNameError("camera", name, known, "Or give the path of a camera file, such as calib.yaml.")
         model.check_given(self.given)
         return replace(self, camera=ORBIT_CAMERA, camera_model=model)
@@ -283,6 +316,11 @@ class SceneDescription:
         if height is None:
             return settings.PHOTOGRAPHED_FROM if self.object.metres is None else TRIPOD / self.metres
         return height / self.metres
+
+    @property
+    def on_table(self) -> bool:
+        """Whether the object stands on a table, as it does in bundled rooms."""
+        return self.number("ground.size") > 0.0 and self.photograph is None and not paved(self)
 
     @property
     def ground_color(self) -> tuple[float, ...]:

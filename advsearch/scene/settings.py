@@ -144,6 +144,14 @@ CAMERA = (
         (0.8, 1.5),
         log=True,
     ),
+    _camera(
+        "height",
+        "object sizes",
+        -1e4,
+        1e5,
+        "as the elevation says",
+        "Height of the lens above the ground, in place of `elevation`; in metres where the object's size is known.",
+    ),
     _camera("fov", "degrees", 1.0, 170.0, 35.0, "Field of view along the larger side of the picture."),
     Parameter(
         "exposure", (), "stops", -10.0, 10.0, 0.0, "Brightness over the metered exposure.", estimators=("image",)
@@ -251,6 +259,8 @@ def resolve(given: Given) -> dict[str, float | None]:
         UnknownNameError: a name is not a setting.
         InputError: a value is not a finite number inside its range.
     """
+    if "camera.elevation" in given and "camera.height" in given:
+        raise InputError("`set` camera.elevation and camera.height say the same thing; leave one of them out")
     values = {name: None if isinstance(one.default, str) else one.default for name, one in SETTINGS.items()}
     return {**values, **{name: _checked(name, value) for name, value in given.items()}}
 

@@ -14,7 +14,7 @@ from advsearch.scene.assets import ObjectAsset
 
 UNITS = {"mm": 0.001, "cm": 0.01, "m": 1.0, "in": 0.0254}
 """Metres of the units that a mesh may be in."""
-IN_METRES = ("camera.distance", "camera.focus", "ground.height", "ground.radius")
+IN_METRES = ("camera.distance", "camera.height", "camera.focus", "ground.height", "ground.radius")
 """What is in metres, and in object sizes where the object's size is not known; paths of files are so too."""
 TRIPOD = 1.6
 """Metres above the floor from which photographed environments are taken, where nobody says it."""
@@ -34,6 +34,15 @@ USUAL = {
 }  # fmt: skip
 """Metres that the longest side of a thing lies between, by the word for it in the name of a file: wide, to tell one
 unit from another."""
+
+ROAD_VEHICLES = frozenset("bicycle bike bus car lorry motorcycle pickup sedan suv tractor truck van vehicle".split())
+"""Words for what is seen from the height of other road users, in the name or the label of an object."""
+
+
+def on_roads(asset: ObjectAsset) -> bool:
+    """Tell whether an object is a vehicle of the road whose size is known."""
+    words = re.split(r"[^a-z]+", f"{asset.name} {asset.label or ''}".lower())
+    return asset.metres is not None and not ROAD_VEHICLES.isdisjoint(words)
 
 
 def sized(asset: ObjectAsset, size: float | None, unit: str | None) -> ObjectAsset:

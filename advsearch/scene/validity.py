@@ -23,7 +23,7 @@ import numpy as np
 
 from advsearch.scene.assets import Doubles
 from advsearch.scene.geometry import camera_to_world
-from advsearch.scene.grounds import paved
+from advsearch.scene.grounds import enclosed, paved
 from advsearch.scene.places.road import EDGES, EYE, FRONTS, LENGTH, STREET_ENDS
 
 if TYPE_CHECKING:
@@ -98,7 +98,7 @@ def _reach(area: Box | float, azimuth: float) -> float:
 def surroundings_of(scene: SceneDescription) -> Surroundings | None:
     """Return what is known of the place in a scene's environment; None where nothing of it has to fit a ground."""
     lit = scene.environment
-    if lit is None or scene.backdrop:
+    if lit is None or scene.backdrop or enclosed(scene):  # what encloses the object is geometry, true from everywhere
         return None
     laid: Box | float = (-LENGTH / 2.0, LENGTH / 2.0, *EDGES) if paved(scene) else math.inf
     if lit.ground is not None and scene.bundled_environment is not None and paved(scene):

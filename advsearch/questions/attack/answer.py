@@ -144,9 +144,9 @@ def failures_part(known: DifferentFailures, *, tried: bool = False) -> AnswerPar
         "failures": range_text,
         "most often answered": answered_text,
         "holds in fresh renders": _held,
-        "objective": lambda one: number_text(one.objective),
+        "objective": lambda failure: number_text(failure.objective),
     }
-    return AnswerPart.table((one for one in known.listed if not tried or one.verified is not None), columns)
+    return AnswerPart.table((failure for failure in known.listed if not tried or failure.verified is not None), columns)
 
 
 def range_text(one: DifferentFailure) -> str:
@@ -154,25 +154,25 @@ def range_text(one: DifferentFailure) -> str:
     return ", ".join(f"{name} {_ends(one, name)}" for name in one.ranges) or "anywhere"
 
 
-def _ends(one: DifferentFailure, name: str) -> str:
-    ends = one.ranges[name]
+def _ends(failure: DifferentFailure, name: str) -> str:
+    ends = failure.ranges[name]
     if isinstance(ends, str):
         return ends
-    value = one.configuration.get(name)
+    value = failure.configuration.get(name)
     unit = "" if value is None or value.unit in ("", "1") else f" {value.unit}"
     return f"{number_text(ends[0])} to {number_text(ends[1])}{unit}"
 
 
-def answered_text(one: DifferentFailure) -> str:
+def answered_text(failure: DifferentFailure) -> str:
     """Return the most frequent wrong answer of its trials; empty where there is none."""
-    return next(iter(one.verified.labels), "") if one.verified else ""
+    return next(iter(failure.verified.labels), "") if failure.verified else ""
 
 
-def _held(one: DifferentFailure) -> str:
-    if one.verified is None:
+def _held(failure: DifferentFailure) -> str:
+    if failure.verified is None:
         return "not tried"
-    rated = f"{one.verified.successes} of {count(one.verified.trials, 'render')}"
-    return f"yes, {rated}" if one.holds else f"no, {rated}"
+    rated = f"{failure.verified.successes} of {count(failure.verified.trials, 'render')}"
+    return f"yes, {rated}" if failure.holds else f"no, {rated}"
 
 
 def _claims_of_attack(result: AttackSummary) -> Iterator[Claim]:
@@ -200,10 +200,10 @@ CURVE_NOTE = (
 
 def _shown_curve(result: CurveResult) -> ShownAnswer:
     by_epsilon: Mapping[str, Column] = {
-        "epsilon": lambda one: plain_epsilon(one.epsilon) or "own",
+        "epsilon": lambda point: plain_epsilon(point.epsilon) or "own",
         "robust": "{0.robust}/{0.objects}",
-        "accuracy": lambda one: percent(one.accuracy),
-        "95 % interval": lambda one: interval_text(one.interval),
+        "accuracy": lambda point: percent(point.accuracy),
+        "95 % interval": lambda point: interval_text(point.interval),
         "wrong already": "{0.already_wrong}",
     }
     by_object: Mapping[str, Column] = {
@@ -215,15 +215,15 @@ def _shown_curve(result: CurveResult) -> ShownAnswer:
         "margin": lambda row: "" if row.margin is None else f"{row.margin:.2f}",
     }
     points = _points(result)
-    told = "; ".join(f"{one.robust} of {one.objects} at {one.epsilon:g}" for one in points)
+    listed = "; ".join(f"{point.robust} of {point.objects} at {point.epsilon:g}" for point in points)
     chart = AnswerPart(
         "Robust accuracy",
-        [f"Over epsilon with 95 % intervals: {told}."],
+        [f"Over epsilon with 95 % intervals: {listed}."],
         draw=lambda axes: _draw_curve(result, axes),
         size=(5.6, 3.6),
         only="page" if len(points) > 1 else "notebook",
     )
-    known = [one for one in result.curve if one.accuracy is not None]
+    known = [point for point in result.curve if point.accuracy is not None]
     curve = AnswerPart.table(known, by_epsilon, title="" if len(points) > 1 else chart.title, note=CURVE_NOTE)
     runs = [row.run for row in result.table]
     objects = AnswerPart.table(result.table, by_object, title="The objects, at the last epsilon tried", parts=runs)
@@ -233,10 +233,10 @@ def _shown_curve(result: CurveResult) -> ShownAnswer:
 
 
 def _said_of_curve(result: CurveResult) -> str:
-    known = [one for one in result.curve if one.accuracy is not None]
+    known = [point for point in result.curve if point.accuracy is not None]
     if not known:
         return "No object was attacked to the end."
-    said = [f"{one.robust} of {one.objects}" + _at(one.epsilon) for one in (known[:1] + known[1:][-1:])]
+    said = [f"{point.robust} of {point.objects}" + _at(point.epsilon) for point in (known[:1] + known[1:][-1:])]
     return f"Still recognised: {' and '.join(said)}." if len(result.objects) > 1 else _of_one(result)
 
 
@@ -262,8 +262,8 @@ def plain_epsilon(value: EpsilonBudget) -> str:
 
 def _draw_curve(answer: CurveResult, axes: Any) -> None:
     points = _points(answer)
-    at, accuracy = [one.epsilon for one in points], [one.accuracy for one in points]
-    low, high = ([one.interval[end] for one in points] for end in (0, 1))
+    at, accuracy = [point.epsilon for point in points], [point.accuracy for point in points]
+    low, high = ([point.interval[end] for point in points] for end in (0, 1))
     axes.fill_between(at, low, high, color=BLUE, alpha=0.15, linewidth=0, label="95 % interval")
     axes.plot(at, accuracy, color=BLUE, marker="o", label="robust accuracy")
     axes.set(xlabel="epsilon", ylabel="robust accuracy", ylim=(-0.02, 1.02))
@@ -273,12 +273,14 @@ def _draw_curve(answer: CurveResult, axes: Any) -> None:
 
 
 def _points(answer: CurveResult) -> list[CurvePoint]:
-    return [one for one in answer.curve if one.epsilon is not None and one.accuracy is not None]
+    return [point for point in answer.curve if point.epsilon is not None and point.accuracy is not None]
 
 
 def _claims_of_curve(result: CurveResult) -> Iterator[Claim]:
     each = [row.renders for row in result.table if row.renders]
-    total = {kind: sum(one.get(kind, 0) for one in each) for kind in {kind for one in each for kind in one}}
+    total = {
+        kind: sum(renders.get(kind, 0) for renders in each) for kind in {kind for renders in each for kind in renders}
+    }
     searched = searches_text(total, result.policy, bool(total.get("baseline")))
     spent = f"Searched were, of all objects and epsilons together, {searched}. "
     for point in result.curve:
@@ -300,10 +302,10 @@ def _claims_of_curve(result: CurveResult) -> Iterator[Claim]:
 
 def _shown_matrix(result: MatrixResult) -> ShownAnswer:
     """The matrix, with a row for the clean scene; the stronger a cell's colour, the more successes."""
-    heads = ["attacked on", "ending", *(f"tested on {short_name(one.model)}" for one in result.tested)]
-    clean = [one.clean for one in result.tested]
-    counts = [f"right {one.correct}/{one.trials}{no_numbers(one.not_a_number)}" for one in clean]
-    right = [f"{text}, {interval_text(one.interval)}" for text, one in zip(counts, clean, strict=True)]
+    heads = ["attacked on", "ending", *(f"tested on {short_name(tried.model)}" for tried in result.tested)]
+    clean = [tried.clean for tried in result.tested]
+    counts = [f"right {control.correct}/{control.trials}{no_numbers(control.not_a_number)}" for control in clean]
+    right = [f"{text}, {interval_text(control.interval)}" for text, control in zip(counts, clean, strict=True)]
     rows = [["clean scene", "", *right]] if clean else []
     before = len(rows)
     rows += [[short_name(row.attacked), row.ending, *map(_cell, row.tested)] for row in result.table]
@@ -324,7 +326,7 @@ def _shown_matrix(result: MatrixResult) -> ShownAnswer:
     size = (2.6 + 1.3 * len(result.models), 1.8 + 0.5 * tried)
     figure = AnswerPart(draw=lambda axes: _draw_matrix(result, axes), size=size, only="notebook")
     facts = {
-        "models": ", ".join(f"{one.model} ({' x '.join(map(str, one.input_size))})" for one in result.tested),
+        "models": ", ".join(f"{tried.model} ({' x '.join(map(str, tried.input_size))})" for tried in result.tested),
         "ensemble": result.ensemble or "",
         "policy": result.policy,
     }
@@ -338,11 +340,11 @@ def _said_of_matrix(result: MatrixResult) -> str:
     if result.ensemble is not None:
         held = sum(cell.ending == "found" for _, cell in pairs)
         return f"One answer to all models together misleads {held} of {len(pairs)}."
-    own = [cell for row, cell in pairs if cell.model == row.attacked]
+    at_home = [cell for row, cell in pairs if cell.model == row.attacked]
     others = [cell for row, cell in pairs if cell.model != row.attacked]
-    held, passed = (sum(cell.ending == "found" for cell in cells) for cells in (own, others))
+    held, passed = (sum(cell.ending == "found" for cell in cells) for cells in (at_home, others))
     return (
-        f"{held} of {len(own)} answers hold on the model that they were searched on; "
+        f"{held} of {len(at_home)} answers hold on the model that they were searched on; "
         f"{passed} of {len(others)} on another one."
     )
 
@@ -364,7 +366,7 @@ def _draw_matrix(answer: MatrixResult, axes: Any) -> None:
             colour = "white" if rated.rate > 0.6 else "black"
             text = f"{rated.successes}/{rated.trials}"
             axes.text(across, up, text, ha="center", va="center", color=colour)
-    names = [short_name(one.model) for one in answer.tested]
+    names = [short_name(tried.model) for tried in answer.tested]
     axes.set_xticks(range(len(names)), names, rotation=20 if max(map(len, names)) > 12 else 0)
     axes.set_yticks(range(len(rows)), [short_name(row.attacked) for row in rows])
     axes.set(xlabel="tested on", ylabel="attacked on")
@@ -375,6 +377,6 @@ def _claims_of_matrix(result: MatrixResult) -> Iterator[Claim]:
     for row in result.table:
         for cell in row.tested:
             name = f"searched on {row.attacked}, tried on {cell.model}"
-            own = cell.model == row.attacked
-            spent = searches_text(row.renders, result.policy, False) if own else None
+            at_home = cell.model == row.attacked
+            spent = searches_text(row.renders, result.policy, False) if at_home else None
             yield case_claim(name, cell.ending, cell.verified, spent)

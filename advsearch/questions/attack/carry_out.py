@@ -108,7 +108,7 @@ def attack(
     """
     options = {name: value for name, value in settings.items() if value is not None}
     task = make_task(task) if callable(task) else task
-    loaded_already = not all(isinstance(one, (str, Path)) for one in (scene, *several(model)))
+    loaded_already = not all(isinstance(network, (str, Path)) for network in (scene, *several(model)))
     if loaded_already or callable(objective) or only_here(controls) or only_here(over) or isinstance(task, OwnTask):
         check_not_spread(options)
     if not isinstance(policy, (str, Mapping, Policy)) or not policy:
@@ -129,7 +129,7 @@ def attack(
     }
     config = AttackConfig(**{**described, **options, "run": None if run is None else str(run)})
     losses.check_aim(objective, targeted=config.target is not None)
-    parts = [f"the model {model_name(one)}" for one in several(model) if exists_here(one)]
+    parts = [f"the model {model_name(network)}" for network in several(model) if exists_here(network)]
     parts += ["the scene"] if scene.only_here else []
     parts += [f"the task {task.name}"] if isinstance(task, Task) and not is_named(task, make_task) else []
     parts += [f"the objective {config.objective}"] if callable(objective) else []
@@ -249,9 +249,9 @@ def _carry_out(job: AttackParts, progress: Progress, resumed: str | Path | None 
                 )
             findings = Attack(journal, job.config, policy, stages, clean=job.clean).carry_out()
         named = job.objective if isinstance(job.objective, str) else job.config.objective
-        found = summarise(job.config, named, findings, journal, stages, warnings)
+        result = summarise(job.config, named, findings, journal, stages, warnings)
         parts = replace(job, clean=CleanMatrix())  # without the matrix of light transport, which may be large
-        return replace(found, parts=lambda: parts)
+        return replace(result, parts=lambda: parts)
 
 
 def attack_answers(settings: JsonObject) -> Call:

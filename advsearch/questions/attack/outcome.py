@@ -157,7 +157,7 @@ def _summary(
         clean=results.CleanAnswer(
             **_answer(clean),
             correct=clean.judgement.right,
-            moved=[MovedValue.of(one) for one in problem.space.moved],
+            moved=[MovedValue.of(value) for value in problem.space.moved],
             control=control_group(findings.clean, findings.spp) if findings.clean else None,
         ),
         adversarial=None if search is None else results.PicturedAnswer(**_answer(adversarial)),
@@ -208,7 +208,7 @@ def _summary(
 
 def _objective_over(trials: Sequence[Judgement]) -> results.ObjectiveValues | None:
     """The objective over trials; None where it was not asked for, as in those of an older run."""
-    values = [one.objective for one in trials if one.objective is not None]
+    values = [trial.objective for trial in trials if trial.objective is not None]
     if not values:
         return None
     spread = statistics.pstdev(values) if all(map(math.isfinite, values)) else math.nan
@@ -225,7 +225,7 @@ def _printability(problem: Problem, findings: Findings) -> results.Printability:
 
     verified, other, unprinted = findings.verification, findings.unprinted_verification, findings.unprinted
     if verified is not None and other is not None and unprinted is not None:
-        ours, theirs = (verified_rate(one) for one in (verified, other))
+        ours, theirs = (verified_rate(checked) for checked in (verified, other))
         cost = results.PrintCost(
             steps=len(unprinted.history),
             margin_with=ours.margin,
@@ -286,13 +286,13 @@ def _conditions(problem: Problem) -> dict[str, VariedValue]:
             moved = start.clone()
             moved[group.begin] = share
             values.append(problem.space.describe(moved).get(group.name))
-        told = [one["value"] for one in values if one is not None]
-        unit = next((str(one["unit"]) for one in values if one is not None), "")
-        numbers = [float(one) for one in told if isinstance(one, (int, float))]
+        listed = [described["value"] for described in values if described is not None]
+        unit = next((str(described["unit"]) for described in values if described is not None), "")
+        numbers = [float(value) for value in listed if isinstance(value, (int, float))]
         if numbers and not block.options:
             found[group.name] = VariedValue(unit=unit, low=min(numbers), high=max(numbers))
-        elif told:
-            found[group.name] = VariedValue(unit=unit, names=[number_text(one) for one in dict.fromkeys(told)])
+        elif listed:
+            found[group.name] = VariedValue(unit=unit, names=[number_text(value) for value in dict.fromkeys(listed)])
     return found
 
 
@@ -379,7 +379,7 @@ def _remarks(findings: Findings, problem: Problem, journal: Journal) -> list[str
                 f"{OVER_LADDER[-1]}, and {MOST_TIMES} times the samples of the searches; `verify_spp` asks for more."
             )
         remarks.append(told)
-    searches = [one.non_finite_elements for one in (findings.search, findings.baseline) if one is not None]
+    searches = [search.non_finite_elements for search in (findings.search, findings.baseline) if search is not None]
     if not_finite := max(problem.renderer.non_finite, sum(searches)):  # what predicts pictures has no such count
         remarks.append(f"{not_finite} values of pictures or gradients were not finite and were set to 0.")
     return [*remarks, *lost_remarks(journal.lost), *journal.machines.remarks]
@@ -404,7 +404,7 @@ def described_failures(problem: Problem, findings: Findings) -> results.Differen
         places=known.places,
         share=None if known.share is None else results.FailingShare.of(known.share),
         tried=len(findings.failures),
-        held=sum(one.ending is Ending.FOUND for one in findings.failures),
+        held=sum(checked.ending is Ending.FOUND for checked in findings.failures),
         listed=listed,
     )
 

@@ -114,15 +114,15 @@ def controls_given(
     budget."""
     check_run_settings(config)
     without_budget = config.model_copy(update={"epsilon": None})
-    found = given_to(config, searched)
-    for one in found:
-        likely = [name for name, spec in getattr(one, "specs", {}).items() if by_distribution(spec)]
+    searched_controls = given_to(config, searched)
+    for control in searched_controls:
+        likely = [name for name, spec in getattr(control, "specs", {}).items() if by_distribution(spec)]
         if likely:
             raise InputError(
-                f"`controls` {one.name}.{likely[0]}: expected values to search, which are all as good, got how likely "
-                "each is; give a range, or put it into `over`, under which it varies by chance"
+                f"`controls` {control.name}.{likely[0]}: expected values to search, which are all as good, got how "
+                "likely each is; give a range, or put it into `over`, under which it varies by chance"
             )
-    return found, given_to(without_budget, drawn)
+    return searched_controls, given_to(without_budget, drawn)
 
 
 def task_and_objective(
@@ -278,7 +278,7 @@ def executor_for(config: SceneConfig, function: str, progress: Progress) -> Abst
 
 def with_derivatives(policy: Policy[Any], config: AttackConfig) -> Policy[Any]:
     """Refuse settings of derivatives beside a policy that takes none; return the policy."""
-    given = "estimators" if config.estimators else "measure" if config.measure == "full" else None
-    if given and not policy.uses_gradient:
-        raise InputError(f"{given}: policy {policy.name} takes no derivatives; leave one of the two out")
+    asked = "estimators" if config.estimators else "measure" if config.measure == "full" else None
+    if asked and not policy.uses_gradient:
+        raise InputError(f"{asked}: policy {policy.name} takes no derivatives; leave one of the two out")
     return policy

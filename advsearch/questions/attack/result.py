@@ -153,7 +153,7 @@ class AttackResult:
             raise InputError(f"settings: the answer says what {twice[0]} is; leave it out")
         seen = seen.with_settings(settings) if settings else seen
         seen = replace(seen, description=seen.description.seen_by(camera)) if camera else seen
-        own = pictures_of(config)
+        as_before = pictures_of(config)
         return render(
             seen,
             parts.loaded[0] if model is None else model,
@@ -161,7 +161,7 @@ class AttackResult:
             label=config.label,
             controls=parts.controls,
             at=self.u,
-            **{**own, **options},
+            **{**as_before, **options},
         )
 
     def __getstate__(self) -> dict[str, Any]:
@@ -356,10 +356,10 @@ Frames = list[npt.NDArray[np.float32]]
 def answer_along(problem: Problem, u: Tensor | None, spp: int, run: RunDirectory | None) -> AnswerAlongDrive | None:
     """Look at an answer, and at the clean scene, at evenly spaced times of the path that varies by chance; None where
     none does. What varies beside it is as the scene comes."""
-    found = _path_of(problem)
-    if found is None:
+    along = _path_of(problem)
+    if along is None:
         return None
-    path, place = found
+    path, place = along
     start = problem.whole(problem.domain.start)
     times = start.repeat(FRAMES, 1)
     times[:, place] = torch.linspace(0.0, 1.0, FRAMES)

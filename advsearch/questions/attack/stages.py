@@ -196,7 +196,7 @@ class Attack:
     def _check_look(self, start: Tensor) -> None:
         """Note what was seen, or refuse to go on with a model or an objective that says something else of the same
         pictures than it did. One that says something else each time can't be told by it."""
-        now = [_values(one) for one in self.findings.first_look]
+        now = [_values(trial) for trial in self.findings.first_look]
         before = self.journal.note(LOOK)
         if before is None:
             self.journal.set_note(LOOK, now)
@@ -222,19 +222,19 @@ class Attack:
         clean configuration, as on the way to it.
         """
         findings, problem = self.findings, self.problem
-        found, baseline, unprinted = findings.search, findings.baseline, findings.unprinted
-        if found is None:
+        answered, baseline, unprinted = findings.search, findings.baseline, findings.unprinted
+        if answered is None:
             raise RuntimeError("nothing was searched, so there is nothing to verify")
-        answer = problem.domain.project(found.best_u)
+        answer = problem.domain.project(answered.best_u)
         if not self.config.smallest or findings.sample_count is None:
-            searched = [one for one in (found, baseline, unprinted) if one is not None]
-            pictures = sum((one.renders + one.gradients) * problem.draws for one in searched)
+            searched = [result for result in (answered, baseline, unprinted) if result is not None]
+            pictures = sum((result.renders + result.gradients) * problem.draws for result in searched)
             candidates = {"adversarial": answer, "clean": problem.domain.start}
             self._verifier.choose_spp(candidates, searched=pictures * problem.spp)
         groups = 1 + (baseline is not None) + (unprinted is not None) + (not self._verifier.clean_tried)
         self._verifier.begin("checking the answer with fresh renders", groups * self._verifier.count, at_most=True)
         self._verifier.try_clean()
-        findings.verification = self._verifier.verified("verification", found)
+        findings.verification = self._verifier.verified("verification", answered)
         if findings.verification.ending is Ending.ALREADY_WRONG:
             findings.smallest = None  # seen with other samples than before: no change at all flips the answer
         if unprinted is not None:
@@ -244,11 +244,11 @@ class Attack:
             findings.baseline_verification = self._verifier.verified(
                 "baseline verification", baseline, curtailed=decided
             )
-            self._take_the_worse(found, baseline)
+            self._take_the_worse(answered, baseline)
         if not self.config.smallest:
-            check_failures(self._verifier, found)
+            check_failures(self._verifier, answered)
 
-    def _take_the_worse(self, found: SearchResult, baseline: SearchResult) -> None:
+    def _take_the_worse(self, result: SearchResult, baseline: SearchResult) -> None:
         """Let the random search's answer be the run's if it is found and the worse one for the model, and remember
         that. It is chosen by its trials, so these are no evidence: it has to be the worse one in fresh ones, too."""
         findings = self.findings
@@ -262,7 +262,7 @@ class Attack:
             return
         findings.beaten, findings.verification = own, other
         findings.search = replace(
-            found,
+            result,
             best_u=baseline.best_u,
             best_objective=baseline.best_objective,
             claimed_objective=baseline.claimed_objective,
@@ -453,8 +453,8 @@ def find_smallest(attack: Attack, verifier: Verifier) -> None:
     answer = results[0].best_u if bracket.u is None else bracket.u
     ending = results[0].ending if bracket.u is None else Ending.FOUND
     findings.smallest = bracket
-    own = results[0 if bracket.u is None else bracket.found_by]
-    findings.search = replace(own, best_u=answer, ending=ending, renders=renders, gradients=gradients)
+    winner = results[0 if bracket.u is None else bracket.found_by]
+    findings.search = replace(winner, best_u=answer, ending=ending, renders=renders, gradients=gradients)
 
 
 def _values(trial: Judgement) -> list[float | None]:
@@ -473,7 +473,7 @@ TRIED = 8
 """Different failures that are tried, at most: the first of the list."""
 
 
-def check_failures(verifier: Verifier, found: SearchResult) -> None:
+def check_failures(verifier: Verifier, result: SearchResult) -> None:
     """Verify the first of the different failures that a search answers with, each for itself.
 
     Each goes through the trials of the answer, with the seeds that the control group had, up to the first that decides
@@ -481,12 +481,12 @@ def check_failures(verifier: Verifier, found: SearchResult) -> None:
     trials, and nothing is tried here.
     """
     problem, findings = verifier.problem, verifier.findings
-    known, rule = found.failures, problem.rule
+    known, rule = result.failures, problem.rule
     if known is None or not known.listed or rule.conditional or rule.already_wrong(count_right(findings.clean, 1)):
         return
     tried = known.listed[:TRIED]
     verifier.begin("checking different failures with fresh renders", len(tried) * verifier.count, at_most=True)
     findings.failures = tuple(
-        verifier.verified(f"failure {number}", replace(found, best_u=failure.u), curtailed=True)
+        verifier.verified(f"failure {number}", replace(result, best_u=failure.u), curtailed=True)
         for number, failure in enumerate(tried)
     )

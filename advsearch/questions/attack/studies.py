@@ -115,10 +115,10 @@ def chains_of(config: AttackConfig) -> list[Chain]:
     if not config.is_matrix:
         return _objects_of(config)
     names = different(config.models, "model")
-    own = [(ALL, {})] if config.ensemble else [(name, {"model": name}) for name in names]
+    attacked = [(ALL, {})] if config.ensemble else [(name, {"model": name}) for name in names]
     return [
         [StudyAttack(AttackConfig.of(config, **more), f"{place:02d}-" + default_name(name, []), name)]
-        for place, (name, more) in enumerate(own)
+        for place, (name, more) in enumerate(attacked)
     ]
 
 
@@ -127,9 +127,11 @@ def _controls_of(config: AttackConfig) -> list[Chain]:
     attacks = []
     for place, name in enumerate(different(config.objects, "object")):
         for number, (control, settings) in enumerate(config.controls.items()):
-            own = settings_alone(config, control, settings)
-            one = AttackConfig.of(config, object=name, controls={control: settings}, **own)
-            attacks.append([StudyAttack(one, f"{place:02d}-{number:02d}-" + default_name(name, [control]), control)])
+            settings_of_it = settings_alone(config, control, settings)
+            changed = AttackConfig.of(config, object=name, controls={control: settings}, **settings_of_it)
+            attacks.append(
+                [StudyAttack(changed, f"{place:02d}-{number:02d}-" + default_name(name, [control]), control)]
+            )
     return attacks
 
 
@@ -141,8 +143,8 @@ def _objects_of(config: AttackConfig) -> list[Chain]:
         epsilons: list[float | None] = [*sorted(config.epsilons)] or [None]
         for epsilon in epsilons:
             words = [] if epsilon is None else [f"epsilon {epsilon:g}".replace(".", "_")]
-            one = AttackConfig.of(config, object=name, epsilon=config.epsilon if epsilon is None else epsilon)
-            chains[-1].append(StudyAttack(one, f"{place:02d}-" + default_name(name, words), name, epsilon))
+            changed = AttackConfig.of(config, object=name, epsilon=config.epsilon if epsilon is None else epsilon)
+            chains[-1].append(StudyAttack(changed, f"{place:02d}-" + default_name(name, words), name, epsilon))
     return chains
 
 
@@ -157,10 +159,10 @@ def attacks_of(settings: JsonObject) -> Call:
         with tempfile.TemporaryDirectory(prefix="advsearch-part-") as folder:
             for part in chains[numbers[0]]:
                 path = Path(folder) / part.name
-                own = part.config.model_copy(update={"run": str(path), "overwrite": True})
-                ending = attack_once(own, clean=clean).summary.ending
-                kept = (one for one in path.rglob("*") if one.is_file() and one.name != files.NAME)
-                read = {one.relative_to(path).as_posix(): one.read_bytes() for one in kept}
+                config_there = part.config.model_copy(update={"run": str(path), "overwrite": True})
+                ending = attack_once(config_there, clean=clean).summary.ending
+                kept = (file for file in path.rglob("*") if file.is_file() and file.name != files.NAME)
+                read = {file.relative_to(path).as_posix(): file.read_bytes() for file in kept}
                 found.append((part.name, str(path), read))
                 if ending in SETTLED:
                     break
@@ -211,9 +213,9 @@ def _label_for_all(config: AttackConfig) -> list[str]:
     if config.label is None or len(config.objects) < 2:
         return []
     bundled = list_objects()
-    own = {name: load_object(name).label if name in bundled else None for name in config.objects}
+    labels = {name: load_object(name).label if name in bundled else None for name in config.objects}
     models, _ = load_models([config.model], make_task(config.task), config)
-    return one_label_for_several(models, config.label, own)
+    return one_label_for_several(models, config.label, labels)
 
 
 class StudyRun:
@@ -238,12 +240,12 @@ class StudyRun:
         """Whether there was an interrupt."""
         return self.asked.ending == INTERRUPTED
 
-    def attack(self, one: StudyAttack, clean: CleanMatrix | None = None) -> AttackSummary | None:
+    def attack(self, study: StudyAttack, clean: CleanMatrix | None = None) -> AttackSummary | None:
         """Return the summary of one attack, or None if there was an interrupt; `clean` as for `attack_once`."""
         if self.interrupted:
             return None
-        config, path = one.config, self.run.path / PARTS / one.name
-        self.names.append(one.name)
+        config, path = study.config, self.run.path / PARTS / study.name
+        self.names.append(study.name)
         budget = f", epsilon {config.epsilon:.3g}" if isinstance(config.epsilon, float) else ""
         what = f"{config.object} against {config.model}, {' and '.join(config.controls)}{budget}"
         self.progress.message(f"attack {len(self.names)} of at most {sum(map(len, self.chains))}: {what}")
@@ -255,8 +257,8 @@ class StudyRun:
                 else attack_of(path)
             )
         else:
-            own = config.model_copy(update={"run": str(path), "overwrite": True})
-            summary = attack_once(own, progress=self.progress, clean=clean).summary
+            config_there = config.model_copy(update={"run": str(path), "overwrite": True})
+            summary = attack_once(config_there, progress=self.progress, clean=clean).summary
         self.warnings += [text for text in summary.warnings if text not in self.warnings]
         if summary.ending == INTERRUPTED:
             self.asked.ending = INTERRUPTED
@@ -332,7 +334,9 @@ def _accuracy(rows: Sequence[ObjectRow], epsilon: float | None) -> CurvePoint:
     known = [row for row in rows if _known(row, epsilon)]
     wrong = sum(row.ending == "already wrong" for row in known)
     flipped = [row.flips_at for row in known if row.ending == "found"]
-    found = sum(epsilon is None or (isinstance(one, float) and one <= epsilon) for one in flipped)
+    found = sum(
+        epsilon is None or (isinstance(epsilon_there, float) and epsilon_there <= epsilon) for epsilon_there in flipped
+    )
     robust = len(known) - wrong - found
     return CurvePoint(
         epsilon=epsilon,
@@ -384,10 +388,10 @@ def matrix(asked: Asked[AttackConfig]) -> MatrixResult:
                 each = trials * len(names)
                 hint = f"{each} answers; `trials` or `verify_spp` shorten it"
                 study.progress.stage("trying the clean scene on every model", each, hint=hint)
-                models = [_model(one, retrials) for one in conditions]
+                models = [_model(condition, retrials) for condition in conditions]
                 for name, u in answers.items():
                     study.progress.stage(f"trying the answer to {name} on every model", each, hint=hint)
-                    checked = [(one.name, retrials.answer(name, u, one)) for one in conditions]
+                    checked = [(condition.name, retrials.answer(name, u, condition)) for condition in conditions]
                     cells[name] = [
                         MatrixCell(model=model, ending=one.ending.value, verified=verified_rate(one))
                         for model, one in checked
@@ -425,13 +429,13 @@ def _answer(summary: AttackSummary) -> Tensor | None:
     return torch.from_numpy(read_answer(Path(summary.run)))
 
 
-def _model(one: RetrialCondition, retrials: Retrials) -> MatrixModel:
+def _model(condition: RetrialCondition, retrials: Retrials) -> MatrixModel:
     return MatrixModel(
-        model=one.name,
-        labels=list(one.problem.task.truth_names(one.problem.truth())),
-        input_size=_size(one.problem),
-        spp=one.spp,
-        clean=control_group(retrials.clean(one), one.spp),
+        model=condition.name,
+        labels=list(condition.problem.task.truth_names(condition.problem.truth())),
+        input_size=_size(condition.problem),
+        spp=condition.spp,
+        clean=control_group(retrials.clean(condition), condition.spp),
     )
 
 

@@ -179,13 +179,13 @@ def _within(name: str, epsilon: Any, norm: Any) -> str:
     return f"{name} within {number_text(epsilon)}" + (f" ({norm})" if norm else "")
 
 
-def _epsilons(told: Mapping[str, float] | None) -> str:
+def _epsilons(by_control: Mapping[str, float] | None) -> str:
     """``0.0123`` of one control; ``texture 0.01, geometry 0.002`` of several."""
-    if not told:
+    if not by_control:
         return ""
-    if len(told) == 1:
-        return f"{next(iter(told.values())):.3g}"
-    return ", ".join(f"{name} {value:.3g}" for name, value in told.items())
+    if len(by_control) == 1:
+        return f"{next(iter(by_control.values())):.3g}"
+    return ", ".join(f"{name} {value:.3g}" for name, value in by_control.items())
 
 
 def renders_text(summary: AttackSummary) -> str:
@@ -368,10 +368,10 @@ def _cut(summary: AttackSummary) -> str:
 
 
 def _not_finite(summary: AttackSummary) -> str:
-    found = summary.non_finite
-    if not found.objectives and not found.gradient_elements:
+    numbers = summary.non_finite
+    if not numbers.objectives and not numbers.gradient_elements:
         return ""
-    return f"{count(found.objectives, 'objective')}, {count(found.gradient_elements, 'number')} of gradients"
+    return f"{count(numbers.objectives, 'objective')}, {count(numbers.gradient_elements, 'number')} of gradients"
 
 
 def _printability(summary: AttackSummary) -> str:
