@@ -68,7 +68,9 @@ def things_as_text(things: object) -> str | None:
         raise InputError(
             f"things: expected a text such as 'car@12,3.5', a mapping or a list of these, got {things!r:.80}"
         )
-    parts = [part for one in listed for part in (_thing_as_text(one) if isinstance(one, Mapping) else one).split(";")]
+    parts = [
+        part for one in listed for part in (_thing_as_text(one) if isinstance(one, Mapping) else str(one)).split(";")
+    ]
     named = []
     for part in filter(None, map(str.strip, parts)):
         what, at, rest = part.rpartition("@")

@@ -91,7 +91,7 @@ class EachThing(Task):
         things = {
             name: {"right": one.right, "margin": one.margin, "answer": one.answer.label} for name, one in said.items()
         }
-        kept = said[worst].payload if isinstance(said[worst].payload, dict) else {}
+        kept: Any = said[worst].payload if isinstance(said[worst].payload, dict) else {}
         average = mean([one.margin for one in said.values()])
         payload: Any = {**kept, "worst": worst, "mean_margin": average, "things": things}
         return Judgement.of(score, margin, said[worst].answer, payload)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -44,9 +43,8 @@ def test_rows_have_the_truth_of_each_thing_and_tasks_judge_what_is_asked(judge: 
         "car", model(), grid={"pose.x": [0.0, 0.05]}, judge=judge, trials=0, run=tmp_path / "run",
         **{**ASKED, "task": {"name": "segmentation", "accuracy": 0.4}},
     )  # fmt: skip
-    rows = found.rows()
-    payload = rows["payload"].iloc[0]
-    payload = json.loads(payload) if isinstance(payload, str) else payload
+    rows = list(found.rows())
+    payload: Any = rows[0].payload
     things = payload["things"]
     assert list(things) == ["object", "stop-sign"] and things["stop-sign"]["label"] == "stop sign"
     x0, y0, x1, y1 = things["stop-sign"]["box"]
@@ -55,7 +53,7 @@ def test_rows_have_the_truth_of_each_thing_and_tasks_judge_what_is_asked(judge: 
     if judge == "all":
         assert things["object"]["right"] is things["stop-sign"]["right"] is True
         assert payload["worst"] in things and payload["mean_margin"] < 0.0
-    assert rows["correct"].all()
+    assert all(row.correct for row in rows)
 
 
 def test_names_of_what_is_judged_are_checked_before_anything_is_rendered() -> None:
