@@ -336,7 +336,20 @@ class SceneDescription:
     @property
     def gain(self) -> float:
         """Factor from scene radiance to display-linear values: the metered exposure times `camera.exposure`."""
-        return (metered_gain(self) if self.metered else 1.0) * math.pow(2.0, self.number("camera.exposure"))
+        return self._exposure * math.pow(2.0, self.number("camera.exposure"))
+
+    @property
+    def _exposure(self) -> float:
+        """Saturation is at 1.2 2^EV cd/m2 (Lagarde and de Rousiers 2014, Moving Frostbite to PBR, section 5.1)."""
+        stops = self.values.get("camera.ev")
+        if stops is None:
+            return metered_gain(self) if self.metered else 1.0
+        if self.environment is None or self.environment.candelas is None:
+            raise InputError(
+                "`set` camera.ev: the brightness of this environment has no unit; take one of the avenue, or leave "
+                "camera.ev out, and exposure is metered"
+            )
+        return self.environment.candelas / (1.2 * math.pow(2.0, stops))
 
 
 def describe(

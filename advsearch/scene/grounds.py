@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from advsearch.scene.description import SceneDescription
 
 
+LUMINANCE = (0.2126, 0.7152, 0.0722)
+"""Shares of linear red, green and blue in luminance (Rec. ITU-R BT.709)."""
 SECTORS = 128
 RINGS = 64
 NEAREST, FARTHEST = 0.01, 1000.0
@@ -125,10 +127,24 @@ def on_its_ground(scene: SceneDescription) -> SceneDescription:
     kind = _kind(scene)
     others = tuple(part for part in scene.parts if not (isinstance(part, MeshPart) and part.laid))
     if kind in settings.AVENUES:
-        return replace(scene, parts=(*others, *avenue(kind == settings.WET_AVENUE, scene.metres)))
+        return replace(scene, parts=(*others, *avenue(kind == settings.WET_AVENUE, scene.metres, _lit(scene))))
     if kind in settings.ROADS:
         return replace(scene, parts=(*others, road(kind == settings.WET_ROAD, scene.metres)))
     return scene if len(others) == len(scene.parts) else replace(scene, parts=others)
+
+
+DUSK = 70.0
+"""Illuminance of the open sky at which street lamps are switched on, lux."""
+
+
+def _lit(scene: SceneDescription) -> float | None:
+    """The luminance of a radiance of 1, cd/m2, where it is so dark that lamps shine; None elsewhere."""
+    light = scene.environment
+    if light is None or light.candelas is None:
+        return None
+    arriving = irradiance(torch.from_numpy(light.radiance.copy()))
+    lux = light.candelas * float(arriving @ torch.tensor(LUMINANCE))
+    return light.candelas if lux < DUSK else None
 
 
 def _kind(scene: SceneDescription) -> str | None:

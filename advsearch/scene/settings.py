@@ -156,6 +156,16 @@ CAMERA = (
     Parameter(
         "exposure", (), "stops", -10.0, 10.0, 0.0, "Brightness over the metered exposure.", estimators=("image",)
     ),
+    Parameter(
+        "ev",
+        (),
+        "EV at ISO 100",
+        -10.0,
+        24.0,
+        "metered",
+        "Absolute exposure in place of the metered one, in the avenue: 14 is for sun, 5 for lit streets.",
+        estimators=(),
+    ),
 )
 ENVIRONMENT = (
     Parameter(

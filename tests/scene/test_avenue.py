@@ -7,8 +7,9 @@ import pytest
 import torch
 
 from advsearch.engine.loading import load_scene
+from advsearch.errors import InputError
 from advsearch.scene.description import SceneDescription, describe
-from advsearch.scene.grounds import enclosed, paved
+from advsearch.scene.grounds import LUMINANCE, enclosed, paved
 from advsearch.scene.places.avenue import END, KERB, LAMP_HEIGHT, lamp_places
 from advsearch.scene.places.paint import FRONTS
 from advsearch.scene.places.quads import SHOWN, Frame, Quads
@@ -75,12 +76,35 @@ def test_the_horizon_is_closed_and_the_road_reaches_far() -> None:
 @pytest.mark.slow
 def test_a_gradient_among_houses_is_that_of_differences() -> None:
     scene = load_scene("car", "avenue", settings={"camera.distance": 12.0})
-    renderer = scene.renderer({"texture": {}, "environment": {"exposure": [-1, 1]}}, resolution=16, denoise="none")
-    _, slope = renderer.gradient(torch.mean, renderer.start, 0, 1024)
+    renderer = scene.renderer(["texture"], resolution=16, denoise="none")
+    at = 0.1 + 0.8 * renderer.start  # nothing is clamped
+    _, slope = renderer.gradient(torch.mean, at, 0, 1024)
     for group in renderer.space.groups:
-        step = torch.zeros_like(renderer.start)
+        step = torch.zeros_like(at)
         step[group.coordinates] = 0.05
         with torch.no_grad():
-            high, low = (renderer((renderer.start + way * step).clamp(0, 1), 1, 4096).mean() for way in (1.0, -1.0))
-        # the texture is clamped where it is dark or bright, and the tone curve bends
+            high, low = (renderer(at + way * step, 1, 4096).mean() for way in (1.0, -1.0))
         assert float(slope[group.coordinates].sum()) == pytest.approx(float(high - low) / 0.1, rel=0.1), group.name
+
+
+def test_lamps_shine_at_dusk_with_the_light_that_they_are_said_to_have() -> None:
+    assert describe("car", "avenue").around["street-lamps"].emission is None
+    night = describe("car", "avenue-night")
+    lamps, unit = night.around["street-lamps"], night.environment
+    assert lamps.emission is not None
+    assert unit is not None
+    assert unit.candelas is not None
+    # a level area of A m2 that shines L cd/m2, h above: E = L A / h^2
+    luminance = float(lamps.emission[0, 0] @ np.array(LUMINANCE)) * unit.candelas
+    corners = lamps.mesh.vertices[lamps.mesh.faces[: len(lamps.mesh.faces)]].astype(np.float64) * night.metres
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2
+    assert luminance * area / len(lamp_places()) / 7.5**2 == pytest.approx(15.0, rel=0.02)
+
+
+def test_an_absolute_exposure_shows_night_as_night() -> None:
+    day, night = (describe("car", name, given={"camera.ev": 14.0}) for name in ("avenue", "avenue-night"))
+    assert day.environment is not None
+    assert day.gain == pytest.approx(day.environment.candelas / (1.2 * 2.0**14))  # type: ignore[operator]
+    assert night.gain < 1e-3 * day.gain
+    with pytest.raises(InputError, match=r"camera.ev: the brightness of this environment has no unit"):
+        _ = describe("car", "street", given={"camera.ev": 14.0}).gain

@@ -38,13 +38,22 @@ WALL, PANE, LEAF, IRON = (
 WET_WALL = Material(roughness=0.5, specular=0.4)
 
 
+LIT = {
+    "street-lamps": np.float32((10650.0 * 1.16, 10650.0 * 0.98, 10650.0 * 0.73)),
+    "lit-windows": np.float32((36.0, 23.5, 10.0)),
+    "shops": np.float32((62.0, 48.0, 31.0)),
+}
+"""Luminance by night, cd/m2: a lamp puts 15 lux on the road below it (7.5 m, 0.36 x 0.22 m)."""
+
+
 @lru_cache(maxsize=4)
-def avenue(wet: bool, metres: float) -> tuple[MeshPart, ...]:
+def avenue(wet: bool, metres: float, candelas: float | None = None) -> tuple[MeshPart, ...]:
     """Return the meshes of the street.
 
     Args:
         wet: whether the road is dark and reflects.
         metres: of one object size, the scene's unit of length.
+        candelas: luminance of a radiance of 1, cd/m2, where lamps and windows shine; None where they don't.
     """
     rows, ground = _houses(), road.WET if wet else road.DRY
     grey, white = np.full((2, 2, 3), 0.25, np.float32), np.full((2, 2, 3), 0.9, np.float32)
@@ -59,7 +68,11 @@ def avenue(wet: bool, metres: float) -> tuple[MeshPart, ...]:
         ("street-lamps", _lamps(), white, PANE),
         ("plain", _plain(), _grass(), WALL),
     )
-    return tuple(MeshPart(name, quads.mesh(metres), base, finish, laid=True) for name, quads, base, finish in made)
+    shine = {} if candelas is None else {name: one[None, None] / np.float32(candelas) for name, one in LIT.items()}
+    return tuple(
+        MeshPart(name, quads.mesh(metres), base, finish, emission=shine.get(name), laid=True)
+        for name, quads, base, finish in made
+    )
 
 
 @lru_cache(maxsize=8)
