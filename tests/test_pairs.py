@@ -7,6 +7,7 @@ were made for it alone, and against a scene in which the values that the row nam
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterable
 from typing import Any
 
 import pytest
@@ -59,14 +60,20 @@ FORMS: dict[str, dict[str, Any]] = {
     "mitsuba": {"ground.bsdf.brdf_0.reflectance.value": [0.1, 0.9]},
 }
 FORMS |= {kind: {} for kind in OWN if kind not in FORMS}  # another one varies as it declares itself
-EXCLUSIVE = {frozenset(("sky", "environment")), frozenset(("path", "camera"))}
-"""Pairs that set the same input and are refused."""
+EXCLUSIVE = {frozenset(("sky", "environment")), frozenset(("path", "camera")), frozenset(("geometry", "body"))}
+EXCLUSIVE |= {frozenset(("contents", "body"))}
+"""Pairs that set the same input and are refused; and nobody is a vessel."""
 
 ALL = [(one,) for one in FORMS] + [
     pair for pair in itertools.combinations(FORMS, 2) if frozenset(pair) not in EXCLUSIVE
 ]
 QUICK = ["camera-occlusion", "pose-contents", "material-patch"]
 """Pairs in which one control goes by what the other does, or both meet in one input; the others take minutes."""
+
+
+def suited(kinds: Iterable[str]) -> str:
+    """An object that some controls can change."""
+    return "person" if "body" in kinds else "mug"
 
 
 def pairs(quick: list[str]) -> list[Any]:
@@ -95,15 +102,14 @@ def model() -> advsearch.Model:
 
 def test_every_control_is_here_and_varies() -> None:
     assert set(FORMS) == set(OWN), "FORMS of tests/test_pairs.py names a control that there is not"
-    scene = describe("mug")
     for kind, form in FORMS.items():
-        varied = compose([make_control(kind, form)], scene).start.numel()
+        varied = compose([make_control(kind, form)], describe(suited([kind]))).start.numel()
         assert varied, f"{kind} has no range: give a parameter `search=(low, high)`, or {kind} a form in FORMS"
 
 
 @pytest.mark.parametrize("pair", pairs(QUICK))
 def test_a_row_of_a_sweep_is_true_of_its_own_picture(pair: tuple[str, ...], model: advsearch.Model) -> None:
-    scene = advsearch.load_scene("mug")
+    scene = advsearch.load_scene(suited(pair))
     controls = {kind: FORMS[kind] for kind in pair}
     grid = {} if {"camera", "path"} & set(pair) else GRID
     samples = ROWS // (2 if grid else 1)

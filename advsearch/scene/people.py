@@ -200,7 +200,9 @@ def body_data() -> Mapping[str, np.ndarray]:
 def hats(value: Tensor, at: Tensor) -> Tensor:
     """Return how much of each of some rising places (n,) a number has, by linear interpolation between them; its sum is
     1 from the first place to the last."""
-    share = ((value - at[:-1]) / (at[1:] - at[:-1])).clamp(0.0, 1.0)
+    share = (value - at[:-1]) / (at[1:] - at[:-1])
+    within = (share >= 0.0) & (share < 1.0)  # at a place the derivative is that of one side, not the sum of both
+    share = torch.where(within, share, (share >= 1.0).to(share.dtype))
     one = torch.ones_like(share[:1])
     return torch.cat([one, share]) - torch.cat([share, torch.zeros_like(one)])
 

@@ -24,9 +24,13 @@ NEEDED: dict[str, dict[str, Any]] = {"mitsuba": {"ground.bsdf.brdf_0.reflectance
 """What a control cannot be made without."""
 
 
+SUITS = {"body": "person"}
+"""Objects for controls that a mug does not suit."""
+
+
 def bound(kind: str, object: str = "mug") -> Control:
     """A control with its defaults in a scene, alone."""
-    return make_space([make_control(kind, NEEDED.get(kind))], describe(object)).controls[0]
+    return make_space([make_control(kind, NEEDED.get(kind))], describe(SUITS.get(kind, object))).controls[0]
 
 
 def test_every_module_of_the_folder_is_a_control_or_shared_by_several() -> None:
@@ -123,7 +127,8 @@ def test_a_bound_control_says_its_configuration_in_values_with_units(kind: str) 
 def test_a_control_can_be_made_again_from_its_settings(kind: str) -> None:
     control = make_control(kind, NEEDED.get(kind))
     again = make_control(kind, control.settings())
-    first, second = (make_space([one], describe("mug")).controls[0] for one in (control, again))
+    scene = describe(SUITS.get(kind, "mug"))
+    first, second = (make_space([one], scene).controls[0] for one in (control, again))
     assert torch.equal(first.start, second.start) and first.groups == second.groups
 
 

@@ -82,7 +82,7 @@ def test_coordinates_have_the_names_of_their_mesh(scene: SceneDescription) -> No
 
 def test_every_such_control_reaches_its_mesh_alone(scene: SceneDescription) -> None:
     able = [kind for kind in CONTROLS if CONTROLS[kind].of_a_mesh]
-    assert set(able) == {"pose", "texture", "material", "geometry"}
+    assert set(able) == {"pose", "texture", "material", "geometry", "body"}
     for kind in ("pose", "texture", "material"):
         space = make_space([make_control(f"{kind}:post")], scene)
         assert {name.partition(".")[0] for name in space.inputs(space.start)} == {"post"}, kind
@@ -141,6 +141,6 @@ def test_a_moved_mesh_is_seen_and_differentiated(scene: SceneDescription) -> Non
 
 
 def test_settings_make_the_same_controls_again() -> None:
-    for kind in ("pose", "texture", "material", "geometry"):
+    for kind in ("pose", "texture", "material", "geometry", "body"):
         control = make_control(f"{kind}:post")
         assert make_control(control.name, control.settings()).name == f"{kind}:post"
