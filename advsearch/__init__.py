@@ -18,25 +18,20 @@ from advsearch.rooms import made_question, made_questions
 __version__ = "0.1.0"
 
 _HOMES = {
-    "AttackResult": "advsearch.engine.attack_result",
+    "AttackResult": "advsearch.questions.attack.result",
     "Control": "advsearch.controls.base",
     "Model": "advsearch.models",
     "Policy": "advsearch.attacks",
     "Rendering": "advsearch.api.render",
     "Scene": "advsearch.engine.loading",
-    "SweepResult": "advsearch.engine.sweeps.summary",
+    "SweepResult": "advsearch.questions.sweep.result",
     "Task": "advsearch.tasks",
     "allow_code": "advsearch.registry",
-    "check": "advsearch.questions.check.carry_out",
-    "harden": "advsearch.questions.harden.carry_out",
     "load_model": "advsearch.api.render",
     "load_run": "advsearch.api.render",
     "load_scene": "advsearch.engine.loading",
     "photo_agreement": "advsearch.questions.photographs.carry_out",
-    "precision": "advsearch.questions.precision.carry_out",
-    "recipe": "advsearch.questions.recipe.carry_out",
     "render": "advsearch.api.render",
-    "stability": "advsearch.questions.stability.carry_out",
 }
 """The public names, and the module of each; besides, every question that
 `advsearch.question` makes."""

@@ -6,7 +6,6 @@ from advsearch.api.render import load_model as load_model
 from advsearch.api.render import load_run as load_run
 from advsearch.attacks.evaluation import Policy as Policy
 from advsearch.controls.base import Control as Control
-from advsearch.engine.attack_result import AttackResult as AttackResult
 from advsearch.engine.judging import Metric
 from advsearch.engine.loading import Controls
 from advsearch.engine.loading import Scene as Scene
@@ -14,9 +13,9 @@ from advsearch.engine.loading import load_scene as load_scene
 from advsearch.engine.naming import AnyModel
 from advsearch.engine.rendering import Rendering as Rendering
 from advsearch.engine.rendering import render as render
-from advsearch.engine.sweeps.summary import SweepResult as SweepResult
 from advsearch.models.model import Model as Model
 from advsearch.progress import Watched
+from advsearch.questions.attack.result import AttackResult as AttackResult
 from advsearch.questions.check.answer import CheckResult
 from advsearch.questions.compare.answer import CompareResult
 from advsearch.questions.explain.answer import ExplainResult
@@ -31,6 +30,7 @@ from advsearch.questions.region.answer import RegionResult
 from advsearch.questions.replay.answer import ReplayResult
 from advsearch.questions.stability.answer import StabilityResult
 from advsearch.questions.sweep.carry_out import AnyScene
+from advsearch.questions.sweep.result import SweepResult as SweepResult
 from advsearch.registry import allow_code as allow_code
 from advsearch.tasks import AnyTask
 from advsearch.tasks.base import Task as Task
@@ -63,8 +63,12 @@ def attack(
     progress: Watched = ...,
     environment: Path | Names | None = ...,
     up: Literal['y', 'z'] | None = ...,
+    size: float | None = ...,
+    unit: Literal['mm', 'cm', 'm', 'in'] | None = ...,
     camera: str | Path | None = ...,
     set: Mapping[str, float | str | Sequence[float]] | None = ...,
+    things: str | Path | None = ...,
+    judge: str | Path = ...,
     exposure: float = ...,
     resolution: int | str | tuple[int, int] | None = ...,
     labels: Path | Names | None = ...,
@@ -109,8 +113,12 @@ def check(
     progress: Watched = ...,
     environment: Path | Names | None = ...,
     up: Literal['y', 'z'] | None = ...,
+    size: float | None = ...,
+    unit: Literal['mm', 'cm', 'm', 'in'] | None = ...,
     camera: str | Path | None = ...,
     set: Mapping[str, float | str | Sequence[float]] | None = ...,
+    things: str | Path | None = ...,
+    judge: str | Path = ...,
     exposure: float = ...,
     resolution: int | str | tuple[int, int] | None = ...,
     labels: Path | Names | None = ...,
@@ -144,8 +152,12 @@ def compare(
     object: Path | Names = ...,
     environment: Path | Names | None = ...,
     up: Literal['y', 'z'] | None = ...,
+    size: float | None = ...,
+    unit: Literal['mm', 'cm', 'm', 'in'] | None = ...,
     camera: str | Path | None = ...,
     set: Mapping[str, float | str | Sequence[float]] | None = ...,
+    things: str | Path | None = ...,
+    judge: str | Path = ...,
     exposure: float = ...,
     resolution: int | str | tuple[int, int] | None = ...,
     labels: Path | Names | None = ...,
@@ -194,8 +206,12 @@ def gap(
     progress: Watched = ...,
     environment: Path | Names | None = ...,
     up: Literal['y', 'z'] | None = ...,
+    size: float | None = ...,
+    unit: Literal['mm', 'cm', 'm', 'in'] | None = ...,
     camera: str | Path | None = ...,
     set: Mapping[str, float | str | Sequence[float]] | None = ...,
+    things: str | Path | None = ...,
+    judge: str | Path = ...,
     exposure: float = ...,
     resolution: int | str | tuple[int, int] | None = ...,
     labels: Path | Names | None = ...,
@@ -288,8 +304,12 @@ def precision(
     progress: Watched = ...,
     environment: Path | Names | None = ...,
     up: Literal['y', 'z'] | None = ...,
+    size: float | None = ...,
+    unit: Literal['mm', 'cm', 'm', 'in'] | None = ...,
     camera: str | Path | None = ...,
     set: Mapping[str, float | str | Sequence[float]] | None = ...,
+    things: str | Path | None = ...,
+    judge: str | Path = ...,
     exposure: float = ...,
     resolution: int | str | tuple[int, int] | None = ...,
     labels: Path | Names | None = ...,
@@ -328,6 +348,8 @@ def recipe(
     object: Path | Names | None = ...,
     environment: Path | Names | None = ...,
     up: Literal['y', 'z'] | None = ...,
+    size: float | None = ...,
+    unit: Literal['mm', 'cm', 'm', 'in'] | None = ...,
     resolution: int | str | tuple[int, int] | None = ...,
     model: Path | Names | None = ...,
     labels: Path | Names | None = ...,
@@ -348,8 +370,12 @@ def region(
     progress: Watched = ...,
     environment: Path | Names | None = ...,
     up: Literal['y', 'z'] | None = ...,
+    size: float | None = ...,
+    unit: Literal['mm', 'cm', 'm', 'in'] | None = ...,
     camera: str | Path | None = ...,
     set: Mapping[str, float | str | Sequence[float]] | None = ...,
+    things: str | Path | None = ...,
+    judge: str | Path = ...,
     exposure: float = ...,
     resolution: int | str | tuple[int, int] | None = ...,
     labels: Path | Names | None = ...,
@@ -409,8 +435,12 @@ def sweep(
     progress: Watched = ...,
     environment: Path | Names | None = ...,
     up: Literal['y', 'z'] | None = ...,
+    size: float | None = ...,
+    unit: Literal['mm', 'cm', 'm', 'in'] | None = ...,
     camera: str | Path | None = ...,
     set: Mapping[str, float | str | Sequence[float]] | None = ...,
+    things: str | Path | None = ...,
+    judge: str | Path = ...,
     exposure: float = ...,
     resolution: int | str | tuple[int, int] | None = ...,
     labels: Path | Names | None = ...,

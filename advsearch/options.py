@@ -6,6 +6,7 @@ import inspect
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import MISSING, Field, fields
+from pathlib import Path
 from typing import Any
 
 from advsearch.errors import InputError, UnknownNameError
@@ -52,6 +53,40 @@ def by_key(controls: Mapping[str, object]) -> dict[str, object]:
     if not isinstance(together, Mapping) or together.keys() & ranges.keys():
         raise InputError(f"`controls` {BY_KEY}: expected each of Mitsuba's names once, with a range")
     return {**found, BY_KEY: {**together, **ranges}}
+
+
+def things_as_text(things: object) -> str | None:
+    """Return things beside an object in the one text that settings have, of a text, a mapping, or a list of such:
+    ``car@12,3.5,heading=180; person@6,-2``. Files are named by their absolute paths, so that a run may go on from
+    anywhere.
+
+    Raises:
+        InputError: it is something else.
+    """
+    listed = things if isinstance(things, (list, tuple)) else [] if things is None else [things]
+    if not all(isinstance(one, (str, Mapping)) for one in listed):
+        raise InputError(
+            f"things: expected a text such as 'car@12,3.5', a mapping or a list of these, got {things!r:.80}"
+        )
+    parts = [part for one in listed for part in (_thing_as_text(one) if isinstance(one, Mapping) else one).split(";")]
+    named = []
+    for part in filter(None, map(str.strip, parts)):
+        what, at, rest = part.rpartition("@")
+        file, mark, node = what.strip().partition("#")
+        what = f"{Path(file).resolve()}{mark}{node}" if "." in file and Path(file).is_file() else what.strip()
+        named.append(f"{what}{at}{rest}")
+    return "; ".join(named) or None
+
+
+def _thing_as_text(thing: Mapping[str, Any]) -> str:
+    options = {name: one for name, one in thing.items() if name not in ("object", "x", "y")}
+    for name in ("object", "x", "y"):
+        if name not in thing:
+            raise InputError(
+                f"things: expected an object, x and y, such as {{'object': 'car', 'x': 12, 'y': 3.5}}, "
+                f"got {dict(thing)!r:.80}"
+            )
+    return ",".join([f"{thing['object']}@{thing['x']}", f"{thing['y']}", *(f"{k}={v}" for k, v in options.items())])
 
 
 def declared_options(kind: type[Any]) -> dict[str, Field[Any]]:

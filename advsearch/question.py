@@ -25,7 +25,7 @@ from advsearch.report.markup import figure_of_answer
 from advsearch.report.shown import shown
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.files import write_bytes
-from advsearch.runs.results.base import INTERRUPTED, Result
+from advsearch.runs.results import INTERRUPTED, Result
 from advsearch.settings import Config
 from advsearch.viewer.pages import keep_answer
 
@@ -76,10 +76,10 @@ class Asked(Generic[Settings]):
 
     def result(self, kind: type[Made], **fields: Any) -> Made:
         """Return a result with these fields, and with those that all results have: what the settings say of object,
-        model and so on, the run, how it ended and how long it took."""
+        model and so on, the run, how it ended and how long it took, beside the seconds of its parts."""
         said = {name: getattr(self.config, of) for name, of in SAID.items() if hasattr(self.config, of)}
         said |= {name: list(said[name]) for name in ("objects", "controls") if name in said}
-        seconds = {"total": time.perf_counter() - self._begun}
+        seconds = {"total": time.perf_counter() - self._begun, **fields.pop("seconds", {})}
         said |= {"run": str(self.run.path), "ending": self.ending, "seconds": seconds}
         return kind(**{**said, "command_line": self.config.command_line(), **fields})
 
@@ -109,6 +109,9 @@ class Question(Generic[Answer]):
     expected: tuple[Any, ...] | None
     brought: Callable[[Path, Mapping[str, Any]], dict[str, Any]] | None
     called: str
+    more: str
+    short: Callable[[Any], bool]
+    listed: str
 
     def from_config(
         self, config: Any, *, progress: Progress | None = None, resumed: Path | None = None, **more: Any
@@ -163,6 +166,9 @@ def question(
     expected: tuple[Any, ...] | None = None,
     brought: Callable[[Path, Mapping[str, Any]], dict[str, Any]] | None = None,
     called: str = "",
+    more: str = "",
+    short: Callable[[Any], bool] = lambda result: False,
+    listed: str = "",
 ) -> Callable[[Callable[..., Answer]], Question[Answer]]:
     """Make a question of a function ``(asked: Asked[NameConfig]) -> NameResult``, called as its command.
 
@@ -171,9 +177,12 @@ def question(
         place: settings that Python takes by position.
         about: the setting that names a run or a file which it is about.
         expected: where that is given without its flag, what stands for it in the help, and what an error says it is;
-            as further fields of `cli.question.Positional`, what the help adds, and whether there may be several.
+            as further fields of `cli.commands.Positional`, what the help adds, and whether there may be several.
         brought: returns settings that the `run.yaml` of that run brings, by what was typed.
         called: ``module:function`` that Python calls, where more can be given there than settings.
+        more: what its help says after what it does.
+        short: whether a result falls short of what was checked, which ends the command with status 3.
+        listed: ``module:function`` that returns what that setting may be, with a line about each: `list` prints it.
     """
 
     def decorate(answer: Callable[..., Answer]) -> Question[Answer]:
@@ -181,6 +190,6 @@ def question(
         first, result = next(iter(inspect.signature(answer).parameters)), hints["return"]
         result = (*get_args(result), result)[0]  # the first of several kinds
         (config,) = get_args(hints[first])
-        return Question(answer, config, result, examples, place, about, expected, brought, called)
+        return Question(answer, config, result, examples, place, about, expected, brought, called, more, short, listed)
 
     return decorate

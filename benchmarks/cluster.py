@@ -44,12 +44,13 @@ from simulated_cluster import Simulated, coordinator  # noqa: E402
 from sweep import ConstantRenderer, resident  # noqa: E402
 
 from advsearch.attacks import Evaluation  # noqa: E402
-from advsearch.config import SweepConfig  # noqa: E402
 from advsearch.engine.journal import Sent  # noqa: E402
-from advsearch.engine.sweeps import KIND, swept_scene  # noqa: E402
-from advsearch.engine.sweeps.loop import Sweep  # noqa: E402
 from advsearch.progress import NullProgress  # noqa: E402
+from advsearch.questions.sweep import job as swept_scene  # noqa: E402
 from advsearch.questions.sweep.carry_out import job_of  # noqa: E402
+from advsearch.questions.sweep.job import KIND  # noqa: E402
+from advsearch.questions.sweep.loop import Sweep  # noqa: E402
+from advsearch.questions.sweep.settings import SweepConfig  # noqa: E402
 from advsearch.runs.directory import RunDirectory  # noqa: E402
 from advsearch.runs.store import NAME, Store  # noqa: E402
 from advsearch.tasks import Answer, Judgement  # noqa: E402

@@ -34,9 +34,9 @@ from torch import Tensor
 
 from advsearch import threads
 from advsearch.attacks import Block, Domain, Evaluation, Policy, Query, StepRecord, make_policy, search
-from advsearch.config import AttackConfig
-from advsearch.engine.attack_parts import problem_from_config
 from advsearch.engine.problem import Problem
+from advsearch.questions.attack.parts import problem_from_config
+from advsearch.questions.attack.settings import AttackConfig
 from advsearch.seeds import stream
 
 SIDE = 10

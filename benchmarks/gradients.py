@@ -33,10 +33,10 @@ from advsearch import threads
 
 threads.configure()
 
-from advsearch.config import AttackConfig  # noqa: E402
-from advsearch.engine.attack_parts import problem_from_config  # noqa: E402
 from advsearch.engine.gradients import Loss, estimated, inside, smooth_loss  # noqa: E402
 from advsearch.engine.loading import load_scene  # noqa: E402
+from advsearch.questions.attack.parts import problem_from_config  # noqa: E402
+from advsearch.questions.attack.settings import AttackConfig  # noqa: E402
 from advsearch.scene.formation import EVERYTHING  # noqa: E402
 from advsearch.scene.gradients import Group  # noqa: E402
 from advsearch.scene.renderer import Renderer  # noqa: E402

@@ -20,9 +20,8 @@ from advsearch import threads
 threads.configure()
 
 from advsearch.progress import watched  # noqa: E402
-from advsearch.questions.harden.answer import HEADS, HardenResult, Share, hardened_rows  # noqa: E402  # noqa: E402
-from advsearch.questions.harden.carry_out import harden_from_config  # noqa: E402
-from advsearch.questions.harden.settings import HardenConfig  # noqa: E402
+from advsearch.questions.harden import harden  # noqa: E402
+from advsearch.questions.harden.answer import HardenConfig, HardenResult, Share, shown  # noqa: E402
 from advsearch.runs.directory import CONFIG, is_run  # noqa: E402
 from advsearch.settings import parse_assignment  # noqa: E402
 
@@ -44,9 +43,10 @@ def main() -> int:
         first = {} if "controls" in changes else SETTINGS
         config = HardenConfig(**{**first, **changes, "run": str(args.run)})
     with watched(True) as progress:
-        result = harden_from_config(config, progress=progress, resumed=args.run if there else None)
-    print(" | ".join(HEADS))
-    for row in hardened_rows(result):
+        result = harden.from_config(config, progress=progress, resumed=args.run if there else None)
+    before_and_after = shown(result).sections[0]
+    print(" | ".join(before_and_after.heads))
+    for row in before_and_after.rows:
         print(" | ".join(row))
     spent = ", ".join(f"{part} {seconds / 60:.0f} minutes" for part, seconds in result.seconds.items())
     print(f"{spent}; rounds: {[one.robust for one in result.rounds]}")

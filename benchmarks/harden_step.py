@@ -20,6 +20,7 @@ import torch  # noqa: E402
 
 from advsearch.models import Model, load_model  # noqa: E402
 from advsearch.models.reference import Trainable, trainable  # noqa: E402
+from advsearch.questions.harden.answer import HardenConfig  # noqa: E402
 from advsearch.questions.harden.lessons import Lesson  # noqa: E402
 from advsearch.questions.harden.scenes import (  # noqa: E402
     TRAINING,
@@ -27,7 +28,6 @@ from advsearch.questions.harden.scenes import (  # noqa: E402
     SceneWork,
     splits_of,
 )
-from advsearch.questions.harden.settings import HardenConfig  # noqa: E402
 from advsearch.questions.harden.training import Course  # noqa: E402
 
 VIEWS = 4

@@ -33,16 +33,16 @@ from typing import Any
 import torch
 
 from advsearch import seeds
-from advsearch.config import AttackConfig
 from advsearch.controls import CONTROLS, OWN, make_space
 from advsearch.controls.base import Parameter
 from advsearch.engine.acceptance import CHECK_SPP, levels_off
-from advsearch.engine.attack_parts import problem_from_config
 from advsearch.engine.gradients import inside, smooth_loss
 from advsearch.engine.loading import as_controls, framed, load_scene, make_renderer
 from advsearch.engine.planning import bounces_of
 from advsearch.engine.problem import Problem
 from advsearch.errors import InputError
+from advsearch.questions.attack.parts import problem_from_config
+from advsearch.questions.attack.settings import AttackConfig
 from advsearch.scene.formation import EVERYTHING, NOTHING
 from advsearch.scene.settings import FAMILIES, MATERIAL, SETTINGS
 from advsearch.scene.surface.renderer import SurfaceRenderer

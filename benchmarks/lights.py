@@ -26,10 +26,9 @@ from advsearch import threads
 threads.configure()
 
 from advsearch.attacks.draws import Seeds  # noqa: E402
-from advsearch.config import SweepConfig  # noqa: E402
-from advsearch.engine.sweeps import KIND  # noqa: E402
-from advsearch.engine.sweeps.swept_scene import SweptScene  # noqa: E402
 from advsearch.questions.sweep.carry_out import job_of  # noqa: E402
+from advsearch.questions.sweep.job import KIND, SweptScene  # noqa: E402
+from advsearch.questions.sweep.settings import SweepConfig  # noqa: E402
 from advsearch.tasks import Judgement  # noqa: E402
 
 ASKED = 20

@@ -22,7 +22,7 @@ from advsearch import threads
 threads.configure()
 
 from advsearch.cli.main import main as advsearch  # noqa: E402
-from advsearch.questions.attack.answer import MatrixResult  # noqa: E402
+from advsearch.questions.attack.summary import MatrixResult  # noqa: E402
 from advsearch.report.shown import shown  # noqa: E402
 from advsearch.runs.summary import read_result  # noqa: E402
 

@@ -18,8 +18,8 @@ from collections.abc import Sequence
 
 from advsearch import threads
 from advsearch.attacks import Ending
-from advsearch.config import AttackConfig
 from advsearch.questions.attack.carry_out import attack_once
+from advsearch.questions.attack.settings import AttackConfig
 
 
 def main(argv: Sequence[str] | None = None) -> int:

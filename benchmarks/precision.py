@@ -23,13 +23,12 @@ from advsearch import threads
 
 threads.configure()
 
-from advsearch.engine.attack_parts import problem_from_config  # noqa: E402
 from advsearch.engine.gradients import inside, smooth_loss  # noqa: E402
-from advsearch.questions.precision.answer import Recommended  # noqa: E402
+from advsearch.questions.attack.parts import problem_from_config  # noqa: E402
+from advsearch.questions.precision.answer import PrecisionConfig, Recommended  # noqa: E402
 from advsearch.questions.precision.benches import GradientBench, PictureBench, TimeBudget, gradient_parts  # noqa: E402
 from advsearch.questions.precision.carry_out import precision_from_config  # noqa: E402
 from advsearch.questions.precision.rule import ReferenceValue, Setting, point_of  # noqa: E402
-from advsearch.questions.precision.settings import PrecisionConfig  # noqa: E402
 
 SCENES = ("bowl/kitchen", "bottle/noon", "ball/studio")
 CONTROL = "environment"

@@ -35,10 +35,10 @@ from torch import Tensor
 
 from advsearch import seeds, threads
 from advsearch.attacks import Evaluation, Query, make_policy, search
-from advsearch.config import AttackConfig
-from advsearch.engine.attack_parts import problem_from_config
 from advsearch.engine.problem import Problem
 from advsearch.engine.transport import Transport
+from advsearch.questions.attack.parts import problem_from_config
+from advsearch.questions.attack.settings import AttackConfig
 
 TRIALS, TRIAL_SPP = 12, 64
 BLIND = ("random", "nes")

@@ -52,17 +52,18 @@ from advsearch import threads
 
 threads.configure()
 
-from advsearch.config import AttackConfig, SweepConfig  # noqa: E402
 from advsearch.engine.acceptance import VIEWS, ComparedView, Deviation, compared, view_of  # noqa: E402
 from advsearch.engine.loading import load_scene  # noqa: E402
-from advsearch.engine.sweeps.loop import Sweep  # noqa: E402
-from advsearch.engine.sweeps.summary import SweepResult  # noqa: E402
 from advsearch.models import Model, load_model  # noqa: E402
 from advsearch.progress import NullProgress  # noqa: E402
 from advsearch.questions.attack.carry_out import attack_once  # noqa: E402
+from advsearch.questions.attack.settings import AttackConfig  # noqa: E402
+from advsearch.questions.recipe.answer import RecipeConfig  # noqa: E402
 from advsearch.questions.recipe.description import planned, read_recipe  # noqa: E402
-from advsearch.questions.recipe.settings import RecipeConfig  # noqa: E402
 from advsearch.questions.sweep.carry_out import job_of  # noqa: E402
+from advsearch.questions.sweep.loop import Sweep  # noqa: E402
+from advsearch.questions.sweep.result import SweepResult  # noqa: E402
+from advsearch.questions.sweep.settings import SweepConfig  # noqa: E402
 from advsearch.scene.renderer import Renderer  # noqa: E402
 from advsearch.scene.surface.renderer import SurfaceRenderer, why_not  # noqa: E402
 

@@ -28,18 +28,15 @@ from advsearch import threads
 
 threads.configure()
 
-from advsearch.config import SweepConfig  # noqa: E402
 from advsearch.controls import Space  # noqa: E402
 from advsearch.engine.loading import as_controls, framed, load_scene  # noqa: E402
-from advsearch.engine.sweeps import (  # noqa: E402
-    Job,
-    NamedScene,
-    swept_scene,
-)
-from advsearch.engine.sweeps.axes import read_axes  # noqa: E402
-from advsearch.engine.sweeps.loop import Sweep  # noqa: E402
 from advsearch.models import load_model  # noqa: E402
 from advsearch.progress import NullProgress  # noqa: E402
+from advsearch.questions.sweep import job as swept_scene  # noqa: E402
+from advsearch.questions.sweep.axes import read_axes  # noqa: E402
+from advsearch.questions.sweep.job import Job, NamedScene  # noqa: E402
+from advsearch.questions.sweep.loop import Sweep  # noqa: E402
+from advsearch.questions.sweep.settings import SweepConfig  # noqa: E402
 from advsearch.runs.directory import RunDirectory  # noqa: E402
 from advsearch.scene.formation import EVERYTHING, ImageFormation  # noqa: E402
 from advsearch.scene.gradients import GradientPlan  # noqa: E402

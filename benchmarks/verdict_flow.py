@@ -34,11 +34,11 @@ from advsearch.attacks import Block, Domain, Ending, Evaluation, Query, SearchRe
 from advsearch.attacks.candidates import Failures, FoundFailure
 from advsearch.attacks.rate_samples import choose_rate_spp
 from advsearch.attacks.verification import OVER_CONDITIONS, WORST_CASE, Rule
-from advsearch.config import AttackConfig
 from advsearch.engine.journal import Journal, Shared
 from advsearch.engine.record import Findings, Stages
-from advsearch.engine.stages import Attack
 from advsearch.progress import NullProgress
+from advsearch.questions.attack.settings import AttackConfig
+from advsearch.questions.attack.stages import Attack
 from advsearch.tasks import Answer, Judgement
 
 RATE, OVER_RATE = 0.75, 0.85

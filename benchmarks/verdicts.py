@@ -58,8 +58,8 @@ from advsearch.attacks.verification import (
     TRIAL_LOOKS,
     WORST_CASE,
 )
-from advsearch.config import AttackConfig
-from advsearch.engine.attack_parts import problem_from_config
+from advsearch.questions.attack.parts import problem_from_config
+from advsearch.questions.attack.settings import AttackConfig
 from advsearch.seeds import stream
 from advsearch.tasks import Answer, Judgement
 

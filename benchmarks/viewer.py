@@ -26,14 +26,14 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from advsearch.config import SweepConfig
 from advsearch.described import Value
+from advsearch.questions.sweep.page import write_sweep_page
+from advsearch.questions.sweep.settings import SweepConfig
+from advsearch.questions.sweep.summary import SweepSummary
 from advsearch.runs.directory import COLUMNS, RunDirectory
-from advsearch.runs.results.sweep import SweepSummary
 from advsearch.runs.store import Row
 from advsearch.viewer import thumbnails
 from advsearch.viewer.server import Dashboard
-from advsearch.viewer.sweep_page import write_sweep_page
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page
@@ -146,7 +146,7 @@ def of_attack(folder: Path) -> dict[str, float]:
     from playwright.sync_api import sync_playwright
 
     import advsearch
-    from advsearch.runs.summary import attack_of
+    from advsearch.questions.attack.summary import attack_of
     from advsearch.viewer.pages import write_page
 
     scene = advsearch.load_scene("teapot")

@@ -24,9 +24,10 @@ from pydantic.fields import ComputedFieldInfo, FieldInfo
 
 from advsearch.cli.flags import SCENE, help_text
 from advsearch.cli.main import add_command
-from advsearch.config import CONFIGS, AttackConfig
+from advsearch.config import CONFIGS
 from advsearch.controls import OWN
-from advsearch.questions.attack.answer import CurveResult, MatrixResult
+from advsearch.questions.attack.settings import AttackConfig
+from advsearch.questions.attack.summary import AttackSummary, CurveResult, MatrixResult
 from advsearch.questions.compare.answer import CompareResult
 from advsearch.questions.explain.answer import ExplainResult
 from advsearch.questions.gap import GapResult
@@ -35,10 +36,20 @@ from advsearch.questions.recipe.description import recipe_names as recipe_names
 from advsearch.questions.region.answer import RegionResult
 from advsearch.questions.replay.answer import ReplayResult
 from advsearch.questions.stability.answer import CaseRow
+from advsearch.questions.sweep.summary import SweepSummary
 from advsearch.questions.test.answer import SuiteResult
-from advsearch.runs.results.attack import AttackSummary, LinearTransport, SharedWork, VerifiedRate
-from advsearch.runs.results.base import CleanScene, Fields, Formation, Result, SceneResult, StudyResult, VariedValue
-from advsearch.runs.results.sweep import SweepSummary
+from advsearch.runs.results import (
+    CleanScene,
+    Fields,
+    Formation,
+    LinearTransport,
+    Result,
+    SceneResult,
+    SharedWork,
+    StudyResult,
+    VariedValue,
+    VerifiedRate,
+)
 from advsearch.scene.settings import SETTINGS
 from advsearch.settings import Setting, settings
 

@@ -16,10 +16,9 @@ from pathlib import Path
 from PIL import Image, ImageDraw, ImageFont
 
 from advsearch.cli.output import shown_text as answer
-from advsearch.report.phrases import CLASSIFICATION, answer_text
+from advsearch.questions.attack.summary import AttackSummary, PicturedAnswer, attack_of
+from advsearch.report.wording import CLASSIFICATION, answer_text
 from advsearch.runs.directory import default_name
-from advsearch.runs.results.attack import AttackSummary, PicturedAnswer
-from advsearch.runs.summary import attack_of
 
 ROOT = Path(__file__).resolve().parent.parent
 PICTURE = ROOT / "docs" / "images" / "attack-mug.png"

@@ -17,10 +17,10 @@ from pathlib import Path
 from typing import Any
 
 import advsearch
-from advsearch.questions.recipe.answer import RecipeResult, told_once
-from advsearch.questions.recipe.carry_out import NOTE, recipe_from_config
+from advsearch.questions.recipe import recipe
+from advsearch.questions.recipe.answer import RecipeConfig, RecipeResult, told_once
+from advsearch.questions.recipe.carry_out import NOTE
 from advsearch.questions.recipe.description import read_recipe
-from advsearch.questions.recipe.settings import RecipeConfig
 from advsearch.runs.directory import CONFIG
 from advsearch.runs.store import NAME as STORE
 from advsearch.runs.store import Store
@@ -136,7 +136,7 @@ def done(run: Path) -> RecipeResult | None:
 
 def gone_on(run: Path) -> RecipeResult | None:
     """Return the result of a run that was begun, once it is done."""
-    return recipe_from_config(RecipeConfig.from_yaml(run / CONFIG), resumed=run) if (run / CONFIG).is_file() else None
+    return recipe.from_config(RecipeConfig.from_yaml(run / CONFIG), resumed=run) if (run / CONFIG).is_file() else None
 
 
 def renew(name: str, run: Path) -> None:

@@ -71,7 +71,9 @@ def everything() -> Iterator[tuple[str, bytes]]:
     for light in ENVIRONMENTS.values():
         yield from environment_files(light).items()
     facts = {
-        name: {"split": family.split, "source": family.script} | ({"ground": family.ground} if family.ground else {})
+        name: {"split": family.split, "source": family.script}
+        | ({"ground": family.ground} if family.ground else {})
+        | ({"candelas": family.make().candelas} if family.lux else {})
         for name, family in ENVIRONMENTS.items()
     }
     yield "environments/environments.json", (json.dumps({"schema": 1, "environments": facts}, indent=1) + "\n").encode()

@@ -8,15 +8,14 @@ from typing import Any
 import numpy as np
 import OpenEXR
 
-from advsearch.config import AttackConfig
-from advsearch.questions.attack.answer import CurveResult, MatrixResult
+from advsearch.questions.attack.settings import AttackConfig
+from advsearch.questions.attack.summary import AttackSummary, CurveResult, MatrixResult, attack_of
 from advsearch.questions.gap import GapResult
 from advsearch.questions.region.answer import RegionResult
+from advsearch.questions.sweep.summary import SweepSummary
 from advsearch.runs.directory import RunDirectory
-from advsearch.runs.results.attack import AttackSummary
-from advsearch.runs.results.sweep import SweepSummary
 from advsearch.runs.store import Row
-from advsearch.runs.summary import attack_of, write_answer
+from advsearch.runs.summary import write_answer
 from advsearch.viewer.pages import write_page
 
 

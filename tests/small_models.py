@@ -94,6 +94,18 @@ def hard() -> Model:
     return advsearch.load_model(Blue(0.07, True), labels=["dog", "vase", "mug"], input_size=24, name="hard")
 
 
+class Same(nn.Module):
+    """Says the same to every picture."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        return torch.tensor([[2.0, 0.0]]).expand(len(x), 2)
+
+
+def blind() -> Model:
+    """One that does not look."""
+    return advsearch.load_model(Same(), labels=["mug", "vase"], input_size=SIDE, name="blind")
+
+
 def strange() -> Model:
     """One that knows no mug."""
     return advsearch.load_model(Blue(0.1), labels=["cat", "dog"], input_size=SIDE, name="strange")

@@ -16,15 +16,15 @@ from torch import Tensor
 from advsearch.attacks import Block, Domain, Evaluation, Policy, Query, make_policy
 from advsearch.attacks.verification import WORST_CASE, Rule
 from advsearch.cluster import Done, InProcess, Work, Workforce
-from advsearch.config import AttackConfig
-from advsearch.engine import attack_parts as attacking
-from advsearch.engine.attack_parts import search_size
 from advsearch.engine.journal import Journal, Shared
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Findings, Stages
-from advsearch.engine.stages import Attack
 from advsearch.progress import NullProgress
+from advsearch.questions.attack import parts as attacking
 from advsearch.questions.attack.carry_out import attack_answers
+from advsearch.questions.attack.parts import search_size
+from advsearch.questions.attack.settings import AttackConfig
+from advsearch.questions.attack.stages import Attack
 from advsearch.runs.directory import RunDirectory
 from advsearch.tasks import Classification, Judgement
 

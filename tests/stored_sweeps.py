@@ -13,16 +13,15 @@ import numpy as np
 import pandas as pd
 from samples import sweep
 
-from advsearch.config import SweepConfig
 from advsearch.described import Value
 from advsearch.files import JsonValue
-from advsearch.questions.photographs.answer import PhotoTaker
+from advsearch.questions.sweep.page import write_sweep_page
+from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.rules import observed
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row
 from advsearch.viewer import thumbnails
 from advsearch.viewer.server import Dashboard
-from advsearch.viewer.sweep_page import write_sweep_page
 
 YAWS, ELEVATIONS, ENVIRONMENTS = (0.0, 45.0, 90.0), (10.0, 40.0), ("noon", "studio")
 
@@ -81,7 +80,7 @@ def make_sweep(
 
 @contextmanager
 def serving(
-    *runs: Path, host: str = "127.0.0.1", https: bool = False, photographs: PhotoTaker | None = None
+    *runs: Path, host: str = "127.0.0.1", https: bool = False, photographs: object | None = None
 ) -> Iterator[Dashboard]:
     """A server of these runs, for as long as the block."""
     server = Dashboard(runs, host, 0, https=https, photographs=photographs)

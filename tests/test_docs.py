@@ -31,20 +31,22 @@ from advsearch.attacks.objectives import check_objective
 from advsearch.cli.export import WRITERS
 from advsearch.cli.flags import config_from
 from advsearch.cli.main import _parse
-from advsearch.config import CONFIGS, AttackConfig, RenderConfig, SceneConfig, SweepConfig
+from advsearch.config import CONFIGS, RenderConfig, SceneConfig
 from advsearch.engine.loading import as_controls
 from advsearch.engine.naming import check_run_settings, given_to
-from advsearch.engine.sweeps.axes import read_axes
 from advsearch.files import MESHES
+from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.compare import CompareConfig
 from advsearch.questions.explain import ExplainConfig
-from advsearch.questions.harden.settings import ALL, HardenConfig
+from advsearch.questions.harden.answer import ALL, HardenConfig
+from advsearch.questions.recipe.answer import RecipeConfig
 from advsearch.questions.recipe.description import planned, read_recipe
 from advsearch.questions.recipe.description import recipe_names as recipes
-from advsearch.questions.recipe.settings import RecipeConfig
 from advsearch.questions.replay.answer import WAYS, ReplayConfig
+from advsearch.questions.stability.answer import StabilityConfig
 from advsearch.questions.stability.carry_out import chosen
-from advsearch.questions.stability.settings import StabilityConfig
+from advsearch.questions.sweep.axes import read_axes
+from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.questions.test.settings import SuiteConfig, read_suite
 from advsearch.runs import export
 from advsearch.scene import environments, library

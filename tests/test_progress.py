@@ -17,15 +17,16 @@ from advsearch.attacks import Evaluation, Query, make_policy
 from advsearch.attacks.trials import choose_spp, most_samples
 from advsearch.cli.flags import with_flags
 from advsearch.cli.output import shown_text as check_text
-from advsearch.config import AttackConfig, SweepConfig
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Findings, Stages
+from advsearch.questions.attack.settings import AttackConfig
+from advsearch.questions.check.answer import CheckConfig
 from advsearch.questions.check.carry_out import check_from_config
-from advsearch.questions.check.settings import CheckConfig
-from advsearch.questions.precision.settings import PrecisionConfig
+from advsearch.questions.precision.answer import PrecisionConfig
 from advsearch.questions.region import growing as region
 from advsearch.questions.region.answer import RegionConfig
 from advsearch.questions.sweep.carry_out import sweep_from_config
+from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.runs.directory import RunDirectory
 from advsearch.settings import Config
 

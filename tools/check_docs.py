@@ -27,23 +27,21 @@ from advsearch.attacks.objectives import OBJECTIVE_KINDS
 from advsearch.attacks.policies import pgd
 from advsearch.attacks.verification import WORST_CASE
 from advsearch.cli.commands import COMMANDS
-from advsearch.cli.names import REGISTRIES
-from advsearch.config import TRIALS, TRIALS_OVER, AttackConfig
-from advsearch.config.attack import FEWEST_TRIALS
+from advsearch.cli.show import REGISTRIES
 from advsearch.controls import CONTROLS, texture
-from advsearch.engine import stages
 from advsearch.files import MESHES
 from advsearch.models import loading, reference
 from advsearch.models.loading import SOURCES as SOURCES_OF_MODELS
-from advsearch.questions.attack.answer import CurveResult, MatrixResult
+from advsearch.questions.attack import stages
+from advsearch.questions.attack.settings import FEWEST_TRIALS, TRIALS, TRIALS_OVER, AttackConfig
+from advsearch.questions.attack.summary import AttackSummary, CurveResult, MatrixResult
 from advsearch.questions.gap import GapResult
 from advsearch.questions.region import growing as mapping
 from advsearch.questions.region.answer import RegionConfig
+from advsearch.questions.sweep.summary import SweepSummary
 from advsearch.questions.test import counterexamples as tested
 from advsearch.runs import directory, export, store
-from advsearch.runs.results.attack import AttackSummary
-from advsearch.runs.results.base import RenderResult, Result
-from advsearch.runs.results.sweep import SweepSummary
+from advsearch.runs.results import RenderResult, Result
 from advsearch.scene import environments, exposure, library
 from advsearch.scene.geometry import FRAME_FILL
 from advsearch.scene.importing.pictures import TEXTURE_LIMIT

@@ -29,7 +29,7 @@ Modules = Mapping[str, Path]
 ENTRIES = {"cli": {"add_arguments", "answer", "run"}, "models": {"load", "source"}}
 """Functions that every module of a room defines so that it is found: commands, and libraries of networks."""
 
-OF_COMMANDS = tuple(f"advsearch.{room}." for room in ("api", "cli", "config", "runs.results", "evaluation"))
+OF_COMMANDS = tuple(f"advsearch.{room}." for room in ("api", "cli"))
 """Where a command has a module, or a folder, of its name."""
 
 

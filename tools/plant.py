@@ -214,7 +214,7 @@ FAULTS = (
     ),
     Fault(
         "sweeps: a rate of another group",
-        "advsearch/engine/sweeps/summary.py",
+        "advsearch/questions/sweep/result.py",
         "answer=counted(per_unit(after, draws), of),",
         "answer=counted(per_unit(before, draws), of),",
         ("tests/engine/test_sweep.py",),
@@ -298,10 +298,10 @@ FAULTS = (
     ),
     Fault(
         "config: a default is the other one's",
-        "advsearch/config/attack.py",
+        "advsearch/questions/attack/settings.py",
         "TRIALS_OVER if self.over else TRIALS",
         "TRIALS if self.over else TRIALS_OVER",
-        ("tests/config/test_config.py",),
+        ("tests/test_config.py",),
     ),
     Fault(
         "explain: a rule is counted on the rows that chose it",
@@ -319,7 +319,7 @@ FAULTS = (
     ),
     Fault(
         "recipes: right and wrong are mixed up",
-        "advsearch/questions/recipe/of_runs.py",
+        "advsearch/questions/recipe/rates.py",
         "for a in (True, False) for b in (True, False)]",
         "for b in (True, False) for a in (True, False)]",
         ("tests/questions/test_recipe.py",),

@@ -53,7 +53,7 @@ AROUND = (
     "attacks/search.py",
     "attacks/candidates.py",
     "attacks/domain.py",
-    "engine/stages.py",
+    "questions/attack/stages.py",
     "engine/journal.py",
     "engine/memory.py",
     "engine/record.py",
@@ -194,7 +194,7 @@ def calling(trees: Trees, *names: str) -> list[Step]:
 
 def declared(trees: Trees) -> Counter[str]:
     """Return how many classes have a field of a name, for every setting of a search."""
-    from advsearch.config.attack import AttackConfig
+    from advsearch.questions.attack.settings import AttackConfig
 
     found: Counter[str] = Counter()
     for tree in trees.values():

@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING
 from advsearch import rooms
 from advsearch import threads as threads  # before torch: it sets how OpenMP waits
 from advsearch.runs.directory import begun
-from advsearch.runs.results.base import Result
+from advsearch.runs.results import Result
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from advsearch.progress import Progress
-    from advsearch.runs.results.base import Result
+    from advsearch.runs.results import Result
     from advsearch.settings import Config
 
 

@@ -7,7 +7,7 @@ import json
 import os
 import tempfile
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -16,24 +16,26 @@ import numpy as np
 from torch import Tensor
 
 import advsearch
-from advsearch import rooms
-from advsearch.config import AttackConfig, SweepConfig
+from advsearch.config import SceneConfig
 from advsearch.described import Value
-from advsearch.engine.attack_parts import SEARCHED_WITH, parts_in, problem_of_parts
-from advsearch.engine.judging import facts_of
-from advsearch.engine.sweeps import KIND
-from advsearch.engine.sweeps.swept_scene import Scenes
+from advsearch.engine.loading import Scene
+from advsearch.engine.rendering import facts_about
 from advsearch.engine.verifier import kept_answer
 from advsearch.errors import FileFormatError, InputError
 from advsearch.files import JsonObject
 from advsearch.models import find_label_set
 from advsearch.models.labels import names_nothing
 from advsearch.progress import Progress
+from advsearch.questions.attack.parts import SEARCHED_WITH, parts_in, problem_of_parts
+from advsearch.questions.attack.settings import AttackConfig
+from advsearch.questions.attack.summary import attack_of
+from advsearch.questions.sweep.carry_out import scenes_of
+from advsearch.questions.sweep.job import KIND
+from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.runs.directory import CONFIG, PARTS, find_run, is_run, only_here
 from advsearch.runs.files import placed_by, storage_errors, write_text
 from advsearch.runs.images import write_png
 from advsearch.runs.store import NAME, Row, Store
-from advsearch.runs.summary import attack_of
 from advsearch.scene.assets import Bools
 from advsearch.scene.description import OBJECT
 from advsearch.scene.outlines import SeenThing, seen_things
@@ -176,7 +178,6 @@ def _pictures(folder: Path, categories: Categories, every: bool, progress: Progr
 
 def _swept(folder: Path, categories: Categories, every: bool, progress: Progress) -> Iterator[Shown]:
     """The pictures of a sweep as its first model sees them."""
-    scenes_of: Callable[[SweepConfig], Scenes] = rooms.in_room("sweep", "carry_out", "scenes_of")
     scenes = scenes_of(SweepConfig.from_yaml(folder / CONFIG).model_copy(update={"metrics": {}}))
     job, rows = scenes.job, defaultdict[int, list[Row]](list)
     with Store(folder / NAME, read_only=True) as store:
@@ -190,7 +191,7 @@ def _swept(folder: Path, categories: Categories, every: bool, progress: Progress
     for number in chosen:
         ((scene, _, query), *_) = job.queries(range(number, number + 1))
         view, place, some = scenes.named(scene), job.places[int(scene)], sorted(rows[number], key=lambda row: row.step)
-        facts, size = facts_of(place.scene, place.object, job.config.label, dict), job.sizes[0]
+        facts, size = object_facts(place.scene, place.object, job.config), job.sizes[0]
         picture = view.pictures([query])[0]
         things = categories.things(job.tasks[0], facts, view.renderers[size], query.u)
         first = next((row.correct for row in some if row.step % len(job.models) == 0), None)
@@ -215,12 +216,18 @@ def _attacked(folder: Path, categories: Categories, every: bool, progress: Progr
         u, seed, spp = kinds[row.kind], max(0, row.seed or 0), row.spp or problem.spp
         picture, whole = problem.picture(u, seed, spp), problem.whole(u, seed)
         things = categories.things(
-            problem.task, facts_of(parts.scene, parts.config.object, parts.config.label, dict), problem.renderer, whole
+            problem.task, object_facts(parts.scene, parts.config.object, parts.config), problem.renderer, whole
         )
         same = row.correct in (None, problem.judge(picture, whole).right)
         values = {**problem.describe(u, seed), **row.values}
         yield Shown(f"{row.kind.replace(' ', '-')}-{row.step:02d}", picture, things, [row], values, same)
         progress.advance(1)
+
+
+def object_facts(scene: Scene, name: str, config: SceneConfig) -> Facts:
+    """What is known of the object, whatever the run judges: a label that was given is that of the judged thing."""
+    judges_object = config.judge not in scene.description.things
+    return facts_about(scene.description, name, config.label if judges_object else None, dict)
 
 
 READ = {SweepConfig.command: _swept, AttackConfig.command: _attacked}
@@ -259,18 +266,19 @@ def _image(number: int, shown: Shown) -> JsonObject:
 
 
 def _thing(number: int, image: int, thing: SeenThing, category: int) -> JsonObject:
-    rows, columns = (np.flatnonzero(thing.mask.any(axis=side)) for side in (1, 0))
-    left, top = int(columns[0]), int(rows[0])
+    left, top, right, bottom = thing.box
     return {
         "id": number,
         "image_id": image,
         "category_id": category,
-        "bbox": [left, top, int(columns[-1]) + 1 - left, int(rows[-1]) + 1 - top],
+        "bbox": [left, top, right - left, bottom - top],
         "area": int(thing.mask.sum()),
         "segmentation": {"size": [*thing.mask.shape], "counts": [*_runs(thing.mask)]},
         "iscrowd": 0,
         "visible_share": None if thing.share is None else round(thing.share, 4),
         "truncated": thing.truncated,
+        "name": thing.name,
+        "distance": round(thing.distance, 4),
     }
 
 

@@ -9,7 +9,7 @@ import math
 import os
 import tempfile
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,22 +19,22 @@ from torch import Tensor
 
 import advsearch
 from advsearch import seeds
-from advsearch.config import AttackConfig
 from advsearch.controls.base import Control
 from advsearch.controls.patch import enlarged
 from advsearch.controls.space import file_name
 from advsearch.controls.texture import TextureControl
-from advsearch.engine.attack_parts import judged_alone, problem_from_config
-from advsearch.engine.loading import as_controls, load_scene
+from advsearch.engine.loading import Scene, as_controls, load_scene
 from advsearch.engine.problem import Problem
 from advsearch.engine.verifier import kept_answer
 from advsearch.errors import FileFormatError, InputError
+from advsearch.questions.attack.parts import judged_alone, problem_from_config
+from advsearch.questions.attack.settings import AttackConfig
+from advsearch.questions.attack.summary import AttackSummary, attack_of
 from advsearch.report.sheets import Mask, Piece
 from advsearch.runs.directory import ARTIFACTS, CONFIG, find_run
 from advsearch.runs.files import placed_by, storage_errors, write_bytes, write_text
 from advsearch.runs.images import read_png, to_8bit
-from advsearch.runs.results.attack import AttackSummary
-from advsearch.runs.summary import attack_of, read_result
+from advsearch.runs.summary import read_result
 from advsearch.scene.assembly import ON_PICTURE
 from advsearch.scene.assets import Floats, Ints, Mesh
 from advsearch.scene.description import NO_MAP, OBJECT
@@ -168,10 +168,13 @@ def write_gltf(run: str | Path, out: Path) -> list[str]:
     description = answer.problem.space.scene
     assert description is not None
     part = description.meshes[OBJECT]
-    found = posed(part, answer.inputs)
+    found, metres = posed(part, answer.inputs), description.object.metres
+    if metres is not None:
+        found = replace(found, mesh=replace(found.mesh, vertices=found.mesh.vertices * np.float32(metres)))
     with placed_by("out"):
         write_bytes(out, glb([found]))
-    notes = ["Lengths are in object sizes, y is up, and the texture is rounded to 8 bits."]
+    unit = "object sizes" if metres is None else "metres"
+    notes = [f"Lengths are in {unit}, y is up, and the texture is rounded to 8 bits."]
     if part.surface is not None:
         notes.append("Its surface is one of Mitsuba's own, of which glTF has the base colour only.")
     elif found.material.specular > PLAIN:
@@ -190,6 +193,28 @@ MOST_PARTS = 9
 """Parts of a texel along each side, odd: the middle one has the texel's own colour."""
 
 
+LONGEST = 100_000.0
+"""Longest side of a printed object, in millimetres."""
+
+
+def real_size(run: str | Path) -> float | None:
+    """Return the longest side of the object of a run of `attack`, in millimetres; None where its size is not known."""
+    _, config = _attack_in(find_run(run))
+    metres = _alone(config).description.object.metres
+    return None if metres is None else metres * 1000.0
+
+
+def _attack_in(folder: Path) -> tuple[AttackSummary, AttackConfig]:
+    summary = read_result(folder)
+    if not isinstance(summary, AttackSummary):
+        raise FileFormatError(f"{folder}: expected a run of attack, got one of {summary.command}")
+    return summary, AttackConfig.from_yaml(folder / CONFIG)
+
+
+def _alone(config: AttackConfig) -> Scene:
+    return load_scene(config.object, NO_MAP, up=config.up, size=config.size, unit=config.unit)
+
+
 def printable(run: str | Path, size: float) -> list[Piece]:
     """Return what of a run's answer can be printed.
 
@@ -205,14 +230,11 @@ def printable(run: str | Path, size: float) -> list[Piece]:
         UnknownNameError: there is no such run.
         FileFormatError: the run is of another kind or has not ended, or lacks its files.
     """
-    if not 1.0 <= size <= 10_000.0:
-        raise InputError(f"size: expected the object's longest side in millimetres, 1 to 10000, got {size}")
+    if not 1.0 <= size <= LONGEST:
+        raise InputError(f"size: expected the object's longest side in millimetres, 1 to {LONGEST:.0f}, got {size}")
     folder = find_run(run)
-    summary = read_result(folder)
-    if not isinstance(summary, AttackSummary):
-        raise FileFormatError(f"{folder}: expected a run of attack, got one of {summary.command}")
-    config = AttackConfig.from_yaml(folder / CONFIG)
-    scene = load_scene(config.object, NO_MAP, up=config.up)
+    summary, config = _attack_in(folder)
+    scene = _alone(config)
     pieces: list[Piece] = []
     for control in as_controls(config.controls):
         picture = folder / ARTIFACTS / f"{file_name(control.name)}.png"

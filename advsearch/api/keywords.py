@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 from torch import nn
 
 from advsearch.calls import check_types, unexpected
-from advsearch.config.scene import SEVERAL
+from advsearch.config import SEVERAL
 from advsearch.engine import loading
 from advsearch.engine.naming import check_not_of_scene, check_not_spread, exists_here, in_turn, model_name
 from advsearch.errors import InputError

@@ -20,22 +20,22 @@ from advsearch import models
 from advsearch.calls import helped
 from advsearch.config import RenderConfig
 from advsearch.engine import rendering
-from advsearch.engine.attack_parts import parts_in
-from advsearch.engine.attack_result import AttackResult
 from advsearch.engine.naming import check_run_settings, given_to, in_turn, load_models, scene_of
 from advsearch.engine.rendering import Rendering as Rendering
 from advsearch.engine.rendering import pictures_of, writable
-from advsearch.engine.sweeps.summary import SweepResult
 from advsearch.errors import InputError
 from advsearch.files import read_bytes
 from advsearch.models import Model
 from advsearch.progress import NullProgress, Progress, shows_progress
+from advsearch.questions.attack.parts import parts_in
+from advsearch.questions.attack.result import AttackResult
+from advsearch.questions.attack.summary import AttackSummary
+from advsearch.questions.sweep.result import SweepResult
+from advsearch.questions.sweep.summary import SweepSummary
 from advsearch.registry import allow_named, names_code
 from advsearch.runs.directory import ARTIFACTS, IMAGES, find_run
 from advsearch.runs.images import read_png
-from advsearch.runs.results.attack import AttackSummary
-from advsearch.runs.results.base import RenderResult, Result
-from advsearch.runs.results.sweep import SweepSummary
+from advsearch.runs.results import RenderResult, Result
 from advsearch.runs.summary import read_answer, read_result
 from advsearch.scene.importing.files import LARGEST_FILE
 from advsearch.scene.importing.hdr import read_exr
@@ -153,6 +153,7 @@ def render_from_config(config: RenderConfig, *, progress: Progress | None = None
         model,
         task=task,
         label=config.label,
+        judge=config.judge,
         controls=controls,
         around=config.around,
         spp=config.spp,

@@ -8,12 +8,153 @@ commands are a `Command` in this package, which is imported when it is asked for
 
 from __future__ import annotations
 
+import argparse
 import importlib
-from typing import Any
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from advsearch.cli.question import Positional, QuestionCommand
+from advsearch.cli import output
+from advsearch.cli.output import at_work
+from advsearch.errors import InputError
 from advsearch.rooms import help_of as help_of_question
 from advsearch.rooms import made_question, made_questions, rooms
+
+if TYPE_CHECKING:
+    from advsearch.settings import Config
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command that asks no question.
+
+    Attributes:
+        add_arguments: adds its arguments to a parser.
+        run: does what they say, and returns the exit status.
+        more: what its help says after what it does.
+        examples: lines of a shell, without `advsearch`.
+    """
+
+    add_arguments: Callable[[argparse.ArgumentParser], None]
+    run: Callable[[argparse.Namespace], int]
+    more: str = ""
+    examples: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Positional:
+    """How a setting is given without its flag: what the help calls it and says of it, what is missing where neither is
+    given, and whether there may be several."""
+
+    metavar: str
+    expected: str
+    more: str = ""
+    several: bool = False
+
+
+@dataclass(frozen=True)
+class QuestionCommand:
+    """A command that asks a question.
+
+    Attributes:
+        name: of the command; `advsearch.config.CONFIGS` has its settings, and `advsearch.api.carry_out` answers them.
+        answer: makes a text for a person of its result; what is shown of it where it has no other.
+        short: whether a result falls short of what was checked.
+        about: the setting that names runs, or a file, which the question is about; `--code` allows Python code that
+            these name.
+        place: how that setting is given without its flag.
+        brought: returns the settings that the `run.yaml` of the run that it is about brings, by what was typed.
+        listed: where the function is that returns what it may be about, with a line about each, which `list` prints.
+        more, examples: as of `Command`.
+    """
+
+    name: str
+    answer: Callable[[Any], str] = output.shown_text
+    short: Callable[[Any], bool] = lambda result: False
+    about: str = ""
+    place: Positional | None = None
+    brought: Callable[[Path, Mapping[str, Any]], dict[str, Any]] | None = None
+    listed: str = ""
+    more: str = ""
+    examples: tuple[str, ...] = ()
+
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        """Add a flag for each of the settings, and those that commands share."""
+        # late, so that --help answers at once
+        from advsearch.cli.flags import add_settings
+        from advsearch.config import CONFIGS
+
+        add_settings(parser, CONFIGS[self.name])
+        output.add_flags(parser, quiet=True)
+        if self.place:
+            parser.add_argument(
+                self.about,
+                metavar=self.place.metavar,
+                nargs="*" if self.place.several else "?",
+                default=argparse.SUPPRESS,
+                help=f"as `--{self.about}`{self.place.more}",
+            )
+        if self.about:
+            output.add_code_flag(parser)
+
+    def run(self, args: argparse.Namespace) -> int:
+        """Ask what the arguments say. Raises InputError where what it is about is missing."""
+        named = getattr(args, self.about, None)
+        if self.listed and named == "list":
+            module, _, function = self.listed.partition(":")
+            lines = getattr(importlib.import_module(module), function)()
+            if args.json:
+                listed = [{"name": name, "title": text} for name, text in lines.items()]
+                output.print_json({"schema": 1, f"{self.name}s": listed})
+            else:
+                print(output.aligned([[name, text] for name, text in lines.items()]))
+            return 0
+        if self.place and named in (None, []):
+            command = f"advsearch {self.name}"
+            raise InputError(f"{command}: expected {self.place.expected}; see {command} --help")
+        if isinstance(named, list):
+            setattr(args, self.about, ",".join(named))
+        return self.carry_out(self.config(args), as_json=args.json, quiet=args.quiet)
+
+    def file(self, args: argparse.Namespace) -> Path | None:
+        """Return the settings of the first run that the question is about, if it is about one."""
+        # late, so that --help answers at once
+        from advsearch.runs.directory import CONFIG, find_run
+        from advsearch.settings import split_names
+
+        if self.about not in args:
+            return None
+        name = getattr(args, self.about)
+        if self.place and self.place.several:
+            name = next(iter(split_names(name)), name)
+        return find_run(name) / CONFIG
+
+    def config(self, args: argparse.Namespace, **over: Any) -> Config:
+        """Return the configuration that the arguments describe, over settings from elsewhere."""
+        # late, so that --help answers at once
+        from advsearch.cli.flags import config_from
+        from advsearch.config import CONFIGS
+        from advsearch.settings import settings
+
+        config = CONFIGS[self.name]
+        if self.brought and (file := self.file(args)):
+            over = {**self.brought(file, vars(args)), **over}
+        elif self.brought and (missing := [one for one in settings(config) if one.required and one.field not in args]):
+            command, run = f"advsearch {self.name}", f"--{self.about.replace('_', '-')} RUN"
+            raise InputError(f"{command}: expected {missing[0].flag} NAME, or {run}; see {command} --help")
+        return config_from(args, config, **over)
+
+    def carry_out(self, config: Config, *, as_json: bool, quiet: bool, resumed: Path | None = None) -> int:
+        """Ask what `config` describes, or go on with it; print the answer and return the exit status."""
+        with at_work(as_json=as_json, quiet=quiet) as progress:
+            # late, so that --help answers at once
+            from advsearch.api import carry_out
+
+            result = carry_out(config, progress=progress, resumed=resumed)
+        status = output.finish(result, self.answer, as_json=as_json)
+        return status or (output.FELL_SHORT if self.short(result) else 0)
+
 
 ROOM = "advsearch.questions."
 
@@ -35,9 +176,9 @@ GROUPS = {
         "view": "advsearch.cli.dashboard:VIEW write the page of a run again, or a folder that any web server can serve",
         "dashboard": "advsearch.cli.dashboard:DASHBOARD show the pages of runs in a browser on this machine",
         "report": "",
-        "list": "advsearch.cli.names:LIST "
+        "list": "advsearch.cli.show:LIST "
         "list all names: objects, environments, controls, policies, tasks, objectives, models and recipes",
-        "labels": "advsearch.cli.names:LABELS find the names of a model's classes, as --label takes them",
+        "labels": "advsearch.cli.show:LABELS find the names of a model's classes, as --label takes them",
     },
     "trust: does an answer hold, and is the tool right?": {
         "test": "",
@@ -55,6 +196,8 @@ GROUPS = {
         "export a run: its rows as a table, a texture for printing, a scene for Mitsuba or an object as glTF",
         "import": "advsearch.cli.imports:IMPORT "
         "show what advsearch reads from a mesh or scene file, as text or as a picture",
+        "completion": "advsearch.cli.completion:COMPLETION "
+        "print a script with which Tab finishes commands, flags and names in bash, zsh or tcsh",
         "import-3db": "advsearch.cli.imports:IMPORT_3DB turn a folder that 3DB wrote into a run",
     },
 }
@@ -75,7 +218,10 @@ def found(name: str) -> Any:
         return getattr(importlib.import_module(place), attribute)
     if made := made_question(name):
         unflagged = Positional(*made.expected) if made.expected else None
-        return QuestionCommand(name, about=made.about, place=unflagged, examples=made.examples, brought=made.brought)
+        return QuestionCommand(
+            name, short=made.short, about=made.about, place=unflagged, brought=made.brought, listed=made.listed,
+            more=made.more, examples=made.examples,
+        )  # fmt: skip
     module = importlib.import_module(f"{ROOM}{name}")
     return getattr(module, "COMMAND", module)
 

@@ -12,11 +12,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from advsearch.cli import output
-from advsearch.cli.question import Command
+from advsearch.cli.commands import Command
 from advsearch.errors import InputError
-from advsearch.questions.photographs.answer import NO_QR, qr_text
+from advsearch.questions.sweep.page import write_bundle
 from advsearch.runs.directory import find_run
-from advsearch.viewer.pages import renewed, write_bundle
+from advsearch.viewer.clients import NO_QR, qr_text
+from advsearch.viewer.pages import renewed
 from advsearch.viewer.server import Dashboard
 
 if TYPE_CHECKING:

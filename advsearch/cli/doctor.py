@@ -24,7 +24,7 @@ from pathlib import Path
 
 from advsearch import __version__, threads
 from advsearch.cli import output
-from advsearch.cli.question import Command
+from advsearch.cli.commands import Command
 from advsearch.errors import AdvsearchError
 from advsearch.registry import OWN_FOLDER
 from advsearch.scene.mitsuba_backend import llvm

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from advsearch.cli import output
+from advsearch.cli.commands import Command
 from advsearch.cli.output import at_work, output_errors
-from advsearch.cli.question import Command
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.runs.directory import PARTS, find_run
 from advsearch.runs.export import FORMATS, write_rows, write_threedb
@@ -72,15 +72,16 @@ def _mitsuba(args: argparse.Namespace, out: Path) -> Written:
 
 
 USUAL_SIZE = 100.0
-"""Longest side of a printed object where nobody says it, in millimetres."""
+"""Longest side of a printed object whose size is not known, in millimetres."""
 
 
 def _print(args: argparse.Namespace, out: Path) -> Written:
-    longest = USUAL_SIZE if args.size is None else args.size
     with at_work(as_json=True, quiet=False):
-        from advsearch.api.export import printable  # takes seconds
+        from advsearch.api.export import printable, real_size  # takes seconds
         from advsearch.report.sheets import MOST_SHEETS, write_sheets  # draws with matplotlib
 
+        known = real_size(args.run) if args.size is None else args.size
+        longest = USUAL_SIZE if known is None else known
         pieces = printable(args.run, longest)
         profile = None if args.icc is None else Path(args.icc)
         title = f"{Path(args.run).name}, object of {longest:g} mm"
@@ -89,7 +90,7 @@ def _print(args: argparse.Namespace, out: Path) -> Written:
             pages = write_sheets(part, pieces, title, paper=paper, profile=profile, most=most)
     sizes = [{"name": piece.name, "width_mm": piece.size[0], "height_mm": piece.size[1]} for piece in pieces]
     text = f"{pages} pages in {out}; print them at 100 % and measure the square on the first"
-    if args.size is None:
+    if known is None:
         text += f"\nThe real object's longest side is taken for {longest:g} mm; --size says otherwise."
     return {"pages": pages, "size_mm": longest, "pieces": sizes}, text
 
@@ -144,7 +145,8 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--kind", help="only rows of this kind: search, baseline, sweep, ... (default: all)")
     parser.add_argument(
         "--size", metavar="MM", type=float,
-        help=f"print: the real object's longest side in millimetres (default: {USUAL_SIZE:g})",
+        help=f"print: the real object's longest side in millimetres (default: its own where "
+        f"that is known, or {USUAL_SIZE:g})",
     )  # fmt: skip
     parser.add_argument(
         "--sheets", metavar="N", type=int, help="print: sheets that may be written; more are refused (default: 200)"

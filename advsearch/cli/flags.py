@@ -12,8 +12,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from advsearch.config import CONFIGS, AttackConfig
+from advsearch.config import CONFIGS
 from advsearch.errors import InputError, UnknownNameError
+from advsearch.questions.attack.settings import AttackConfig
 from advsearch.registry import allow_named
 from advsearch.settings import Config, Setting, check_once, parse_assignment, read_yaml, settings, shown, split_names
 

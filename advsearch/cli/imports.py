@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import advsearch
 from advsearch.cli import output
+from advsearch.cli.commands import Command
 from advsearch.cli.output import at_work
-from advsearch.cli.question import Command
 from advsearch.errors import InputError
 from advsearch.files import MESHES, either
 from advsearch.runs.summary import read_result
@@ -170,7 +170,7 @@ def _threedb_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _import_threedb(args: argparse.Namespace) -> int:
-    from advsearch.engine.sweeps.summary import import_threedb  # takes seconds
+    from advsearch.questions.sweep.result import import_threedb  # takes seconds
 
     path = import_threedb(Path(args.folder), args.run, overwrite=args.overwrite)
     if args.json:

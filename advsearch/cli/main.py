@@ -111,6 +111,20 @@ def _run(given: list[str]) -> int:
 
 
 def _parse(given: list[str], command: str | None) -> argparse.Namespace:
+    parser, subparsers = without_commands()
+    for name in COMMANDS:
+        add_command(subparsers, name, whole=name == command)
+    args, unknown = parser.parse_known_args(given)
+    if unknown:
+        raise _unknown_argument(unknown[0], subparsers.choices[args.command] if args.command else parser)
+    if args.command is None:
+        parser.print_help()
+        parser.exit()
+    return args
+
+
+def without_commands() -> tuple[argparse.ArgumentParser, argparse._SubParsersAction[Any]]:
+    """Return the parser, and what `add_command` adds the commands to."""
     parser = Parser(
         prog="advsearch",
         description="Find the scene that a vision model gets wrong most badly.",
@@ -126,15 +140,7 @@ def _parse(given: list[str], command: str | None) -> argparse.Namespace:
         help="one of those below; advsearch COMMAND --help explains it",
         parser_class=Parser,
     )
-    for name in COMMANDS:
-        add_command(subparsers, name, whole=name == command)
-    args, unknown = parser.parse_known_args(given)
-    if unknown:
-        raise _unknown_argument(unknown[0], subparsers.choices[args.command] if args.command else parser)
-    if args.command is None:
-        parser.print_help()
-        parser.exit()
-    return args
+    return parser, subparsers
 
 
 def _listing() -> str:
@@ -161,6 +167,7 @@ def add_command(
     more, lines = texts_of(name)
     parser: argparse.ArgumentParser = subparsers.add_parser(
         name,
+        help=text,
         description=f"{text[0].upper()}{text[1:]}{more}.",
         epilog="".join(["examples:\n", *(f"  advsearch {line}\n" for line in lines)]) if lines else None,
         formatter_class=argparse.RawDescriptionHelpFormatter if lines else argparse.HelpFormatter,

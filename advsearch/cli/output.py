@@ -24,7 +24,7 @@ from advsearch.interrupts import INTERRUPTS
 from advsearch.progress import Progress, watched
 
 if TYPE_CHECKING:
-    from advsearch.runs.results.base import Result
+    from advsearch.runs.results import Result
 
 
 OK, BAD_INPUT, FELL_SHORT, INTERRUPTED = 0, 2, 3, 130
@@ -161,7 +161,7 @@ def add_code_flag(parser: argparse.ArgumentParser) -> None:
 def print_json(value: Any) -> None:
     """Print `value` as JSON on standard output; NaN and infinity become null."""
     # late, so that --help answers at once
-    from advsearch.runs.results.base import plain
+    from advsearch.runs.results import plain
 
     text = json.dumps(plain(value), indent=2, allow_nan=False, ensure_ascii=False)
     text = "".join(sign if sign.isprintable() or sign == "\n" else json.dumps(sign)[1:-1] for sign in text)

@@ -9,8 +9,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from advsearch.cli import commands, output
+from advsearch.cli.commands import Command
 from advsearch.cli.flags import command_in, config_of_file
-from advsearch.cli.question import Command
 from advsearch.cli.show import show_run
 from advsearch.errors import InputError
 from advsearch.registry import allow_named

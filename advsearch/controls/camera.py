@@ -21,10 +21,14 @@ from advsearch.controls.numbers import NumberControl, Values
 from advsearch.controls.values import Fixed
 from advsearch.errors import InputError
 from advsearch.scene.camera_model import COEFFICIENTS, NUMBERS, OF_KIND, CameraModel, pinhole
+from advsearch.scene.camera_presets import PRESETS
 from advsearch.scene.description import SceneDescription
-from advsearch.scene.geometry import affine, camera_to_world, framing_distance, middle
+from advsearch.scene.geometry import STEEPEST, affine, camera_to_world, framing_distance, middle
 from advsearch.scene.settings import CAMERA, ORBIT, ORBIT_CAMERA, moving
+from advsearch.scene.sizes import on_roads
 
+ROAD_USERS = (0.5, 4.0)
+"""Metres above the road from which vehicles are seen: from a bumper to the roof of a lorry."""
 SENSOR_WIDTH = 36.0
 """Width in millimetres of the full-frame sensor that a focal length refers to."""
 
@@ -49,7 +53,7 @@ class CameraControl(NumberControl):
         moving(ORBIT, "shift_x", "picture widths", -2.0, 2.0, 0.0, "Shift of the picture to the right."),
         moving(ORBIT, "shift_y", "picture heights", -2.0, 2.0, 0.0, "Shift of the picture downwards."),
         _lens("aperture", 0.0, 10.0, 0.0, "Radius of the lens; 0 is a pinhole."),
-        _lens("focus", 0.01, 1e4, "the object's middle", "Distance in focus.", log=True),
+        _lens("focus", 1e-4, 1e5, "the object's middle", "Distance in focus.", log=True),
         *map(_coefficient, COEFFICIENTS),
         CAMERA[-1],
     )
@@ -62,6 +66,8 @@ class CameraControl(NumberControl):
             )
         if "fov" in self.specs and "focal_length" in self.specs:
             raise InputError(f"`controls` {self.name}: fov and focal_length say the same thing; leave one of them out")
+        if "elevation" in self.specs and "height" in self.specs:
+            raise InputError(f"`controls` {self.name}: elevation and height say the same thing; leave one of them out")
         wanted = "aperture" in self.specs or "focus" in self.specs
         if wanted and ("shift_x" in self.specs or "shift_y" in self.specs):
             raise InputError(
@@ -99,6 +105,8 @@ class CameraControl(NumberControl):
             return model.values[parameter.name]
         if parameter.name == "distance" or parameter.name == "focus":
             return fitted_distance(self._described()) * self.scene.metres
+        if parameter.name == "height":
+            return float(camera_to_world(self._described())[2, 3]) * self.scene.metres
         if parameter.name == "focal_length":
             return SENSOR_WIDTH / 2.0 / math.tan(math.radians(self.scene.number("camera.fov")) / 2.0)
         return super().default(parameter)
@@ -107,6 +115,14 @@ class CameraControl(NumberControl):
         return "camera.fov" if parameter.name == "focal_length" else super().setting(parameter)
 
     def search_range(self, parameter: Parameter) -> tuple[float, float] | None:
+        preset = PRESETS.get(self.scene.preset)
+        if preset is not None:
+            own = self.scene.number("camera.azimuth")
+            around = (0.0, 360.0) if preset.aside >= 180.0 else (own - preset.aside, own + preset.aside)
+            return around if parameter.name == "azimuth" else preset.search.get(parameter.name)
+        if on_roads(self.scene.object) and parameter.name in ("elevation", "height"):
+            high = max(ROAD_USERS[1], float(self.default(parameter)))
+            return None if parameter.name == "elevation" else (ROAD_USERS[0], high)
         if parameter.name == "distance" and parameter.search is not None:
             fitted = fitted_distance(self._described()) * self.scene.metres
             return parameter.search[0] * fitted, parameter.search[1] * fitted
@@ -116,7 +132,7 @@ class CameraControl(NumberControl):
         scene, fov = self.scene, values["fov"]
         if "focal_length" in self.specs:
             fov = _fov_of(values["focal_length"])
-        if "distance" in self.specs or not self.asked or "camera.distance" in scene.given:
+        if "distance" in self.specs or not self.asked or scene.values.get("camera.distance") is not None:
             distance = values["distance"] / scene.metres
         else:
             distance = framing_distance(scene, fov, scene.aspect).float()
@@ -154,8 +170,21 @@ class CameraControl(NumberControl):
             return scene.with_values(camera__fov=_fov_of(torch.tensor(float(focal_length.value))).item())
         return scene
 
+    @property
+    def _keeps_height(self) -> bool:
+        """Whether the height above the ground says how high the camera is, and not the elevation."""
+        if {"elevation", "height"} & self.specs.keys():
+            return "height" in self.specs
+        heights = next(one for one in self.own if one.name == "height")
+        return self.scene.values.get("camera.height") is not None or not (
+            self.asked or self.search_range(heights) is None
+        )
+
     def _orbit(self, values: Values, distance: Tensor) -> Tensor:
         azimuth, elevation, roll = (torch.deg2rad(values[name]) for name in ("azimuth", "elevation", "roll"))
+        if self._keeps_height:
+            above = values["height"] / self.scene.metres - float(middle(self.scene)[2])
+            elevation = torch.asin((above / distance).clamp(-STEEPEST, STEEPEST))
         zero = torch.zeros_like(azimuth)
         outwards = torch.stack([elevation.cos() * azimuth.cos(), elevation.cos() * azimuth.sin(), elevation.sin()])
         left = torch.stack([azimuth.sin(), -azimuth.cos(), zero])
@@ -167,7 +196,9 @@ class CameraControl(NumberControl):
 
 def measured_in(parameter: Parameter, metres: bool) -> Parameter:
     """Return a parameter of the camera as it is around an object that has a size in metres, or has none."""
-    return replace(parameter, unit="metres") if metres and parameter.name in ("distance", "focus") else parameter
+    return (
+        replace(parameter, unit="metres") if metres and parameter.name in ("distance", "height", "focus") else parameter
+    )
 
 
 def fitted_distance(scene: SceneDescription) -> float:

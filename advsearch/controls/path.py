@@ -50,7 +50,7 @@ SHIFT, TURNING = ("object_x", "object_y", "object_z"), "object_heading"
 """Columns of the object in a file that is about both."""
 MOST_WAYPOINTS, MOST_BYTES = 100_000, 16 * 2**20
 FARTHEST = 1e5
-"""Object sizes that a waypoint may be away."""
+"""Metres, or object sizes, that a waypoint may be away."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +59,8 @@ class Waypoints:
 
     Attributes:
         times: (n,) ascending, seconds from the first.
-        places: (n, 3) object sizes from the middle of where the object stands; of an object that moves, its shift.
+        places: (n, 3) from the middle of where the object stands, in metres where its size is known, in object sizes
+            elsewhere; of an object that moves, its shift.
         targets: (n, 3) what the camera looks at, from the same middle; None for the middle itself.
         headings: (n,) degrees that the object is turned by; None for none.
         notes: sentences about how it is read.
@@ -220,8 +221,8 @@ class PathControl(NumberControl):
         if way is None:
             return start, center
         if isinstance(way, Waypoints):
-            target = center + (shift if way.targets is None else way.at(time, way.targets))
-            return center + way.at(time, way.places), target
+            target = center + (shift if way.targets is None else way.at(time, way.targets) / self.scene.metres)
+            return center + way.at(time, way.places) / self.scene.metres, target
         along, away, reach = own[:3, 2], (start - center).norm(), float(self.chosen["reach"])
         ahead = torch.stack([along[0], along[1], own.new_zeros(())])  # the camera keeps its height, as a car's does
         ahead = ahead / ahead.norm().clamp_min(1e-6)
@@ -243,7 +244,8 @@ class PathControl(NumberControl):
         if way is None:
             return own.new_zeros(3), still
         if isinstance(way, Waypoints):
-            return way.at(time, way.places), still if way.headings is None else way.at(time, way.headings)
+            shift = way.at(time, way.places) / self.scene.metres
+            return shift, still if way.headings is None else way.at(time, way.headings)
         share, reach = self._share(time), float(self.chosen["reach"])
         if way == TURN:
             return own.new_zeros(3), 360.0 * share

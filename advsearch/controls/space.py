@@ -9,12 +9,18 @@ from functools import cached_property
 
 import torch
 from torch import Tensor
+from torch.quasirandom import SobolEngine
 
 from advsearch.controls.base import NOTHING, Control, Group, Value
+from advsearch.controls.numbers import NumberControl
 from advsearch.controls.values import Moved
 from advsearch.copies import is_ours
 from advsearch.errors import InputError
 from advsearch.scene.description import ENVIRONMENT, OWN_MAP, SceneDescription
+from advsearch.scene.validity import View, past, surroundings_of, view_of
+
+VIEWS = 256
+"""Configurations of a camera, a power of two, by which is found how far it goes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,6 +182,34 @@ class Space:
                 chosen = str(values[group.name]["value"])
                 return None if chosen == OWN_MAP else chosen
         return self.environment
+
+    def notes(self, scene: SceneDescription) -> tuple[str, ...]:
+        """Return what a user should know of the scene (without one of its own, of `scene`), and of how far the camera
+        goes in it: see `advsearch.scene.validity`."""
+        scene = self.scene or scene
+        turns = any(group.setting == "environment.rotation" for group in self.groups)
+        return (*scene.notes, *past(scene, self._views(scene), turns=turns))
+
+    def _views(self, scene: SceneDescription) -> list[View]:
+        """How the camera looks in some configurations, evenly spread, and where a coordinate is at an end."""
+        if surroundings_of(scene) is None:
+            return []
+        for control, start in self.slices(self.start):
+            if not isinstance(control, (NumberControl, _Held)) or "camera.to_world" not in control.inputs(start):
+                continue
+            size = len(start)
+            spread = SobolEngine(size).draw(VIEWS) if size else torch.zeros(1, 0)
+            ends = [torch.where(torch.eye(size) > 0.0, end, 0.5) for end in (0.0, 1.0)]
+            posed = [control.inputs(one) for one in torch.cat([spread, *ends])]
+            return [
+                view_of(
+                    scene,
+                    one["camera.to_world"].detach().double().numpy(),
+                    float(one["camera.fov"]) if "camera.fov" in one else None,
+                )
+                for one in posed
+            ]
+        return [view_of(scene)]
 
     def artifacts(self, u: Tensor) -> dict[str, Tensor]:
         """Return the pictures worth keeping of a configuration, by file stem."""

@@ -20,7 +20,7 @@ from advsearch.attacks.evaluation import Query, WhichGradient
 from advsearch.engine.acceptance import ComparedView
 from advsearch.engine.transport import PredictedSearch
 from advsearch.files import scaled
-from advsearch.runs.results.attack import BankOfConditions
+from advsearch.runs.results import BankOfConditions
 from advsearch.scene.formation import to_8_bit
 from advsearch.scene.predictor import MOST_BYTES
 from advsearch.scene.transport.matrix import LinearRenderer, Tick

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from advsearch import seeds
-from advsearch.runs.results.base import GradientStatus, Measured
+from advsearch.runs.results import GradientStatus, Measured
 from advsearch.scene.gradients import STEP_RANGE, GradientPlan, Group, compared
 from advsearch.scene.renderer import Renderer
 

@@ -21,15 +21,18 @@ from advsearch.controls import Space
 from advsearch.copies import copied
 from advsearch.described import Value
 from advsearch.engine.loading import Scene
-from advsearch.engine.rendering import pictures_of, render, sight_of
+from advsearch.engine.rendering import facts_about, pictures_of, render, things_seen
 from advsearch.errors import InputError
+from advsearch.files import JsonObject
 from advsearch.models import Model
 from advsearch.options import check_takes
 from advsearch.registry import check_import, current_directory_importable
-from advsearch.report.phrases import seen_text
+from advsearch.report.wording import seen_text
 from advsearch.runs.export import AFTER, OWN
+from advsearch.scene.description import OBJECT
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.surfaces import Surfaces
+from advsearch.scene.things import ALL
 from advsearch.scene.transport.matrix import linear_inputs
 from advsearch.tasks import Answer, Facts, Judgement, Task
 from advsearch.tasks.base import Output, Truth, mean
@@ -124,6 +127,16 @@ def judgements(
     return [measured(said[k], metrics, pictures[k], output[k : k + 1], truth) for k, truth in enumerate(truths)]
 
 
+def with_things(judgement: Judgement, things: JsonObject | None) -> Judgement:
+    """Return a judgement whose payload has what the picture shows of each thing, beside what is said of it."""
+    if things is None or judgement.not_a_number:
+        return judgement
+    kept = judgement.payload if isinstance(judgement.payload, dict) else {}
+    said: Any = kept.get("things", {})
+    shown: Any = {name: {**seen, **said.get(name, {})} for name, seen in things.items()}  # type: ignore[dict-item]
+    return replace(judgement, payload={**kept, "things": shown})
+
+
 def measured(judgement: Judgement, metrics: Metrics, image: Tensor, output: Output, truth: Truth) -> Judgement:
     """Return the judgement of a picture (H, W, 3), sRGB in [0, 1], with what metrics say of it. A metric gets the truth
     as an objective does, of one picture; all that it gets are copies."""
@@ -180,17 +193,10 @@ Looked = Callable[[], Surfaces]
 """What says what the camera sees, when it is asked."""
 
 
-def facts_of(scene: Scene, name: str, label: str | None, describe: Described, look: Looked | None = None) -> Facts:
-    """Return what a scene gives a task to judge by: what `describe` says of the configuration, and of the rest what the
-    scene was given; and what `look` sees, if anything looks."""
-    fixed = {key: value for key, value in scene.description.values.items() if value is not None}
-
-    def numbers() -> dict[str, float]:
-        said = {key: one["value"] for key, one in describe().items()}
-        return {key: float(v) for key, v in {**fixed, **said}.items() if isinstance(v, (int, float))}
-
-    sight = None if look is None else lambda: sight_of(look())
-    return Facts(name, label, scene.description.object.label, numbers, sight)
+def facts_of(scene: Scene, name: str, config: SceneConfig, describe: Described, look: Looked | None = None) -> Facts:
+    """Return what a scene gives a task to judge by, with what is right and what is judged by the settings; see
+    `facts_about`."""
+    return facts_about(scene.description, name, config.label, describe, look, config.judge)
 
 
 def shown(task: Task, model: Model, scenes: Sequence[Scene], config: SceneConfig) -> Task:
@@ -199,7 +205,10 @@ def shown(task: Task, model: Model, scenes: Sequence[Scene], config: SceneConfig
     if not task.looks:
         return task
     for scene in scenes:
-        view = render(scene, model, task=task, label=config.label, spp=LOOK_SPP, **pictures_of(config)).views[0]
+        judge = OBJECT if config.judge == ALL else config.judge
+        view = render(
+            scene, model, task=task, label=config.label, judge=judge, spp=LOOK_SPP, **pictures_of(config)
+        ).views[0]
         task = task.seeing(view.output, view.truth)
         if not task.unsaid:
             return task
@@ -210,7 +219,8 @@ def check_truth(task: Task, model: Model, scene: Scene, facts: Facts, config: Sc
     """Refuse a scene of which the task cannot say what is right, before anything is prepared; where no label was given,
     with the model's first answers to a clean picture."""
     try:
-        task.check(facts)
+        for one in facts.each.values() or (facts,):
+            task.check(one)
     except InputError as error:
         if facts.label is not None:
             raise
@@ -276,6 +286,7 @@ class KnownTruths:
     renderer: Renderer
     facts: Callable[[Described, Looked], Facts]
     _kept: dict[bytes, Truth] = field(default_factory=dict)
+    _seen: dict[bytes, JsonObject | None] = field(default_factory=dict)
 
     def at(self, whole: Tensor, listed: Mapping[str, Value] | None = None) -> Truth:
         """Return what is true at (d,) of the whole space. Values that are `listed` count as they are there, not as what
@@ -297,6 +308,17 @@ class KnownTruths:
                 del self._kept[next(iter(self._kept))]
             self._kept[key] = truth
         return truth
+
+    def things(self, whole: Tensor) -> JsonObject | None:
+        """Return what the picture at (d,) of the whole space shows of each thing, see `things_seen`."""
+        if not self.renderer.scene.made[0].things:
+            return None
+        key = whole.detach()[self._rest].numpy().tobytes()
+        if key not in self._seen:
+            while len(self._seen) >= MOST:
+                del self._seen[next(iter(self._seen))]
+            self._seen[key] = things_seen(self.renderer, whole)
+        return self._seen[key]
 
     @cached_property
     def _rest(self) -> Tensor:

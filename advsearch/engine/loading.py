@@ -19,7 +19,7 @@ from advsearch.controls import CONTROLS, Control, Space, gathered, make_control,
 from advsearch.distributions import OwnQuantiles, as_setting
 from advsearch.errors import InputError
 from advsearch.models.guards import plainly
-from advsearch.options import told
+from advsearch.options import things_as_text, told
 from advsearch.registry import names_code
 from advsearch.scene import settings
 from advsearch.scene.assembly import Motion
@@ -141,6 +141,8 @@ class Scene:
         if own.camera_model is not None:
             own.camera_model.check_given(given)
         values = {**own.values, **{name: resolved[name] for name in given}}
+        if "camera.elevation" in given:
+            values["camera.height"] = None
         return Scene(on_its_ground(replace(own, values=values, given=own.given | set(given))), self.only_here)
 
 
@@ -152,9 +154,12 @@ def load_scene(
     *,
     scene: str | Path | Mapping[str, object] | None = None,
     up: str | None = None,
+    size: float | None = None,
+    unit: str | None = None,
     settings: Given | None = None,
     camera: str | None = None,
     texture: Texture | None = None,
+    things: str | Mapping[str, object] | Sequence[str | Mapping[str, object]] | None = None,
 ) -> Scene:
     """Load a scene.
 
@@ -164,25 +169,39 @@ def load_scene(
         scene: the file or, of Mitsuba, the dictionary (`mi.cornell_box()`) in which `object` is a node or the id of a
             shape; a file may as well be written before it: "scene.glb#chair", "box.xml#large-box".
         up: the up axis of a mesh file, "y" or "z"; by default what its format or else its shape says.
+        size: of the object, its longest side in metres, 1e-4 to 1e4. Distances of the camera, paths of files and the
+            height of a photograph are in metres where the size of the object is known, and in object sizes elsewhere.
+        unit: of the coordinates of the object's file, "mm", "cm", "m" or "in", which gives it its size; by default
+            glTF is in metres, and of other files it is not known.
         settings: parameters to fix, e.g. ``{"camera.azimuth": 130.0}``. The size of a picture belongs to none of them
             but to what makes it: `resolution` of `attack`, `sweep`, `render` and `Scene.renderer`.
-        camera: a camera file (docs/cameras.md), "fisheye" or "equirectangular", whose lens the camera
-            around the object then has; the name of a camera of a scene file; "orbit" or None for a pinhole.
+        camera: a camera file (docs/cameras.md), "fisheye" or "equirectangular", whose lens the camera around the object
+            then has; "dashcam" or "robot", mounted at its height above the ground; the name of a camera of a scene
+            file; "orbit" or None for a pinhole.
         texture: of the object in place of its own: a picture file, or (h, w, 3) sRGB in [0, 1] or of 8 bits, row 0 on
             top; `result.artifacts["texture"]`, say.
+        things: what stands beside the object, in metres from it, x forwards and y to its left: a text such as
+            "car@12,3.5,heading=180; person@6,-2", or a list of such texts or of mappings, {"object": "car", "x": 12,
+            "y": 3.5, "heading": 180}; `size` (metres), `name` and `label` may be said too.
 
     Raises:
         InputError: a name is unknown, a file cannot be used, or a value is out of range.
     """
-    settings = None if settings is None else as_python(settings)
+    said: dict[str, Any] = {
+        "given": None if settings is None else as_python(settings),
+        "up": up,
+        "size": size,
+        "unit": unit,
+        "things": things_as_text(things),
+    }
     if scene is None:
-        described = describe(object, environment, given=settings, up=up)
+        described = describe(object, environment, **said)
     elif not isinstance(object, str):
         raise InputError(f"object: expected the name of a node or shape of the scene, got {object!r}")
     elif isinstance(scene, Mapping):
-        described = describe(object, environment, given=settings, up=up, plugins=scene)
+        described = describe(object, environment, **said, plugins=scene)
     else:
-        described = describe(f"{scene}#{object}", environment, given=settings, up=up)
+        described = describe(f"{scene}#{object}", environment, **said)
     only_here = isinstance(scene, Mapping) or not all(
         one is None or isinstance(one, (str, Path)) for one in (object, environment)
     )
@@ -213,13 +232,18 @@ def scene_as_settings(scene: Scene) -> dict[str, Any]:
         "object": described.object_name,
         "environment": described.environment_name,
         "up": described.up,
+        "size": described.size,
+        "unit": described.unit,
         "camera": named_camera(described),
+        "things": described.things_spec or None,
         "set": described.given_values,
     }
 
 
 def named_camera(description: SceneDescription) -> str | None:
     """Return the camera in use, as `load_scene` takes it; None for the pinhole around the object."""
+    if description.preset:
+        return description.preset
     if description.camera_model is not None and description.camera_model.name:
         return description.camera_model.name
     return None if description.camera == ORBIT_CAMERA else description.camera

@@ -30,7 +30,13 @@ def scene_of(config: SceneConfig, name: str | None = None, environment: str | No
     """Load the scene that a configuration describes: its only object in its environment, or a named one."""
     if name is None:
         name, environment = config.object, config.environment
-    return load_scene(name, environment, up=config.up, settings=scene_settings(config), camera=config.camera)
+    return load_scene(name, environment, **told_of_scene(config))
+
+
+def told_of_scene(config: SceneConfig) -> dict[str, Any]:
+    """Return what `load_scene` is told beside object and environment."""
+    said = {name: getattr(config, name) for name in ("up", "size", "unit", "camera", "things")}
+    return {**said, "settings": scene_settings(config)}
 
 
 def scene_settings(config: SceneConfig) -> Given:
@@ -108,7 +114,7 @@ def different(names: Sequence[str], setting: str) -> Sequence[str]:
     return names
 
 
-OF_SCENE = ("set", "environment", "up", "camera", "exposure", "object")
+OF_SCENE = ("set", "environment", "up", "size", "unit", "camera", "things", "exposure", "object")
 
 
 def check_not_of_scene(settings: Mapping[str, object]) -> None:

@@ -20,7 +20,7 @@ from advsearch.controls.base import Control
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.models import Model
 from advsearch.models.features import features_of
-from advsearch.runs.results.attack import PrintTerms
+from advsearch.runs.results import PrintTerms
 from advsearch.scene.renderer import Renderer
 from advsearch.tasks import Task
 from advsearch.tasks.together import Ensemble, Outputs, Together, of_each

@@ -17,7 +17,7 @@ from torch import Tensor
 from advsearch import seeds
 from advsearch.engine.gradients import Keep, Loss, gradients, measured_now, only
 from advsearch.engine.problem import Problem
-from advsearch.runs.results.base import GradientStatus, Measured, PathCut, PathLength
+from advsearch.runs.results import GradientStatus, Measured, PathCut, PathLength
 from advsearch.scene.gradients import BY_ADJOINT, BY_DIFFERENCES, GradientPlan, Group, compared
 from advsearch.scene.renderer import Renderer
 

@@ -19,10 +19,10 @@ from advsearch.attacks.verification import EASIER, OVER_CONDITIONS, WORST_CASE, 
 from advsearch.controls import Space
 from advsearch.described import Value
 from advsearch.engine.acceptance import ComparedView, view_of
-from advsearch.engine.judging import Described, KnownTruths, Looked, Metrics, judgements, mean_metrics
+from advsearch.engine.judging import Described, KnownTruths, Looked, Metrics, judgements, mean_metrics, with_things
 from advsearch.engine.objective import ConfigurationInputs, domain_of
 from advsearch.models import Model
-from advsearch.runs.results.base import GroupDerivative, PlannedGradient
+from advsearch.runs.results import GroupDerivative, PlannedGradient
 from advsearch.scene.description import NO_MAP
 from advsearch.scene.formation import to_8_bit
 from advsearch.scene.gradients import GradientPlan, Group
@@ -157,7 +157,7 @@ class Problem:
         with torch.no_grad():
             output, truth = self.model(picture), self.truth(whole)
             objective = float(self.objective(output, picture[None], truth, self.asked(whole))[0])
-            (said,) = judgements(self.task, output, picture[None], [truth], self.metrics)
+            (said,) = self._judged(output, picture[None], [truth], [whole])
             return replace(said, objective=objective)
 
     def judge_several(
@@ -168,10 +168,17 @@ class Problem:
         with torch.no_grad():
             output = self.model(pictures)
             truths = [self.truth()] if not self.task.varies else list(map(self.truth, wholes, listed))
-            said = judgements(self.task, output, pictures, truths, self.metrics)
+            said = self._judged(output, pictures, truths, wholes)
         return [
             replace(Judgement.of(one.score, one.margin, one.answer, one.payload), metrics=one.metrics) for one in said
         ]
+
+    def _judged(
+        self, output: Output, pictures: Tensor, truths: Sequence[Truth], wholes: Sequence[Tensor]
+    ) -> list[Judgement]:
+        """What task and metrics say of pictures (N, H, W, 3), and what these show of each thing."""
+        said = judgements(self.task, output, pictures, truths, self.metrics)
+        return [with_things(one, self._truths.things(at)) for one, at in zip(said, wholes, strict=True)]
 
     def view(
         self, predict: Callable[[Tensor], Tensor], whole: Tensor, seed: int, spp: int, *, drawn: Tensor | None = None
@@ -330,7 +337,7 @@ class Problem:
                 with torch.no_grad():
                     value = loss(renderer(whole, seed=seed, spp=spp))
         image, output = seen[0]
-        (judgement,) = judgements(self.task, output, image[None], [truth], self.metrics)
+        (judgement,) = self._judged(output, image[None], [truth], [whole])
         evaluation = Evaluation(
             objective=float(value),
             gradient=derivative,
@@ -363,7 +370,7 @@ class Problem:
             derivative = None
             if values.requires_grad:
                 derivative = torch.autograd.grad((values * hard_first(values)).sum(), at)[0]
-        said = judgements(self.task, outputs, pictures, truths, self.metrics)
+        said = self._judged(outputs, pictures, truths, wholes)
         evaluations = [
             Evaluation(float(value), None, judgement.success, judgement=judgement)
             for value, judgement in zip(values.detach(), said, strict=True)

@@ -21,8 +21,7 @@ from advsearch.interrupts import interruptible
 from advsearch.progress import Progress
 from advsearch.report.wording import count
 from advsearch.runs.directory import RunDirectory
-from advsearch.runs.results.attack import ControlGroup, VerifiedRate
-from advsearch.runs.results.base import INTERRUPTED, OUT_OF_TIME, Fields, Result
+from advsearch.runs.results import INTERRUPTED, OUT_OF_TIME, ControlGroup, Fields, Result, VerifiedRate
 from advsearch.runs.store import Row
 from advsearch.runs.summary import NAME, read_result
 from advsearch.tasks import Answer, Judgement

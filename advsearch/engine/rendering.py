@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -12,27 +12,31 @@ import torch
 from torch import Tensor, nn
 
 from advsearch import seeds
-from advsearch.config import SceneConfig
-from advsearch.config.scene import PICTURE_SPP, PICTURES
+from advsearch.config import PICTURE_SPP, PICTURES, SceneConfig
 from advsearch.controls import Space, compose
 from advsearch.controls.values import sentences
 from advsearch.described import Value
 from advsearch.engine.loading import Controls, Scene, Texture, as_controls, framed, load_scene, make_renderer
-from advsearch.errors import InputError
+from advsearch.errors import InputError, UnknownNameError
+from advsearch.files import JsonObject
 from advsearch.models import Model, load_model
 from advsearch.models.guards import plainly
 from advsearch.progress import Watched, watcher
 from advsearch.report.marks import contact_sheet, marked
-from advsearch.report.phrases import seen_text
+from advsearch.report.wording import seen_text
 from advsearch.runs.files import placed_by
 from advsearch.runs.images import png_bytes, write_exr, write_layers, write_png
-from advsearch.runs.results.base import Formation, MeshUp, RenderResult, ViewAnswers
+from advsearch.runs.results import Formation, MeshUp, RenderResult, ViewAnswers
 from advsearch.scene.description import OBJECT, SceneDescription
 from advsearch.scene.formation import SAMPLER, ImageFormation, to_8_bit
+from advsearch.scene.outlines import seen_things
+from advsearch.scene.renderer import Renderer
 from advsearch.scene.settings import ORBIT_CAMERA
 from advsearch.scene.surfaces import Surfaces
+from advsearch.scene.things import ALL
 from advsearch.settings import as_python
 from advsearch.tasks import Answer, AnyTask, Facts, Mark, Sight, make_task
+from advsearch.tasks.each_thing import each_thing
 
 MOST_ANSWERS = 5
 """Answers of the model that are kept of a picture."""
@@ -51,6 +55,7 @@ class View:
         surfaces: what is seen in each pixel; None where nobody asked.
         output: of the model, for its task.
         truth: of the scene; None where the task does not depend on what is seen, or nobody says it.
+        things: what is seen of the object and each thing beside it, see `things_seen`.
     """
 
     azimuth: float
@@ -61,6 +66,7 @@ class View:
     surfaces: Surfaces | None = None
     output: Any = None
     truth: Any = None
+    things: JsonObject | None = None
 
     def __repr__(self) -> str:
         said = self.answers[0].label if self.answers else None
@@ -205,6 +211,7 @@ def render(
     *,
     task: AnyTask = "classification",
     label: str | None = None,
+    judge: str = OBJECT,
     controls: Controls = (),
     around: int | None = None,
     texture: Texture | None = None,
@@ -224,6 +231,7 @@ def render(
         model: from `load_model`, or what that takes.
         task: what says the model's answers: a name, a mapping with a `name` and options, an instance, or a function.
         label: the right answers, for a task that draws what is true; None for the object's own.
+        judge: the thing of which that is drawn: "object", the name of one beside it, or "all".
         controls: what differs from the scene: names, instances, or a mapping from names to settings. A parameter with
             a range stays where a search would start.
         around: number of views, from azimuths all around the object; None for one, from the scene's own camera.
@@ -245,7 +253,7 @@ def render(
     scene = scene if texture is None else scene.with_texture(texture)
     made = make_task(task)
     model = load_model(model, task=made)
-    asked = made.on(model)
+    asked = made.on(model) if judge != ALL else each_thing(made.on(model))
     instances = as_controls(controls)
     if around is not None and any(one.kind == "camera" and "azimuth" in one.settings() for one in instances):
         raise InputError("around: sets camera.azimuth itself, and `controls` fixes it; leave one of them out")
@@ -267,7 +275,10 @@ def render(
             picture = to_8_bit(space.picture(u, formation.display(radiance)))
             output, truth = model(picture), None
             if asked.varies:
-                facts = _facts(description, label, partial(renderer.surfaces, u), space.describe(u))
+                facts = facts_about(
+                    description, description.object_name, label, partial(space.describe, u),
+                    partial(renderer.surfaces, u), judge,
+                )  # fmt: skip
                 try:
                     truth = asked.truth(facts)
                 except InputError as error:
@@ -278,11 +289,12 @@ def render(
         remarks = remarks or asked.remarks
         azimuth = description.number("camera.azimuth")
         surfaces = renderer.surfaces(u) if aov else None
-        views.append(View(azimuth, picture, radiance * formation.gain, answers, marks, surfaces, output, truth))
+        things = things_seen(renderer, u)
+        views.append(View(azimuth, picture, radiance * formation.gain, answers, marks, surfaces, output, truth, things))
         progress.advance(1)
     assert formation is not None
     own = scene.description
-    warnings = (*(space.scene or own).notes, *sentences(space.moved), *untold, *remarks)
+    warnings = (*space.notes(own), *sentences(space.moved), *untold, *remarks)
     shown = replace(own, environment_spec=space.environment or own.environment_spec)
     return Rendering(shown, model.name, made.name, formation, spp, tuple(views), warnings)
 
@@ -296,17 +308,77 @@ def _configuration(at: Tensor, space: Space) -> Tensor:
     return u
 
 
-def _facts(
-    description: SceneDescription, label: str | None, look: Callable[[], Surfaces], values: Mapping[str, Value]
+def facts_about(
+    description: SceneDescription,
+    name: str,
+    label: str | None,
+    values: Callable[[], Mapping[str, Value]],
+    look: Callable[[], Surfaces] | None = None,
+    judge: str = OBJECT,
 ) -> Facts:
-    said = {**description.values, **{name: one["value"] for name, one in values.items()}}
-    numbers = {name: float(one) for name, one in said.items() if isinstance(one, (int, float))}
-    return Facts(description.object_name, label, description.object.label, lambda: numbers, lambda: sight_of(look()))
+    """Return what a scene gives a task to judge by.
+
+    Args:
+        description: the scene.
+        name: what the object is called.
+        label: what is right, of the thing that is judged, or of the object where all are.
+        values: says the configuration; of the rest is said what the scene was given.
+        look: sees it.
+        judge: the thing that is judged: `OBJECT`, the name of one beside it, or `ALL`.
+
+    Raises:
+        UnknownNameError: there is no such thing.
+    """
+    fixed = {key: value for key, value in description.values.items() if value is not None}
+
+    def numbers() -> dict[str, float]:
+        said = {**fixed, **{key: one["value"] for key, one in values().items()}}
+        return {key: float(v) for key, v in said.items() if isinstance(v, (int, float))}
+
+    things = description.things
+    if judge not in (OBJECT, ALL, *things):
+        raise UnknownNameError("thing to judge:", judge, (OBJECT, ALL, *things), "It stands in `judge`.")
+    if judge == ALL and not things:
+        raise InputError("judge: all, and nothing stands beside the object; add `things`, or leave it out")
+    looked = None if look is None else cache(look)
+
+    def of(mesh: str, label: str | None) -> Facts:
+        sight = None if looked is None else lambda: sight_of(looked(), mesh)
+        if mesh == OBJECT:
+            return Facts(name, label, description.object.label, numbers, sight)
+        return Facts(mesh, label, things[mesh].label, numbers, sight)
+
+    if judge != ALL:
+        return of(judge, label)
+    each = {OBJECT: of(OBJECT, label), **{mesh: of(mesh, None) for mesh in things}}
+    return replace(each[OBJECT], each=each)
 
 
-def sight_of(surfaces: Surfaces) -> Sight:
-    """Return what a task judges by, of what the camera sees."""
-    return Sight(surfaces.seen(OBJECT), surfaces.depth, surfaces.z_depth)
+def sight_of(surfaces: Surfaces, mesh: str = OBJECT) -> Sight:
+    """Return what a task judges by, of what the camera sees: of the object, or of another mesh."""
+    return Sight(surfaces.seen(mesh), surfaces.depth, surfaces.z_depth)
+
+
+def things_seen(renderer: Renderer, u: Tensor) -> JsonObject | None:
+    """Return what the picture of a configuration (d,) shows of the object and each thing beside it, by name; None
+    where nothing stands beside it. See `runs.results.ThingSeen`."""
+    description = renderer.scene.made[0]
+    if not description.things:
+        return None
+    names = (OBJECT, *description.things)
+    found = {one.name: one for one in seen_things(renderer, u, names)}
+    shown: JsonObject = {}
+    for name in names:
+        one = found.get(name)
+        shown[name] = {
+            "label": description.meshes[name].label,
+            "box": None if one is None else [*one.box],
+            "pixels": 0 if one is None else int(one.mask.sum()),
+            "share": 0.0 if one is None else None if one.share is None else round(one.share, 4),
+            "truncated": None if one is None else one.truncated,
+            "distance": None if one is None else round(one.distance * description.metres, 3),
+        }
+    return shown
 
 
 def pictures_of(config: SceneConfig) -> dict[str, Any]:

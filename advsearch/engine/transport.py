@@ -21,7 +21,7 @@ from advsearch.attacks import Evaluate, Evaluation
 from advsearch.attacks.evaluation import Query
 from advsearch.engine.acceptance import ComparedView, Deviation, compared
 from advsearch.engine.problem import Problem
-from advsearch.runs.results.attack import BankOfConditions, LinearTransport, PredictionError
+from advsearch.runs.results import BankOfConditions, LinearTransport, PredictionError
 from advsearch.scene.formation import to_8_bit
 from advsearch.scene.predictor import NOISE, Predictor
 from advsearch.scene.transport.lights import HAZE, lights_to_collect, predicting, samples_to_collect, why_not

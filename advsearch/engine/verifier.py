@@ -18,28 +18,23 @@ from advsearch.attacks import (
     SearchResult,
     Verification,
     choose_spp,
-    count_right,
     run_trials,
     verify,
 )
-from advsearch.attacks.candidates import FoundFailure
 from advsearch.attacks.draws import batches
 from advsearch.attacks.evaluation import Query, most_at_once
 from advsearch.attacks.rate_samples import CONDITIONS, OVER_LADDER, affordable, choose_rate_spp
 from advsearch.attacks.trials import LADDER, margins_of, most_samples
 from advsearch.cluster import Executor
-from advsearch.config.scene import SceneConfig
-from advsearch.engine.attack_result import save_trial
+from advsearch.config import SceneConfig
 from advsearch.engine.journal import Journal, Shared
 from advsearch.engine.problem import Problem
-from advsearch.engine.record import KEPT, Findings, Stages, verified_rate
+from advsearch.engine.record import KEPT, Findings, Stages
 from advsearch.engine.transport import PredictedSearch
 from advsearch.errors import InputError
 from advsearch.progress import Progress
 from advsearch.report.wording import count as plural
 from advsearch.runs.directory import RunDirectory
-from advsearch.runs.results import attack as results
-from advsearch.runs.results.attack import PicturedAnswer
 from advsearch.runs.summary import read_answer
 from advsearch.scene.formation import next_count, to_8_bit
 from advsearch.tasks import Judgement
@@ -216,85 +211,6 @@ class Verifier:
         most = "at most " if at_most else ""
         hint = f"{most}{trials} pictures of {plural(self.findings.spp, 'sample')} a pixel; {flags} shorten it"
         self.stages.begin(name, title, trials, hint=hint, at_most=at_most)
-
-
-TRIED = 8
-"""Different failures that are tried, at most: the first of the list."""
-
-
-def check_failures(verifier: Verifier, found: SearchResult) -> None:
-    """Verify the first of the different failures that a search answers with, each for itself.
-
-    Each goes through the trials of the answer, with the seeds that the control group had, up to the first that decides
-    against it: what holds is found by the rule of the answer. Over conditions that vary one answer takes hundreds of
-    trials, and nothing is tried here.
-    """
-    problem, findings = verifier.problem, verifier.findings
-    known, rule = found.failures, problem.rule
-    if known is None or not known.listed or rule.conditional or rule.already_wrong(count_right(findings.clean, 1)):
-        return
-    tried = known.listed[:TRIED]
-    verifier.begin("checking different failures with fresh renders", len(tried) * verifier.count, at_most=True)
-    findings.failures = tuple(
-        verifier.verified(f"failure {number}", replace(found, best_u=failure.u), curtailed=True)
-        for number, failure in enumerate(tried)
-    )
-
-
-def write_failures(run: RunDirectory, problem: Problem, findings: Findings) -> None:
-    """Write a picture of each failure that was tried, as the model saw it in its first trial."""
-    for number, checked in enumerate(findings.failures):
-        save_trial(run, problem, findings, (f"failure {number}", 0), _picture(number), checked.u)
-
-
-def described_failures(problem: Problem, findings: Findings) -> results.DifferentFailures | None:
-    """Return what a summary says of the different failures; None of a policy that looks for one."""
-    known = findings.search.failures if findings.search else None
-    if known is None:
-        return None
-    listed = [_described(problem, findings, number, failure) for number, failure in enumerate(known.listed)]
-    return results.DifferentFailures(
-        over=[problem.domain.names[place] for place in known.over],
-        found=known.found,
-        seen=known.seen,
-        places=known.places,
-        share=None if known.share is None else results.FailingShare.of(known.share),
-        tried=len(findings.failures),
-        held=sum(one.ending is Ending.FOUND for one in findings.failures),
-        listed=listed,
-    )
-
-
-def _described(problem: Problem, findings: Findings, number: int, failure: FoundFailure) -> results.DifferentFailure:
-    checked = findings.failures[number] if number < len(findings.failures) else None
-    names, ranges, first = problem.domain.names, failure.ranges, checked.adversarial_trials[0] if checked else None
-    return results.DifferentFailure(
-        ranges={names[place]: _range(problem, failure.u, place, ends) for place, ends in ranges.items()},
-        configuration={name: results.DescribedValue.of(value) for name, value in problem.describe(failure.u).items()},
-        objective=failure.objective,
-        holds=None if checked is None else checked.ending is Ending.FOUND,
-        verified=None if checked is None else verified_rate(checked),
-        picture=None if checked is None else f"images/{_picture(number)}.png",
-        pictured=None if first is None else PicturedAnswer(**vars(first.answer), payload=first.payload, trial=0),
-    )
-
-
-def _picture(number: int) -> str:
-    return f"failure-{number:02d}"
-
-
-def _range(problem: Problem, u: Tensor, place: int, ends: tuple[float, float]) -> tuple[float, float] | str:
-    """Return both ends of one element of u in its parameter's unit, the option of a choice; in u where it is not told
-    by itself."""
-    block, said = problem.domain.block_of(place), list[float]()
-    for end in ends:
-        moved = u.clone()
-        moved[place] = u[place] if block.options else end
-        value = problem.describe(moved).get(block.name, {"value": end, "unit": "1"})["value"]
-        if isinstance(value, str):
-            return value
-        said.append(float(value) if block.size == 1 else end)
-    return min(said), max(said)
 
 
 def unchanged(picture: Tensor, seed: int) -> Tensor:

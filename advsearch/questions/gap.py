@@ -7,16 +7,15 @@ from typing import Any, ClassVar
 
 from pydantic import Field
 
-from advsearch.config.attack import AttackConfig
-from advsearch.config.scene import SceneConfig
+from advsearch.config import SceneConfig
 from advsearch.question import Asked, question
+from advsearch.questions.attack.settings import AttackConfig
 from advsearch.report import wording
 from advsearch.report.figures import BLUE, GREY, RED
 from advsearch.report.markup import InNotebook
-from advsearch.report.phrases import margin_text, percent
 from advsearch.report.shown import AnswerPart, Claim, Column, ShownAnswer, average_claim, case_claim, searches_text
-from advsearch.runs.results.attack import AverageCase, VerifiedRate
-from advsearch.runs.results.base import Fields, JsonFloat, StudyResult
+from advsearch.report.wording import margin_text, percent
+from advsearch.runs.results import AverageCase, Fields, JsonFloat, StudyResult, VerifiedRate
 from advsearch.settings import setting_as_in
 
 NOTE = (
@@ -70,7 +69,7 @@ class GapResult(InNotebook, StudyResult):
 )
 def gap(asked: Asked[GapConfig]) -> GapResult:
     """Compare the worst configuration with the average, for each object and each control (docs/questions.md)."""
-    from advsearch.api.studies import StudyRun  # imports torch
+    from advsearch.questions.attack.studies import StudyRun  # imports torch
 
     study, rows = StudyRun(asked), list[GapRow]()
     for (one,) in study.chains:

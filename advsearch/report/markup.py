@@ -19,7 +19,7 @@ from advsearch.errors import InputError
 from advsearch.report.figures import BLUE, GREY, RED, Figures, drawn, new_axes
 from advsearch.report.shown import AnswerPart, ShownAnswer, shown
 from advsearch.runs.images import png_bytes
-from advsearch.runs.results.base import Result
+from advsearch.runs.results import Result
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

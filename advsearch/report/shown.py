@@ -22,9 +22,8 @@ from pydantic import Field
 
 from advsearch import rooms
 from advsearch.report import wording
-from advsearch.report.phrases import percent
-from advsearch.runs.results.attack import AverageCase, VerifiedRate
-from advsearch.runs.results.base import INTERRUPTED, Fields, Formation, Interval, Result
+from advsearch.report.wording import percent
+from advsearch.runs.results import INTERRUPTED, AverageCase, Fields, Formation, Interval, Result, VerifiedRate
 
 LONG = 24
 """Rows of a table of fields above which it is folded."""

@@ -1,146 +1,244 @@
-"""A summary (docs/answers.md) in plain words, for the final table and the report alike."""
+"""Numbers and results in plain words, and what a task's answers are called in sentences and tables, by its name."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import PurePath
 from typing import TYPE_CHECKING, Any
 
-from advsearch.report import phrases
+from advsearch.described import NOT_A_NUMBER
 from advsearch.settings import split_names
 
 if TYPE_CHECKING:
-    from advsearch.runs.results.attack import AttackSummary, SharedWork, VerifiedRate
-    from advsearch.runs.results.base import ConditionRow, Formation, Interval
+    from advsearch.runs.results import ConditionRow, Formation, Interval, SharedWork, VerifiedRate
+
+
+CLASSIFICATION, DETECTION, SEGMENTATION = "classification", "detection", "segmentation"
+DEPTH, SIMILARITY = "depth", "similarity"
+"""Tasks whose answers have words of their own; others are quoted."""
+
+_MARGINS = {
+    CLASSIFICATION: "how far the wrong answer leads the right one, in logits",
+    DETECTION: "how far the best right box is under the score that counts, in log-odds; over 0 where none is found",
+    SEGMENTATION: "the lead of wrong classes at the pixel that decides, in logits; over 0 where too few are right",
+    DEPTH: "the logarithm of the factor by which the object's distance is off, less that of the tolerance",
+    SIMILARITY: "how far the nearest wrong name leads the right one, in logits",
+}
+_MARKS = {
+    DETECTION: "Blue is the true box, orange what the model finds with a score that counts.",
+    SEGMENTATION: "Blue is the true outline, orange the pixels to which the model gives a right class.",
+    DEPTH: "Blue is the true outline, orange the object's pixels whose distance is right. Beside it is the inverse of "
+    "the true distance, and of the model's: light is near.",
+}
+_WANTED = {
+    "mislabel": "makes the model take {} for something else",
+    "displace": "makes the model see {} elsewhere",
+    "create": "makes the model see beside {} what is not there",
+    "nearer": "makes the model judge {} nearer than it is",
+    "farther": "makes the model judge {} farther than it is",
+    "gone": "makes the model judge {} to be as far as what is behind it",
+}
+SUCCESS_ABOVE_ZERO = ("margin", "score", "vanish", *_WANTED)
+"""Objectives that are over 0 exactly where an answer is what is sought."""
+
+_UNITS = {
+    "logits": ("margin", "log_odds", "pixel_margin"),
+    "logarithm of a factor": ("nearer", "farther", "gone"),
+    "log-odds": ("vanish", "mislabel", "displace", "create"),
+    "nats": ("cross_entropy",),
+    "lengths of the clean features": ("feature_distance",),
+    "1 - cosine": ("distance",),
+    "those of the tasks": ("each",),
+}
+
+MOST_DECIMALS = 4
+"""Of a percentage."""
+PROBABILITY_DECIMALS = 1
+"""Of a probability that a model gives."""
+
+WHOLE = ("background", "itself", "something else")
+"""Answers without an article."""
+
+_NONE, _ELSEWHERE = "no ", " elsewhere"
+
+_DOING = {"calls": "calling", "finds": "finding", "sees": "seeing", "takes": "taking", "judges": "judging"}
+_DOING |= {"answers": "answering"}
+
+
+Said = Any
+"""An answer of a model: `advsearch.tasks.Answer`, or what a result holds of one."""
+
+
+def percent(share: float | None, most: int = MOST_DECIMALS) -> str:
+    """Return ``83 %`` for 0.83. 100 and 0 are said only of exactly 1 and 0."""
+    return "unknown" if share is None else f"{percent_number(float(share), most)} %"
+
+
+def percent_number(share: float, most: int = MOST_DECIMALS) -> str:
+    """Return ``83`` for 0.83, ``4.6`` for 0.0459, ``0.02`` for 0.000211 and ``99.98`` for 0.99979.
+
+    Within five of 0 or 100 it has one decimal, and nearer to them as many, `most` at most, as show how far it is away.
+    """
+    value = 100.0 * share
+    away = min(value, 100.0 - value)
+    if away >= 5.0 or away <= 0.0:
+        return f"{value:.0f}"
+    decimals = min(max(1, -math.floor(math.log10(away))), most)
+    text = f"{value:.{decimals}f}".rstrip("0").rstrip(".")
+    if text not in ("0", "100"):
+        return text
+    least = 10.0**-decimals
+    return f"under {least:.{decimals}f}" if text == "0" else f"over {100.0 - least:.{decimals}f}"
+
+
+def share_of_text(count: int, total: int, interval: tuple[float, float]) -> str:
+    """Return a share with its interval and what it is of: ``12 % (9 to 16) of 340``."""
+    if not total:
+        return "none of 0"
+    low, high = map(percent_number, interval)
+    return f"{percent(count / total)} ({low} to {high}) of {total:,}"
+
+
+def with_article(name: str) -> str:
+    """Return ``a mug``, ``an iron``."""
+    return f"{'an' if name[:1].lower() in 'aeiou' else 'a'} {name}"
+
+
+def beside_text(answer: str, pair: Any) -> str:
+    """Return what a model does without and with the answer of a run (`PairedRates`), in sentences."""
+    sides = [
+        f"{one.correct} of {one.configurations} ({percent(one.accuracy)}, 95 % interval "
+        f"{percent_number(one.interval[0])}-{percent_number(one.interval[1])} %)"
+        for one in (pair.clean, pair.answer)
+    ]
+    low, high = (100.0 * end for end in pair.interval)
+    ends = f"{-high:.0f} to {-low:.0f}" if pair.difference < 0 else f"{low:.0f} to {high:.0f}"
+    shown = "" if low > 0.0 or high < 0.0 else "; that there is a difference is not shown"
+    return (
+        f"{pair.model} is right in {sides[0]} of the clean scene, and in {sides[1]} with the answer of {answer}: "
+        f"{abs(100.0 * pair.difference):.0f} points {'fewer' if pair.difference < 0 else 'more'} (95 % interval of "
+        f"pairs {ends}){shown}. Right in the clean one alone are {pair.clean_only} pairs, with the answer alone "
+        f"{pair.answer_only}."
+    )
+
+
+def margin_text(task: str) -> str:
+    """Return what the margin of a task is, as a clause."""
+    return _MARGINS.get(task, "over 0 where the answer is wrong")
+
+
+def is_command(text: str) -> bool:
+    """Whether what a result says of asking the same again is a command; otherwise it says why there is none."""
+    return not text or text.startswith("advsearch ")
+
+
+def objective_label(objective: str) -> str:
+    """Return an objective with its unit, for an axis: ``margin [logits]``."""
+    return next((f"{objective} [{unit}]" for unit, names in _UNITS.items() if objective in names), objective)
+
+
+def marks_text(task: str) -> str:
+    """Return what is drawn into the pictures of a task's answers, in a sentence."""
+    return _MARKS.get(task, "Blue is true of the scene, orange is the model's answer.")
+
+
+def wanted(objective: str, thing: str) -> str:
+    """Return what a search with an objective looks for, as a clause: "makes the model miss this mug"."""
+    return _WANTED.get(objective, "makes the model miss {}").format(thing)
+
+
+def answer_cells(task: str, answer: Said) -> list[str]:
+    """Return an answer and its number, for a table: ``["vase", "84 %"]``, ``["no cup found", "best score of cup
+    0.12"]``.
+    """
+    label, share = answer.label, answer.probability
+    if share is None:
+        return [label, ""]
+    if task == SIMILARITY:
+        return [label, _similar(percent(share, PROBABILITY_DECIMALS), getattr(answer, "payload", None))]
+    if task == DETECTION:
+        if label.startswith(_NONE):
+            return [f"{label} found", f"best score of {label.removeprefix(_NONE)} {share:.2f}"]
+        return [label, f"score {share:.2f}"]
+    return [label, f"accuracy {percent(share)}" if task == SEGMENTATION else percent(share, PROBABILITY_DECIMALS)]
+
+
+def answer_text(task: str, answer: Said) -> str:
+    """Return an answer on one line: ``vase, 91 %``, ``no cup found (best score of cup 0.12)``."""
+    label, number = answer_cells(task, answer)
+    if task == SEGMENTATION and number and label.startswith(_NONE):
+        return f"{label} found, accuracy over the object's pixels {percent(answer.probability)}"
+    if task == SEGMENTATION and number:
+        return f"accuracy over the object's pixels {percent(answer.probability)}, most often {label}"
+    if task == DETECTION and number:
+        return f"{label} ({number})"
+    return f"{label}, {number}" if number else label
+
+
+SEEN = ("seen", "box", "distance")
+"""Heads of `things_rows`, behind the name."""
+
+
+def things_rows(things: Mapping[str, Any]) -> list[list[str]]:
+    """Return what is seen of each thing, for a table, from its name to `runs.results.ThingSeen` as a mapping."""
+    rows = []
+    for name, one in things.items():
+        share = "nothing" if one["box"] is None else "in part" if one["share"] is None else percent(one["share"])
+        box = "" if one["box"] is None else ", ".join(map(str, one["box"]))
+        rows.append([name, share, box, "" if one["distance"] is None else f"{one['distance']:.1f} m"])
+    return rows
+
+
+def seen_cells(task: str, answer: Said) -> list[str]:
+    """Return one of the answers to a whole picture, for a table: ``["cup", "score 0.77"]``, ``["mug", "91 %"]``."""
+    if answer.probability is None:
+        return [answer.label, ""]
+    if task == DETECTION:
+        return [answer.label, f"score {answer.probability:.2f}"]
+    share = percent(answer.probability, PROBABILITY_DECIMALS)
+    return [answer.label, f"{share} of the picture" if task == SEGMENTATION else share]
+
+
+def seen_text(task: str, answer: Said) -> str:
+    """Return the same on one line: ``cup (score 0.77)``, ``mug 91 %``."""
+    label, number = seen_cells(task, answer)
+    return f"{label} ({number})" if task == DETECTION and number else f"{label} {number}".rstrip()
+
+
+def calls(task: str, thing: str, label: str) -> str:
+    """Return what a model does to a thing, as a clause: ``calls this mug a vase``, ``finds no cup``."""
+    if label == NOT_A_NUMBER:
+        return f"answers nothing for {thing}, for its answer is not a number"
+    if task in (SEGMENTATION, DETECTION) and label.startswith(_NONE):
+        return f"finds {label}"
+    if task == DETECTION and label.endswith(_ELSEWHERE):
+        return f"sees {with_article(label.removesuffix(_ELSEWHERE))} where there is none"
+    if task == CLASSIFICATION:
+        return f"calls {thing} {with_article(label)}"
+    if task == DEPTH:
+        return f"judges {thing} {label}"
+    if task in (DETECTION, SEGMENTATION, SIMILARITY):
+        return f"takes {thing} for {label if label in WHOLE and task != DETECTION else with_article(label)}"
+    return f'answers "{label}" for {thing}'
+
+
+def calling(task: str, label: str) -> str:
+    """Return the same of a thing that was named already: ``calling it a vase``, ``finding no cup``."""
+    verb, _, rest = calls(task, "it", label).partition(" ")
+    return f"{_DOING[verb]} {rest.removesuffix(' for it')}"
+
+
+def _similar(share: str, kept: Any) -> str:
+    """Return how sure an answer of similarity is, and where the right one stands or how like the clean one it is."""
+    if not isinstance(kept, dict) or "cosine" not in kept:
+        return share
+    if "rank" not in kept:
+        return f"cosine {kept['cosine']:.2f}"
+    return f"{share}, right one at rank {kept['rank']} of {kept['references']}" if kept["rank"] > 1 else share
+
 
 NO_INTERVAL = "no interval"
-
-PATH = "path"
-"""The control whose conditions are moments."""
-
-NORMS = {"linf": "the largest change of any value", "l2": "the root of the sum of all squared changes"}
-"""What these words mean, said where they are first used."""
-
-_REASONS = {
-    "budget spent": "The budget is spent.",
-    "stalled": "The policy had nothing more to propose.",
-    "non-finite objective": "The objective was not a number several times in a row.",
-}
-"""Why a search ended without an answer, where the name of the ending doesn't say it."""
-
-
-def attack_verdict(summary: AttackSummary) -> str:
-    """Return what the run found, in one sentence that holds on its own."""
-    ending, verified = summary.ending, summary.verified
-    thing = f"this {noun(summary)}"
-    if ending == "already wrong":
-        wrong = phrases.calls(summary.task, thing, summary.clean.label)
-        return f"The model already {wrong}: nothing was changed and nothing counts as found."
-    if verified is None and ending == "interrupted" and summary.adversarial:
-        says = phrases.calls(summary.task, thing, summary.adversarial.label)
-        return f"Interrupted after {count(summary.steps, 'step')}. The answer so far is not verified: the model {says}."
-    if verified is None:
-        return f"{ending[:1].upper()}{ending[1:]} after {count(summary.steps, 'step')}; nothing is verified."
-    rate = rate_text(verified) + another_text(summary.over)
-    claim = _claim(summary, thing)
-    if ending == "found":
-        return f"{_how_it_errs(summary, verified, thing)} in {rate}."
-    if ending == "interrupted":
-        return f"Interrupted; so far {claim} in {rate}."
-    if ending == "not verified":
-        return f"The search claims an answer that is not confirmed: {claim} in {rate}."
-    why = _REASONS.get(ending, f"The search ended: {ending}.")
-    return f"No {budget_text(summary)} was found that {_wanted(summary, thing)}: {claim} in {rate}. {why}"
-
-
-def another_text(over: Sequence[str]) -> str:
-    """Return what is another one in each trial: ``, each with another camera``; of a path it is the moment."""
-    others = [name for name in over if name != PATH]
-    said = [f"with another {' and '.join(others)}"] if others else []
-    said += ["at another moment of the path"] if PATH in over else []
-    return f", each {' and '.join(said)}" if said else ""
-
-
-def remarks(summary: AttackSummary) -> list[str]:
-    """Return what has to be known beside the verdict: the control group, the random search, the run's warnings."""
-    said = []
-    control, own = summary.clean.control, summary.policy_verified
-    missed = control.trials - control.correct if control else 0
-    if control and missed and summary.ending != "already wrong" and not summary.minimises:
-        apart = " They do not count." if summary.over else ""
-        nothing = f"; in {control.not_a_number} the answer is not a number" if control.not_a_number else ""
-        said.append(f"The clean scene itself fails {missed} of its {control.trials} trials{nothing}.{apart}")
-    if summary.answer_from == "random" and own:
-        said.append(
-            "The random search beside it found a worse configuration than the policy did "
-            f"({own.successes} of {own.trials} with a margin of {own.margin:.2f}); that of the random search is the "
-            f"answer. The margin is {phrases.margin_text(summary.task)}."
-        )
-    else:
-        said += _against_random(summary)
-    return said + summary.warnings
-
-
-def noun(summary: AttackSummary) -> str:
-    """Return what the object is called: ``wine glass`` for ``wine-glass`` and ``mug`` for ``data/mug.obj``."""
-    return PurePath(summary.object).stem.replace("-", " ").replace("_", " ")
-
-
-def title(summary: AttackSummary) -> str:
-    """Return a short name for the run: ``mug, texture``."""
-    return ", ".join([noun(summary), *summary.controls])
-
-
-def success(summary: AttackSummary) -> str:
-    """Return one word for a trial that counts: ``wrong``, ``target`` or ``easier``."""
-    return "target" if summary.target else "easier" if summary.minimises else "wrong"
-
-
-def goal_text(summary: AttackSummary) -> str:
-    """Return what was asked for, where it was not just any wrong answer."""
-    if summary.target:
-        return f"the model should answer {' or '.join(summary.target)}"
-    return "easier to recognise" if summary.minimises else ""
-
-
-def objective_text(summary: AttackSummary) -> str:
-    """Return what came of an objective that is no margin, over the trials; empty where there is nothing to say."""
-    tried = summary.tried_objective
-    if tried is None or summary.objective in phrases.SUCCESS_ABOVE_ZERO:
-        return ""
-    parts = [
-        f"{name} {one.mean:.3g} (from {one.low:.3g} to {one.high:.3g})"
-        for name, one in (("clean", tried.clean), ("answer", tried.answer))
-        if one is not None
-    ]
-    return f"{summary.objective} in the trials: {', '.join(parts)}" if parts else ""
-
-
-def over_text(summary: AttackSummary) -> str:
-    """Return what varied by chance: ``camera and environment, drawn anew for every picture``."""
-    return f"{' and '.join(summary.over)}, drawn anew for every picture" if summary.over else ""
-
-
-def drive_text(summary: AttackSummary) -> str:
-    """Return in how many frames of a drive the model is right; empty where none was looked at."""
-    drive = summary.drive
-    if drive is None:
-        return ""
-    answer = "" if drive.answer is None else f", {drive.answer} with the answer"
-    return f"right in {drive.clean} of {drive.frames} frames of the clean scene{answer}"
-
-
-def smallest_text(summary: AttackSummary) -> str:
-    """Return the bracket of the smallest epsilon; empty if it was not asked for."""
-    bracket = summary.smallest
-    if bracket is None:
-        return ""
-    found, below = _epsilons(bracket.epsilon), _epsilons(bracket.not_found_at)
-    if not found:
-        return f"none found up to {below}"
-    floor = f"no search found one at {below}" if below else "no search failed, so it may be smaller still"
-    still = "" if bracket.closed or not below else "; the searches did not suffice to bring the two together"
-    return f"{found}; {floor}{still}"
 
 
 def short_name(value: Any) -> str:
@@ -169,7 +267,7 @@ def short_names(text: str) -> str:
 
 def interval_text(interval: Interval | None) -> str:
     """Return ``83-100 %`` for the interval of a rate."""
-    return f"{phrases.percent_number(interval[0])}-{phrases.percent_number(interval[1])} %" if interval else NO_INTERVAL
+    return f"{percent_number(interval[0])}-{percent_number(interval[1])} %" if interval else NO_INTERVAL
 
 
 def rate_text(rated: VerifiedRate) -> str:
@@ -215,61 +313,10 @@ def workers_text(shared: SharedWork | None) -> str:
         return ""
     told = [f"{shared.most} at most"]
     if shared.utilisation is not None:
-        told.append(f"busy {phrases.percent(shared.utilisation)} of {seconds_text(shared.alive)}")
+        told.append(f"busy {percent(shared.utilisation)} of {seconds_text(shared.alive)}")
     told.append(f"loading took {seconds_text(shared.loading)}")
     counts = {"lost": shared.lost, "refused": shared.refused, "given out again": shared.retried}
     return ", ".join([*told, *(f"{number} {what}" for what, number in counts.items() if number)])
-
-
-def changed_text(summary: AttackSummary) -> str:
-    """Return `budget_text` with a word on each norm: ``texture within 0.1 (linf: the largest change of any value)``."""
-    text = budget_text(summary)
-    for norm, meaning in NORMS.items():
-        text = text.replace(f"({norm})", f"({norm}: {meaning})", 1)  # at its first use
-    return text
-
-
-def budget_text(summary: AttackSummary) -> str:
-    """Return what could change and how far: ``texture within 0.1 (linf)``."""
-    epsilon, norm = summary.epsilon, summary.norm
-    if isinstance(epsilon, dict) or isinstance(norm, dict):
-        epsilons, norms = (one if isinstance(one, dict) else {} for one in (epsilon, norm))
-        return " and ".join(_within(name, epsilons.get(name), norms.get(name)) for name in summary.controls)
-    return _within(" and ".join(summary.controls) or "nothing", epsilon, norm)
-
-
-def _within(name: str, epsilon: Any, norm: Any) -> str:
-    if not isinstance(epsilon, (int, float)):
-        return name
-    return f"{name} within {number_text(epsilon)}" + (f" ({norm})" if norm else "")
-
-
-def _epsilons(told: Mapping[str, float] | None) -> str:
-    """``0.0123`` of one control; ``texture 0.01, geometry 0.002`` of several."""
-    if not told:
-        return ""
-    if len(told) == 1:
-        return f"{next(iter(told.values())):.3g}"
-    return ", ".join(f"{name} {value:.3g}" for name, value in told.items())
-
-
-def renders_text(summary: AttackSummary) -> str:
-    """Return ``40 of the search, 40 gradients, 21 of the verification``."""
-    known = {"search": "of the search", "gradient": "gradients", "verification": "of the verification"}
-    known |= {"baseline": "of the random search", "unprinted": "of the search without print terms"}
-    known |= {"products": "predicted"}
-    spent = [f"{number} {known.get(name, f'of {name}')}" for name, number in summary.renders.items() if number]
-    return ", ".join(spent) or "none"
-
-
-def print_cost_text(summary: AttackSummary) -> str:
-    """Return ``margin 4.1 with the print terms, 6.3 without (200 steps): they cost 2.2 logits``; empty: not known."""
-    cost = None if summary.printability is None else summary.printability.cost
-    if cost is None or cost.cost is None or cost.margin_with is None or cost.margin_without is None:
-        return ""
-    said = f"they cost {cost.cost:.3g} logits" if cost.cost > 0 else "they cost nothing that shows here"
-    margins = f"margin {cost.margin_with:.3g} with the print terms, {cost.margin_without:.3g} without"
-    return f"{margins} (another search of {count(cost.steps, 'step')}, {cost.verified.trials} trials each): {said}"
 
 
 def formation_text(formation: Formation, gains: Mapping[str, float] | None = None) -> str:
@@ -293,61 +340,6 @@ def formation_text(formation: Formation, gains: Mapping[str, float] | None = Non
 def number_text(value: Any) -> str:
     """Return a value as text; a number with the digits that mean something to a reader."""
     return f"{value:.4g}" if isinstance(value, float) else str(value)
-
-
-def _how_it_errs(summary: AttackSummary, verified: VerifiedRate, thing: str) -> str:
-    """Return "The model calls this mug a vase" where that is known of every trial, a weaker clause otherwise."""
-    if summary.minimises:
-        return f"The model recognises {thing}, more surely than in the clean scene,"
-    answers = verified.labels
-    if len(answers) == 1:
-        return f"The model {phrases.calls(summary.task, thing, next(iter(answers)))}"
-    if answers:
-        most = max(answers, key=lambda label: answers[label])
-        what = "takes {} for one of the targets" if summary.target else "is wrong about {}"
-        return f"The model {what.format(thing)}, most often {phrases.calling(summary.task, most)},"
-    if summary.task != phrases.CLASSIFICATION:
-        return f"The model is wrong about {thing}"
-    called = phrases.with_article(summary.adversarial.label) if summary.adversarial else "something else"
-    return f"The model takes {thing} for something else ({called})"
-
-
-def _claim(summary: AttackSummary, thing: str) -> str:
-    """Return what a trial counts as, as a clause: "the model is wrong about this mug"."""
-    if summary.minimises:
-        return f"the model recognises {thing}, more surely than in the clean scene,"
-    if summary.target and summary.task == phrases.CLASSIFICATION:
-        return f"the model calls {thing} {_a_target(summary)}"
-    if summary.target:
-        return f"the model answers {' or '.join(summary.target)}"
-    return "it is wrong" if summary.ending in _REASONS else f"the model is wrong about {thing}"
-
-
-def _wanted(summary: AttackSummary, thing: str) -> str:
-    """Return what was looked for, as a clause: "makes the model miss this mug"."""
-    if summary.minimises:
-        return f"makes {thing} easier to recognise"
-    return (
-        f"makes the model call {thing} {_a_target(summary)}"
-        if summary.target
-        else phrases.wanted(summary.objective, thing)
-    )
-
-
-def _a_target(summary: AttackSummary) -> str:
-    return " or ".join(phrases.with_article(name) for name in summary.target or ())
-
-
-def _against_random(summary: AttackSummary) -> list[str]:
-    ours, random = summary.verified, summary.baseline.verified if summary.baseline else None
-    if ours is None or random is None:
-        return []
-    tally = f"{random.successes} of {random.trials}"
-    if random.rate > ours.rate:
-        return [f"Random search with as many renders does better: {tally}."]
-    if random.rate == ours.rate > 0:
-        return [f"Random search with as many renders does as well: {tally}. The policy adds nothing here."]
-    return []
 
 
 def conditions_text(conditions: Sequence[ConditionRow]) -> str:

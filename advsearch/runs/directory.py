@@ -24,7 +24,7 @@ from advsearch.yaml_text import LARGEST
 if TYPE_CHECKING:
     from contextlib import AbstractContextManager
 
-    from advsearch.runs.results.base import Result
+    from advsearch.runs.results import Result
     from advsearch.settings import Config
 
 HOME = Path("runs")

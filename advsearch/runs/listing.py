@@ -11,7 +11,7 @@ from pathlib import Path
 from advsearch.errors import AdvsearchError
 from advsearch.runs import files, store, summary
 from advsearch.runs.directory import CONFIG, check_links, is_run
-from advsearch.runs.results.base import Result
+from advsearch.runs.results import Result
 from advsearch.settings import read_yaml
 
 FAULT = "it cannot be read, which is a fault of advsearch"

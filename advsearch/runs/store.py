@@ -30,7 +30,7 @@ from advsearch.runs.files import (
     readable,
     storage_errors,
 )
-from advsearch.runs.results.base import plain
+from advsearch.runs.results import plain
 
 NAME = "results.sqlite"
 

@@ -22,9 +22,7 @@ from pydantic import ValidationError
 from advsearch.errors import FileFormatError
 from advsearch.files import opened_for, parse_json, read_bytes, read_text, split_paths
 from advsearch.runs.files import write_bytes, write_text
-from advsearch.runs.results import kind_of
-from advsearch.runs.results.attack import AttackSummary
-from advsearch.runs.results.base import Result
+from advsearch.runs.results import Result, kind_of
 from advsearch.settings.configuration import FILES
 
 NAME = "summary.json"
@@ -49,31 +47,25 @@ def read_result(folder: Path) -> Result:
     try:
         values = parse_json(read_text(path, "the summary of a run", LARGEST), finite=True)
     except FileNotFoundError:
-        raise _other(path, "no such file; did the run end?") from None
+        raise other_summary(path, "no such file; did the run end?") from None
     except (OSError, ValueError) as error:
-        raise _other(path, str(error)) from None
+        raise other_summary(path, str(error)) from None
     if not isinstance(values, dict):
-        raise _other(path, type(values).__name__)
+        raise other_summary(path, type(values).__name__)
     kind = kind_of(values)
     if kind is None:
-        raise _other(path, f"one of the command {str(values.get('command'))[:40]!r}")
+        raise other_summary(path, f"one of the command {str(values.get('command'))[:40]!r}")
     try:
         return kind.of(values)
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
         what = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"[:120]
-        raise _other(path, f"one with a part that is missing or of another type ({what}); run it again") from None
+        raise other_summary(
+            path, f"one with a part that is missing or of another type ({what}); run it again"
+        ) from None
 
 
-def attack_of(folder: Path) -> AttackSummary:
-    """Return the result of the attack in `folder`; errors as for `read_result`."""
-    result = read_result(folder)
-    if not isinstance(result, AttackSummary):
-        raise _other(folder / NAME, f"that of {result.command}")
-    return result
-
-
-def _other(path: Path, got: str) -> FileFormatError:
+def other_summary(path: Path, got: str) -> FileFormatError:
     return FileFormatError(f"{path}: expected the summary of a run, got {got}")
 
 

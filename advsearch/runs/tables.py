@@ -15,10 +15,7 @@ import pandas as pd
 
 from advsearch.described import NOT_A_NUMBER
 from advsearch.runs.export import as_columns, as_record
-from advsearch.runs.results.sweep import SweepSummary
 from advsearch.runs.store import NAME, Row, Store
-from advsearch.runs.summary import NAME as SUMMARY
-from advsearch.runs.summary import read_result
 from advsearch.runs.units import units_of
 
 KIND = "sweep"
@@ -56,9 +53,6 @@ def read_sweep(
     with Store(run / NAME, read_only=True) as store:
         frame, noted = sweep_frame(islice(store.rows(KIND, after=after), most), also), store.noted(EDGES)
         units = units_of(store)
-        if units is None and (run / SUMMARY).is_file():
-            result = read_result(run)
-            units = units_of(store, result if isinstance(result, SweepSummary) else None)
     if units is not None:
         frame["unit"] = units.of(frame["step"].to_numpy())
     for name, ends in noted.items() if isinstance(noted, dict) else ():

@@ -11,7 +11,6 @@ import numpy as np
 import numpy.typing as npt
 
 from advsearch.errors import FileFormatError
-from advsearch.runs.results.sweep import SweepSummary
 from advsearch.runs.store import Store
 
 NOTE = "units"
@@ -69,24 +68,13 @@ class Units:
         return {**vars(self), "sizes": list(self.sizes)}
 
 
-def units_of(store: Store, summary: SweepSummary | None = None) -> Units | None:
-    """Return what a run notes of its units; of an older one, what its summary says; None where neither does."""
+def units_of(store: Store) -> Units | None:
+    """Return what a run notes of its units; None where it notes nothing."""
     noted = store.noted(NOTE)
-    if noted is not None:
-        found = _read(noted)
-        if found is None:
-            raise FileFormatError(f"{store.path}: expected what units of sampling are, got {str(noted)[:80]}")
-        return found
-    if summary is None:
-        return None
-    times = [name.endswith(".time") and not name.startswith("mitsuba") for name in summary.grid]
-    return Units(
-        sizes=tuple(summary.grid.values()),
-        frames=times.index(True) if any(times) else None,
-        samples=summary.samples,
-        models=summary_models(summary),
-        again=0 if summary.beside is None else summary.planned // 2 // summary_models(summary),
-    )
+    units = None if noted is None else _read(noted)
+    if noted is not None and units is None:
+        raise FileFormatError(f"{store.path}: expected what units of sampling are, got {str(noted)[:80]}")
+    return units
 
 
 def _read(noted: Any) -> Units | None:
@@ -99,8 +87,3 @@ def _read(noted: Any) -> Units | None:
     if not known or noted["again"] < 0 or not (frames is None or (type(frames) is int and 0 <= frames < len(sizes))):
         return None
     return Units(tuple(sizes), frames, noted["samples"], noted["models"], noted["again"])
-
-
-def summary_models(summary: SweepSummary) -> int:
-    """Return how many models a sweep has."""
-    return max(1, len({row.value for row in summary.axes if row.axis == "model"}))

@@ -161,8 +161,9 @@ class ObjectAsset(Shape):
         up: the axis of the file that was taken for up; None for what comes from no file.
         finishes: of an object of several materials, what each of `mesh.materials` is like beside its base colour; what
             none of them covers is like `material`.
-        metres: its largest extent in metres, where it has a size of its own; then distances of the camera are in
-            metres. None where distances are in object sizes.
+        metres: its largest extent in metres, where that is known; then distances of the camera are in metres. None
+            where distances are in object sizes. See `advsearch.scene.sizes`.
+        extent: its largest extent in the coordinates of its file; None for what comes from no file.
     """
 
     source: str = ""
@@ -170,6 +171,7 @@ class ObjectAsset(Shape):
     up: UpAxis | None = None
     finishes: Mapping[str, Material] = field(default_factory=dict)
     metres: float | None = None
+    extent: float | None = None
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -191,6 +193,7 @@ class EnvironmentAsset:
         photographed: it shows the floor of a real place: the ground that things stand on is that floor by itself.
         ground: the kind of ground that belongs to it by itself (`advsearch.scene.settings.GROUND_KINDS`); None for the
             usual one.
+        candelas: luminance of a radiance of 1, cd/m2; None where the map's brightness means nothing.
 
     Raises:
         InputError: a texel is negative, NaN or infinite.
@@ -202,6 +205,7 @@ class EnvironmentAsset:
     warnings: tuple[str, ...] = ()
     photographed: bool = False
     ground: str | None = None
+    candelas: float | None = None
 
     def __post_init__(self) -> None:
         bad = ~(np.isfinite(self.radiance) & (self.radiance >= 0.0)).all(axis=2)

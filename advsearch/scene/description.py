@@ -1,8 +1,8 @@
 """A scene as data: meshes, of which one is the object, lamps, an environment and the settings; nothing of Mitsuba.
 
 Conventions: z up, right-handed, lengths in object sizes (the object's largest extent is 1 before `pose.scale`), angles
-in degrees. `camera.distance` and `camera.focus` are in metres where the object has a size in metres. The camera at
-azimuth 0 and elevation 0 looks from +x towards the object.
+in degrees. What `advsearch.scene.sizes.IN_METRES` names is in metres where the object has a size in metres. The camera
+at azimuth 0 and elevation 0 looks from +x towards the object.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.files import reading
@@ -22,13 +23,16 @@ from advsearch.scene import environments, library, settings
 from advsearch.scene.assets import Doubles, EnvironmentAsset, Material, ObjectAsset
 from advsearch.scene.camera_files import read_camera
 from advsearch.scene.camera_model import CameraModel, bundled
+from advsearch.scene.camera_presets import ON_TABLES, PRESETS, TABLE, TABLE_SIDE
 from advsearch.scene.exposure import metered_gain
-from advsearch.scene.geometry import moved_part, object_to_world
-from advsearch.scene.grounds import Photograph, on_its_ground, photograph_of
+from advsearch.scene.geometry import framing_distance, moved_part, object_to_world
+from advsearch.scene.grounds import Photograph, on_its_ground, paved, photograph_of
 from advsearch.scene.importing.objects import import_object
 from advsearch.scene.importing.scenes import MITSUBA_FILE, ImportedScene, import_scene, split_node
 from advsearch.scene.parts import Lamp, MeshPart, PlacedCamera, PluginPart, ScenePart, mesh_part, plugins_in
 from advsearch.scene.settings import ORBIT_CAMERA
+from advsearch.scene.sizes import TRIPOD, doubts, on_roads, sized
+from advsearch.scene.things import ThingPart, with_things
 
 DEFAULT_ENVIRONMENT = "studio"
 OBJECT = "object"
@@ -55,6 +59,8 @@ class SceneDescription:
         object_spec: how the object was asked for: a bundled name, a path, or an asset's own name.
         environment_spec: how the environment was asked for, likewise.
         up: the up axis that was given for a mesh file, or None.
+        size: the object's longest side in metres that was given, or None.
+        unit: of the object's file, that was given (`advsearch.scene.sizes.UNITS`), or None.
         given: what was asked for: names of settings, and "environment".
         parts: what is in the scene beside the object, the environment and the ground: further meshes, lamps, haze.
         thin_lens: the camera has an aperture and a focus distance.
@@ -62,9 +68,11 @@ class SceneDescription:
         aspect: width over height of the picture.
         cameras: those with poses of their own, by name.
         camera: name of the one in use; `ORBIT_CAMERA` for that of the settings.
+        preset: name of the mounted camera that it is (`advsearch.scene.camera_presets`); "" for none.
         camera_model: intrinsics and distortion of the camera around the object; None for a pinhole.
         metered: exposure is metered; otherwise a radiance of 1 is the white of the picture, as Mitsuba shows it.
-        remarks: what a user should know of further files that controls have read.
+        remarks: what a user should know of further files that controls have read, and of things in each other.
+        things_spec: how the things beside the object were asked for.
     """
 
     object: ObjectAsset
@@ -73,6 +81,8 @@ class SceneDescription:
     object_spec: str = ""
     environment_spec: str = ""
     up: str | None = None
+    size: float | None = None
+    unit: str | None = None
     given: frozenset[str] = frozenset()
     parts: tuple[ScenePart, ...] = ()
     thin_lens: bool = False
@@ -80,9 +90,11 @@ class SceneDescription:
     aspect: float = 1.0
     cameras: Mapping[str, PlacedCamera] = field(default_factory=dict)
     camera: str = ORBIT_CAMERA
+    preset: str = ""
     camera_model: CameraModel | None = None
     metered: bool = True
     remarks: tuple[str, ...] = ()
+    things_spec: str = ""
 
     def with_part(self, part: ScenePart) -> SceneDescription:
         """Return the scene with one more part.
@@ -107,13 +119,16 @@ class SceneDescription:
         """Return the scene as one of its cameras sees it, or as the camera around the object does with another lens.
 
         Args:
-            camera: name of a camera of the scene, a path to a camera file, or the name of a bundled camera model.
+            camera: name of a camera of the scene, a path to a camera file, the name of a bundled camera model, or that
+                of a mounted camera.
 
         Raises:
             UnknownNameError: it has no such camera.
             InputError: a setting of the camera around the object was given, and another is to see it; or a file cannot
                 be used.
         """
+        if camera in PRESETS and camera not in self.cameras:
+            return self._mounted(camera)
         if camera not in (ORBIT_CAMERA, *self.cameras):
             return self._with_model(camera)
         idle = sorted(name for name in self.given if name.startswith("camera.") and name != "camera.exposure")
@@ -124,6 +139,32 @@ class SceneDescription:
             )
         return replace(self, camera=camera, camera_model=None)
 
+    def _mounted(self, name: str) -> SceneDescription:
+        preset = PRESETS[name]
+        if self.object.metres is None:
+            raise InputError(
+                f"`camera={name}` is {preset.height:g} m high, and how large {self.object.name} is is not known; give "
+                "its longest side in metres, such as `size=0.1`"
+            )
+        on_table = self.on_table and self.object.metres <= ON_TABLES
+        height = preset.height - (TABLE if on_table else 0.0)
+        azimuth = preset.azimuth
+        if azimuth is not None and on_roads(self.object):
+            azimuth += 180.0
+        own = {"height": height, "fov": preset.fov, "azimuth": azimuth}
+        values = {f"camera.{one}": value for one, value in own.items() if value is not None}
+        if "camera.elevation" in self.given:
+            del values["camera.height"]
+        if on_table:
+            values["ground.size"] = TABLE_SIDE / self.metres
+        values = {**self.values, **{one: value for one, value in values.items() if one not in self.given}}
+        seen = replace(self, camera=ORBIT_CAMERA, camera_model=None, preset=name, values=values)
+        if "camera.distance" in self.given:
+            return seen
+        fov = torch.tensor(seen.number("camera.fov"), dtype=torch.float64)
+        fitted = float(framing_distance(seen, fov, seen.aspect)) * seen.metres
+        return seen.with_values(camera__distance=max(preset.distance, fitted))
+
     def _with_model(self, name: str) -> SceneDescription:
         if is_path(name):
             with reading(name.partition("#")[0]):
@@ -131,7 +172,7 @@ class SceneDescription:
         elif name in bundled():
             model = bundled()[name]
         else:
-            known = (ORBIT_CAMERA, *self.cameras, *bundled())
+            known = (ORBIT_CAMERA, *self.cameras, *bundled(), *PRESETS)
             raise UnknownNameError("camera", name, known, "Or give the path of a camera file, such as calib.yaml.")
         model.check_given(self.given)
         return replace(self, camera=ORBIT_CAMERA, camera_model=model)
@@ -146,6 +187,11 @@ class SceneDescription:
     def around(self) -> Mapping[str, MeshPart]:
         """The meshes around the object by name, as they came."""
         return {one.name: one for one in self.parts if isinstance(one, MeshPart)}
+
+    @property
+    def things(self) -> Mapping[str, ThingPart]:
+        """The things beside the object by name, as they came."""
+        return {one.name: one for one in self.parts if isinstance(one, ThingPart)}
 
     @property
     def cut_out(self) -> bool:
@@ -181,8 +227,8 @@ class SceneDescription:
 
     @property
     def metres(self) -> float:
-        """What distances of the camera are to be divided by to be in object sizes: the object's size in metres; 1 where
-        it has none."""
+        """What lengths in metres are to be divided by to be in object sizes, the scene's own unit: the object's size in
+        metres; 1 where it has none."""
         return self.object.metres or 1.0
 
     @property
@@ -200,7 +246,8 @@ class SceneDescription:
         """What a user should know of how object and environment were read, and what controls name."""
         lit = () if self.environment is None else self.environment.warnings
         seen = () if self.camera_model is None else self.camera_model.notes
-        return tuple(dict.fromkeys((*self.object.notes, *lit, *seen, *self.remarks)))
+        size = doubts(self.object, asked=self.size is not None, laid=paved(self))
+        return tuple(dict.fromkeys((*self.object.notes, *size, *lit, *seen, *self.remarks)))
 
     @property
     def bundled_environment(self) -> str | None:
@@ -260,7 +307,20 @@ class SceneDescription:
             return None
         if kind is not None and settings.GROUND_KINDS[int(kind)] != settings.PHOTOGRAPH:
             return None
-        return photograph_of(own, self.number("ground.height"), self.number("environment.rotation"))
+        return photograph_of(own, self.capture_height, self.number("environment.rotation"))
+
+    @property
+    def capture_height(self) -> float:
+        """Height above the floor from which the environment's photograph was taken, object sizes."""
+        height = self.values.get("ground.height")
+        if height is None:
+            return settings.PHOTOGRAPHED_FROM if self.object.metres is None else TRIPOD / self.metres
+        return height / self.metres
+
+    @property
+    def on_table(self) -> bool:
+        """Whether the object stands on a table, as it does in bundled rooms."""
+        return self.number("ground.size") > 0.0 and self.photograph is None and not paved(self)
 
     @property
     def ground_color(self) -> tuple[float, ...]:
@@ -284,7 +344,10 @@ def describe(
     *,
     given: settings.Given | None = None,
     up: str | None = None,
+    size: float | None = None,
+    unit: str | None = None,
     plugins: Mapping[str, object] | None = None,
+    things: str | None = None,
 ) -> SceneDescription:
     """Find and read an object and an environment, bundled or from a file.
 
@@ -296,7 +359,11 @@ def describe(
             for the default.
         given: settings to fix, by name.
         up: "y" or "z", the up axis of a mesh file; None takes what its format or else its shape says.
+        size: of the object, its longest side in metres.
+        unit: of the coordinates of its file, one of `advsearch.scene.sizes.UNITS`; without both its size is what its
+            format says.
         plugins: a Mitsuba scene as its loader takes it, in which `object_spec` is the id of a shape.
+        things: what stands beside the object (`advsearch.scene.things`).
 
     Raises:
         InputError: a name is unknown, a file cannot be used, or a setting is out of range.
@@ -308,6 +375,7 @@ def describe(
         around = _mitsuba(Path(str(file)) if plugins is None else plugins, node or str(object_spec), up)
     else:
         around = ImportedScene(_object(object_spec, up)) if node is None else _scene(Path(str(file)), node, up)
+    around = replace(around, object=sized(around.object, size, unit))
     shining = (isinstance(part, Lamp) or (isinstance(part, PluginPart) and part.shines) for part in around.surroundings)
     alone = any(shining) or (mitsuba and around.object.emission is not None)
     lit_by = environment_spec or (NO_MAP if alone else DEFAULT_ENVIRONMENT)
@@ -325,18 +393,21 @@ def describe(
         _spec(object_spec),
         _spec(lit_by),
         up,
+        size,
+        unit,
         given=frozenset((*(given or {}), *asked)),
         parts=around.surroundings,
         cameras=around.cameras,
         camera=next(iter(around.cameras), ORBIT_CAMERA) if mitsuba and not orbits else ORBIT_CAMERA,
         metered=not mitsuba,
     )
+    described = with_things(on_its_ground(described), things, lambda spec: _object(spec, None))
     check_meshes(described, values)
     idle = [name for name in given or {} if name.startswith("material.")]
     if described.object.surface is not None and idle:
         whose = "several materials" if described.object.finishes else "a surface of Mitsuba's own"
         raise InputError(f"`set` {idle[0]}: the object has {whose}, without it; leave it out")
-    return on_its_ground(described)
+    return described
 
 
 def check_meshes(scene: SceneDescription, names: Iterable[str]) -> None:
@@ -376,7 +447,7 @@ def check_ground(given: settings.Given, lit_by: str | Path | EnvironmentAsset) -
         InputError: there is no photograph, or a table is described beside it.
     """
     kind = given.get("ground.kind")
-    if kind not in (settings.PHOTOGRAPH, *settings.ROADS):
+    if kind not in (settings.PHOTOGRAPH, *settings.ROADS, *settings.AVENUES):
         return
     if lit_by == NO_MAP and kind == settings.PHOTOGRAPH:
         raise InputError(

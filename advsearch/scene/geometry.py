@@ -36,6 +36,8 @@ FRAME_FILL = 0.86
 """Share of the picture's half-width that the object's outline may reach when the distance is worked out."""
 CLEARANCE = 0.02
 """Smallest distance, in object sizes, to the sphere around the object."""
+STEEPEST = math.sin(math.radians(89.0))
+"""Sine of the elevation at which a camera stays that is to be higher above the object than it is away."""
 DEFAULT_VIEW = ("camera.azimuth", "camera.elevation", "camera.roll")
 
 
@@ -199,11 +201,15 @@ def camera_to_world(description: SceneDescription, aspect: float | None = None) 
         return description.cameras[description.camera].to_world
     aspect = description.aspect if aspect is None else aspect
     number = description.number
-    axes = camera_axes(number("camera.azimuth"), number("camera.elevation"), number("camera.roll"))
     asked = description.values["camera.distance"]
     distance = 0.0 if asked is None else asked / description.metres
     if asked is None:
         distance = float(framing_distance(description, torch.tensor(number("camera.fov"), dtype=torch.float64), aspect))
+    elevation, height = number("camera.elevation"), description.values.get("camera.height")
+    if height is not None:
+        above = (height / description.metres - float(middle(description)[2])) / distance
+        elevation = math.degrees(math.asin(min(max(above, -STEEPEST), STEEPEST)))
+    axes = camera_axes(number("camera.azimuth"), elevation, number("camera.roll"))
     matrix = np.eye(4)
     matrix[:3, 0], matrix[:3, 1], matrix[:3, 2] = axes[0], axes[1], -axes[2]
     matrix[:3, 3] = middle(description) + distance * axes[2]

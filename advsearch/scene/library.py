@@ -11,7 +11,7 @@ import re
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from importlib import resources
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -85,10 +85,10 @@ def list_environments(split: str | None = None) -> tuple[str, ...]:
     return tuple(sorted(name for name, fact in facts if split is None or fact["split"] == split))
 
 
-def _environments() -> dict[str, dict[str, str]]:
+def _environments() -> dict[str, dict[str, Any]]:
     """What is known of each bundled environment, by name."""
     text = (_data() / "environments" / "environments.json").read_text("utf-8")
-    facts: dict[str, dict[str, str]] = json.loads(text)["environments"]
+    facts: dict[str, dict[str, Any]] = json.loads(text)["environments"]
     return facts
 
 
@@ -141,7 +141,10 @@ def load_environment(name: str) -> EnvironmentAsset:
         radiance = _exr((_data() / "environments" / f"{name}.exr").read_bytes())
     except (OSError, ValueError, KeyError, RuntimeError) as error:
         raise FileFormatError(f"bundled environment {name!r} cannot be read ({error}); reinstall advsearch") from error
-    return EnvironmentAsset(name, radiance, source=BUNDLED_ENVIRONMENT, ground=_environments()[name].get("ground"))
+    facts = _environments()[name]
+    return EnvironmentAsset(
+        name, radiance, source=BUNDLED_ENVIRONMENT, ground=facts.get("ground"), candelas=facts.get("candelas")
+    )
 
 
 def _mesh(content: bytes) -> Mesh:

@@ -4,7 +4,7 @@ on, by its mesh, projected and rasterised without a renderer."""
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,24 +36,33 @@ class SeenThing:
         mask: (H, W) bool, the pixels that it is first seen in.
         share: of its outline that these are, in (0, 1]; None where the outline is not known.
         truncated: whether the outline goes on beyond the picture; None where it is not known.
+        distance: of the nearest point that is seen from the camera, along the ray, object sizes.
     """
 
     name: str
     mask: Bools
     share: float | None
     truncated: bool | None
+    distance: float
+
+    @property
+    def box(self) -> tuple[int, int, int, int]:
+        """The smallest box round the mask: x0, y0, x1, y1 in pixels from the top left, with x0 <= x < x1."""
+        rows, columns = (np.flatnonzero(self.mask.any(axis=side)) for side in (1, 0))
+        return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
 
 
-def seen_things(renderer: Renderer, u: Tensor) -> list[SeenThing]:
-    """Return the meshes that the picture of a configuration (d,) shows."""
+def seen_things(renderer: Renderer, u: Tensor, names: Collection[str] | None = None) -> list[SeenThing]:
+    """Return the meshes, or those of some names, that the picture of a configuration (d,) shows."""
     description, surfaces = renderer.scene.made[0], renderer.surfaces(u)
     with torch.no_grad():
         inputs = renderer.scene.assembly(renderer.space.inputs(u))
     found = []
-    for name in description.meshes:
+    for name in description.meshes if names is None else names:
         mask = surfaces.seen(name).numpy() if name in surfaces.names else np.zeros(surfaces.id.shape, np.bool_)
         if mask.any():
-            found.append(SeenThing(name, mask, *_outline(renderer, description, inputs, name, mask)))
+            near = float(surfaces.depth.numpy()[mask].min())
+            found.append(SeenThing(name, mask, *_outline(renderer, description, inputs, name, mask), near))
     return found
 
 

@@ -53,9 +53,11 @@ class MeshPart(Shape, ScenePart):
 
     Attributes:
         to_world: (4, 4) its base pose.
+        laid: it belongs to the ground that the scene has by itself, and goes with it.
     """
 
     to_world: Doubles = field(default_factory=lambda: np.eye(4))
+    laid: bool = False
 
 
 def mesh_part(name: str, shape: Shape, to_world: Doubles, material: Material) -> MeshPart:

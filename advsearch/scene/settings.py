@@ -137,12 +137,20 @@ CAMERA = (
     _camera(
         "distance",
         "object sizes",
-        0.05,
-        1000.0,
+        1e-4,
+        1e5,
         "fits the object",
-        "Distance to the object's middle; in metres where the object has a size.",
+        "Distance to the object's middle; in metres where the object's size is known.",
         (0.8, 1.5),
         log=True,
+    ),
+    _camera(
+        "height",
+        "object sizes",
+        -1e4,
+        1e5,
+        "as the elevation says",
+        "Height of the lens above the ground, in place of `elevation`; in metres where the object's size is known.",
     ),
     _camera("fov", "degrees", 1.0, 170.0, 35.0, "Field of view along the larger side of the picture."),
     Parameter(
@@ -166,8 +174,12 @@ ENVIRONMENT = (
         "exposure", (), "stops", -10.0, 10.0, 0.0, "Brightness, after metering.", search=(-1.0, 1.0), estimators=LIT
     ),
 )
-GROUND_KINDS = TABLE, PHOTOGRAPH, DRY_ROAD, WET_ROAD = "table", "photograph", "road", "wet-road"
-ROADS = (DRY_ROAD, WET_ROAD)
+GROUND_KINDS = TABLE, PHOTOGRAPH, DRY_ROAD, WET_ROAD, DRY_AVENUE, WET_AVENUE = (
+    "table", "photograph", "road", "wet-road", "avenue", "wet-avenue",
+)  # fmt: skip
+ROADS, AVENUES = (DRY_ROAD, WET_ROAD), (DRY_AVENUE, WET_AVENUE)
+PHOTOGRAPHED_FROM = 3.0
+"""Height above the floor from which a photograph is taken of an object whose size is not known, object sizes."""
 TABLE_SETTINGS = ("ground.size", *(f"ground.{channel}" for channel in CHANNELS))
 """Settings that only a table has."""
 GROUND = (
@@ -176,15 +188,31 @@ GROUND = (
         (),
         "name",
         0.0,
-        3.0,
+        len(GROUND_KINDS) - 1.0,
         "what the environment has: photograph where the map is a file, a road in a street, else table",
-        "What the object stands on: a square table, the floor that the environment's photograph shows, or a road.",
+        "What the object stands on: a square table, the floor that the environment's photograph shows, a road, or an "
+        "avenue, a road with all that stands beside it.",
         options=GROUND_KINDS,
     ),
     Parameter("size", (), "object sizes", 0.0, 1000.0, 3.0, "Side of the table; 0 leaves the ground out."),
     *colors("of the table.", defaults=(0.55, 0.45, 0.37), estimators=("differences",)),
     Parameter(
-        "height", (), "object sizes", 0.1, 1000.0, 3.0, "Height above the floor from which the photograph was taken."
+        "height",
+        (),
+        "object sizes",
+        1e-3,
+        1000.0,
+        f"{PHOTOGRAPHED_FROM:g}, or 1.6 m",
+        "Height above the floor from which the photograph was taken; in metres where the object's size is known.",
+    ),
+    Parameter(
+        "radius",
+        (),
+        "object sizes",
+        1e-3,
+        1e5,
+        "5 heights",
+        "How far from the photograph's camera its floor is empty; in metres where the object's size is known.",
     ),
 )
 MATERIAL = (
@@ -231,6 +259,8 @@ def resolve(given: Given) -> dict[str, float | None]:
         UnknownNameError: a name is not a setting.
         InputError: a value is not a finite number inside its range.
     """
+    if "camera.elevation" in given and "camera.height" in given:
+        raise InputError("`set` camera.elevation and camera.height say the same thing; leave one of them out")
     values = {name: None if isinstance(one.default, str) else one.default for name, one in SETTINGS.items()}
     return {**values, **{name: _checked(name, value) for name, value in given.items()}}
 

@@ -137,6 +137,7 @@ class Facts:
         own_label: what the object says it is; None if it does not.
         describe: the numbers of the configuration by parameter ("pose.yaw"), in the units that rows have.
         look: says what is seen in the picture, see `mask` and `depth`; None where no configuration is meant.
+        each: the facts of each thing that is judged, by name, the object first; empty where it is one thing alone.
     """
 
     object: str
@@ -144,6 +145,7 @@ class Facts:
     own_label: str | None = None
     describe: Callable[[], Mapping[str, float]] = dict
     look: Callable[[], Sight] | None = None
+    each: Mapping[str, Facts] = field(default_factory=dict)
     gives_copies: ClassVar[bool] = True
 
     @cached_property

@@ -7,6 +7,8 @@ its time is up, or for `GRACE` only where others wait.
 from __future__ import annotations
 
 import hashlib
+import importlib
+import io
 import ipaddress
 import math
 import selectors
@@ -19,6 +21,7 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from http import HTTPStatus
 from pathlib import Path
 from queue import Empty, LifoQueue
 from typing import Any
@@ -44,6 +47,20 @@ GRACE = 1.0
 TICK = 0.05
 """Seconds between two looks at the clock."""
 
+
+class Refused(Exception):
+    """A request that is not answered as asked."""
+
+    def __init__(self, status: HTTPStatus, text: str) -> None:
+        super().__init__(text)
+        self.status = status
+
+
+LARGEST_SENT = 16 << 20
+"""Bytes of what is sent, at most."""
+
+NO_QR = "pip install segno"
+"""What to type where there is nothing to draw a code with."""
 
 DAYS = 7
 """For which a certificate is good."""
@@ -226,3 +243,19 @@ class Clients:
     def _work(self) -> None:
         while (job := self._ready.get()) is not None:
             self.serve_one(*job)
+
+
+def qr_text(address: str) -> str | None:
+    """Return an address as a QR code for a terminal; None where segno is not installed."""
+    made, text = qr_code(address), io.StringIO()
+    if made is not None:
+        made.terminal(out=text, compact=True)
+    return text.getvalue() or None
+
+
+def qr_code(address: str) -> Any:
+    """Return a QR code of an address; None where segno is not installed."""
+    try:
+        return importlib.import_module("segno").make(address, error="m", micro=False)
+    except ImportError:
+        return None

@@ -16,7 +16,7 @@ from advsearch.report.markup import Html, element, join_html
 from advsearch.runs import files, listing, store
 from advsearch.runs.directory import PARTS, REPORT
 from advsearch.runs.listing import Listed
-from advsearch.runs.results.base import plain
+from advsearch.runs.results import plain
 from advsearch.runs.store import Row
 from advsearch.viewer.document import data_script, data_url, document, in_address, scrolled
 from advsearch.viewer.thumbnails import thumbnail

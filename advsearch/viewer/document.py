@@ -21,7 +21,7 @@ from advsearch import __version__
 from advsearch.files import MESHES
 from advsearch.report import wording
 from advsearch.report.markup import Html, element, join_html
-from advsearch.report.phrases import is_command
+from advsearch.report.wording import is_command
 from advsearch.runs.directory import CONFIG, PARTS, REPORT
 
 MOST_NOTES = 3

@@ -8,25 +8,115 @@ from __future__ import annotations
 import base64
 import json
 import struct
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TypeVar
 
 from advsearch import rooms
-from advsearch.errors import FileFormatError, InputError
+from advsearch.errors import FileFormatError
 from advsearch.files import read_bytes
-from advsearch.report.markup import Html, element, join_html
-from advsearch.report.shown import AnswerPart, ShownAnswer, remarks_of, shown, subject_of
-from advsearch.runs.directory import OBJECT_FILE, PARTS, REPORT, RunDirectory
-from advsearch.runs.files import placed_by, write_bytes, write_text
-from advsearch.runs.results.base import Result
-from advsearch.runs.results.sweep import SweepSummary
+from advsearch.report.markup import NARROW, WIDE, Html, element, join_html, study_chart
+from advsearch.report.shown import AnswerPart, Picture, ShownAnswer, facts_of, remarks_of, shown, subject_of
+from advsearch.runs.directory import IMAGES, OBJECT_FILE, REPORT, RunDirectory
+from advsearch.runs.files import write_text
+from advsearch.runs.images import smaller_png
+from advsearch.runs.results import Result
 from advsearch.runs.summary import read_result
 from advsearch.viewer import document
-from advsearch.viewer.columns import packed, read_columns
-from advsearch.viewer.parts import end_html, figures_of, links_html, part_html
-from advsearch.viewer.sweep_page import SweepSource, sweep_page_html, whole_page, write_sweep_page
-from advsearch.viewer.thumbnails import kept_pictures, path_of, read_thumbnail
+
+LARGEST_FIGURE = 2_000_000
+"""Bytes of a figure or a picture that the page takes along."""
+
+LARGEST_PNG = 50_000_000
+"""Bytes of a picture that is read to be made smaller."""
+
+LARGE_PICTURE = 1_000_000
+"""Bytes above which a PNG is put into the page at a smaller size; the file itself stays as it is."""
+
+SMALLER_SIDE = 640
+"""Longest side in pixels of such a smaller picture."""
+
+KINDS = {".png": "image/png", ".jpg": "image/jpeg", ".jpeg": "image/jpeg"}
+"""Media types of pictures."""
+
+
+def kept(run: Path, name: str | Path, largest: int = LARGEST_FIGURE) -> Path | None:
+    """Return the file of a picture in the folder of a run; None where it is missing, elsewhere or too large."""
+    file = run / name
+    inside = file.resolve().is_relative_to(run.resolve()) and file.is_file()  # a summary may name any
+    return file if inside and file.stat().st_size <= largest else None
+
+
+def part_html(run: Path, one: AnswerPart, said: str) -> Html:
+    """A part of an answer, which says `said`; a folded one has its title as the handle."""
+    chart = None
+    if one.draw is not None:
+        words = " ".join([f"{one.title}.", *(one.text or [said])])
+        chart = element("div", *(study_chart(one.draw, words, width, one.height) for width in (WIDE, NARROW)))
+    table = (
+        document.study_table(one.heads, one.rows, document.part_links(run, one.parts), one.shares, one.bars)
+        if one.heads
+        else None
+    )
+    inside = join_html(
+        *(element("p", text) for text in one.text if text and one.draw is None),
+        chart or _figure(run, one.figure, " ".join(one.text) or one.title),
+        (table or document.facts_table({row[0]: row[1] for row in one.rows})) if one.rows else None,
+        *(_pictures(run, group, one.layout) for group in one.pictures),
+        element("p", one.note, class_="soft") if one.note else None,
+    )
+    if one.live:
+        title = element("h2", one.title) if one.title else None
+        return element("div", title, element("div", id=one.live), inside, hidden="hidden", class_="screen")
+    if one.folded:
+        return element("details", element("summary", one.title), inside)
+    return join_html(element("h2", one.title) if one.title else None, inside)
+
+
+def _pictures(run: Path, group: Iterable[Picture], layout: str) -> Html | None:
+    """Pictures side by side, of those that are there."""
+    figures = []
+    for one in group:
+        png = one.file.lower().endswith(".png")
+        if (file := kept(run, one.file, LARGEST_PNG if png else LARGEST_FIGURE)) is None:
+            continue
+        data, kind = file.read_bytes(), KINDS[file.suffix.lower()]
+        data = smaller_png(data, SMALLER_SIDE) if png and len(data) > LARGE_PICTURE else data
+        alt = ": ".join(filter(None, (one.name, one.caption)))
+        picture = element("img", src=document.data_url(data, kind), alt=alt, data_picture=file.stem)
+        name = [element("strong", one.name), ": "] if one.name else []
+        figures.append(element("figure", picture, element("figcaption", *name, one.caption)))
+    layout = layout or ("pair" if len(figures) < 3 else "")
+    return element("div", *figures, class_=f"pictures {layout}".strip()) if figures else None
+
+
+def figures_of(run: Path, said: str) -> Iterator[Html]:
+    """The figures among the images of a run whose question names none."""
+    for file in sorted((run / IMAGES).glob("*.png")):
+        name = file.stem.replace("-", " ").replace("_", " ").capitalize()
+        yield _figure(run, f"{IMAGES}/{file.name}", f"{name}: {said}") or Html()
+
+
+def _figure(run: Path, name: str, alt: str) -> Html | None:
+    file = kept(run, name) if name else None
+    if file is None:
+        return None
+    picture = element("img", src=document.data_url(file.read_bytes(), "image/png"), alt=alt)
+    return element("figure", document.scrolled(picture, "wide"), class_="wide")
+
+
+def links_html(run: Path, parts: list[str]) -> Html:
+    linked = zip(parts, document.part_links(run, parts), strict=True)
+    lines = [element("li", element("a", name, href=link) if link else name) for name, link in linked]
+    return element("details", element("summary", f"The runs ({len(parts)})"), element("ul", *lines))
+
+
+def end_html(run: Path, result: Result, given: ShownAnswer) -> Html:
+    """Return what stands at the end of a page: how the answer came about, and the commands that ask the same again."""
+    facts = {name[:1].upper() + name[1:]: text for name, text in facts_of(result, given).items()}
+    again = document.again(run, getattr(result, "command_line", ""), goes_on=result.goes_on)
+    return join_html(element("h2", "Cost and conditions"), document.facts_table(facts), again)
+
 
 Answer = TypeVar("Answer", bound=Result)
 
@@ -72,16 +162,12 @@ def _header(data: bytes) -> dict[str, dict[str, object]]:
 def write_page(run: Path, result: Result) -> Path:
     """Write `report.html` into the folder of a run and return its path. Raises FileFormatError where other results of
     the run are damaged, StorageError where the page cannot be written."""
-    if isinstance(result, SweepSummary):
-        return write_sweep_page(run, result)
     return write_text(run / REPORT, page_of(run, result), durable=False)
 
 
 def page_of(run: Path, result: Result) -> str:
     """Return the page of a run, which needs no other file but those of its parts. Raises FileFormatError where other
     results of the run are damaged."""
-    if isinstance(result, SweepSummary):
-        return whole_page(run, result, read_columns(run))
     room = rooms.room(result.command)
     made: str | None = room.page(run, result) if room and room.page else None
     return made or shown_page(run, result, shown(result))
@@ -116,9 +202,6 @@ def shown_page(
     return document.document(title, header, main, data=data, scripts=scripts, footer=footer)
 
 
-INDEX = "index.html"
-
-
 def renewed(run: Path) -> Path:
     """Write the page of a run anew and return its path.
 
@@ -127,38 +210,3 @@ def renewed(run: Path) -> Path:
         StorageError: it cannot be written.
     """
     return write_page(run, read_result(run))
-
-
-def write_bundle(runs: Sequence[Path], folder: Path) -> Path:
-    """Write a folder with a page, the rows and the thumbnails of sweeps, or the page of another run; return the page.
-
-    Raises:
-        InputError: the folder is there and not empty, or runs of these commands have no common page.
-        FileFormatError: results are damaged.
-        StorageError: the folder cannot be written.
-    """
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise InputError(f"bundle: {folder} is there already and not empty; name another folder")
-    results = [(run, read_result(run)) for run in runs]
-    sweeps = [(run, result) for run, result in results if isinstance(result, SweepSummary)]
-    with placed_by("bundle"):
-        if len(results) == 1 and not sweeps:
-            run, result = results[0]
-            for page in sorted((run / PARTS).glob(f"*/{REPORT}")):  # made anew: what lies there may be anybody's
-                write_text(folder / page.relative_to(run), page_of(page.parent, read_result(page.parent)))
-            return write_text(folder / INDEX, page_of(run, result))
-        if len(sweeps) < len(results):
-            raise InputError("bundle: one run or several sweeps make a page; give one kind of them")
-        sources = [_copied(run, folder, number) for number, (run, _) in enumerate(sweeps)]
-        return write_text(folder / INDEX, sweep_page_html(sweeps, sources))
-
-
-def _copied(run: Path, folder: Path, number: int) -> SweepSource:
-    """Write rows and thumbnails of a sweep into the folder, and say where they are."""
-    rows, pictures = f"rows-{number}.bin", f"pictures-{number}"
-    write_bytes(folder / rows, packed(read_columns(run)))
-    kept = kept_pictures(run)
-    for one in kept.numbers if kept else ():
-        place = path_of(folder / pictures, one)
-        write_bytes(folder / pictures / place.parent.name / place.name, read_thumbnail(run, one))
-    return SweepSource(run.name, rows, pictures=kept, folder=pictures)

@@ -25,27 +25,28 @@ from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import parse_qs, unquote, urlsplit
 
-from advsearch import rooms
 from advsearch.errors import AdvsearchError, InputError
 from advsearch.files import read_bytes
+from advsearch.questions.photographs import answer as photos
+from advsearch.questions.sweep.page import SweepSource, result_of, sweep_page_html
 from advsearch.report.markup import element, join_html
 from advsearch.runs import files, listing
 from advsearch.runs.directory import COLUMNS, HOME, PARTS, REPORT, check_links, is_run
-from advsearch.viewer.clients import PATIENCE, SLOWEST, TICK, Clients, https_context, is_address, reachable
+from advsearch.viewer.clients import (
+    LARGEST_SENT,
+    PATIENCE,
+    SLOWEST,
+    TICK,
+    Clients,
+    Refused,
+    https_context,
+    is_address,
+    reachable,
+)  # fmt: skip
 from advsearch.viewer.columns import packed, read_columns
 from advsearch.viewer.dashboard import START, following_page, is_under_way, list_page, progress_json
 from advsearch.viewer.document import has_other_scripts, in_address, served_policy
-from advsearch.viewer.sweep_page import SweepSource, result_of, sweep_page_html
 from advsearch.viewer.thumbnails import cover, kept_pictures, read_thumbnail
-
-
-class Refused(Exception):
-    """A request that is not answered as asked."""
-
-    def __init__(self, status: HTTPStatus, text: str) -> None:
-        super().__init__(text)
-        self.status = status
-
 
 LOOPBACK = "127.0.0.1"
 
@@ -350,26 +351,34 @@ class _Handler(BaseHTTPRequestHandler):
     def _align(self, _query: Query, name: str) -> Served:
         path = f"/runs/{in_address(name)}/align/"
         elsewhere = self.server.address_of(path) if self.server.token else None
-        page = _photographs("photographs_html")(
+        page = photos.photographs_html(
             self.server.photographs, self.server.run(name), name, self.server.key(name), elsewhere
         )
         return _own(page, "../../../", ("../", name))
 
     def _take(self, _query: Query, name: str, rendering: str) -> Served:
-        _photographs("check_sender")(self.headers, self.server.key(name))
-        return Served(*_photographs("take")(self.server.photographs, self.server.run(name), rendering, self._body))
+        server, run, key = self.server, self.server.run(name), self.server.key(name)
+        return Served(*photos.take(server.photographs, run, rendering, self.headers, key, self._body))
 
     def _body(self) -> bytes:
+        """What was sent along; nothing is read of what says that it is larger than `LARGEST_SENT`."""
+        length = self.headers.get("Content-Length", "")
+        if not re.fullmatch(r"[0-9]{1,15}", length):
+            raise Refused(HTTPStatus.LENGTH_REQUIRED, "its length is missing")
+        if int(length) > LARGEST_SENT:
+            raise Refused(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"more than {LARGEST_SENT >> 20} MB")
         self.server.clients.wait_for(SENDING)
-        data: bytes = _photographs("request_body")(self.headers, self.rfile)
+        data = self.rfile.read(int(length))
         self.server.clients.wait_for(None)
+        if len(data) < int(length):
+            raise Refused(HTTPStatus.BAD_REQUEST, "a part of it did not come")
         return data
 
     def _rendering(self, _query: Query, name: str, rendering: str) -> Served:
-        return Served(*_photographs("rendering_picture")(self.server.run(name), rendering))
+        return Served(*photos.picture("rendering", self.server.run(name), rendering))
 
     def _photo(self, _query: Query, name: str, photo: str) -> Served:
-        return Served(*_photographs("photo")(self.server.run(name), photo))
+        return Served(*photos.picture("photo", self.server.run(name), photo))
 
 
 Query = Mapping[str, list[str]]
@@ -398,14 +407,6 @@ def _after(query: Mapping[str, list[str]], otherwise: int) -> int:
     if not re.fullmatch(r"[0-9]{1,15}", after):
         raise Refused(HTTPStatus.BAD_REQUEST, "after: expected the id of a row")
     return int(after)
-
-
-def _photographs(what: str) -> Callable[..., Any]:
-    """A part of what takes photographs in, which the tool works without."""
-    found: Callable[..., Any] | None = rooms.in_room("photographs", "answer", what)
-    if found is None:
-        raise Refused(HTTPStatus.NOT_FOUND, "there are no photographs")
-    return found
 
 
 def _source(name: str, run: Path, base: str) -> SweepSource:

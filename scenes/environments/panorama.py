@@ -36,6 +36,7 @@ class EnvironmentFamily:
         needs_mitsuba: whether making it runs Mitsuba.
         height: rows of the map; it has twice as many columns.
         ground: the kind of ground that belongs to it; None for the usual table.
+        lux: illuminance on an open level surface, where the map stands for light of a known strength.
     """
 
     name: str
@@ -45,6 +46,7 @@ class EnvironmentFamily:
     needs_mitsuba: bool = False
     height: int = HEIGHT
     ground: str | None = None
+    lux: float | None = None
 
     def make(self) -> EnvironmentAsset:
         """Return the (height, 2 height, 3) map at the common brightness, every value a half-precision number."""
@@ -54,7 +56,10 @@ class EnvironmentFamily:
         scaled = radiance * (LEVEL / round(brightness(radiance), 6))
         coarse = np.ldexp(np.round(np.ldexp(scaled, 12)), -12)  # a step far above what machines disagree by
         half = np.minimum(coarse, 65000.0).astype(np.float16)
-        return EnvironmentAsset(self.name, half.astype(np.float32), source=self.script, ground=self.ground)
+        kept = half.astype(np.float32)
+        level = float(irradiance(kept, np.array([0.0, 0.0, 1.0])) @ LUMINANCE)
+        candelas = None if self.lux is None else float(f"{self.lux / level:.4g}")
+        return EnvironmentAsset(self.name, kept, source=self.script, ground=self.ground, candelas=candelas)
 
 
 def directions(height: int, width: int) -> Array:

@@ -12,15 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from advsearch.scene.grounds import WETNESS, reflectance
+from advsearch.scene.places.road import EYE, FRONTS, WETNESS, reflectance
+from advsearch.scene.places.road import STREET_ENDS as END
 
 from .panorama import Array, EnvironmentFamily
 
 Bools = npt.NDArray[np.bool_]
 
-EYE = 1.5
-FRONTS = (-12.0, 15.6)  # y of the fronts of the houses
-END = 170.0  # the street is closed by trees there
 WALLS = np.array(
     [
         (0.42, 0.30, 0.22), (0.55, 0.50, 0.42), (0.36, 0.17, 0.12), (0.48, 0.44, 0.40), (0.60, 0.52, 0.36),
@@ -206,8 +204,61 @@ DUSK = Weather(
 
 _SCRIPT = "scenes/environments/streets.py"
 ROWS = 320
+
+
+# ------------------------------------------------------------------------- skies of the avenue, which is geometry
+
+
+def _open(rays: Array, sky: Array, field: float) -> Array:
+    """A sky over a plain, whose brightness goes over into that of the horizon in haze; `field` is the plain's."""
+    far = np.exp(np.minimum(rays[:, 2:], 0.0) / 0.02)
+    plain = field * (np.array([0.075, 0.095, 0.045]) * (1.0 - far) + np.array([0.22, 0.24, 0.25]) * far)
+    return np.where(rays[:, 2:] > 0.0, sky, plain)
+
+
+def _cumulus(rays: Array) -> Array:
+    """(N,) cover of clouds in heaps, denser towards the horizon."""
+    up = np.clip(rays[:, 2], 0.0, 1.0)
+    x, y = 2.2 * rays[:, 0] / (up + 0.18), 2.2 * rays[:, 1] / (up + 0.18)
+    wave, high = np.zeros_like(x), 1.0
+    for octave in range(5):
+        a = 0.7 + 1.1 * octave
+        x, y = np.cos(a) * x - np.sin(a) * y + 1.7, np.sin(a) * x + np.cos(a) * y + 0.6
+        wave = wave + high * np.sin(x + 1.2 * np.sin(0.8 * y + a)) * np.sin(y + 0.9 * np.sin(1.1 * x))
+        x, y, high = 1.9 * x, 1.9 * y, 0.52 * high
+    cover: Array = np.clip(1.5 * (wave - 0.15), 0.0, 1.0)
+    return cover
+
+
+def _open_day(rays: Array) -> Array:
+    up = np.clip(rays[:, 2], 0.0, 1.0)[:, None]
+    blue = np.array([0.13, 0.27, 0.62]) + np.array([0.50, 0.48, 0.30]) * np.exp(-up / 0.2)
+    cover = 0.8 * _cumulus(rays)[:, None]
+    sky = blue * (1.0 - cover) + cover * (0.75 + 0.35 * up) * np.array([1.0, 1.0, 1.03])
+    return _open(rays, sky, 1.6) + _spot(rays, -42.0, 55.0, 1.2)[:, None] * np.array([5.6, 5.2, 4.6])
+
+
+def _open_grey(rays: Array) -> Array:
+    return _open(rays, _grey_sky(rays), 0.8)
+
+
+def _open_dusk(rays: Array) -> Array:
+    return _open(rays, _dusk_sky(rays), 0.25)
+
+
+def _open_night(rays: Array) -> Array:
+    """The glow of a town over its roofs."""
+    up = np.clip(rays[:, 2], 0.0, 1.0)[:, None]
+    glow = np.array([0.35, 0.38, 0.55]) + np.array([1.4, 1.0, 0.7]) * np.exp(-up / 0.12)
+    return _open(rays, glow * (1.0 + 0.4 * _cumulus(rays)[:, None]), 1.0)
+
+
 STREETS = (
     EnvironmentFamily("street", "street", lambda rays: street(rays, DAY), _SCRIPT, height=ROWS, ground="road"),
     EnvironmentFamily("street-wet", "street", lambda rays: street(rays, RAIN), _SCRIPT, height=ROWS, ground="wet-road"),
     EnvironmentFamily("street-dusk", "street", lambda rays: street(rays, DUSK), _SCRIPT, height=ROWS, ground="road"),
+    EnvironmentFamily("avenue", "street", _open_day, _SCRIPT, height=ROWS, ground="avenue", lux=75000.0),
+    EnvironmentFamily("avenue-wet", "street", _open_grey, _SCRIPT, ground="wet-avenue", lux=9000.0),
+    EnvironmentFamily("avenue-dusk", "street", _open_dusk, _SCRIPT, ground="avenue", lux=12.0),
+    EnvironmentFamily("avenue-night", "street", _open_night, _SCRIPT, ground="avenue", lux=0.3),
 )

@@ -16,10 +16,10 @@ from torch import Tensor, nn
 
 import advsearch
 from advsearch.cli.output import shown_text as answer_text
-from advsearch.config import AttackConfig
-from advsearch.engine.attack_parts import problem_from_config
 from advsearch.errors import InputError, RunExistsError, UnknownNameError
 from advsearch.progress import NullProgress
+from advsearch.questions.attack.parts import problem_from_config
+from advsearch.questions.attack.settings import AttackConfig
 from advsearch.runs.listing import can_resume, listed_runs
 from advsearch.runs.store import Row, Store
 

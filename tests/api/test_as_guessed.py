@@ -21,17 +21,17 @@ from PIL import Image
 from torch import Tensor, nn
 
 import advsearch
-from advsearch.config import AttackConfig
 from advsearch.controls import LightControl, PoseControl
-from advsearch.engine.attack_result import AttackResult
 from advsearch.engine.loading import as_controls, instances_in, settings_of
 from advsearch.engine.naming import given_to
-from advsearch.engine.sweeps.summary import SweepResult
 from advsearch.errors import FileFormatError, InputError, ModelError, UnknownNameError
 from advsearch.progress import BarProgress, LineProgress, NotebookProgress, NullProgress, watched
+from advsearch.questions.attack.result import AttackResult
+from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.gap import GapResult
 from advsearch.questions.region.answer import RegionResult
-from advsearch.runs.results.base import Result
+from advsearch.questions.sweep.result import SweepResult
+from advsearch.runs.results import Result
 
 SIDE = 16
 PICTURE: dict[str, Any] = {"resolution": SIDE, "spp": 1, "denoise": "none", "threads": 1}
@@ -270,9 +270,9 @@ def _other() -> Callable[..., float]:
 
 
 def test_a_metric_has_a_name_that_workers_and_files_can_use(model: advsearch.Model) -> None:
-    from advsearch.config import SweepConfig
     from advsearch.engine.judging import metrics_as_settings, only_here
     from advsearch.questions.sweep.carry_out import job_of, sweep_answers
+    from advsearch.questions.sweep.settings import SweepConfig
 
     named = metrics_as_settings({"red": red, "own": lambda image, output, truth: 0.0})
     assert named == {"red": f"{__name__}:red", "own": "<lambda>"}

@@ -19,8 +19,8 @@ from small_models import easy
 import advsearch
 from advsearch.api.dataset import _runs
 from advsearch.cli.main import main
-from advsearch.config import AttackConfig
-from advsearch.engine.attack_parts import parts_in, problem_of_parts
+from advsearch.questions.attack.parts import parts_in, problem_of_parts
+from advsearch.questions.attack.settings import AttackConfig
 from advsearch.runs.directory import PARTS, RunDirectory
 from advsearch.runs.images import read_png
 from advsearch.runs.store import NAME, Row, Store

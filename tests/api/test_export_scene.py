@@ -16,9 +16,9 @@ from scipy.spatial import KDTree
 import advsearch
 from advsearch.api.export import answer_of
 from advsearch.cli.main import main
-from advsearch.config import AttackConfig
 from advsearch.controls import make_control, make_space
-from advsearch.engine.attack_result import write_object
+from advsearch.questions.attack.result import write_object
+from advsearch.questions.attack.settings import AttackConfig
 from advsearch.runs.directory import OBJECT_FILE, RunDirectory
 from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.importing.objects import import_object

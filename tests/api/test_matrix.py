@@ -14,16 +14,16 @@ from stand_ins import rows, shared
 from torch import Tensor
 
 import advsearch
-from advsearch.api import studies as parts
 from advsearch.attacks import get_objective
 from advsearch.cli.main import main
-from advsearch.config import AttackConfig
 from advsearch.engine.objective import of_ensemble
 from advsearch.engine.verifier import Retrials
 from advsearch.errors import InputError
-from advsearch.questions.attack.answer import MatrixResult
-from advsearch.questions.attack.carry_out import attack_from_config
-from advsearch.questions.attack.several import models_answering
+from advsearch.questions.attack import attack
+from advsearch.questions.attack import studies as parts
+from advsearch.questions.attack.settings import AttackConfig
+from advsearch.questions.attack.studies import models_answering
+from advsearch.questions.attack.summary import MatrixResult
 from advsearch.questions.gap import GapConfig
 from advsearch.runs.store import Store
 from advsearch.runs.summary import read_result
@@ -38,7 +38,7 @@ SHORT: dict[str, Any] = {
 
 
 def carried_out(run: Path, **more: Any) -> MatrixResult:
-    result = attack_from_config(AttackConfig(**{**SHORT, "model": BOTH, "run": str(run), **more}))
+    result = attack.from_config(AttackConfig(**{**SHORT, "model": BOTH, "run": str(run), **more}))
     assert isinstance(result, MatrixResult)
     return result
 
@@ -89,7 +89,7 @@ def test_a_matrix_goes_on_with_the_trial_at_which_it_was_stopped(
     monkeypatch.setattr(Retrials, "_rendered", stopped)
     first = carried_out(tmp_path / "run")
     assert first.ending == "interrupted" and first.goes_on
-    again = attack_from_config(AttackConfig.from_yaml(tmp_path / "run" / "run.yaml"), resumed=tmp_path / "run")
+    again = attack.from_config(AttackConfig.from_yaml(tmp_path / "run" / "run.yaml"), resumed=tmp_path / "run")
     assert isinstance(again, MatrixResult) and again.ending == "done"
     assert [row.tested for row in again.table] == [row.tested for row in whole.table]
     assert done < 2 * 6 * 3 + 2, "what was tried is not tried again"

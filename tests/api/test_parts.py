@@ -9,13 +9,12 @@ from typing import Any
 
 import pytest
 
-from advsearch.api import studies as parts
-from advsearch.api.studies import chains_of
 from advsearch.cluster import Done, Work, Workforce
-from advsearch.config import AttackConfig
 from advsearch.errors import ClusterError
 from advsearch.question import Asked, answered
-from advsearch.questions.attack.several import curve
+from advsearch.questions.attack import studies as parts
+from advsearch.questions.attack.settings import AttackConfig
+from advsearch.questions.attack.studies import chains_of, curve
 from advsearch.questions.gap import GapConfig, gap
 from advsearch.runs.store import NAME, Store
 from advsearch.runs.summary import read_answer
@@ -43,7 +42,7 @@ class Backwards:
 
     def __init__(self, work: Work, lost: str) -> None:
         self.call, self.lost = parts.attacks_of(work.settings), lost
-        assert work.function == "advsearch.api.studies:attacks_of"
+        assert work.function == "advsearch.questions.attack.studies:attacks_of"
 
     def results(self, ranges: Iterable[range]) -> Iterator[Done]:
         for one in reversed(list(ranges)):

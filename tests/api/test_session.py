@@ -25,18 +25,20 @@ from torch import Tensor, nn
 
 import advsearch
 from advsearch.cli.main import main
-from advsearch.config import CONFIGS, AttackConfig, SweepConfig
+from advsearch.config import CONFIGS
 from advsearch.controls import Control
 from advsearch.controls.numbers import NumberControl
 from advsearch.controls.pose import PoseControl
 from advsearch.controls.texture import TextureControl
-from advsearch.engine.attack_parts import problem_from_config
 from advsearch.errors import AdvsearchError, InputError
 from advsearch.models import ModelWarning
 from advsearch.progress import NullProgress
 from advsearch.questions.attack import carry_out as attacking
+from advsearch.questions.attack.parts import problem_from_config
+from advsearch.questions.attack.settings import AttackConfig
+from advsearch.questions.attack.wording import objective_text
 from advsearch.questions.region.answer import RegionConfig
-from advsearch.report.wording import objective_text
+from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.runs.directory import is_run
 from advsearch.runs.store import Store
 from advsearch.scene.settings import Parameter
@@ -487,7 +489,7 @@ def test_a_run_that_is_killed_while_it_loads_goes_on(tmp_path: Path) -> None:
         lambda: carry_out(RegionConfig(object="mug", controls="pose", run=str(run))),
     ):
         with pytest.MonkeyPatch.context() as patch:
-            for module in ("engine.attack_parts", "questions.sweep.carry_out"):
+            for module in ("questions.attack.parts", "questions.sweep.carry_out"):
                 patch.setattr(f"advsearch.{module}.load_models", killed)
             with pytest.raises(InterruptedError):
                 ask()

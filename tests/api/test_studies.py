@@ -19,18 +19,18 @@ from advsearch.api import carry_out
 from advsearch.cli.main import main
 from advsearch.cli.output import shown_text as answer
 from advsearch.cli.output import shown_text as region_text
-from advsearch.config import AttackConfig
 from advsearch.engine.transport import CleanMatrix
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.question import Asked, answered
-from advsearch.questions.attack import carry_out as attacking
-from advsearch.questions.attack.several import curve
+from advsearch.questions.attack import studies as attacking
+from advsearch.questions.attack.settings import AttackConfig
+from advsearch.questions.attack.studies import curve
+from advsearch.questions.attack.summary import AttackSummary
 from advsearch.questions.gap import GapConfig, gap
 from advsearch.questions.region import growing, region
 from advsearch.questions.region.answer import RegionConfig
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.listing import finished, listed_runs
-from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.summary import read_result
 
 FLIPS = {"mug": 0.02, "bowl": 0.1, "vase": 0.0, "pan": 9.0}
@@ -98,7 +98,7 @@ def test_an_attack_on_several_objects_or_epsilons_is_a_curve(
 ) -> None:
     run = str(tmp_path / "it")
     monkeypatch.setattr(
-        "advsearch.questions.attack.carry_out.curve", lambda asked: samples.curve(run=str(asked.run.path))
+        "advsearch.questions.attack.studies.curve", lambda asked: samples.curve(run=str(asked.run.path))
     )
     assert carry_out(AttackConfig(**several, run=run)) == samples.curve(run=run)
 

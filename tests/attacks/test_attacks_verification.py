@@ -39,8 +39,8 @@ from advsearch.attacks.verification import (
     WORST_CASE,
     Rule,
 )
-from advsearch.config import FEWEST_TRIALS
 from advsearch.errors import InputError
+from advsearch.questions.attack.settings import FEWEST_TRIALS
 from advsearch.questions.region.answer import FEWEST_SAMPLES
 from advsearch.questions.region.growing import GrownBox
 from advsearch.seeds import stream

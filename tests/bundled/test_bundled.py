@@ -184,7 +184,8 @@ def test_things_of_the_street_have_their_size_and_several_materials() -> None:
 
 def test_half_of_the_environments_are_held_out() -> None:
     streets = {name for name, family in ENVIRONMENTS.items() if family.split == "street"}
-    assert streets == {"street", "street-wet", "street-dusk"} == set(library.list_environments("street"))
+    avenues = {"avenue", "avenue-wet", "avenue-dusk", "avenue-night"}
+    assert streets == {"street", "street-wet", "street-dusk", *avenues} == set(library.list_environments("street"))
     splits = [family.split for family in ENVIRONMENTS.values()]
     assert splits.count("train") == splits.count("heldout") >= 4
     assert ENVIRONMENTS["studio"].split == ENVIRONMENTS["noon"].split == "train"
@@ -197,7 +198,7 @@ def test_half_of_the_environments_are_held_out() -> None:
 @pytest.mark.parametrize("name", sorted(ENVIRONMENTS))
 def test_a_shipped_environment_is_light_of_the_common_brightness(name: str) -> None:
     radiance = library.load_environment(name).radiance
-    assert radiance.shape == ((320, 640, 3) if name.startswith("street") else (HEIGHT, WIDTH, 3))
+    assert radiance.shape == ((320, 640, 3) if name.startswith("street") or name == "avenue" else (HEIGHT, WIDTH, 3))
     assert radiance.dtype == np.float32
     assert np.isfinite(radiance).all()
     assert radiance.min() >= 0.0

@@ -23,19 +23,20 @@ from samples import ATTACK, AVERAGE, BRACKET, EASIER, SUMMARY, TARGET, make_run,
 
 import advsearch
 from advsearch import __version__
-from advsearch.cli import names
+from advsearch.cli import show as names
 from advsearch.cli.commands import COMMANDS, help_of
 from advsearch.cli.flags import with_flags
 from advsearch.cli.main import main
 from advsearch.cli.output import aligned, finish
 from advsearch.cli.output import shown_text as answer
-from advsearch.config import AttackConfig, SweepConfig
 from advsearch.controls.base import Choice
 from advsearch.described import Value
 from advsearch.errors import InputError, StorageError
 from advsearch.progress import BarProgress, LineProgress, NullProgress, Progress, watched
+from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.gap import GapConfig
 from advsearch.questions.region.answer import RegionConfig
+from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row
 from advsearch.scene.settings import Parameter

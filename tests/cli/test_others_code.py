@@ -19,15 +19,15 @@ from stored_sweeps import make_sweep
 
 import advsearch
 from advsearch import testing
-from advsearch.api.studies import attacks_of
 from advsearch.cli.commands import COMMANDS
 from advsearch.cli.dashboard import _LoadedLater as TakenLater
 from advsearch.cli.main import main
 from advsearch.cluster import Work
 from advsearch.cluster.worker import Failure, Files, prepare, version
-from advsearch.config import AttackConfig
-from advsearch.engine.attack_parts import parts_in
 from advsearch.errors import InputError
+from advsearch.questions.attack.parts import parts_in
+from advsearch.questions.attack.settings import AttackConfig
+from advsearch.questions.attack.studies import attacks_of
 from advsearch.questions.photographs.carry_out import Photographs
 from advsearch.registry import allow_named, allowed_code, nothing_allowed
 from advsearch.runs.directory import RunDirectory

@@ -11,13 +11,15 @@ from stored_sweeps import make_sweep
 
 import advsearch
 from advsearch import registry
-from advsearch.api import studies
 from advsearch.cli.flags import IN_A_FILE as COMMANDS
 from advsearch.cli.main import main
-from advsearch.config import CONFIGS, AttackConfig, SweepConfig
+from advsearch.config import CONFIGS
 from advsearch.errors import InputError
 from advsearch.progress import NullProgress
+from advsearch.questions.attack import studies
+from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.sweep import carry_out as sweeping
+from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.runs.directory import RunDirectory
 from advsearch.settings import HEADER, power, settings
 from advsearch.threads import cores

@@ -12,14 +12,14 @@ import torch
 import advsearch
 from advsearch.cli.flags import with_flags
 from advsearch.cli.main import main
-from advsearch.config import SweepConfig
 from advsearch.controls import Space, make_control, make_space
 from advsearch.controls.pose import PoseControl
 from advsearch.controls.values import sentences
 from advsearch.errors import InputError
 from advsearch.progress import NullProgress
 from advsearch.questions.sweep.carry_out import sweep_from_config
-from advsearch.runs.results.base import plain
+from advsearch.questions.sweep.settings import SweepConfig
+from advsearch.runs.results import plain
 from advsearch.scene.assets import EnvironmentAsset
 from advsearch.scene.description import DEFAULT_ENVIRONMENT, SceneDescription, describe
 

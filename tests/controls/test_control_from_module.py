@@ -11,10 +11,10 @@ import pytest
 
 import advsearch
 from advsearch.cli.main import main
-from advsearch.config import AttackConfig
 from advsearch.controls import CONTROLS, make_control
 from advsearch.controls.space import Space
 from advsearch.errors import InputError
+from advsearch.questions.attack.settings import AttackConfig
 from advsearch.runs.directory import RunDirectory
 
 MODULE = '''

@@ -15,14 +15,14 @@ from torch.distributions import Beta, Exponential, Gumbel, Kumaraswamy, LogNorma
 from torch.distributions import Laplace as TorchLaplace
 
 from advsearch.attacks.draws import Draws
-from advsearch.config import AttackConfig
 from advsearch.controls import CameraControl, EnvironmentControl, PatchControl
 from advsearch.controls.numbers import NumberControl
 from advsearch.controls.ranges import DrawnRange
 from advsearch.distributions import as_setting
-from advsearch.engine.attack_parts import controls_given
 from advsearch.engine.loading import as_controls, load_scene, only_here, settings_of
 from advsearch.errors import InputError
+from advsearch.questions.attack.parts import controls_given
+from advsearch.questions.attack.settings import AttackConfig
 
 MUG = load_scene("mug").description
 NORM = {"distribution": "norm", "loc": 30.0, "scale": 10.0}

@@ -12,12 +12,12 @@ import torch
 import advsearch
 from advsearch.cli.flags import config_from
 from advsearch.cli.main import _parse
-from advsearch.config import AttackConfig
 from advsearch.controls import make_space
 from advsearch.engine.gradients import smooth_loss
 from advsearch.engine.loading import as_controls
-from advsearch.engine.sweeps.axes import on_grid, read_axes
 from advsearch.errors import InputError
+from advsearch.questions.attack.settings import AttackConfig
+from advsearch.questions.sweep.axes import on_grid, read_axes
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.mitsuba_backend.variant import mitsuba
 from advsearch.scene.mitsuba_backend.writing import write_scene, write_xml

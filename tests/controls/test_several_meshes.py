@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from advsearch.config import AttackConfig
 from advsearch.controls import CONTROLS, Space, gathered, make_control, make_space
 from advsearch.engine.loading import Controls, Scene
-from advsearch.engine.sweeps.axes import read_axes
 from advsearch.errors import InputError, UnknownNameError
+from advsearch.questions.attack.settings import AttackConfig
+from advsearch.questions.sweep.axes import read_axes
 from advsearch.scene.assembly import Assembly
 from advsearch.scene.assets import Material, Mesh
 from advsearch.scene.description import SceneDescription, describe

@@ -12,13 +12,13 @@ from torch import Tensor, nn
 
 import advsearch
 from advsearch.attacks import Query, get_objective
-from advsearch.config import AttackConfig
 from advsearch.engine import bank
-from advsearch.engine.attack_parts import problem_of
 from advsearch.engine.bank import Bank
 from advsearch.engine.problem import Problem
 from advsearch.engine.transport import PredictedSearch, Transport
 from advsearch.errors import InputError, UnknownNameError
+from advsearch.questions.attack.parts import problem_of
+from advsearch.questions.attack.settings import AttackConfig
 
 SMALL: dict[str, Any] = {
     "resolution": 16, "spp": 2, "trials": 6, "verify_spp": 4, "denoise": "none", "baseline": False, "measure": "no",

@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 from scipy.stats import chi2_contingency
 
-from advsearch.engine.sweeps.surface import SHARINGS, PartCounts, _likelihood_ratio, _newcombe, association, exchange
+from advsearch.questions.sweep.surface import (
+    SHARINGS,
+    PartCounts,
+    _likelihood_ratio,
+    _newcombe,
+    association,
+    exchange,
+)
 
 
 def test_the_interval_of_a_difference_is_newcombe_s() -> None:

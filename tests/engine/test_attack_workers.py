@@ -12,10 +12,10 @@ from stand_ins import shared
 
 import advsearch
 from advsearch.cli.output import shown_text as answer
-from advsearch.config import AttackConfig
-from advsearch.engine.attack_result import AttackResult
 from advsearch.errors import InputError
 from advsearch.questions.attack.carry_out import attack_once
+from advsearch.questions.attack.result import AttackResult
+from advsearch.questions.attack.settings import AttackConfig
 from advsearch.runs.store import Row, Store
 
 SMALL: dict[str, Any] = {

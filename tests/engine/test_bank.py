@@ -12,13 +12,13 @@ from stand_ins import Impatient, rows, shared
 
 import advsearch
 from advsearch.attacks.domain import Block, Domain
-from advsearch.config import AttackConfig
 from advsearch.engine import acceptance, bank
-from advsearch.engine.attack_result import AttackResult
 from advsearch.engine.bank import Bank, stratified
 from advsearch.engine.problem import hard_first
 from advsearch.errors import ClusterError
 from advsearch.questions.attack.carry_out import attack_once
+from advsearch.questions.attack.result import AttackResult
+from advsearch.questions.attack.settings import AttackConfig
 from advsearch.scene.surface import renderer as surface_renderer
 
 SMALL: dict[str, Any] = {

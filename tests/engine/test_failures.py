@@ -17,11 +17,11 @@ from advsearch.attacks.candidates import Failures, FailureShare, FoundFailure
 from advsearch.attacks.verification import OVER_CONDITIONS, Rule
 from advsearch.cli.output import shown_text as answer
 from advsearch.engine.record import Findings, Stages
-from advsearch.engine.stages import Attack
-from advsearch.engine.verifier import TRIED, check_failures, described_failures
 from advsearch.progress import NullProgress
 from advsearch.questions.attack.answer import failures_part, failures_text
-from advsearch.runs.results.attack import DifferentFailures
+from advsearch.questions.attack.outcome import described_failures
+from advsearch.questions.attack.stages import TRIED, Attack, check_failures
+from advsearch.questions.attack.summary import DifferentFailures
 
 NAMED = Domain(torch.full((3,), 0.5), (Block(1, name="u.0"), Block(1, name="u.1"), Block(1, name="kind", options=2)))
 

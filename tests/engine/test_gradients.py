@@ -13,9 +13,7 @@ import torch
 from torch import Tensor
 
 from advsearch import load_scene
-from advsearch.config import AttackConfig
 from advsearch.controls import make_control
-from advsearch.engine.attack_parts import problem_from_config
 from advsearch.engine.gradients import (
     Estimate,
     Probe,
@@ -30,10 +28,11 @@ from advsearch.engine.gradients import (
 )
 from advsearch.engine.planning import TELLS, contested, cosines, measured_plan, status_of, tuned
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.questions.check.answer import shown
+from advsearch.questions.attack.parts import problem_from_config
+from advsearch.questions.attack.settings import AttackConfig
+from advsearch.questions.check.answer import CheckConfig, shown
 from advsearch.questions.check.carry_out import check_from_config
-from advsearch.questions.check.settings import CheckConfig
-from advsearch.runs.results.base import Measured
+from advsearch.runs.results import Measured
 from advsearch.scene.formation import ImageFormation
 from advsearch.scene.gradients import ESTIMATORS, SEARCH_STEP, Group, first_plan
 from advsearch.scene.renderer import Renderer

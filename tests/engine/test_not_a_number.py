@@ -15,9 +15,9 @@ import advsearch
 from advsearch.attacks import Trials
 from advsearch.engine.record import control_group, judgement_of, rate_of, trial_row
 from advsearch.errors import InputError
-from advsearch.report import wording
-from advsearch.report.phrases import answer_cells, calls
-from advsearch.runs.results.attack import AttackSummary
+from advsearch.questions.attack import wording
+from advsearch.questions.attack.summary import AttackSummary
+from advsearch.report.wording import answer_cells, calls, tally
 from advsearch.tasks import Answer, Judgement
 
 NOTHING = Judgement.of(math.nan, math.nan, Answer("tench", 0, math.nan))
@@ -57,9 +57,9 @@ def test_the_headline_never_calls_it_right_or_wrong() -> None:
     assert "0 of 20 fresh" not in all_of_them.replace("none of 20", "")
     some = wording.attack_verdict(told(2, 5))
     assert "in 2 of 20 fresh renders (95 % interval 0-20 %), and in 5 its answer is not a number." in some
-    assert wording.tally("wrong", 0, 20, 20) == "not a number in 20 of 20"
-    assert wording.tally("wrong", 2, 20, 5) == "wrong in 2, not a number in 5 of 20"
-    assert wording.tally("wrong", 2, 20) == "wrong in 2 of 20"
+    assert tally("wrong", 0, 20, 20) == "not a number in 20 of 20"
+    assert tally("wrong", 2, 20, 5) == "wrong in 2, not a number in 5 of 20"
+    assert tally("wrong", 2, 20) == "wrong in 2 of 20"
 
 
 def test_a_clean_scene_without_a_number_is_said_as_such() -> None:

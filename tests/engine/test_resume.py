@@ -22,13 +22,13 @@ from covering import only
 from stand_ins import StandInProblem, attack_on, carry_out, configuration, rows
 
 from advsearch.attacks import Domain, Evaluated, Evaluation, Policy, Proposal, Query, make_policy
-from advsearch.config import AttackConfig
 from advsearch.engine.journal import Journal, Shared
 from advsearch.engine.record import Stages
 from advsearch.errors import FileFormatError, InputError, RunExistsError
 from advsearch.progress import NullProgress
-from advsearch.questions.check.settings import CheckConfig
-from advsearch.questions.stability.settings import StabilityConfig
+from advsearch.questions.attack.settings import AttackConfig
+from advsearch.questions.check.answer import CheckConfig
+from advsearch.questions.stability.answer import StabilityConfig
 from advsearch.runs import files
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.listing import can_resume

@@ -11,17 +11,19 @@ from advsearch.api import render as rendering
 from advsearch.attacks import make_policy
 from advsearch.cli.flags import with_flags
 from advsearch.cli.main import main
-from advsearch.config import AttackConfig, RenderConfig, SweepConfig
+from advsearch.config import RenderConfig
 from advsearch.controls import CONTROLS, make_control
 from advsearch.controls.patch import PatchControl
 from advsearch.controls.pose import PoseControl
 from advsearch.controls.texture import TextureControl
-from advsearch.engine.attack_parts import with_derivatives
 from advsearch.engine.naming import RUN_SETTINGS, check_run_settings, given_to
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.questions.attack import carry_out as attacking
+from advsearch.questions.attack.parts import with_derivatives
+from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.gap import GapConfig, gap
 from advsearch.questions.sweep.carry_out import job_of
+from advsearch.questions.sweep.settings import SweepConfig
 
 ALL: dict[str, Any] = {"epsilon": 0.07, "norm": "l2", "texture_resolution": 16}
 
@@ -115,7 +117,7 @@ def test_a_sweep_and_a_render_give_every_texture_its_resolution(asked: Any, monk
 def test_a_gap_gives_each_control_what_it_takes(monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> None:
     seen: list[Any] = []
 
-    monkeypatch.setattr("advsearch.api.studies.StudyRun.attack", lambda self, one: _seen(one.config, seen))
+    monkeypatch.setattr("advsearch.questions.attack.studies.StudyRun.attack", lambda self, one: _seen(one.config, seen))
     config = GapConfig(object="mug", controls="texture,pose,geometry", run=str(tmp_path / "gap"), **ALL)
     gap.from_config(config)
     assert seen == [(0.07, "l2", 16), (None, None, None), (0.07, None, None)]

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from advsearch.attacks import Block, Domain, Ending, SearchResult
 from advsearch.attacks.verification import WORST_CASE
-from advsearch.engine.stages import CONFIRMED, find_smallest
+from advsearch.questions.attack.stages import CONFIRMED, find_smallest
 
 DOMAIN = Domain(torch.full((2,), 0.5), (Block(2, "linf", 0.4),))
 

@@ -14,12 +14,12 @@ from torch import Tensor, nn
 
 import advsearch
 from advsearch.cli.main import main
-from advsearch.engine.sweeps import surface
-from advsearch.engine.sweeps.surface import LEAST, SurfaceCounts
 from advsearch.errors import InputError
 from advsearch.models import Model
+from advsearch.questions.sweep import surface
+from advsearch.questions.sweep.summary import SurfaceTable, SweepSummary
+from advsearch.questions.sweep.surface import LEAST, SurfaceCounts
 from advsearch.runs import store
-from advsearch.runs.results.sweep import SurfaceTable, SweepSummary
 from advsearch.scene import library
 from advsearch.scene.surface_parts import CELLS
 from advsearch.tasks import make_task

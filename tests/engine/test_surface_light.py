@@ -15,14 +15,14 @@ from torch import Tensor
 import advsearch
 from advsearch.attacks import make_policy
 from advsearch.attacks.evaluation import Query
-from advsearch.config import AttackConfig
 from advsearch.engine import acceptance, surface_light
 from advsearch.engine import problem as problems
 from advsearch.engine.acceptance import ComparedView, Deviation
-from advsearch.engine.attack_parts import parts_of, problem_of_parts
-from advsearch.engine.attack_result import AttackResult
 from advsearch.engine.surface_light import SurfaceLight
 from advsearch.questions.attack.carry_out import attack_once
+from advsearch.questions.attack.parts import parts_of, problem_of_parts
+from advsearch.questions.attack.result import AttackResult
+from advsearch.questions.attack.settings import AttackConfig
 from advsearch.runs.store import NAME as STORE
 from advsearch.runs.store import Store
 from advsearch.scene.surface import arrangement, texels

@@ -32,25 +32,27 @@ from torch import Tensor, nn
 import advsearch
 from advsearch.attacks import clopper_pearson
 from advsearch.attacks.draws import NET, Draws, Product, Seeds, batches
+from advsearch.cli.commands import QuestionCommand
 from advsearch.cli.flags import READERS, help_text, with_flags
 from advsearch.cli.main import main
 from advsearch.cli.output import shown_text as answer
-from advsearch.cli.question import QuestionCommand
-from advsearch.config import AttackConfig, SweepConfig
 from advsearch.controls import CONTROLS, make_control, make_space
 from advsearch.controls.base import Parameter
 from advsearch.engine.objective import domain_of
-from advsearch.engine.sweeps import KIND, swept_scene
-from advsearch.engine.sweeps.axes import axis_values, on_grid, read_axes
-from advsearch.engine.sweeps.loop import Sweep
-from advsearch.engine.sweeps.points import Points, parts_of_ranges
 from advsearch.errors import AdvsearchError, InputError, RunExistsError, UnknownNameError
 from advsearch.progress import NullProgress
+from advsearch.questions.attack.settings import AttackConfig
+from advsearch.questions.sweep import job as swept_scene
+from advsearch.questions.sweep.axes import axis_values, on_grid, read_axes
 from advsearch.questions.sweep.carry_out import job_of, sweep_from_config
+from advsearch.questions.sweep.job import KIND
+from advsearch.questions.sweep.loop import Sweep
+from advsearch.questions.sweep.points import Points, parts_of_ranges
+from advsearch.questions.sweep.settings import SweepConfig
+from advsearch.questions.sweep.summary import SweepSummary
 from advsearch.report.wording import formation_text
 from advsearch.runs.directory import RunDirectory
-from advsearch.runs.results.base import plain
-from advsearch.runs.results.sweep import SweepSummary
+from advsearch.runs.results import plain
 from advsearch.runs.store import Row
 from advsearch.runs.summary import write_answer
 from advsearch.runs.tables import read_sweep

@@ -12,10 +12,10 @@ import advsearch
 from advsearch.attacks.draws import Product
 from advsearch.engine import acceptance
 from advsearch.engine.acceptance import Deviation
-from advsearch.engine.sweeps import predicting
-from advsearch.engine.sweeps.predicting import Groups, combined
-from advsearch.engine.sweeps.swept_scene import SweptScene
-from advsearch.runs.results.attack import LinearTransport, PredictionError
+from advsearch.questions.sweep import predicting
+from advsearch.questions.sweep.job import SweptScene
+from advsearch.questions.sweep.predicting import Groups, combined
+from advsearch.runs.results import LinearTransport, PredictionError
 
 SMALL: dict[str, Any] = {"resolution": 48, "trials": 0}
 GRID = {"camera.exposure": [-10, -1, 6], "light.power": "0:6:8"}

@@ -14,18 +14,18 @@ from stand_ins import rows
 import advsearch
 from advsearch.attacks.draws import Product
 from advsearch.cluster import Done, Workforce
-from advsearch.config import SweepConfig
 from advsearch.engine import acceptance
 from advsearch.engine.acceptance import Deviation
 from advsearch.engine.journal import answering
-from advsearch.engine.sweeps import predicting
-from advsearch.engine.sweeps.loop import Sweep
-from advsearch.engine.sweeps.predicting import Groups
-from advsearch.engine.sweeps.swept_scene import Scenes, SweptScene
 from advsearch.progress import NullProgress
+from advsearch.questions.sweep import predicting
 from advsearch.questions.sweep.carry_out import job_of
+from advsearch.questions.sweep.job import Scenes, SweptScene
+from advsearch.questions.sweep.loop import Sweep
+from advsearch.questions.sweep.predicting import Groups
+from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.runs.directory import RunDirectory
-from advsearch.runs.results.attack import LinearTransport
+from advsearch.runs.results import LinearTransport
 from advsearch.scene.surface import arrangement, texels
 from advsearch.scene.surface.renderer import SurfaceRenderer
 

@@ -16,17 +16,17 @@ import advsearch
 from advsearch.cli.main import main
 from advsearch.cli.output import shown_text as answer
 from advsearch.cluster import Call, Done, Workforce
-from advsearch.config import SweepConfig
 from advsearch.engine.journal import answering
 from advsearch.engine.record import LOST
-from advsearch.engine.sweeps import swept_scene
-from advsearch.engine.sweeps.loop import Sweep
-from advsearch.engine.sweeps.swept_scene import Scenes
 from advsearch.errors import InputError
 from advsearch.progress import NullProgress
+from advsearch.questions.sweep import job as swept_scene
 from advsearch.questions.sweep.carry_out import job_of
+from advsearch.questions.sweep.job import Scenes
+from advsearch.questions.sweep.loop import Sweep
+from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.runs.directory import RunDirectory
-from advsearch.runs.results.attack import SharedWork
+from advsearch.runs.results import SharedWork
 from advsearch.runs.store import NAME, Store
 
 SMALL = {"object": "mug", "grid": {"pose.yaw": "0:360:3", "camera.elevation": [5, 35]}, "environment": "studio,noon"}

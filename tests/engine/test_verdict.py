@@ -10,7 +10,7 @@ from stand_ins import StandInProblem, carry_out, configuration, rows
 
 from advsearch.attacks import Ending, Evaluation, Query
 from advsearch.attacks.verification import TRIAL_LOOKS
-from advsearch.config import AttackConfig
+from advsearch.questions.attack.settings import AttackConfig
 from advsearch.runs.directory import RunDirectory
 
 UNASKED: AttackConfig = configuration().model_copy(update={"verify_spp": None, "trials": None, "average": 0})

@@ -235,7 +235,7 @@ def load_blend(path: Path) -> None:
 
 def load_threedb(path: Path) -> None:
     """Read a folder of 3DB as `import-3db` does."""
-    from advsearch.engine.sweeps.summary import read_picture
+    from advsearch.questions.sweep.result import read_picture
     from advsearch.runs.export import read_threedb
 
     for one in read_threedb(path.parent):

@@ -16,8 +16,8 @@ import yaml
 from samples import attack, gap, keep_object, make_run
 from stored_sweeps import make_sweep
 
-from advsearch.config import AttackConfig
 from advsearch.described import Value
+from advsearch.questions.attack.settings import AttackConfig
 from advsearch.runs.directory import PARTS, RunDirectory
 from advsearch.runs.store import Row
 from advsearch.runs.summary import read_result

@@ -24,12 +24,11 @@ from advsearch.interrupts import INTERRUPTS
 from advsearch.progress import NullProgress, Progress
 from advsearch.questions.check import answer as words
 from advsearch.questions.check import carry_out as checking
-from advsearch.questions.check.answer import CheckedRow, CheckResult, GainRow
+from advsearch.questions.check.answer import CheckConfig, CheckedRow, CheckResult, GainRow
 from advsearch.questions.check.carry_out import check_from_config
-from advsearch.questions.check.settings import CheckConfig
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.listing import finished, listed_runs
-from advsearch.runs.results.base import PathLength, Result
+from advsearch.runs.results import PathLength, Result
 from advsearch.runs.summary import read_result
 
 FLAGS = "check --object mug --control camera.azimuth,environment.rotation --loss linear --resolution 16 --spp 1"

@@ -17,14 +17,14 @@ from stored_sweeps import described
 import advsearch
 from advsearch.attacks.trials import mcnemar, paired_difference
 from advsearch.cli.main import main
-from advsearch.config import SweepConfig
 from advsearch.described import Value
 from advsearch.errors import FileFormatError, InputError
 from advsearch.questions.compare import CompareConfig
 from advsearch.questions.compare.answer import ComparedPair, CompareResult
 from advsearch.questions.report.evidence import claims_of
+from advsearch.questions.sweep.settings import SweepConfig
+from advsearch.questions.sweep.summary import SweepSummary
 from advsearch.runs.directory import RunDirectory
-from advsearch.runs.results.sweep import SweepSummary
 from advsearch.runs.store import Row
 from advsearch.runs.summary import read_result
 from advsearch.runs.tables import EDGES
@@ -299,7 +299,7 @@ def test_a_comparison_that_was_stopped_goes_on(
         stored(path, {"a": good, "b": low})
         return sweep(ending="finished")
 
-    monkeypatch.setattr("advsearch.api.studies.carry_out_part", swept)
+    monkeypatch.setattr("advsearch.questions.attack.studies.carry_out_part", swept)
     line = ["compare", "a", "b", "--object", "mug", "--control", "camera", "--pictures", "0"]
     assert main([*line, "--run", str(tmp_path / "run")]) == 130
     assert f"Go on with: advsearch resume {tmp_path / 'run'}" in capsys.readouterr().out

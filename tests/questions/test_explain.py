@@ -16,11 +16,11 @@ from stored_sweeps import described, make_sweep, seen
 
 import advsearch
 from advsearch.cli.main import main
-from advsearch.config import SweepConfig
 from advsearch.errors import FileFormatError, InputError
 from advsearch.questions.explain import renders as explaining
 from advsearch.questions.explain.answer import ExplainResult, pairs_text
 from advsearch.questions.explain.renders import along, can_be_given, sweep_inside
+from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.rules import CountedRule, RuleCondition, covered
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import NAME, Row, Store

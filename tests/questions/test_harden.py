@@ -15,19 +15,21 @@ import advsearch
 from advsearch.attacks import make_policy
 from advsearch.cli.main import main
 from advsearch.cli.output import shown_text as answer
-from advsearch.config import AttackConfig
-from advsearch.engine.attack_parts import executor_for, problem_of
 from advsearch.engine.loading import Scene
 from advsearch.engine.surface_light import reason_against
 from advsearch.errors import InputError, ModelError
 from advsearch.models import Model
 from advsearch.models.reference import Trainable, load
 from advsearch.progress import NullProgress
+from advsearch.question import Question
+from advsearch.questions.attack.parts import executor_for, problem_of
+from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.harden import carry_out as hardening
+from advsearch.questions.harden import harden as asked
 from advsearch.questions.harden import scenes as harden_scenes
+from advsearch.questions.harden.answer import QUICK, HardenConfig
 from advsearch.questions.harden.lessons import Lesson, RenderedLesson, TextureLesson
 from advsearch.questions.harden.scenes import FURTHER, TRAINING, VALIDATION, Drawing, SceneWork
-from advsearch.questions.harden.settings import QUICK, HardenConfig
 from advsearch.questions.harden.training import ROUNDS, Course, Score
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.summary import read_result
@@ -50,9 +52,9 @@ def attacks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[tuple[str, 
         return "found" if config.object == "book" else "robust"
 
     monkeypatch.setattr(harden_scenes, "attacked", attacked)
-    monkeypatch.setattr(hardening, "CLEAN_SCENES", 1)
-    monkeypatch.setattr(hardening, "PLAIN_SCENES", 1)
-    monkeypatch.setattr(hardening, "RENDERED_SCENES", 2)
+    monkeypatch.setattr(harden_scenes, "CLEAN_SCENES", 1)
+    monkeypatch.setattr(hardening.answer, "PLAIN_SCENES", 1)
+    monkeypatch.setattr(hardening.answer, "RENDERED_SCENES", 2)
     return done
 
 
@@ -70,7 +72,7 @@ def test_a_run_trains_measures_and_goes_on(
         taught(self, number, *args)
 
     monkeypatch.setattr(Course, "round", stopped)
-    first = hardening.harden_from_config(config)
+    first = asked.from_config(config)
     assert (first.ending, len(first.rounds), first.after, first.hardened) == ("interrupted", 2, None, None)
     both = [("ball", 40), ("book", 40), ("ball", 120)]  # what was found is not sought any harder
     assert attacks == both
@@ -94,7 +96,11 @@ def test_a_run_trains_measures_and_goes_on(
     assert len(list(Path(str(result.pictures)).glob("*/*.png"))) == 2 * (2 + 1 + 1)
     assert "robust to texture" in answer(result)
     page = Path("runs/run/report.html").read_text("utf-8")
-    assert "Of 2 held-out scenes the searches leave 1 right, before 1;" in page and "data:image/png" in page
+    assert (
+        "Of 2 held-out scenes the searches leave 1 right, before 1;" in page
+        and "<svg" in page
+        and Path("runs/run/images/harden.png").is_file()
+    )
 
 
 def work_of(config: HardenConfig, run: RunDirectory, course: Course) -> hardening.Hardening:
@@ -143,7 +149,7 @@ def test_a_measurement_over_viewpoints_may_be_predicted() -> None:
     config = HardenConfig(**{**SMALL, "object": "mug", "model": "reference", "controls": "camera", "epsilon": None})
     work = SceneWork(config, load(), harden_scenes.splits_of(config, load()))
     name, scene = work.splits["held out"].scene(0)
-    problem = problem_of(work._of(("camera",), name), scene, work.model)
+    problem = problem_of(work.attack(("camera",), name), scene, work.model)
     against = [reason_against(problem, steps, make_policy("auto"), True) for steps in (config.steps, QUICK["steps"])]
     assert against == [None, "light on surfaces pays from 32 pictures on"]
 
@@ -230,7 +236,7 @@ def test_what_cannot_be_hardened_is_refused_in_words(
     attacks: list[tuple[str, int | None]], given: dict[str, Any], text: str
 ) -> None:
     with pytest.raises(InputError, match=text):
-        hardening.harden_from_config(HardenConfig(**{**SMALL, "labels": "labels.json", **given}))
+        asked.from_config(HardenConfig(**{**SMALL, "labels": "labels.json", **given}))
     assert not list(Path("runs").glob("*/*"))
 
 
@@ -241,7 +247,7 @@ def test_the_command_asks_what_its_flags_say(monkeypatch: pytest.MonkeyPatch, ca
         given.append(config)
         raise InputError("stop here")
 
-    monkeypatch.setattr(hardening, "harden_from_config", noted)
+    monkeypatch.setattr(Question, "from_config", lambda self, config, **others: noted(config))
     flags = "harden --model reference --control texture --epsilon 0.03 --quick --held-out a.glb --json"
     assert main(flags.split()) == 2 and "stop here" in capsys.readouterr().err
     assert given == [HardenConfig(controls={"texture": {}}, epsilon=0.03, quick=True, held_out="a.glb")]

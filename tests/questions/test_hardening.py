@@ -21,14 +21,14 @@ from torch import Tensor, nn
 from advsearch import threads
 from advsearch.attacks import Block, Domain
 from advsearch.bundled.changed_light import white_light_changed
-from advsearch.config import AttackConfig
-from advsearch.engine.attack_parts import problem_of
 from advsearch.engine.loading import load_scene
 from advsearch.errors import InputError, ModelError
 from advsearch.models import load_model, reference
 from advsearch.models.reference import Trainable, trainable
 from advsearch.progress import NullProgress
-from advsearch.questions.harden.answer import TrainingRound
+from advsearch.questions.attack.parts import problem_of
+from advsearch.questions.attack.settings import AttackConfig
+from advsearch.questions.harden.answer import HardenConfig, TrainingRound
 from advsearch.questions.harden.lessons import (
     Disguise,
     Lesson,
@@ -49,7 +49,6 @@ from advsearch.questions.harden.scenes import (
     check_unmeasured,
     fingerprint,
 )
-from advsearch.questions.harden.settings import HardenConfig
 from advsearch.questions.harden.training import Course, Gradients, Score, TrainingRounds, score
 from advsearch.scene.formation import levels_of, to_8_bit
 from advsearch.scene.library import load_environment

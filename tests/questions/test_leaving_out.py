@@ -14,14 +14,13 @@ from covering import only
 from advsearch import attack, load_scene
 from advsearch.attacks import Query
 from advsearch.cli.output import shown_text as answer
-from advsearch.config import AttackConfig
 from advsearch.controls import CameraControl, LightControl, MaterialControl, TextureControl
-from advsearch.engine.attack_parts import problem_from_config
 from advsearch.engine.gradients import inside, smooth_loss
 from advsearch.engine.planning import BOUND, measured_bounces
-from advsearch.questions.check.carry_out import check_from_config
-from advsearch.questions.check.saved import ALL, WHAT, measured_gains, resolved_texels
-from advsearch.questions.check.settings import CheckConfig
+from advsearch.questions.attack.parts import problem_from_config
+from advsearch.questions.attack.settings import AttackConfig
+from advsearch.questions.check.answer import CheckConfig
+from advsearch.questions.check.carry_out import ALL, WHAT, check_from_config, measured_gains, resolved_texels
 from advsearch.scene.formation import EVERYTHING, ITEMS, NOTHING
 from advsearch.scene.renderer import Renderer
 
@@ -85,8 +84,8 @@ def test_gains_have_a_row_for_each_item_and_their_proof() -> None:
 
 
 def test_what_changes_the_picture_is_not_called_safe(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("advsearch.questions.check.saved.ITEMS", {"tracing": ""})
-    monkeypatch.setattr("advsearch.questions.check.saved.NOTHING", EVERYTHING)
+    monkeypatch.setattr("advsearch.questions.check.carry_out.ITEMS", {"tracing": ""})
+    monkeypatch.setattr("advsearch.questions.check.carry_out.NOTHING", EVERYTHING)
     renderer = made("camera.exposure")
     rows = measured_gains(renderer, smooth_loss((SIZE, SIZE)), renderer.start, seed=1, spp=128, repeats=2, depth=2)
     tracing, bounces, _ = rows

@@ -14,20 +14,23 @@ import pytest
 
 from advsearch.cli.main import main
 from advsearch.cli.output import shown_text as precision_text
-from advsearch.config import AttackConfig
-from advsearch.engine.attack_parts import problem_from_config
 from advsearch.engine.gradients import smooth_loss
 from advsearch.engine.loading import load_scene
 from advsearch.errors import InputError
 from advsearch.progress import NullProgress
+from advsearch.questions.attack.parts import problem_from_config
+from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.precision import carry_out as measuring
 from advsearch.questions.precision.answer import (
+    SAMPLERS,
     WARM_UP,
+    PrecisionConfig,
     PrecisionPoint,
     PrecisionResult,
     Recommended,
     cautions,
     headline,
+    precision_figures,
 )
 from advsearch.questions.precision.benches import (
     COUNTS,
@@ -40,7 +43,6 @@ from advsearch.questions.precision.benches import (
     in_rounds,
 )
 from advsearch.questions.precision.carry_out import Measurement, precision_from_config, recommended, timing_machine
-from advsearch.questions.precision.figures import precision_figures
 from advsearch.questions.precision.rule import (
     FURTHEST,
     ReferenceValue,
@@ -56,7 +58,6 @@ from advsearch.questions.precision.rule import (
     typical,
     warning_of,
 )
-from advsearch.questions.precision.settings import SAMPLERS, PrecisionConfig
 from advsearch.runs.listing import finished
 from advsearch.runs.summary import read_result
 from advsearch.scene.formation import next_count

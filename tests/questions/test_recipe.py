@@ -12,24 +12,25 @@ import numpy as np
 import pytest
 
 import advsearch
-from advsearch.api import carry_out, studies
+from advsearch.api import carry_out
 from advsearch.attacks import clopper_pearson, make_policy
 from advsearch.cli.main import main
-from advsearch.config import AttackConfig, SweepConfig
-from advsearch.engine.attack_parts import parts_of, problem_of_parts
 from advsearch.engine.surface_light import reason_against
 from advsearch.errors import AdvsearchError, FileFormatError, InputError, UnknownNameError
+from advsearch.questions.attack import studies
+from advsearch.questions.attack.parts import parts_of, problem_of_parts
+from advsearch.questions.attack.settings import AttackConfig
+from advsearch.questions.attack.summary import AnswerDistribution, FoundValue
 from advsearch.questions.recipe import carry_out as carrying_out
-from advsearch.questions.recipe.answer import RecipeFigure, RecipeResult, told_once
+from advsearch.questions.recipe import recipe as asked
+from advsearch.questions.recipe.answer import RecipeConfig, RecipeFigure, RecipeResult, told_once
 from advsearch.questions.recipe.description import Recipe, planned, read_recipe, recipe_names, titles
 from advsearch.questions.recipe.figures import FIGURES, check_figures, files_of, make, read_options
-from advsearch.questions.recipe.given import CuesOptions, fitting, predicted
-from advsearch.questions.recipe.settings import RecipeConfig
-from advsearch.questions.recipe.table import MadeFigure, Table, Tally
-from advsearch.questions.recipe.ternary import all_triangles, triangle_of
+from advsearch.questions.recipe.frame import MadeFigure, Rows, Tally, frame_of
+from advsearch.questions.recipe.given import CuesOptions, all_triangles, fitting, predicted, triangle_of
+from advsearch.questions.sweep.settings import SweepConfig
+from advsearch.questions.sweep.summary import SurfaceMap
 from advsearch.runs.images import write_png
-from advsearch.runs.results.attack import AnswerDistribution, FoundValue
-from advsearch.runs.results.sweep import SurfaceMap
 from advsearch.runs.summary import read_result
 
 SCENES = Path(__file__).resolve().parents[2] / "advsearch/bundled/data/environments"
@@ -61,15 +62,15 @@ class Answered:
     unit: str | None = None
 
 
-def tabled(given: Sequence[Answered], groups: dict[str, list[str]] | None = None, **more: Any) -> Table:
-    """Rows as the table of a recipe."""
+def tabled(given: Sequence[Answered], groups: dict[str, list[str]] | None = None, **more: Any) -> Rows:
+    """Rows as the frame of a recipe."""
     said = ("part", "answer", "correct", "time", "margin")
     listed = [
         {"model": "m", **one.values, **{name: getattr(one, name) for name in said}, "unit": one.unit or f"row {n}"}
         for n, one in enumerate(given)
     ]
     units = {name: unit for one in given for name, unit in one.units.items()}
-    return Table.of(listed, groups or {}, units=units, **more)
+    return frame_of(listed, groups or {}, units=units, **{"cores": 1, "surfaces": {}, **more})
 
 
 def rows(counts: dict[str, tuple[int, int]], **more: float | str) -> list[Answered]:
@@ -140,7 +141,7 @@ def test_every_bundled_recipe_is_one_that_can_be_carried_out(name: str, quick: b
     ("text", "message"),
     [
         ("title: a", "parts: Field required"),
-        ("title: a\nparts: {a: {command: doctor}}", "parts.a.command: expected attack or sweep, got 'doctor'"),
+        ("title: a\nparts: {a: {command: doctor}}", "parts.a.command: Input should be 'attack' or 'sweep'"),
         ("title: a\nparts: {a: {command: sweep, settings: {run: /x}}}", "'run' is the same for all parts"),
         ("title: a\nparts: {../a: {command: sweep}}", "expected names of small letters, digits and hyphens"),
         ("title: a\nparts: {a: {command: sweep}}\nsettings: {overwrite: true}", "'overwrite' is said with the command"),
@@ -335,7 +336,7 @@ def test_a_recipe_is_carried_out_and_goes_on_where_it_was_stopped(
     with pytest.raises(KeyboardInterrupt):
         advsearch.recipe(path, run=run)
     path.unlink()  # it goes on as it began
-    result = carrying_out.recipe_from_config(RecipeConfig.from_yaml(run / "run.yaml"), resumed=run)
+    result = asked.from_config(RecipeConfig.from_yaml(run / "run.yaml"), resumed=run)
     assert done == ["mug", "bowl", "bowl"]
     assert result.to_dict() == read_result(run).to_dict() and isinstance(read_result(run), RecipeResult)
     assert [one.renders for one in result.parts] == [4, 4] and result.ending == "done"
@@ -436,7 +437,7 @@ def test_what_is_drawn_has_the_mean_and_the_deviation_that_a_search_answers_with
 
 def test_intervals_are_over_drives_where_frames_of_one_share_a_draw() -> None:
     frames = [replace(row, unit=f"drive {n // 10}") for n, row in enumerate(rows({"noon": (40, 100)}))]
-    alone, together = (Tally.over("noon", tabled(some).rows) for some in (rows({"noon": (40, 100)}), frames))
+    alone, together = (Tally.over("noon", tabled(some)) for some in (rows({"noon": (40, 100)}), frames))
     own, others = alone.interval(), together.interval()
     assert own is not None and others is not None and alone.cells[:3] == together.cells[:3] == [40, 100, 0.4]
     assert own == clopper_pearson(40, 100) and others[0] < own[0] and others[1] > own[1]

@@ -25,7 +25,7 @@ from advsearch.questions.report.evidence import (
     warnings_over,
 )
 from advsearch.report.shown import ENDED, NO_PROOF, NOTHING, Claim
-from advsearch.runs.results.base import Result
+from advsearch.runs.results import Result
 from advsearch.runs.summary import to_json
 
 ENDINGS = (

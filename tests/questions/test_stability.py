@@ -16,11 +16,20 @@ from covering import only
 from advsearch.cli.main import main
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.questions.stability import carry_out as suite
-from advsearch.questions.stability.answer import FELL_SHORT, OK, Check, StabilityResult, check, holds
+from advsearch.questions.stability.answer import (
+    CASES,
+    FELL_SHORT,
+    OK,
+    Case,
+    Check,
+    Outcome,
+    StabilityConfig,
+    StabilityResult,
+    check,
+    holds,
+)
 from advsearch.questions.stability.carry_out import chosen
-from advsearch.questions.stability.settings import StabilityConfig
 from advsearch.questions.stability.stiff import condition_number, hessian
-from advsearch.questions.stability.suite import CASES, Case, Outcome
 from advsearch.runs.directory import RunDirectory, find_run
 from advsearch.runs.summary import read_result
 
@@ -163,8 +172,8 @@ def test_the_command_prints_json(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_the_command_lists_its_cases_without_running_them(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["stability", "--list", "--json", "--quiet"]) == 0
-    assert [one["case"] for one in json.loads(capsys.readouterr().out)["cases"]] == [case.name for case in CASES]
+    assert main(["list", "cases", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["cases"] == [case.name for case in CASES]
 
 
 def test_unknown_cases_and_groups_are_refused() -> None:

@@ -13,9 +13,9 @@ from stored_sweeps import make_sweep
 
 from advsearch.attacks.trials import clopper_pearson
 from advsearch.errors import InputError
-from advsearch.report.sweeps import distance_of, distance_sentence, seen_from
-from advsearch.runs.results.sweep import AxisRow
-from advsearch.viewer.sweep_page import SweepSource, sweep_page_html
+from advsearch.questions.sweep.answer import distance_of, distance_sentence, seen_from
+from advsearch.questions.sweep.page import SweepSource, sweep_page_html
+from advsearch.questions.sweep.summary import AxisRow
 
 DISTANCES = (5.0, 10.0, 20.0, 40.0, 80.0)
 

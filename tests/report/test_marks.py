@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from advsearch.report.marks import SAID, SMALLEST, TINT, TRUE, marked
-from advsearch.report.phrases import answer_cells, answer_text, calling, calls, margin_text, marks_text, wanted
+from advsearch.report.wording import answer_cells, answer_text, calling, calls, margin_text, marks_text, wanted
 from advsearch.tasks import Answer, Mark
 
 

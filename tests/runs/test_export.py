@@ -15,8 +15,8 @@ from samples import attack, rated
 
 from advsearch.cli.export import WRITERS
 from advsearch.cli.main import main
-from advsearch.config import AttackConfig
 from advsearch.errors import UnknownNameError
+from advsearch.questions.attack.settings import AttackConfig
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.export import FORMATS, as_columns, write_rows
 from advsearch.runs.listing import finished, listed_runs

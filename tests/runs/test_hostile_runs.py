@@ -24,7 +24,7 @@ from advsearch.runs.directory import RunDirectory, find_run
 from advsearch.runs.files import write_text
 from advsearch.runs.images import read_png
 from advsearch.runs.listing import listed_run
-from advsearch.runs.results.base import Result
+from advsearch.runs.results import Result
 from advsearch.runs.store import Row, Store, Told
 from advsearch.settings import HEADER
 from advsearch.viewer import thumbnails

@@ -28,15 +28,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from samples import attack, exr, rated, sweep
 
-from advsearch.config import AttackConfig, SweepConfig
 from advsearch.errors import FileFormatError, InputError, RunExistsError, StorageError, UnknownNameError
 from advsearch.files import open_regular
+from advsearch.questions.attack.settings import AttackConfig
+from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.runs import directory, images, summary
 from advsearch.runs.directory import RunDirectory, default_name, find_run, run_path
 from advsearch.runs.export import FORMATS, write_rows
 from advsearch.runs.files import PART, VERSION, RunLock, replacing, write_bytes, write_text
 from advsearch.runs.listing import finished, listed_runs
-from advsearch.runs.results.base import Result, plain
+from advsearch.runs.results import Result, plain
 from advsearch.runs.store import Row, Store
 from advsearch.runs.summary import read_result
 

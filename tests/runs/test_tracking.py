@@ -11,9 +11,10 @@ from typing import Any
 
 import pytest
 
-from advsearch.config import AttackConfig, SweepConfig
 from advsearch.errors import InputError
-from advsearch.questions.attack.carry_out import attack_from_config
+from advsearch.questions.attack import attack
+from advsearch.questions.attack.settings import AttackConfig
+from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.runs import tracking
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row, Store
@@ -170,7 +171,7 @@ def test_a_whole_attack_is_told_as_it_is_stored(tmp_path: Path, told: Told, name
         object="mug", controls="pose", policy="random", steps=3, trials=6, verify_spp=16, spp=4, resolution=64,
         denoise="none", baseline=False, log=name, run=str(tmp_path / "run"),
     )  # fmt: skip
-    attack_from_config(config)
+    attack.from_config(config)
     with Store(tmp_path / "run" / "results.sqlite", read_only=True) as store:
         rows = [(row.kind, row.step, row.objective) for row in store.rows()]
     assert [kind for kind, *_ in rows].count("search") > 2

@@ -10,7 +10,7 @@ import torch
 
 from advsearch.engine.acceptance import ACCEPTED, Deviation, levels_off, view_of
 from advsearch.engine.gradients import smooth_loss
-from advsearch.questions.stability.answer import check, holds
+from advsearch.questions.stability.answer import Outcome, check, holds
 from advsearch.questions.stability.scene import (
     REFERENCE_SPP,
     ControlSettings,
@@ -22,7 +22,6 @@ from advsearch.questions.stability.scene import (
     small,
 )
 from advsearch.questions.stability.scenes import FLASH, TEXTURE, glass
-from advsearch.questions.stability.suite import Outcome
 from advsearch.scene.assets import EnvironmentAsset
 from advsearch.scene.surface.renderer import SurfaceRenderer, why_not
 from advsearch.scene.transport.lights import BasisRenderer

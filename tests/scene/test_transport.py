@@ -15,12 +15,12 @@ from stand_ins import Impatient, rows
 from torch import Tensor
 
 import advsearch
-from advsearch.config import AttackConfig
 from advsearch.engine import acceptance
 from advsearch.engine import transport as searching
 from advsearch.question import Asked, answered
-from advsearch.questions.attack.several import curve
-from advsearch.runs.summary import attack_of
+from advsearch.questions.attack.settings import AttackConfig
+from advsearch.questions.attack.studies import curve
+from advsearch.questions.attack.summary import attack_of
 from advsearch.scene.mitsuba_backend.transport import Vertices
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.transport import lights

@@ -25,7 +25,7 @@ from advsearch.engine.record import judgement_of, trial_row
 from advsearch.errors import InputError
 from advsearch.models import load_model
 from advsearch.runs.directory import RunDirectory
-from advsearch.runs.results.base import plain
+from advsearch.runs.results import plain
 from advsearch.runs.store import Row, Store
 from advsearch.tasks import Answer, Facts, Judgement, Sight, Task
 

@@ -13,10 +13,10 @@ from torch import nn
 
 import advsearch
 from advsearch.cli.main import main
-from advsearch.config import AttackConfig
 from advsearch.engine.objective import objective_for
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.models import Model
+from advsearch.questions.attack.settings import AttackConfig
 from advsearch.runs.images import read_png
 from advsearch.runs.store import Store
 from advsearch.tasks import Depth, Detection, Facts, Segmentation, Sight, Task, make_task

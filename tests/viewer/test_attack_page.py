@@ -32,16 +32,15 @@ from samples import (
 from advsearch.attacks import clopper_pearson
 from advsearch.attacks.objectives import OBJECTIVE_KINDS
 from advsearch.errors import FileFormatError
-from advsearch.report import wording
+from advsearch.questions.attack import wording
 from advsearch.report.figures import search_axes
 from advsearch.report.markup import NARROW, WIDE, Html, element, figure_of_answer, join_html, study_chart
-from advsearch.report.phrases import objective_label, percent
 from advsearch.report.shown import shown
+from advsearch.report.wording import interval_text, objective_label, percent, seconds_text
 from advsearch.runs.directory import OBJECT_FILE
 from advsearch.runs.images import read_png
 from advsearch.viewer.document import asset
-from advsearch.viewer.pages import LARGEST, object_part, read_object
-from advsearch.viewer.parts import LARGE_PICTURE, SMALLER_SIDE
+from advsearch.viewer.pages import LARGE_PICTURE, LARGEST, SMALLER_SIDE, object_part, read_object
 
 VOID = {"meta", "img", "br", "hr", "link"}
 
@@ -485,10 +484,10 @@ def test_of_a_path_each_trial_has_another_moment() -> None:
 
 
 def test_the_ends_of_an_interval_have_the_digits_that_fit_and_are_not_clamped() -> None:
-    assert wording.interval_text(clopper_pearson(1, 120)) == "0.02-4.6 %"
-    assert wording.interval_text(clopper_pearson(119, 120)) == "95.4-99.98 %"
-    assert wording.interval_text(clopper_pearson(1, 10_000)) == "0.0003-0.06 %"
-    assert wording.interval_text(clopper_pearson(60, 120)) == "41-59 %"
+    assert interval_text(clopper_pearson(1, 120)) == "0.02-4.6 %"
+    assert interval_text(clopper_pearson(119, 120)) == "95.4-99.98 %"
+    assert interval_text(clopper_pearson(1, 10_000)) == "0.0003-0.06 %"
+    assert interval_text(clopper_pearson(60, 120)) == "41-59 %"
 
 
 @pytest.mark.parametrize(
@@ -515,7 +514,7 @@ def test_only_certainty_is_called_100_percent(share: float | None, text: str) ->
     [(0.26, "0.3 s"), (99.4, "99.4 s"), (185, "3 min 5 s"), (7800, "2 h 10 min"), (None, "unknown")],
 )
 def test_times(seconds: float | None, text: str) -> None:
-    assert wording.seconds_text(seconds) == text
+    assert seconds_text(seconds) == text
 
 
 def test_where_random_search_won_it_is_said() -> None:

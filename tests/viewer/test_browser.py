@@ -35,21 +35,22 @@ from samples import (
 from samples import attack as attack_with
 from stored_sweeps import described, make_sweep, serving
 
-from advsearch.config import AttackConfig
+from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.explain.answer import ExplainResult
 from advsearch.questions.harden.answer import HardenResult
 from advsearch.questions.photographs.carry_out import Photographs
 from advsearch.questions.recipe.answer import RecipeResult
 from advsearch.questions.replay.answer import ReplayResult
 from advsearch.questions.stability.answer import StabilityResult
-from advsearch.report.phrases import answer_text, percent_number
+from advsearch.questions.sweep.page import write_bundle
+from advsearch.report.wording import answer_text, percent_number
 from advsearch.runs.directory import RunDirectory
-from advsearch.runs.results.base import Result
+from advsearch.runs.results import Result
 from advsearch.runs.store import Row, Store, Told
 from advsearch.tasks import Answer
 from advsearch.viewer import thumbnails
 from advsearch.viewer.document import asset
-from advsearch.viewer.pages import write_bundle, write_page
+from advsearch.viewer.pages import write_page
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page

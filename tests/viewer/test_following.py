@@ -10,7 +10,7 @@ from urllib.request import urlopen
 import numpy as np
 from stored_sweeps import described, serving
 
-from advsearch.config import AttackConfig
+from advsearch.questions.attack.settings import AttackConfig
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row, Told
 from advsearch.viewer.dashboard import START, following_page, is_under_way, progress_json

@@ -16,9 +16,10 @@ from matplotlib.figure import Figure
 from PIL import Image
 from samples import CURVE, GAP, sweep
 
-from advsearch.questions.attack.answer import CurveResult
+from advsearch.questions.attack.summary import CurveResult
 from advsearch.questions.gap import GapResult
-from advsearch.report.figures import search_axes, sweep_axes
+from advsearch.questions.sweep.figures import sweep_axes
+from advsearch.report.figures import search_axes
 from advsearch.report.markup import side_by_side
 
 NOTEBOOK, LOSSES = ROOT / "docs" / "notebook.ipynb", ROOT / "docs" / "own-loss.ipynb"

@@ -27,7 +27,6 @@ from advsearch.attacks import clopper_pearson
 from advsearch.cli.main import main
 from advsearch.errors import InputError
 from advsearch.questions.photographs.answer import (
-    LARGEST,
     align_page,
     photo_file,
     rendering_file,
@@ -38,7 +37,7 @@ from advsearch.questions.photographs.carry_out import Photographs, photo_agreeme
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Store
 from advsearch.viewer.clients import https_context, reachable
-from advsearch.viewer.server import Dashboard
+from advsearch.viewer.server import LARGEST_SENT, Dashboard
 
 
 def picture(size: tuple[int, int] = (64, 48), format: str = "JPEG", level: int = 128) -> bytes:
@@ -132,7 +131,7 @@ def test_a_photograph_is_cut_to_the_renderings_shape_and_says_nothing_else() -> 
         (bomb(12_000), "at most 50,000,000 pixels"),
         (bomb(60_000), "at most 50,000,000 pixels"),
         (bomb(100), "expected a picture"),
-        (bytes(LARGEST + 1), "at most 16 MB"),
+        (bytes(LARGEST_SENT + 1), "at most 16 MB"),
     ],
 )
 def test_what_is_no_photograph_is_refused(data: bytes, text: str) -> None:
@@ -228,7 +227,7 @@ def test_a_page_takes_a_photograph(server: Dashboard, run: Path) -> None:
         ({"Host": "evil.example"}, 403),
         ({"Content_Length": None}, 411),
         ({"Content_Length": "-5"}, 411),
-        ({"Content_Length": str(LARGEST + 1)}, 413),
+        ({"Content_Length": str(LARGEST_SENT + 1)}, 413),
         ({"Content_Length": "9" * 15}, 413),
     ],
 )

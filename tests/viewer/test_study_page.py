@@ -12,12 +12,12 @@ from samples import AVERAGE, CURVE, GAP, RECIPE, STABILITY, curve, gap, make_run
 from stored_sweeps import serving
 
 from advsearch.cli.main import main
-from advsearch.config import AttackConfig
+from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.recipe.answer import RecipeResult
 from advsearch.questions.stability.answer import StabilityResult
 from advsearch.report.shown import fields_shown
 from advsearch.runs.directory import RunDirectory
-from advsearch.runs.results.base import Result, StudyResult
+from advsearch.runs.results import Result, StudyResult
 from advsearch.viewer.document import heading
 from advsearch.viewer.pages import shown_page, write_page
 

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from advsearch.config import AttackConfig
 from advsearch.question import Asked, question
-from advsearch.questions.attack.answer import BY_FIELD as BY_FIELD
-from advsearch.questions.attack.answer import CurveResult, MatrixResult
 from advsearch.questions.attack.answer import claims as claims
 from advsearch.questions.attack.answer import shown as shown
 from advsearch.questions.attack.page import page as page
-from advsearch.runs.results.attack import AttackSummary
-from advsearch.runs.results.base import Result
+from advsearch.questions.attack.settings import AttackConfig
+from advsearch.questions.attack.summary import BY_FIELD as BY_FIELD
+from advsearch.questions.attack.summary import AttackSummary, CurveResult, MatrixResult
 
 
 @question(
@@ -21,7 +19,10 @@ from advsearch.runs.results.base import Result
 )
 def attack(asked: Asked[AttackConfig]) -> AttackSummary | CurveResult | MatrixResult:
     """Find the worst configuration of a scene, and verify it with fresh renders; or do so for several."""
-    from advsearch.questions.attack.carry_out import attack_from_config  # imports torch
+    # imports torch
+    from advsearch.questions.attack.carry_out import attack_once
+    from advsearch.questions.attack.studies import curve, matrix
 
-    answer = attack_from_config(asked.config, progress=asked.progress, resumed=asked.resumed)
-    return answer if isinstance(answer, Result) else answer.summary
+    if asked.config.is_study:
+        return matrix(asked) if asked.config.is_matrix else curve(asked)
+    return attack_once(asked.config, progress=asked.progress, resumed=asked.resumed).summary

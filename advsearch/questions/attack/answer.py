@@ -1,16 +1,23 @@
-"""The results of `attack`: of one (`advsearch/runs/results/attack.py`), of several epsilons, and of several models."""
+"""What is shown and claimed of the results of `attack`: of one, of several epsilons, and of several models."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any
 
-from pydantic import Field
-
-from advsearch.report import wording
+from advsearch.questions.attack import wording
+from advsearch.questions.attack.summary import (
+    AttackSummary,
+    CurvePoint,
+    CurveResult,
+    DifferentFailure,
+    DifferentFailures,
+    EpsilonBudget,
+    FailingShare,
+    MatrixCell,
+    MatrixResult,
+)
 from advsearch.report.figures import BLUE
-from advsearch.report.markup import InNotebook
-from advsearch.report.phrases import answer_cells, margin_text, percent
 from advsearch.report.shown import (
     ENDED,
     NO_PROOF,
@@ -28,108 +35,18 @@ from advsearch.report.shown import (
     searches_text,
     share_text,
 )
-from advsearch.report.wording import count, interval_text, number_text, short_name
-from advsearch.runs.results.attack import (
-    AttackSummary,
-    ControlGroup,
-    DifferentFailure,
-    DifferentFailures,
-    FailingShare,
-    VerifiedRate,
+from advsearch.report.wording import (
+    answer_cells,
+    count,
+    interval_text,
+    margin_text,
+    no_numbers,
+    number_text,
+    percent,
+    short_name,
+    tally,
 )
-from advsearch.runs.results.base import Fields, Interval, JsonFloat, Result, StudyResult
-
-EpsilonBudget = float | None | dict[str, float | None]
-
-
-class ObjectRow(Fields):
-    """What the attacks on one object found, at the largest epsilon that was tried."""
-
-    object: str
-    clean: ControlGroup | None
-    ending: str | None = None
-    epsilon: EpsilonBudget = Field(default=None, description="of the last attack")
-    flips_at: EpsilonBudget = Field(description="the least epsilon at which an answer was found; null: at none")
-    verified: VerifiedRate | None = None
-    margin: JsonFloat | None = Field(default=None, description="mean of the trials, in logits")
-    run: str | None = None
-    tried: float | None = Field(default=None, description="the largest epsilon that was tried")
-    renders: dict[str, int] | None = Field(
-        default=None, description="pictures by kind, of the attacks at all epsilons together; null in older runs"
-    )
-
-
-class CurvePoint(Fields):
-    """How many objects are still recognised at an epsilon."""
-
-    epsilon: float | None
-    objects: int = Field(description="of which something is known there")
-    robust: int
-    found: int
-    already_wrong: int
-    accuracy: float | None
-    interval: Interval
-
-
-class CurveResult(InNotebook, StudyResult):
-    """Robust accuracy against epsilon, over objects."""
-
-    command: ClassVar[str] = "attack"
-    tabular: ClassVar[str] = "curve"
-
-    epsilons: list[float | None] = Field(description="those that were tried; null: the own of each control")
-    table: list[ObjectRow]
-    curve: list[CurvePoint]
-
-
-class MatrixModel(Fields):
-    """One of the models, and what it says of the clean scene in the pictures of all trials."""
-
-    model: str
-    labels: list[str] = Field(description="the names that count as right")
-    input_size: tuple[int, int] = Field(description="of the pictures that it is shown, [height, width] in pixels")
-    spp: int = Field(description="samples a pixel")
-    clean: ControlGroup
-
-
-class MatrixCell(Fields):
-    """One answer, tried on one model."""
-
-    model: str = Field(description="that it is tried on")
-    ending: str = Field(description="`found` where it is verified on this model, as for an attack")
-    verified: VerifiedRate
-
-
-class MatrixRow(Fields):
-    """One answer, and what it does to each model."""
-
-    attacked: str = Field(description="the model that it was searched on; `all` for an ensemble")
-    ending: str = Field(description="of the search and its own verification")
-    run: str | None
-    renders: dict[str, int] = Field(description="of the search and its own verification")
-    tested: list[MatrixCell] = Field(description="on each model; empty where nothing was searched")
-
-
-class MatrixResult(InNotebook, StudyResult):
-    """Answers that were searched on each of several models, or on all of them together, tried on each."""
-
-    command: ClassVar[str] = "attack"
-
-    models: list[str] = Field(description="as they were asked for")
-    ensemble: str | None = Field(description="how objectives were put together; null: each model by itself")
-    tested: list[MatrixModel] = Field(description="the models that answers were tried on; empty where none was")
-    table: list[MatrixRow]
-
-    @property
-    def brief(self) -> str:
-        """How many answers hold on models that they were not searched on."""
-        others = [cell for row in self.table for cell in row.tested if cell.model != row.attacked]
-        return f"{sum(cell.ending == 'found' for cell in others)} of {len(others)} transfer" if others else ""
-
-
-BY_FIELD: dict[str, type[Result]] = {"models": MatrixResult, "curve": CurveResult}
-"""Other results of the command, by a field that they alone have."""
-
+from advsearch.runs.results import ControlGroup, VerifiedRate
 
 NOT_VERIFIED = ("not verified", "")
 """Cells of what was not rendered afresh."""
@@ -173,7 +90,7 @@ def _rates(summary: AttackSummary) -> list[list[str]]:
         pictures = f"{summary.baseline.renders} pictures"
         rows.append(["random search", pictures, "", *_verified(success, summary.baseline.verified)])
     if average:
-        rate = [wording.tally("right", average.correct, average.configurations), interval_text(average.interval)]
+        rate = [tally("right", average.correct, average.configurations), interval_text(average.interval)]
         rows.append(["average case", count(average.configurations, "configuration"), "", *rate])
     return rows
 
@@ -183,7 +100,7 @@ def _verified(what: str, rated: VerifiedRate | None) -> Sequence[str]:
 
 
 def _rate(what: str, number: int, rated: VerifiedRate | ControlGroup) -> Sequence[str]:
-    return [wording.tally(what, number, rated.trials, rated.not_a_number), interval_text(rated.interval)]
+    return [tally(what, number, rated.trials, rated.not_a_number), interval_text(rated.interval)]
 
 
 def _facts(summary: AttackSummary) -> dict[str, str]:
@@ -197,7 +114,7 @@ def _facts(summary: AttackSummary) -> dict[str, str]:
         "along the drive": wording.drive_text(summary),
         "smallest": wording.smallest_text(summary),
         "failures": failures_text(summary.failures) if summary.failures else "",
-        "search": f"{summary.policy}, {wording.count(summary.steps, 'step')}: {summary.ending}",
+        "search": f"{summary.policy}, {count(summary.steps, 'step')}: {summary.ending}",
         "renders": wording.renders_text(summary),
         "environment": "",
         "seed": "",
@@ -227,9 +144,9 @@ def failures_part(known: DifferentFailures, *, tried: bool = False) -> AnswerPar
         "failures": range_text,
         "most often answered": answered_text,
         "holds in fresh renders": _held,
-        "objective": lambda one: number_text(one.objective),
+        "objective": lambda failure: number_text(failure.objective),
     }
-    return AnswerPart.table((one for one in known.listed if not tried or one.verified is not None), columns)
+    return AnswerPart.table((failure for failure in known.listed if not tried or failure.verified is not None), columns)
 
 
 def range_text(one: DifferentFailure) -> str:
@@ -237,25 +154,25 @@ def range_text(one: DifferentFailure) -> str:
     return ", ".join(f"{name} {_ends(one, name)}" for name in one.ranges) or "anywhere"
 
 
-def _ends(one: DifferentFailure, name: str) -> str:
-    ends = one.ranges[name]
+def _ends(failure: DifferentFailure, name: str) -> str:
+    ends = failure.ranges[name]
     if isinstance(ends, str):
         return ends
-    value = one.configuration.get(name)
+    value = failure.configuration.get(name)
     unit = "" if value is None or value.unit in ("", "1") else f" {value.unit}"
     return f"{number_text(ends[0])} to {number_text(ends[1])}{unit}"
 
 
-def answered_text(one: DifferentFailure) -> str:
+def answered_text(failure: DifferentFailure) -> str:
     """Return the most frequent wrong answer of its trials; empty where there is none."""
-    return next(iter(one.verified.labels), "") if one.verified else ""
+    return next(iter(failure.verified.labels), "") if failure.verified else ""
 
 
-def _held(one: DifferentFailure) -> str:
-    if one.verified is None:
+def _held(failure: DifferentFailure) -> str:
+    if failure.verified is None:
         return "not tried"
-    rated = f"{one.verified.successes} of {count(one.verified.trials, 'render')}"
-    return f"yes, {rated}" if one.holds else f"no, {rated}"
+    rated = f"{failure.verified.successes} of {count(failure.verified.trials, 'render')}"
+    return f"yes, {rated}" if failure.holds else f"no, {rated}"
 
 
 def _claims_of_attack(result: AttackSummary) -> Iterator[Claim]:
@@ -283,10 +200,10 @@ CURVE_NOTE = (
 
 def _shown_curve(result: CurveResult) -> ShownAnswer:
     by_epsilon: Mapping[str, Column] = {
-        "epsilon": lambda one: plain_epsilon(one.epsilon) or "own",
+        "epsilon": lambda point: plain_epsilon(point.epsilon) or "own",
         "robust": "{0.robust}/{0.objects}",
-        "accuracy": lambda one: percent(one.accuracy),
-        "95 % interval": lambda one: interval_text(one.interval),
+        "accuracy": lambda point: percent(point.accuracy),
+        "95 % interval": lambda point: interval_text(point.interval),
         "wrong already": "{0.already_wrong}",
     }
     by_object: Mapping[str, Column] = {
@@ -298,15 +215,15 @@ def _shown_curve(result: CurveResult) -> ShownAnswer:
         "margin": lambda row: "" if row.margin is None else f"{row.margin:.2f}",
     }
     points = _points(result)
-    told = "; ".join(f"{one.robust} of {one.objects} at {one.epsilon:g}" for one in points)
+    listed = "; ".join(f"{point.robust} of {point.objects} at {point.epsilon:g}" for point in points)
     chart = AnswerPart(
         "Robust accuracy",
-        [f"Over epsilon with 95 % intervals: {told}."],
+        [f"Over epsilon with 95 % intervals: {listed}."],
         draw=lambda axes: _draw_curve(result, axes),
         size=(5.6, 3.6),
         only="page" if len(points) > 1 else "notebook",
     )
-    known = [one for one in result.curve if one.accuracy is not None]
+    known = [point for point in result.curve if point.accuracy is not None]
     curve = AnswerPart.table(known, by_epsilon, title="" if len(points) > 1 else chart.title, note=CURVE_NOTE)
     runs = [row.run for row in result.table]
     objects = AnswerPart.table(result.table, by_object, title="The objects, at the last epsilon tried", parts=runs)
@@ -316,10 +233,10 @@ def _shown_curve(result: CurveResult) -> ShownAnswer:
 
 
 def _said_of_curve(result: CurveResult) -> str:
-    known = [one for one in result.curve if one.accuracy is not None]
+    known = [point for point in result.curve if point.accuracy is not None]
     if not known:
         return "No object was attacked to the end."
-    said = [f"{one.robust} of {one.objects}" + _at(one.epsilon) for one in (known[:1] + known[1:][-1:])]
+    said = [f"{point.robust} of {point.objects}" + _at(point.epsilon) for point in (known[:1] + known[1:][-1:])]
     return f"Still recognised: {' and '.join(said)}." if len(result.objects) > 1 else _of_one(result)
 
 
@@ -340,13 +257,13 @@ def plain_epsilon(value: EpsilonBudget) -> str:
     """Return an epsilon as text, by control where there are more; empty of none."""
     if isinstance(value, dict):
         return ",".join(f"{name}={plain_epsilon(one)}" for name, one in value.items())
-    return "" if value is None else wording.number_text(value)
+    return "" if value is None else number_text(value)
 
 
 def _draw_curve(answer: CurveResult, axes: Any) -> None:
     points = _points(answer)
-    at, accuracy = [one.epsilon for one in points], [one.accuracy for one in points]
-    low, high = ([one.interval[end] for one in points] for end in (0, 1))
+    at, accuracy = [point.epsilon for point in points], [point.accuracy for point in points]
+    low, high = ([point.interval[end] for point in points] for end in (0, 1))
     axes.fill_between(at, low, high, color=BLUE, alpha=0.15, linewidth=0, label="95 % interval")
     axes.plot(at, accuracy, color=BLUE, marker="o", label="robust accuracy")
     axes.set(xlabel="epsilon", ylabel="robust accuracy", ylim=(-0.02, 1.02))
@@ -356,12 +273,14 @@ def _draw_curve(answer: CurveResult, axes: Any) -> None:
 
 
 def _points(answer: CurveResult) -> list[CurvePoint]:
-    return [one for one in answer.curve if one.epsilon is not None and one.accuracy is not None]
+    return [point for point in answer.curve if point.epsilon is not None and point.accuracy is not None]
 
 
 def _claims_of_curve(result: CurveResult) -> Iterator[Claim]:
     each = [row.renders for row in result.table if row.renders]
-    total = {kind: sum(one.get(kind, 0) for one in each) for kind in {kind for one in each for kind in one}}
+    total = {
+        kind: sum(renders.get(kind, 0) for renders in each) for kind in {kind for renders in each for kind in renders}
+    }
     searched = searches_text(total, result.policy, bool(total.get("baseline")))
     spent = f"Searched were, of all objects and epsilons together, {searched}. "
     for point in result.curve:
@@ -383,10 +302,10 @@ def _claims_of_curve(result: CurveResult) -> Iterator[Claim]:
 
 def _shown_matrix(result: MatrixResult) -> ShownAnswer:
     """The matrix, with a row for the clean scene; the stronger a cell's colour, the more successes."""
-    heads = ["attacked on", "ending", *(f"tested on {short_name(one.model)}" for one in result.tested)]
-    clean = [one.clean for one in result.tested]
-    counts = [f"right {one.correct}/{one.trials}{wording.no_numbers(one.not_a_number)}" for one in clean]
-    right = [f"{text}, {interval_text(one.interval)}" for text, one in zip(counts, clean, strict=True)]
+    heads = ["attacked on", "ending", *(f"tested on {short_name(tried.model)}" for tried in result.tested)]
+    clean = [tried.clean for tried in result.tested]
+    counts = [f"right {control.correct}/{control.trials}{no_numbers(control.not_a_number)}" for control in clean]
+    right = [f"{text}, {interval_text(control.interval)}" for text, control in zip(counts, clean, strict=True)]
     rows = [["clean scene", "", *right]] if clean else []
     before = len(rows)
     rows += [[short_name(row.attacked), row.ending, *map(_cell, row.tested)] for row in result.table]
@@ -407,7 +326,7 @@ def _shown_matrix(result: MatrixResult) -> ShownAnswer:
     size = (2.6 + 1.3 * len(result.models), 1.8 + 0.5 * tried)
     figure = AnswerPart(draw=lambda axes: _draw_matrix(result, axes), size=size, only="notebook")
     facts = {
-        "models": ", ".join(f"{one.model} ({' x '.join(map(str, one.input_size))})" for one in result.tested),
+        "models": ", ".join(f"{tried.model} ({' x '.join(map(str, tried.input_size))})" for tried in result.tested),
         "ensemble": result.ensemble or "",
         "policy": result.policy,
     }
@@ -421,11 +340,11 @@ def _said_of_matrix(result: MatrixResult) -> str:
     if result.ensemble is not None:
         held = sum(cell.ending == "found" for _, cell in pairs)
         return f"One answer to all models together misleads {held} of {len(pairs)}."
-    own = [cell for row, cell in pairs if cell.model == row.attacked]
+    at_home = [cell for row, cell in pairs if cell.model == row.attacked]
     others = [cell for row, cell in pairs if cell.model != row.attacked]
-    held, passed = (sum(cell.ending == "found" for cell in cells) for cells in (own, others))
+    held, passed = (sum(cell.ending == "found" for cell in cells) for cells in (at_home, others))
     return (
-        f"{held} of {len(own)} answers hold on the model that they were searched on; "
+        f"{held} of {len(at_home)} answers hold on the model that they were searched on; "
         f"{passed} of {len(others)} on another one."
     )
 
@@ -433,8 +352,8 @@ def _said_of_matrix(result: MatrixResult) -> str:
 def _cell(cell: MatrixCell) -> str:
     rated = cell.verified
     mark = " *" if cell.ending == "found" else " (wrong already)" if cell.ending == "already wrong" else ""
-    rate = f"{rated.successes}/{rated.trials}{wording.no_numbers(rated.not_a_number)}"
-    return f"{rate}, {wording.interval_text(rated.interval)}{mark}"
+    rate = f"{rated.successes}/{rated.trials}{no_numbers(rated.not_a_number)}"
+    return f"{rate}, {interval_text(rated.interval)}{mark}"
 
 
 def _draw_matrix(answer: MatrixResult, axes: Any) -> None:
@@ -447,7 +366,7 @@ def _draw_matrix(answer: MatrixResult, axes: Any) -> None:
             colour = "white" if rated.rate > 0.6 else "black"
             text = f"{rated.successes}/{rated.trials}"
             axes.text(across, up, text, ha="center", va="center", color=colour)
-    names = [short_name(one.model) for one in answer.tested]
+    names = [short_name(tried.model) for tried in answer.tested]
     axes.set_xticks(range(len(names)), names, rotation=20 if max(map(len, names)) > 12 else 0)
     axes.set_yticks(range(len(rows)), [short_name(row.attacked) for row in rows])
     axes.set(xlabel="tested on", ylabel="attacked on")
@@ -458,6 +377,6 @@ def _claims_of_matrix(result: MatrixResult) -> Iterator[Claim]:
     for row in result.table:
         for cell in row.tested:
             name = f"searched on {row.attacked}, tried on {cell.model}"
-            own = cell.model == row.attacked
-            spent = searches_text(row.renders, result.policy, False) if own else None
+            at_home = cell.model == row.attacked
+            spent = searches_text(row.renders, result.policy, False) if at_home else None
             yield case_claim(name, cell.ending, cell.verified, spent)

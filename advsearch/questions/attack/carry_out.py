@@ -15,9 +15,32 @@ from advsearch.api.keywords import asks
 from advsearch.attacks import Policy, make_policy
 from advsearch.attacks.objectives import OBJECTIVE_KINDS
 from advsearch.cluster import Call
-from advsearch.config import AttackConfig, SceneConfig
+from advsearch.config import SceneConfig
 from advsearch.controls.values import sentences
-from advsearch.engine.attack_parts import (
+from advsearch.engine.journal import Journal, Shared, answering, check_made_of
+from advsearch.engine.judging import Metric, check_shared, load_metrics, metrics_as_settings
+from advsearch.engine.judging import only_here as metrics_only_here
+from advsearch.engine.loading import Controls, Scene, load_scene, only_here, scene_as_settings, settings_of
+from advsearch.engine.naming import (
+    OF_SCENE,
+    AnyModel,
+    check_not_of_scene,
+    check_not_spread,
+    exists_here,
+    model_name,
+    several,
+    told_of_scene,
+)
+from advsearch.engine.problem import Problem
+from advsearch.engine.record import Stages
+from advsearch.engine.transport import CleanMatrix
+from advsearch.errors import InputError
+from advsearch.files import JsonObject
+from advsearch.models import Model
+from advsearch.options import as_setting, told
+from advsearch.progress import NullProgress, Progress, Watched, watcher
+from advsearch.questions.attack.outcome import summarise
+from advsearch.questions.attack.parts import (
     LOADING,
     AttackParts,
     controls_given,
@@ -30,34 +53,9 @@ from advsearch.engine.attack_parts import (
     task_and_objective,
     with_derivatives,
 )
-from advsearch.engine.attack_result import AttackResult
-from advsearch.engine.journal import Journal, Shared, answering, check_made_of
-from advsearch.engine.judging import Metric, check_shared, load_metrics, metrics_as_settings
-from advsearch.engine.judging import only_here as metrics_only_here
-from advsearch.engine.loading import Controls, Scene, load_scene, only_here, scene_as_settings, settings_of
-from advsearch.engine.naming import (
-    OF_SCENE,
-    AnyModel,
-    check_not_of_scene,
-    check_not_spread,
-    exists_here,
-    model_name,
-    scene_settings,
-    several,
-)
-from advsearch.engine.outcome import summarise
-from advsearch.engine.problem import Problem
-from advsearch.engine.record import Stages
-from advsearch.engine.stages import Attack
-from advsearch.engine.transport import CleanMatrix
-from advsearch.errors import InputError
-from advsearch.files import JsonObject
-from advsearch.models import Model
-from advsearch.options import as_setting, told
-from advsearch.progress import NullProgress, Progress, Watched, watcher
-from advsearch.question import Asked, answered
-from advsearch.questions.attack.answer import CurveResult, MatrixResult
-from advsearch.questions.attack.several import curve, matrix
+from advsearch.questions.attack.result import AttackResult
+from advsearch.questions.attack.settings import AttackConfig
+from advsearch.questions.attack.stages import Attack
 from advsearch.report.wording import count
 from advsearch.runs.directory import RunDirectory, begun, check_free, is_run, run_path
 from advsearch.tasks import AnyTask, OwnTask, Task, function_of, make_task
@@ -110,7 +108,7 @@ def attack(
     """
     options = {name: value for name, value in settings.items() if value is not None}
     task = make_task(task) if callable(task) else task
-    loaded_already = not all(isinstance(one, (str, Path)) for one in (scene, *several(model)))
+    loaded_already = not all(isinstance(network, (str, Path)) for network in (scene, *several(model)))
     if loaded_already or callable(objective) or only_here(controls) or only_here(over) or isinstance(task, OwnTask):
         check_not_spread(options)
     if not isinstance(policy, (str, Mapping, Policy)) or not policy:
@@ -131,7 +129,7 @@ def attack(
     }
     config = AttackConfig(**{**described, **options, "run": None if run is None else str(run)})
     losses.check_aim(objective, targeted=config.target is not None)
-    parts = [f"the model {model_name(one)}" for one in several(model) if exists_here(one)]
+    parts = [f"the model {model_name(network)}" for network in several(model) if exists_here(network)]
     parts += ["the scene"] if scene.only_here else []
     parts += [f"the task {task.name}"] if isinstance(task, Task) and not is_named(task, make_task) else []
     parts += [f"the objective {config.objective}"] if callable(objective) else []
@@ -164,17 +162,6 @@ def attack(
         return _carry_out(job, watcher(progress), folder)
 
 
-def attack_from_config(
-    config: AttackConfig, *, progress: Progress | None = None, resumed: Path | None = None
-) -> AttackResult | CurveResult | MatrixResult:
-    """Do what a configuration describes: one attack, a curve or a matrix of several; see `attack`."""
-    if config.is_matrix:
-        return answered(matrix, Asked(config, progress, resumed))
-    if config.is_curve:
-        return answered(curve, Asked(config, progress, resumed))
-    return attack_once(config, progress=progress, resumed=resumed)
-
-
 def attack_once(
     config: AttackConfig,
     *,
@@ -182,7 +169,7 @@ def attack_once(
     resumed: Path | None = None,
     clean: CleanMatrix | None = None,
 ) -> AttackResult:
-    """Attack one object with one epsilon, in a run directory; arguments and errors as for `attack_from_config`.
+    """Attack one object with one epsilon, in a run directory; otherwise as `attack`.
 
     `clean` is shared with attacks whose configurations differ in epsilon alone.
     """
@@ -198,7 +185,7 @@ def attack_on(config: AttackConfig, scene: Scene, model: Model) -> AttackResult:
     """Attack a model on a scene that are there, in place of those that the configuration names; nothing is kept.
 
     Raises:
-        InputError: as for `attack_from_config`.
+        InputError: as for `attack`.
     """
     return _carry_out(parts_given(config, scene, model), NullProgress())
 
@@ -220,12 +207,12 @@ def _scene(scene: Scene | str | Path | Mapping[str, Any], object: str | None, se
         check_not_of_scene({**settings, "object": object})
         return scene
     said = SceneConfig(**{"object": "mug", **{name: one for name, one in settings.items() if name in OF_SCENE}})
-    given = scene_settings(said)
+    given = told_of_scene(said)
     if object is not None:
-        return load_scene(object, said.environment, scene=scene, up=said.up, settings=given, camera=said.camera)
+        return load_scene(object, said.environment, scene=scene, **given)
     if isinstance(scene, Mapping):
         raise InputError("object: which shape of the scene is it? Give its id")
-    return load_scene(scene, said.environment, up=said.up, settings=given, camera=said.camera)
+    return load_scene(scene, said.environment, **given)
 
 
 def _set_by(scene: Scene, exposure: float | None) -> dict[str, float | str]:
@@ -243,8 +230,7 @@ def _carry_out(job: AttackParts, progress: Progress, resumed: str | Path | None 
         stages = Stages(progress)
         stages.begin("setup", PREPARING)
         problem = problem_on(job)
-        own = job.scene.description
-        warnings = [*(problem.space.scene or own).notes, *job.loaded[1], *sentences(problem.space.moved)]
+        warnings = [*problem.space.notes(job.scene.description), *job.loaded[1], *sentences(problem.space.moved)]
         for text in warnings:
             progress.message(text)
         policy = _policy(job, problem)
@@ -263,9 +249,9 @@ def _carry_out(job: AttackParts, progress: Progress, resumed: str | Path | None 
                 )
             findings = Attack(journal, job.config, policy, stages, clean=job.clean).carry_out()
         named = job.objective if isinstance(job.objective, str) else job.config.objective
-        found = summarise(job.config, named, findings, journal, stages, warnings)
+        result = summarise(job.config, named, findings, journal, stages, warnings)
         parts = replace(job, clean=CleanMatrix())  # without the matrix of light transport, which may be large
-        return replace(found, parts=lambda: parts)
+        return replace(result, parts=lambda: parts)
 
 
 def attack_answers(settings: JsonObject) -> Call:

@@ -15,15 +15,22 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageSequence
 
+from advsearch.questions.attack import wording
 from advsearch.questions.attack.answer import answered_text, failures_part, failures_text, range_text, shown
-from advsearch.questions.attack.method import PLAN_HEADS, method_facts, plan_rows, plan_text
-from advsearch.report import wording
+from advsearch.questions.attack.summary import AttackSummary, FoundValue, PicturedAnswer
 from advsearch.report.figures import search_axes
-from advsearch.report.phrases import SUCCESS_ABOVE_ZERO, answer_text, marks_text, objective_label
 from advsearch.report.shown import AnswerPart, Picture
+from advsearch.report.wording import (
+    SUCCESS_ABOVE_ZERO,
+    answer_text,
+    formation_text,
+    marks_text,
+    number_text,
+    objective_label,
+    seconds_text,
+)
 from advsearch.runs import directory, images, store
-from advsearch.runs.results.attack import AttackSummary, FoundValue, PicturedAnswer
-from advsearch.runs.results.base import Result
+from advsearch.runs.results import Result
 from advsearch.viewer.document import data_script, data_url
 from advsearch.viewer.pages import object_data, object_part, read_object, shown_page
 
@@ -55,15 +62,15 @@ def page(run: Path, result: Result) -> str | None:
         *_failures(result),
         _rates(result, given.sections[0]),
         _curve(result, curves),
-        AnswerPart("How the search worked", rows=_named(method_facts(result)), folded=True),
-        AnswerPart(plan_text(result), heads=PLAN_HEADS, rows=plan_rows(result), folded=True),
+        AnswerPart("How the search worked", rows=_named(wording.method_facts(result)), folded=True),
+        AnswerPart(wording.plan_text(result), heads=wording.PLAN_HEADS, rows=wording.plan_rows(result), folded=True),
     ]
     seconds = result.seconds
-    parts = ", ".join(f"{name} {wording.seconds_text(value)}" for name, value in seconds.items() if name != "total")
+    parts = ", ".join(f"{name} {seconds_text(value)}" for name, value in seconds.items() if name != "total")
     facts = {
         **given.facts,
-        "time": wording.seconds_text(seconds["total"]) + (f" ({parts})" if parts else ""),
-        "image formation": wording.formation_text(result.image_formation),
+        "time": seconds_text(seconds["total"]) + (f" ({parts})" if parts else ""),
+        "image formation": formation_text(result.image_formation),
         "environment": result.environment,
         "seed": str(result.seed),
     }
@@ -128,8 +135,8 @@ def _changes(summary: AttackSummary) -> AnswerPart:
     """The answer in a few values, each beside its range where it has one, from the clean value to the one found."""
     found = summary.configuration or {}
     rows = [
-        [name, "" if one.clean is None else wording.number_text(one.clean), _value_text(one), _range_text(one)]
-        for name, one in found.items()
+        [name, "" if value.clean is None else number_text(value.clean), _value_text(value), _range_text(value)]
+        for name, value in found.items()
     ]
     heads = ("parameter", "clean", "adversarial", "in its range")
     kept = [at for at in range(len(heads)) if any(row[at] for row in rows)]
@@ -137,32 +144,34 @@ def _changes(summary: AttackSummary) -> AnswerPart:
         "What was changed" if rows else "",
         heads=[heads[at] for at in kept],
         rows=[[row[at] for at in kept] for row in rows],
-        bars=[_place(one) for one in found.values()] if len(kept) == len(heads) else (),
+        bars=[_place(value) for value in found.values()] if len(kept) == len(heads) else (),
     )
 
 
-def _value_text(one: FoundValue) -> str:
-    values = one.value if isinstance(one.value, list) else [one.value]
-    unit = "" if one.unit in ("", "1", "name") else f" {one.unit}"
-    return ", ".join(map(wording.number_text, values)) + unit
+def _value_text(changed: FoundValue) -> str:
+    values = changed.value if isinstance(changed.value, list) else [changed.value]
+    unit = "" if changed.unit in ("", "1", "name") else f" {changed.unit}"
+    return ", ".join(map(number_text, values)) + unit
 
 
-def _range_text(one: FoundValue) -> str:
-    if one.low is None or one.high is None or not isinstance(one.value, (int, float)):
+def _range_text(changed: FoundValue) -> str:
+    if changed.low is None or changed.high is None or not isinstance(changed.value, (int, float)):
         return ""
-    stopped = min(one.value - one.low, one.high - one.value) <= AT_THE_END * (one.high - one.low)
-    said = f"{wording.number_text(one.low)} to {wording.number_text(one.high)}"
+    stopped = min(changed.value - changed.low, changed.high - changed.value) <= AT_THE_END * (
+        changed.high - changed.low
+    )
+    said = f"{number_text(changed.low)} to {number_text(changed.high)}"
     return f"{said}, at its end" if stopped else said
 
 
-def _place(one: FoundValue) -> tuple[float, float, float] | None:
+def _place(changed: FoundValue) -> tuple[float, float, float] | None:
     """Where the clean and the found value lie between the ends of the range."""
-    if one.low is None or one.high is None or not isinstance(one.value, (int, float)):
+    if changed.low is None or changed.high is None or not isinstance(changed.value, (int, float)):
         return None
-    begin = one.clean if isinstance(one.clean, (int, float)) else one.value
+    begin = changed.clean if isinstance(changed.clean, (int, float)) else changed.value
     low, high, mark = (
-        min(max((value - one.low) / (one.high - one.low), 0.0), 1.0)
-        for value in (min(begin, one.value), max(begin, one.value), one.value)
+        min(max((value - changed.low) / (changed.high - changed.low), 0.0), 1.0)
+        for value in (min(begin, changed.value), max(begin, changed.value), changed.value)
     )
     return low, high, mark
 
@@ -186,12 +195,12 @@ def _failures(summary: AttackSummary) -> Iterator[AnswerPart]:
         return
     pictures = [
         Picture(
-            one.picture,
-            range_text(one),
-            answer_text(summary.task, one.pictured) if one.pictured else answered_text(one),
+            failure.picture,
+            range_text(failure),
+            answer_text(summary.task, failure.pictured) if failure.pictured else answered_text(failure),
         )
-        for one in known.listed
-        if one.picture and one.holds
+        for failure in known.listed
+        if failure.picture and failure.holds
     ]
     said = [f"Failures are {failures_text(known)}."]
     yield replace(failures_part(known), title="Different failures", text=said, pictures=[pictures] if pictures else [])
@@ -203,7 +212,7 @@ def _rates(summary: AttackSummary, table: AnswerPart) -> AnswerPart:
     baseline, average = summary.baseline, summary.average
     rated = [summary.clean.control, *([summary.verified] if summary.adversarial else [])]
     rated += [baseline.verified] if baseline else []
-    bars = [None if one is None else (*one.interval, one.rate) for one in rated]
+    bars = [None if rate is None else (*rate.interval, rate.rate) for rate in rated]
     bars += [(*average.interval, average.accuracy)] if average else []
     if not any(bars):
         return AnswerPart()
@@ -221,11 +230,11 @@ def _curve(summary: AttackSummary, curves: dict[str, list[float | None]]) -> Ans
     above = "right" if summary.minimises else wording.success(summary)
     zero = f"above: {above}" if summary.objective in SUCCESS_ABOVE_ZERO else ""
     ends = {name: [one for one in values if one is not None] for name, values in known.items()}
-    told = "; ".join(f"{name}: from {one[0]:.3g} to {max(one):.3g}" for name, one in ends.items())
+    listed = "; ".join(f"{name}: from {one[0]:.3g} to {max(one):.3g}" for name, one in ends.items())
     label = objective_label(summary.objective)
     return AnswerPart(
         "The search",
-        [f"{label} over evaluations. {told}"],
+        [f"{label} over evaluations. {listed}"],
         draw=partial(search_axes, known, label, zero_means=zero),
         note="Lines: the best so far. Dots: each evaluation. These are the search's claims; the table above is "
         "verified.",

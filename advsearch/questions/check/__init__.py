@@ -1,16 +1,24 @@
-"""`advsearch check`: gradients of a scene beside differences, the plan of a search over it, and what it leaves out."""
+"""Check every gradient against differences; show how a search gets them and what it leaves out."""
 
-from advsearch.cli.question import QuestionCommand
+from __future__ import annotations
 
-HELP = "check every gradient against differences; show how a search gets them and what it leaves out"
-MORE = ". Exit status 3 if a gradient is biased or noisy"
-EXAMPLES = (
+from advsearch.question import Asked, question
+from advsearch.questions.check.answer import CheckConfig, CheckResult
+from advsearch.questions.check.answer import shown as shown
+
+
+@question(
     "check --object mug --control pose",
     "check --object mug --control environment.rotation --loss linear --json",
     "check --object mug --control texture,camera --loss model --seconds 120 --run derivatives",
     "check --all --resolution 128 --loss linear --seconds 600 --run gradients",
     "resume gradients",
+    place=("object", "model"),
+    more=". Exit status 3 if a gradient is biased or noisy",
+    short=lambda result: bool(result.falls_short),
 )
+def check(asked: Asked[CheckConfig]) -> CheckResult:
+    """Compare every gradient of a scene with differences, and plan a search over it (docs/gradients.md)."""
+    from advsearch.questions.check.carry_out import check_from_config  # imports torch
 
-
-COMMAND = QuestionCommand("check", short=lambda result: bool(result.falls_short))
+    return check_from_config(asked.config, progress=asked.progress, resumed=asked.resumed)

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
+import math
+import statistics
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import torch
 from pydantic import TypeAdapter
+from torch import Tensor
 
 from advsearch import seeds
-from advsearch.api.keywords import asks, configured
 from advsearch.controls import CONTROLS
-from advsearch.engine.attack_parts import LOADING, problem_from_config
-from advsearch.engine.gradients import FACTORS, attempts, derivatives, inside, smooth_loss
-from advsearch.engine.loading import Scene
-from advsearch.engine.naming import AnyModel, settings_alone
+from advsearch.engine.gradients import FACTORS, Loss, attempts, derivatives, inside, smooth_loss
+from advsearch.engine.naming import settings_alone
 from advsearch.engine.planning import (
     CONVERGED,
     COUNTS,
@@ -30,15 +31,17 @@ from advsearch.engine.planning import (
 )
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Results, kept_rows
-from advsearch.progress import NullProgress, Progress, Watched, watcher
-from advsearch.questions.check.answer import CheckedRow, CheckResult, GainRow, SearchPlan, TexelRow
-from advsearch.questions.check.saved import MOST_GRADIENTS, measured_gains, resolved_texels
-from advsearch.questions.check.settings import CheckConfig
+from advsearch.progress import NullProgress, Progress
+from advsearch.questions.attack.parts import LOADING, problem_from_config
+from advsearch.questions.check.answer import CheckConfig, CheckedRow, CheckResult, GainRow, SearchPlan, TexelRow
 from advsearch.runs.directory import RunDirectory
-from advsearch.runs.results.base import Measured, PathLength
+from advsearch.runs.results import Measured, PathLength
+from advsearch.scene.assembly import ON_PICTURE
 from advsearch.scene.description import DEFAULT_ENVIRONMENT
+from advsearch.scene.formation import EVERYTHING, ITEMS, NOTHING
 from advsearch.scene.gradients import BY_ADJOINT, BY_DIFFERENCES
 from advsearch.scene.mitsuba_backend.material_adjoint import LIMITS
+from advsearch.scene.renderer import Renderer
 
 SCENES = (("mug", "studio"), ("bowl", "kitchen"), ("bottle", "noon"))
 """Bundled scenes that `check --all` goes through."""
@@ -54,19 +57,6 @@ HINT = "`resolution` or fewer controls shorten it, `seconds` ends it"
 
 Finding = CheckedRow | SearchPlan | PathLength | GainRow | TexelRow
 FINDINGS: TypeAdapter[list[Finding]] = TypeAdapter(list[Finding])
-
-
-@asks(CheckConfig)
-def check(
-    object: Scene | str | Path = "mug",
-    model: AnyModel = "reference",
-    *,
-    progress: Watched = None,
-    **settings: Any,
-) -> CheckResult:
-    """Compare every gradient of a scene with differences, and plan a search over it (docs/gradients.md)."""
-    config = configured(CheckConfig, object=object, model=model, **settings)
-    return check_from_config(config, progress=watcher(progress))
 
 
 def check_from_config(
@@ -266,3 +256,120 @@ def _planned(problem: Problem, part: CheckedPart, spp: int, results: Results, pr
     yield (length := results.row(f"{part.key} bounces", PathLength, lengths))
     yield from results.rows(f"{part.key} gains", GainRow, gains)
     yield from results.rows(f"{part.key} texels", TexelRow, lambda: resolved_texels(renderer, u, seed=seed))
+
+
+# ---- what leaving something out saves --------------------------------------------------------------------------------
+
+
+ALL, BOUNCES = "everything above", "bounces"
+"""Names of the rows in which all items are put back together, and in which paths have their full length."""
+WHAT = {
+    **ITEMS,
+    BOUNCES: "bounces of light beyond the search's longest path",
+    ALL: "all of these",
+}
+"""What is left out, in words, for each row."""
+AGREES = 1.2
+"""Difference, as a share of what another seed changes, up to which two pictures or gradients agree: 1 is expected where
+the random numbers are others."""
+REPEATS = 3
+"""Timed gradients of each."""
+MOST_GRADIENTS = (2 + REPEATS) * (len(ITEMS) + 3)
+"""That `measured_gains` takes: with every item put back, with all, with all bounces and with none."""
+PER_PIXEL = 2.0
+"""Texels a pixel that `TexelRow.enough` keeps: two samples a period (Nyquist), with room for oblique views."""
+
+
+@dataclass
+class Samples:
+    """Pictures and gradients of two seeds, and the seconds of a gradient."""
+
+    pictures: list[Tensor]
+    gradients: list[Tensor]
+    seconds: float = 0.0
+
+
+def measured_gains(
+    renderer: Renderer,
+    loss: Loss,
+    u: Tensor,
+    *,
+    seed: int,
+    spp: int,
+    repeats: int = REPEATS,
+    depth: int | None = None,
+    tick: Callable[[], None] = lambda: None,
+) -> list[GainRow]:
+    """Put back what a renderer leaves out, item by item and all at once, and measure a gradient of a loss at u (d,).
+
+    `depth` is the longest light path of the search, where it is shorter than the scene's; `tick` is called after each
+    gradient. There is one row for each item, one for the bounces, and one for all.
+    """
+    scene = renderer.scene
+    depth = scene.max_depth if depth is None else depth
+    renderers = {"": renderer if depth == scene.max_depth else renderer.like(scene.like(max_depth=depth))}
+    for item in ITEMS:
+        renderers[item] = renderer.like(scene.like(max_depth=depth, leave_out=EVERYTHING - {item}))
+    if depth < scene.max_depth:
+        renderers[BOUNCES] = renderer
+    renderers[ALL] = renderer.like(scene.like(leave_out=NOTHING))
+    both = seed, seeds.stream(seed, "another")
+    samples = {item: Samples([], []) for item in renderers}
+    for noise in both:  # the first compiles
+        for item, each in renderers.items():
+            with torch.no_grad():
+                samples[item].pictures.append(each(u, noise, spp))
+            samples[item].gradients.append(each.gradient(loss, u, noise, spp)[1])
+            tick()
+    times: dict[str, list[float]] = {item: [] for item in renderers}
+    for number in range(repeats):
+        for item, each in renderers.items():
+            begun = time.perf_counter()
+            each.gradient(loss, u, seeds.stream(seed, "round", number), spp)
+            times[item].append(time.perf_counter() - begun)
+            tick()
+    for item, taken in times.items():
+        samples[item].seconds = statistics.median(taken)
+    lean = samples.pop("")
+    return [_gain(item, lean, having) for item, having in samples.items()]
+
+
+def _gain(item: str, without: Samples, having: Samples) -> GainRow:
+    picture, gradient = _share(without.pictures, having.pictures), _share(without.gradients, having.gradients)
+    noise, lean_noise = (float((each.pictures[1] - each.pictures[0]).norm()) for each in (having, without))
+    return GainRow(
+        item=item,
+        what=WHAT[item],
+        time_gain=((noise / lean_noise) ** 2 if lean_noise > 0.0 else 1.0) * having.seconds / without.seconds,
+        picture_difference=picture,
+        gradient_difference=gradient,
+        safe=max(picture, gradient) <= AGREES,
+        seconds=having.seconds,
+    )
+
+
+def _share(without: list[Tensor], having: list[Tensor]) -> float:
+    """The difference at one seed over the root mean square of those that another seed makes."""
+    size = math.sqrt(statistics.fmean(float((one - other).norm()) ** 2 for one, other in (without, having)))
+    difference = float((having[0] - without[0]).norm())
+    return difference / size if size > 0.0 else difference
+
+
+def resolved_texels(renderer: Renderer, u: Tensor, *, seed: int, spp: int = 16) -> list[TexelRow]:
+    """Return, for every searched texture, how its texels compare with the pixels that show them."""
+    scene, rows = renderer.scene, []
+    assembled = scene.assembly(renderer.space.inputs(u))
+    inputs = {name: value.detach() for name, value in assembled.items() if name not in ON_PICTURE}
+    for group in renderer.plan.groups:
+        for name in sorted(renderer.routes.get(group.name, ())) if group.parameter == "texels" else ():
+            bright, dark = ({**inputs, name: torch.full_like(inputs[name], level)} for level in (1.0, 0.0))
+            difference = scene.guides(bright, seed, spp)[0] - scene.guides(dark, seed, spp)[0]
+            pixels = int((difference.amax(dim=-1) > 0.0).sum())
+            with scene.shorter(2):
+                gradient = scene.adjoint(inputs, torch.ones(*scene.resolution, 3), seed, spp, wrt=[name])[name]
+            seen, side = int((gradient.abs().amax(dim=-1) > 0.0).sum()), max(inputs[name].shape[:2])
+            enough = side
+            while enough > 2 and seen * (enough / 2 / side) ** 2 >= PER_PIXEL * pixels:
+                enough //= 2
+            rows.append(TexelRow(control=group.control, side=side, seen=seen, pixels=pixels, enough=enough))
+    return rows

@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from pydantic import ValidatorFunctionWrapHandler, field_validator, model_validator
 
-from advsearch.config.scene import SceneConfig
-from advsearch.config.sweep import SweepConfig
+from advsearch.config import SceneConfig
 from advsearch.errors import InputError
 from advsearch.question import Asked, question
 from advsearch.questions.compare.answer import ComparedPair, ComparedSide, CompareResult
 from advsearch.questions.compare.answer import claims as claims
 from advsearch.questions.compare.answer import shown as shown
+from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.runs.directory import PARTS, find_run
-from advsearch.runs.results.base import INTERRUPTED
+from advsearch.runs.results import INTERRUPTED
 from advsearch.settings import each_once, setting, setting_as_in, settings, split_names, texts
 
 if TYPE_CHECKING:
@@ -110,7 +110,7 @@ def compare(asked: Asked[CompareConfig]) -> CompareResult:
             `object`, names of models, which are shown it first.
     """
     # these import torch and pandas
-    from advsearch.api.studies import carry_out_part
+    from advsearch.questions.attack.studies import carry_out_part
     from advsearch.questions.compare.pairs import Pictures, compared, differing, read_sides
     from advsearch.rules import interval_of
 

@@ -8,13 +8,12 @@ from typing import ClassVar
 import numpy as np
 from pydantic import Field
 
+from advsearch.questions.sweep.summary import AxisValue, CountedAnswers
 from advsearch.report import wording
 from advsearch.report.markup import InNotebook
-from advsearch.report.phrases import percent, share_of_text
 from advsearch.report.shown import AnswerPart, Claim, Column, Extent, Picture, ShownAnswer
-from advsearch.report.wording import conditions_text
-from advsearch.runs.results.base import ConditionRow, Fields, Interval, JsonFloat, RunResult
-from advsearch.runs.results.sweep import AxisValue, CountedAnswers
+from advsearch.report.wording import conditions_text, percent, share_of_text
+from advsearch.runs.results import ConditionRow, Fields, Interval, JsonFloat, RunResult
 
 
 class ComparedSide(CountedAnswers):

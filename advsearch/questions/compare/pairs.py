@@ -20,17 +20,17 @@ import pandas as pd
 
 from advsearch import seeds
 from advsearch.attacks.units import paired_by_unit
-from advsearch.config import SweepConfig
-from advsearch.engine.sweeps.swept_scene import Scenes
 from advsearch.errors import FileFormatError, InputError, ModelError
 from advsearch.question import Asked
 from advsearch.questions.compare.answer import ComparedPair, CountOf, PairPart, PairPicture, PairRule
 from advsearch.questions.sweep.carry_out import scenes_of
+from advsearch.questions.sweep.job import Scenes
+from advsearch.questions.sweep.settings import SweepConfig
+from advsearch.questions.sweep.summary import SweepSummary
 from advsearch.report.wording import short_names
 from advsearch.rules import FEWEST_ROWS, find_rules, halves, interval_of, observed
 from advsearch.runs.directory import CONFIG
 from advsearch.runs.files import write_bytes
-from advsearch.runs.results.sweep import SweepSummary
 from advsearch.runs.summary import read_result
 from advsearch.runs.tables import read_sweep
 from advsearch.viewer import thumbnails
@@ -41,7 +41,10 @@ DRAWS = ("grid", "controls", "samples", "sampler", "seed")
 OF_THE_SIDE = ("object", "model", "answer")
 """What may tell sides apart, as rows have it."""
 
-FOLLOWS = (*DRAWS, "label", "labels", "prompt", "up", "batch", "keep_pictures", "trials", "verify_spp", "specialise")
+FOLLOWS = (
+    *(*DRAWS, "label", "labels", "prompt", "up", "size", "unit", "batch", "keep_pictures", "trials", "verify_spp"),
+    "specialise",
+)
 """Settings that do not tell sweeps apart: of draws, along with object and model, or of no answer."""
 
 TOLERANCE = 1e-4

@@ -6,14 +6,14 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import ClassVar
 
-from advsearch.config.scene import SceneConfig
+from advsearch.config import SceneConfig
 from advsearch.errors import InputError
 from advsearch.question import Asked, question
 from advsearch.questions.explain.answer import EnvelopeRow, ExplainResult, ParameterWeight, RuleRow
 from advsearch.questions.explain.answer import claims as claims
 from advsearch.questions.explain.answer import shown as shown
 from advsearch.runs.directory import PARTS, find_run
-from advsearch.runs.results.base import INTERRUPTED
+from advsearch.runs.results import INTERRUPTED
 from advsearch.runs.summary import read_result
 from advsearch.settings import Clash, Config, each_once, setting, setting_as_in, split_names, texts
 

@@ -8,7 +8,6 @@ from typing import ClassVar
 from pydantic import Field
 
 from advsearch.report import wording
-from advsearch.report.phrases import percent, share_of_text
 from advsearch.report.shown import (
     AnswerPart,
     Claim,
@@ -20,8 +19,8 @@ from advsearch.report.shown import (
     nothing_claimed,
     share_text,
 )
-from advsearch.report.wording import conditions_text, interval_text
-from advsearch.runs.results.base import ConditionRow, Fields, Interval, JsonFloat, RunResult
+from advsearch.report.wording import conditions_text, interval_text, percent, share_of_text
+from advsearch.runs.results import ConditionRow, Fields, Interval, JsonFloat, RunResult
 
 
 class RightOf(Fields):

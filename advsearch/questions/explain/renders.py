@@ -16,8 +16,6 @@ import torch
 from torch import Tensor
 
 from advsearch import seeds
-from advsearch.api.studies import carry_out_part
-from advsearch.config import SweepConfig
 from advsearch.controls import CONTROLS
 from advsearch.errors import FileFormatError, InputError, ModelError
 from advsearch.interrupts import interruptible
@@ -25,13 +23,15 @@ from advsearch.models.features import Features, features_of
 from advsearch.options import BY_KEY
 from advsearch.progress import Progress
 from advsearch.question import Asked
+from advsearch.questions.attack.studies import carry_out_part
 from advsearch.questions.explain.answer import FailureCluster, FailureClusters, NearestRight, RightOf
 from advsearch.questions.explain.findings import find_clusters, right_of
 from advsearch.questions.sweep.carry_out import scenes_of
+from advsearch.questions.sweep.settings import SweepConfig
+from advsearch.questions.sweep.summary import SweepSummary
 from advsearch.report.wording import figure_value
 from advsearch.rules import CountedRule, Mask, RuleConditions, covered
 from advsearch.runs.directory import CONFIG, PARTS
-from advsearch.runs.results.sweep import SweepSummary
 from advsearch.runs.summary import read_result
 from advsearch.runs.tables import read_sweep
 from advsearch.settings import split_names

@@ -1,12 +1,22 @@
-"""`advsearch harden`: train a copy of a model on its worst cases, and measure what came of it."""
+"""Train a copy of a model on its worst cases, and measure it before and after on scenes that training never saw."""
 
-from advsearch.cli.question import QuestionCommand
+from __future__ import annotations
 
-HELP = "train a copy of a model on its worst cases, and measure it before and after on scenes that training never saw"
-EXAMPLES = (
+from typing import Any
+
+from advsearch.question import Asked, question
+from advsearch.questions.harden.answer import HardenConfig, HardenResult
+from advsearch.questions.harden.answer import claims as claims
+from advsearch.questions.harden.answer import shown as shown
+
+
+@question(
     "harden --model reference --control texture --epsilon 0.03 --quick",
     "harden --model mypackage:network@weights.safetensors --labels labels.json --control texture,pose,light",
+    called="advsearch.questions.harden.carry_out:harden",
 )
+def harden(asked: Asked[HardenConfig], **given: Any) -> HardenResult:
+    """Train a copy of a model on its worst cases, and prove what it is better at."""
+    from advsearch.questions.harden.carry_out import hardened  # imports torch
 
-
-COMMAND = QuestionCommand("harden")
+    return hardened(asked, **given)

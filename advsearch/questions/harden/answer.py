@@ -1,19 +1,108 @@
-"""The result of `harden`."""
+"""The settings of `harden`, and its result."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from typing import Any, ClassVar
+from collections.abc import Iterator
+from typing import Any, ClassVar, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
+from advsearch.questions.attack.settings import STEPS, AttackConfig
 from advsearch.report import wording
-from advsearch.report.figures import BLUE, RED, Figures, drawn
+from advsearch.report.figures import BLUE, RED, draw_shares
 from advsearch.report.markup import InNotebook
-from advsearch.report.phrases import percent
-from advsearch.report.shown import NO_PROOF, AnswerPart, Claim, Column, Extent, ShownAnswer, claim, share_text
-from advsearch.runs.results.attack import SharedWork
-from advsearch.runs.results.base import Fields, Interval, RunResult
+from advsearch.report.shown import NO_PROOF, AnswerPart, Claim, Extent, ShownAnswer, claim, share_text
+from advsearch.report.wording import percent
+from advsearch.runs.results import Fields, Interval, RunResult, SharedWork
+from advsearch.settings import setting, setting_as_in
+
+ALL = "all"  # the objects of a command that takes all bundled ones
+PLAIN_SCENES, RENDERED_SCENES = 6, 15
+"""Scenes that come with each one of the training, of which nothing is drawn but one view: plain ones, where nothing is
+rendered, or such as are rendered. What is learned is lost on other scenes where there are few, and so is clean
+accuracy."""
+
+TEXTURE_LOOKS = 6
+"""How often an epoch looks at a scene with a texture, over its views: it is another one each time, while what was
+rendered stays."""
+
+QUICK: dict[str, int] = {"rounds": 1, "scenes": 14, "views": 2, "epochs": 6, "measured": 14, "steps": 20}
+"""What `quick` takes where nothing else was said: minutes instead of an hour."""
+
+
+class HardenConfig(AttackConfig):
+    """Everything that decides what `harden` does: training on worst cases, and the measurement before and after."""
+
+    # fmt: off
+    command: ClassVar[str] = "harden"
+    several: ClassVar[tuple[str, ...]] = ("object", "environment")
+    without: ClassVar[tuple[str, ...]] = (
+        "smallest", "ensemble", "printable", "aov", "metrics", "log", "target", "minimise", "over", "draws", "path",
+        "average", "baseline", "seconds", "camera", "up", "size", "unit", "label", "task", "measure", "estimators",
+        "things", "judge",
+    )
+
+    object: str = setting_as_in(
+        AttackConfig, "object", default=ALL,
+        description="objects to train on, separated by commas; all: every bundled one that the model has a class for; "
+        "a file is called as its class: coffee-mug.glb",
+    )
+    environment: str | None = setting_as_in(
+        AttackConfig, "environment",
+        description="what lights the training; several, separated by commas, take turns",
+        otherwise="the bundled environments that the reference model was trained in",
+    )
+    held_out: str | None = setting(
+        None, "scene", "objects that training never sees, which are measured, separated by commas",
+        "names of objects or files", otherwise="other instances of the bundled objects", min_length=1,
+    )
+    held_out_environment: str | None = setting(
+        None, "scene", "what lights the measurement, and never the training",
+        "names of environments or files, separated by commas",
+        otherwise="the bundled environments that the reference model was not trained in", min_length=1,
+    )
+    layers: Literal["all", "last"] = setting("all", "training", "layers that are trained")
+    rounds: int = setting(2, "training", "rounds of search and training", ge=1, le=1000)
+    scenes: int = setting(
+        336, "training",
+        f"new scenes a round for each control; of what is rendered {RENDERED_SCENES + 1} times as many",
+        ge=1, le=100_000,
+    )
+    views: int = setting(2, "training", "views of each scene, unless it is rendered", ge=1, le=1000)
+    epochs: int = setting(
+        3, "training",
+        "how often a round looks at each view; where a texture is searched, as many times as often as makes "
+        f"{TEXTURE_LOOKS} for a scene, at most, over its views",
+        ge=1, le=10_000,
+    )
+    rate: float = setting(1e-3, "training", "the highest learning rate", gt=0.0, le=1.0)
+    clean_loss: float = setting(
+        0.02, "training", "clean accuracy that may be lost; weights that lose more are not kept", ge=0.0, le=1.0
+    )
+    measured: int = setting(28, "verification", "held-out scenes that are attacked, before and after", ge=1, le=100_000)
+    steps: int = setting_as_in(AttackConfig, "steps", default=STEPS, otherwise="")
+    trials: int | None = setting_as_in(AttackConfig, "trials", default=6)
+    verify_spp: int | None = setting_as_in(AttackConfig, "verify_spp", default=32)
+    workers: int | None = setting_as_in(
+        AttackConfig, "workers", description="worker processes that share the scenes that are drawn and attacked"
+    )
+    quick: bool = setting(False, "training", "minutes instead of an hour: fewer rounds, scenes and steps")
+    # fmt: on
+
+    @model_validator(mode="before")
+    @classmethod
+    def _quickly(cls, data: Any) -> Any:
+        """Let `quick` say what is not said otherwise."""
+        return {**QUICK, **data} if data.get("quick") is True else data
+
+    @property
+    def texture_looks(self) -> int:
+        """How often an epoch looks at each view with a texture."""
+        return max(1, TEXTURE_LOOKS // self.views)
+
+    @property
+    def title(self) -> tuple[str, ...]:
+        return self.command, *self.controls
 
 
 class Share(Fields):
@@ -23,6 +112,15 @@ class Share(Fields):
     interval: Interval
     right: int
     count: int
+
+    @property
+    def drawn(self) -> tuple[float, Interval]:
+        return self.accuracy, self.interval
+
+    @property
+    def cells(self) -> tuple[str, str]:
+        """The share and its interval, in words."""
+        return percent(self.accuracy), wording.interval_text(self.interval)
 
 
 class HardenedControl(Fields):
@@ -86,13 +184,9 @@ class HardenResult(InNotebook, RunResult):
 
     @property
     def brief(self) -> str:
-        """How many scenes were robust and are."""
         if self.before is None or self.after is None:
             return ""
         return f"robust in {self.after.right} of {self.after.count} scenes, before {self.before.right}"
-
-
-RESULT = HardenResult
 
 
 ROBUST = (
@@ -103,27 +197,39 @@ TRAINED = (
     "Round 0 is the model as it was. Weights are part of the way from those to the trained ones. Judged on scenes in "
     "the training's environments on which it was not trained."
 )
-
 HEADS = ("on held-out scenes", "before", "95 % interval", "after", "95 % interval")
+ROUNDS = ("round", "views trained on", "part of the way", "plain pictures right", "worst pictures right", "kept")
+SPLIT = ("side", "objects", "environments", "scenes", "views")
 
 
 def shown(result: HardenResult) -> ShownAnswer:
     """Return how robust the model was and is, what it was trained on, and what never was."""
-    rounds: Mapping[str, Column] = {
-        "round": "{0[0]}",
-        "views trained on": "{0[1].lessons}",
-        "part of the way": lambda one: percent(one[1].part),
-        "plain pictures right": lambda one: percent(one[1].clean),
-        "worst pictures right": lambda one: percent(one[1].robust),
-        "kept": lambda one: "yes" if one[1].kept else "",
-    }
-    split: Mapping[str, Column] = {
-        "side": "{0[0]}",
-        "objects": lambda one: ", ".join(one[1].objects),
-        "environments": lambda one: ", ".join(one[1].environments),
-        "scenes": "{0[1].scenes}",
-        "views": "{0[1].views}",
-    }
+    shares = shares_of(result)
+
+    def draw(axes: Any) -> None:
+        bars = {name: [None if share is None else share.drawn for share in both] for name, both in shares.items()}
+        draw_shares(axes, bars, ("before", "after"), (RED, BLUE))
+        axes.set(xlabel="share that is right, with 95 % interval")
+        axes.set_title(f"Held-out scenes: {wording.short_name(result.model)}")
+        axes.figure.legend(loc="outside lower center", ncols=2)
+
+    measured = [
+        [name, *(text for share in both for text in (("", "") if share is None else share.cells))]
+        for name, both in shares.items()
+    ]
+    rounds = [
+        [
+            str(number),
+            str(done.lessons),
+            *map(percent, (done.part, done.clean, done.robust)),
+            "yes" if done.kept else "",
+        ]
+        for number, done in enumerate(result.rounds)
+    ]
+    split = [
+        [name, ", ".join(side.objects), ", ".join(side.environments), str(side.scenes), str(side.views)]
+        for name, side in result.split.items()
+    ]
     facts = {
         "model": result.model,
         "searched with": result.search,
@@ -139,14 +245,27 @@ def shown(result: HardenResult) -> ShownAnswer:
             f"Of {after.count} held-out scenes the searches leave {after.right} right, before {before.right}; "
             f"of {left.count} plain pictures {left.right} are right, before {clean.right}."
         )
+    chart: dict[str, Any] = {"draw": draw, "size": (6.4, 1.4 + 0.45 * len(shares))} if shares else {}
     sections = [
-        AnswerPart(
-            "Before and after", heads=HEADS, rows=hardened_rows(result), note=ROBUST, figure="images/harden.png"
-        ),
-        AnswerPart.table(enumerate(result.rounds), rounds, title="The training", note=TRAINED, only="page"),
-        AnswerPart.table(result.split.items(), split, title="What it was trained and measured on", only="page"),
+        AnswerPart("Before and after", heads=HEADS, rows=measured, note=ROBUST, height=110 + 44 * len(shares), **chart),
+        AnswerPart("The training", heads=ROUNDS, rows=rounds, note=TRAINED, only="page"),
+        AnswerPart("What it was trained and measured on", heads=SPLIT, rows=split, only="page"),
     ]
     return ShownAnswer(said, sections, facts, about=[",".join(result.objects), ", ".join(result.controls)])
+
+
+def shares_of(result: HardenResult) -> dict[str, tuple[Share | None, Share | None]]:
+    """Return what was measured, before and after: two for each control, one of each search; one for all of them where
+    there are several; and one of plain pictures."""
+    shares: dict[str, tuple[Share | None, Share | None]] = {}
+    for row in result.table:
+        shares[f"robust to {row.control}"] = row.before, row.after
+        shares[f"robust to {row.control}, stronger search"] = row.stronger_before, row.stronger
+    if len(result.table) > 1:
+        shares["robust to each"] = result.before, result.after
+    if result.clean_after is not None:
+        shares["plain pictures right"] = result.clean_before, result.clean_after
+    return shares
 
 
 def claims(result: HardenResult) -> Iterator[Claim]:
@@ -156,51 +275,3 @@ def claims(result: HardenResult) -> Iterator[Claim]:
             extent = Extent(what="held-out scenes", count=share.right, total=share.count, interval=share.interval)
             text = f"{when}, the searches ({result.search}) found no failure in {share_text(extent)} held-out"
             yield claim("measured", f"{text} scenes. {NO_PROOF}", extent)
-
-
-def hardened_rows(result: HardenResult) -> list[list[str]]:
-    """Return two rows for each control, one of each search; one for all of them where there are several; and one for
-    plain pictures."""
-
-    def cells(share: Share | None) -> tuple[str, str]:
-        return ("", "") if share is None else (percent(share.accuracy), wording.interval_text(share.interval))
-
-    return [[name, *cells(before), *cells(after)] for name, before, after in _shares(result)]
-
-
-def _shares(result: HardenResult) -> list[tuple[str, Share | None, Share | None]]:
-    """What was measured, before and after."""
-    shares = list[tuple[str, Share | None, Share | None]]()
-    for row in result.table:
-        shares.append((f"robust to {row.control}", row.before, row.after))
-        shares.append((f"robust to {row.control}, stronger search", row.stronger_before, row.stronger))
-    if len(result.table) > 1:
-        shares.append(("robust to each", result.before, result.after))
-    if result.clean_after is not None:
-        shares.append(("plain pictures right", result.clean_before, result.clean_after))
-    return shares
-
-
-def hardened_figure(result: HardenResult) -> Figures:
-    """Draw each share before and after with its interval; nothing where none is known."""
-    shares = _shares(result)
-    if not shares:
-        return {}
-
-    def draw(figure: Any) -> None:
-        axes = figure.subplots()
-        for place, (_, *of_each) in enumerate(shares):
-            for label, colour, share, shift in zip(
-                ("before", "after"), (RED, BLUE), of_each, (-0.14, 0.14), strict=True
-            ):
-                if share is not None:
-                    axes.plot(share.interval, [place + shift] * 2, color=colour, alpha=0.35, linewidth=5)
-                    axes.plot(share.accuracy, place + shift, "o", color=colour, ms=4, label=None if place else label)
-        axes.set_yticks(range(len(shares)), [name for name, *_ in shares])
-        axes.invert_yaxis()
-        axes.set(xlabel="share that is right, with 95 % interval", xlim=(-0.03, 1.03))
-        axes.set_title(f"Held-out scenes: {wording.short_name(result.model)}")
-        axes.grid(True, axis="x")
-        figure.legend(loc="outside lower center", ncols=2)
-
-    return drawn(draw, (6.4, 1.4 + 0.45 * len(shares)))

@@ -28,7 +28,6 @@ from advsearch import seeds
 from advsearch.attacks import Domain
 from advsearch.controls import Space
 from advsearch.engine.problem import Problem
-from advsearch.files import JsonObject
 from advsearch.models import Model
 from advsearch.runs.files import replacing
 from advsearch.runs.images import write_png
@@ -36,15 +35,11 @@ from advsearch.scene.formation import levels_of, to_8_bit
 from advsearch.scene.transport.lights import why_not
 from advsearch.scene.transport.matrix import LinearRenderer
 
-SPP, DEPTH = 2, 4
-"""Samples a pixel of a lesson's pictures, and segments of the longest path: many lessons with some noise teach more
-than few without."""
-MATRIX_SPP = 4
-"""Samples a pixel of a matrix of light transport."""
-STEP = 0.5
-"""A step of an adversarial texture, as a share of its budget."""
-TOGETHER = 32
-"""Pictures that a model is asked about at once."""
+SPP, MATRIX_SPP, DEPTH = 2, 4, 4
+"""Samples a pixel of a lesson's pictures, and of a matrix of light transport; segments of the longest path: many
+lessons with some noise teach more than few without."""
+STEP = 0.5  # a step of an adversarial texture, as a share of its budget
+TOGETHER = 32  # pictures that a model is asked about at once
 
 
 @dataclass(eq=False)
@@ -121,56 +116,53 @@ def plain_lessons(problem: Problem, views: int, seed: int) -> list[Lesson]:
     drawn = [seeds.stream(seed, "plain lesson", number) for number in range(views)]
     quickly = problem.renderer.like(quick=True)
     with torch.no_grad(), quickly.scene.shorter(DEPTH):
-        pictures = [quickly(problem.whole(problem.domain.start, one), seed=one, spp=SPP) for one in drawn]
+        pictures = [quickly(problem.whole(problem.domain.start, view), seed=view, spp=SPP) for view in drawn]
     return [Lesson(right, levels_of(picture)) for picture in pictures]
 
 
 def has_matrix(problem: Problem) -> bool:
     """Whether a matrix of light transport says the pictures of what is searched."""
-    return why_not(problem.renderer, [one.name for one in problem.space.controls[problem.searched :]]) is None
+    return why_not(problem.renderer, [control.name for control in problem.space.controls[problem.searched :]]) is None
 
 
 def lessons(problem: Problem, views: int, seed: int, *, tries: int | None = None, shared: bool = False) -> list[Lesson]:
-    """Draw lessons from so many views of one scene, each with conditions of its own, drawn by chance.
+    """Draw lessons from so many views of one scene, each with conditions of its own, drawn by chance. Where no matrix
+    says the pictures, `tries` configurations are rendered beside each view as it is (see `tried`); None for two renders
+    of a view: one of the controls moved, and all of them. Views that are `shared` have one adversarial texture."""
 
-    Where no matrix says the pictures, `tries` configurations are rendered beside each view as it is (see `tried`); None
-    for two renders of a view: one of the controls moved, and all of them. Views that are `shared` have one adversarial
-    texture.
-    """
+    def begun(seed: int) -> Disguise:
+        return Disguise(problem.domain.sample(torch.Generator().manual_seed(seed), extreme=True)[0])
+
     linear, quickly, found = has_matrix(problem), problem.renderer.like(quick=True), list[Lesson]()
     right = tuple(int(index) for index in problem.truth())
-    common, whole_space = _begun(problem, seed), replace(problem.space, scene=None)
+    common, whole_space = begun(seed), replace(problem.space, scene=None)
     space = replace(problem.searched_space, scene=None)
     with torch.no_grad(), problem.renderer.scene.shorter(DEPTH):
         for number in range(views):
-            own = seeds.stream(seed, "lesson", number)
-            whole = problem.whole(problem.domain.start, own)
+            view = seeds.stream(seed, "lesson", number)
+            whole = problem.whole(problem.domain.start, view)
             numbers = whole[problem.domain.dim :].clone()  # and not all that it is a part of
             if linear:
-                made = LinearRenderer(problem.renderer, whole, own, spp=MATRIX_SPP, quick=True)
-                plain = made(whole)
-                texture = common if shared else _begun(problem, own)
+                made = LinearRenderer(problem.renderer, whole, view, spp=MATRIX_SPP, quick=True)
+                plain, texture = made(whole), common if shared else begun(view)
                 made.let_go(whole_space)
-                levels = levels_of(plain)
-                found.append(TextureLesson(right, levels, space, problem.domain, made, numbers, texture))
+                found.append(TextureLesson(right, levels_of(plain), space, problem.domain, made, numbers, texture))
+                continue
+            generator = torch.Generator().manual_seed(view)
+            if tries is None:
+                *alone, together = tried(problem.domain, generator, 1 + len(problem.searched_space.controls))
+                wanted = [alone[torch.randint(len(alone), (), generator=generator)], together]
             else:
-                generator = torch.Generator().manual_seed(own)
-                if tries is None:
-                    *alone, together = tried(problem.domain, generator, 1 + len(problem.searched_space.controls))
-                    wanted = [alone[torch.randint(len(alone), (), generator=generator)], together]
-                else:
-                    wanted = [problem.domain.start, *tried(problem.domain, generator, tries)]
-                plain, *shown = (quickly(torch.cat([u, numbers]), seed=own, spp=SPP) for u in wanted)
-                found.append(RenderedLesson.of(right, plain, torch.stack(shown)))
+                wanted = [problem.domain.start, *tried(problem.domain, generator, tries)]
+            plain, *pictures = (quickly(torch.cat([u, numbers]), seed=view, spp=SPP) for u in wanted)
+            found.append(RenderedLesson.of(right, plain, torch.stack(pictures)))
     return found
 
 
 def tried(domain: Domain, generator: torch.Generator, count: int) -> Tensor:
     """Draw configurations (count, d) at random. In half of them each number is moved to the nearer end of its range by
-    chance, as searches end where several numbers are. Choices, and numbers that are periodic, have no ends.
-
-    Of several controls each moves alone in turn, then all of them at once.
-    """
+    chance, as searches end where several numbers are. Choices, and numbers that are periodic, have no ends. Of several
+    controls each moves alone in turn, then all of them at once."""
     drawn = domain.sample(generator, count)
     at_ends = (torch.rand(drawn.shape, generator=generator) < 0.5) & (torch.rand(count, 1, generator=generator) < 0.5)
     owners = [block.name.rpartition(".")[0] for block, _ in domain.parts()]
@@ -186,10 +178,6 @@ def tried(domain: Domain, generator: torch.Generator, count: int) -> Tensor:
     return torch.stack([domain.project(row) for row in torch.where(at_ends, ends, drawn)])
 
 
-def _begun(problem: Problem, seed: int) -> Disguise:
-    return Disguise(problem.domain.sample(torch.Generator().manual_seed(seed), extreme=True)[0])
-
-
 def surprise(logits: Tensor, right: Sequence[tuple[int, ...]]) -> Tensor:
     """Return (N,): the negative logarithm of the probability that logits (N, C) give to the right classes of each."""
     found = F.log_softmax(logits, dim=1)
@@ -198,7 +186,7 @@ def surprise(logits: Tensor, right: Sequence[tuple[int, ...]]) -> Tensor:
 
 def with_worst(some: Sequence[Lesson]) -> list[TextureLesson | RenderedLesson]:
     """Those lessons that something makes harder."""
-    return [one for one in some if isinstance(one, (TextureLesson, RenderedLesson))]
+    return [lesson for lesson in some if isinstance(lesson, (TextureLesson, RenderedLesson))]
 
 
 def harder(chosen: Sequence[Lesson], model: Model, steps: int = 1) -> None:
@@ -210,10 +198,10 @@ def harder(chosen: Sequence[Lesson], model: Model, steps: int = 1) -> None:
         several = [one for one in part if isinstance(one, RenderedLesson) and len(one.pictures) > 1]
         if several:
             with torch.no_grad():
-                pictures = torch.cat([one.pictures for one in several]) / 255.0
-                loss = surprise(model(pictures), [one.right for one in several for _ in one.pictures])
-            for one, own in zip(several, loss.split([len(one.pictures) for one in several]), strict=True):
-                one.losses = own.clone()
+                pictures = torch.cat([lesson.pictures for lesson in several]) / 255.0
+                loss = surprise(model(pictures), [lesson.right for lesson in several for _ in lesson.pictures])
+            for lesson, losses in zip(several, loss.split([len(one.pictures) for one in several]), strict=True):
+                lesson.losses = losses.clone()
 
 
 def ascend(
@@ -221,16 +209,13 @@ def ascend(
 ) -> None:
     """Steps uphill of the textures of lessons, by what `slopes` says of them; views that share one add up. Lessons
     without a texture stay as they are."""
-    chosen = [one for one in some if isinstance(one, TextureLesson)]
-    if not chosen:
-        return
-    domains = {one.texture: one.domain for one in chosen}
-    for _ in range(steps):
-        total = dict[Disguise, Tensor]()
-        for one, slope in zip(chosen, slopes_of(chosen), strict=True):
-            total[one.texture] = total[one.texture] + slope if one.texture in total else slope
-        for texture, slope in total.items():
-            domain = domains[texture]
+    chosen = [lesson for lesson in some if isinstance(lesson, TextureLesson)]
+    for _ in range(steps if chosen else 0):
+        total = dict[Disguise, tuple[Domain, Tensor]]()
+        for lesson, slope in zip(chosen, slopes_of(chosen), strict=True):
+            before = total.get(lesson.texture)
+            total[lesson.texture] = lesson.domain, slope if before is None else before[1] + slope
+        for texture, (domain, slope) in total.items():
             texture.u = domain.project(texture.u + STEP * domain.steepest(texture.u, slope))
 
 
@@ -241,8 +226,8 @@ def slopes(
 ) -> Sequence[Tensor]:
     """Return the derivative (d,) of the loss of each lesson with respect to its texture; `change` is what happens to
     the pictures (N, H, W, 3) before the model sees them."""
-    leaves = [one.texture.u.clone().requires_grad_() for one in chosen]
-    pictures = torch.stack([one.picture(u) for one, u in zip(chosen, leaves, strict=True)])
+    leaves = [lesson.texture.u.clone().requires_grad_() for lesson in chosen]
+    pictures = torch.stack([lesson.picture(u) for lesson, u in zip(chosen, leaves, strict=True)])
     return torch.autograd.grad(surprise(model(change(pictures)), [one.right for one in chosen]).sum(), leaves)
 
 
@@ -251,29 +236,25 @@ FOLDER, ARCHIVE = "pictures", "pictures.tar"
 
 def save_pictures(folder: Path, number: int, chosen: Sequence[Lesson], labels: Sequence[str]) -> None:
     """Write the pictures of a round's lessons: ``CLASS/ROUND-LESSON-plain.png`` and ``...-worst.png``."""
-    for place, one in enumerate(chosen):
-        name = re.sub(r"[^a-z0-9]+", "-", labels[one.right[0]].lower()).strip("-")
-        for kind in ("plain", "worst") if with_worst([one]) else ("plain",):
-            path = folder / f"{one.right[0]:04d}-{name}" / f"{number:03d}-{place:05d}-{kind}.png"
+    for place, lesson in enumerate(chosen):
+        name = re.sub(r"[^a-z0-9]+", "-", labels[lesson.right[0]].lower()).strip("-")
+        for kind in ("plain", "worst") if with_worst([lesson]) else ("plain",):
+            path = folder / f"{lesson.right[0]:04d}-{name}" / f"{number:03d}-{place:05d}-{kind}.png"
             path.parent.mkdir(parents=True, exist_ok=True)
-            write_png(path, getattr(one, kind))
+            write_png(path, getattr(lesson, kind))
 
 
 def write_archive(folder: Path, archive: Path) -> int:
-    """Write the pictures of a data set as a WebDataset and return how many there are.
-
-    Of each there is a ``.png``, a ``.cls`` with the index of its class and a ``.json`` with that and the kind of
-    picture. Members have no time and no owner, so that equal pictures make equal files.
-    """
+    """Write the pictures of a data set as a WebDataset and return how many there are: of each a ``.png``, a ``.cls``
+    with the index of its class and a ``.json`` with that and the kind of picture. Members have no time and no owner, so
+    that equal pictures make equal files."""
     pictures = sorted(folder.glob("*/*.png"))
     with replacing(archive) as part, tarfile.open(part, "w") as tar:
         for path in pictures:
             index, kind = int(path.parent.name[:4]), path.stem.rpartition("-")[2]
-            facts: JsonObject = {"class": index, "kind": kind}
-            key = f"{path.parent.name}-{path.stem}"
-            files = {"png": path.read_bytes(), "cls": str(index).encode(), "json": json.dumps(facts).encode()}
-            for suffix, data in files.items():
-                member = tarfile.TarInfo(f"{key}.{suffix}")
+            facts = json.dumps({"class": index, "kind": kind})
+            for suffix, data in {"png": path.read_bytes(), "cls": str(index).encode(), "json": facts.encode()}.items():
+                member = tarfile.TarInfo(f"{path.parent.name}-{path.stem}.{suffix}")
                 member.size = len(data)
                 tar.addfile(member, io.BytesIO(data))
     return len(pictures)

@@ -18,8 +18,6 @@ from advsearch.attacks.verification import WORST_CASE
 from advsearch.bundled.changed_light import varied, white_light_changed
 from advsearch.bundled.objects import OBJECTS
 from advsearch.cluster import Call
-from advsearch.config import AttackConfig
-from advsearch.engine.attack_parts import problem_of
 from advsearch.engine.loading import Scene, load_scene
 from advsearch.engine.naming import RUN_SETTINGS, load_models, scene_settings, settings_alone
 from advsearch.engine.problem import Problem
@@ -28,18 +26,24 @@ from advsearch.files import JsonObject
 from advsearch.models import Model
 from advsearch.models.reference import trainable
 from advsearch.questions.attack.carry_out import attack_on
+from advsearch.questions.attack.parts import problem_of
+from advsearch.questions.attack.settings import AttackConfig
+from advsearch.questions.harden.answer import ALL, HardenConfig
 from advsearch.questions.harden.lessons import Lesson, has_matrix, lessons, plain_lessons
-from advsearch.questions.harden.settings import ALL, HardenConfig
-from advsearch.runs.results.base import INTERRUPTED
+from advsearch.runs.results import INTERRUPTED
 from advsearch.scene.assets import ObjectAsset
 from advsearch.scene.formation import levels_of
 from advsearch.scene.library import list_environments
 from advsearch.scene.settings import Given
 from advsearch.settings import split_names
+from advsearch.settings.values import merged
 from advsearch.tasks import make_task
 
-ROBUST = "robust"
-"""Of a scene in which nothing was found; otherwise there is an ending."""
+TRAINING, FURTHER, VALIDATION, HELD_OUT = "training", "further training", "validation", "held out"
+"""The splits: what the weights are fitted to (the second mostly as it is), what chooses among them, and what is
+measured in the end."""
+
+ROBUST = "robust"  # of a scene in which nothing was found; otherwise there is an ending
 
 OVER: dict[str, dict[str, object]] = {
     "camera": {"azimuth": [0.0, 360.0], "elevation": [8.0, 55.0], "roll": [-6.0, 6.0]},
@@ -47,8 +51,7 @@ OVER: dict[str, dict[str, object]] = {
 }
 """What varies by chance from view to view, unless it is searched."""
 
-TRIES_TO_CHOOSE = 6
-"""Random configurations of a view that is rendered to choose weights by, of which the worst counts."""
+TRIES_TO_CHOOSE = 6  # random configurations of a view that is rendered to choose weights by, of which the worst counts
 CLEAN_SCENES, CLEAN_VIEWS = 4, 2
 """Held-out scenes whose plain pictures are looked at, for each one that is attacked, and the views of each."""
 CLEAN_SPP = 16
@@ -71,6 +74,12 @@ class Drawing:
     shared: bool = False
     beside: tuple[str, ...] = ()
 
+    def done(self, work: SceneWork) -> list[Lesson]:
+        problem, seed = work.problem(work.splits[self.side], self.number, self.controls, self.beside)
+        tries = TRIES_TO_CHOOSE if self.side == VALIDATION else None
+        found = lessons(problem, self.views, seed, tries=tries, shared=self.shared) if self.views else []
+        return found + plain_lessons(problem, self.plain, seed)
+
 
 @dataclass(frozen=True)
 class Attacking:
@@ -82,6 +91,19 @@ class Attacking:
     times: int
     weights: bytes | None = field(repr=False)
 
+    def done(self, work: SceneWork) -> str:
+        """How it ended: `ROBUST` where it found nothing and the clean scene is right in as many trials as a verified
+        answer would have to be wrong in."""
+        config, model = work.config, work.model
+        if self.weights is not None:
+            student = trainable(model)
+            student.net.load_state_dict(safetensors.load(self.weights))
+            model = student.model
+        name, scene = work.splits[HELD_OUT].scene(self.number, scene_settings(config))
+        seed = seeds.stream(config.seed, f"measured {self.control}", self.number)
+        harder = {} if self.times == 1 else {"policy": STRONGER, "steps": self.times * config.steps}
+        return attacked(work.attack((self.control,), name, seed=seed, **harder), scene, model)
+
 
 @dataclass(frozen=True)
 class Looking:
@@ -89,14 +111,28 @@ class Looking:
 
     number: int
 
+    def done(self, work: SceneWork) -> list[Lesson]:
+        side = work.splits[HELD_OUT]
+        problem, _ = work.problem(side, self.number, tuple(work.config.controls)[:1])
+        right = tuple(int(index) for index in problem.truth())
+        drawn = [seeds.stream(side.seed, "plain", self.number * CLEAN_VIEWS + view) for view in range(CLEAN_VIEWS)]
+        return [Lesson(right, levels_of(problem.picture(problem.domain.start, seed, CLEAN_SPP))) for seed in drawn]
+
 
 Wanted = Drawing | Attacking | Looking
 
 
 def splits_of(config: HardenConfig, model: Model) -> dict[str, Split]:
     """Return the sides of the split by name; an InputError where there is nothing on a side."""
+
+    def has_class(label: str) -> bool:
+        try:
+            return bool(model.label_set(label).indices)
+        except InputError:
+            return False
+
     objects = tuple(OBJECTS) if config.object == ALL else config.objects
-    known = tuple(name for name in objects if name not in OBJECTS or _has_class(model, OBJECTS[name].label))
+    known = tuple(name for name in objects if name not in OBJECTS or has_class(OBJECTS[name].label))
     if not known:
         raise InputError(f"object: model {model.name} has a class for none of {', '.join(objects)}; name others")
     files = [name for name in known if name not in OBJECTS]
@@ -111,13 +147,6 @@ def splits_of(config: HardenConfig, model: Model) -> dict[str, Split]:
     sides = {name: (known, training, True) for name in (TRAINING, FURTHER, VALIDATION)}
     sides[HELD_OUT] = held, measured, False
     return {name: Split(name, a, b, seeds.stream(config.seed, name), c) for name, (a, b, c) in sides.items()}
-
-
-def _has_class(model: Model, label: str) -> bool:
-    try:
-        return bool(model.label_set(label).indices)
-    except InputError:
-        return False
 
 
 def scenes_of(settings: JsonObject) -> Call:
@@ -139,24 +168,17 @@ class SceneWork:
 
     def __call__(self, wanted: Iterable[Wanted]) -> list[list[Lesson] | str]:
         """Return what came of each: lessons, or how an attack ended."""
-        return [
-            self._attack(one)
-            if isinstance(one, Attacking)
-            else self._look(one)
-            if isinstance(one, Looking)
-            else self._draw(one)
-            for one in wanted
-        ]
+        return [one.done(self) for one in wanted]
 
     @cached_property
     def linear(self) -> tuple[str, ...]:
-        """The controls whose pictures a matrix of light transport says; the others are rendered."""
-        return tuple(one for one in self.config.controls if self._has_matrix(one))
+        """The controls whose pictures a matrix of light transport says."""
+        return tuple(control for control in self.config.controls if self._has_matrix(control))
 
-    @cached_property
+    @property
     def rendered(self) -> tuple[str, ...]:
-        """The controls whose pictures no matrix says."""
-        return tuple(one for one in self.config.controls if one not in self.linear)
+        """The other controls."""
+        return tuple(control for control in self.config.controls if control not in self.linear)
 
     @cached_property
     def beside(self) -> tuple[str, ...]:
@@ -166,7 +188,7 @@ class SceneWork:
     def _has_matrix(self, *controls: str) -> bool:
         """Whether a matrix says the pictures of the first control, the others varying by chance."""
         try:
-            return has_matrix(self._problem(self.splits[TRAINING], 0, controls[:1], controls[1:])[0])
+            return has_matrix(self.problem(self.splits[TRAINING], 0, controls[:1], controls[1:])[0])
         except InputError:
             if len(controls) > 1:
                 return False
@@ -178,61 +200,29 @@ class SceneWork:
         count = CLEAN_SCENES * self.config.measured
         return frozenset(fingerprint(asset) for asset in self.splits[HELD_OUT].assets(count))
 
-    def _draw(self, one: Drawing) -> list[Lesson]:
-        problem, seed = self._problem(self.splits[one.side], one.number, one.controls, one.beside)
-        tries = TRIES_TO_CHOOSE if one.side == VALIDATION else None
-        found = lessons(problem, one.views, seed, tries=tries, shared=one.shared) if one.views else []
-        return found + plain_lessons(problem, one.plain, seed)
-
-    def _attack(self, one: Attacking) -> str:
-        """How an attack ended: "robust" where it found nothing and the clean scene is right in as many trials as a
-        verified answer would have to be wrong in."""
-        config, model = self.config, self.model
-        if one.weights is not None:
-            student = trainable(model)
-            student.net.load_state_dict(safetensors.load(one.weights))
-            model = student.model
-        name, scene = self.splits[HELD_OUT].scene(one.number, scene_settings(self.config))
-        seed = seeds.stream(config.seed, f"measured {one.control}", one.number)
-        harder_search = {} if one.times == 1 else {"policy": STRONGER, "steps": one.times * config.steps}
-        return attacked(self._of((one.control,), name, seed=seed, **harder_search), scene, model)
-
-    def _look(self, one: Looking) -> list[Lesson]:
-        side, controls = self.splits[HELD_OUT], tuple(self.config.controls)[:1]
-        problem, _ = self._problem(side, one.number, controls)
-        right, found = tuple(int(index) for index in problem.truth()), list[Lesson]()
-        for view in range(CLEAN_VIEWS):
-            seed = seeds.stream(side.seed, "plain", one.number * CLEAN_VIEWS + view)
-            found.append(Lesson(right, levels_of(problem.picture(problem.domain.start, seed, CLEAN_SPP))))
-        return found
-
-    def _problem(
+    def problem(
         self, side: Split, number: int, controls: Sequence[str], beside: Sequence[str] = ()
     ) -> tuple[Problem, int]:
-        """What a scene is searched as, with controls that vary by chance beside, and the root of its lessons' draws."""
+        """Return what a scene is searched as, with controls that vary by chance beside, and the root of the draws of
+        its lessons."""
         name, scene = side.scene(number, scene_settings(self.config))
         if side.name != HELD_OUT:
             check_unmeasured(scene.description.object, self._measured)
         kinds = {control.partition(":")[0].partition(".")[0] for control in (*controls, *beside)}
-        over = {other: given for other, given in OVER.items() if other not in kinds}
+        over = {other: ranges for other, ranges in OVER.items() if other not in kinds}
         over |= {control: self.config.controls[control] for control in beside}
-        problem = problem_of(self._of(controls, name, over=over), scene, self.model, differentiated=False)
+        problem = problem_of(self.attack(controls, name, over=over), scene, self.model, differentiated=False)
         return problem, seeds.stream(side.seed, "views", number)
 
-    def _of(self, controls: Sequence[str], name: str, **changes: object) -> AttackConfig:
-        """What some of the controls are searched with, on an object of a name."""
-        config, given = self.config, {control: self.config.controls[control] for control in controls}
+    def attack(self, controls: Sequence[str], name: str, **changes: object) -> AttackConfig:
+        """Return what some of the controls are searched with, on an object of a name."""
+        searched = {control: self.config.controls[control] for control in controls}
         own: dict[str, object] = dict.fromkeys(RUN_SETTINGS)
-        for control in controls:
-            for setting, value in settings_alone(config, control, given[control]).items():
-                before = own[setting]
-                if isinstance(before, Mapping) and isinstance(value, Mapping):
-                    own[setting] = {**before, **value}
-                elif value is not None:
-                    own[setting] = value
-        found: dict[str, object] = {"object": name, "environment": None, "set_": {}, "exposure": 0.0, **own, **changes}
-        found |= {"controls": given, "measure": "no", "baseline": False, "workers": None, "cluster": None}
-        return AttackConfig.of(config, **found)
+        for control, given in searched.items():
+            alone = settings_alone(self.config, control, given)
+            own = merged(own, {setting: value for setting, value in alone.items() if value is not None})
+        own |= {"object": name, "environment": None, "set_": {}, "exposure": 0.0, **changes, "controls": searched}
+        return AttackConfig.of(self.config, **own, measure="no", baseline=False, workers=None, cluster=None)
 
 
 def attacked(config: AttackConfig, scene: Scene, model: Model) -> str:
@@ -247,13 +237,7 @@ def attacked(config: AttackConfig, scene: Scene, model: Model) -> str:
     return ROBUST if steady else "unsteady"
 
 
-TRAINING, FURTHER, VALIDATION, HELD_OUT = "training", "further training", "validation", "held out"
-"""The splits: what the weights are fitted to (the second mostly as it is), what chooses among them, and what is
-measured in the end."""
-
-ELEVATION = (8.0, 55.0)
-FIELD = (25.0, 45.0)
-GROUND = (0.1, 0.9)
+ELEVATION, FIELD, GROUND = (8.0, 55.0), (25.0, 45.0), (0.1, 0.9)
 """Ranges from which scenes draw the camera's elevation and field of view in degrees, and the ground's colour (sRGB)."""
 
 
@@ -270,34 +254,28 @@ class Split:
 
     def scene(self, number: int, given: Given | None = None) -> tuple[str, Scene]:
         """Return the scene with this number, from 0, and the name of its object; the objects take turns. Parameters
-        that are given are fixed.
-
-        An object in a file that brings no label is called as the file: ``coffee-mug.glb`` is a "coffee mug".
+        that are given are fixed. An object in a file without a label is called as it: ``coffee-mug.glb``, "coffee mug".
         """
         name, rng = self.objects[number % len(self.objects)], self._draws(number)
         made = OBJECTS[name].generate(rng) if name in OBJECTS else Path(name)
         environment = self.environments[int(rng.integers(len(self.environments)))]
         ground = np.clip(rng.uniform(*GROUND) + rng.normal(0.0, 0.05, 3), 0.02, 0.98)
-        drawn = {
-            "camera.azimuth": rng.uniform(0.0, 360.0),
-            "camera.elevation": rng.uniform(*ELEVATION),
-            "camera.fov": rng.uniform(*FIELD),
-            "environment.rotation": rng.uniform(0.0, 360.0),
-            **dict(zip(("ground.red", "ground.green", "ground.blue"), ground, strict=True)),
+        names = ("camera.azimuth", "camera.elevation", "camera.fov", "environment.rotation")
+        ends = ((0.0, 360.0), ELEVATION, FIELD, (0.0, 360.0))
+        drawn = {name: rng.uniform(*both) for name, both in zip(names, ends, strict=True)}
+        drawn |= {
+            f"ground.{channel}": float(level) for channel, level in zip(("red", "green", "blue"), ground, strict=True)
         }
-        settings = {**{key: float(value) for key, value in drawn.items()}, **(given or {})}
-        scene = load_scene(made, environment, settings=settings)
+        scene = load_scene(made, environment, settings={**drawn, **(given or {})})
         own = scene.description
         if self.varied and own.environment is not None:
             own = replace(own, environment=white_light_changed(varied(own.environment, rng), rng))
-            scene = Scene(own)
         if own.object.label is None:
             label = Path(name).stem.replace("-", " ").replace("_", " ")
-            scene = Scene(replace(own, object=replace(own.object, label=label)))
-        return name, scene
+            own = replace(own, object=replace(own.object, label=label))
+        return name, scene if own is scene.description else Scene(own)
 
     def _draws(self, number: int) -> np.random.Generator:
-        """What a scene is drawn from, its object first."""
         return np.random.default_rng([seeds.stream(self.seed, f"{self.name} scene", number)])
 
     def assets(self, count: int) -> Iterator[ObjectAsset]:
@@ -321,12 +299,8 @@ def fingerprint(asset: ObjectAsset) -> str:
 
 
 def check_disjoint(held: Split, taught: Sequence[Split]) -> None:
-    """Refuse, by an InputError that names it, to measure what is trained on: one of the training's environments, or one
-    of its files.
-
-    Of each bundled object the first instance is looked at; all others are checked when they are drawn, by
-    `check_unmeasured`: to make them takes minutes.
-    """
+    """Refuse, by an InputError, to measure what is trained on: one of the training's environments, or of its files. Of
+    each bundled object the first instance is looked at; all others, which take minutes, when they are drawn."""
     both = sorted({name for split in taught for name in split.environments} & set(held.environments))
     if both:
         raise InputError(f"held_out_environment: {', '.join(both)} is an environment of the training too; name others")
@@ -337,7 +311,6 @@ def check_disjoint(held: Split, taught: Sequence[Split]) -> None:
 
 
 def check_unmeasured(asset: ObjectAsset, measured: Set[str]) -> None:
-    """Refuse, by an InputError that names it, to train on an object whose fingerprint is among those of what is
-    measured."""
+    """Refuse, by an InputError, to train on an object whose fingerprint is among those of what is measured."""
     if fingerprint(asset) in measured:
         raise InputError(f"held_out: {asset.name} is an object of the training too; name others")

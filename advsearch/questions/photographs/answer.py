@@ -10,16 +10,14 @@ page lays a rendering, translucent or its edges, over the camera's picture, afte
 from __future__ import annotations
 
 import hmac
-import importlib
 import io
 import json
 import re
 from collections.abc import Callable, Sequence
 from email.message import Message
 from http import HTTPStatus
-from io import BufferedIOBase
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from PIL import Image, ImageOps
 from pydantic import Field
@@ -27,18 +25,17 @@ from pydantic import Field
 from advsearch.errors import InputError
 from advsearch.report import wording
 from advsearch.report.markup import Html, element, join_html
-from advsearch.report.phrases import percent
+from advsearch.report.wording import percent
 from advsearch.runs.directory import IMAGES
-from advsearch.runs.results.base import Fields, Interval
+from advsearch.runs.results import Fields, Interval
+from advsearch.viewer.clients import LARGEST_SENT, NO_QR, Refused, qr_code
 from advsearch.viewer.document import data_script, document, in_address, study_table
-from advsearch.viewer.server import Refused
 from advsearch.viewer.thumbnails import kept_file, kept_pictures
 
 PHOTO, LOOSE_PHOTO = "photo", "loose photo"
 """Kinds of rows in a run's store: photographs that were aligned with a rendering, and ones that were with none."""
 
-FOLDER = "photos"
-"""Where photographs are, in `images/` of the run."""
+FOLDER = "photos"  # where photographs are, in `images/` of the run
 
 
 class PhotographedRendering(Fields):
@@ -71,28 +68,16 @@ class PhotoAgreement(Fields):
     renderings: list[PhotographedRendering]
 
 
-LARGEST = 16 << 20
-"""Most bytes of a photograph's file."""
-
-MOST_PIXELS = 50_000_000
-"""Of a photograph before it is made smaller; the largest phones take 50 million."""
-
-SIDE = 1024
-"""Longest side of a photograph that is kept, pixels."""
-
-QUALITY = 95
-"""Of its JPEG file, from 1 to 95."""
-
+MOST_PIXELS = 50_000_000  # of a photograph before it is made smaller; the largest phones take 50 million
+SIDE, QUALITY = 1024, 95  # longest side in pixels of a photograph that is kept, and of its JPEG file from 1 to 95
 _NAME = re.compile(r"[0-9]{1,12}|clean|adversarial|verification-[0-9]{2}")
 _PHOTO = re.compile(rf"(?:{_NAME.pattern})-[0-9]{{4,9}}\.jpg")
 
+KEY = "X-Advsearch-Key"  # the header with which this server's page sends a photograph; another page could not send it
+
 
 def rendering_file(run: Path, name: str) -> Path:
-    """Return the file of a rendering.
-
-    Raises:
-        InputError: the run has none of that name.
-    """
+    """Return the file of a rendering; an InputError where the run has none of that name."""
     file = None
     if _NAME.fullmatch(name):
         file = kept_file(run, int(name)) if name.isdigit() else run / IMAGES / f"{name}.png"
@@ -103,19 +88,14 @@ def rendering_file(run: Path, name: str) -> Path:
 
 def rendering_names(run: Path) -> tuple[str, ...]:
     """Return the names of a run's renderings; empty where it kept none."""
-    kept = kept_pictures(run)
-    if kept is not None:
+    if (kept := kept_pictures(run)) is not None:
         return tuple(map(str, kept.numbers))
     names = [file.stem for file in (run / IMAGES).glob("*.png") if _NAME.fullmatch(file.stem)]
     return tuple(sorted(names, key=lambda name: (name != "adversarial", name)))
 
 
 def photo_file(run: Path, name: str) -> Path:
-    """Return the file of a photograph that was kept.
-
-    Raises:
-        InputError: there is none of that name.
-    """
+    """Return the file of a photograph that was kept; an InputError where there is none of that name."""
     file = run / IMAGES / FOLDER / name
     if not _PHOTO.fullmatch(name) or not file.is_file():
         raise InputError("photo: there is none of that name")
@@ -123,40 +103,28 @@ def photo_file(run: Path, name: str) -> Path:
 
 
 def sound_photo(data: bytes, shape: tuple[int, int]) -> bytes:
-    """Return a photograph as a JPEG of at most `SIDE` pixels a side, its middle cut to a shape.
-
-    Args:
-        data: the file as it was sent: JPEG, PNG or WebP.
-        shape: (width, height) of the rendering; their ratio counts.
-
-    Raises:
-        InputError: it is too large, or no such picture.
-    """
-    if len(data) > LARGEST:
-        raise InputError(f"photo: expected at most {LARGEST >> 20} MB, got more; send a smaller one")
-    bombs = (Image.DecompressionBombError, Image.DecompressionBombWarning)
+    """Return a photograph, sent as JPEG, PNG or WebP, as a JPEG of at most `SIDE` pixels a side, its middle cut to the
+    ratio of a shape (width, height). An InputError where it is too large, or no such picture."""
+    if len(data) > LARGEST_SENT:
+        raise InputError(f"photo: expected at most {LARGEST_SENT >> 20} MB, got more; send a smaller one")
     try:
         with Image.open(io.BytesIO(data), formats=("JPEG", "PNG", "WEBP")) as image:
             if image.width * image.height > MOST_PIXELS:
                 raise InputError(f"photo: expected at most {MOST_PIXELS:,} pixels, got {image.width} x {image.height}")
             image.draft("RGB", (2 * SIDE, 2 * SIDE))  # a JPEG is decoded at about the size that is needed
             upright = ImageOps.exif_transpose(image).convert("RGB")
-    except InputError:
-        raise
-    except bombs:
+    except (Image.DecompressionBombError, Image.DecompressionBombWarning):
         raise InputError(f"photo: expected at most {MOST_PIXELS:,} pixels, got far more") from None
     except (OSError, SyntaxError, ValueError, EOFError, OverflowError, MemoryError):
         raise InputError("photo: expected a picture in JPEG, PNG or WebP, got something else or a part") from None
-    width, height = shape
-    shrunk = min(SIDE, max(upright.size)) / max(width, height)
-    size = max(1, round(width * shrunk)), max(1, round(height * shrunk))
+    shrunk = min(SIDE, max(upright.size)) / max(shape)
+    width, height = (max(1, round(side * shrunk)) for side in shape)
     buffer = io.BytesIO()
-    ImageOps.fit(upright, size, Image.Resampling.LANCZOS).save(buffer, "JPEG", quality=QUALITY)
+    ImageOps.fit(upright, (width, height), Image.Resampling.LANCZOS).save(buffer, "JPEG", quality=QUALITY)
     return buffer.getvalue()
 
 
-NO_QR = "pip install segno"
-"""What to type where there is nothing to draw a code with."""
+# ---- the page -------------------------------------------------------------------------------------------------------
 
 
 def align_page(run: str, renderings: Sequence[str], table: PhotoAgreement, key: str, elsewhere: str | None) -> str:
@@ -175,7 +143,7 @@ def align_page(run: str, renderings: Sequence[str], table: PhotoAgreement, key: 
     )  # fmt: skip
     code = None
     if elsewhere is not None:
-        made = _code(elsewhere)
+        made = qr_code(elsewhere)
         svg = made and Html(made.svg_inline(omitsize=True, light="#fff", title="QR code of the address below"))
         code = element(
             "details", element("summary", "Open this page on a phone"),
@@ -195,27 +163,6 @@ def align_page(run: str, renderings: Sequence[str], table: PhotoAgreement, key: 
     return document(f"{run}, photographs", header, main, data=data, scripts=scripts, connects=True)
 
 
-def qr_text(address: str) -> str | None:
-    """Return an address as a QR code for a terminal; None where segno is not installed."""
-    made, text = _code(address), io.StringIO()
-    if made is None:
-        return None
-    made.terminal(out=text, compact=True)
-    return text.getvalue()
-
-
-def _code(address: str) -> Any:
-    """A QR code of an address; None where segno is not installed."""
-    try:
-        return importlib.import_module("segno").make(address, error="m", micro=False)
-    except ImportError:
-        return None
-
-
-COUNTED = ("photographs", "right in the photograph", "wrong in the photograph")
-"""Heads of the table of agreement."""
-
-
 def table_html(table: PhotoAgreement) -> Html:
     """Return the counts of right and wrong answers in rendering and photograph, in all and by rendering."""
     if not table.photos or table.interval is None:
@@ -229,75 +176,53 @@ def table_html(table: PhotoAgreement) -> Html:
         f"They agree in {agreeing} of {wording.count(table.photos, 'photograph')}: {percent(table.agreement)}, 95 % "
         f"interval {wording.interval_text(table.interval)}."
     )
-    several = len({one.model for one in table.renderings}) > 1
+    several = len({row.model for row in table.renderings}) > 1
     rows = []
-    for one in table.renderings:
+    for row in table.renderings:
         photos = [
             join_html(element("a", label or "nothing", href=f"photos/{in_address(file)}"), " ")
-            for label, file in zip(one.labels, one.files, strict=True)
+            for label, file in zip(row.labels, row.files, strict=True)
         ]
-        rows.append(
-            [
-                one.rendering,
-                *([one.model] if several else []),
-                f"{'right' if one.rendering_right else 'wrong'}: {one.label}",
-                join_html(f"{one.photos_right} of {one.photos} right: ", *photos),
-                f"{one.agreeing} of {one.photos}",
-                wording.interval_text(one.interval),
-            ]
-        )
+        rows.append([
+            row.rendering,
+            *([row.model] if several else []),
+            f"{'right' if row.rendering_right else 'wrong'}: {row.label}",
+            join_html(f"{row.photos_right} of {row.photos} right: ", *photos),
+            f"{row.agreeing} of {row.photos}",
+            wording.interval_text(row.interval),
+        ])  # fmt: skip
     heads = ["rendering", *(["model"] if several else []), "in the rendering", "in photographs", "agree", "interval"]
-    each = study_table(heads, rows, [f"renderings/{in_address(one.rendering)}" for one in table.renderings])
+    each = study_table(heads, rows, [f"renderings/{in_address(row.rendering)}" for row in table.renderings])
+    counted = ("photographs", "right in the photograph", "wrong in the photograph")
     return join_html(
-        element("div", study_table(COUNTED, counts), class_="agreement"),
+        element("div", study_table(counted, counts), class_="agreement"),
         element("p", text),
         element("div", each, class_="scroll", tabindex="0", role="region", aria_label="by rendering"),
     )
 
 
-KEY = "X-Advsearch-Key"
-"""The header with which this server's page sends a photograph; another page could not send it."""
-
-Response = tuple[str, bytes]
+# ---- what the server answers ----------------------------------------------------------------------------------------
 
 
-class PhotoTaker(Protocol):
-    """Takes photographs in; `Photographs` does."""
-
-    def add(self, run: Path, rendering: str, data: bytes) -> PhotoAgreement:
-        """Judge and keep a photograph, and return the run's table; InputError says why it can't."""
-
-    def agreement(self, run: Path) -> PhotoAgreement:
-        """Return the run's table."""
-
-
-def photographs_html(taker: PhotoTaker | None, run: Path, name: str, key: str, elsewhere: str | None) -> str:
+def photographs_html(taker: Any, run: Path, name: str, key: str, elsewhere: str | None) -> str:
     """Return the page of a run's photographs; arguments as for `align_page`."""
-    table = _there(taker).agreement(run)
-    return align_page(name, rendering_names(run), table, key, elsewhere)
+    return align_page(name, rendering_names(run), _there(taker).agreement(run), key, elsewhere)
 
 
-def rendering_picture(run: Path, name: str) -> Response:
-    """Return the picture of a rendering."""
-    file = _found(rendering_file, run, name)
+def picture(find: str, run: Path, name: str) -> tuple[str, bytes]:
+    """Return the type and the data of a "rendering", or of a "photo" that was kept."""
+    file = _found(rendering_file if find == "rendering" else photo_file, run, name)
     return "image/png" if file.suffix == ".png" else "image/jpeg", file.read_bytes()
 
 
-def photo(run: Path, name: str) -> Response:
-    """Return a photograph that was kept."""
-    return "image/jpeg", _found(photo_file, run, name).read_bytes()
-
-
-def check_sender(headers: Message, key: str) -> None:
-    """Refuse what this server's own page did not send: it has no origin, or not the key."""
-    given = headers.get(KEY, "").encode("utf-8", "replace")
-    if headers.get("Origin") is None or not hmac.compare_digest(key.encode(), given):
+def take(taker: Any, run: Path, name: str, headers: Message, key: str, data: Callable[[], bytes]) -> tuple[str, bytes]:
+    """Take a photograph of a rendering in, from this server's own page: another one has no origin, or not the key.
+    `data` reads what was sent, once there is something to compare it with. It is refused where there is no such
+    rendering, or it is no photograph."""
+    if headers.get("Origin") is None or not hmac.compare_digest(
+        key.encode(), headers.get(KEY, "").encode("utf-8", "replace")
+    ):
         raise Refused(HTTPStatus.FORBIDDEN, "a photograph is sent by the page that this server shows; open it anew")
-
-
-def take(taker: PhotoTaker | None, run: Path, name: str, data: Callable[[], bytes]) -> Response:
-    """Take a photograph of a rendering in; `data` reads what was sent, once there is something to compare it with. It
-    is refused where there is no such rendering, or it is no photograph."""
     _found(rendering_file, run, name)
     try:
         table = _there(taker).add(run, name, data())
@@ -306,24 +231,7 @@ def take(taker: PhotoTaker | None, run: Path, name: str, data: Callable[[], byte
     return "application/json", json.dumps({"table": str(table_html(table))}).encode()
 
 
-def request_body(headers: Message, stream: BufferedIOBase) -> bytes:
-    """Return what was sent along; nothing is read of what says that it is larger than `LARGEST`.
-
-    Raises:
-        Refused: it is too large, says no length, or does not come.
-    """
-    length = headers.get("Content-Length", "")
-    if not re.fullmatch(r"[0-9]{1,15}", length):
-        raise Refused(HTTPStatus.LENGTH_REQUIRED, "its length is missing")
-    if int(length) > LARGEST:
-        raise Refused(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"more than {LARGEST >> 20} MB")
-    data = stream.read(int(length))
-    if len(data) < int(length):
-        raise Refused(HTTPStatus.BAD_REQUEST, "a part of it did not come")
-    return data
-
-
-def _there(taker: PhotoTaker | None) -> PhotoTaker:
+def _there(taker: Any) -> Any:
     if taker is None:
         raise Refused(HTTPStatus.NOT_FOUND, "this server takes no photographs; advsearch dashboard does")
     return taker

@@ -11,15 +11,14 @@ from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import torch
 from PIL import Image
 
 from advsearch import seeds
 from advsearch.attacks import clopper_pearson
 from advsearch.calls import helped
-from advsearch.config import AttackConfig, SweepConfig
 from advsearch.described import Value
-from advsearch.engine.attack_parts import judged_alone, problem_from_config
 from advsearch.engine.judging import judgements
 from advsearch.engine.naming import in_turn
 from advsearch.engine.record import judged
@@ -27,17 +26,12 @@ from advsearch.engine.verifier import kept_answer
 from advsearch.errors import FileFormatError, InputError
 from advsearch.files import JsonObject, read_bytes
 from advsearch.models import Model
-from advsearch.questions.photographs.answer import (
-    FOLDER,
-    LARGEST,
-    LOOSE_PHOTO,
-    PHOTO,
-    PhotoAgreement,
-    PhotographedRendering,
-    rendering_file,
-    sound_photo,
-)
+from advsearch.questions.attack.parts import judged_alone, problem_from_config
+from advsearch.questions.attack.settings import AttackConfig
+from advsearch.questions.photographs import answer
+from advsearch.questions.photographs.answer import LOOSE_PHOTO, PHOTO, PhotoAgreement, PhotographedRendering
 from advsearch.questions.sweep.carry_out import scenes_of
+from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.runs.directory import CONFIG, IMAGES, RunDirectory, find_run
 from advsearch.runs.files import write_bytes
 from advsearch.runs.store import NAME, Row, Store
@@ -45,10 +39,9 @@ from advsearch.settings import read_yaml
 from advsearch.tasks import AnyTask, Judgement, Task, make_task
 from advsearch.tasks.base import Truth
 from advsearch.tasks.together import Together
+from advsearch.viewer.clients import LARGEST_SENT
 
-SUFFIXES = (".jpg", ".jpeg", ".png", ".webp")
-"""Of the files in a folder that are photographs."""
-
+SUFFIXES = (".jpg", ".jpeg", ".png", ".webp")  # of the files in a folder that are photographs
 _ALIGNED = re.compile(r"rendering-([0-9]{1,12})(?:-.*)?")
 """The name of a file with a photograph that was aligned with a rendering."""
 
@@ -65,16 +58,57 @@ def photo_agreement(run: str | Path) -> PhotoAgreement:
         UnknownNameError: there is no such run.
         FileFormatError: what was kept of a photograph is something else.
     """
+    kept, rows = ["rendering", "right", "label", "file"], list[dict[str, object]]()
     with Store(find_run(run) / NAME, read_only=True) as store:
-        return _agreement(list(store.rows(PHOTO)))
+        for row in store.rows(PHOTO):
+            if not {*kept} <= (photo := _photo_of(row)).keys():
+                raise FileFormatError(f"row {row.id}: expected what was kept of a photograph, got something else")
+            model = str(row.values["model"]["value"]) if "model" in row.values else ""
+            said = {"model": model, "correct": bool(row.correct), "said": row.label or ""}
+            rows.append({**photo, "right": bool(photo["right"]), **said})
+    table = pd.DataFrame(rows, columns=[*kept, "model", "correct", "said"])
+    counts = {
+        (a, b): int(((table["right"] == a) & (table["correct"] == b)).sum())
+        for a in (True, False)
+        for b in (True, False)
+    }
+    table["agrees"] = table["right"] == table["correct"]
+    agreeing = int(table["agrees"].sum())
+    return PhotoAgreement(
+        photos=len(table),
+        right_right=counts[True, True],
+        right_wrong=counts[True, False],
+        wrong_right=counts[False, True],
+        wrong_wrong=counts[False, False],
+        agreement=agreeing / len(table) if rows else None,
+        interval=clopper_pearson(agreeing, len(table)) if rows else None,
+        renderings=[
+            PhotographedRendering(
+                rendering=str(name),
+                model=str(model),
+                label=str(group["label"].iloc[-1]),
+                rendering_right=bool(group["right"].iloc[-1]),
+                photos=len(group),
+                photos_right=int(group["correct"].sum()),
+                agreeing=int(group["agrees"].sum()),
+                interval=clopper_pearson(int(group["agrees"].sum()), len(group)),
+                labels=list(group["said"]),
+                files=list(map(str, group["file"])),
+            )
+            for (name, model), group in table.groupby(["rendering", "model"], sort=False)
+        ],
+    )
+
+
+def _photo_of(row: Row) -> JsonObject:
+    """What was kept of a photograph: its file, `source` of one that was no browser's, and what its rendering says."""
+    photo = row.payload.get("photo") if isinstance(row.payload, dict) else None
+    return photo if isinstance(photo, dict) else {}
 
 
 def photographs_in(folder: Path, task: AnyTask) -> list[Path]:
-    """Return the files in a folder that are photographs by their names; none where there is no such folder.
-
-    Raises:
-        InputError: the task asks where the object is, and one of them was aligned with no rendering.
-    """
+    """Return the files in a folder that are photographs by their names; none where there is no such folder. An
+    InputError where the task asks where the object is, and one of them was aligned with no rendering."""
     files = sorted(folder.iterdir()) if folder.is_dir() else []
     photographs = [file for file in files if file.suffix.lower() in SUFFIXES and file.is_file()]
     loose = [file for file in photographs if not _ALIGNED.fullmatch(file.stem)]
@@ -95,71 +129,56 @@ class Photographs:
 
     def add(self, run: Path, rendering: str, data: bytes) -> PhotoAgreement:
         """Judge a photograph by the models and the task of a run, keep both beside the rendering that it was aligned
-        with, and return the table.
-
-        Raises:
-            InputError: there is no such rendering, it is no photograph, another process works on the run, or its scene
-                is another one now.
-        """
+        with, and return the table. An InputError where there is no such rendering, it is no photograph, another process
+        works on the run, or its scene is another one now."""
         self._thread.submit(self._add, run, rendering, data, "").result()
-        return self.agreement(run)
+        return photo_agreement(run)
 
     def add_files(self, run: Path, files: Sequence[Path]) -> None:
-        """Judge the photographs among some files that the run, of a sweep of one object, does not have yet, by their
-        names.
-
+        """Judge the photographs in some files that the run, a sweep of one object, does not have yet, by their names.
         A file ``rendering-12.jpg``, or ``rendering-12-`` and anything, was aligned with the rendering 12. All others
-        show the object as it stood by chance: they are judged, but are compared with no single rendering. Errors are
-        those of `add`.
-        """
+        show the object as it stood by chance: they are judged, but are compared with no single rendering."""
         with Store(run / NAME, read_only=True) as store:
             known = {_photo_of(row).get("source") for kind in (PHOTO, LOOSE_PHOTO) for row in store.rows(kind)}
-        for file in files:
-            if file.name in known:
-                continue
-            aligned = _ALIGNED.fullmatch(file.stem)
-            data = read_bytes(file, "a photograph", LARGEST)
+        for file in (file for file in files if file.name not in known):
+            aligned, data = _ALIGNED.fullmatch(file.stem), read_bytes(file, "a photograph", LARGEST_SENT)
             try:
                 self._thread.submit(self._add, run, aligned and aligned[1], data, file.name).result()
             except InputError as error:
                 raise InputError(f"{file.name}: {error}") from None
 
     def agreement(self, run: Path) -> PhotoAgreement:
-        """Return the table of a run; see `photo_agreement`."""
         return photo_agreement(run)
 
     def _add(self, run: Path, rendering: str | None, data: bytes, source: str) -> None:
         """Judge and keep a photograph of the file `source`. Of one that was aligned with no rendering, only what the
         models say of it is kept."""
-        file, kind = None if rendering is None else rendering_file(run, rendering), PHOTO if rendering else LOOSE_PHOTO
-        if file is not None:
+        file, kind, sound, name = None, PHOTO if rendering else LOOSE_PHOTO, b"", ""
+        if rendering is not None:
+            file = answer.rendering_file(run, rendering)
             with Image.open(file, formats=("PNG", "JPEG")) as image:
-                sound = sound_photo(data, image.size)  # before anything is loaded
+                sound = answer.sound_photo(data, image.size)  # before anything is loaded
         with RunDirectory.resume(run) as held:
             number, rows, judges = held.store.last_step(kind) + 1, [], self._judges(run)
-            for model, judge in enumerate(judges):
+            for place, judge in enumerate(judges):
                 kept: JsonObject = {"source": source}
                 values: dict[str, Value] = {}
-                if file is not None and rendering is not None:
-                    step = int(rendering) * len(judges) + model if rendering.isdigit() else None
+                if file is None or rendering is None:
+                    sound = answer.sound_photo(data, judge.size[::-1])
+                else:
+                    step = int(rendering) * len(judges) + place if rendering.isdigit() else None
                     seen = None if step is None else held.store.row("sweep", step)
                     values = {} if seen is None else dict(seen.values)
                     right, label = _rendered(judge, rendering, file, seen)
                     name = f"{rendering}-{number:04d}.jpg"
                     kept |= {"rendering": rendering, "right": right, "label": label, "file": name}
-                else:
-                    sound = sound_photo(data, judge.size[::-1])
+                shown = str(values["object"]["value"]) if "object" in values else None  # of a sweep over several
                 values["model"] = {"value": judge.model.name, "unit": ""}
-                row = judged(Row(kind, number, values=values), judge.judgement(rendering, _object(values), sound))
+                row = judged(Row(kind, number, values=values), judge.judgement(rendering, shown, sound))
                 rows.append(replace(row, payload={"photo": kept, "answer": row.payload}))
             if file is not None:
-                write_bytes(run / IMAGES / FOLDER / name, sound)
+                write_bytes(run / IMAGES / answer.FOLDER / name, sound)
             held.record(*rows)
-
-
-def _object(values: dict[str, Value]) -> str | None:
-    """The object that a row of a sweep over several shows."""
-    return str(values["object"]["value"]) if "object" in values else None
 
 
 @dataclass(frozen=True)
@@ -175,13 +194,11 @@ class _PhotoJudge:
     def judgement(self, rendering: str | None, name: str | None, data: bytes) -> Judgement:
         """What is to be said of a picture, made as large as the run's renderings are: in 8 bits, with Lanczos' filter,
         which averages where it shrinks."""
-        height, width = self.size
         with Image.open(io.BytesIO(data), formats=("JPEG", "PNG", "WEBP")) as image:
-            small = image.convert("RGB").resize((width, height), Image.Resampling.LANCZOS)
+            small = image.convert("RGB").resize(self.size[::-1], Image.Resampling.LANCZOS)
         pixels = torch.from_numpy(np.asarray(small, dtype=np.float32) / np.float32(255.0))
-        truth = self.truth(rendering, name)
         with torch.no_grad():
-            return judgements(self.task, self.model(pixels), pixels[None], [truth])[0]
+            return judgements(self.task, self.model(pixels), pixels[None], [self.truth(rendering, name)])[0]
 
 
 def _judges_of(run: Path) -> Sequence[_PhotoJudge]:
@@ -202,7 +219,7 @@ def _by_sweep(config: SweepConfig) -> Sequence[_PhotoJudge]:
     def truth(model: int, rendering: str | None, name: str | None) -> Truth:
         task = job.tasks[model]
         if rendering is None or not (task.varies or task.looks):
-            place = next((one for one in job.places if one.object == name), job.places[0])
+            place = next((place for place in job.places if place.object == name), job.places[0])
             return job.truth(place, model, {})
         number = int(rendering)
         if number >= job.per_scene * len(job.places):
@@ -210,30 +227,27 @@ def _by_sweep(config: SweepConfig) -> Sequence[_PhotoJudge]:
         scene, _, query = job.queries(range(number, number + 1))[model]
         return scenes.named(scene).problems[model].truth(query.u, query.values)
 
-    return [
-        _PhotoJudge(model, task, size, partial(truth, number))
-        for number, (model, task, size) in enumerate(zip(job.models, job.tasks, job.sizes, strict=True))
-    ]
+    alone = enumerate(zip(job.models, job.tasks, job.sizes, strict=True))
+    return [_PhotoJudge(model, task, size, partial(truth, number)) for number, (model, task, size) in alone]
 
 
 def _by_attack(run: Path, config: AttackConfig) -> Sequence[_PhotoJudge]:
     problem, _ = problem_from_config(judged_alone(config))
-    task = problem.task
-    alone = (task.models, task.tasks) if isinstance(task, Together) else ((problem.model,), (task,))
+    whole_task, size = problem.task, config.resolution
+    alone: list[tuple[Model, Task]] = [(problem.model, whole_task)]
+    if isinstance(whole_task, Together):
+        alone = list(zip(whole_task.models, whole_task.tasks, strict=True))
 
-    def truth(own: Task, rendering: str | None, _: str | None) -> Truth:
+    def truth(task: Task, rendering: str | None, _: str | None) -> Truth:
         """Of the clean configuration, of the answer, or of one of its trials."""
-        known = rendering in (None, "clean") or not (own.varies or own.looks)
+        known = rendering in (None, "clean") or not (task.varies or task.looks)
         u = problem.domain.start if known else kept_answer(run, problem)
         trial = (rendering or "").rpartition("verification-")[2]
         whole = problem.whole(u, seeds.stream(problem.seed, "verification", int(trial)) if trial.isdigit() else None)
         look = partial(problem.renderer.surfaces, whole)
-        return own.truth(problem.facts(partial(problem.space.describe, whole), look))
+        return task.truth(problem.facts(partial(problem.space.describe, whole), look))
 
-    return [
-        _PhotoJudge(model, own, config.resolution or model.input_size, partial(truth, own))
-        for model, own in zip(*alone, strict=True)
-    ]
+    return [_PhotoJudge(model, task, size or model.input_size, partial(truth, task)) for model, task in alone]
 
 
 def _rendered(judge: _PhotoJudge, rendering: str, file: Path, row: Row | None) -> tuple[bool, str]:
@@ -244,51 +258,3 @@ def _rendered(judge: _PhotoJudge, rendering: str, file: Path, row: Row | None) -
         raise InputError(f"rendering: the results have no row for {file.stem}; it belongs to another run")
     judgement = judge.judgement(rendering, None, file.read_bytes())
     return judgement.right, judgement.answer.label
-
-
-def _agreement(rows: Sequence[Row]) -> PhotoAgreement:
-    """Count photographs, in all and of each rendering and model, by where the model is right."""
-    kept = [_photo_of(row) for row in rows]
-    for row, photo in zip(rows, kept, strict=True):
-        if not {"rendering", "right", "label", "file"} <= photo.keys():
-            raise FileFormatError(f"row {row.id}: expected what was kept of a photograph, got something else")
-    counts = {(a, b): 0 for a in (True, False) for b in (True, False)}
-    groups: dict[tuple[str, str], list[tuple[Row, JsonObject]]] = {}
-    for row, photo in zip(rows, kept, strict=True):
-        counts[bool(photo["right"]), bool(row.correct)] += 1
-        model = str(row.values["model"]["value"]) if "model" in row.values else ""
-        groups.setdefault((str(photo["rendering"]), model), []).append((row, photo))
-    agreeing, renderings = counts[True, True] + counts[False, False], []
-    for (name, model), group in groups.items():
-        own = sum(bool(row.correct) == bool(photo["right"]) for row, photo in group)
-        last = group[-1][1]
-        renderings.append(
-            PhotographedRendering(
-                rendering=name,
-                model=model,
-                label=str(last["label"]),
-                rendering_right=bool(last["right"]),
-                photos=len(group),
-                photos_right=sum(bool(row.correct) for row, _ in group),
-                agreeing=own,
-                interval=clopper_pearson(own, len(group)),
-                labels=[row.label or "" for row, _ in group],
-                files=[str(photo["file"]) for _, photo in group],
-            )
-        )
-    return PhotoAgreement(
-        photos=len(rows),
-        right_right=counts[True, True],
-        right_wrong=counts[True, False],
-        wrong_right=counts[False, True],
-        wrong_wrong=counts[False, False],
-        agreement=agreeing / len(rows) if rows else None,
-        interval=clopper_pearson(agreeing, len(rows)) if rows else None,
-        renderings=renderings,
-    )
-
-
-def _photo_of(row: Row) -> JsonObject:
-    """What was kept of a photograph: its file, `source` of one that was no browser's, and what its rendering says."""
-    photo = row.payload.get("photo") if isinstance(row.payload, dict) else None
-    return photo if isinstance(photo, dict) else {}

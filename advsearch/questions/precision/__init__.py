@@ -1,11 +1,20 @@
-"""`advsearch precision`: error against run time, as a table, JSON and diagrams."""
+"""Measure error against run time, draw it, and recommend settings."""
 
-from advsearch.cli.question import QuestionCommand
+from __future__ import annotations
 
-HELP = "measure error against run time, draw it, and recommend settings"
-EXAMPLES = (
+from advsearch.question import Asked, question
+from advsearch.questions.precision.answer import PrecisionConfig, PrecisionResult
+from advsearch.questions.precision.answer import shown as shown
+
+
+@question(
     "precision --object mug --control pose",
     "precision --object mug --control texture --seconds 300 --error 0.1 --run diagrams",
     "precision --object bowl --control camera --quantities gradient --loss model --json",
+    place=("object", "model"),
 )
-COMMAND = QuestionCommand("precision")
+def precision(asked: Asked[PrecisionConfig]) -> PrecisionResult:
+    """Measure error against run time of a scene and its gradients (docs/precision.md)."""
+    from advsearch.questions.precision.carry_out import precision_from_config  # imports torch
+
+    return precision_from_config(asked.config, progress=asked.progress, resumed=asked.resumed)

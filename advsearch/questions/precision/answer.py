@@ -1,15 +1,86 @@
-"""The result of `precision`."""
+"""What `precision` needs to know, and its result."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
+from advsearch.config import DerivativeConfig, SceneConfig
+from advsearch.report.figures import BLUE, GREY, RED, Figures, drawn
 from advsearch.report.shown import AnswerPart, Column, ShownAnswer
-from advsearch.runs.results.base import Fields, Formation, Interval, JsonFloat, Measured, RunResult
+from advsearch.runs.results import Fields, Formation, Interval, JsonFloat, Measured, RunResult
+from advsearch.settings import Clash, check_once, setting, setting_as_in, split_names
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
+    from matplotlib.figure import Figure
+
+
+QUANTITIES = ("image", "gradient")
+SAMPLERS = ("independent", "stratified", "multijitter", "orthogonal", "ldsampler")
+"""What `precision` measures, and the samplers that it knows."""
+
+
+class PrecisionConfig(DerivativeConfig):
+    """Everything that decides what `precision` does: error against run time, for a scene, its controls and a model."""
+
+    command: ClassVar[str] = "precision"
+    clashes: ClassVar[tuple[Clash, ...]] = (
+        *DerivativeConfig.clashes,
+        Clash(
+            "samplers",
+            lambda config: "image" not in split_names(config.quantities),
+            "is of the image, which `quantities` leaves out; leave it out too",
+        ),
+        Clash(
+            "loss",
+            lambda config: "gradient" not in split_names(config.quantities),
+            "is of the gradient, which `quantities` leaves out; leave it out too",
+        ),
+    )
+
+    quantities: str = setting(
+        "image,gradient", "search", "what is measured, separated by commas", ", ".join(QUANTITIES)
+    )
+    seconds: float = setting(120.0, "search", "time that all measurements may take", unit="seconds", gt=0.0, le=1e9)
+    error: float = setting(0.05, "search", "relative error that the recommended settings should have", gt=0.0, le=1.0)
+    rounds: int = setting(8, "search", "measurements of every setting, at most", ge=3, le=1000)
+    samplers: str = setting(
+        ",".join(SAMPLERS), "search", "samplers that are compared, separated by commas", ", ".join(SAMPLERS)
+    )
+    loss: Literal["linear", "model"] = setting(
+        "linear",
+        "search",
+        "whose gradient is measured: a smooth linear loss of the raw picture, or the model's in its image formation",
+    )
+    run: str | None = setting_as_in(SceneConfig, "run", otherwise="runs/OBJECT-precision-NNN")
+
+    @field_validator("quantities", "samplers", mode="before")
+    @classmethod
+    def _names_from_list(cls, value: Any) -> Any:
+        """Accept a list of names for names separated by commas."""
+        return ",".join(str(part) for part in value) if isinstance(value, (list, tuple)) else value
+
+    @field_validator("quantities", "samplers")
+    @classmethod
+    def _several(cls, value: str, info: Any) -> str:
+        """Refuse lists with nothing in them, with something twice, and with names that are not known."""
+        names = split_names(value)
+        if not "".join(names).strip() or not set(names) <= set(
+            QUANTITIES if info.field_name == "quantities" else SAMPLERS
+        ):
+            raise ValueError("nothing, or unknown names")
+        check_once(names, info.field_name)
+        return value
+
+    @property
+    def title(self) -> tuple[str, ...]:
+        """The object, and what is asked of it."""
+        return self.object, self.command
 
 
 class PrecisionPoint(Measured):
@@ -114,8 +185,6 @@ class PrecisionResult(RunResult):
     left_out: list[str] = Field(description="settings for which there was no time")
     figures: list[str]
 
-
-RESULT = PrecisionResult
 
 WARM_UP = 3
 """Calls of a setting whose times don't count where there are more: the first compiles and records kernels, the second
@@ -234,3 +303,135 @@ def _errors(quantity: str, points: Sequence[PrecisionPoint]) -> AnswerPart:
 
 def _between(interval: Interval | None) -> str:
     return "" if interval is None else f"{100 * interval[0]:.2g} to {100 * interval[1]:.2g}"
+
+
+# ---- figures ---------------------------------------------------------------------------------------------------------
+
+
+COLORS = (BLUE, "#b4540a", "#1f7a45", "#7a3fa8", RED, "#4a7d8c", "#8a6d00", GREY, "#c2488f", "#3f5fd0", "#a06a50")
+MARKERS = "osD^vP*X<>d"
+PANEL = (5.6, 3.9)
+"""Width and height of one diagram in inches."""
+PERCENT = 100.0
+MINUS = "\N{MINUS SIGN}"
+
+
+def precision_figures(result: PrecisionResult) -> Figures:
+    """Return work-precision diagrams as files: error against seconds, both logarithmic; none where nothing is known.
+
+    Filled markers are known errors; open ones with an arrow are limits: the reference is no better than that. The
+    dashed line falls as independent samples do.
+    """
+    panels: dict[str, list[PrecisionPoint]] = {}
+    for point in result.points:
+        title = f"gradient: {point.control}" if point.control else point.quantity
+        if 0.0 < point.rms < math.inf:
+            panels.setdefault(title, []).append(point)
+    if not panels:
+        return {}
+    wide = min(2, len(panels))
+    tall = math.ceil(len(panels) / wide)
+
+    def draw(figure: Figure) -> None:
+        for number, (title, points) in enumerate(panels.items(), start=1):
+            axes = figure.add_subplot(tall, wide, number)
+            axes.set_title(title)
+            _draw_errors(axes, points, result)
+        _explain(figure, result)
+
+    return drawn(draw, (PANEL[0] * wide, PANEL[1] * tall + 0.8))
+
+
+def _draw_errors(axes: Axes, points: Sequence[PrecisionPoint], result: PrecisionResult) -> None:
+    for number, name in enumerate(dict.fromkeys(point.estimator for point in points)):
+        line = sorted((point for point in points if point.estimator == name), key=lambda point: point.spp)
+        _draw_line(axes, line, number, _labelled(line[0], result))
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    _draw_theory(axes, points)
+    _plain_axis(axes.xaxis)
+    _plain_axis(axes.yaxis)
+    goal, (low, high) = result.goal * PERCENT, axes.get_ylim()
+    if low < goal < high:
+        axes.axhline(goal, color="#1c1d20", linewidth=0.8, linestyle=":")
+        where = ("axes fraction", "data")
+        axes.annotate(f"{goal:g} %", (1.0, goal), xycoords=where, ha="right", va="bottom", fontsize=8)
+    axes.set_xlabel("seconds of processor time")
+    axes.set_ylabel("relative error, %")
+    axes.grid(True, which="major")
+    place: dict[str, Any] = {"bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.2, "handlelength": 1.6}
+    place |= {"title": "slope against samples", "title_fontsize": 8, "alignment": "left"}
+    axes.legend(loc="upper left", **place)
+
+
+def _draw_line(axes: Axes, line: Sequence[PrecisionPoint], number: int, label: str) -> None:
+    color, marker = COLORS[number % len(COLORS)], MARKERS[number % len(MARKERS)]
+    axes.plot([p.seconds for p in line], [PERCENT * p.rms for p in line], color=color, linewidth=1.0, alpha=0.55)
+    for point in line:
+        x, y = point.seconds, PERCENT * point.rms
+        low, high = (PERCENT * end for end in point.interval or (math.nan, math.nan))
+        if high < 4.0 * y:
+            axes.plot([x, x], [low, high], color=color, linewidth=0.8, alpha=0.6)
+        axes.plot([x], [y], marker=marker, markersize=5, color=color, markerfacecolor=color if point.known else "white")
+        if not point.known:
+            arrow = {"arrowstyle": "-|>", "color": color, "linewidth": 0.8, "shrinkA": 3}
+            axes.annotate("", (x, y * 0.72), (x, y), arrowprops=arrow)
+    axes.plot([], [], marker=marker, markersize=5, color=color, linewidth=1.0, label=label)
+
+
+def _labelled(point: PrecisionPoint, result: PrecisionResult) -> str:
+    """An estimator with the slope of its line against samples, and theory where it disagrees with that."""
+    place = point.quantity, point.control, point.estimator
+    for slope in result.slopes:
+        if (slope.quantity, slope.control, slope.estimator) == place:
+            doubt = f" (not {slope.theory:.2f})" if slope.agrees is False else ""
+            return f"{point.estimator}  {slope.slope:.2f}{doubt}".replace(" -", f" {MINUS}")
+    return point.estimator
+
+
+def _draw_theory(axes: Axes, points: Sequence[PrecisionPoint]) -> None:
+    """A dashed line of slope -1/2 under the points."""
+    low, high = min(point.seconds for point in points), max(point.seconds for point in points)
+    if high < 1.5 * low:
+        return
+    at = PERCENT * min(point.rms * math.sqrt(point.seconds) for point in points) * 0.8
+    axes.plot([low, high], [at / math.sqrt(low), at / math.sqrt(high)], color=GREY, linewidth=1.0, linestyle="--")
+    middle = math.sqrt(low * high)
+    axes.annotate(f"{MINUS}1/2", (middle, at / math.sqrt(middle)), fontsize=8, color=GREY, ha="right", va="top")
+
+
+def _plain_axis(axis: Axis) -> None:
+    """Ticks at 1, 2 and 5 times powers of ten (only at powers over a wide range), as plain numbers."""
+    from matplotlib.ticker import FixedLocator, FuncFormatter, NullFormatter  # takes long to import
+
+    low, high = sorted(axis.get_view_interval())
+    powers = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
+    for factors in (
+        (1.0,),
+        (1.0, 2.0, 5.0),
+        (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0),
+        tuple(1.0 + 0.2 * k for k in range(45)),
+    ):
+        ticks = [factor * 10.0**power for power in powers for factor in factors if low <= factor * 10.0**power <= high]
+        if len(ticks) >= 3:
+            break
+    axis.set_major_locator(FixedLocator(ticks))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.3g}"))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def _explain(figure: Figure, result: PrecisionResult) -> None:
+    machine, points = result.machine, result.points
+    height, width = result.image_formation.resolution
+    threads = ", ".join(f"{count} {name} thread" + "s" * (count != 1) for name, count in machine.threads.items())
+    what = f"{result.object} in {result.environment}, {result.model}, {width} x {height} pixels"
+    figure.suptitle(what, fontsize=11, fontweight="bold", x=0.01, ha="left")
+    most = max(point.repeats for point in points)
+    seconds = f"of the last of {most} repeats at most"
+    if most > WARM_UP + 1:
+        seconds = f"medians of at most {most - WARM_UP} interleaved repeats"
+    key = "Filled: known" + (", with its 95 % interval." if any(point.interval for point in points) else ".")
+    if not all(point.known for point in points):
+        key += " Open, with an arrow: at most this, the reference is no better."
+    place = f"{machine.cpu}, {machine.cores} cores, {threads}; seconds are {seconds}."
+    figure.supxlabel(f"{place}\n{key}", fontsize=8, color=GREY, x=0.01, ha="left")

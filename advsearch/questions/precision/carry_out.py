@@ -9,28 +9,27 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import torch
 
 from advsearch import seeds, threads
-from advsearch.api.keywords import asks, configured
 from advsearch.cluster.worker import processor
-from advsearch.engine.attack_parts import LOADING, problem_from_config
 from advsearch.engine.gradients import Loss, inside, smooth_loss
-from advsearch.engine.loading import Scene
-from advsearch.engine.naming import AnyModel
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Results, kept_rows
 from advsearch.errors import InputError
-from advsearch.progress import NullProgress, Progress, Watched, watcher
+from advsearch.progress import NullProgress, Progress
+from advsearch.questions.attack.parts import LOADING, problem_from_config
 from advsearch.questions.precision.answer import (
     Machine,
+    PrecisionConfig,
     PrecisionPoint,
     PrecisionResult,
     Recommended,
     Sitting,
     cautions,
+    precision_figures,
 )
 from advsearch.questions.precision.benches import (
     OIDN,
@@ -41,12 +40,10 @@ from advsearch.questions.precision.benches import (
     gradient_parts,
     in_rounds,
 )
-from advsearch.questions.precision.figures import precision_figures
 from advsearch.questions.precision.rule import RoundUp, confirmed, fit_line, point_of, reaching, warning_of
-from advsearch.questions.precision.settings import PrecisionConfig
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.files import write_bytes
-from advsearch.runs.results.base import Formation
+from advsearch.runs.results import Formation
 from advsearch.scene.formation import next_count
 from advsearch.settings import split_names
 from advsearch.viewer.pages import keep_answer
@@ -58,19 +55,6 @@ REFERENCE_SHARE = 0.35
 CONFIRM_SHARE, CONFIRM_LEAST, CONFIRM_MOST = 0.4, 4, 64
 """Of the time of a gradient's measurements, for measuring the recommended setting again; how often at least for that to
 count, and at most."""
-
-
-@asks(PrecisionConfig)
-def precision(
-    object: Scene | str | Path = "mug",
-    model: AnyModel = "reference",
-    *,
-    progress: Watched = None,
-    **settings: Any,
-) -> PrecisionResult:
-    """Measure error against run time of a scene and its gradients (docs/precision.md)."""
-    config = configured(PrecisionConfig, object=object, model=model, **settings)
-    return precision_from_config(config, progress=watcher(progress))
 
 
 def precision_from_config(

@@ -1,43 +1,29 @@
-"""`advsearch recipe`: an experiment that a YAML file describes, and what its figures say."""
+"""Run a whole experiment that a recipe describes, and write a page of figures."""
 
 from __future__ import annotations
 
-import argparse
+from advsearch.question import Asked, question
+from advsearch.questions.recipe.answer import RecipeConfig, RecipeResult
+from advsearch.questions.recipe.answer import shown as shown
 
-from advsearch.cli import output
-from advsearch.cli.question import Positional, QuestionCommand
 
-HELP = "run a whole experiment that a recipe describes, and write a page of figures"
-EXAMPLES = (
+@question(
     "recipe list",
     "recipe backgrounds --quick",
     'recipe backgrounds --object mug.obj --environment a.hdr,b.hdr --model model.pt2 --label "coffee mug,cup"',
     "show recipe backgrounds > mine.yaml",
     "recipe mine.yaml",
+    place=("recipe",),
+    about="recipe",
+    expected=("NAME", "a recipe, or list", "; list shows the recipes that there are"),
+    listed="advsearch.questions.recipe.description:titles",
 )
+def recipe(asked: Asked[RecipeConfig]) -> RecipeResult:
+    """Carry out a recipe: its runs, its figures, and what they say (docs/recipes.md).
 
-LIST = "list"
-"""What lists the recipes instead."""
+    Args:
+        recipe: the name of a bundled recipe, or a YAML file.
+    """
+    from advsearch.questions.recipe.carry_out import carried_out  # imports torch
 
-
-class _Recipe(QuestionCommand):
-    """The command, which can list the recipes too."""
-
-    def run(self, args: argparse.Namespace) -> int:
-        """Carry out the recipe and print what it says, or list the recipes."""
-        if getattr(args, "recipe", None) != LIST:
-            return super().run(args)
-        # late, so that --help answers at once
-        from advsearch.questions.recipe.description import titles
-
-        if args.json:
-            listed = [{"name": name, "title": text} for name, text in titles().items()]
-            output.print_json({"schema": 1, "recipes": listed})
-        else:
-            print(output.aligned([[name, text] for name, text in titles().items()]))
-        return 0
-
-
-COMMAND = _Recipe(
-    "recipe", about="recipe", place=Positional("NAME", "a recipe, or list", "; list shows the recipes that there are")
-)
+    return carried_out(asked)

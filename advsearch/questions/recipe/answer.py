@@ -1,27 +1,121 @@
-"""The result of `recipe`: what its runs were, its figures with their numbers, and what they say."""
+"""The settings of `recipe`, and its result: what its runs were, its figures with their numbers, and what they say."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
-from pathlib import PurePath
-from typing import ClassVar
+from collections.abc import Sequence
+from pathlib import Path, PurePath
+from typing import Any, ClassVar, Literal
 
-from pydantic import Field
+from pydantic import Field, JsonValue, field_validator
 
+from advsearch.config import SceneConfig, read_joined
+from advsearch.files import MESHES, either
 from advsearch.report.markup import InNotebook
-from advsearch.report.phrases import percent
-from advsearch.report.shown import AnswerPart, Column, ShownAnswer
-from advsearch.report.wording import count, short_name
-from advsearch.runs.results.base import Fields, RunResult
+from advsearch.report.shown import AnswerPart, ShownAnswer
+from advsearch.report.wording import count, percent, short_name
+from advsearch.runs.results import Fields, RunResult
+from advsearch.settings import Clash, Config, setting, setting_as_in, split_names
 
 Cell = str | int | float | None
 
-PHOTOGRAPHS = "photographs"
-"""The part that photographs are of."""
+ALL_OBJECTS = "*"  # under this a label stands that is right for every object without one of its own
+NAMED = "what the recipe names"
 
-SHARES = ("share", "low", "high")
-"""Columns of a figure's numbers that are a share and the ends of its 95 % interval."""
+
+class RecipeConfig(Config):
+    """Everything that decides what `recipe` does: which recipe, and on what objects, environments and models."""
+
+    command: ClassVar[str] = "recipe"
+    free: ClassVar[tuple[str, ...]] = (*Config.free, "photographs")
+    clashes: ClassVar[tuple[Clash, ...]] = SceneConfig.clashes
+
+    # fmt: off
+    recipe: str = setting(
+        ..., "recipe", "the experiment to run",
+        "the name of a recipe, which advsearch recipe list shows, or a YAML file",
+    )
+    quick: bool = setting(False, "recipe", "few and small pictures, for a first look")
+    photographs: str | None = setting(
+        None, "recipe", "photographs to compare with renderings, of each object in a folder of its name", "a folder",
+        otherwise="those taken with advsearch dashboard",
+    )
+    object: str | None = setting_as_in(
+        SceneConfig, "object", default=None, otherwise=NAMED,
+        description="the object that the model should recognise; several, separated by commas",
+        expects=f"names of objects or {either(MESHES)} files",
+    )
+    environment: str | None = setting_as_in(
+        SceneConfig, "environment", otherwise=NAMED,
+        description="the environment map that lights the scene; several, separated by commas",
+        expects="names of environments or .hdr or .exr files",
+    )
+    up: Literal["y", "z"] | None = setting_as_in(SceneConfig, "up")
+    size: float | None = setting_as_in(SceneConfig, "size")
+    unit: Literal["mm", "cm", "m", "in"] | None = setting_as_in(SceneConfig, "unit")
+    resolution: tuple[int, int] | None = setting_as_in(
+        SceneConfig, "resolution", otherwise="what the recipe says, or what the model takes"
+    )
+    model: str | None = setting_as_in(
+        SceneConfig, "model", default=None, otherwise=NAMED,
+        description="the network under test; several separated by commas",
+    )
+    labels: str | None = setting_as_in(SceneConfig, "labels")
+    prompt: str | None = setting_as_in(SceneConfig, "prompt")
+    task: str | dict[str, JsonValue] | None = setting_as_in(
+        SceneConfig, "task", default=None, otherwise="what the recipe says, or classification"
+    )
+    label: dict[str, str] = setting(
+        dict, "model",
+        "the right answers, separated by commas, for all objects or one (OBJECT=LABELS); may be repeated",
+        'names of classes, such as "coffee mug,cup" or mug="coffee mug,cup"',
+        form="choices", metavar="LABELS", otherwise="each object's own",
+    )
+    seed: int = setting_as_in(SceneConfig, "seed")
+    threads: int | None = setting_as_in(SceneConfig, "threads")
+    deterministic: bool = setting_as_in(SceneConfig, "deterministic")
+    run: str | None = setting_as_in(SceneConfig, "run", otherwise="runs/RECIPE-NNN")
+    overwrite: bool = setting_as_in(SceneConfig, "overwrite")
+    # fmt: on
+
+    _named = field_validator(
+        "recipe", "photographs", "object", "environment", "model", "labels", "task", "run", mode="before"
+    )(lambda value, info: SceneConfig._as_text(value, info))
+    _prompts = field_validator("prompt", mode="before")(lambda value: SceneConfig._prompts_as_text(value))
+    _sized = field_validator("resolution", mode="before")(lambda value: SceneConfig._resolution_from_text(value))
+    _in_range = field_validator("resolution")(lambda value: SceneConfig._resolution_in_range(value))
+    _task = field_validator("task", mode="before")(lambda value: read_joined(value, "task", "classification"))
+
+    @field_validator("photographs")
+    @classmethod
+    def _folder_from_anywhere(cls, value: str | None) -> str | None:
+        """A run is gone on with from any folder."""
+        return None if value is None else str(Path(value).expanduser().resolve())
+
+    @field_validator("label", mode="before")
+    @classmethod
+    def _label_for_all(cls, value: Any) -> Any:
+        """Accept one text for all objects."""
+        return {ALL_OBJECTS: value} if isinstance(value, str) else value
+
+    @field_validator("label")
+    @classmethod
+    def _labels_with_names(cls, value: dict[str, str]) -> dict[str, str]:
+        if any(not text.strip(" ,\t\n") or "\0" in name + text for name, text in value.items()):
+            raise ValueError("an empty name")
+        return value
+
+    @property
+    def title(self) -> tuple[str, ...]:
+        """The recipe's name, and the first object if one was asked for."""
+        return (Path(self.recipe).stem, *(Path(name).stem for name in split_names(self.object or "")[:1]))
+
+    def label_of(self, name: str) -> str | None:
+        """Return what was said to be the right answer for an object; None for its own."""
+        return self.label.get(name) or self.label.get(Path(name).stem) or self.label.get(ALL_OBJECTS)
+
+
+SHARES = ("share", "low", "high")  # columns of a figure's numbers that are a share and the ends of its 95 % interval
 
 
 class RecipePart(Fields):
@@ -62,31 +156,24 @@ class RecipeResult(InNotebook, RunResult):
 
     @property
     def brief(self) -> str:
-        """How many figures there are."""
         return f"{len(self.figures)} figures"
-
-
-RESULT = RecipeResult
 
 
 def shown(result: RecipeResult) -> ShownAnswer:
     """Return each figure with what it says and its numbers, and the runs that it took."""
     sections = [AnswerPart(text=[result.about], only="page")]
     for number, (made, texts) in enumerate(zip(result.figures, told_once(result.figures), strict=True), start=1):
-        rows = [[_cell(*one) for one in zip(made.columns, row, strict=True)] for row in made.rows]
+        rows = [list(map(_cell, made.columns, row)) for row in made.rows]
         sections.append(AnswerPart(made.title, texts, figure=f"images/figure-{number}.png"))
         sections.append(AnswerPart("The numbers", heads=made.columns, rows=rows, folded=True, only="page"))
-    columns: Mapping[str, Column] = {
-        "run in parts/": "{0.name}", "command": "{0.command}", "ending": "{0.ending}", "renders": "{0.renders}",
-    }  # fmt: skip
-    runs = {"title": count(len(result.parts), "run"), "parts": [one.name for one in result.parts]}
-    sections.append(AnswerPart.table(result.parts, columns, **runs, folded=True, only="page"))
-    objects, environments, models = (
-        ", ".join(map(short_name, names))
-        for names in (result.objects, result.environment.split(","), result.model.split(","))
-    )
+    rows = [[run.name, run.command, run.ending, str(run.renders)] for run in result.parts]
+    heads, names = ("run in parts/", "command", "ending", "renders"), [run.name for run in result.parts]
+    title = count(len(result.parts), "run")
+    sections.append(AnswerPart(title, heads=heads, rows=rows, parts=names, folded=True, only="page"))
+    of_what = result.objects, result.environment.split(","), result.model.split(",")
+    objects, environments, models = (", ".join(map(short_name, listed)) for listed in of_what)
     facts = {"objects": objects, "environments": environments, "models": models, "runs": str(len(result.parts))}
-    facts |= {"renders": str(sum(one.renders for one in result.parts))}
+    facts |= {"renders": str(sum(run.renders for run in result.parts))}
     quick = ["Made with few and small pictures, to see what comes out; no result."] if result.quick else []
     return ShownAnswer(result.title, sections, facts, [PurePath(result.recipe).stem, models, objects], quick)
 
@@ -99,13 +186,11 @@ def _cell(column: str, value: Cell) -> str:
 
 def told_once(figures: Sequence[RecipeFigure]) -> list[list[str]]:
     """Return what each figure says without counts that a figure before it has told; where nothing is left, that."""
-    said: set[str] = set()
-    told = []
-    for number, figure in enumerate(figures):
-        same = number > 0 and figure.text == figures[number - 1].text
+    said, told = set[str](), list[list[str]]()
+    for before, figure in zip([None, *figures], figures, strict=False):
         new = [text for text in figure.text if text not in said or not re.search(r"\d of \d", text)]
-        told.append(
-            ["It says the same as the figure before it."] if same else new or ["It says what figures before it say."]
-        )
+        same = before is not None and figure.text == before.text
+        nothing = ["It says the same as the figure before it." if same else "It says what figures before it say."]
+        told.append(nothing if same or not new else new)
         said |= set(figure.text)
     return told

@@ -11,26 +11,22 @@ from dataclasses import dataclass
 from importlib import resources
 from itertools import product
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from advsearch import seeds
-from advsearch.config import CONFIGS
-from advsearch.config.scene import DEFAULT_ENVIRONMENT, SceneConfig
+from advsearch.config import CONFIGS, DEFAULT_ENVIRONMENT, SceneConfig
 from advsearch.errors import FileFormatError, InputError, UnknownNameError
-from advsearch.questions.recipe.answer import PHOTOGRAPHS
-from advsearch.questions.recipe.settings import RecipeConfig
+from advsearch.questions.recipe.answer import RecipeConfig
 from advsearch.runs.directory import default_name
 from advsearch.settings import read_yaml, split_names
 from advsearch.settings.configuration import PLACE, SettingsError
 from advsearch.settings.values import merged
 
-COMMANDS = ("attack", "sweep")
-"""What a part may be."""
-
-OWN = (*PLACE, "object", "seed", "threads", "deterministic", "label")
-"""Settings that a part has from the recipe's command and may not say itself."""
+PHOTOGRAPHS = "photographs"  # the part that photographs are of
+OF_THE_COMMAND = (*PLACE, "seed", "threads", "deterministic")
+"""Settings that are said with the command and not in its file."""
 
 MOST_PARTS, MOST_FIGURES, MOST_RUNS = 64, 32, 1000
 
@@ -44,33 +40,21 @@ class _Described(BaseModel):
 
 
 class Part(_Described):
-    """Runs of one command, one for each object.
+    """Runs of one command, one for each object, with settings over those that all parts have. What it draws is drawn
+    from the distributions that the searches of the part `around` answer with; or it draws the very configurations that
+    the part `drawn_as` does, which has the same ranges."""
 
-    Attributes:
-        command: one of `COMMANDS`.
-        settings: of that command, over those that all parts have.
-        around: a part whose searches answer with distributions: what this one draws is drawn from those.
-        drawn_as: a part with the same ranges: this one draws the very configurations that that one does.
-    """
-
-    command: str
+    command: Literal["attack", "sweep"]
     settings: Settings = Field(default_factory=dict)
     around: str | None = None
     drawn_as: str | None = None
 
-    @field_validator("command")
-    @classmethod
-    def _known(cls, value: str) -> str:
-        if value not in COMMANDS:
-            raise ValueError(f"expected {' or '.join(COMMANDS)}, got {value[:40]!r}")
-        return value
-
     @field_validator("settings")
     @classmethod
     def _not_own(cls, value: Settings) -> Settings:
-        own = [name for name in value if name in OWN]
-        if own:
-            raise ValueError(f"{own[0]!r} is the same for all parts; leave it out here")
+        for name in (*OF_THE_COMMAND, "object", "label"):
+            if name in value:
+                raise ValueError(f"{name!r} is the same for all parts; leave it out here")
         return value
 
 
@@ -83,17 +67,9 @@ class Changes(_Described):
 
 
 class Recipe(_Described):
-    """What a recipe's file says.
-
-    Attributes:
-        title: the question, in one line.
-        about: what is done for an answer, and whose experiment it is.
-        settings: of all parts; what the command line says of objects, environments and models goes over them.
-        parts: by name, in the order in which they are carried out.
-        figures: each with a `figure`, its kind, and options (`advsearch.questions.recipe.figures`).
-        groups: names of groups, each with the names of objects in it.
-        quick: what is different when it should be quick.
-    """
+    """What a recipe's file says (docs/recipes.md): its question, what is done for an answer and whose experiment it
+    is, settings of all parts, parts in the order in which they are carried out, figures with a `figure`, their kind,
+    and options, groups of objects by name, and what is different when it should be quick."""
 
     title: Annotated[str, Field(min_length=1, max_length=200)]
     about: Annotated[str, Field(max_length=2000)] = ""
@@ -106,9 +82,9 @@ class Recipe(_Described):
     @field_validator("settings")
     @classmethod
     def _no_place(cls, value: Settings) -> Settings:
-        own = [name for name in value if name in (*PLACE, "seed", "threads", "deterministic")]
-        if own:
-            raise ValueError(f"{own[0]!r} is said with the command, not in its file; leave it out")
+        for name in OF_THE_COMMAND:
+            if name in value:
+                raise ValueError(f"{name!r} is said with the command, not in its file; leave it out")
         return value
 
     @field_validator("parts")
@@ -126,9 +102,9 @@ class Recipe(_Described):
 
     def made_quick(self) -> Recipe:
         """Return it with what `quick` makes different."""
-        unknown = [name for name in (*self.quick.parts, *self.quick.without) if name not in self.parts]
-        if unknown:
-            raise UnknownNameError("part", unknown[0], self.parts, "It stands under `quick` in the recipe.")
+        for name in (*self.quick.parts, *self.quick.without):
+            if name not in self.parts:
+                raise UnknownNameError("part", name, self.parts, "It stands under `quick` in the recipe.")
         parts = {
             name: part.model_copy(update={"settings": merged(part.settings, self.quick.parts.get(name, {}))})
             for name, part in self.parts.items()
@@ -155,12 +131,8 @@ def recipe_yaml(name: str) -> str:
 
 
 def read_recipe(name: str) -> Recipe:
-    """Return a bundled recipe by its name, or that of a YAML file: it has a suffix, or a folder before it.
-
-    Raises:
-        UnknownNameError: there is no such recipe.
-        FileFormatError: the file is missing, no YAML, or as for `recipe_of`.
-    """
+    """Return a bundled recipe by its name, or that of a YAML file: it has a suffix, or a folder before it. An
+    UnknownNameError or a FileFormatError where there is none, or as for `recipe_of`."""
     if is_file_name(name):
         return recipe_of(read_yaml(name), name)
     recipe_yaml(name)
@@ -174,21 +146,20 @@ def is_file_name(name: str) -> bool:
 
 
 def recipe_of(data: Mapping[str, object], where: str) -> Recipe:
-    """Return the recipe that a mapping describes, as it stands in the file `where`.
-
-    Raises:
-        FileFormatError: something is missing, unknown, or of another kind.
-    """
-    given = {name: value for name, value in data.items() if name not in ("schema", "command")}
+    """Return the recipe that a mapping describes, as it stands in the file `where`; a FileFormatError where something
+    is missing, unknown, or of another kind."""
     try:
-        return Recipe(**given)
+        return Recipe(**{name: value for name, value in data.items() if name not in ("schema", "command")})
     except ValidationError as error:
-        first = error.errors(include_url=False, include_input=False)[0]
-        what = ".".join(str(one) for one in first["loc"])[:80]
-        text = first["msg"].removeprefix("Value error, ")[:200]
-        raise FileFormatError(f"{where}: {what}: {text}; advsearch show recipe backgrounds prints one") from None
+        raise FileFormatError(f"{where}: {first_of(error)}; advsearch show recipe backgrounds prints one") from None
     except (RecursionError, TypeError) as error:
         raise FileFormatError(f"{where}: expected a recipe, got {type(error).__name__}") from None
+
+
+def first_of(error: ValidationError) -> str:
+    """Return what is wrong first, and where: ``parts.a.shell: Extra inputs are not permitted``."""
+    first = error.errors(include_url=False, include_input=False)[0]
+    return f"{'.'.join(map(str, first['loc']))[:80]}: {first['msg'].removeprefix('Value error, ')[:200]}"
 
 
 @dataclass(frozen=True)
@@ -203,15 +174,10 @@ class PlannedRun:
 
 
 def planned(recipe: Recipe, config: RecipeConfig) -> list[PlannedRun]:
-    """Return the runs of a recipe in the order in which they are carried out.
-
-    A run is about one object. Where a part's command takes one environment or one model only, it has a run for each.
-
-    Raises:
-        InputError: a part has a setting that its command has not, or too many runs; the message names the part.
-    """
+    """Return the runs of a recipe in the order in which they are carried out; an InputError names a part with a setting
+    that its command has not. A run is about one object; a search, about one environment and one model, too."""
     chosen = made_of(recipe, config)
-    runs = [one for name in chosen.parts for one in _runs(chosen, name, config)]
+    runs = [run for name in chosen.parts for run in _runs(chosen, name, config)]
     if len(runs) > MOST_RUNS:
         raise InputError(f"{config.recipe}: expected at most {MOST_RUNS} runs, got {len(runs)}; name fewer objects")
     return runs
@@ -221,16 +187,16 @@ def check_powers(recipe: Recipe, config: RecipeConfig) -> None:
     """Refuse, by an InputError, a part that would do more than its run: connect, or start more processes than there are
     processors. A bundled recipe may."""
     if is_file_name(config.recipe) or recipe != read_recipe(config.recipe):
-        for one in planned(recipe, config):
-            one.config.check_powers(f"{config.recipe}: parts: {one.part}")
+        for run in planned(recipe, config):
+            run.config.check_powers(f"{config.recipe}: parts: {run.part}")
 
 
 def made_of(recipe: Recipe, config: RecipeConfig) -> Recipe:
     """Return the recipe as it was asked for: quick or not, with the objects, environments and models of `config`."""
     chosen = recipe.made_quick() if config.quick else recipe
-    names = ("object", "environment", "model", "labels", "prompt", "task", "up", "resolution")
-    given = {name: value for name in names if (value := getattr(config, name)) is not None}
-    settings: Settings = {**chosen.settings, **given}
+    names = ("object", "environment", "model", "labels", "prompt", "task", "up", "size", "unit", "resolution")
+    asked = {name: value for name in names if (value := getattr(config, name)) is not None}
+    settings: Settings = {**chosen.settings, **asked}
     if "object" not in settings:
         raise InputError(f"object: expected one, since {config.recipe} names none")
     return chosen.model_copy(update={"settings": settings})
@@ -238,19 +204,16 @@ def made_of(recipe: Recipe, config: RecipeConfig) -> Recipe:
 
 def names_listed(value: object) -> list[str]:
     """Return names that stand in a list, or in a text with commas between them."""
-    return [str(one) for one in value] if isinstance(value, (list, tuple)) else list(split_names(str(value)))
+    return [str(name) for name in value] if isinstance(value, (list, tuple)) else list(split_names(str(value)))
 
 
 def _runs(recipe: Recipe, name: str, config: RecipeConfig) -> Iterator[PlannedRun]:
-    part, kind = recipe.parts[name], CONFIGS[recipe.parts[name].command]
-    settings = {**recipe.settings, **part.settings}
-    several = kind.several if issubclass(kind, SceneConfig) and part.command != "attack" else ()
-    axes = {
-        axis: names_listed(settings.get(axis) or default)
-        for axis, default in (("object", ""), ("environment", DEFAULT_ENVIRONMENT), ("model", "reference"))
-        if axis not in several or axis == "object"
-    }
-    where = f"{config.recipe}: parts: {name}"
+    part, where = recipe.parts[name], f"{config.recipe}: parts: {name}"
+    kind, settings = CONFIGS[part.command], {**recipe.settings, **part.settings}
+    apart = {"object": ""} | (
+        {"environment": DEFAULT_ENVIRONMENT, "model": "reference"} if part.command == "attack" else {}
+    )
+    axes = {axis: names_listed(settings.get(axis) or usual) for axis, usual in apart.items()}
     for number, values in enumerate(product(*axes.values())):
         own: Settings = dict(zip(axes, values, strict=True))
         words = [value for axis, value in zip(axes, values, strict=True) if axis == "object" or len(axes[axis]) > 1]

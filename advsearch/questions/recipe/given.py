@@ -1,33 +1,28 @@
-"""Which answers are given: the most frequent ones for each value of something; whether they go by shape or texture."""
+"""Figures of which answers are given: the most frequent ones, whether they go by shape or texture, and where in a
+mixture each is given (ternary diagrams)."""
 
 from __future__ import annotations
 
+import math
 import random
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from itertools import product
+from statistics import NormalDist
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
 import pandas as pd
 from pydantic import Field
 
-from advsearch.questions.recipe.table import (
-    ANSWER,
-    COUNT,
-    MadeFigure,
-    Options,
-    Table,
-    Tally,
-    extremes,
-    most_frequent,
-    plural,
-)
+from advsearch.attacks.trials import CONFIDENCE
+from advsearch.questions.recipe import frame
+from advsearch.questions.recipe.frame import MadeFigure, Options, Rows, Tally
 from advsearch.report.figures import BLUE, GREY, RED
-from advsearch.report.phrases import percent
+from advsearch.report.wording import percent
 
-LETTERS = 85
-"""Letters that a bar of the whole width has room for."""
-FEWEST_LETTERS = 4
-"""Of a name that is cut short."""
+LETTERS, FEWEST_LETTERS = 85, 4  # letters that a bar of the whole width has room for, and of a name that is cut short
 
 
 class AnswersOptions(Options):
@@ -37,58 +32,52 @@ class AnswersOptions(Options):
     most: int = Field(default=4, ge=1, le=10)
 
 
-def answers(table: Table, options: AnswersOptions) -> MadeFigure:
+def answers(rows: Rows, options: AnswersOptions) -> MadeFigure:
     """Count the most frequent answers for each value of something."""
     groups: dict[str, list[tuple[Tally, int]]] = {}  # how often each was given, and how often it was a right one
-    for value, rows in table.by(options.by).items():
-        most = most_frequent(rows)[: options.most]
-        given = {answer: rows[ANSWER] == answer for answer, _ in most}
+    for value, some in frame.by(rows, options.by).items():
+        given = {answer: some[frame.ANSWER] == answer for answer, _ in frame.most_frequent(some)[: options.most]}
         groups[value] = [
-            (Tally.over(answer, rows, flags), int(rows["correct"][flags].sum())) for answer, flags in given.items()
+            (Tally.over(answer, some, flags), int(some["correct"][flags].sum())) for answer, flags in given.items()
         ]
     wrong = {value: each[0] for value, each in groups.items() if 2 * each[0][1] < each[0][0].times}
-    known, thing = len(groups) - len(wrong), plural(options.by)
+    known, thing = len(groups) - len(wrong), frame.plural(options.by)
     text = [f"For {known} of {len(groups)} {thing} the most frequent answer is mostly a right one."]
     text += [
-        f"For {value} it is {one.name}, {one.told('given')} and right in {right} of these."
-        for value, (one, right) in wrong.items()
+        f"For {value} it is {tally.name}, {tally.told('given')} and right in {right} of these."
+        for value, (tally, right) in wrong.items()
     ]
-    title = options.title or f"Most frequent answers by {options.by}"
 
     def draw(figure: Any) -> None:
         axes = figure.subplots()
         for place, given in enumerate(groups.values()):
             left = 0.0
-            for one, right in given:
-                share, colour = one.share or 0.0, BLUE if 2 * right >= one.times else RED
+            for tally, right in given:
+                share, colour = tally.share or 0.0, BLUE if 2 * right >= tally.times else RED
                 axes.barh(place, share, left=left, color=colour, alpha=0.5, height=0.72, edgecolor="white")
-                axes.text(left + share / 2, place, fitting(one.name, share), ha="center", va="center", fontsize=7)
+                axes.text(left + share / 2, place, fitting(tally.name, share), ha="center", va="center", fontsize=7)
                 left += share
             axes.barh(place, max(1.0 - left, 0.0), left=left, color=GREY, alpha=0.15, height=0.72)
         axes.set_yticks(range(len(groups)), list(groups))
         axes.invert_yaxis()
         axes.set(xlabel="share of answers; blue: mostly right, red: mostly wrong, grey: others", xlim=(0.0, 1.0))
 
-    rows = [[value, one.name, *one.cells, right] for value, given in groups.items() for one, right in given]
-    columns = [options.by, "answer", "given in", *COUNT, "right"]
-    return MadeFigure(title, text, columns, rows, draw, (6.4, 1.2 + 0.3 * len(groups)))
+    table = [[value, tally.name, *tally.cells, right] for value, given in groups.items() for tally, right in given]
+    heads, title = [options.by, "answer", "given in", *frame.COUNT, "right"], f"Most frequent answers by {options.by}"
+    return MadeFigure(options.title or title, text, heads, table, draw, (6.4, 1.2 + 0.3 * len(groups)))
 
 
 def fitting(name: str, share: float) -> str:
     """Return as much of an answer's name as a bar has room for: the first of several names, or its beginning."""
     room, first = int(share * LETTERS), name.partition(",")[0]
-    fits = next((one for one in (name, first) if len(one) <= room), None)
-    return fits if fits is not None else f"{first[: room - 1].rstrip()}…" if room > FEWEST_LETTERS else ""
+    cut = f"{first[: room - 1].rstrip()}…" if room > FEWEST_LETTERS else ""
+    return next((text for text in (name, first) if len(text) <= room), cut)
 
 
-SEED, RESAMPLES = 0, 2000
-"""Of the answers that predict, and of the bootstrap."""
+# ---- shape and texture ----------------------------------------------------------------------------------------------
 
-FEWEST_PAIRS = 4
-"""Pairs of object and texture: two of each."""
-
-Predicted = tuple[int, int, int]
-"""Of one object with one texture: answers, and how many of these the shape and the texture predict."""
+SEED, RESAMPLES = 0, 2000  # of the answers that predict, and of the bootstrap
+FEWEST_PAIRS = 4  # pairs of object and texture: two of each
 
 
 class CuesOptions(Options):
@@ -99,72 +88,63 @@ class CuesOptions(Options):
     classes: dict[str, list[str]] = Field(default_factory=dict)
 
 
-def cues(table: Table, options: CuesOptions) -> MadeFigure:
+def cues(rows: Rows, options: CuesOptions) -> MadeFigure:
     """Count how often the answer is the object and how often the texture, and which of both predicts answers better."""
-    textures = table.by(options.texture)
-    shapes = {name: Tally.over(name, rows) for name, rows in textures.items()}
-    naming = {
-        name: rows[ANSWER].map(lambda answer, name=name: _names(answer, options.classes.get(name, [])))
-        for name, rows in textures.items()
-    }
-    named = {name: Tally.over(name, rows, naming[name]) for name, rows in textures.items()}
-    asked = [name for name in textures if options.classes.get(name)]
-    text = [f"The answer is the object, whatever its texture: {Tally.over('', table.rows).told('so')}."]
-    if asked:
+
+    def says(texture: str, some: Rows) -> Any:  # the whole answer, or one of the names that it consists of
+        classes = options.classes.get(texture, ())
+        return some[frame.ANSWER].map(lambda said: any(name.strip() in classes for name in [said, *said.split(",")]))
+
+    textures = frame.by(rows, options.texture)
+    shapes = {name: Tally.over(name, some) for name, some in textures.items()}
+    naming = {name: says(name, some) for name, some in textures.items()}
+    named = {name: Tally.over(name, some, naming[name]) for name, some in textures.items()}
+    text = [f"The answer is the object, whatever its texture: {Tally.over('', rows).told('so')}."]
+    if asked := [name for name in textures if options.classes.get(name)]:
         flags = pd.concat([naming[name] for name in asked])
-        total = Tally.over("", table.rows.loc[flags.index], flags)
+        total = Tally.over("", rows.loc[flags.index], flags)
         text.append(f"The answer names the texture ({', '.join(asked)}): {total.told('so')}.")
-        if not total.share:
-            text.append("A model that has no class for a texture cannot name it.")
-    text.append(_which(predicted(table, options)))
-    text += extremes(list(shapes.values()), "The hardest texture", "the easiest", "textures")
-    title = options.title or "Answers by shape and by texture"
+        text += [] if total.share else ["A model that has no class for a texture cannot name it."]
+    text.append(_which(predicted(rows, options)))
+    text += frame.extremes(list(shapes.values()), "The hardest texture", "the easiest", "textures")
 
     def draw(figure: Any) -> None:
-        axes = figure.subplots()
-        names = sorted(shapes, key=lambda name: shapes[name].share or 0.0)
-        own, other = ([counts[name].share or 0.0 for name in names] for counts in (shapes, named))
-        axes.barh(names, own, color=BLUE, alpha=0.55, height=0.66, label="the object")
-        axes.barh(names, other, left=own, color=RED, alpha=0.55, height=0.66, label="the texture")
-        for place, name in enumerate(names):
+        axes, ordered = figure.subplots(), sorted(shapes, key=lambda name: shapes[name].share or 0.0)
+        shape, texture = ([counts[name].share or 0.0 for name in ordered] for counts in (shapes, named))
+        axes.barh(ordered, shape, color=BLUE, alpha=0.55, height=0.66, label="the object")
+        axes.barh(ordered, texture, left=shape, color=RED, alpha=0.55, height=0.66, label="the texture")
+        for place, name in enumerate(ordered):
             axes.plot(shapes[name].interval(), [place, place], color="#1c1d20", linewidth=1.2)
         axes.set(xlabel="share of answers; line: 95 % interval of the object's", xlim=(0.0, 1.0))
         axes.grid(True, axis="x")
         figure.legend(loc="outside lower center", ncols=2, title="the answer names")
 
-    rows = [[name, *shapes[name].cells, named[name].times] for name in textures]
-    columns = [options.texture, "the object", *COUNT, "the texture"]
-    return MadeFigure(title, text, columns, rows, draw, (6.0, 1.7 + 0.27 * len(textures)))
+    table = [[name, *shapes[name].cells, named[name].times] for name in textures]
+    heads, title = [options.texture, "the object", *frame.COUNT, "the texture"], "Answers by shape and by texture"
+    return MadeFigure(options.title or title, text, heads, table, draw, (6.0, 1.7 + 0.27 * len(textures)))
 
 
-def _names(answer: str, classes: list[str]) -> bool:
-    """Whether an answer, or one of the names that it consists of, is among some."""
-    return any(name.strip() in classes for name in [answer, *answer.split(",")])
-
-
-def predicted(table: Table, options: CuesOptions) -> list[Predicted]:
-    """Predict the answers about each object with each texture by those about it with others, and with others by it.
-
-    Each cue predicts the most frequent one of as many answers: those about the same object with other textures, and
+def predicted(rows: Rows, options: CuesOptions) -> list[tuple[int, int, int]]:
+    """Predict the answers about each object with each texture by those about it with others, and with others by it;
+    return of each pair how many answers there are, and how many of these the shape and the texture predict. Each cue
+    predicts the most frequent one of as many answers: those about the same object with other textures, and
     about the same texture on other objects, drawn so that both are as many as the fewer are. None of the predicted
     answers is among them, so that a model which answers by neither cue is predicted as well by both.
     """
-    generator = random.Random(SEED)
-    groups = table.rows.groupby([table.column(options.shape), table.column(options.texture)], sort=False)
-    pairs = {pair: list(rows[ANSWER]) for pair, rows in groups}
-    counts = []
+    generator, counts = random.Random(SEED), []
+    groups = rows.groupby([frame.column(rows, options.shape), frame.column(rows, options.texture)], sort=False)
+    pairs = {pair: list(some[frame.ANSWER]) for pair, some in groups}
     for (shape, texture), given in pairs.items():
         same_shape = [one for (s, t), more in pairs.items() if s == shape and t != texture for one in more]
         same_texture = [one for (s, t), more in pairs.items() if t == texture and s != shape for one in more]
-        drawn = min(len(same_shape), len(same_texture))
-        if drawn:
-            each = (Counter(generator.sample(one, drawn)).items() for one in (same_shape, same_texture))
-            by_shape, by_texture = (min(one, key=lambda item: (-item[1], item[0]))[0] for one in each)
+        if drawn := min(len(same_shape), len(same_texture)):
+            each = (Counter(generator.sample(cue, drawn)).items() for cue in (same_shape, same_texture))
+            by_shape, by_texture = (min(cue, key=lambda item: (-item[1], item[0]))[0] for cue in each)
             counts.append((len(given), given.count(by_shape), given.count(by_texture)))
     return counts
 
 
-def _which(pairs: Sequence[Predicted]) -> str:
+def _which(pairs: Sequence[tuple[int, int, int]]) -> str:
     """By how much more the shape predicts than the texture, both of the same answers. Answers about one pair go
     together: the interval is a percentile bootstrap over pairs."""
     if len(pairs) < FEWEST_PAIRS:
@@ -173,20 +153,168 @@ def _which(pairs: Sequence[Predicted]) -> str:
             f"textures, {FEWEST_PAIRS} pairs in all."
         )
 
-    def ahead(some: Sequence[Predicted]) -> float:
-        return sum(shape - texture for _, shape, texture in some) / sum(given for given, _, _ in some)
+    def ahead(some: Sequence[tuple[int, int, int]]) -> float:
+        return 100 * sum(shape - texture for _, shape, texture in some) / sum(given for given, _, _ in some)
 
     generator, outside = random.Random(SEED), round(RESAMPLES * 0.025)
     drawn = sorted(ahead(generator.choices(pairs, k=len(pairs))) for _ in range(RESAMPLES))
-    interval = drawn[outside], drawn[-1 - outside]
-    total, shape, texture = (sum(one) for one in zip(*pairs, strict=True))
-    verdict = (
-        "the model goes more by shape than by texture" if interval[0] > 0.0
-        else "the model goes more by texture than by shape" if interval[1] < 0.0 else "no difference is shown"
-    )  # fmt: skip
+    low, high = drawn[outside], drawn[-1 - outside]
+    total, shape, texture = map(sum, zip(*pairs, strict=True))
+    cue = "shape than by texture" if low > 0.0 else "texture than by shape" if high < 0.0 else ""
+    verdict = f"the model goes more by {cue}" if cue else "no difference is shown"
     return (
         f"The most frequent answer about the same object with other textures is given in {percent(shape / total)}, "
         f"and that about the same texture on other objects, of as many answers, in {percent(texture / total)}: "
-        f"{100 * ahead(pairs):.0f} points more by shape (95 % interval {100 * interval[0]:.0f} to "
-        f"{100 * interval[1]:.0f}, over pairs of object and texture): {verdict}."
+        f"{ahead(pairs):.0f} points more by shape (95 % interval {low:.0f} to {high:.0f}, over pairs of object and "
+        f"texture): {verdict}."
     )
+
+
+# ---- mixtures -------------------------------------------------------------------------------------------------------
+
+Doubles = npt.NDArray[np.float64]
+Shares = tuple[float, float, float]
+Triangle = tuple[int, int, bool]  # how far along the first and the second share it is, and whether it points down
+MEANINGLESS = (
+    "The answer is {} in every picture, so that shares of answers tell nothing. Colours are how far the right answer "
+    "leads the best wrong one: the margin with its sign turned, in logits for a classifier."
+)
+
+
+class TernaryOptions(Options):
+    """Options of ternary diagrams of three shares. Of normalised ones the colours of each answer end at its own largest
+    share, and those of leads begin at the smallest; `side` is triangles along a side."""
+
+    shares: tuple[str, str, str]
+    normalised: bool = False
+    most: int = Field(default=3, ge=1, le=6)
+    side: int = Field(default=5, ge=1, le=20)
+
+
+def ternary(rows: Rows, options: TernaryOptions) -> MadeFigure:
+    """Count where in a mixture each answer is given; where all are the same, how far the right one leads."""
+    amounts = np.stack([frame.numbers(rows, name) for name in options.shares], axis=1)
+    sums, names = amounts.sum(axis=1, keepdims=True), [frame.bare(name) for name in options.shares]
+    mixtures = amounts / np.where(sums == 0.0, 1.0, sums)
+    most = mixtures.argmax(axis=1)  # of what most of each mixture is
+    corners = all_triangles(options.side)
+    places = pd.Series([triangle_of(mixture, options.side) for mixture in mixtures])
+    inside = {triangle: (places == triangle).to_numpy() for triangle in corners}
+    given, lead = frame.most_frequent(rows), -rows["margin"].astype(float).to_numpy()
+    leads = {name: lead[(most == number) & ~np.isnan(lead)] for number, name in enumerate(names)}
+    by_lead = len(given) == 1 and min(map(len, leads.values())) >= 2
+    text, table = list[str](), list[list[frame.Cell]]()
+    panels: dict[str, list[float | None]] = {}
+    for answer, times in given[: options.most]:
+        flags = (rows[frame.ANSWER] == answer).to_numpy()
+        values = lead if by_lead else flags
+        known = [values[here & ~np.isnan(values)] for here in inside.values()]
+        panels[answer] = [float(some.mean()) if len(some) else None for some in known]
+        if not by_lead:
+            by_most = [Tally.over(name, rows[most == k], flags[most == k]) for k, name in enumerate(names)]
+            whose = f"{answer}, {percent(times / len(rows))} of all answers, is"
+            if len({tally.share for tally in by_most if tally.total}) == 1:
+                text.append(f"{whose} given as often whatever most of the mixture is: no difference is shown.")
+            else:
+                least, most_often = f"{whose} rarest where most of the mixture", "most frequent where most of it"
+                text += frame.extremes(by_most, least, most_often, "ingredients", "given")
+            table += [[answer, tally.name, *tally.cells] for tally in by_most]
+    heads = ["answer", "where most is", "given in", *frame.COUNT]
+    if by_lead:
+        text = [MEANINGLESS.format(given[0][0]), _told_leads(leads)]
+        heads = ["where most is", "pictures", "mean lead of the right answer", "standard error"]
+        table = [[name, len(own), float(own.mean()), _error(own)] for name, own in leads.items()]
+    if empty := sum(not here.any() for here in inside.values()):
+        text.append(f"No picture was drawn in {empty} of {len(corners)} parts of the diagram, which are hatched.")
+
+    def draw(figure: Any) -> None:
+        each = figure.subplots(1, len(panels), squeeze=False)[0]
+        label = "mean lead of the right answer" if by_lead else "share of answers"
+        for axes, (answer, values) in zip(each, panels.items(), strict=True):
+            colours = _panel(axes, answer, values, list(corners.values()), names)
+            known = [value for value in values if value is not None]
+            low = min(known) if options.normalised and by_lead else min([*known, 0.0])
+            colours.set_clim(low, max([*known, 1e-9]) if options.normalised or by_lead else 1.0)
+            if options.normalised:
+                figure.colorbar(colours, ax=axes, shrink=0.7, location="bottom", label=label)
+        if not options.normalised:
+            figure.colorbar(colours, ax=list(each), shrink=0.7 / len(each), location="bottom", label=label)
+
+    title = options.title or f"Answers over {', '.join(names)}"
+    return MadeFigure(title, text, heads, table, draw, (max(2.4 * len(panels), 4.8), 3.5))
+
+
+def triangle_of(mixture: Sequence[float], side: int) -> Triangle:
+    """Return the triangle that three shares (3,) lie in, of a diagram with so many along a side."""
+    a, b, c = (int(share * side) for share in mixture)
+    while a + b + c >= side:  # where triangles meet
+        a, b, c = (a - 1, b, c) if a >= max(b, c) else (a, b - 1, c) if b >= c else (a, b, c - 1)
+    return a, b, a + b + c < side - 1
+
+
+def all_triangles(side: int) -> dict[Triangle, tuple[Shares, Shares, Shares]]:
+    """Return every triangle of the diagram with the shares at its corners."""
+
+    def at(x: int, y: int) -> Shares:
+        return x / side, y / side, (side - x - y) / side
+
+    found = {}
+    for a, b in product(range(side), range(side)):
+        if a + b >= side:
+            continue
+        found[a, b, False] = at(a, b), at(a + 1, b), at(a, b + 1)
+        if a + b < side - 1:
+            found[a, b, True] = at(a + 1, b + 1), at(a, b + 1), at(a + 1, b)
+    return found
+
+
+def _told_leads(leads: Mapping[str, Doubles]) -> str:
+    """The smallest mean lead beside the largest, by intervals of the normal distribution widened for a choice among
+    all."""
+    least, most = (pick(leads, key=lambda name: leads[name].mean()) for pick in (min, max))
+    wide = NormalDist().inv_cdf(1.0 - (1.0 - CONFIDENCE) / (2.0 * len(leads)))
+    shown = leads[least].mean() + wide * _error(leads[least]) < leads[most].mean() - wide * _error(leads[most])
+    usual = NormalDist().inv_cdf(0.5 + CONFIDENCE / 2.0)
+
+    def told(name: str) -> str:
+        mean, half, count = leads[name].mean(), usual * _error(leads[name]), len(leads[name])
+        return f"{name}: {mean:.3g} (95 % interval {mean - half:.3g} to {mean + half:.3g}, {count} pictures)"
+
+    verdict = "The difference is shown: {} do not overlap" if shown else "No difference is shown: {} overlap"
+    widened = f"their intervals, widened for having been chosen among {len(leads)},"
+    return (
+        f"It leads least where most of the mixture is {told(least)}; most where most of it is {told(most)}. "
+        f"{verdict.format(widened)}."
+    )
+
+
+def _error(values: Doubles) -> float:
+    return float(values.std(ddof=1)) / math.sqrt(len(values))
+
+
+def _panel(
+    axes: Any, answer: str, values: Sequence[float | None], corners: Sequence[Sequence[Shares]], names: Sequence[str]
+) -> Any:
+    """Draw a diagram; what is coloured in it is returned."""
+    from matplotlib.collections import PolyCollection  # matplotlib takes half a second
+
+    def place(shares: Shares) -> tuple[float, float]:  # the first share at the left, the third at the top
+        return shares[1] + shares[2] / 2.0, shares[2] * math.sqrt(3.0) / 2.0
+
+    places = [([place(corner) for corner in three], value) for three, value in zip(corners, values, strict=True)]
+    known = [(at, value) for at, value in places if value is not None]
+    coloured = PolyCollection(
+        [at for at, _ in known], array=[value for _, value in known], cmap="viridis", edgecolors="face"
+    )
+    empty = [at for at, value in places if value is None]
+    axes.add_collection(coloured)
+    axes.add_collection(PolyCollection(empty, facecolors="#eeeeef", edgecolors="#b9bbc0", hatch="////", linewidth=0))
+    outer = [place(corner) for corner in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))]
+    axes.plot(*zip(*outer, outer[0], strict=True), color="#1c1d20", linewidth=0.8)
+    for (x, y), name in zip(outer, names, strict=True):
+        away, side = (-4, "top") if y < 0.1 else (4, "bottom")
+        axes.annotate(name, (x, y), (0, away), textcoords="offset points", ha="center", va=side, fontsize=8)
+    axes.set_title(answer, fontsize=9, loc="center", pad=14)
+    axes.set(xlim=(-0.12, 1.12), ylim=(-0.14, 1.0), aspect="equal")
+    axes.axis("off")
+    return coloured

@@ -1,10 +1,10 @@
-"""How often the model is right, or wrong, by one or two columns: bars, lines along a parameter, or a map of pairs."""
+"""Figures of how often: right or wrong answers by one or two columns, photographs that agree with renderings, pictures
+a second, and parts of a surface that go with wrong answers."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from itertools import pairwise
 from typing import Any, Literal
 
@@ -13,28 +13,16 @@ from pandas.api.types import is_numeric_dtype
 from pydantic import Field
 
 from advsearch.errors import InputError
-from advsearch.questions.recipe.table import (
-    COLOURS,
-    COUNT,
-    MARKS,
-    MODEL,
-    PART,
-    MadeFigure,
-    Options,
-    Rows,
-    Table,
-    Tally,
-    bare,
-    draw_bars,
-    extremes,
-    plural,
-)
-from advsearch.report.wording import figure_value
+from advsearch.questions.recipe import frame
+from advsearch.questions.recipe.description import PHOTOGRAPHS
+from advsearch.questions.recipe.frame import MadeFigure, Options, Rows, Tally
+from advsearch.questions.sweep.answer import surface_sentences
+from advsearch.report.figures import BLUE, MARKS, SERIES, draw_shares
+from advsearch.report.wording import count, figure_value, percent, short_name
+from advsearch.runs.directory import IMAGES, PARTS
 
-BINS = 12
-"""Parts of a range where lines are drawn along it."""
-SHORT = 4
-"""Letters that stand level under a column."""
+BINS, FITTING = 12, 4  # parts of a range where lines are drawn along it, and letters that stand level under a column
+Cells = Mapping[str, Sequence[Tally]]  # counts by the name of a row, one of each series
 
 
 class RatesOptions(Options):
@@ -53,106 +41,103 @@ class RatesOptions(Options):
 
     @property
     def parts(self) -> tuple[str, ...]:
-        """With the part beside them, where parts are named."""
         return (*self.of, *([self.beside] if self.beside and self.of else []))
 
+    @property
+    def what(self) -> str:
+        return self.by if self.away_from is None else f"the distance of {self.by} from {figure_value(self.away_from)}"
 
-def rates(table: Table, options: RatesOptions) -> MadeFigure:
+
+def rates(rows: Rows, options: RatesOptions) -> MadeFigure:
     """Count the answers and say what the counts show."""
-    verb = "wrong" if options.wrong else "right"
-    beside = table.where(table.rows[PART] == options.beside)
-    table = table.where(table.rows[PART] != options.beside)
-    if table.rows.empty:
+    verb, form, second = "wrong" if options.wrong else "right", options.form, options.series
+    beside, rows = rows[rows[frame.PART] == options.beside], rows[rows[frame.PART] != options.beside]
+    if rows.empty:
         raise InputError(f"figures: rates: expected rows of a part beside {options.beside!r}, got none")
-    lines = list(table.by(options.series)) if options.series else [""]
-    groups, middles = _groups(table, options)
+    lines = list(frame.by(rows, second)) if second else [""]
+    groups, middles = _groups(rows, options)
 
-    def counts(name: str, rows: Rows) -> list[Tally]:
-        split = replace(table, rows=rows).by(options.series) if options.series and len(rows) else {"": rows}
-        each = [split.get(line, rows[:0]) for line in lines]
-        return [Tally.over(name, some, some["correct"] != options.wrong) for some in each]
+    def called(name: str) -> str:
+        return options.names.get(name, name)
 
-    cells = {options.names.get(name, name): counts(name, rows) for name, rows in groups.items()}
-    if options.form == "bars" and middles is None and not is_numeric_dtype(table.column(options.by)):
+    def counts(name: str, some: Rows) -> list[Tally]:
+        split = frame.by(some, second) if second and len(some) else {"": some}
+        each = [split.get(line, some[:0]) for line in lines]
+        return [Tally.over(name, part, part["correct"] != options.wrong) for part in each]
+
+    cells = {called(name): counts(name, some) for name, some in groups.items()}
+    if form == "bars" and middles is None and not is_numeric_dtype(frame.column(rows, options.by)):
         cells = dict(sorted(cells.items(), key=lambda item: -(item[1][0].share or 0.0)))
-    series = [options.names.get(name, name) for name in lines]
-    totals = counts("all", table.rows)
-    where = f" where {_of_what(options)}" if middles else ""
-    of_series = plural(options.series or "")
-    thing = plural(options.by) + (f" and {of_series}" if options.series else "")
-    apart = {}
-    if options.beside and len(beside.rows):
-        apart[options.names.get(options.beside, options.beside)] = counts("", beside.rows)
-    text = list[str]()
-    if options.form == "map":
-        pairs = [
-            one.called(f"{row} with {_named(name, options.series or '')}")
-            for row, each in cells.items()
-            for name, one in zip(series, each, strict=True)
-        ]
-        text += extremes(pairs, "The lowest pair", "the highest", f"pairs of {thing}", verb)
-    else:
-        for number, name in enumerate(series):
-            worst = f"For {name}, lowest" if len(series) > 1 else "Lowest"
-            along = [one[number].called(row) for row, one in cells.items()]
-            if len(series) < 2 or sum(one.total > 0 for one in along) > 1:  # of one row all is said below
-                text += extremes(along, f"{worst}{where}", f"highest{where}", plural(options.by), verb)
-    if len(series) > 1:  # in one text, so that figures by other columns do not repeat it
-        overall = [
-            one.called(f"that of {_named(name, options.series or '')}")
-            for name, one in zip(series, totals, strict=True)
-        ]
-        text.append(" ".join(extremes(overall, "Over all, the lowest share", "the highest", of_series, verb)))
-    if options.wrong and options.series == MODEL:
-        text += _relative(cells, series)
-    for name, alone in apart.items():
-        for line, count, total in zip(series, alone, totals, strict=True):
-            more = "is shown" if count.below(total) or total.below(count) else "is not shown"
-            whose = f"{line}, " if len(series) > 1 else ""
-            text.append(f"{whose}{name}: {count.told(verb)}; the others: {total.told(verb)}. A difference {more}.")
-    every = {**apart, **cells, **({"all": totals} if options.series else {})}
-    rows = [
-        [name, *([line] if options.series else []), *count.cells]
-        for name, row in every.items()
-        for line, count in zip(series, row, strict=True)
+    series, totals = [called(name) for name in lines], counts("all", rows)
+    # a number says what it is of: "severity 3"
+    of_series = [
+        f"{frame.bare(second or '')} {name}" if name[:1] in "-0123456789" and name else name for name in series
     ]
-    columns = [options.by, *([options.series] if options.series else []), verb, *COUNT]
-    title = options.title or f"{'Error' if options.wrong else 'Accuracy'} by {thing}"
+    thing = frame.plural(options.by) + (f" and {frame.plural(second)}" if second else "")
+    apart = {called(options.beside): counts("", beside)} if options.beside and len(beside) else {}
+    text = list[str]()
+    if form == "map":
+        tallies = [
+            (row, name, tally) for row, each in cells.items() for name, tally in zip(of_series, each, strict=True)
+        ]
+        pairs = [tally.called(f"{row} with {name}") for row, name, tally in tallies]
+        text += frame.extremes(pairs, "The lowest pair", "the highest", f"pairs of {thing}", verb)
+    else:
+        where = f" where {options.what}" if middles else ""
+        for number, name in enumerate(series):
+            along = [each[number].called(row) for row, each in cells.items()]
+            if len(series) < 2 or sum(tally.total > 0 for tally in along) > 1:  # of one row all is said below
+                worst = f"For {name}, lowest" if len(series) > 1 else "Lowest"
+                text += frame.extremes(along, f"{worst}{where}", f"highest{where}", frame.plural(options.by), verb)
+    if second and len(series) > 1:  # in one text, so that figures by other columns do not repeat it
+        overall = [tally.called(f"that of {name}") for name, tally in zip(of_series, totals, strict=True)]
+        of_all = frame.extremes(overall, "Over all, the lowest share", "the highest", frame.plural(second), verb)
+        text.append(" ".join(of_all))
+    for number, name in enumerate(series[1:] if options.wrong and second == frame.MODEL else (), start=1):
+        # the mean over rows of each model's errors over those of the first; rows without any of that are left out
+        if ratios := [(each[number].share or 0.0) / each[0].share for each in cells.values() if each[0].share]:
+            mean = 100.0 * sum(ratios) / len(ratios)
+            text.append(f"Relative to {series[0]}, in AlexNet's place, the mCE of {name} is {mean:.0f} %.")
+    for name, alone in apart.items():
+        for line, tally, total in zip(series, alone, totals, strict=True):
+            more = "is shown" if tally.below(total) or total.below(tally) else "is not shown"
+            whose = f"{line}, " if len(series) > 1 else ""
+            text.append(f"{whose}{name}: {tally.told(verb)}; the others: {total.told(verb)}. A difference {more}.")
+    every = {**apart, **cells, **({"all": totals} if second else {})}
+    counted = [(name, line, tally) for name, each in every.items() for line, tally in zip(series, each, strict=True)]
+    table = [[name, *([line] if second else []), *tally.cells] for name, line, tally in counted]
 
     def draw(figure: Any) -> None:
-        axes = figure.subplots()
-        label = f"{verb}, share"
-        if options.form == "map":
-            _draw_map(figure, axes, cells, series, (options.by, options.series or "", label))
-        elif options.form == "lines":
+        axes, label = figure.subplots(), f"{verb}, share"
+        if form == "map":
+            _draw_map(axes, cells, series, label)
+            axes.set(ylabel=options.by, xlabel=second or "")
+        elif form == "lines":
             _draw_lines(axes, cells, series, middles or range(len(cells)))
-            unit = f" [{table.unit(options.by)[1:]}]" if table.unit(options.by) else ""
-            axes.set(xlabel=f"{_of_what(options)}{unit}", ylabel=f"{label} with 95 % interval")
+            unit = frame.unit_of(rows, options.by)
+            across = f"{options.what} [{unit[1:]}]" if unit else options.what
+            axes.set(xlabel=across, ylabel=f"{label} with 95 % interval")
         else:
-            draw_bars(axes, {**apart, **cells}, series)
+            shares = {name: [tally.drawn for tally in each] for name, each in {**apart, **cells}.items()}
+            draw_shares(axes, shares, series)
             axes.set(xlabel=f"{label} with 95 % interval")
-        if len(series) > 1 and options.form != "map":
+        if len(series) > 1 and form != "map":
             figure.legend(loc="outside lower center", ncols=min(len(series), 3))
 
     size = {
         "map": (max(2.8 + 0.42 * len(series), 5.4), 1.9 + 0.28 * len(cells)),
         "lines": (6.0, 3.4),
         "bars": (6.0, 1.4 + (0.2 + 0.09 * len(series)) * len({**apart, **cells})),
-    }[options.form]
-    return MadeFigure(title, text, columns, rows, draw, size)
+    }[form]
+    title = options.title or f"{'Error' if options.wrong else 'Accuracy'} by {thing}"
+    return MadeFigure(title, text, [options.by, *([second] if second else []), verb, *frame.COUNT], table, draw, size)
 
 
-def _of_what(options: RatesOptions) -> str:
-    """What numbers are of."""
-    away, by = options.away_from, options.by
-    return by if away is None else f"the distance of {by} from {figure_value(away)}"
-
-
-def _groups(table: Table, options: RatesOptions) -> tuple[Mapping[str, Rows], list[float] | None]:
+def _groups(rows: Rows, options: RatesOptions) -> tuple[Mapping[str, Rows], list[float] | None]:
     """The rows by their values, or by the parts of a range with the middle of each."""
     if options.bins is None and options.form != "lines":
-        return table.by(options.by), None
-    values, bins = table.numbers(options.by), options.bins or BINS
+        return frame.by(rows, options.by), None
+    values, bins, unit = frame.numbers(rows, options.by), options.bins or BINS, frame.unit_of(rows, options.by)
     if options.away_from is not None:
         values = (values - options.away_from).abs()
         if options.turn is not None:  # the shorter way round
@@ -161,54 +146,192 @@ def _groups(table: Table, options: RatesOptions) -> tuple[Mapping[str, Rows], li
     if not high > low:
         raise InputError(f"figures: rates: expected values of {options.by} that differ, got {low:g} to {high:g}")
     places = ((values - low) / (high - low) * bins).clip(upper=bins - 1).where(values.between(low, high)) // 1
-    edges, unit = [low + (high - low) * number / bins for number in range(bins + 1)], table.unit(options.by)
-    ends = list(pairwise(edges))
-    parts = {f"{figure_value(begin)} to {figure_value(end)}{unit}": place for place, (begin, end) in enumerate(ends)}
-    return {name: table.rows[places == place] for name, place in parts.items()}, [(a + b) / 2 for a, b in ends]
+    ends = list(pairwise(low + (high - low) * number / bins for number in range(bins + 1)))
+    named = [f"{figure_value(begin)} to {figure_value(end)}{unit}" for begin, end in ends]
+    return {name: rows[places == place] for place, name in enumerate(named)}, [(a + b) / 2 for a, b in ends]
 
 
-def _named(value: str, column: str) -> str:
-    """A number says what it is of: ``severity 3``."""
-    return f"{bare(column)} {value}" if value[:1].isdigit() or value[:1] == "-" else value
-
-
-def _relative(cells: Mapping[str, Sequence[Tally]], series: Sequence[str]) -> list[str]:
-    """The mean over rows of each model's errors over those of the first; rows without any of that are left out."""
-    text = []
-    for number, name in enumerate(series[1:], start=1):
-        ratios = [(row[number].share or 0.0) / row[0].share for row in cells.values() if row[0].share]
-        if ratios:
-            mean = 100.0 * sum(ratios) / len(ratios)
-            text.append(f"Relative to {series[0]}, in AlexNet's place, the mCE of {name} is {mean:.0f} %.")
-    return text
-
-
-def _draw_map(
-    figure: Any, axes: Any, cells: Mapping[str, Sequence[Tally]], series: Sequence[str], labels: tuple[str, str, str]
-) -> None:
-    shares = [[math.nan if one.share is None else one.share for one in row] for row in cells.values()]
+def _draw_map(axes: Any, cells: Cells, series: Sequence[str], label: str) -> None:
+    shares = [[math.nan if tally.share is None else tally.share for tally in each] for each in cells.values()]
     image = axes.imshow(shares, cmap="RdBu", vmin=0.0, vmax=1.0, aspect="auto")
-    for up, row in enumerate(shares):
-        for across, share in enumerate(row):
-            if not math.isnan(share):
-                colour = "white" if abs(share - 0.5) > 0.3 else "black"
-                axes.text(across, up, f"{100 * share:.0f}", ha="center", va="center", color=colour, fontsize=7.5)
-    turned = {"rotation": 35, "ha": "right", "rotation_mode": "anchor"} if max(map(len, series)) > SHORT else {}
-    axes.set_xticks(range(len(series)), series, **turned)
+    for (up, across), share in np.ndenumerate(shares):
+        if not math.isnan(share):
+            colour = "white" if abs(share - 0.5) > 0.3 else "black"
+            axes.text(across, up, f"{100 * share:.0f}", ha="center", va="center", color=colour, fontsize=7.5)
+    turned = {"rotation": 35, "ha": "right", "rotation_mode": "anchor"}
+    axes.set_xticks(range(len(series)), series, **(turned if max(map(len, series)) > FITTING else {}))
     axes.set_yticks(range(len(cells)), list(cells))
-    axes.set(ylabel=labels[0], xlabel=labels[1])
-    figure.colorbar(image, ax=axes, label=f"{labels[2]} [%]", format=lambda share, _: f"{100 * share:.0f}")
+    axes.figure.colorbar(image, ax=axes, label=f"{label} [%]", format=lambda share, _: f"{100 * share:.0f}")
 
 
-def _draw_lines(
-    axes: Any, cells: Mapping[str, Sequence[Tally]], series: Sequence[str], middles: Sequence[float]
-) -> None:
+def _draw_lines(axes: Any, cells: Cells, series: Sequence[str], middles: Sequence[float]) -> None:
     for number, name in enumerate(series):
-        known = [(at, row[number]) for at, row in zip(middles, cells.values(), strict=True) if row[number].total]
-        at, colour = [place for place, _ in known], COLOURS[number % len(COLOURS)]
-        low, high = ([(one.interval() or (0.0, 1.0))[end] for _, one in known] for end in (0, 1))
+        known = [(at, each[number]) for at, each in zip(middles, cells.values(), strict=True) if each[number].total]
+        at, colour = [place for place, _ in known], SERIES[number % len(SERIES)]
+        low, high = ([(tally.interval() or (0.0, 1.0))[end] for _, tally in known] for end in (0, 1))
         axes.fill_between(at, low, high, color=colour, alpha=0.15, linewidth=0)
         mark = MARKS[number % len(MARKS)]
-        axes.plot(at, [one.share for _, one in known], color=colour, marker=mark, ms=4, label=name)
+        axes.plot(at, [tally.share for _, tally in known], color=colour, marker=mark, ms=4, label=name)
     axes.set(ylim=(-0.03, 1.03))
     axes.grid(True, axis="y")
+
+
+NO_PHOTOGRAPHS = (
+    "There are no photographs yet: nothing is said about reality here. Take some with advsearch dashboard and the "
+    "runs in parts/, or name a folder of them (photographs=FOLDER), and let advsearch resume go on with this run."
+)
+ALL = "all objects"
+
+
+class AgreementOptions(Options):
+    """Options of agreements: the part whose renderings are compared with photographs, and parts that picture the same
+    configurations under other conditions."""
+
+    of: tuple[str, ...] = Field(min_length=1)
+    names: dict[str, str] = Field(default_factory=dict)
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        return (*self.of, PHOTOGRAPHS)
+
+
+def agreement(rows: Rows, options: AgreementOptions) -> MadeFigure:
+    """Count in how many pairs the model is right, or wrong, about a rendering and another picture of the same alike."""
+    renderings = rows[rows[frame.PART] == options.of[0]].dropna(axis=1, how="all")
+    if renderings.empty:
+        raise InputError(f"figures: agreement: expected answers of a part {options.of[0]!r}, got none")
+    # the values that renderings have; other pictures may have more
+    shared = [
+        name for name in renderings if name not in (frame.ANSWER, frame.PART, "correct", "margin", "time", "unit")
+    ]
+    text, table, series = list[str](), list[list[frame.Cell]](), list[str]()
+    bars: dict[str, list[Tally]] = {thing: [] for thing in (ALL, *renderings["object"].unique())}
+    for part in (PHOTOGRAPHS, *options.of[1:]):
+        others, name = rows[rows[frame.PART] == part], options.names.get(part, part)
+        pairs = others.merge(renderings, on=shared, suffixes=("", " rendered"))
+        alone = len(others) - len(pairs)
+        if part == PHOTOGRAPHS and others.empty:
+            text.append(NO_PHOTOGRAPHS)
+            continue
+        if part != PHOTOGRAPHS and alone:
+            raise InputError(f"figures: agreement: expected {part} to have the configurations of {options.of[0]}")
+        series.append(name)
+        for thing, tallies in bars.items():
+            some = pairs if thing == ALL else pairs[pairs["object"] == thing]
+            first, second = some["correct rendered"], some["correct"]
+            four = [int(((first == a) & (second == b)).sum()) for a in (True, False) for b in (True, False)]
+            same = int((some[f"{frame.ANSWER} rendered"] == some[frame.ANSWER]).sum())
+            tallies.append(tally := Tally.over(thing, some, first == second))
+            table.append([name, thing, *four, same, *tally.cells])
+            if thing == ALL and len(some):
+                text.append(
+                    f"Renderings and {name}: {tally.told('right about both or wrong about both')}. "
+                    f"{_where(True, some)} {_where(False, some)} "
+                    f"The answer is the same in {same} of {len(some)} ({percent(same / len(some))})."
+                )
+        if part == PHOTOGRAPHS:
+            text += ["The intervals take photographs as independent."] if len(pairs) else []
+            belong = "belongs" if alone == 1 else "belong"
+            text += [f"{alone} of the photographs {belong} to no rendering and so to no pair."] if alone else []
+
+    def draw(figure: Any) -> None:
+        axes = figure.subplots()
+        shares = {name: [tally.drawn for tally in each] for name, each in bars.items()}
+        draw_shares(axes, shares, series)
+        axes.set(xlabel="share that agrees, with 95 % interval")
+        figure.legend(loc="outside lower center", ncols=1)
+
+    four_heads = ["right, right", "right, wrong", "wrong, right", "wrong, wrong"]
+    heads = ["rendering and", "object", *four_heads, "same answer", "agree", *frame.COUNT]
+    title = options.title or "Renderings and other pictures of the same"
+    return MadeFigure(title, text, heads, table, draw, (6.0, 1.7 + 0.2 * len(series) + 0.34 * (len(bars) - 1)))
+
+
+def _where(right: bool, pairs: Rows) -> str:
+    verb, some = "right" if right else "wrong", pairs[pairs["correct rendered"] == right]
+    if some.empty:
+        return f"It is {verb} about none of the renderings."
+    told = Tally.over("", some, some["correct"] == right).told(verb)
+    return f"Where it is {verb} about the rendering, it is {told} about the other."
+
+
+def scaling(rows: Rows, options: Options) -> MadeFigure:
+    """Measure the pictures a second of sweeps by the number of workers that shared them."""
+    if frame.WORKERS not in rows:
+        raise InputError("figures: scaling: expected sweeps with `workers` among the parts, got none")
+    runs = rows.groupby([frame.WORKERS, "object"], sort=False)["time"].agg(
+        _rate
+    )  # without rows of sweeps that say none
+    by_count = {int(workers): found.droplevel(0) for workers, found in runs.groupby(level=0)}
+    fewest, slowest = next(iter(by_count.items()))
+    text, table = list[str](), list[list[frame.Cell]]()
+    for workers, found in by_count.items():
+        gains = (found / slowest.reindex(found.index)).dropna()
+        table += [[workers, str(name), float(rate), gains.get(name)] for name, rate in found.items()]
+        told = f"{count(workers, 'worker')}: {_spread(found)} pictures a second"
+        if workers > fewest and len(gains):
+            share = 100 * gains.median() * fewest / workers
+            told += f", {_spread(gains)} times as many as {count(fewest, 'worker')} ({share:.0f} % of linear)"
+        text.append(f"{told}.")
+    if (few := min(map(len, by_count.values()))) > 1:
+        text.append(
+            f"Medians of {few} runs, one of each object, with the lowest and the highest, which enclose the median of "
+            f"all such runs with a confidence of {100 * (1 - 0.5 ** (few - 1)):.3g} %."
+        )
+    cores = count(rows.attrs["cores"], "core")
+    text.append(f"This machine gives {cores}; what other programs took of it meanwhile is in these numbers.")
+
+    def draw(figure: Any) -> None:
+        axes, counts = figure.subplots(), list(by_count)
+        straight = [slowest.median() / fewest * workers for workers in counts]
+        axes.plot(counts, straight, color="0.7", label=f"linear, from {count(fewest, 'worker')}")
+        for workers, found in by_count.items():
+            axes.plot([workers] * 2, [found.min(), found.max()], color=BLUE, alpha=0.45, linewidth=3)
+        middle = [found.median() for found in by_count.values()]
+        axes.plot(counts, middle, "o-", color=BLUE, ms=5, label="median; bar: lowest to highest run")
+        axes.set_xticks(counts, list(map(str, counts)))
+        axes.set(xlabel="workers", ylabel="pictures a second", ylim=(0.0, 1.08 * max(*straight, runs.max())))
+        axes.grid(True, axis="y")
+        figure.legend(loc="outside lower center", ncols=2)
+
+    heads = ["workers", "object", "pictures a second", "times as many as the fewest workers"]
+    return MadeFigure(options.title or "Pictures a second by number of workers", text, heads, table, draw, (6.0, 3.4))
+
+
+def _rate(times: Any) -> float:
+    """Pictures a second, without the first quarter, in which workers load; rows of one batch are stored at once."""
+    times = np.sort(times)
+    begun = times[len(times) // 4]
+    if times[-1] <= begun:
+        raise InputError("figures: scaling: expected runs of several batches; ask for more `samples`, or set `batch`")
+    return float((times > begun).sum() / (times[-1] - begun))
+
+
+def _spread(values: Any) -> str:
+    """The median, and where there are several values the ends of them: ``1.9 (1.8 to 2)``."""
+    text = f"{values.median():.3g}"
+    return f"{text} ({values.min():.3g} to {values.max():.3g})" if len(values) > 1 else text
+
+
+def surface(rows: Rows, options: Options) -> MadeFigure:
+    """Show which parts of each object, when seen, go with wrong answers."""
+    surfaces = rows.attrs["surfaces"]
+    if not surfaces:
+        raise InputError("figures: surface: expected a sweep with `surface: true` among its parts, got none")
+
+    def draw(figure: Any) -> None:
+        from matplotlib.image import imread  # matplotlib takes half a second
+
+        for axes, run in zip(figure.subplots(len(surfaces), squeeze=False)[:, 0], surfaces, strict=True):
+            axes.imshow(imread(rows.attrs["folder"] / PARTS / run / IMAGES / "surface.png"))
+            axes.axis("off")
+
+    table: list[list[frame.Cell]] = [
+        [part.object, short_name(part.model), part.part, part.seen, part.compared, part.worse, part.better]
+        for found in surfaces.values()
+        for part in found.tables
+    ]
+    heads = ["object", "model", "parts", "seen", "compared", "with wrong answers", "with right answers"]
+    text = [sentence for found in surfaces.values() for sentence in surface_sentences(found)]
+    title = options.title or "Which parts of the surface go with wrong answers"
+    return MadeFigure(title, text, heads, table, draw, (6.4, 2.65 * len(surfaces)))

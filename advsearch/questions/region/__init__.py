@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from advsearch.config.attack import AttackConfig
 from advsearch.question import Asked, question
+from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.region.answer import RegionConfig, RegionResult
 from advsearch.questions.region.answer import claims as claims
 from advsearch.questions.region.answer import shown as shown

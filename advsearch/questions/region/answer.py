@@ -7,13 +7,21 @@ from typing import Annotated, ClassVar
 
 from pydantic import Field
 
-from advsearch.config.attack import AttackConfig, DerivativeConfig
-from advsearch.config.scene import SceneConfig
+from advsearch.config import DerivativeConfig, SceneConfig
+from advsearch.questions.attack.settings import AttackConfig
 from advsearch.report.markup import InNotebook
-from advsearch.report.phrases import percent
 from advsearch.report.shown import AnswerPart, Claim, Column, Extent, ShownAnswer, claim, share_text
-from advsearch.runs.results.attack import LinearTransport
-from advsearch.runs.results.base import CleanScene, Fields, Formation, Interval, JsonFloat, SceneResult, having
+from advsearch.report.wording import percent
+from advsearch.runs.results import (
+    CleanScene,
+    Fields,
+    Formation,
+    Interval,
+    JsonFloat,
+    LinearTransport,
+    SceneResult,
+    having,
+)
 from advsearch.settings import setting, setting_as_in
 
 FEWEST_SAMPLES = 8

@@ -13,22 +13,22 @@ from advsearch import seeds
 from advsearch.attacks.draws import batches
 from advsearch.attacks.evaluation import most_at_once
 from advsearch.attacks.trials import clopper_pearson
-from advsearch.config import AttackConfig
-from advsearch.engine.attack_parts import LOADING, problem_from_config
 from advsearch.engine.journal import Journal, Shared
-from advsearch.engine.outcome import transport_of
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Stages
 from advsearch.engine.surface_light import LIGHTS, SurfaceLight
-from advsearch.engine.sweeps.predicting import pays_from
 from advsearch.engine.verifier import Verifier, ladder_of
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.question import Asked
+from advsearch.questions.attack.outcome import transport_of
+from advsearch.questions.attack.parts import LOADING, problem_from_config
+from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.region.answer import AxisRange, BoxSide, GrownRegion, MarginMap, RegionConfig, RegionResult
+from advsearch.questions.sweep.predicting import pays_from
 from advsearch.report.figures import MARGIN, Figures, axis_title, figure_of, heat
 from advsearch.runs.directory import CONFIG, RunDirectory, find_run
 from advsearch.runs.files import write_bytes
-from advsearch.runs.results.base import CleanScene, Formation, MovedValue
+from advsearch.runs.results import CleanScene, Formation, MovedValue
 from advsearch.runs.summary import read_answer
 from advsearch.scene.surface import renderer as surface_renderer
 from advsearch.scene.surface.arrangement import CAMERAS, FREE

@@ -8,13 +8,12 @@ from typing import ClassVar
 
 from pydantic import Field, field_validator
 
-from advsearch.config.attack import FEWEST_TRIALS
-from advsearch.config.scene import SceneConfig
+from advsearch.config import SceneConfig
+from advsearch.questions.attack.settings import FEWEST_TRIALS
 from advsearch.report import wording
 from advsearch.report.markup import InNotebook
 from advsearch.report.shown import AnswerPart, Claim, ShownAnswer, case_claim
-from advsearch.runs.results.attack import ControlGroup, VerifiedRate
-from advsearch.runs.results.base import Fields, SceneResult
+from advsearch.runs.results import ControlGroup, Fields, SceneResult, VerifiedRate
 from advsearch.settings import Clash, Config, each_once, setting, setting_as_in, split_names, texts
 
 WAYS = ("samples", "resolution", "depth", "integrator", "sampler", "denoiser", "curve", "jpeg", "sensor", "blender")

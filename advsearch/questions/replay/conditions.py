@@ -15,8 +15,6 @@ from advsearch import seeds
 from advsearch.api.keywords import asks, configured
 from advsearch.controls.corruption import coded
 from advsearch.controls.sensor import SensorControl, through_sensor
-from advsearch.engine.attack_parts import LOADING, SEARCHED_WITH, AttackParts, parts_in, problem_of_parts
-from advsearch.engine.attack_result import AttackResult
 from advsearch.engine.naming import different
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import control_group, verified_rate
@@ -24,11 +22,13 @@ from advsearch.engine.verifier import RetrialCondition, Retrials, kept_answer, u
 from advsearch.errors import InputError
 from advsearch.progress import Progress, Watched, watcher
 from advsearch.question import Asked, answered
+from advsearch.questions.attack.parts import LOADING, SEARCHED_WITH, AttackParts, parts_in, problem_of_parts
+from advsearch.questions.attack.result import AttackResult
+from advsearch.questions.attack.summary import AttackSummary, attack_of
 from advsearch.questions.replay.answer import NOT_DONE, ReplayConfig, ReplayResult, ReplayRow
 from advsearch.runs.directory import RunDirectory, find_run, only_here
-from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.store import NAME, Store
-from advsearch.runs.summary import MADE_WITH, attack_of, changed_file
+from advsearch.runs.summary import MADE_WITH, changed_file
 from advsearch.scene.cycles import BlenderError, Cycles
 from advsearch.scene.renderer import MAX_SPP
 

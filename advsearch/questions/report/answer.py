@@ -9,7 +9,7 @@ from pydantic import Field
 from advsearch.report.markup import Html, element, join_html
 from advsearch.report.shown import Claim
 from advsearch.report.wording import interval_text
-from advsearch.runs.results.base import Fields, Result
+from advsearch.runs.results import Fields, Result
 from advsearch.viewer.document import document, facts_table, heading, study_table
 
 

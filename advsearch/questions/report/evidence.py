@@ -12,14 +12,15 @@ from typing import Any
 from advsearch import __version__, rooms
 from advsearch.errors import AdvsearchError
 from advsearch.options import FROM_RUN
+from advsearch.questions.attack import wording as attack_wording
+from advsearch.questions.attack.summary import AttackSummary
 from advsearch.questions.photographs.answer import FOLDER, PhotoAgreement
 from advsearch.questions.report.answer import Evidence, EvidenceRun
+from advsearch.questions.sweep.summary import SweepSummary
 from advsearch.report import wording
 from advsearch.report.shown import Claim, Extent, claim, nothing_claimed, share_text
 from advsearch.runs.directory import CONFIG, IMAGES, PARTS, find_run, is_run, typed_name
-from advsearch.runs.results.attack import AttackSummary
-from advsearch.runs.results.base import Result, VariedValue
-from advsearch.runs.results.sweep import SweepSummary
+from advsearch.runs.results import Result, VariedValue
 from advsearch.runs.store import NAME as STORE
 from advsearch.runs.store import Store
 from advsearch.runs.summary import MADE_WITH, read_result
@@ -130,13 +131,13 @@ def searched_lines(result: Result, settings: Mapping[str, object]) -> list[str]:
     """Return what could change and how far, a line for each part of it."""
     lines = []
     if isinstance(result, AttackSummary):
-        lines.append(wording.changed_text(result))
+        lines.append(attack_wording.changed_text(result))
         lines += [
             f"{name}: {one.low:.4g} to {one.high:.4g} {one.unit}".rstrip()
             for name, one in (result.configuration or {}).items()
             if one.low is not None and one.high is not None
         ]
-        lines += [wording.over_text(result)] if result.over else []
+        lines += [attack_wording.over_text(result)] if result.over else []
         lines += [f"{name}: {_span(one)}, by chance" for name, one in result.conditions.items()]
     elif isinstance(result, SweepSummary):
         lines += _axes(result)
@@ -206,7 +207,7 @@ def _excluded(result: Result, claims: Sequence[Claim]) -> list[str]:
     """What a reader has to know beside the claims: what stood still, what failed, the run's own warnings."""
     lines = ["Nothing varied but what stands under What varied, and the noise of the renders."]
     if isinstance(result, AttackSummary):
-        lines += [one for one in wording.remarks(result) if one not in result.warnings]
+        lines += [one for one in attack_wording.remarks(result) if one not in result.warnings]
         bad = result.non_finite
         if bad.objectives or bad.gradient_elements:
             lines.append(f"Not finite: {bad.objectives} objectives, {bad.gradient_elements} numbers of gradients.")

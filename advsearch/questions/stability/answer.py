@@ -1,17 +1,55 @@
-"""The result of `stability`."""
+"""What `stability` needs to know, its result, and what a case is; the cases are in the files beside this one."""
 
 from __future__ import annotations
 
 import math
 import textwrap
-from collections.abc import Mapping
-from typing import Annotated, ClassVar
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Annotated, Any, ClassVar
 
 from pydantic import Field
 
+from advsearch.config import SceneConfig, TimedConfig
+from advsearch.errors import AdvsearchError
 from advsearch.report.markup import InNotebook
 from advsearch.report.shown import AnswerPart, Column, ShownAnswer
-from advsearch.runs.results.base import Fields, JsonFloat, Result, having
+from advsearch.runs.results import Fields, JsonFloat, Result, having
+from advsearch.settings import Clash, Config, each_once, setting, setting_as_in, split_names, texts
+
+
+class StabilityConfig(Config):
+    """Everything that decides what `stability` does: which cases it tries, for how long, and where that is kept."""
+
+    command: ClassVar[str] = "stability"
+    free: ClassVar[tuple[str, ...]] = (*Config.free, "seconds")
+    clashes: ClassVar[tuple[Clash, ...]] = tuple(one for one in SceneConfig.clashes if one.setting == "overwrite")
+
+    case: str | None = setting(
+        None, "check", "cases to try, separated by commas", "names of cases", otherwise="all", form="names"
+    )
+    group: str | None = setting(
+        None, "check", "groups of cases to try, separated by commas", "names of groups", otherwise="all", form="names"
+    )
+    seconds: float | None = setting_as_in(TimedConfig, "seconds")
+    run: str | None = setting_as_in(SceneConfig, "run", otherwise="runs/stability-NNN")
+    overwrite: bool = setting_as_in(SceneConfig, "overwrite")
+
+    _named = texts("run", several=["case", "group"])
+    _different = each_once("case", "group")
+
+    @property
+    def cases(self) -> tuple[str, ...]:
+        """Names of cases."""
+        return () if self.case is None else split_names(self.case)
+
+    @property
+    def groups(self) -> tuple[str, ...]:
+        """Names of groups."""
+        return () if self.group is None else split_names(self.group)
+
 
 OK, FELL_SHORT = "ok", "fell short"
 
@@ -80,8 +118,6 @@ class StabilityResult(InNotebook, Result):
         return f"{sum(row.status == OK for row in self.rows)} of {len(self.rows)} hold"
 
 
-RESULT = StabilityResult
-
 COLUMNS: Mapping[str, Column] = {
     "group": "{0.group}",
     "case": "{0.case}",
@@ -112,3 +148,99 @@ def shown(result: StabilityResult) -> ShownAnswer:
             AnswerPart("Not run", [", ".join(result.not_run)]),
         ],
     )
+
+
+# ---- cases -----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a case found: the numbers that decide, and whether every picture and gradient was finite, and none had to be
+    made so.
+
+    Attributes:
+        relative_error: of a gradient (or of what the case is about) against the reference; None where there is none.
+        ending: how the case's search ended, "refused" where the input was, or empty.
+        measured: further numbers that are worth printing.
+    """
+
+    checks: Sequence[Check]
+    finite: bool = True
+    relative_error: float | None = None
+    ending: str = ""
+    measured: Mapping[str, float] = field(default_factory=dict)
+
+    def also(self, *more: Check, **known: Any) -> Outcome:
+        """Return it with further checks, and other fields where they are known."""
+        return replace(self, checks=[*self.checks, *more], **known)
+
+
+@dataclass(frozen=True)
+class Case:
+    """One extreme.
+
+    Attributes:
+        name: unique; what `--case` takes.
+        group: what it is about; what `--group` takes.
+        holds: what must hold, in a sentence.
+        slow: takes more than about a second on two quiet cores, so that the tests run it seldom.
+    """
+
+    name: str
+    group: str
+    holds: str
+    slow: bool
+    find: Callable[[], Outcome]
+
+    def run(self) -> CaseRow:
+        """Run it. An exception is a finding like any other: the case falls short, and the exception says why."""
+        begun = time.perf_counter()
+        try:
+            outcome = self.find()
+        except AdvsearchError as error:
+            outcome = Outcome([check(f"refused: {error}", 1.0, 0.0, 0.0)], ending="refused")
+        except Exception as error:
+            what = f"raised {type(error).__name__}: {error}"
+            outcome = Outcome([check(what, 1.0, 0.0, 0.0)], finite=False, ending="raised")
+        failed = [number for number in outcome.checks if not number.ok]
+        if failed or outcome.finite:
+            decides = "".join(str(number) for number in (failed[:1] or outcome.checks[-1:]))
+        else:
+            decides = "NaN or infinite values"
+        return CaseRow(
+            case=self.name,
+            group=self.group,
+            holds=self.holds,
+            status=OK if outcome.finite and not failed else FELL_SHORT,
+            decides=decides,
+            finite=outcome.finite,
+            relative_error=outcome.relative_error,
+            ending=outcome.ending,
+            checks=list(outcome.checks),
+            measured=dict(outcome.measured),
+            seconds=time.perf_counter() - begun,
+        )
+
+
+CASES: list[Case] = []
+"""Every case, in the order in which they run."""
+
+
+def case(
+    group: str, name: str, holds: str = "", *, slow: bool = False
+) -> Callable[[Callable[[], Outcome]], Callable[[], Outcome]]:
+    """Make a function a case; the first sentence of its docstring says what must hold where `holds` does not."""
+
+    def added(find: Callable[[], Outcome]) -> Callable[[], Outcome]:
+        sentence = holds or " ".join((find.__doc__ or "").partition("\n\n")[0].split())
+        CASES.append(Case(name, group, sentence, slow, find))
+        return find
+
+    return added
+
+
+def cases(group: str, find: Callable[..., Outcome], table: Iterable[tuple[str, str, dict[str, Any]]]) -> None:
+    """Make each row of a table a case: a name, what must hold, and arguments of a function. `slow` is among these."""
+    for name, holds, data in table:
+        given = {key: value for key, value in data.items() if key != "slow"}
+        CASES.append(Case(name, group, holds, bool(data.get("slow")), partial(find, **given)))

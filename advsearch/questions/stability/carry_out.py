@@ -5,24 +5,14 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import advsearch.questions.stability.scenes
 import advsearch.questions.stability.stiff  # noqa: F401  (both fill `CASES`)
-from advsearch.api.keywords import asks, configured
 from advsearch.engine.record import Results, kept_rows
 from advsearch.errors import UnknownNameError
-from advsearch.progress import NullProgress, Progress, Watched, watcher
-from advsearch.questions.stability.answer import CaseRow, StabilityResult
-from advsearch.questions.stability.settings import StabilityConfig
-from advsearch.questions.stability.suite import CASES, Case
+from advsearch.progress import NullProgress, Progress
+from advsearch.questions.stability.answer import CASES, Case, CaseRow, StabilityConfig, StabilityResult
 from advsearch.runs.directory import RunDirectory
-
-
-@asks(StabilityConfig)
-def stability(*, progress: Watched = None, **settings: Any) -> StabilityResult:
-    """Try stiff and extreme scenes, and say whether each of them holds (docs/stability.md)."""
-    return stability_from_config(configured(StabilityConfig, **settings), progress=watcher(progress))
 
 
 def stability_from_config(
@@ -59,6 +49,11 @@ def stability_from_config(
             )
 
         return kept_rows(run, results, rows(), result)
+
+
+def sentences() -> dict[str, str]:
+    """Return what must hold in each case, by its name; behind the group that it is of."""
+    return {case.name: f"{case.group}: {case.holds}" for case in CASES}
 
 
 def chosen(names: Sequence[str] = (), groups: Sequence[str] = ()) -> list[Case]:

@@ -16,9 +16,8 @@ from advsearch.attacks import PGD, Domain, Evaluation, Query, SearchResult, sear
 from advsearch.controls import Space, make_control, make_space
 from advsearch.engine import objective
 from advsearch.engine.gradients import Loss, derivatives, smooth_loss
-from advsearch.questions.stability.answer import check, holds
-from advsearch.questions.stability.suite import Outcome
-from advsearch.runs.results.base import Measured
+from advsearch.questions.stability.answer import Outcome, check, holds
+from advsearch.runs.results import Measured
 from advsearch.scene import library
 from advsearch.scene.assembly import Motion
 from advsearch.scene.assets import EnvironmentAsset, Floats, Material, Mesh, ObjectAsset

@@ -16,7 +16,7 @@ from advsearch.attacks import PGD, Adam, Auto, Query, search
 from advsearch.controls.occlusion import sphere
 from advsearch.engine.gradients import smooth_loss
 from advsearch.errors import InputError
-from advsearch.questions.stability.answer import check, holds
+from advsearch.questions.stability.answer import Outcome, case, cases, check, holds
 from advsearch.questions.stability.scene import (
     ERROR,
     REFERENCE_SPP,
@@ -36,7 +36,6 @@ from advsearch.questions.stability.scene import (
     shown,
     small,
 )
-from advsearch.questions.stability.suite import Outcome, case, cases
 from advsearch.scene.assets import EnvironmentAsset, ObjectAsset, normalised
 from advsearch.scene.description import describe
 from advsearch.scene.environments import import_environment

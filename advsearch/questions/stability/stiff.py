@@ -16,9 +16,8 @@ from torch import Tensor
 
 from advsearch.attacks import PGD, search
 from advsearch.engine.gradients import smooth_loss
-from advsearch.questions.stability.answer import check, holds
+from advsearch.questions.stability.answer import Outcome, case, cases, check, holds
 from advsearch.questions.stability.scene import SHARPNESS, ControlSettings, Evaluator, search_domain, seen, shown, small
-from advsearch.questions.stability.suite import Outcome, case, cases
 
 RATIO = 1e6
 

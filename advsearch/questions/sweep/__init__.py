@@ -6,11 +6,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from advsearch.config import AttackConfig, SweepConfig
 from advsearch.question import Asked, question
+from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.sweep.answer import claims as claims
 from advsearch.questions.sweep.answer import shown as shown
-from advsearch.runs.results.sweep import SweepSummary
+from advsearch.questions.sweep.page import page as page
+from advsearch.questions.sweep.settings import SweepConfig
+from advsearch.questions.sweep.summary import SweepSummary
 
 
 def of_the_answer(file: Path, typed: Mapping[str, Any]) -> dict[str, Any]:

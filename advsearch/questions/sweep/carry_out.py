@@ -12,11 +12,8 @@ import torch
 
 from advsearch.api.keywords import asks
 from advsearch.cluster import Call
-from advsearch.config import AttackConfig, SweepConfig
 from advsearch.controls import Control
 from advsearch.controls.camera import CameraControl, measured_in
-from advsearch.engine.attack_parts import LOADING, executor_for, is_named
-from advsearch.engine.attack_result import AttackResult
 from advsearch.engine.journal import answering, check_made_of
 from advsearch.engine.judging import (
     Metric,
@@ -41,26 +38,32 @@ from advsearch.engine.naming import (
     scene_of,
     several,
 )
-from advsearch.engine.sweeps import Job, NamedScene, check_all, check_scenes
-from advsearch.engine.sweeps.axes import Axis, on_grid, read_axes
-from advsearch.engine.sweeps.drives import with_frames
-from advsearch.engine.sweeps.loop import carry_out
-from advsearch.engine.sweeps.summary import SweepResult
-from advsearch.engine.sweeps.swept_scene import Scenes
 from advsearch.errors import InputError
 from advsearch.files import JsonObject
 from advsearch.models import Model
 from advsearch.options import as_setting
 from advsearch.progress import NullProgress, Progress, Watched, watcher
+from advsearch.questions.attack.parts import LOADING, executor_for, is_named
+from advsearch.questions.attack.result import AttackResult
+from advsearch.questions.attack.settings import AttackConfig
+from advsearch.questions.attack.summary import attack_of
+from advsearch.questions.sweep.axes import Axis, on_grid, read_axes
+from advsearch.questions.sweep.drives import with_frames
+from advsearch.questions.sweep.job import Job, NamedScene, Scenes, check_all, check_scenes
+from advsearch.questions.sweep.loop import carry_out
+from advsearch.questions.sweep.result import SweepResult
+from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.runs.directory import CONFIG, RunDirectory, begun, check_free, find_run, is_run, run_path
 from advsearch.runs.listing import finished
-from advsearch.runs.summary import attack_of, read_answer
+from advsearch.runs.summary import read_answer
 from advsearch.scene.description import ENVIRONMENT
 from advsearch.scene.surfaces import aovs_of
+from advsearch.scene.things import ALL
 from advsearch.settings import split_names
 from advsearch.tasks import AnyTask, OwnTask, Task, function_of, make_task
+from advsearch.tasks.each_thing import each_thing
 
-OF_A_SCENE = ("object", "environment", "up", "camera", "set_", "exposure")
+OF_A_SCENE = ("object", "environment", "up", "size", "unit", "camera", "things", "set_", "exposure")
 """Settings that a scene of the caller's own has."""
 
 ANSWERING = "advsearch.questions.sweep.carry_out:sweep_answers"
@@ -239,7 +242,10 @@ def _described(places: Sequence[NamedScene]) -> dict[str, object]:
         "object": ",".join(dict.fromkeys(place.object for place in places)),
         "environment": ",".join(dict.fromkeys(place.environment for place in places)),
         "up": first.up,
+        "size": first.size if len(places) == 1 else None,
+        "unit": first.unit,
         "camera": named_camera(first),
+        "things": first.things_spec or None,
         "set": first.given_values if len(places) == 1 else {},
     }
 
@@ -287,6 +293,7 @@ def _job(
     scenes = [place.scene for place in places]
     tasks = tuple(shown(made.on(network), network, scenes, config) for network in networks)
     warnings += [remark for task in tasks for remark in task.remarks]
+    tasks = tuple(map(each_thing, tasks)) if config.judge == ALL else tasks
     own = {place.object: place.scene.description.object.label for place in places}
     warnings += one_label_for_several(networks, config.label, own)
     for place in places:
@@ -294,7 +301,7 @@ def _job(
         for control in on_grid(drawn, axes, described):
             described = control.prepare(described) if control.kind == ENVIRONMENT else described
         warnings += described.notes
-    return Job(
+    job = Job(
         config=config,
         places=tuple(places),
         models=networks,
@@ -302,8 +309,10 @@ def _job(
         controls=drawn,
         axes=axes,
         aovs=aovs_of(config.aov),
-        warnings=tuple(dict.fromkeys(warnings)),
     )
+    for place in places:
+        warnings += job.space(place, job.sizes[0]).notes(place.scene.description)
+    return replace(job, warnings=tuple(dict.fromkeys(warnings)))
 
 
 def _places(config: SweepConfig) -> tuple[NamedScene, ...]:

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from advsearch.cli import output
+from advsearch.cli.commands import Positional, QuestionCommand
 from advsearch.cli.output import at_work
-from advsearch.cli.question import Positional, QuestionCommand
 from advsearch.errors import InputError
 
 if TYPE_CHECKING:

@@ -13,15 +13,22 @@ from xml.etree import ElementTree
 from pydantic import Field
 
 from advsearch import __version__
-from advsearch.config.attack import AttackConfig
-from advsearch.config.scene import SceneConfig
-from advsearch.questions.test.settings import AnyClaim, NoWorseClaim, RightClaim
+from advsearch.config import SceneConfig
+from advsearch.questions.attack.settings import AttackConfig
+from advsearch.questions.attack.summary import AttackSummary
+from advsearch.questions.test.settings import (
+    BLIND,
+    HARMLESS,
+    AnyClaim,
+    MustChangeClaim,
+    MustNotChangeClaim,
+    NoWorseClaim,
+    RightClaim,
+)
 from advsearch.report.markup import InNotebook
-from advsearch.report.phrases import percent, with_article
 from advsearch.report.shown import AnswerPart, Claim, Kind, Picture, ShownAnswer
-from advsearch.report.wording import count, interval_text, number_text, seconds_text, short_name
-from advsearch.runs.results.attack import AttackSummary
-from advsearch.runs.results.base import Fields, Interval, JsonFloat, RunResult
+from advsearch.report.wording import count, interval_text, number_text, percent, seconds_text, short_name, with_article
+from advsearch.runs.results import Fields, Interval, JsonFloat, RunResult
 
 HELD, UNDECIDED, FAILED = "held", "undecided", "failed"
 ANSWERS = (HELD, UNDECIDED, FAILED)
@@ -35,14 +42,18 @@ class ClaimAnswer(Fields):
     """One claim, or one counterexample, and what came out."""
 
     name: str = Field(description="in the suite; of a counterexample, its file's")
-    kind: str = Field(description="`right`, `not_broken`, `no_worse` or `counterexample`")
+    kind: str = Field(
+        description="`right`, `not_broken`, `no_worse`, `must_change`, `must_not_change` or `counterexample`"
+    )
     statement: str = Field(description="what is claimed, in words")
     answer: str = Field(description="`held`, `failed` or `undecided`")
     reason: str = Field(description="why, with the numbers")
     expected: str = Field(HELD, description="what it said when `update` was given last; absent for `held`")
     pictures: int = Field(0, description="that it took; absent if none")
     rate: JsonFloat | None = Field(
-        None, description="share of right answers, or the difference of two models; absent of a search"
+        None,
+        description="share of right answers, or of pictures as claimed; of two models the difference; absent of "
+        "a search",
     )
     interval: Interval | None = Field(
         None,
@@ -133,6 +144,10 @@ def statement(claim: AnyClaim, config: SceneConfig) -> str:
         spanned = "the frames" if "path" in config.controls else "the pictures"
         share = f"at least {percent(claim.at_least)} of {spanned} that the ranges span"
         return f"{short_name(config.model)} is right in {share}: {what}"
+    if isinstance(claim, MustChangeClaim | MustNotChangeClaim):
+        says = "says something else" if isinstance(claim, MustChangeClaim) else "says the same"
+        when = f"{(BLIND | HARMLESS)[claim.when]}, in at least {percent(claim.at_least)} of pictures"
+        return f"{short_name(config.model)} {says} when {when}: {what}"
     if isinstance(claim, NoWorseClaim):
         points = f"{number_text(claim.points)} points"
         models = f"{short_name(config.model)} is right at most {points} less often than {short_name(claim.than)}"
@@ -142,10 +157,10 @@ def statement(claim: AnyClaim, config: SceneConfig) -> str:
     return f"no search finds a picture that {short_name(config.model)} gets wrong: {what}{within}"
 
 
-def right_reason(answer: str, right: int, pictures: int, interval: tuple[float, float], worst: str) -> str:
-    """Return why a claim about a share is held, failed or undecided, with the interval at all times together. `worst`
-    is what was seen where it was most wrong; empty where it never was."""
-    said = f"right in {right} of {pictures} (interval {interval_text(interval)})" if pictures else "no picture"
+def share_reason(what: str, answer: str, right: int, pictures: int, interval: tuple[float, float], worst: str) -> str:
+    """Return why a claim about a share is held, failed or undecided, with the interval at all times together. `what` is
+    so in `right` of the pictures; `worst` says where it was not, and is empty where it always was."""
+    said = f"{what} in {right} of {pictures} (interval {interval_text(interval)})" if pictures else "no picture"
     more = f"; not decided after {count(pictures, 'picture')}" if answer == UNDECIDED else ""
     return said + more + (f"; {worst}" if worst else "")
 
@@ -253,6 +268,8 @@ MEANINGS = {
     "right": "The model is right in at least a share of the pictures that some controls span.",
     "not_broken": "No search finds a configuration within a budget that the model gets wrong.",
     "no_worse": "The model is right at most so many points less often than another one, on the same pictures.",
+    "must_change": "The model says something else where there is nothing left to see.",
+    "must_not_change": "The model says the same where a change means nothing.",
     "counterexample": "The model is right on the answer of an earlier search.",
 }
 """What a claim of each kind says; the rules of SARIF."""

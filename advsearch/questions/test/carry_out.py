@@ -10,12 +10,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from advsearch.config import AttackConfig, SceneConfig
-from advsearch.engine.attack_parts import check_from_config
+from advsearch.config import SceneConfig
 from advsearch.engine.record import Results
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.interrupts import interruptible
 from advsearch.progress import NullProgress, Progress
+from advsearch.questions.attack.parts import check_from_config
+from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.test.answer import (
     FAILED,
     NOT_TRIED,
@@ -27,7 +28,8 @@ from advsearch.questions.test.answer import (
     statement,
     verdict,
 )
-from advsearch.questions.test.claims import Trial, check_pictures
+from advsearch.questions.test.changes import OTHER_SCENE
+from advsearch.questions.test.claims import Trial, check_pictures, with_scene
 from advsearch.questions.test.counterexamples import (
     Counterexample,
     add,
@@ -38,6 +40,7 @@ from advsearch.questions.test.counterexamples import (
 )
 from advsearch.questions.test.settings import (
     COUNTEREXAMPLES,
+    MustChangeClaim,
     NotBrokenClaim,
     NoWorseClaim,
     Suite,
@@ -46,7 +49,7 @@ from advsearch.questions.test.settings import (
     suite_of,
 )
 from advsearch.runs.directory import RunDirectory
-from advsearch.runs.results.base import INTERRUPTED, OUT_OF_TIME
+from advsearch.runs.results import INTERRUPTED, OUT_OF_TIME
 from advsearch.runs.store import NAME as STORE
 from advsearch.runs.store import Store
 from advsearch.viewer.pages import keep_answer
@@ -267,6 +270,8 @@ def _check(planned: Sequence[PlannedClaim], suite: Suite) -> list[str]:
         wanted = [whole]
         if isinstance(claim, NoWorseClaim):
             wanted.append(whole.model_copy(update={"model": claim.than}))
+        if isinstance(claim, MustChangeClaim) and claim.when in OTHER_SCENE:
+            wanted.append(AttackConfig.of(with_scene(whole, claim)))
         for config in wanted:
             if config not in known:
                 try:

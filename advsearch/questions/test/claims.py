@@ -10,20 +10,23 @@ from itertools import islice
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from advsearch import seeds
-from advsearch.api.studies import carry_out_part
 from advsearch.attacks import Evaluation
 from advsearch.attacks.evaluation import Query
 from advsearch.attacks.trials import ConfidenceSequence, clopper_pearson, draws_needed
-from advsearch.config import AttackConfig, SceneConfig
-from advsearch.engine.attack_parts import executor_for, parts_of, problem_of
+from advsearch.config import SceneConfig
 from advsearch.engine.journal import Journal, Shared, answering
 from advsearch.engine.problem import Problem
 from advsearch.engine.verifier import ladder_of
 from advsearch.errors import InputError
 from advsearch.files import JsonObject
 from advsearch.progress import Progress
+from advsearch.questions.attack.parts import executor_for, parts_of, problem_of
+from advsearch.questions.attack.settings import AttackConfig
+from advsearch.questions.attack.studies import carry_out_part
+from advsearch.questions.attack.summary import AttackSummary
 from advsearch.questions.test.answer import (
     FAILED,
     HELD,
@@ -31,15 +34,23 @@ from advsearch.questions.test.answer import (
     UNDECIDED,
     ClaimAnswer,
     difference_reason,
-    right_reason,
     search_answer,
+    share_reason,
     tried_reason,
 )
+from advsearch.questions.test.changes import ALIKE, CHANGED, OTHER_SCENE
 from advsearch.questions.test.counterexamples import TRIALS, Counterexample, is_over, same_scene
-from advsearch.questions.test.settings import AnyClaim, DrawnConfig, NoWorseClaim, RightClaim
+from advsearch.questions.test.settings import (
+    AnyClaim,
+    DrawnConfig,
+    MustChangeClaim,
+    MustNotChangeClaim,
+    NoWorseClaim,
+    RightClaim,
+    ShareClaim,
+)
 from advsearch.report.wording import number_text
 from advsearch.runs.directory import IMAGES, PARTS, RunDirectory
-from advsearch.runs.results.attack import AttackSummary
 from advsearch.settings import split_names
 
 MANY = 4
@@ -79,6 +90,8 @@ class Trial:
             return self._right(asked, claim, config)
         if isinstance(claim, NoWorseClaim):
             return self._no_worse(asked, claim, config)
+        if isinstance(claim, MustChangeClaim | MustNotChangeClaim):
+            return self._changes(asked, claim, config)
         assert isinstance(config, AttackConfig)
         return self._not_broken(asked, config)
 
@@ -106,55 +119,101 @@ class Trial:
             _, query, label = wrong[0]
             worst = f"most wrong where it says {label}: {self._described(problem, query)}"
             picture = self._picture(asked.name, problem, query)
-        reason = right_reason(answer, right, sequence.count, sequence.interval, worst)
+        reason = share_reason("right", answer, right, sequence.count, sequence.interval, worst)
         return self._decided(asked, answer, reason, sequence, config, picture, (0.0, 1.0))
 
     def _no_worse(self, asked: ClaimAnswer, claim: NoWorseClaim, config: SceneConfig) -> ClaimAnswer:
         problem, other = self._problem(config), self._problem(config.model_copy(update={"model": claim.than}))
         same = other.renderer.formation == problem.renderer.formation
         sequence, ours, theirs, answer = ConfidenceSequence(self.confidence, sides=1), 0, 0, UNDECIDED
-        kind, first = f"claim {asked.name}", None
-        self.progress.stage(asked.name, claim.pictures, hint="fewer pictures in the suite shorten it", at_most=True)
+        first = None
         shared = self._shared(config).model_copy(update={"model": f"{config.model},{claim.than}"})
         with executor_for(shared, "advsearch.questions.test.claims:answering_of", self.progress) as executor:
             journal = Journal(self.run, Shared(problem, executor, "0"))
             beside = Journal(self.run, Shared(other, executor, "1"))
-            pictures: dict[int, torch.Tensor | None] = {}
-
-            def shown(queries: Sequence[Query]) -> Iterator[Evaluation]:
-                """The answers of the model, whose pictures the other one is shown."""
-                answers = journal.traced([replace(query, keep=same) for query in queries])
-                for query, evaluation in zip(queries, answers, strict=True):
-                    pictures[query.number] = evaluation.picture
-                    yield evaluation
-
-            def shown_again(queries: Sequence[Query]) -> Iterable[Evaluation]:
-                if not same:
-                    return beside.traced(queries)
-                return (_judged(other, query, pictures.get(query.number)) for query in queries)
-
-            queries = drawn(problem, kind, claim.pictures, spp_of(config))
-            while answer == UNDECIDED and (batch := list(islice(queries, self._at_once(journal)))):
-                pictures.clear()
-                mine = list(journal.answers(batch, shown))
-                both = beside.answers([replace(query, kind=f"{kind} beside") for query in batch], shown_again)
-                for query, own, its in zip(batch, mine, both, strict=True):
-                    ours += own.said.right and not its.said.right
-                    theirs += its.said.right and not own.said.right
-                    if first is None and its.said.right and not own.said.right:
-                        first = query
-                    sequence.add((own.said.right - its.said.right + 1) / 2)
-                    self.progress.advance(1, **journal.traced.told)
-                    answer = decided(sequence, least_mean(claim))
-                    if answer != UNDECIDED:
-                        break
-                if self.late():
+            for query, own, its in self._pairs(asked, claim, config, journal, beside, Tensor.clone if same else None):
+                ours += own.said.right and not its.said.right
+                theirs += its.said.right and not own.said.right
+                if first is None and its.said.right and not own.said.right:
+                    first = query
+                sequence.add((own.said.right - its.said.right + 1) / 2)
+                answer = decided(sequence, least_mean(claim))
+                if answer != UNDECIDED:
                     break
         low, high = sequence.interval
         counts = (sequence.count, ours, theirs)
         reason = difference_reason(answer, counts, (2 * low - 1, 2 * high - 1), claim.than)
         picture = None if first is None else self._picture(asked.name, problem, first)
         return self._decided(asked, answer, reason, sequence, config, picture, (-1.0, 2.0))
+
+    def _changes(
+        self, asked: ClaimAnswer, claim: MustChangeClaim | MustNotChangeClaim, config: SceneConfig
+    ) -> ClaimAnswer:
+        """Whether a change of the picture changes what the model says, or not."""
+        problem = self._problem(config)
+        other = self._problem(with_scene(config, claim)) if claim.when in OTHER_SCENE else problem
+        sequence, held, example, answer = ConfidenceSequence(self.confidence, sides=1), 0, "", UNDECIDED
+        picture = None
+        shared = self._shared(config)
+        with executor_for(shared, "advsearch.questions.attack.carry_out:attack_answers", self.progress) as executor:
+            journal, beside = Journal(self.run, Shared(problem, executor)), Journal(self.run, Shared(other))
+            for query, own, its in self._pairs(asked, claim, config, journal, beside, CHANGED.get(claim.when)):
+                before, after = own.said.answer, its.said.answer
+                moved = abs((before.probability or 0.0) - (after.probability or 0.0))
+                another = before.label != after.label
+                as_claimed = another or moved > ALIKE if claim.claim == "must_change" else not another
+                held += as_claimed
+                if not as_claimed and picture is None:
+                    example = f"{before.label} before and {after.label} after: {self._described(problem, query)}"
+                    picture = self._picture(asked.name, problem, query)
+                sequence.add(float(as_claimed))
+                answer = decided(sequence, least_mean(claim))
+                if answer != UNDECIDED:
+                    break
+        reason = share_reason("as claimed", answer, held, sequence.count, sequence.interval, example)
+        return self._decided(asked, answer, reason, sequence, config, picture, (0.0, 1.0))
+
+    def _pairs(
+        self,
+        asked: ClaimAnswer,
+        claim: NoWorseClaim | MustChangeClaim | MustNotChangeClaim,
+        config: SceneConfig,
+        journal: Journal,
+        beside: Journal,
+        shown: Callable[[Tensor], Tensor] | None,
+    ) -> Iterator[tuple[Query, Evaluation, Evaluation]]:
+        """Yield a claim's pictures, what is said of each, and what the other side says of what is `shown` to it of this
+        picture; without, of a picture of its own."""
+        kind = f"claim {asked.name}"
+        self.progress.stage(asked.name, claim.pictures, hint="fewer pictures in the suite shorten it", at_most=True)
+        problem, other = journal.traced.problem, beside.traced.problem
+        pictures: dict[int, Tensor | None] = {}
+
+        def here(queries: Sequence[Query]) -> Iterator[Evaluation]:
+            answers = journal.traced([replace(query, keep=shown is not None) for query in queries])
+            for query, evaluation in zip(queries, answers, strict=True):
+                pictures[query.number] = evaluation.picture
+                yield evaluation
+
+        def there(queries: Sequence[Query]) -> Iterable[Evaluation]:
+            if shown is None:
+                return beside.traced(queries)
+            return (_judged(other, query, shown(picture_of(query))) for query in queries)
+
+        def picture_of(query: Query) -> Tensor:
+            kept = pictures.get(query.number)  # what was asked before is read back, without its picture
+            return problem.picture(query.u, query.seed, query.spp) if kept is None else kept
+
+        queries = drawn(problem, kind, claim.pictures, spp_of(config))
+        while batch := list(islice(queries, self._at_once(journal))):
+            pictures.clear()
+            mine = list(journal.answers(batch, here))
+            both = beside.answers([replace(query, kind=f"{kind} beside") for query in batch], there)
+            for query, own, its in zip(batch, mine, both, strict=True):
+                self.progress.advance(1, **journal.traced.told)
+                yield query, own, its
+            if self.late():
+                return
 
     def _not_broken(self, asked: ClaimAnswer, config: AttackConfig) -> ClaimAnswer:
         seconds = min(self.left(), config.seconds or math.inf)
@@ -214,7 +273,7 @@ class Trial:
         whole = AttackConfig.of(config)
         parts = parts_of(whole)
         problem = problem_of(whole, parts.scene, parts.loaded[0], differentiated=False)
-        self.warnings += [*parts.scene.description.notes, *parts.loaded[1]]
+        self.warnings += [*problem.space.notes(parts.scene.description), *parts.loaded[1]]
         return problem
 
     def _shared(self, config: SceneConfig) -> AttackConfig:
@@ -284,10 +343,13 @@ def answering_of(settings: JsonObject) -> Callable[[Any], Any]:
     return answering(cache(problem))
 
 
-def _judged(problem: Problem, query: Query, picture: torch.Tensor | None) -> Evaluation:
-    """What a model says of a picture that another one was shown; it is rendered if it is not at hand."""
-    picture = problem.picture(query.u, query.seed, query.spp) if picture is None else picture
+def _judged(problem: Problem, query: Query, picture: Tensor) -> Evaluation:
     return Evaluation.of(problem.judge(picture, problem.whole(query.u)))
+
+
+def with_scene(config: SceneConfig, claim: MustChangeClaim | MustNotChangeClaim) -> SceneConfig:
+    """Return what the changed scene of a claim is made with."""
+    return config.model_copy(update={"set_": {**config.set_, **OTHER_SCENE.get(claim.when, {})}})
 
 
 def drawn(problem: Problem, kind: str, count: int, spp: int) -> Iterator[Query]:
@@ -300,10 +362,10 @@ def drawn(problem: Problem, kind: str, count: int, spp: int) -> Iterator[Query]:
         yield Query(u, seed, kind, number, spp=spp, values=values, sought=False)
 
 
-def least_mean(claim: RightClaim | NoWorseClaim) -> float:
-    """Return what the mean of the draws is claimed to be over: 1 for right and 0 for wrong; or 0, 1/2 and 1, of two
+def least_mean(claim: ShareClaim | NoWorseClaim) -> float:
+    """Return what the mean of the draws is claimed to be over: 1 for as claimed and 0 for not; or 0, 1/2 and 1, of two
     models."""
-    return claim.at_least if isinstance(claim, RightClaim) else 0.5 - claim.points / 200.0
+    return claim.at_least if isinstance(claim, ShareClaim) else 0.5 - claim.points / 200.0
 
 
 def check_pictures(name: str, claim: AnyClaim, confidence: float) -> str:
@@ -312,7 +374,7 @@ def check_pictures(name: str, claim: AnyClaim, confidence: float) -> str:
     Raises:
         InputError: no answers to so many pictures could decide it, or only one way.
     """
-    if not isinstance(claim, RightClaim | NoWorseClaim):
+    if not isinstance(claim, ShareClaim | NoWorseClaim):
         return ""
     least = least_mean(claim)
     needed = max(draws_needed(one, confidence=confidence) for one in (least, 1.0 - least))

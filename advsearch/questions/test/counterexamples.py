@@ -19,19 +19,20 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from torch import Tensor
 
 from advsearch import seeds
-from advsearch.config import AttackConfig, SceneConfig
-from advsearch.engine.attack_parts import parts_in, problem_of_parts
+from advsearch.config import SceneConfig
 from advsearch.engine.loading import Scene
 from advsearch.engine.problem import Problem
 from advsearch.engine.verifier import kept_answer
 from advsearch.errors import FileFormatError, InputError
 from advsearch.files import parse_json, read_text
+from advsearch.questions.attack.parts import parts_in, problem_of_parts
+from advsearch.questions.attack.settings import AttackConfig
+from advsearch.questions.attack.summary import attack_of
 from advsearch.questions.test.answer import ANSWERS, HELD
 from advsearch.questions.test.settings import OWN, Suite
 from advsearch.runs.directory import CONFIG, IMAGES, PARTS, default_name, find_run
 from advsearch.runs.files import write_bytes, write_text
 from advsearch.runs.images import read_png
-from advsearch.runs.summary import attack_of
 from advsearch.settings import FILES, settings
 from advsearch.viewer.thumbnails import thumbnail
 

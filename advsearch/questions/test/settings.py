@@ -12,9 +12,9 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
-from advsearch.config.attack import AttackConfig
-from advsearch.config.scene import SceneConfig
+from advsearch.config import SceneConfig
 from advsearch.errors import FileFormatError, InputError, resembling
+from advsearch.questions.attack.settings import AttackConfig
 from advsearch.settings import (
     Clash,
     Config,
@@ -142,14 +142,29 @@ PICTURES, MOST = 400, 1_000_000
 COUNTEREXAMPLES = "counterexamples"
 """What stands for all of them, and no claim is called."""
 
+BLIND = {
+    "black": "the picture is black",
+    "covered": "the camera is covered (one even colour, the picture's mean)",
+    "away": "the object is taken away",
+}
+"""Changes with which nothing is left to see of the object: a model that looks at it says something else."""
+
+HARMLESS = {
+    "exposure": "the exposure is a third of a stop higher",
+    "shift": "the picture moves by one pixel to the right",
+    "jpeg": "the picture is a JPEG file of quality 95",
+}
+"""Changes that mean nothing: it says the same."""
+
 Settings = dict[str, object]
 
 EXPECTED = {
-    "claim": "right, not_broken or no_worse",
+    "claim": "right, not_broken, no_worse, must_change or must_not_change",
     "claims": "names with a claim each, such as `right-around: {claim: right, at_least: 0.9}`",
     "at_least": "a share over 0 and under 1, such as 0.95",
     "points": "percentage points over 0 and under 100, such as 2",
     "pictures": f"a whole number from 1 to {MOST}",
+    "when": f"{', '.join(BLIND)} of must_change, and {', '.join(HARMLESS)} of must_not_change",
     "than": "another model, by its name or its file",
     "confidence": "a number from 0.5 to 0.9999, such as 0.95",
     "seconds": "a number of seconds over 0",
@@ -181,8 +196,8 @@ class _Claim(_Described):
     settings: Settings = Field(default_factory=dict)
 
 
-class RightClaim(_Claim):
-    """The model is right in at least a share of the pictures that the controls span.
+class ShareClaim(_Claim):
+    """Something is so in at least a share of the pictures that the controls span.
 
     Attributes:
         at_least: that share.
@@ -190,7 +205,6 @@ class RightClaim(_Claim):
     """
 
     kind: ClassVar[type[SceneConfig]] = DrawnConfig
-    claim: Literal["right"]
     at_least: Annotated[float, Field(gt=0.0, lt=1.0)]
     pictures: Annotated[int, Field(ge=1, le=MOST)] = PICTURES
 
@@ -200,6 +214,34 @@ class RightClaim(_Claim):
         """Accept ``95 %``."""
         found = re.fullmatch(r"\s*(\d+(?:\.\d+)?) ?%\s*", value) if isinstance(value, str) else None
         return value if found is None else float(found[1]) / 100.0
+
+
+class RightClaim(ShareClaim):
+    """The model is right."""
+
+    claim: Literal["right"]
+
+
+class MustChangeClaim(ShareClaim):
+    """The model says something else where there is nothing left to see: a model that does not is not looking.
+
+    Attributes:
+        when: what is done to the picture, a name of `BLIND`.
+    """
+
+    claim: Literal["must_change"]
+    when: Literal["black", "covered", "away"]
+
+
+class MustNotChangeClaim(ShareClaim):
+    """The model says the same where a change means nothing.
+
+    Attributes:
+        when: what is done to the picture, a name of `HARMLESS`.
+    """
+
+    claim: Literal["must_not_change"]
+    when: Literal["exposure", "shift", "jpeg"]
 
 
 class NotBrokenClaim(_Claim):
@@ -225,8 +267,11 @@ class NoWorseClaim(_Claim):
     pictures: Annotated[int, Field(ge=1, le=MOST)] = PICTURES
 
 
-AnyClaim = RightClaim | NotBrokenClaim | NoWorseClaim
+AnyClaim = RightClaim | NotBrokenClaim | NoWorseClaim | MustChangeClaim | MustNotChangeClaim
 """The kinds of claims; each is tried by a method of `Trial`. A claim about the frames of a drive would stand here."""
+
+
+KINDS = ("right", "not_broken", "no_worse", "must_change", "must_not_change")
 
 
 class Suite(_Described):
@@ -298,7 +343,7 @@ def suite_of(data: Mapping[str, object], where: str) -> Suite:
 
 def _told(error: Any) -> str:
     """What is wrong, in words: where, what was expected and what was got."""
-    place = [str(one) for one in error["loc"] if one not in ("right", "not_broken", "no_worse")]
+    place = [str(one) for one in error["loc"] if one not in KINDS]
     if place[-1] == "[key]":  # a name that is a number
         got = shown(error["input"])
         return f"{place[0]}: expected names of small letters, digits and hyphens, got {got}; put it in quotes"

@@ -99,9 +99,7 @@ def join(parts: Sequence[ImportedPart], source: str, *, y_up: bool) -> Soup:
         )
     faces = np.concatenate([part.faces + start for part, start in zip(parts, starts[:-1], strict=True)])
     turn = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]]) if y_up else np.eye(3)
-    used = vertices[np.unique(faces)]
-    low, high = used.min(axis=0), used.max(axis=0)
-    size = float((high / 2 - low / 2).max()) * 2
+    low, size = vertices[np.unique(faces)].min(axis=0), extent_of(parts)
     if not 0.0 < size < np.inf:
         what = "all vertices coincide" if size == 0.0 else "its extent is too large to compute with"
         raise InputError(f"{source}: expected an object with a size, got a mesh in which {what}; export it again")
@@ -116,6 +114,13 @@ def join(parts: Sequence[ImportedPart], source: str, *, y_up: bool) -> Soup:
         colors=np.concatenate([np.ones((len(p.faces), 3, 3)) if p.colors is None else p.colors for p in parts]),
         flat=np.concatenate([np.full(len(part.faces), part.flat) for part in parts]),
     )
+
+
+def extent_of(parts: Sequence[ImportedPart]) -> float:
+    """Return the largest extent of all faces together along an axis, in the file's unit; infinite beyond float64."""
+    used = [part.vertices[np.unique(part.faces)] for part in parts]
+    low, high = np.min([one.min(axis=0) for one in used], axis=0), np.max([one.max(axis=0) for one in used], axis=0)
+    return float((high / 2 - low / 2).max()) * 2
 
 
 def repaired(soup: Soup, source: str) -> tuple[Soup, list[str]]:

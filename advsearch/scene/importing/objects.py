@@ -28,12 +28,13 @@ from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.importing import gltf, gltf_left_out
 from advsearch.scene.importing.blender import read_mesh_bytes
 from advsearch.scene.importing.files import Notes, check_faces, damaged, looks_like, safe_name, shown, text_of
-from advsearch.scene.importing.geometry import Soup, assemble, join, repaired
+from advsearch.scene.importing.geometry import Soup, assemble, extent_of, join, repaired
 from advsearch.scene.importing.gltf_parts import read_gltf
 from advsearch.scene.importing.parts import NEUTRAL, ImportedPart, ImportedSurface, visible
 from advsearch.scene.importing.ply import read_ply
 from advsearch.scene.importing.texture import by_material, textured
 from advsearch.scene.importing.wavefront import read_obj
+from advsearch.scene.sizes import LARGEST, SMALLEST
 
 Attributes = npt.NDArray[np.uint16]
 
@@ -174,6 +175,8 @@ def import_object(path: str | PathLike[str], *, up: Literal["y", "z"] | None = N
     - Parts with an opacity of 0 everywhere are left out, with a warning, unless the whole object is so.
     - What else a file has is named in the warnings.
 
+    - glTF is in metres, which gives the object its size; the other formats leave the unit open.
+
     The same file gives the same bytes every time.
 
     Args:
@@ -220,6 +223,7 @@ def object_of(parts: list[ImportedPart], notes: list[str], file: Path, name: str
         opacity, bakes = None, [*bakes, "it is transparent all over; it is shown opaque"]
     material, blends = _material(soup, surfaces)
     warnings = [*notes, *(f"{file.name}: {note}" for note in cleared + repairs + bakes + blends)]
+    extent = extent_of(parts) * float(np.ptp(soup.points[soup.faces].reshape(-1, 3), axis=0).max())
     kept = warnings[:MOST_WARNINGS]
     more = len(warnings) - len(kept)
     return ObjectAsset(
@@ -233,6 +237,8 @@ def object_of(parts: list[ImportedPart], notes: list[str], file: Path, name: str
         opacity=opacity,
         normal_map=maps.normals,
         emission=_let_out(maps.emission, opacity),
+        metres=extent if file.suffix.lower() in GLTF and SMALLEST <= extent <= LARGEST else None,
+        extent=extent,
     )
 
 

@@ -199,6 +199,7 @@ def import_plugins(scene: Path | Mapping[str, object], wanted: str) -> ImportedS
         up=UpAxis("z"),
         surface=surface.plugin,
         emission=light,
+        extent=frame.size,
     )
     around: list[ScenePart] = [] if haze is None else [haze]
     cameras: dict[str, PlacedCamera] = {}

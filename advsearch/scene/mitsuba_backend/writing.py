@@ -23,7 +23,7 @@ from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.description import OBJECT, SceneDescription
 from advsearch.scene.mitsuba_backend.meshes import base_texture, emitter, loadable, matt, own_surface, principled
 from advsearch.scene.mitsuba_backend.parts import GROUND, scene_dict, translation
-from advsearch.scene.mitsuba_backend.scene import NO_ROULETTE, MitsubaScene
+from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.mitsuba_backend.variant import VARIANT, Plugin, mi
 from advsearch.scene.parts import (
     BallLamp,
@@ -72,7 +72,7 @@ def write_scene(
     if description.camera_model is not None:
         raise InputError("camera: stock Mitsuba has no sensor with distortion; export the run as glTF (.glb) instead")
     kind = "volpath" if scene.volumetric else "path"  # not `prbvolpath`, which starts outside of all media
-    integrator: Plugin = {"type": kind, "max_depth": scene.max_depth, "rr_depth": NO_ROULETTE, "hide_emitters": hide}
+    integrator: Plugin = {"type": kind, "max_depth": scene.max_depth, "rr_depth": scene.roulette, "hide_emitters": hide}
     base = scene_dict(description, scene.resolution, filter, scene.sampler)
     plugins = described(base, description, inputs, integrator)
     meshes = {shape.id(): shape for shape in scene.held(inputs).shapes() if shape.is_mesh()}

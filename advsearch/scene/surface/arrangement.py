@@ -173,7 +173,7 @@ class Arrangement:
             above = np.asarray((seen[self.texels.of(self.sides)] >= len(self.texels.of_cell)).any(axis=1))
             self._smooth = smoothed(some[-1], above)
         self.lobes = [self._measured()] * self.sides + [Lobes.matt()] * (len(some) - self.sides)
-        self._photographed = None if photograph is None else description.number("ground.height")
+        self._photographed = None if photograph is None else description.capture_height
         self.to_map = torch.tensor(to_map(scene), dtype=torch.float32)
         self._below = self._seen_below(middle)
         model = description.camera_model

@@ -40,7 +40,7 @@
 
   // ---- numbers -----------------------------------------------------------------------------------------------------
 
-  // As `percent_number` in advsearch/report/phrases.py.
+  // As `percent_number` in advsearch/report/wording.py.
   function percentNumber(share, most = 4) {
     const value = 100 * share, away = Math.min(value, 100 - value);
     if (away >= 5 || away <= 0) return String(Math.round(value));
@@ -248,7 +248,7 @@
       const parts = Boolean(edges) || seen.size > MOST_LEVELS;
       const level = new Uint16Array(data.length);
       let labels, place;
-      if (edges) { // the parts of the table in the terminal (engine/sweeps/points.py), ascending
+      if (edges) { // the parts of the table in the terminal (questions/sweep/points.py), ascending
         const inner = Float32Array.from(edges.slice(1, -1));
         labels = edges.slice(1).map((end, k) => `${short(edges[k])} to ${short(end)}`);
         place = (value) => inner.reduce((sum, edge) => sum + (value >= edge), 0);

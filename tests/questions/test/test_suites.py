@@ -26,20 +26,22 @@ from torch import Tensor
 import advsearch
 from advsearch.cli.main import main
 from advsearch.cluster import InProcess
-from advsearch.config import AttackConfig
 from advsearch.engine.problem import Problem
 from advsearch.errors import AdvsearchError
 from advsearch.questions.attack.carry_out import attack_once
+from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.report.evidence import claims_of
 from advsearch.questions.test import answer as words
 from advsearch.questions.test import claims
 from advsearch.questions.test.answer import ClaimAnswer, SuiteResult
 from advsearch.questions.test.carry_out import test_from_config as carry_out
+from advsearch.questions.test.changes import CHANGED
 from advsearch.questions.test.counterexamples import _Block as Block
 from advsearch.questions.test.counterexamples import counterexamples, folder_of
-from advsearch.questions.test.settings import NoWorseClaim, SuiteConfig
+from advsearch.questions.test.settings import BLIND, HARMLESS, NoWorseClaim, SuiteConfig
 from advsearch.runs.store import Store
 from advsearch.runs.summary import read_result
+from advsearch.scene.color import linear_to_srgb
 from advsearch.testing import assert_no_worse, assert_not_broken, assert_right, assert_suite
 
 EASY, HARD = "small_models:easy", "small_models:hard"
@@ -166,6 +168,51 @@ def test_a_search_fails_a_claim_by_a_verified_counterexample_and_never_calls_it_
     assert little.reason.startswith("not broken by 8 steps of random") and "no proof" in little.reason
     assert "wrong in 6 of 6 trials (interval 54-100 %), most often a vase" in much.reason
     assert much.picture == "parts/much/images/adversarial.png" and (tmp_path / "run" / much.picture).is_file()
+
+
+ALL_SAY = {f"{when}-{kind}": (kind, when) for kind, names in (
+    ("must_change", BLIND), ("must_not_change", HARMLESS)
+) for when in names}  # fmt: skip
+
+
+def test_a_model_that_looks_says_something_else_where_there_is_nothing_and_the_same_where_nothing_matters(
+    tmp_path: Path,
+) -> None:
+    asked = {
+        name.replace("_", "-"): claim(kind, when=when, at_least=0.6, pictures=20)
+        for name, (kind, when) in ALL_SAY.items()
+    }
+    suite = written(tmp_path, asked, settings={"object": "mug", "model": "reference", "resolution": 64})
+    result = carry_out(SuiteConfig(suite=suite, run=str(tmp_path / "run")))
+    assert {one.name: one.answer for one in result.claims} == dict.fromkeys(asked, "held")
+    assert all("as claimed in" in one.reason for one in result.claims) and len(asked) == 6
+    advsearch.allow_code("small_models:blind")
+    blind = carry_out(SuiteConfig(suite=suite, model="small_models:blind", run=str(tmp_path / "blind")))
+    answers = {one.name: one.answer for one in blind.claims}
+    assert answers == {name: "failed" if "must-change" in name else "held" for name in asked}
+    failed = next(one for one in blind.claims if one.name == "black-must-change")
+    assert "says something else when the picture is black" in failed.statement
+    assert "before and" in failed.reason and (tmp_path / "blind" / str(failed.picture)).is_file()
+    assert words.MEANINGS["must_change"] in words.sarif(blind)
+
+
+@pytest.mark.parametrize("name", CHANGED)
+def test_what_changes_a_picture(name: str) -> None:
+    picture = torch.rand(8, 8, 3, generator=torch.Generator().manual_seed(1))
+    changed = CHANGED[name](picture)
+    assert changed.shape == picture.shape and 0.0 <= float(changed.min()) and float(changed.max()) <= 1.0
+    if name == "black":
+        assert not changed.any()
+    elif name == "covered":
+        assert torch.allclose(changed, picture.mean(dim=(0, 1)).expand(8, 8, 3))
+    elif name == "exposure":  # a middle grey of linear 0.2 is one of 0.252
+        assert torch.allclose(CHANGED[name](linear_to_srgb(torch.full((1, 1, 3), 0.2))), linear_to_srgb(
+            torch.full((1, 1, 3), 0.2 * 2 ** (1 / 3))), atol=1e-5)  # fmt: skip
+    elif name == "shift":
+        assert torch.equal(changed[:, 1:], picture[:, :-1])
+    else:
+        ramp = torch.linspace(0.2, 0.8, 64)[:, None, None].expand(64, 64, 3)
+        assert 0.0 < float((CHANGED[name](ramp) - ramp).abs().max()) < 0.03
 
 
 @contextmanager
@@ -425,7 +472,10 @@ GOOD = CLAIMS["in-front"]
     [
         ({"claims": {}}, r"claims: expected names with a claim each, .* got none"),
         ({"claims": {"a": {**GOOD, "at_least": 95}}}, r"claims.a.at_least: expected a share over 0 and under 1"),
-        ({"claims": {"a": {**GOOD, "claim": "rihgt"}}}, r"claims.a.claim: expected right, not_broken or no_worse, got"),
+        (
+            {"claims": {"a": {**GOOD, "claim": "rihgt"}}},
+            r"claims.a.claim: expected right, not_broken, no_worse, must_change or must_not_change, got",
+        ),
         ({"claims": {"a": {"claim": "right", "atleast": 0.9}}}, r"claims.a.atleast: there is no such name"),
         ({"claims": {"a": 3}}, r"claims.a: expected a claim such as"),
         ({"claims": {"a": claim("right", {"camra": {}}, at_least=0.9)}}, r"a: unknown control 'camra'.*'camera'"),
@@ -437,6 +487,15 @@ GOOD = CLAIMS["in-front"]
             r"a claim of this kind has no at_least",
         ),
         ({"claims": {"a": {**GOOD, "pictures": True}}}, r"a.pictures: expected a whole number .* got True"),
+        (
+            {"claims": {"a": claim("must_change", when="jpeg", at_least=0.9)}},
+            r"a.when: expected black, .* of must_change",
+        ),
+        ({"claims": {"a": claim("must_not_change", at_least=0.9)}}, r"a.when: expected .*, got nothing"),
+        (
+            {"claims": {"a": claim("must_change", {"pose": {"y": [0, 1]}}, when="away", at_least=0.5)}},
+            r"claims.a: .*pose.y",
+        ),
         ({"claims": {"a": {"claim": "no_worse", "points": 3}}}, r"a.than: expected another model, by its name"),
         (
             {"claims": {"a": {"claim": "not_broken", "settings": {"epsilon": [0.1, 0.2]}}}},

@@ -1,0 +1,81 @@
+"""`advsearch completion`: a script with which the Tab key finishes commands, flags, names and files in a shell."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from advsearch.cli import output
+from advsearch.cli.commands import COMMANDS, Command
+from advsearch.cli.show import REGISTRIES, list_names
+from advsearch.errors import InputError
+
+NAMED = {
+    "--object": "objects",
+    "--environment": "environments",
+    "--control": "controls",
+    "--over": "controls",
+    "--policy": "policies",
+    "--task": "tasks",
+    "--objective": "objectives",
+    "--model": "models",
+}
+"""Flags whose value is a name, and the kind of that name."""
+
+OR_A_FILE = ("--object", "--environment", "--model")
+
+
+def _arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("shell", choices=["bash", "zsh", "tcsh"], help="the shell that the script is for")
+    output.add_flags(parser)
+
+
+def _completion(args: argparse.Namespace) -> int:
+    try:
+        import shtab  # an optional extra
+    except ImportError as error:
+        raise InputError("completion needs the package shtab; install it with: pip install shtab") from error
+    # late: it imports this module
+    from advsearch.cli.main import add_command, without_commands
+
+    parser, commands = without_commands()
+    names = {kind: sorted(list_names(kind)) for kind in NAMED.values() if kind in REGISTRIES}
+    for command in COMMANDS:
+        for action in add_command(commands, command)._actions:
+            flag = action.option_strings[-1] if action.option_strings else ""
+            named = names.get(NAMED.get(flag, ""))
+            if action.nargs == 0 or action.choices is not None:
+                continue
+            if named and flag not in OR_A_FILE:
+                action.choices = named
+            else:  # where shtab looks for it
+                action.complete = _names_or_files(flag, named) if named else shtab.FILE  # type: ignore[attr-defined]
+    script = shtab.complete(parser, shell=args.shell)
+    if args.json:
+        output.print_json({"schema": 1, "command": "completion", "shell": args.shell, "script": script})
+    else:
+        print(script)
+    return 0
+
+
+def _names_or_files(flag: str, names: list[str]) -> dict[str, Any]:
+    """Return how each shell finishes a flag that takes a name or a file, in shtab's form."""
+    function = f"_advsearch{flag.replace('-', '_')}"
+    words = " ".join(names)
+    return {
+        "preamble": {"bash": f'{function}() {{ compgen -W "{words}" -- "$1"; compgen -f -- "$1"; }}'},
+        "bash": function,
+        "zsh": f"_alternative 'names:name:({words})' 'files:file:_files'",
+        "tcsh": "f",
+    }
+
+
+COMPLETION = Command(
+    _arguments,
+    _completion,
+    more=". It needs the package shtab (pip install shtab)",
+    examples=(
+        "completion bash > ~/.local/share/bash-completion/completions/advsearch",
+        "completion zsh > ~/.zfunc/_advsearch",
+    ),
+)

@@ -1,0 +1,539 @@
+"""The typed description of a run: what YAML files, flags and Python calls all become.
+
+Each setting states its flag, unit, range and default once; the command line's help and the docs are made from that
+(`settings`). Here is what many commands need to know, and what `render` does; the rest is with each question. Names of
+objects, controls, policies and the rest are checked by whoever looks them up, so that settings stay light.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+from pydantic import JsonValue, field_validator, model_validator
+
+from advsearch import rooms
+from advsearch.errors import InputError
+from advsearch.files import MESHES, either
+from advsearch.options import JOINED, by_key, things_as_text
+from advsearch.settings import (
+    Clash,
+    Config,
+    as_text,
+    check_once,
+    number_or_text,
+    parse_assignment,
+    power,
+    setting,
+    setting_as_in,
+    shown,
+    split_names,
+)
+
+FOLDERS = ("references",)
+"""Options that are a folder. It is kept by its absolute path, so that a run may go on from anywhere."""
+
+
+def read_named(value: Any, setting: str, otherwise: str) -> Any:
+    """Return a name, or a mapping with a `name` and options, from ``NAME``, ``NAME={OPTION: VALUE}`` or such a mapping,
+    which may leave out the name `otherwise`."""
+    if isinstance(value, str) and "=" in value:
+        name, options = parse_assignment(value, setting)
+        value = {"name": name, **(options if isinstance(options, Mapping) else {"": options})}
+    if not isinstance(value, Mapping):
+        return value
+    options = {option: given for option, given in value.items() if option != "name"}
+    for option in FOLDERS:
+        given = options.get(option)
+        if isinstance(given, (str, os.PathLike)) and given:
+            options[option] = str(Path(given).expanduser().absolute())
+    name = value.get("name", otherwise)
+    return {"name": name, **options} if options else name
+
+
+def read_joined(value: Any, setting: str, otherwise: str) -> Any:
+    """Return what `read_named` returns, of one or of several joined with + or in a list: the names with + between them,
+    and under each name its options: ``{"name": "detection+depth", "detection": {"iou": 0.7}}``."""
+    parts = re.split(r"\+(?![^{]*\})", value) if isinstance(value, str) else value
+    if not isinstance(parts, (list, tuple)) or len(parts) < 2:
+        return read_named(value, setting, otherwise)
+    read = [read_named(one.strip() if isinstance(one, str) else one, setting, otherwise) for one in parts]
+    named = [one.get("name") if isinstance(one, Mapping) else one for one in read]
+    names = [name for name in named if isinstance(name, str) and name]
+    if len(names) < len(read):
+        return value
+    options = {one["name"]: {k: v for k, v in one.items() if k != "name"} for one in read if isinstance(one, Mapping)}
+    last = options.get(names[-1], {})
+    if last.keys() <= set(names):  # as a command is written back: detection+depth={depth: {seek: gone}}
+        options = {**options, **last} if names[-1] in last else {**options, names[-1]: {}, **last}
+    return read_named({**{k: v for k, v in options.items() if v}, "name": JOINED.join(names)}, setting, otherwise)
+
+
+def name_in(named: str | Mapping[str, object]) -> str:
+    """Return the name in what `read_named` returns."""
+    return named if isinstance(named, str) else str(named["name"])
+
+
+DEFAULT_ENVIRONMENT = "studio"
+"""What lights a scene of which nothing is said: `scene.description.DEFAULT_ENVIRONMENT`, which a test holds this to."""
+
+SEVERAL = ("object", "environment", "model", "labels", "label", "target", "held_out", "held_out_environment")
+"""The settings that may be several names, where a command takes several."""
+
+TEXTS = (*SEVERAL, "task", "up", "camera", "run", "objective")
+"""The settings that are texts, whatever they are given as."""
+
+ControlsByName = dict[str, dict[str, object]]
+"""Controls as they are asked for: their names, each with its settings."""
+
+SEARCH_SPP = {"oidn": 8, "none": 16}
+"""Samples a pixel of a search that asks for none. `benchmarks/formation.py` shows the noise that is left at each."""
+
+AUTO_SHARE = 2
+"""With `--spp auto` a search takes the default's samples divided by this."""
+CLOSE_LOOKS = 4
+"""Then a candidate is rendered so many times more, at most, while it is not clearly worse than the best."""
+
+
+class SceneConfig(Config):
+    """What every command over a scene and a model needs to know.
+
+    A file is looked for relative to the current directory. None means "choose for me", and the description says how.
+    """
+
+    several: ClassVar[tuple[str, ...]] = ()
+    """Which of object, environment and model may be several, separated by commas."""
+    # fmt: off
+    clashes: ClassVar[tuple[Clash, ...]] = (
+        Clash(
+            "threads", lambda one: one.deterministic and one.threads != 1,
+            "`deterministic` works on one thread; leave one of them out",
+        ),
+        Clash(
+            "overwrite", lambda one: one.run is None,
+            "replaces the run that `run` names, and none is named; name it, or leave `overwrite` out",
+        ),
+    )
+
+    object: str = setting(
+        ..., "scene", "the object that the model should recognise", f"the name of an object or a {either(MESHES)} file"
+    )
+    environment: str | None = setting(
+        None, "scene", "the environment map that lights the scene",
+        "the name of an environment, a .hdr or .exr file, or none", otherwise=DEFAULT_ENVIRONMENT,
+    )
+    up: Literal["y", "z"] | None = setting(
+        None, "scene", "which axis of an imported object points up",
+        otherwise="as the format says, or else the axis along which it stands best",
+    )
+    size: float | None = setting(
+        None, "scene", "how large the object is: its longest side; distances are then in metres",
+        "a number of metres from 1e-4 to 1e4", otherwise="as its file says: glTF is in metres", ge=1e-4, le=1e4,
+    )
+    unit: Literal["mm", "cm", "m", "in"] | None = setting(
+        None, "scene", "unit of the coordinates of the object's file, which says how large it is",
+        otherwise="as its file says: glTF is in metres",
+    )
+    camera: str | None = setting(
+        None, "scene",
+        "which camera takes the picture: one of a scene file, or the one around the object, mounted somewhere or with "
+        "a lens of its own",
+        "a name that advsearch import lists, orbit, dashcam, robot, fisheye, equirectangular, or a camera file of "
+        "OpenCV, Kalibr, ROS, COLMAP or nerfstudio",
+        metavar="NAME", otherwise="orbit, the pinhole around the object that camera.* describes", min_length=1,
+    )
+    set_: dict[str, float | str | tuple[float, ...]] = setting(
+        dict, "scene", "fix a parameter of the scene, such as camera.azimuth=130; may be repeated",
+        "PARAMETER=VALUE with a finite number, a name or a list of numbers", alias="set", flag="--set",
+        metavar="PARAMETER=VALUE", form="assignments",
+    )
+    things: str | None = setting(
+        None, "scene", "what stands beside the object, in metres from it: x forwards, y to its left",
+        "OBJECT@X,Y with heading=DEGREES, size=METRES, name=NAME or label=LABEL after it, several with ; between them",
+        flag="--with", otherwise="nothing",
+    )
+    judge: str = setting(
+        "object", "model", "which thing the answers are judged by", "object, the name of a thing beside it, or all",
+        min_length=1,
+    )
+    exposure: float = setting(
+        0.0, "scene", "brightness, relative to the metered exposure", unit="stops", ge=-10.0, le=10.0
+    )
+    resolution: tuple[int, int] | None = setting(
+        None, "scene", "size of the rendered picture", "SIDE or HEIGHTxWIDTH, each from 8 to 4096",
+        otherwise="what the model takes", unit="pixels",
+    )
+
+    model: str = setting(
+        "reference", "model", "the network under test",
+        "reference, a .pt2, TorchScript or .onnx file, torchvision:NAME, timm:NAME, hf:REPOSITORY, or "
+        "package.module:callable",
+    )
+    labels: str | None = setting(
+        None, "model", "names of the model's classes",
+        "a JSON or text file, imagenet, cifar10, cifar100, coco, coco90, coco91, voc, or the names with commas between "
+        "them",
+        metavar="FILE", otherwise="the model's own",
+    )
+    prompt: str | None = setting(
+        None, "model",
+        "text for a model that takes text beside the picture: for CLIP what a picture is compared with, one text for "
+        "each label; for a model such as LLaVA the question",
+        "a text, for CLIP with {} where the name goes, or several with | between them",
+        otherwise="a photo of a {}, or What is this?", metavar="TEXT",
+    )
+    task: str | dict[str, JsonValue] = setting(
+        "classification", "model",
+        "what the model does, and how its answers are judged; for several models one task each, with + between them",
+        "the name of a task, or NAME={OPTION: VALUE}",
+    )
+    label: str | None = setting(
+        None, "model", "the answers that count as right, separated by commas",
+        'names of classes or their numbers, such as "coffee mug,cup" or #504', otherwise="the object's own",
+    )
+
+    controls: ControlsByName = setting(
+        lambda: {"texture": {}}, "search", "what may change in the scene, separated by commas",
+        "names of controls, or NAME={PARAMETER: VALUE or [LOW, HIGH]}", flag="--control", metavar="NAME",
+        form="controls", min_length=1,
+    )
+    texture_resolution: int | None = setting(
+        None, "search", "side length of the searched texture", unit="texels", otherwise="chosen from the object's own",
+        ge=2, le=4096,
+    )
+    spp: int | Literal["auto"] | None = setting(
+        None, "search",
+        "samples per pixel of a render of the search; auto takes half of the default, and renders the best candidates "
+        "again while they are close",
+        "a whole number from 1 to 65536, or auto", otherwise="8 with the denoiser, 16 without", unit="samples",
+    )
+    denoise: Literal["oidn", "none"] = setting("oidn", "search", "denoiser of every render, in search and verification")
+    pixel_sampler: Literal["independent", "multijitter"] = setting(
+        "multijitter", "search",
+        "how samples are spread over a pixel, in search and verification; multijitter has less noise and rounds the "
+        "number of samples up to a product of two near numbers",
+    )
+
+    seed: int = setting(
+        0, "run", "seed of all random numbers", "a whole number from 0 to 2**63 - 1", ge=0, le=2**63 - 1
+    )
+    threads: int | None = setting(None, "run", "number of processor threads", otherwise="all", ge=1, le=1024)
+    deterministic: bool = setting(False, "run", "use one thread, so that a run repeats bit for bit; slower")
+    run: str | None = setting(
+        None, "run", "where the run is stored", "a name (kept in runs/) or the path of a folder",
+        otherwise="runs/OBJECT-CONTROL-NNN", min_length=1, power=power.place,
+    )
+    # fmt: on
+    overwrite: bool = setting(False, "run", "replace a run that is already there", power=power.replacing)
+
+    @model_validator(mode="after")
+    def _one_of_each(self) -> SceneConfig:
+        """Refuse several objects, environments or models where one is looked at."""
+        for name in ("object", "environment", "model"):
+            names, tasks = split_names(getattr(self, name) or ""), self.task_name.split(JOINED)
+            if name == "model" and len(tasks) > 1:
+                if len(names) != len(tasks):
+                    raise InputError(
+                        f"model: expected {len(tasks)} with commas between them, one for each of {', '.join(tasks)}, "
+                        f"got {len(names)}"
+                    )
+                continue
+            if len(names) > 1 and name not in self.several:
+                raise one_only(name, names)
+        if self.size is not None and len(self.objects) > 1:
+            raise InputError("size: it is the size of one object, and there are several; leave it out, or give `unit`")
+        return self
+
+    @property
+    def title(self) -> tuple[str, ...]:
+        return self.object, *self.controls
+
+    @property
+    def task_name(self) -> str:
+        """Name of the task."""
+        return name_in(self.task)
+
+    @property
+    def used_threads(self) -> int | None:
+        """Processor threads that are taken; None for all."""
+        return 1 if self.deterministic else self.threads
+
+    @property
+    def lit_by(self) -> str:
+        """The environment by name: the default one where none was asked for."""
+        return self.environment or DEFAULT_ENVIRONMENT
+
+    @property
+    def kinds_of_controls(self) -> tuple[str, ...]:
+        """What says of which kind the controls are: their names, or the `kind` among their settings."""
+        named = {**self.controls, **getattr(self, "over", {})}
+        return tuple(str(given.get("kind", name)) for name, given in named.items())
+
+    @property
+    def search_spp(self) -> int:
+        """Samples a pixel of the search: what was asked for, or the default for the denoiser."""
+        if self.spp == "auto":
+            return SEARCH_SPP[self.denoise] // AUTO_SHARE
+        return self.spp if isinstance(self.spp, int) else SEARCH_SPP[self.denoise]
+
+    @property
+    def close_looks(self) -> int:
+        """Renders more of a search's best configurations, at most, while it is close between them."""
+        return CLOSE_LOOKS if self.spp == "auto" else 0
+
+    @property
+    def objects(self) -> tuple[str, ...]:
+        """The objects by name."""
+        return split_names(self.object)
+
+    @property
+    def models(self) -> tuple[str, ...]:
+        """The models by name; those of several tasks are one together."""
+        return (self.model,) if JOINED in self.task_name else split_names(self.model)
+
+    @field_validator(*TEXTS, mode="before", check_fields=False)
+    @classmethod
+    def _as_text(cls, value: Any, info: Any) -> Any:
+        listed = info.field_name == "labels" and isinstance(value, (list, tuple))
+        if listed and any("," in str(one) for one in value):
+            raise ValueError("a name that would be two; a file can have it")
+        return as_text(value, several=info.field_name in SEVERAL)
+
+    @field_validator("things", mode="before")
+    @classmethod
+    def _things_as_text(cls, value: Any) -> Any:
+        return things_as_text(value)
+
+    @field_validator("prompt", mode="before")
+    @classmethod
+    def _prompts_as_text(cls, value: Any) -> Any:
+        several = isinstance(value, (list, tuple)) and all(isinstance(one, str) for one in value)
+        text = " | ".join(value) if several else value
+        if isinstance(text, str) and not all(one.strip() for one in text.split("|")):
+            raise ValueError("no text")
+        return text
+
+    @field_validator("task", mode="before")
+    @classmethod
+    def _task_with_options(cls, value: Any) -> Any:
+        """Accept ``{name: yaw, tolerance: 5}``, ``yaw={tolerance: 5}`` and a name, and several with + between them."""
+        return read_joined(value, "task", cls.model_fields["task"].default)
+
+    @field_validator("spp")
+    @classmethod
+    def _spp_in_range(cls, value: Any) -> Any:
+        if isinstance(value, int) and not 1 <= value <= 65536:
+            raise ValueError("out of range")
+        return value
+
+    @field_validator("controls", "over", mode="before", check_fields=False)
+    @classmethod
+    def _controls_from_names(cls, value: Any) -> Any:
+        """Accept ``"texture"`` and ``["texture", "pose"]`` for controls with nothing set, and an empty YAML value."""
+        names = [part.strip() for part in value.split(",") if part.strip()] if isinstance(value, str) else value
+        if isinstance(names, (list, tuple)) and all(isinstance(name, str) for name in names):
+            check_once(names, "controls")
+            return {name: {} for name in names}
+        if isinstance(names, Mapping):
+            return {name: {} if given is None else given for name, given in by_key(names).items()}
+        return value
+
+    @field_validator("estimators", mode="before", check_fields=False)
+    @classmethod
+    def _estimators_from_name(cls, value: Any) -> Any:
+        """Accept ``differences`` for all controls."""
+        return {"*": value} if isinstance(value, str) else value
+
+    @field_validator("resolution", mode="before")
+    @classmethod
+    def _resolution_from_text(cls, value: Any) -> Any:
+        """Accept 224, ``"224"`` and ``"224x320"`` (height by width)."""
+        parts = value.lower().split("x") if isinstance(value, str) else value
+        if isinstance(parts, int):
+            parts = [parts]
+        return [*parts, *parts] if isinstance(parts, (list, tuple)) and len(parts) == 1 else parts
+
+    @field_validator("resolution")
+    @classmethod
+    def _resolution_in_range(cls, value: tuple[int, int] | None) -> tuple[int, int] | None:
+        if value is not None and not all(8 <= side <= 4096 for side in value):
+            raise ValueError("out of range")
+        return value
+
+    @field_validator("set_", mode="before")
+    @classmethod
+    def _numbers_from_text(cls, value: Any) -> Any:
+        """Read ``1e-3`` as a number: YAML takes it for text."""
+        return {name: number_or_text(given) for name, given in value.items()} if isinstance(value, Mapping) else value
+
+
+def one_only(name: str, names: Sequence[str]) -> InputError:
+    """The error for several objects, environments or models where one is looked at."""
+    listed = shown(",".join(names))
+    return InputError(f"{name}: expected one {name}, got {listed}; give one, or compare several with advsearch sweep")
+
+
+PICTURE_SPP = 64
+"""Samples a pixel of a picture that is made to be looked at."""
+PICTURES = (".png", ".exr")
+"""The pictures that can be written."""
+
+
+class RenderConfig(SceneConfig):
+    """Everything that decides what `render` does: pictures of a scene, and what the model says of them."""
+
+    command: ClassVar[str] = "render"
+    without: ClassVar[tuple[str, ...]] = ("run", "overwrite")
+
+    # fmt: off
+    controls: ControlsByName = setting_as_in(
+        SceneConfig, "controls", default=dict, group="picture",
+        description="what differs from the scene, separated by commas; a range stays where a search would start",
+        expects="names of controls, or NAME={PARAMETER: VALUE}", min_length=None,
+    )
+    around: int | None = setting(
+        None, "picture", "one sheet of so many views, from azimuths all around the object", otherwise="one view",
+        unit="views", ge=2, le=64,
+    )
+    spp: int = setting(PICTURE_SPP, "picture", "samples per pixel", unit="samples", ge=1, le=65536)
+    aov: str | None = setting(
+        None, "picture",
+        "write ground truth of each pixel, names separated by commas, as layers of an EXR beside the picture",
+        "names among mask, depth, normal, uv, id", otherwise="none", metavar="NAMES",
+    )
+    out: str = setting(
+        ..., "picture", "the file to write: a .png holds what the model sees, an .exr linear radiance times the gain",
+        "the path of a .png or .exr file",
+    )
+    # fmt: on
+
+    @field_validator("out", mode="before")
+    @classmethod
+    def _picture_file(cls, value: Any) -> Any:
+        text = str(value) if isinstance(value, Path) else value
+        if not isinstance(text, str) or "\0" in text or Path(text).suffix.lower() not in PICTURES:
+            raise ValueError("not a picture")
+        return text
+
+
+LARGEST_EPSILON = 1e6
+"""No control has a distance of that size; far above it, its square is none in float32."""
+
+
+class DerivativeConfig(SceneConfig):
+    """What every command that differentiates a scene needs to know: budgets of the controls, and what is maximised."""
+
+    # fmt: off
+    clashes: ClassVar[tuple[Clash, ...]] = (
+        *SceneConfig.clashes,
+        Clash(
+            "epsilon", lambda one: one.epsilons and "epsilon" not in one.several,
+            "several make a curve, which only `advsearch attack` draws; give one",
+        ),
+    )
+
+    object: str = setting_as_in(SceneConfig, "object", default="mug")
+    epsilon: float | dict[str, float] | tuple[float, ...] | None = setting(
+        None, "search",
+        "how far a control may move from its start, in its own unit (for several controls CONTROL=NUMBER,...; in "
+        "`attack` also NUMBER,NUMBER,... for a curve)",
+        f"a number greater than 0 and at most {LARGEST_EPSILON:g}", otherwise="the control's own",
+    )
+    norm: Literal["linf", "l2"] | None = setting(
+        None, "search", "norm in which epsilon is measured", otherwise="the control's own"
+    )
+    estimators: dict[str, str] = setting(
+        dict, "search", "force a gradient estimator",
+        "NAME for all controls, or CONTROL=NAME or CONTROL.PARAMETER=NAME; `advsearch check` shows the names",
+        alias="estimator", flag="--estimator", metavar="NAME", form="choices",
+    )
+    objective: str | None = setting(
+        None, "search", "the objective that the search maximises", "the name of an objective",
+        otherwise="the task's own: margin",
+    )
+    specialise: bool = setting(
+        True, "search", "leave out what the scene and the search don't need", flag="--no-specialise",
+        switched="compute everything, also what this search does not need; `advsearch check` shows what is left out "
+        "otherwise",
+    )
+    # fmt: on
+
+    @field_validator("epsilon", mode="before")
+    @classmethod
+    def _epsilon_from_text(cls, value: Any) -> Any:
+        """Accept ``0.05``, ``0.01,0.02`` and ``texture=0.05,geometry=0.01``; numbers in range, and none twice."""
+        if isinstance(value, str):
+            parts = [part.strip() for part in value.split(",")]
+            if "=" in value:
+                pairs = [parse_assignment(part, "epsilon") for part in parts]
+                check_once((name for name, _ in pairs), "epsilon")
+                value = dict(pairs)
+            else:
+                value = tuple(parts)
+        if isinstance(value, (list, tuple)) and len(value) == 1:
+            value = value[0]
+        if isinstance(value, Mapping):
+            numbers = [_positive(one) for one in value.values()]
+        elif isinstance(value, (list, tuple)):
+            numbers = [_positive(one) for one in value]
+            check_once((f"{one:g}" for one in numbers), "epsilon")
+        else:
+            numbers = [1.0 if value is None else _positive(value)]
+        if not numbers:
+            raise ValueError("nothing is named")
+        return value
+
+    @property
+    def epsilons(self) -> tuple[float, ...]:
+        """The several epsilons of a curve; empty where there is one."""
+        return self.epsilon if isinstance(self.epsilon, tuple) else ()
+
+
+def _positive(value: Any) -> float:
+    try:
+        number = float("nan") if isinstance(value, bool) else float(value)
+    except (TypeError, OverflowError):
+        raise ValueError("not a number") from None
+    if not 1e-30 < number <= LARGEST_EPSILON:  # what is smaller has no square in float32
+        raise ValueError("out of range")
+    return number
+
+
+class TimedConfig(Config):
+    """A question that may run out of time."""
+
+    # fmt: off
+    seconds: float | None = setting(
+        None, "check",
+        "time after which no measurement is begun any more; `advsearch resume` goes on for as long again",
+        otherwise="no limit", unit="seconds", gt=0.0, le=1e9,
+    )
+
+
+FIRST = ("attack", "render", "sweep")
+"""The commands that the docs show first."""
+
+
+class _Configs(Mapping[str, type[Config]]):
+    def __iter__(self) -> Iterator[str]:
+        there = [name for name in FIRST if name in ("render", *rooms.rooms())]
+        return iter(
+            (*there, *(one for one in rooms.rooms() if one not in FIRST and rooms.Room(one).config is not None))
+        )
+
+    def __len__(self) -> int:
+        return len(list(iter(self)))
+
+    def __getitem__(self, name: str) -> type[Config]:
+        config: type[Config] | None = RenderConfig if name == "render" else getattr(rooms.room(name), "config", None)
+        if config is None:
+            raise KeyError(name)
+        return config
+
+
+CONFIGS: Mapping[str, type[Config]] = _Configs()
+"""What the settings of each command are, in the order in which the docs show them; those of a question are read when
+somebody first asks for them."""

@@ -1,0 +1,284 @@
+"""What an attack is asked with, found and loaded by the names of a configuration, and the problem that it makes.
+
+Everything that renders and judges single configurations begins here; `advsearch/questions/attack` searches.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from advsearch import seeds
+from advsearch.attacks import Policy, make_policy
+from advsearch.attacks.objectives import OBJECTIVE_KINDS, asked_by, check_objective
+from advsearch.attacks.policies import POLICIES
+from advsearch.cluster import Executor, Work
+from advsearch.cluster.dask_pool import executor_of
+from advsearch.config import SceneConfig, one_only
+from advsearch.controls import make_space
+from advsearch.controls.base import Control
+from advsearch.controls.values import by_distribution, sentences
+from advsearch.engine.judging import Described, Looked, Metrics, check_truth, facts_of, load_metrics, shown
+from advsearch.engine.loading import SCENE, Controls, Scene, framed, lent, make_renderer
+from advsearch.engine.naming import AnyModel, check_run_settings, given_to, load_models, scene_of, several
+from advsearch.engine.objective import AnyObjective, objective_for, print_terms, task_for
+from advsearch.engine.problem import Problem
+from advsearch.engine.transport import CleanMatrix, reason_against
+from advsearch.errors import InputError
+from advsearch.models import Model
+from advsearch.options import as_setting
+from advsearch.progress import Progress
+from advsearch.questions.attack.settings import (
+    OVER_NUMBERS,
+    OVER_ONE,
+    OVER_PREDICTED,
+    OVER_RENDERED,
+    STEPS,
+    AttackConfig,
+)
+from advsearch.runs.directory import CONFIG
+from advsearch.runs.directory import only_here as only_python_has
+from advsearch.scene.formation import EVERYTHING, NOTHING, next_count
+from advsearch.scene.surfaces import aovs_of
+from advsearch.scene.things import ALL
+from advsearch.settings import FILES
+from advsearch.tasks import AnyTask, Facts, Task, make_task
+from advsearch.tasks.each_thing import each_thing
+from advsearch.tasks.together import Together, together
+
+LOADING = "loading the scene and the model"
+"""What a person who waits is told first."""
+
+SEARCHED_WITH = ("the objective", "the policy", "the metric")
+"""How the parts of a run begin that say nothing of whether its answer is right."""
+
+
+@dataclass
+class AttackParts:
+    """Everything that was asked for, found and loaded: the model and what was said of it, a task that is not yet on the
+    model, the controls that are searched and those `over` that vary by chance; objective and policy may be the caller's
+    own. Attacks may share `clean`, the matrix of light transport of the clean scene. A run is kept in a folder, or
+    (`keep`) not."""
+
+    config: AttackConfig
+    scene: Scene
+    loaded: tuple[Model, list[str]]
+    task: Task
+    controls: tuple[Any, ...]
+    over: tuple[Any, ...]
+    objective: str | Callable[..., Tensor]
+    policy: str | Policy[Any]
+    keep: bool
+    metrics: Metrics = field(default_factory=dict)
+    clean: CleanMatrix = field(default_factory=CleanMatrix)
+
+
+def parts_of(config: AttackConfig) -> AttackParts:
+    """Find and load everything that a configuration names; nothing is rendered."""
+    if len(config.objects) > 1:
+        raise one_only("object", config.objects)
+    searched, drawn = controls_given(config, config.controls, config.over)
+    task, objective = task_and_objective(config, config.task, config.objective)
+    policy = make_policy(config.policy_name, **config.policy_options)
+    scene = lent(SCENE, config.object) or scene_of(config)
+    model = models_as_one(config.model, config, task)
+    metrics = load_metrics(config.metrics)
+    return AttackParts(config, scene, model, task, searched, drawn, objective, policy, True, metrics)
+
+
+def parts_in(run: Path) -> AttackParts:
+    """Find and load everything that the run of an attack was asked with, as its answer is judged."""
+    if needed := [one for one in only_python_has(run) if not one.startswith(SEARCHED_WITH)]:
+        raise InputError(f"{run}: {', '.join(needed)}: only the Python session that asked has what judges its answer")
+    return parts_of(judged_alone(AttackConfig.from_yaml(run / CONFIG)))
+
+
+def parts_given(config: AttackConfig, scene: Scene, model: Model) -> AttackParts:
+    """Find what a configuration names besides its scene and its model."""
+    searched, drawn = controls_given(config, config.controls, config.over)
+    task, objective = task_and_objective(config, config.task, config.objective)
+    policy = make_policy(config.policy_name, **config.policy_options)
+    return AttackParts(config, scene, (model, []), task, searched, drawn, objective, policy, False)
+
+
+def controls_given(
+    config: AttackConfig, searched: Controls, drawn: Controls
+) -> tuple[tuple[Control, ...], tuple[Control, ...]]:
+    """The controls that are searched and those that vary by chance, with the run's settings; only a search has a
+    budget."""
+    check_run_settings(config)
+    without_budget = config.model_copy(update={"epsilon": None})
+    searched_controls = given_to(config, searched)
+    for control in searched_controls:
+        likely = [name for name, spec in getattr(control, "specs", {}).items() if by_distribution(spec)]
+        if likely:
+            raise InputError(
+                f"`controls` {control.name}.{likely[0]}: expected values to search, which are all as good, got how "
+                "likely each is; give a range, or put it into `over`, under which it varies by chance"
+            )
+    return searched_controls, given_to(without_budget, drawn)
+
+
+def task_and_objective(
+    config: AttackConfig, task: AnyTask, objective: AnyObjective | None
+) -> tuple[Task, AnyObjective]:
+    """The task, and the objective that was asked for or else the task's own, checked before anything is loaded."""
+    made = make_task(task)
+    wanted = made.objective if objective is None else objective
+    check_objective(wanted, made.name, targeted=config.target is not None, minimise=config.minimise)
+    return made, wanted
+
+
+def models_as_one(model: AnyModel | Sequence[AnyModel], config: AttackConfig, task: Task) -> tuple[Model, list[str]]:
+    """Load the model, or the models of an ensemble as one; their warnings become sentences of the run."""
+    models, warnings = load_models(several(model), task, config)
+    return models[0] if len(models) == 1 else together(models, config.resolution), warnings
+
+
+def check_from_config(config: AttackConfig) -> None:
+    """Refuse what a configuration names that is not there, contradicts itself, or could not be judged; nothing is
+    rendered."""
+    job = parts_of(config)
+    _task(job, shows=False)
+    size = config.resolution or job.loaded[0].input_size
+    make_space((*job.controls, *job.over), framed(job.scene.description, size))
+
+
+def problem_from_config(config: SceneConfig, *, denoise: str | None = None) -> tuple[Problem, list[str]]:
+    """Load what a configuration describes without searching: the problem, and warnings on the way."""
+    return problem_of_parts(parts_of(AttackConfig.of(config, denoise=denoise or config.denoise)))
+
+
+def problem_of_parts(parts: AttackParts, **changes: object) -> tuple[Problem, list[str]]:
+    """Return the problem that an attack was asked with, other settings in `changes` (of another `model`, its name), and
+    warnings on the way."""
+    config = parts.config.model_copy(update=changes)
+    model = (
+        models_as_one(config.model, config, parts.task) if "model" in changes else (parts.loaded[0], [*parts.loaded[1]])
+    )
+    job = replace(parts, config=config, loaded=model)
+    problem = problem_on(job)
+    return problem, [*job.loaded[1], *sentences(problem.space.moved)]
+
+
+def problem_of(config: AttackConfig, scene: Scene, model: Model, *, differentiated: bool = True) -> Problem:
+    """Return the problem of a configuration on a scene and a model that are there, in place of those that it names."""
+    return problem_on(parts_given(config, scene, model), differentiated=differentiated)
+
+
+def problem_on(job: AttackParts, *, differentiated: bool = True) -> Problem:
+    """Return the problem that parts make; `differentiated` as for `problem_of`."""
+    config, (model, _) = job.config, job.loaded
+    description = job.scene.description
+    task, facts = _task(job)
+    resolution = config.resolution or model.input_size
+    description = framed(description, resolution)
+    space = make_space((*job.controls, *job.over), description)
+    renderer = make_renderer(
+        description,
+        space,
+        resolution,
+        config.denoise,
+        config.seed,
+        config.estimators,
+        leave_out=EVERYTHING if config.specialise else NOTHING,
+        sampler=config.pixel_sampler,
+        differentiated=differentiated,
+    )
+    features_seed = seeds.stream(config.seed, "clean features")
+    objective, note = objective_for(job.objective, task, model, renderer, features_seed, config.ensemble)
+    if note:
+        job.loaded[1].append(note)
+    if config.printable:
+        searched = make_space(job.controls, description)
+        print_terms(searched, searched.start)  # refuses where nothing can be printed
+    problem = Problem(
+        renderer,
+        space,
+        model,
+        task,
+        facts,
+        objective,
+        next_count(config.pixel_sampler, config.search_spp),
+        config.seed,
+        searched=len(job.controls),
+        aovs=aovs_of(config.aov),
+        metrics=job.metrics,
+    )
+    for name in asked_by(job.objective):
+        problem.asked(problem.whole(problem.domain.start))(name)  # refuses what is not there
+    problem.steps, problem.draws = search_size(config, problem)
+    return problem
+
+
+def _task(job: AttackParts, *, shows: bool = True) -> tuple[Task, Callable[[Described, Looked], Facts]]:
+    """The task on the model, and what gives it facts; refuses what cannot be judged.
+
+    With `shows`, the task is shown a clean picture where it asks for one.
+    """
+    config, (model, _) = job.config, job.loaded
+    asked = job.task.seeking(job.objective) if isinstance(job.objective, str) else job.task
+    task = task_for(asked, model).on(model, target=config.target, minimise=config.minimise)
+    facts = partial(facts_of, job.scene, config.object, config)
+    alone = zip(task.tasks, task.models, strict=True) if isinstance(task, Together) else [(task, model)]
+    tasks = list[Task]()
+    for one, network in alone:
+        known = task.told(one, facts(dict)) if isinstance(task, Together) else facts(dict)
+        check_truth(one, network, job.scene, known, config)
+        tasks.append(shown(one, network, [job.scene], config) if shows else one)
+        job.loaded[1].extend(remark for remark in tasks[-1].remarks if remark not in job.loaded[1])
+    task = replace(task, tasks=tuple(tasks)) if isinstance(task, Together) else tasks[0]
+    return each_thing(task) if config.judge == ALL else task, facts
+
+
+def search_size(config: AttackConfig, problem: Problem) -> tuple[int, int]:
+    """Return the steps of a search, and how many conditions each looks at: what was asked for, or what is right for
+    one picture, or for many conditions: predicted, rendered, or rendered where only a few numbers are searched."""
+    if problem.conditions is None:
+        return config.steps or STEPS, 1
+    usual = OVER_ONE if problem.conditions.dim == 1 else OVER_PREDICTED
+    predicted = reason_against(problem, config.steps or usual[0], config.specialise) is None
+    balls = any(block.norm != "box" for block in problem.domain.blocks)
+    steps, draws = usual if predicted else OVER_RENDERED if balls else OVER_NUMBERS
+    return config.steps or steps, config.draws or draws
+
+
+def is_named(entry: Task | Policy[Any], make: Callable[[Any], object]) -> bool:
+    """Whether a file can name a task or a policy, with all of its options."""
+    try:
+        return bool(make(as_setting(entry)) == entry)
+    except InputError:
+        return False
+
+
+def judged_alone(config: AttackConfig) -> AttackConfig:
+    """Return what an answer of a run is judged with: what counts as success needs no metric, and neither an objective
+    nor a policy that only the session had which searched with them."""
+    change: dict[str, object] = {"metrics": {}}
+    if config.objective is not None and config.objective not in OBJECTIVE_KINDS:
+        change["objective"] = None
+    if config.policy_name not in POLICIES:
+        change["policy"] = AttackConfig.model_fields["policy"].default
+    return config.model_copy(update=change)
+
+
+def executor_for(config: SceneConfig, function: str, progress: Progress) -> AbstractContextManager[Executor | None]:
+    """Return what carries out a function of a configuration, as its workers and cluster say; None for this process."""
+    settings = config.to_repeat().model_copy(update={"workers": None, "cluster": None}).plain()
+    work = Work(function, settings, FILES, config.used_threads or 1)
+    workers, cluster = (getattr(config, name, None) for name in ("workers", "cluster"))
+    return executor_of(work, workers=workers, cluster=cluster, tell=progress.message)
+
+
+def with_derivatives(policy: Policy[Any], config: AttackConfig) -> Policy[Any]:
+    """Refuse settings of derivatives beside a policy that takes none; return the policy."""
+    asked = "estimators" if config.estimators else "measure" if config.measure == "full" else None
+    if asked and not policy.uses_gradient:
+        raise InputError(f"{asked}: policy {policy.name} takes no derivatives; leave one of the two out")
+    return policy

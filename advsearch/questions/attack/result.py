@@ -1,0 +1,412 @@
+"""The answer of an attack as Python has it, and its pictures: of trials, of the object to turn, along a drive."""
+
+from __future__ import annotations
+
+import io
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypedDict
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from PIL import Image
+from torch import Tensor
+
+from advsearch import seeds
+from advsearch.attacks import Ending, SearchResult
+from advsearch.controls.path import PathControl
+from advsearch.engine.loading import Scene, load_scene
+from advsearch.engine.naming import AnyModel, in_turn
+from advsearch.engine.objective import task_for
+from advsearch.engine.problem import Problem
+from advsearch.engine.record import KEPT, Findings
+from advsearch.engine.rendering import Rendering, pictures_of, render
+from advsearch.errors import InputError
+from advsearch.questions.attack.parts import AttackParts
+from advsearch.questions.attack.summary import AnswerAlongDrive, AttackSummary
+from advsearch.registry import names_code
+from advsearch.report.figures import new_axes, search_axes
+from advsearch.report.marks import marked
+from advsearch.report.markup import answer_html, side_by_side
+from advsearch.report.shown import shown
+from advsearch.runs import images, store
+from advsearch.runs.directory import IMAGES, OBJECT_FILE, RunDirectory
+from advsearch.runs.files import write_bytes
+from advsearch.scene.assets import Shape, simpler
+from advsearch.scene.description import OBJECT
+from advsearch.scene.formation import to_8_bit
+from advsearch.scene.geometry import camera_to_world
+from advsearch.scene.glb import posed, web_glb
+from advsearch.scene.settings import Given
+from advsearch.settings import as_python
+from advsearch.tasks import Judgement, Mark
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+
+class RenderKeywords(TypedDict, total=False):
+    """What may be said of a picture, see `render`."""
+
+    resolution: int | tuple[int, int] | None
+    spp: int
+    denoise: str
+    sampler: str
+    seed: int
+    around: int | None
+    aov: bool
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class AttackResult:
+    """The answer of an attack.
+
+    Attributes:
+        summary: what `summary.json` holds.
+        run: the run directory, or None if it was not kept.
+        u: (d,) the configuration that was verified; the start where nothing was searched.
+        clean: (H, W, 3) display-referred sRGB in [0, 1], 8-bit values: the clean configuration, as in the trial that
+            the summary names; its `clean` has what the model says of it.
+        adversarial: the same of `u`.
+        artifacts: what the controls hand over of `u`, by name: the texture, say; (h, w, 3) sRGB in [0, 1].
+        search: the search's own log and claim; None where nothing was searched, and of a run that was loaded.
+        in_memory: the rows, where there is no run directory.
+        parts: returns what the attack was asked with; None of a result that came from another process.
+    """
+
+    summary: AttackSummary
+    run: Path | None
+    u: Tensor
+    clean: Tensor
+    adversarial: Tensor
+    artifacts: dict[str, Tensor]
+    search: SearchResult | None
+    in_memory: tuple[store.Row, ...] = ()
+    parts: Callable[[], AttackParts] | None = None
+
+    @property
+    def found(self) -> bool:
+        """Whether a verified configuration was found."""
+        return self.summary.ending == Ending.FOUND.value
+
+    @property
+    def success(self) -> bool:
+        """The same as `found`."""
+        return self.found
+
+    @property
+    def images(self) -> dict[str, Tensor]:
+        """The two pictures by name, `clean` and `adversarial`: (H, W, 3) display-referred sRGB in [0, 1]."""
+        return {"clean": self.clean, "adversarial": self.adversarial}
+
+    @property
+    def history(self) -> list[float]:
+        """The objective of each evaluation of the search, in order; `rows("search")` has all that is known of them."""
+        rows = [row for row in self.rows("search") if row.phase != "ranking"]
+        return [row.objective for row in rows if row.objective is not None]
+
+    @names_code
+    @in_turn()
+    def render(
+        self,
+        model: AnyModel | None = None,
+        *,
+        scene: Scene | str | Path | None = None,
+        camera: str | Mapping[str, float] | None = None,
+        settings: Given | None = None,
+        **options: Unpack[RenderKeywords],
+    ) -> Rendering:
+        """Render the answer again, and ask a model what it sees.
+
+        What the answer does not say is as the scene comes: conditions of `over` have their start.
+
+        Args:
+            model: None for the attack's own.
+            scene: another one with the same object; None for the attack's own.
+            camera: where it is seen from, ``{"azimuth": 130.0}``; or the name of one of the scene's cameras.
+            settings: parameters of the scene to fix to other values, e.g. ``{"camera.azimuth": 130.0}``.
+            **options: `resolution`, `spp`, `denoise`, `sampler`, `seed`, `around` and `aov`, as for `render`; by
+                default as in the attack.
+
+        Raises:
+            TypeError: there is no such keyword.
+            InputError: the answer sets one of `settings` itself, or has other numbers than the scene takes.
+        """
+        if self.parts is None:
+            raise InputError(
+                "render: expected a result of this session, got one from another process; load_run(FOLDER) has it "
+                "with all that it needs"
+            )
+        if unknown := sorted(options.keys() - RenderKeywords.__annotations__):
+            known = ", ".join(["model", "scene", "camera", "settings", *RenderKeywords.__annotations__])
+            raise TypeError(f"render() got an unexpected keyword argument {unknown[0]!r}; it takes {known}")
+        parts = self.parts()
+        config = parts.config
+        camera, settings = as_python(camera), as_python(settings)
+        seen = parts.scene if scene is None else scene if isinstance(scene, Scene) else load_scene(scene)
+        if isinstance(camera, Mapping):
+            settings, camera = {**(settings or {}), **{f"camera.{name}": one for name, one in camera.items()}}, None
+        if twice := sorted({*(settings or {})} & {*(self.summary.configuration or {})}):
+            raise InputError(f"settings: the answer says what {twice[0]} is; leave it out")
+        seen = seen.with_settings(settings) if settings else seen
+        seen = replace(seen, description=seen.description.seen_by(camera)) if camera else seen
+        as_before = pictures_of(config)
+        return render(
+            seen,
+            parts.loaded[0] if model is None else model,
+            task=parts.task if model is not None else task_for(parts.task, parts.loaded[0]),
+            label=config.label,
+            controls=parts.controls,
+            at=self.u,
+            **{**as_before, **options},
+        )
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What is pickled: not what only this session has."""
+        return {**vars(self), "parts": None}
+
+    def rows(self, kind: str | None = None) -> Iterator[store.Row]:
+        """Yield every evaluated configuration, or those of one kind ("search", "verification", ...), in order."""
+        if self.run is None:
+            yield from (row for row in self.in_memory if kind in (None, row.kind))
+            return
+        with store.Store(self.run / store.NAME, read_only=True) as results:
+            yield from results.rows(kind)
+
+    def to_pandas(self, kind: str | None = None) -> Any:
+        """Return these rows as a `pandas.DataFrame`: columns as in an export (docs/runs.md), units in its `attrs`."""
+        from advsearch.runs.tables import to_pandas  # pandas takes half a second
+
+        return to_pandas(self.rows(kind))
+
+    def plot(self, axes: Any = None) -> Any:
+        """Draw the objective over the search's evaluations, and return the matplotlib axes.
+
+        Args:
+            axes: to draw on; None makes new ones.
+        """
+        axes = new_axes() if axes is None else axes
+        search_axes({self.summary.policy: self.history}, self.summary.objective, axes)
+        return axes
+
+    def __repr__(self) -> str:
+        summary, run = self.summary, None if self.run is None else str(self.run)
+        verified = f", verified {summary.brief}" if summary.verified else ""
+        controls = ",".join(summary.controls)
+        return f"AttackResult({summary.object!r}, {controls!r}, {summary.ending!r}{verified}, run={run!r})"
+
+    def _repr_html_(self) -> str:
+        pictures = {"clean": self.clean.numpy(), "adversarial": self.adversarial.numpy()}
+        return answer_html(shown(self.summary), pictures)
+
+    def _repr_png_(self) -> bytes:
+        return side_by_side([self.clean.numpy(), self.adversarial.numpy()])
+
+
+MOST_FACES = 30_000
+"""Faces of the meshes that are kept to turn; of more, as many are shown."""
+
+NEAR = 2.0
+"""How far from the object's middle another mesh may be to be shown with it, in the object's extent."""
+
+
+PICTURE_SPP = 16
+"""Samples a pixel of the pictures that are kept where nothing was tried."""
+
+
+@dataclass(frozen=True, eq=False)
+class KeptPicture:
+    """The picture of a configuration of the whole space that is kept, as the model sees it: (H, W, 3) sRGB, 8-bit
+    values in [0, 1], and its linear radiance; what is said of it, and the number of its trial, None where nothing was
+    tried."""
+
+    whole: Tensor
+    radiance: Tensor
+    picture: Tensor
+    judgement: Judgement
+    trial: int | None
+
+    @classmethod
+    def of(cls, problem: Problem, findings: Findings, u: Tensor, trial: int | None) -> KeptPicture:
+        """Render the searched controls at `u` as they are in a trial; as the scene comes, where that is None."""
+        seed = seeds.stream(problem.seed, *(("pictures",) if trial is None else ("verification", trial)))
+        whole, spp = problem.whole(u, None if trial is None else seed), PICTURE_SPP if trial is None else findings.spp
+        with torch.no_grad():
+            radiance = problem.renderer.radiance(whole, seed, spp)
+            picture = to_8_bit(problem.space.picture(whole, problem.renderer.formation.display(radiance)))
+        return cls(whole, radiance, picture, problem.judge(picture, whole), trial)
+
+
+def trial_to_show(findings: Findings) -> int | None:
+    """Return the trial whose pictures are kept, of the clean scene and of the answer, which see the same conditions.
+
+    It is the first with the most frequent answer among the successes (else among the trials that count), if there is
+    one beside which the clean scene has its own most frequent answer. None where nothing was tried.
+    """
+    checked = findings.verification
+    clean = _labels(findings.clean if checked is None else checked.clean_trials)
+    if checked is None:
+        return clean.index(_usual(clean)) if clean else None
+    answers = _labels(checked.adversarial_trials)
+    usual, usual_clean = _usual(_labels(checked.successes or checked.counting)), _usual(clean)
+    ranks = [
+        (answer == usual and outcome is bool(checked.successes), answer == usual, beside == usual_clean)
+        for answer, outcome, beside in zip(answers, checked.outcomes, clean, strict=False)
+    ]
+    return checked.begin + ranks.index(max(ranks))
+
+
+def _labels(trials: Sequence[Judgement]) -> list[str]:
+    return [trial.answer.label for trial in trials]
+
+
+def _usual(labels: Sequence[str]) -> str:
+    """The most frequent label; the first of equals."""
+    return Counter(labels).most_common(1)[0][0]
+
+
+def write_pictures(run: RunDirectory, problem: Problem, findings: Findings, shown: Mapping[str, KeptPicture]) -> None:
+    """Write the pictures of the clean and the adversarial scene, of their difference, of trials and of the search."""
+    gain = problem.renderer.formation.gain
+    for name, one in shown.items():
+        run.save_image(name, one.picture)
+        run.save_exr(name, one.radiance * gain)
+        save_marked(run, name, one.picture, problem.marks(one.picture, one.whole))
+        if problem.aovs:
+            surfaces, file = problem.renderer.surfaces(one.whole), run.path / IMAGES / f"{name}.aov.exr"
+            images.write_layers(file, surfaces.layers(problem.aovs, OBJECT), surfaces.notes(problem.aovs))
+    run.save_image("difference", images.difference(shown["clean"].picture, shown["adversarial"].picture))
+    checked = findings.verification
+    kind = "verification" if findings.beaten is None else "baseline verification"
+    if checked is not None:
+        for number in range(checked.begin, checked.begin + len(checked.adversarial_trials))[:KEPT]:
+            save_trial(run, problem, findings, (kind, number), f"verification-{number:02d}", checked.u)
+    if findings.frames:
+        last = shown["adversarial"].picture
+        if problem.conditions is not None and findings.search is not None:  # the frames see the scene as it comes
+            last = KeptPicture.of(problem, findings, problem.domain.project(findings.search.best_u), None).picture
+        run.save_animation("search", [*findings.frames, last.numpy()])
+
+
+def save_trial(
+    run: RunDirectory, problem: Problem, findings: Findings, trial: tuple[str, int], name: str, u: Tensor
+) -> None:
+    """Write the picture of a trial, by kind and number, as the model saw it, and with its answer."""
+    seed, picture = seeds.stream(problem.seed, "verification", trial[1]), findings.pictures.get(trial)
+    picture = problem.picture(u, seed, findings.spp) if picture is None else picture
+    run.save_image(name, picture)
+    save_marked(run, name, picture, problem.marks(picture, problem.whole(u, seed)))
+
+
+def save_marked(run: RunDirectory, name: str, picture: Tensor, marks: list[Mark]) -> None:
+    """Write ``<name>-answer.png``, the picture with marks; nothing where there are none."""
+    if marks:
+        run.save_image(f"{name}-answer", marked(picture.numpy(), marks))
+
+
+def write_artifacts(run: RunDirectory, artifacts: dict[str, Tensor]) -> None:
+    """Keep what the controls hand over: an 8-bit PNG, and an EXR of the same display-referred values in float32."""
+    for name, picture in artifacts.items():
+        run.save_image(name, picture, folder="artifacts")
+        run.save_exr(name, picture, folder="artifacts")
+
+
+def write_object(run: RunDirectory, problem: Problem, u: Tensor) -> None:
+    """Keep the object, and the meshes beside it that controls move or paint, to turn in a browser."""
+    scene, assembly = problem.space.scene, problem.renderer.scene.assembly
+    if scene is None:
+        return
+    with torch.no_grad():
+        after, before = (assembly(problem.space.inputs(problem.whole(at))) for at in (u, problem.domain.start))
+    parts = [
+        part
+        for name, part in scene.meshes.items()
+        if name == OBJECT or any(key.partition(".")[0] == name for key in after)
+    ]
+    fewer = {part.name: simpler(part.mesh, MOST_FACES // len(parts)) for part in parts}
+
+    def shown(inputs: Mapping[str, Tensor]) -> list[Shape]:
+        found = [posed(part, inputs) for part in parts]
+        thing = next(one for one in found if one.name == OBJECT).mesh.vertices
+        middle, reach = thing.mean(axis=0), NEAR * float(np.ptp(thing, axis=0).max())
+        near = [one for one in found if np.abs(one.mesh.vertices.mean(axis=0) - middle).max() < reach]
+        return [replace(one, mesh=left.of(one.mesh)) if (left := fewer[one.name]) else one for one in near]
+
+    camera = after.get("camera.to_world")
+    pose = camera_to_world(scene) if camera is None else camera.double().numpy()
+    cut = [f"{len(part.mesh.faces):,} of {part.name}" for part in parts if fewer[part.name]]
+    note = f"It is shown with fewer faces than it has ({', '.join(cut)})." if cut else ""
+    write_bytes(run.path / OBJECT_FILE, web_glb(shown(after), shown(before), pose, note))
+
+
+FRAMES = 24
+
+STRIP, SIDE = 8, 160
+"""Pictures of a strip at most, and the height of each in pixels."""
+
+FASTEST = 40
+"""Milliseconds that a frame of an animation is shown at least."""
+
+Frames = list[npt.NDArray[np.float32]]
+
+
+def answer_along(problem: Problem, u: Tensor | None, spp: int, run: RunDirectory | None) -> AnswerAlongDrive | None:
+    """Look at an answer, and at the clean scene, at evenly spaced times of the path that varies by chance; None where
+    none does. What varies beside it is as the scene comes."""
+    along = _path_of(problem)
+    if along is None:
+        return None
+    path, place = along
+    start = problem.whole(problem.domain.start)
+    times = start.repeat(FRAMES, 1)
+    times[:, place] = torch.linspace(0.0, 1.0, FRAMES)
+    first, last = (problem.space.describe(times[end], [path])[f"{path.name}.time"]["value"] for end in (0, -1))
+    seconds = float(str(last)) - float(str(first))
+    counts: dict[str, int] = {}
+    for name, at in (("drive-clean", start[: len(problem.domain.start)]), ("drive", u)):
+        if at is None:
+            continue
+        pictures, counts[name] = Frames(), 0
+        for number, whole in enumerate(times):
+            whole[: len(at)] = at
+            with torch.no_grad():
+                picture = to_8_bit(problem.renderer(whole, seed=seeds.stream(problem.seed, "drive", number), spp=spp))
+            right, marks = problem.seen(picture, whole)
+            counts[name] += right
+            pictures.append(np.asarray(marked(picture.numpy(), marks), dtype=np.float32))
+        if run is not None:
+            write_drive(run, name, pictures, seconds)
+    return AnswerAlongDrive(
+        frames=FRAMES, seconds=seconds, clean=counts["drive-clean"], answer=counts.get("drive"), spp=spp
+    )
+
+
+def _path_of(problem: Problem) -> tuple[PathControl, int] | None:
+    """The path among what varies by chance, and the coordinate of the whole space that is its time."""
+    begin = 0
+    for number, bound in enumerate(problem.space.controls):
+        chance = problem.searched is not None and number >= problem.searched
+        if chance and isinstance(bound, PathControl) and bound.groups:
+            return bound, begin
+        begin += len(bound.start)
+    return None
+
+
+def write_drive(run: RunDirectory, name: str, pictures: Sequence[npt.NDArray[np.float32]], seconds: float) -> None:
+    """Write frames (h, w, 3) in sRGB as an animation, NAME.webp, and some side by side, NAME.png, into a run."""
+    frames = [Image.fromarray((one * 255.0).round().clip(0, 255).astype(np.uint8)) for one in pictures]
+    file = io.BytesIO()
+    pause = max(FASTEST, round(1000.0 * seconds / len(frames)))
+    frames[0].save(file, "WEBP", save_all=True, append_images=frames[1:], duration=pause, loop=0, quality=80)
+    write_bytes(run.path / IMAGES / f"{name}.webp", file.getvalue())
+    size = max(1, round(frames[0].width * SIDE / frames[0].height)), SIDE
+    small = [frames[number].resize(size, Image.Resampling.LANCZOS) for number in evenly(len(frames), STRIP)]
+    run.save_image(name, np.concatenate([np.asarray(one, dtype=np.float32) / 255.0 for one in small], axis=1))
+
+
+def evenly(count: int, most: int) -> npt.NDArray[np.int64]:
+    """Return the numbers of some of so many frames, evenly spaced, the first and the last among them."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(np.int64))

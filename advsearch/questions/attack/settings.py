@@ -1,0 +1,239 @@
+"""What `attack` needs to know."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar, Literal
+
+from pydantic import JsonValue, model_validator
+
+from advsearch.config import ControlsByName, DerivativeConfig, RenderConfig, SceneConfig, name_in, read_named
+from advsearch.files import JsonObject
+from advsearch.settings import Clash, power, setting, setting_as_in, split_names
+
+TRIALS, TRIALS_OVER = 20, 200
+"""Fresh renders that check an answer, and one that holds for many conditions."""
+
+STEPS = 40
+"""Of a search about one picture."""
+
+OVER_PREDICTED, OVER_ONE, OVER_RENDERED, OVER_NUMBERS = (300, 8), (100, 4), (150, 4), (STEPS, 4)
+"""Steps, and conditions that each looks at, of a search for many conditions: where a bank of light transport predicts
+pictures (`benchmarks/bank.py`), where that is so and conditions are one number (docs/drives.md), where each is
+rendered, and where only a few numbers are searched (a pose)."""
+
+FEWEST_TRIALS = 6
+"""With fewer, nothing can be called found: `attacks.verification.Rule.fewest`, which a test holds this to."""
+
+
+class AttackConfig(DerivativeConfig):
+    """Everything that decides what `attack` does. Frozen; unknown names are refused."""
+
+    command: ClassVar[str] = "attack"
+    several: ClassVar[tuple[str, ...]] = ("object", "epsilon", "model")
+
+    free: ClassVar[tuple[str, ...]] = (*DerivativeConfig.free, "log", "workers", "cluster")
+    # fmt: off
+    clashes: ClassVar[tuple[Clash, ...]] = (
+        *DerivativeConfig.clashes,
+        Clash(
+            "smallest", lambda one: one.epsilons,
+            "finds one epsilon by itself; give one `epsilon` as the largest, or none",
+        ),
+        Clash(
+            "smallest", lambda one: one.is_study,
+            "is about one object and one model; name one `object`, one `model`, and one `epsilon` as the largest",
+        ),
+        Clash(
+            "model", lambda one: one.is_matrix and one.is_curve,
+            "several make a matrix, of one object and one epsilon; name one `object` and one `epsilon`, or one `model`",
+        ),
+        Clash(
+            "ensemble", lambda one: len(split_names(one.model)) < 2,
+            "is of several models; name them in `model`, separated by commas, or leave `ensemble` out",
+        ),
+        Clash(
+            "smallest", lambda one: one.seconds is not None,
+            "takes several searches; give `steps` for each, and leave `seconds` out",
+        ),
+        Clash("smallest", lambda one: one.over, "cannot be combined with `over` yet; leave one of them out"),
+        Clash("smallest", lambda one: one.printable, "cannot be combined with `printable`; leave one of them out"),
+        Clash("minimise", lambda one: one.is_curve, "has no robust accuracy; name one `object` and one `epsilon`"),
+        Clash("minimise", lambda one: one.target, "makes the right answer easier to give; leave `target` out"),
+        Clash("minimise", lambda one: one.smallest, "has no smallest change; leave `smallest` out"),
+        Clash(
+            "over", lambda one: {*map(instance, one.over)} & {*map(instance, one.controls)},
+            "names a control that is searched already; leave it out of one of the two",
+        ),
+        Clash(
+            "draws",
+            lambda one: not one.over and one.draws != OVER_RENDERED[1],  # which run.yaml of older versions always say
+            "is how many conditions of `over` a step looks at, and there are none; add `over`, or leave `draws` out",
+        ),
+        Clash(
+            "estimators",
+            lambda one: (
+                {name.partition(".")[0] for name in one.estimators}
+                & {part for name in map(instance, one.over) for part in (name, name.rpartition(":")[2])}
+            ),
+            "names a control that varies by chance, whose derivative nobody asks for; leave it out",
+        ),
+        Clash(
+            "average", lambda one: one.command == "attack" and one.is_curve,
+            "is not part of a curve; `advsearch gap` compares with the average, or name one `object` and one `epsilon`",
+        ),
+    )
+
+    object: str = setting_as_in(
+        SceneConfig, "object",
+        description="the object that the model should recognise; several, separated by commas, are attacked in turn",
+    )
+    model: str = setting_as_in(
+        SceneConfig, "model",
+        description="the network under test; of several, separated by commas, each is attacked and its answer tried "
+        "on all",
+    )
+    ensemble: Literal["mean", "worst"] | None = setting(
+        None, "model",
+        "find one answer against several models together: maximise the mean of their objectives, or the lowest one",
+        otherwise="each by itself",
+    )
+    measure: Literal["no", "quick", "full"] = setting(
+        "quick",
+        "search",
+        "measure which gradient estimator is best on this scene; full also measures step and samples",
+    )
+    policy: str | dict[str, JsonValue] = setting(
+        "auto", "search", "the search policy, which proposes configurations",
+        "the name of a policy, or NAME={OPTION: VALUE}",
+    )
+    steps: int | None = setting(
+        None, "search", "number of search steps, each of which evaluates one configuration",
+        otherwise=f"{STEPS}; for textures and the like with --over {OVER_PREDICTED[0]} where pictures are predicted, "
+        f"{OVER_ONE[0]} where one number varies, as along a path, and {OVER_RENDERED[0]} where they are rendered",
+        ge=1, le=1_000_000,
+    )
+    seconds: float | None = setting(
+        None, "search", "stop the search after this time; the random search beside it gets as many renders",
+        otherwise="no limit", unit="seconds", gt=0.0, le=1e9,
+    )
+    target: str | None = setting(
+        None, "search", "the wrong answer to aim for, or several",
+        "names of classes or their numbers, separated by commas", otherwise="any wrong answer",
+    )
+    minimise: bool = setting(False, "search", "make the object easier to recognise, not harder")
+    smallest: bool = setting(
+        False, "search", "find the smallest epsilon at which the model is wrong; --epsilon is the largest to try"
+    )
+    printable: bool = setting(
+        False, "search",
+        "prefer a smooth texture or patch in printable colours; a second search without this tells what it costs in "
+        "margin",
+    )
+    aov: str | None = setting_as_in(
+        RenderConfig, "aov",
+        description="write ground truth of each pixel, names separated by commas, as layers of an EXR, for the clean "
+        "scene and the answer",
+    )
+    metrics: dict[str, str] = setting(
+        dict, "run", "your own numbers for every picture, each a column of the rows; may be repeated",
+        "NAME=package.module:function of image, output and truth", flag="--metric", metavar="NAME=FUNCTION",
+        form="assignments",
+    )
+    log: Literal["mlflow", "tensorboard", "wandb"] | None = setting(
+        None, "run", "experiment tracker to which every evaluation is sent; its package has to be installed",
+        otherwise="none", power=power.tracker,
+    )
+    over: ControlsByName = setting_as_in(
+        SceneConfig, "controls", default=dict,
+        description="controls that are drawn at random; one answer has to hold across the draws", flag="",
+        min_length=None,
+    )
+    path: str | None = setting(
+        None, "search",
+        "the path along which camera or object travel, with --over path; pictures of the answer along it are kept",
+        "approach, pass, orbit, a .csv file, or two of them, the camera's and the object's, as in approach+orbit",
+        otherwise="approach", min_length=1,
+    )
+    draws: int | None = setting(
+        None, "search", "how many random conditions each step looks at, with --over",
+        otherwise=f"{OVER_PREDICTED[1]} where pictures are predicted and more than one number varies, otherwise "
+        f"{OVER_RENDERED[1]}", ge=1, le=1000,
+    )
+    average: int = setting(
+        0, "search", "also evaluate this many random configurations, to tell how often the model is wrong on average",
+        unit="renders", ge=0, le=1_000_000,
+    )
+    baseline: bool = setting(
+        True, "search", "run a random search with as many renders beside it", flag="--no-baseline",
+        switched="skip the random search that runs beside the search as a baseline",
+    )
+
+    verify_spp: int | None = setting(
+        None, "verification", "samples per pixel of the verification",
+        otherwise="raised until more would leave the margin on its side", unit="samples", ge=1, le=65536,
+    )
+    trials: int | None = setting(
+        None, "verification", "fresh renders that verify the answer, and as many of the clean scene",
+        f"a whole number from {FEWEST_TRIALS} to 100000 (with fewer, nothing can be called found)",
+        otherwise=f"14, or 23 where one fails; with --over 30, or up to {TRIALS_OVER} where some fail; {TRIALS} with "
+        "--smallest", unit="renders", ge=FEWEST_TRIALS, le=100_000,
+    )
+
+    workers: int | None = setting(
+        None, "run",
+        "worker processes; they share the attacks of several objects or models, or the independent renders of one",
+        otherwise="this one alone", unit="processes", ge=1, le=100_000, power=power.many_processes,
+    )
+    cluster: str | None = setting(
+        None, "run", "where the workers are", "the address of a Dask scheduler, local, or a .yaml file",
+        metavar="PLACE", otherwise="this machine, if there are `workers`", min_length=1, power=power.connection,
+    )
+    # fmt: on
+
+    @model_validator(mode="before")
+    @classmethod
+    def _policy_with_steps(cls, data: Any) -> Any:
+        """Accept ``policy: {name: pgd, steps: 80, momentum: 0.9}``, ``pgd={momentum: 0.9}`` and a name."""
+        policy = read_named(data.get("policy"), "policy", "auto")
+        if not isinstance(policy, Mapping):
+            return data if policy is None else {**data, "policy": policy}
+        steps = {"steps": policy["steps"]} if "steps" in policy else {}
+        rest = {option: value for option, value in policy.items() if option != "steps"}
+        return {**data, **steps, "policy": read_named(rest, "policy", "auto")}
+
+    @property
+    def policy_name(self) -> str:
+        """Name of the policy."""
+        return name_in(self.policy)
+
+    @property
+    def policy_options(self) -> JsonObject:
+        """Options of the policy."""
+        return {} if isinstance(self.policy, str) else {k: v for k, v in self.policy.items() if k != "name"}
+
+    @property
+    def is_curve(self) -> bool:
+        """Whether it takes several attacks, over objects or over epsilons."""
+        return bool(self.epsilons) or len(self.objects) > 1
+
+    @property
+    def is_matrix(self) -> bool:
+        """Whether there are several models."""
+        return len(self.models) > 1
+
+    @property
+    def is_study(self) -> bool:
+        """Whether it takes several attacks."""
+        return self.is_curve or self.is_matrix
+
+    @property
+    def trial_count(self) -> int:
+        """Trials of each group in the verification."""
+        return self.trials if self.trials is not None else TRIALS_OVER if self.over else TRIALS
+
+
+def instance(asked: str) -> str:
+    """A control as it is asked for, without its parameter: `light:key`, or `camera` of `camera.azimuth`."""
+    kind, colon, own = asked.partition(":")
+    return kind.partition(".")[0] + colon + own.partition(".")[0]

@@ -1,0 +1,492 @@
+"""The stages of an attack, one after the other: first look, search, random search beside it, verification. For the
+smallest change that flips the answer, searches and trials take turns, within ever smaller budgets."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any
+
+from torch import Tensor
+
+from advsearch import seeds
+from advsearch.attacks import (
+    Domain,
+    Ending,
+    Evaluation,
+    Policy,
+    SearchResult,
+    StepRecord,
+    Verification,
+    count_right,
+    make_policy,
+    planned_renders,
+    run_trials,
+    search,
+)
+from advsearch.attacks.candidates import ATTEMPTS, MOST_CHECKS, ROUNDS, confirmed, scaled, smallest
+from advsearch.attacks.evaluation import Query
+from advsearch.attacks.verification import OVER_LOOKS, TRIAL_LOOKS
+from advsearch.engine import planning, surface_light
+from advsearch.engine.bank import Bank
+from advsearch.engine.gradients import inside
+from advsearch.engine.journal import PLAN, Journal, finite, other_answers, same
+from advsearch.engine.objective import penalised
+from advsearch.engine.problem import Problem
+from advsearch.engine.record import Findings, Stages
+from advsearch.engine.surface_light import SurfaceLight
+from advsearch.engine.transport import CleanMatrix, PredictedSearch, Transport, reason_against, remark
+from advsearch.engine.verifier import Verifier, ladder_of
+from advsearch.interrupts import interruptible
+from advsearch.questions.attack.settings import AttackConfig
+from advsearch.report.wording import count
+from advsearch.scene.transport.matrix import TransportTooLargeError
+from advsearch.tasks import Judgement
+
+MOST_FRAMES = 60
+
+UNPRINTED = "search without print terms"
+"""The kind of the search beside one with print terms: what these cost is told by its answer."""
+
+
+LOOK, LOOKED_AT = "first look", ("score", "margin", "objective")
+"""The note of what the model and the objective said of the first look, and of what it consists for each picture."""
+
+FIRST_LOOK = 4
+"""Renders of the clean configuration before the search; wrong in all of them, it goes through the full trials first."""
+
+
+@dataclass
+class Attack:
+    """One search on one problem with its verification; what is known so far is in `findings`. Attacks with other
+    budgets share the matrix `clean`."""
+
+    journal: Journal
+    config: AttackConfig
+    policy: Policy[Any]
+    stages: Stages
+    findings: Findings = field(default_factory=Findings)
+    clean: CleanMatrix = field(default_factory=CleanMatrix)
+
+    def __post_init__(self) -> None:
+        self.problem: Problem = self.journal.problem
+        self._asked_spp = self.problem.spp  # a preparation may choose another one for the search
+        ladder = ladder_of(self.config)
+        asked = self.config.trials is not None or self.config.smallest
+        unasked = TRIAL_LOOKS if self.problem.conditions is None else OVER_LOOKS
+        looks = (self.config.trial_count,) if asked else unasked
+        self._verifier = Verifier(self.journal, ladder, self.stages, self.findings, looks)
+
+    def carry_out(self) -> Findings:
+        if self.config.smallest:
+            scaled(self.problem.domain, 1.0)  # refuses what has no budget before anything is rendered
+        try:
+            with interruptible():
+                self.plan()
+                if self.worth_attacking():
+                    self.collect_transport()
+                    if self.config.smallest:
+                        find_smallest(self, self._verifier)
+                    else:
+                        self.search_all()
+                    self.verify()
+                if self.config.average:
+                    self._verifier.average(self.config.average)
+        except KeyboardInterrupt:
+            self.findings.interrupted = True
+        self.stages.end()
+        return self.findings
+
+    # ---- before the search ------------------------------------------------------------------------------------------
+
+    def plan(self) -> None:
+        """Measure the gradient plan, or take the one that the run was begun with."""
+        problem, stored = self.problem, self.journal.note(PLAN)
+        if stored is None:
+            self._cut_paths()
+            self._measure()
+            chosen = {"plan": problem.plan.to_dict(), "spp": problem.spp, "search_depth": problem.search_depth}
+            self.journal.set_note(PLAN, chosen)
+            return
+        problem.plan = problem.plan.restored(stored["plan"])
+        problem.spp, problem.search_depth = stored["spp"], stored.get("search_depth")
+
+    def _cut_paths(self) -> None:
+        """Leave bounces of light out of the search's renders, where it is long enough for that to pay."""
+        problem, config = self.problem, self.config
+        worth = config.specialise and (config.measure == "full" or problem.steps >= planning.WORTH_BOUNCES)
+        if worth and self.against_surface_light() is not None:  # else no step will be rendered
+            self.stages.begin(
+                "setup",
+                "finding how many bounces of light the search needs",
+                planning.most_pictures(problem),
+                hint="few samples each; `specialise=false` leaves it out",
+                at_most=True,
+            )
+            problem.search_depth = planning.bounces_of(problem, problem.seed, tick=self._advance).depth
+
+    def _measure(self) -> None:
+        """Replace the first gradient plan by a measured one, as far as the preparation wants that."""
+        problem, config = self.problem, self.config
+        full = config.measure == "full"
+        if config.measure == "no" or not self.policy.uses_gradient:
+            return
+        if not full and reason_against(problem, problem.steps, config.specialise) is None:
+            return  # derivatives will come from what predicts the pictures
+        renderer = problem.renderer
+        u, seed = inside(renderer), seeds.stream(problem.seed, "measure")
+        gradients = planning.plan_gradients(renderer.plan, every=full)
+        if gradients:
+            self.stages.begin(
+                "setup",
+                "measuring which gradients are best here",
+                gradients,
+                hint=f"{gradients} gradients of {count(problem.spp, 'sample')} a pixel; `measure=no` leaves it out",
+            )
+        problem.plan = planning.measured_plan(
+            renderer,
+            problem.loss,
+            u,
+            seed=seed,
+            spp=problem.spp,
+            every=full,
+            counted=not full or config.deterministic,
+            tick=self._advance,
+        )
+        if full:
+            self.stages.begin(
+                "setup",
+                "choosing step and samples of gradients",
+                planning.cosine_samples(problem.plan),
+                hint="counted in samples a pixel; `measure=quick` leaves it out",
+                at_most=True,
+            )
+            table = list(planning.cosines(renderer, problem.loss, u, seed=seed, tick=self._advance))
+            plan, spp = planning.tuned(problem.plan, table)
+            problem.plan = plan
+            problem.spp = spp if config.spp is None and spp is not None else problem.spp
+
+    def worth_attacking(self) -> bool:
+        """Look at the clean configuration; one that is wrong in every look goes through the full trials at once, as
+        does one whose smallest change is wanted."""
+        problem, config, findings = self.problem, self.config, self.findings
+        seed, start = seeds.stream(problem.seed, "first look"), problem.domain.start
+        self.stages.begin(
+            "setup", "looking at the clean scene", FIRST_LOOK, hint="the first picture compiles the renderer's code"
+        )
+
+        def look(query: Query) -> Evaluation:
+            answer = problem.evaluate(query)
+            self._advance()
+            return answer
+
+        spp = self._asked_spp
+        findings.first_look = run_trials(partial(map, look), start, spp=spp, seed=seed, trials=FIRST_LOOK)
+        self._check_look(start)
+        looks_right = any(trial.right for trial in findings.first_look)
+        if not self.problem.rule.control or (looks_right and not config.smallest):
+            return True
+        self._verifier.choose_spp({"clean": start})
+        self._verifier.begin("checking the clean scene with fresh renders", self._verifier.looks[0])
+        self._verifier.try_clean()
+        return not self.problem.rule.already_wrong(count_right(findings.clean, findings.spp))
+
+    def _check_look(self, start: Tensor) -> None:
+        """Note what was seen, or refuse to go on with a model or an objective that says something else of the same
+        pictures than it did. One that says something else each time can't be told by it."""
+        now = [_values(trial) for trial in self.findings.first_look]
+        before = self.journal.note(LOOK)
+        if before is None:
+            self.journal.set_note(LOOK, now)
+            return
+        if all(map(same, before, now)):
+            return
+        seed = seeds.stream(seeds.stream(self.problem.seed, "first look"), "verification", 0)
+        again = self.problem.evaluate(Query(start, seed, spp=self._asked_spp))
+        if same(_values(again.said), now[0]):
+            values = dict(zip(LOOKED_AT, zip(before[0], now[0], strict=True), strict=True))
+            raise other_answers(self.journal.run, values)
+
+    def _advance(self, steps: int = 1) -> None:
+        self.stages.progress.advance(steps)
+
+    # ---- verification -----------------------------------------------------------------------------------------------
+
+    def verify(self) -> None:
+        """Choose the sample count, then try the clean configuration, the answer, that without print terms and the
+        baseline's with equal seeds.
+
+        The smallest change lies at the decision, where no sample count settles the margin: it is tried with that of the
+        clean configuration, as on the way to it.
+        """
+        findings, problem = self.findings, self.problem
+        answered, baseline, unprinted = findings.search, findings.baseline, findings.unprinted
+        if answered is None:
+            raise RuntimeError("nothing was searched, so there is nothing to verify")
+        answer = problem.domain.project(answered.best_u)
+        if not self.config.smallest or findings.sample_count is None:
+            searched = [result for result in (answered, baseline, unprinted) if result is not None]
+            pictures = sum((result.renders + result.gradients) * problem.draws for result in searched)
+            candidates = {"adversarial": answer, "clean": problem.domain.start}
+            self._verifier.choose_spp(candidates, searched=pictures * problem.spp)
+        groups = 1 + (baseline is not None) + (unprinted is not None) + (not self._verifier.clean_tried)
+        self._verifier.begin("checking the answer with fresh renders", groups * self._verifier.count, at_most=True)
+        self._verifier.try_clean()
+        findings.verification = self._verifier.verified("verification", answered)
+        if findings.verification.ending is Ending.ALREADY_WRONG:
+            findings.smallest = None  # seen with other samples than before: no change at all flips the answer
+        if unprinted is not None:
+            findings.unprinted_verification = self._verifier.verified("unprinted verification", unprinted)
+        if baseline is not None:
+            decided = findings.verification.ending is Ending.FOUND
+            findings.baseline_verification = self._verifier.verified(
+                "baseline verification", baseline, curtailed=decided
+            )
+            self._take_the_worse(answered, baseline)
+        if not self.config.smallest:
+            check_failures(self._verifier, answered)
+
+    def _take_the_worse(self, result: SearchResult, baseline: SearchResult) -> None:
+        """Let the random search's answer be the run's if it is found and the worse one for the model, and remember
+        that. It is chosen by its trials, so these are no evidence: it has to be the worse one in fresh ones, too."""
+        findings = self.findings
+        own, other = findings.verification, findings.baseline_verification
+        if own is None or other is None or other.ending is not Ending.FOUND or _rank(other) <= _rank(own):
+            return
+        title = "checking the random search's answer again"
+        self._verifier.begin(title, 2 * self._verifier.count, at_most=True)
+        other = findings.baseline_verification = self._verifier.verified("baseline verification", baseline, again=True)
+        if _rank(other) <= _rank(own):
+            return
+        findings.beaten, findings.verification = own, other
+        findings.search = replace(
+            result,
+            best_u=baseline.best_u,
+            best_objective=baseline.best_objective,
+            claimed_objective=baseline.claimed_objective,
+            success_rate=baseline.success_rate,
+            distribution=None,
+        )
+
+    # ---- searches ---------------------------------------------------------------------------------------------------
+
+    def collect_transport(self) -> None:
+        """Make the matrix that predicts the pictures of the searches, where there can be one and it pays."""
+        problem, steps, findings = self.problem, self.problem.steps, self.findings
+        matrix, surface = reason_against(problem, steps, self.config.specialise), self.against_surface_light()
+        if matrix is None and problem.conditions is None:
+            self._prepare(Transport(problem, steps, clean=self.clean), "collecting light transport")
+            return
+        if surface is None:
+            light = SurfaceLight(problem, steps)
+            self._prepare(light, "finding the light on surfaces")
+            surface = light.too_far_off
+            if surface is None:
+                return
+            findings.transport, findings.surface_refused = None, surface
+            others = "rendered" if matrix else "predicted by matrices"
+            self.stages.progress.message(f"Pictures are {others}: {surface}.")
+        if matrix is None:
+            self._prepare(Bank(problem, steps, self.journal.traced), "collecting light transport")
+            return
+        too_short = not findings.surface_refused and not reason_against(problem, 1 << 30, self.config.specialise)
+        self._renders_because(matrix if too_short or surface == surface_light.NO_CAMERA else surface)
+
+    def against_surface_light(self) -> str | None:
+        """Why light on surfaces does not predict the search, in words; None if it may."""
+        return surface_light.reason_against(self.problem, self.problem.steps, self.policy, self.config.specialise)
+
+    def _prepare(self, predictor: PredictedSearch, title: str) -> None:
+        """Make what predicts pictures; where its matrix would be too large, pictures are rendered."""
+        hint = "from here on the search renders nothing (counted in samples a pixel); `specialise=false` leaves it out"
+        self.stages.begin("transport", title, predictor.samples, hint=hint)
+        self.findings.transport = predictor
+        try:
+            predictor.prepare(self.stages.progress.advance)
+        except TransportTooLargeError as error:
+            self.findings.transport = None
+            self._renders_because(str(error))
+
+    def _renders_because(self, reason: str) -> None:
+        """Keep why the search renders, and say so where that needn't be."""
+        self.findings.rendered_because = reason
+        if told := remark(reason):
+            self.stages.progress.message(told)
+
+    def search_all(self) -> None:
+        """The search, the same without print terms where it has them, and the random one, each with as many renders."""
+        config, findings, steps = self.config, self.findings, self.problem.steps
+        self.begin("search", f"searching with {self.policy.name}", steps, "`steps` or `seconds` shorten it")
+        seed, frames = self.problem.seed, findings.frames
+        findings.search = self.search("search", self.policy, steps, seed, frames, config.seconds)
+        if config.seconds is not None:  # renders of the search itself, without those of the ranking
+            steps = max(1, findings.search.history[-1].renders) if findings.search.history else 1
+        if config.printable:
+            title = "searching without print terms, to see what they cost"
+            self.begin("without print terms", title, steps, "`printable=false` leaves both out")
+            findings.unprinted = self.search(UNPRINTED, self.policy, steps, seed)
+        if not config.baseline or self.policy.name == "random":
+            return
+        self.begin("baseline", "searching at random, to compare", steps, "`baseline=false` leaves it out")
+        findings.baseline = self.search("baseline", make_policy("random"), steps, seeds.stream(seed, "baseline"))
+
+    def search(
+        self,
+        kind: str,
+        policy: Policy[Any],
+        steps: int,
+        seed: int,
+        frames: list[Any] | None = None,
+        seconds: float | None = None,
+        domain: Domain | None = None,
+        ranked: bool = True,
+    ) -> SearchResult:
+        """Search, reading back what is stored already; `ranked` renders the best configurations again.
+
+        Raises:
+            KeyboardInterrupt: the search was interrupted; the result of an interrupted main search is kept before.
+        """
+
+        before, every = 0, max(1, -(-steps // MOST_FRAMES))
+
+        def on_step(record: StepRecord, u: Tensor, evaluation: Evaluation) -> None:
+            nonlocal before
+            if evaluation.picture is not None and frames is not None:
+                frames.append(evaluation.picture.numpy())
+            self.stages.progress.advance(record.renders - before, best=record.best, **self.journal.traced.told)
+            before = record.renders
+
+        def answers(queries: Sequence[Query]) -> Iterator[Evaluation]:
+            if frames is not None:
+                queries = [replace(one, keep=one.phase == "search" and one.number % every == 0) for one in queries]
+            passed = (lambda query: None) if self.findings.transport is None else self.findings.transport.passed
+            return self.journal.answers(queries, self._evaluated, passed)
+
+        domain = self.problem.domain if domain is None else domain
+        transport = self.findings.transport
+        exact, drawn = (transport.exact, transport.drawn) if transport is not None else (False, False)
+        found = search(
+            answers,
+            replace(domain, exact=exact, drawn=drawn and policy.uses_gradient),
+            policy,
+            steps=steps,
+            seed=seed,
+            candidates=4 if ranked else 0,
+            close=self.config.close_looks,
+            late=self.journal.clock(kind, seconds),
+            on_step=on_step,
+            kind=kind,
+            noise=self.problem.seed,
+        )
+        if found.ending is Ending.INTERRUPTED:
+            self.findings.search = self.findings.search or found
+            raise KeyboardInterrupt
+        return found
+
+    def _evaluated(self, queries: Sequence[Query]) -> Iterator[Evaluation]:
+        """Have queries of one search answered: predicted where something predicts, and traced otherwise."""
+        transport, traced = self.findings.transport, self.journal.traced
+        predicted = transport is not None and bool(queries) and queries[0].phase == "search"
+        answers = transport.answered(queries, traced) if transport is not None and predicted else traced(queries)
+        for query, answer in zip(queries, answers, strict=True):
+            printed = self.config.printable and query.kind != UNPRINTED
+            yield penalised(answer, self.problem.searched_space, query.u) if printed else answer
+
+    def begin(self, name: str, title: str, steps: int, shorter: str) -> None:
+        renders = planned_renders(steps, close=self.config.close_looks)
+        hint = f"{renders} pictures of {count(self.problem.spp, 'sample')} a pixel; {shorter}"
+        if self.findings.transport is not None:
+            hint = f"{steps} pictures predicted and {renders - steps} traced; {shorter}"
+        self.stages.begin(name, title, renders, hint=hint, at_most=True)
+
+
+CONFIRMED = 40
+"""Trials in a row that the upper end of a smallest epsilon has to pass, or as many checks as have them."""
+
+
+def find_smallest(attack: Attack, verifier: Verifier) -> None:
+    """Bracket the smallest epsilon; every claim on the way goes through trials with seeds of its own.
+
+    On the way the fewest trials that can verify anything are enough where none fails. The upper end is tried again in
+    full, and what is verified at the end is the configuration there.
+    """
+    problem, findings, trials = attack.problem, attack.findings, verifier.count
+    results: list[SearchResult] = []
+    transport = findings.transport if isinstance(findings.transport, Transport) else None
+
+    def found(inside: Domain, number: int) -> Tensor:
+        attack.begin(
+            "search", f"search {number + 1} of at most {ROUNDS}", problem.steps, "`steps` shortens each search"
+        )
+        kind, seed = f"search {number}" if number else "search", seeds.stream(problem.seed, "smallest", number)
+        ranked = transport is None  # what is predicted has no noise
+        results.append(attack.search(kind, attack.policy, problem.steps, seed, domain=inside, ranked=ranked))
+        findings.search = findings.search or results[0]  # the answer if this is interrupted
+        verifier.begin("trying smaller changes", MOST_CHECKS * trials, at_most=True)
+        return results[-1].best_u
+
+    def passes(u: Tensor, check: int, few: int = trials) -> bool:
+        """Whether all trials together pass; so `few` do without a failure."""
+        allowed, scores, failures = problem.rule.allowed(trials), list[float](), 0
+        while len(scores) < trials and failures <= allowed and (failures or len(scores) < few):
+            (trial,) = verifier.trials(f"check {check}", {len(scores): u})
+            scores.append(trial.score)
+            failures += not trial.success
+        if transport is not None:
+            transport.correct(u, scores)
+        if failures <= allowed:
+            findings.search = replace(results[-1], best_u=u)
+        return failures <= allowed
+
+    def seems(u: Tensor, check: int) -> bool:
+        return passes(u, check, problem.rule.fewest)
+
+    times = -(-CONFIRMED // trials)
+    bracket = smallest(found, seems, problem.domain, likely=None if transport is None else transport.likely)
+    if bracket.u is not None:
+        most = ATTEMPTS * times * trials
+        verifier.begin("checking the smallest change", most, at_most=True)
+    bracket = confirmed(bracket, passes, problem.domain, times=times)
+    renders, gradients = sum(one.renders for one in results), sum(one.gradients for one in results)
+    answer = results[0].best_u if bracket.u is None else bracket.u
+    ending = results[0].ending if bracket.u is None else Ending.FOUND
+    findings.smallest = bracket
+    winner = results[0 if bracket.u is None else bracket.found_by]
+    findings.search = replace(winner, best_u=answer, ending=ending, renders=renders, gradients=gradients)
+
+
+def _values(trial: Judgement) -> list[float | None]:
+    return [finite(getattr(trial, name)) for name in LOOKED_AT]
+
+
+def _rank(verification: Verification) -> tuple[bool, float, float]:
+    """How bad an answer is for the model: found, then the rate of successes, then the mean margin."""
+    scores = [trial.score for trial in verification.counting]
+    mean = sum(scores) / len(scores)
+    mean = mean if mean == mean else -math.inf
+    return verification.ending is Ending.FOUND, verification.adversarial.rate, mean
+
+
+TRIED = 8
+"""Different failures that are tried, at most: the first of the list."""
+
+
+def check_failures(verifier: Verifier, result: SearchResult) -> None:
+    """Verify the first of the different failures that a search answers with, each for itself.
+
+    Each goes through the trials of the answer, with the seeds that the control group had, up to the first that decides
+    against it: what holds is found by the rule of the answer. Over conditions that vary one answer takes hundreds of
+    trials, and nothing is tried here.
+    """
+    problem, findings = verifier.problem, verifier.findings
+    known, rule = result.failures, problem.rule
+    if known is None or not known.listed or rule.conditional or rule.already_wrong(count_right(findings.clean, 1)):
+        return
+    tried = known.listed[:TRIED]
+    verifier.begin("checking different failures with fresh renders", len(tried) * verifier.count, at_most=True)
+    findings.failures = tuple(
+        verifier.verified(f"failure {number}", replace(result, best_u=failure.u), curtailed=True)
+        for number, failure in enumerate(tried)
+    )

@@ -1,0 +1,443 @@
+"""Studies: questions that take several attacks, each in a folder of its own in the run, on workers if asked to.
+
+A part is carried out in its folder, gone on with, or read where it is done. A worker carries an attack out in a folder
+on its own disk, which comes back as files. An attack that this process has begun itself stays its own. What is shared
+are whole attacks, in a curve all those of an object, so that one whose worker died begins again.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from advsearch import seeds
+from advsearch.api import carry_out
+from advsearch.attacks import clopper_pearson
+from advsearch.attacks.verification import WORST_CASE
+from advsearch.cluster import Call, Work
+from advsearch.cluster.dask_pool import executor_of
+from advsearch.config import CONFIGS
+from advsearch.engine.journal import answering
+from advsearch.engine.judging import one_label_for_several
+from advsearch.engine.naming import check_run_settings, different, load_models, settings_alone
+from advsearch.engine.problem import Problem
+from advsearch.engine.record import control_group, verified_rate
+from advsearch.engine.transport import CleanMatrix
+from advsearch.engine.verifier import RetrialCondition, Retrials
+from advsearch.errors import ClusterError
+from advsearch.files import JsonObject
+from advsearch.progress import Progress
+from advsearch.question import Asked
+from advsearch.questions.attack.carry_out import attack_once
+from advsearch.questions.attack.parts import LOADING, check_from_config, executor_for, problem_from_config
+from advsearch.questions.attack.settings import AttackConfig
+from advsearch.questions.attack.summary import (
+    AttackSummary,
+    CurvePoint,
+    CurveResult,
+    MatrixCell,
+    MatrixModel,
+    MatrixResult,
+    MatrixRow,
+    ObjectRow,
+    attack_of,
+)
+from advsearch.runs import files
+from advsearch.runs.directory import CONFIG, PARTS, default_name, is_run
+from advsearch.runs.files import PART, storage_errors, write_bytes
+from advsearch.runs.listing import finished
+from advsearch.runs.results import INTERRUPTED, Result
+from advsearch.runs.summary import read_answer, read_result
+from advsearch.scene.library import list_objects, load_object
+from advsearch.settings import FILES, Config
+from advsearch.tasks import make_task
+
+
+def carry_out_part(path: Path, config: Config, progress: Progress) -> Result:
+    """Return the result of the part in the folder `path`; what is done of it is not done again. The configuration is
+    what it does, where it has not begun."""
+    if not is_run(path) or not (path / CONFIG).is_file():
+        return carry_out(config.model_copy(update={"run": str(path), "overwrite": True}), progress=progress)
+    if finished(path):
+        return read_result(path)
+    return carry_out(type(config).from_yaml(path / CONFIG, config.asked), progress=progress, resumed=path)
+
+
+LONGEST = 6 * 3600.0
+"""Seconds that one attack may take on a worker before it counts as hanging."""
+
+TEXTS = (".json", ".html", ".yaml")
+"""Files that may say where the run is."""
+
+
+SETTLED = ("found", "already wrong")
+"""Endings after which an object is not attacked with a larger epsilon."""
+
+ALL = "all"
+"""What an ensemble is called among the models that were attacked."""
+
+
+@dataclass(frozen=True)
+class StudyAttack:
+    """One attack of a study: what it is carried out with, the name of its folder, and what tells it from the others: an
+    object, a control of it, or a model. The epsilon is that of a curve, or None."""
+
+    config: AttackConfig
+    name: str
+    of: str
+    epsilon: float | None = None
+
+    @property
+    def title(self) -> str:
+        """What it is, in words."""
+        return self.config.object + ("" if self.of == self.config.object else f" with {self.of}")
+
+
+Chain = list[StudyAttack]
+"""Attacks that follow one another, until one finds something."""
+
+
+def chains_of(config: AttackConfig) -> list[Chain]:
+    """Return the attacks of a study: of a gap, a matrix or a curve.
+
+    Raises:
+        InputError: a setting that none of the controls takes, or a name comes twice.
+    """
+    if config.command == "gap":
+        return _controls_of(config)
+    if not config.is_matrix:
+        return _objects_of(config)
+    names = different(config.models, "model")
+    attacked = [(ALL, {})] if config.ensemble else [(name, {"model": name}) for name in names]
+    return [
+        [StudyAttack(AttackConfig.of(config, **more), f"{place:02d}-" + default_name(name, []), name)]
+        for place, (name, more) in enumerate(attacked)
+    ]
+
+
+def _controls_of(config: AttackConfig) -> list[Chain]:
+    check_run_settings(config)
+    attacks = []
+    for place, name in enumerate(different(config.objects, "object")):
+        for number, (control, settings) in enumerate(config.controls.items()):
+            settings_of_it = settings_alone(config, control, settings)
+            changed = AttackConfig.of(config, object=name, controls={control: settings}, **settings_of_it)
+            attacks.append(
+                [StudyAttack(changed, f"{place:02d}-{number:02d}-" + default_name(name, [control]), control)]
+            )
+    return attacks
+
+
+def _objects_of(config: AttackConfig) -> list[Chain]:
+    """Every object with every epsilon, from the smallest."""
+    chains: list[Chain] = []
+    for place, name in enumerate(different(config.objects, "object")):
+        chains.append([])
+        epsilons: list[float | None] = [*sorted(config.epsilons)] or [None]
+        for epsilon in epsilons:
+            words = [] if epsilon is None else [f"epsilon {epsilon:g}".replace(".", "_")]
+            changed = AttackConfig.of(config, object=name, epsilon=config.epsilon if epsilon is None else epsilon)
+            chains[-1].append(StudyAttack(changed, f"{place:02d}-" + default_name(name, words), name, epsilon))
+    return chains
+
+
+def attacks_of(settings: JsonObject) -> Call:
+    """Return what carries out the attacks of the study that the settings describe: what a worker does."""
+    config = CONFIGS[str(settings["command"])](**{k: v for k, v in settings.items() if k != "command"})
+    assert isinstance(config, AttackConfig)
+    chains = chains_of(config)
+
+    def call(numbers: Sequence[int]) -> list[tuple[str, str, dict[str, bytes]]]:
+        found, clean = [], CleanMatrix()
+        with tempfile.TemporaryDirectory(prefix="advsearch-part-") as folder:
+            for part in chains[numbers[0]]:
+                path = Path(folder) / part.name
+                config_there = part.config.model_copy(update={"run": str(path), "overwrite": True})
+                ending = attack_once(config_there, clean=clean).summary.ending
+                kept = (file for file in path.rglob("*") if file.is_file() and file.name != files.NAME)
+                read = {file.relative_to(path).as_posix(): file.read_bytes() for file in kept}
+                found.append((part.name, str(path), read))
+                if ending in SETTLED:
+                    break
+        return found
+
+    return call
+
+
+def share(config: AttackConfig, chains: Sequence[Chain], run: Path, progress: Progress) -> None:
+    """Have the attacks of a study that are not begun carried out by workers into its folder, where some were asked for.
+    Raises ClusterError: every worker died of an attack, or there are none."""
+    left = [number for number, chain in enumerate(chains) if not any(is_run(run / PARTS / one.name) for one in chain)]
+    plain = config.to_repeat().model_copy(update={"workers": None, "cluster": None}).plain()
+    settings, threads = {"command": config.command, **plain}, config.used_threads or 1
+    work = Work("advsearch.questions.attack.studies:attacks_of", settings, FILES, threads, seconds=LONGEST)
+    workers, cluster = (config.workers, config.cluster) if left else (None, None)
+    with executor_of(work, workers=workers, cluster=cluster, tell=progress.message) as executor:
+        if executor is None:
+            return
+        progress.stage("attacks on workers", len(left))
+        for done in executor.results([number] for number in left):
+            if done.lost:
+                title = chains[done.items[0]][0].title
+                raise ClusterError(f"{title}: {done.lost}; leave it out, or go on without it")
+            for name, place, files in done.value:
+                _place(run / PARTS, name, place, files)
+            facts = executor.facts
+            progress.advance(1, **({} if facts is None else {"workers": facts.workers}))
+
+
+def _place(folder: Path, name: str, before: str, files: Mapping[str, bytes]) -> None:
+    """Write the files of an attack that was carried out in another folder, whole or not at all."""
+    path, part = folder / name, folder / f"{PART}{name}"
+    with storage_errors(path):
+        for relative, data in files.items():
+            if relative.endswith(TEXTS):
+                data = data.replace(before.encode(), str(path).encode())
+            (part / relative).parent.mkdir(parents=True, exist_ok=True)
+            write_bytes(part / relative, data)
+        part.rename(path)
+
+
+# ---- one study ------------------------------------------------------------------------------------------------------
+
+
+def _label_for_all(config: AttackConfig) -> list[str]:
+    """What there is to say where several bundled objects have one label."""
+    if config.label is None or len(config.objects) < 2:
+        return []
+    bundled = list_objects()
+    labels = {name: load_object(name).label if name in bundled else None for name in config.objects}
+    models, _ = load_models([config.model], make_task(config.task), config)
+    return one_label_for_several(models, config.label, labels)
+
+
+class StudyRun:
+    """Carries out attacks, each in a folder of its own, unless they are done already; first on workers, if asked to.
+
+    `chains` are all that there are, `names` are of those so far, and `warnings` what they said, each sentence once.
+    After an interrupt nothing more is carried out.
+    """
+
+    def __init__(self, asked: Asked[AttackConfig]) -> None:
+        self.asked, self.run, self.progress = asked, asked.run, asked.progress
+        self.warnings = _label_for_all(asked.config)
+        for text in self.warnings:
+            self.progress.message(text)
+        self.chains = chains_of(asked.config)
+        self.names: list[str] = []
+        with asked.until_interrupted():
+            share(asked.config, self.chains, self.run.path, self.progress)
+
+    @property
+    def interrupted(self) -> bool:
+        """Whether there was an interrupt."""
+        return self.asked.ending == INTERRUPTED
+
+    def attack(self, study: StudyAttack, clean: CleanMatrix | None = None) -> AttackSummary | None:
+        """Return the summary of one attack, or None if there was an interrupt; `clean` as for `attack_once`."""
+        if self.interrupted:
+            return None
+        config, path = study.config, self.run.path / PARTS / study.name
+        self.names.append(study.name)
+        budget = f", epsilon {config.epsilon:.3g}" if isinstance(config.epsilon, float) else ""
+        what = f"{config.object} against {config.model}, {' and '.join(config.controls)}{budget}"
+        self.progress.message(f"attack {len(self.names)} of at most {sum(map(len, self.chains))}: {what}")
+        if is_run(path) and (path / CONFIG).is_file():
+            began = None if finished(path) else AttackConfig.from_yaml(path / CONFIG, config.asked)
+            summary = (
+                attack_once(began, progress=self.progress, resumed=path, clean=clean).summary
+                if began
+                else attack_of(path)
+            )
+        else:
+            config_there = config.model_copy(update={"run": str(path), "overwrite": True})
+            summary = attack_once(config_there, progress=self.progress, clean=clean).summary
+        self.warnings += [text for text in summary.warnings if text not in self.warnings]
+        if summary.ending == INTERRUPTED:
+            self.asked.ending = INTERRUPTED
+        return None if self.interrupted else summary
+
+
+# ---- several objects or epsilons, and several models ----------------------------------------------------------------
+
+
+def curve(asked: Asked[AttackConfig]) -> CurveResult:
+    """Robust accuracy against epsilon, over objects.
+
+    The epsilons are tried from the smallest. An object that flips at one of them flips at every larger one, whose ball
+    has the same configuration in it, so it is not attacked again. An object that is wrong as it is counts as not robust
+    at any epsilon, and is told apart from those that were found.
+    """
+    study = StudyRun(asked)
+    rows = []
+    for chain in study.chains:
+        row, clean = ObjectRow(object=chain[0].of, clean=None, flips_at=None), CleanMatrix()
+        renders: Counter[str] = Counter()
+        for one in chain:
+            summary = study.attack(one, clean)
+            if summary is None:
+                break
+            renders.update(summary.renders)
+            row = _seen(one.of, summary, one.epsilon).model_copy(update={"renders": dict(renders)})
+            if row.ending in SETTLED:
+                break
+        rows.append(row)
+    epsilons: Sequence[float | None] = sorted(asked.config.epsilons) or [None]
+    return asked.result(
+        CurveResult,
+        epsilons=list(epsilons),
+        table=rows,
+        curve=[_accuracy(rows, epsilon) for epsilon in epsilons],
+        parts=study.names,
+        warnings=study.warnings,
+    )
+
+
+def _seen(name: str, summary: AttackSummary, tried: float | None) -> ObjectRow:
+    epsilon = summary.epsilon if tried is None else tried
+    return ObjectRow(
+        object=name,
+        clean=summary.clean.control,
+        ending=summary.ending,
+        epsilon=epsilon,
+        flips_at=epsilon if summary.ending == "found" else None,
+        verified=summary.verified,
+        margin=summary.verified.margin if summary.verified else None,
+        run=summary.run,
+        tried=tried,
+    )
+
+
+def _known(row: ObjectRow, epsilon: float | None) -> bool:
+    """Whether a row says anything about an epsilon: it was tried there, or had flipped before.
+
+    What ended without a number says nothing, and neither does an object that its own noise makes wrong too often for
+    any answer to be verified.
+    """
+    if row.ending in (None, "non-finite objective"):
+        return False
+    if row.ending in SETTLED:
+        return True
+    steady = row.clean is not None and row.clean.correct >= WORST_CASE.needed(row.clean.trials)
+    return steady and (epsilon is None or (row.tried is not None and row.tried >= epsilon))
+
+
+def _accuracy(rows: Sequence[ObjectRow], epsilon: float | None) -> CurvePoint:
+    """How many objects are still recognised at an epsilon."""
+    known = [row for row in rows if _known(row, epsilon)]
+    wrong = sum(row.ending == "already wrong" for row in known)
+    flipped = [row.flips_at for row in known if row.ending == "found"]
+    found = sum(
+        epsilon is None or (isinstance(epsilon_there, float) and epsilon_there <= epsilon) for epsilon_there in flipped
+    )
+    robust = len(known) - wrong - found
+    return CurvePoint(
+        epsilon=epsilon,
+        objects=len(known),
+        robust=robust,
+        found=found,
+        already_wrong=wrong,
+        accuracy=robust / len(known) if known else None,
+        interval=clopper_pearson(robust, len(known)) if known else (0.0, 1.0),
+    )
+
+
+LEAST_SPP = 64
+"""Samples a pixel of the trials, where none of the attacks needed more and nothing was asked for."""
+
+
+def matrix(asked: Asked[AttackConfig]) -> MatrixResult:
+    """Attack several models, and try every answer on each of them in pictures that are the same for all.
+
+    Trial k has the same seed for every answer and every model, and none that a search or its verification has used.
+    Models of one input size are shown the same picture; for another size the same configuration is rendered anew. A
+    success needs the model to be right on the clean scene with the same seed, as everywhere.
+    """
+    config, names = asked.config, different(asked.config.models, "model")
+    asked.progress.stage(LOADING)
+    for name in names:
+        check_from_config(_alone(config, name))
+
+    study = StudyRun(asked)
+    attacked: list[tuple[str, AttackSummary]] = []
+    for (one,) in study.chains:
+        summary = study.attack(one)
+        if summary is not None:
+            attacked.append((one.of, summary))
+    models: list[MatrixModel] = []
+    cells: dict[str, list[MatrixCell]] = {}
+    answers = {name: u for name, summary in attacked if (u := _answer(summary)) is not None}
+    if answers and not study.interrupted:
+        spp = config.verify_spp or max([LEAST_SPP, *(s.sample_count.spp for _, s in attacked if s.sample_count)])
+        with asked.until_interrupted():
+            study.progress.stage("loading the models to try the answers on")
+            problems = {name: problem_from_config(_alone(config, name))[0] for name in names}
+            seed, trials = seeds.stream(config.seed, "matrix"), config.trial_count
+            with executor_for(
+                config, "advsearch.questions.attack.studies:models_answering", study.progress
+            ) as executor:
+                conditions = [RetrialCondition(name, one, spp, _size(one)) for name, one in problems.items()]
+                retrials = Retrials(conditions, study.run, study.progress, trials=trials, seed=seed, executor=executor)
+                each = trials * len(names)
+                hint = f"{each} answers; `trials` or `verify_spp` shorten it"
+                study.progress.stage("trying the clean scene on every model", each, hint=hint)
+                models = [_model(condition, retrials) for condition in conditions]
+                for name, u in answers.items():
+                    study.progress.stage(f"trying the answer to {name} on every model", each, hint=hint)
+                    checked = [(condition.name, retrials.answer(name, u, condition)) for condition in conditions]
+                    cells[name] = [
+                        MatrixCell(model=model, ending=one.ending.value, verified=verified_rate(one))
+                        for model, one in checked
+                    ]
+    rows = [
+        MatrixRow(attacked=name, ending=one.ending, run=one.run, renders=one.renders, tested=cells.get(name, []))
+        for name, one in attacked
+    ]
+    return asked.result(
+        MatrixResult,
+        models=list(names),
+        ensemble=config.ensemble,
+        tested=models,
+        table=rows,
+        parts=study.names,
+        warnings=study.warnings,
+    )
+
+
+def models_answering(settings: JsonObject) -> Call:
+    """Return what answers queries of the models of a configuration: what a worker does."""
+    config = AttackConfig(**settings)
+    return answering(cache(lambda name: problem_from_config(_alone(config, name))[0]))
+
+
+def _alone(config: AttackConfig, name: str) -> AttackConfig:
+    """What an answer is tried on one model with; nothing is searched."""
+    return AttackConfig.of(config, model=name, ensemble=None)
+
+
+def _answer(summary: AttackSummary) -> Tensor | None:
+    """The configuration that an attack answers with; None where nothing was searched."""
+    if summary.adversarial is None or summary.run is None:
+        return None
+    return torch.from_numpy(read_answer(Path(summary.run)))
+
+
+def _model(condition: RetrialCondition, retrials: Retrials) -> MatrixModel:
+    return MatrixModel(
+        model=condition.name,
+        labels=list(condition.problem.task.truth_names(condition.problem.truth())),
+        input_size=_size(condition.problem),
+        spp=condition.spp,
+        clean=control_group(retrials.clean(condition), condition.spp),
+    )
+
+
+def _size(problem: Problem) -> tuple[int, int]:
+    return problem.renderer.formation.resolution

@@ -1,0 +1,144 @@
+"""Drives: what a sweep over the frames of a path says of whole drives, everything that varies but the time, and the
+worst of them. Frames are not independent, so intervals are over drives, and hold for any number of them: each number
+has ends that it cannot pass (`attacks.units`)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from advsearch.attacks.units import mean_interval
+from advsearch.controls import Control
+from advsearch.controls.path import PathControl
+from advsearch.engine.naming import given_to
+from advsearch.questions.attack.result import evenly, write_drive
+from advsearch.questions.sweep.axes import Axis
+from advsearch.questions.sweep.job import Job, Scenes
+from advsearch.questions.sweep.settings import SweepConfig
+from advsearch.questions.sweep.summary import DriveRates, OverDrives
+from advsearch.report.marks import marked
+from advsearch.runs.directory import RunDirectory
+from advsearch.runs.store import Row
+
+ANIMATED = 60
+
+UNKNOWN = -1
+
+Flags = npt.NDArray[np.int8]
+
+
+def with_frames(config: SweepConfig, drawn: tuple[Control, ...]) -> tuple[tuple[Control, ...], dict[str, object]]:
+    """Return the controls with what travels along the path of the configuration, and the grid with its frames last."""
+    travelling = next((one for one in drawn if isinstance(one, PathControl)), None)
+    if travelling is None:
+        (added,) = given_to(config, {PathControl.kind: {}})
+        assert isinstance(added, PathControl)
+        drawn, travelling = (*drawn, added), added
+    name, seconds = f"{travelling.name}.time", travelling.seconds
+    frames = f"0:{seconds:g}:{max(2, round(seconds * config.fps) + 1)}"
+    return drawn, config.grid if name in config.grid else {**config.grid, name: frames}
+
+
+def time_axis(axes: Sequence[Axis]) -> int | None:
+    """Return the number of the axis whose values are frames; None where there is none, or one frame."""
+    return next((place for place, axis in enumerate(axes) if axis.is_time and len(axis.values) > 1), None)
+
+
+class Drives:
+    """The frames of every drive of a sweep."""
+
+    def __init__(self, job: Job, rows: Iterable[Row]) -> None:
+        place = time_axis(job.axes)
+        assert place is not None
+        self._job, axis = job, job.axes[place]
+        sizes = [len(one.values) for one in job.axes]
+        shape = (len(job.places), *sizes, job.samples, len(job.models))
+        right: Flags = np.full(shape, UNKNOWN, np.int8)
+        away = np.full((len(job.places), sizes[place]), np.nan)
+        before = int(np.prod(sizes[place + 1 :], dtype=np.int64)) * job.samples * len(job.models)
+        name, self._unit = f"{axis.instance}.distance", "object sizes"
+        for row in rows:
+            right.flat[row.step] = bool(row.correct)
+            if name in row.values:
+                distance = row.values[name]
+                scene = row.step // len(job.models) // job.per_scene
+                away[scene, row.step // before % sizes[place]] = float(str(distance["value"]))
+                self._unit = distance["unit"]
+        order = np.argsort([float(value) for value in axis.values])
+        self.times = np.array([float(value) for value in axis.values])[order]
+        self._numbers = np.moveaxis(np.arange(right.size).reshape(shape), place + 1, -1)[..., order]
+        self._right = np.moveaxis(right, place + 1, -1)[..., order]
+        self._away = away[:, order]
+
+    def rates(self) -> list[DriveRates]:
+        """Return what is said of the drives of each model, without and with an answer."""
+        found, places = list[DriveRates](), self._job.places
+        for answer in dict.fromkeys(one.answer for one in places):
+            mine = [number for number, one in enumerate(places) if one.answer == answer]
+            for model, network in enumerate(self._job.models):
+                right = self._right[mine][..., model, :].reshape(len(mine), -1, len(self.times))
+                whole = (right != UNKNOWN).all(axis=2)
+                away = np.repeat(self._away[mine][:, None], right.shape[1], axis=1)[whole]
+                if whole.any():
+                    found.append(self._rates(network.name, answer, right[whole] == 1, away))
+        return found
+
+    def _rates(
+        self, model: str, answer: str, right: npt.NDArray[np.bool_], away: npt.NDArray[np.float64]
+    ) -> DriveRates:
+        """What is said of drives: (n, frames) whether the model is right, and how far away it is."""
+        seconds, frames = float(self.times[-1] - self.times[0]), len(self.times)
+        step = seconds / (frames - 1)
+        seen = right.any(axis=1)
+        first = away[np.arange(len(right)), right.argmax(axis=1)][seen]
+        changes = (right[:, 1:] != right[:, :-1]).sum(axis=1) / seconds
+        ends = float(away.min()), float(away.max())
+        return DriveRates(
+            model=model,
+            answer=answer or None,
+            drives=len(right),
+            frames=right.shape[1],
+            seconds=seconds,
+            right=over_drives(right.mean(axis=1), worst=min),
+            longest_gap=over_drives(np.array([longest(~one) for one in right]) * step, max, (0.0, frames * step)),
+            first_seen=over_drives(first, min, ends) if len(first) and np.isfinite(ends).all() else None,
+            unit=self._unit,
+            never_seen=int((~seen).sum()),
+            flicker=over_drives(changes, max, (0.0, (frames - 1) / seconds)),
+        )
+
+    def keep_worst(self, scenes: Scenes, run: RunDirectory) -> None:
+        """Write a strip and an animation of the drive in which the first model is right least often, with its marks."""
+        right = self._right[..., 0, :].reshape(-1, len(self.times))
+        numbers = self._numbers[..., 0, :].reshape(-1, len(self.times)) // len(self._job.models)
+        whole = (right != UNKNOWN).all(axis=1)
+        if not whole.any():
+            return
+        worst = numbers[whole][(right[whole] == 1).mean(axis=1).argmin()]
+        pictures = [picture_of(scenes, int(number)) for number in worst[evenly(len(worst), ANIMATED)]]
+        write_drive(run, "drive", pictures, float(self.times[-1] - self.times[0]))
+
+
+def picture_of(scenes: Scenes, number: int) -> npt.NDArray[np.float32]:
+    """Return the picture (h, w, 3) with a number, with the marks of the first model's answer."""
+    sent = scenes.job.queries(range(number, number + 1))
+    view, query = scenes.named(sent[0][0]), sent[0][2]
+    picture = view.pictures([query])[0]
+    return np.asarray(marked(picture.numpy(), view.problems[0].marks(picture, query.u)), dtype=np.float32)
+
+
+def longest(flags: npt.NDArray[np.bool_]) -> int:
+    """Return the length of the longest run of true values."""
+    ends = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(np.int8), [0]])))
+    return int((ends[1::2] - ends[::2]).max(initial=0))
+
+
+def over_drives(
+    values: npt.NDArray[np.float64], worst: Callable[[list[float]], float], ends: tuple[float, float] = (0.0, 1.0)
+) -> OverDrives:
+    """Return the mean of a number over drives, its 95 % interval, and that of the worst drive; `ends` are what it is
+    between whatever a model says."""
+    interval = mean_interval(values, *ends) if len(values) > 1 else None
+    return OverDrives(mean=float(values.mean()), interval=interval, worst=worst(values.tolist()))

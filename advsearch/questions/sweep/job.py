@@ -1,0 +1,367 @@
+"""Sweeps. Here: what one is asked for, found and loaded: scenes, models, controls and axes."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
+
+import torch
+from torch import Tensor
+
+from advsearch import seeds
+from advsearch.attacks import Evaluation, Query, Trials, run_trials
+from advsearch.attacks.draws import Seeds
+from advsearch.controls import Control, Space, make_control, make_space
+from advsearch.described import Value
+from advsearch.engine.journal import Journal, Sent, Shared
+from advsearch.engine.judging import Looked, Metrics, check_truth, facts_of
+from advsearch.engine.loading import Scene, framed, make_renderer
+from advsearch.engine.objective import domain_of
+from advsearch.engine.problem import Prepared, Problem
+from advsearch.engine.record import Stages, rate_of
+from advsearch.engine.verifier import Verifier, ladder_of
+from advsearch.errors import InputError
+from advsearch.models import Model
+from advsearch.questions.sweep.axes import Axis, on_grid
+from advsearch.questions.sweep.points import Drawn, Points
+from advsearch.questions.sweep.predicting import PredictedSweep, SweptPicture
+from advsearch.questions.sweep.settings import SweepConfig
+from advsearch.questions.sweep.summary import WorstVerified
+from advsearch.runs.directory import RunDirectory
+from advsearch.scene.description import ENVIRONMENT, OBJECT
+from advsearch.scene.formation import next_count, to_8_bit
+from advsearch.scene.renderer import Renderer
+from advsearch.tasks import Facts, Judgement, Task
+from advsearch.tasks.base import Truth
+from advsearch.viewer import thumbnails
+
+KIND = "sweep"
+"""Rows of the sweep, and the stream of their seeds."""
+
+SAMPLES = 100
+"""Draws where there is no grid and nothing is said."""
+
+
+@dataclass(frozen=True)
+class NamedScene:
+    """One of the scenes. Controls that are `held` stay where `u` (d,) has them, or as the scene is without it; `answer`
+    is what the place is called beside the same one without the answer of a run, empty where there is no such."""
+
+    object: str
+    environment: str
+    scene: Scene
+    held: tuple[Control, ...] = ()
+    u: Tensor | None = None
+    answer: str = ""
+
+    @property
+    def values(self) -> dict[str, Value]:
+        named: dict[str, Value] = {
+            "object": {"value": self.object, "unit": ""},
+            "environment": {"value": self.environment, "unit": ""},
+        }
+        return {**named, "answer": {"value": self.answer, "unit": ""}} if self.answer else named
+
+
+@dataclass(frozen=True)
+class Job:
+    """Everything that was asked for, found and loaded: `controls` are drawn by chance; `aovs` are layers of ground
+    truth that are kept of every picture of the first model (`scene.surfaces.AOVS`)."""
+
+    config: SweepConfig
+    places: tuple[NamedScene, ...]
+    models: tuple[Model, ...]
+    tasks: tuple[Task, ...]
+    controls: tuple[Control, ...]
+    axes: tuple[Axis, ...]
+    aovs: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+    metrics: Metrics = field(default_factory=dict)
+    _bound: dict[int, dict[tuple[int, int], Points]] = field(default_factory=dict, init=False, repr=False)
+
+    @property
+    def samples(self) -> int:
+        return self.config.samples or (SAMPLES if self.controls and not self.axes else 1)
+
+    @cached_property
+    def spp(self) -> int:
+        """Samples a pixel, as the sampler has them."""
+        return next_count(self.config.pixel_sampler, self.config.search_spp)
+
+    @cached_property
+    def sizes(self) -> tuple[tuple[int, int], ...]:
+        """(height, width) of the pictures for each model."""
+        return tuple(self.config.resolution or model.input_size for model in self.models)
+
+    @cached_property
+    def first_of_size(self) -> tuple[bool, ...]:
+        """Of each model, whether no model before it is shown the same pictures."""
+        return tuple(size not in self.sizes[:model] for model, size in enumerate(self.sizes))
+
+    # ---- what is asked ----------------------------------------------------------------------------------------------
+
+    @cached_property
+    def per_scene(self) -> int:
+        """Pictures of a scene."""
+        return next(iter(self.bound(0).values())).count
+
+    @cached_property
+    def seeds(self) -> Seeds:
+        """Of the noise of draws."""
+        return Seeds(self.config.seed, KIND)
+
+    def bound(self, scene: int) -> dict[tuple[int, int], Points]:
+        """The configurations of a scene for each size of picture; those of the last scene are held."""
+        if scene not in self._bound:
+            self._bound.clear()
+            spaces = self.spaces(self.places[scene])
+            self._bound[scene] = {size: self.points(space) for size, space in spaces.items()}
+        return self._bound[scene]
+
+    def queries(self, numbers: range) -> list[Sent]:
+        """Ask all models about the pictures with these numbers, all of one scene, whose number is the name."""
+        scene = numbers.start // self.per_scene
+        before, models = scene * self.per_scene, len(self.models)
+        place, keep = self.places[scene], self.config.keep_pictures != "none"
+        held, found = {control.name for control in place.held}, list[Sent]()
+        picked: dict[tuple[int, int], tuple[Tensor, list[dict[str, Value]]]] = {}
+        for size, points in self.bound(scene).items():
+            picks = points.picks(numbers.start - before, len(numbers), before)
+            u = points.configurations(picks)
+            picked[size] = u, points.values(u, picks)
+        for k, number in enumerate(numbers):
+            for model, size in enumerate(self.sizes):
+                points, (u, values) = self.bound(scene)[size], picked[size]
+                said, lit_by = place.values, points.lit_by(values[k])
+                if lit_by is not None:
+                    said["environment"] = {"value": lit_by, "unit": ""}
+                said["model"] = {"value": self.models[model].name, "unit": ""}
+                said |= {name: value for name, value in values[k].items() if name.partition(".")[0] not in held}
+                seed, step = self.seeds(points.noise(number)), number * models + model
+                query = Query(
+                    u[k].clone(), seed, KIND, step, spp=self.spp, drawn=False, values=said, sought=False, keep=keep
+                )
+                found.append((str(scene), None, query))
+        return found
+
+    def spaces(self, place: NamedScene) -> dict[tuple[int, int], Space]:
+        return {size: self.space(place, size) for size in dict.fromkeys(self.sizes)}
+
+    def space(self, place: NamedScene, size: tuple[int, int]) -> Space:
+        """The controls, those of the grid as choices, bound to a scene."""
+        description = framed(place.scene.description, size)
+        controls = (*place.held, *on_grid(self.controls, self.axes, description))
+        if not controls:
+            return Space((), None)
+        space = make_space(controls, description)
+        if not place.held:
+            return space
+        start = torch.cat([bound.start for bound in space.controls[: len(place.held)]])
+        if place.u is not None and len(place.u) != len(start):
+            raise InputError(
+                f"answer_of: the answer of {place.answer} has {len(place.u)} numbers, and {place.object} takes "
+                f"{len(start)}: it is another object, or it has changed since; do the run again"
+            )
+        return space.holding(start if place.u is None else place.u)
+
+    def points(self, space: Space) -> Points:
+        """The configurations of a space; those with an answer have the draws of those without it."""
+        scenes = len(self.places) // 2 if self.places[0].answer else 0
+        domain = domain_of(space.controls)
+        among, config = len(self.places), self.config
+        return Points(space, domain, self.axes, self.samples, config.sampler, config.seed, scenes, among)
+
+    def truth(self, place: NamedScene, model: int, values: Mapping[str, Value], look: Looked | None = None) -> Truth:
+        """What is true of a configuration, by what is described and seen of it, as the task of a model needs it."""
+        return self.tasks[model].truth(self._facts(place, values, look))
+
+    def _facts(self, place: NamedScene, values: Mapping[str, Value], look: Looked | None = None) -> Facts:
+        return facts_of(place.scene, place.object, self.config, lambda: values, look)
+
+    def check_truths(self, place: NamedScene) -> None:
+        for task, model in zip(self.tasks, self.models, strict=True):
+            check_truth(task, model, place.scene, self._facts(place, {}), self.config)
+
+
+def check_scenes(places: Sequence[NamedScene], controls: Sequence[Control], axes: Sequence[Axis]) -> None:
+    """Refuse to vary what the scenes were asked to have."""
+    given = {name for place in places for name in place.scene.description.given}
+    drawn = {control.name: control for control in controls}
+    varied = {
+        axis: drawn.get(axis.instance)
+        or make_control(axis.instance, {"kind": axis.control, axis.parameter.name: axis.values[0]})
+        for axis in axes
+    }
+    settings = {axis: control.setting(axis.parameter) for axis, control in varied.items()}
+    for axis, setting in settings.items():
+        if setting in given and setting != ENVIRONMENT:
+            raise InputError(f"`grid` {axis.name}: `set` fixes it already; leave it out of one of the two")
+    environments = list(dict.fromkeys(place.environment for place in places))
+    choosing = [f"`grid` {axis.name}" for axis, setting in settings.items() if setting == ENVIRONMENT]
+    choosing += [
+        f"`controls` {control.name}"
+        for control in controls
+        for parameter in control.parameters
+        if control.setting(parameter) == ENVIRONMENT and parameter.name in control.settings()
+    ]
+    if len(environments) > 1 and choosing:
+        raise InputError(
+            f"`environment={','.join(environments)}` and {choosing[0]} both choose what lights the scene; name all of "
+            "them in one of the two, and leave the other out"
+        )
+
+
+def check_all(job: Job) -> tuple[Points, tuple[Drawn, ...]]:
+    """Bind every scene once, so that what is wrong is said before anything is rendered. Returns the points of the first
+    scene, and what the table shows of the draws: shares of the range where scenes, or pictures of different shapes,
+    have different ones."""
+    bound = []
+    for place in job.places:
+        spaces = list(job.spaces(place).values())
+        _check_draws(place, spaces[0])
+        bound += [(place, job.points(space)) for space in spaces]
+        job.check_truths(place)
+    first = bound[0][1]
+    for place, points in bound:
+        if points.drawn_numbers != first.drawn_numbers:
+            raise InputError(
+                f"`object` {place.object}: its controls draw other numbers than those of {job.places[0].object}; sweep "
+                "the two by themselves"
+            )
+    drawn = []
+    for versions in zip(*(points.drawn for _, points in bound), strict=True):
+        same = all(one.parts == versions[0].parts for one in versions)
+        shares = tuple([k / first.parts, (k + 1) / first.parts] for k in range(first.parts))
+        drawn.append(versions[0] if same else replace(versions[0], unit="of its range", parts=shares, settled=False))
+    return first, tuple(drawn)
+
+
+def _check_draws(place: NamedScene, space: Space) -> None:
+    for group in space.groups:
+        if group.setting in place.scene.description.given - {ENVIRONMENT}:
+            raise InputError(
+                f"`controls` {group.control}: draws {group.parameter} by chance, and `set` {group.setting} fixes it; "
+                "leave it out of one of the two"
+            )
+
+
+# ---- scenes, rendered ------------------------------------------------------------------------------------------------
+
+
+class SweptScene:
+    """One scene, ready to be rendered and shown to the models: a `Problem` for each of them. Points, renderers and what
+    predicts pictures are there for each size of picture, on which what a control frames may depend."""
+
+    def __init__(self, job: Job, number: int) -> None:
+        place, config = job.places[number], job.config
+        self.number, self.job = number, job
+        self.points: dict[tuple[int, int], Points] = {}
+        self.renderers: dict[tuple[int, int], Renderer] = {}
+        spaces = job.spaces(place)
+        for size, space in spaces.items():
+            description = framed(place.scene.description, size)
+            self.renderers[size] = make_renderer(
+                description, space, size, config.denoise, config.seed, sampler=config.pixel_sampler
+            )
+            self.points[size] = job.points(space)
+        facts, spp, seed = partial(facts_of, place.scene, place.object, config), job.spp, config.seed
+        self.problems = tuple(
+            Problem(self.renderers[size], spaces[size], model, task, facts, None, spp, seed, metrics=job.metrics)
+            for size, model, task in zip(job.sizes, job.models, job.tasks, strict=True)
+        )
+        seed, self.predicted = seeds.stream(seed, "sweep light", number), dict[tuple[int, int], PredictedSweep]()
+        for size, points in self.points.items():
+            problem, before = self.problems[job.sizes.index(size)], number * points.count
+            self.predicted[size] = PredictedSweep(problem, points, job.axes, seed, config.specialise, before)
+
+    @property
+    def not_finite(self) -> int:
+        rendered = sum(renderer.non_finite for renderer in self.renderers.values())
+        return rendered + sum(one.not_finite for one in self.predicted.values())
+
+    def answers(self, queries: Sequence[Query], prepared: Prepared | None = None) -> list[Evaluation]:
+        """Answer queries of neighbouring rows: a picture is made once for each size, and a model sees all of its own at
+        once. Nothing is prepared for these."""
+        begun, before, job = time.perf_counter(), self.not_finite, self.job
+        models = len(job.models)
+        made = {size: self._made(size, queries) for size in self.points}
+        said: dict[int, Judgement] = {}
+        for model, (size, problem) in enumerate(zip(job.sizes, self.problems, strict=True)):
+            mine = [query for query in queries if query.number % models == model]
+            if mine:
+                shown = torch.stack([made[size][query.number // models].picture for query in mine])
+                judged = problem.judge_several(shown, [query.u for query in mine], [query.values for query in mine])
+                said |= {query.number: judgement for query, judgement in zip(mine, judged, strict=True)}
+        wrong = {number // models for number, judgement in said.items() if not judgement.right}
+        seconds, answers = (time.perf_counter() - begun) / len(queries), list[Evaluation]()
+        for query in queries:
+            number, model = divmod(query.number, models)
+            picture, first = made[job.sizes[model]][number], job.first_of_size[model]
+            answer = Evaluation.of(
+                said[query.number], cost=picture.traced * first, predicted=picture.predicted, seconds=seconds
+            )
+            if model == 0 and query.keep and (job.config.keep_pictures == "all" or number in wrong):
+                answer = replace(answer, small=thumbnails.thumbnail(picture.picture))
+            if model == 0 and job.aovs:
+                surfaces = self.renderers[job.sizes[0]].surfaces(query.u)
+                layers = {name: layer.numpy() for name, layer in surfaces.layers(job.aovs, OBJECT).items()}
+                answer = replace(answer, layers=(layers, surfaces.notes(job.aovs)))
+            answers.append(answer)
+        so_far = [one.summary() for one in self.predicted.values()]
+        return [*answers[:-1], replace(answers[-1], light=so_far, non_finite=max(0, self.not_finite - before))]
+
+    def _made(self, size: tuple[int, int], queries: Sequence[Query]) -> dict[int, SweptPicture]:
+        """The pictures of one size, rounded to 8 bits, by their numbers."""
+        job, models, before = self.job, len(self.job.models), self.number * self.points[size].count
+        asked = {one.number // models - before: one for one in queries if job.sizes[one.number % models] == size}
+        with torch.no_grad():
+            made = self.predicted[size].pictures(asked)
+        return {before + number: replace(one, picture=to_8_bit(one.picture)) for number, one in made.items()}
+
+    def pictures(self, queries: Sequence[Query]) -> Tensor:
+        """Return the pictures (n, H, W, 3) of rows as the first model sees them."""
+        made, models = self._made(self.job.sizes[0], queries), len(self.job.models)
+        return torch.stack([made[number].picture for number in dict.fromkeys(one.number // models for one in queries)])
+
+
+class Scenes:
+    """The scenes of a sweep in this process, of which the last one is held."""
+
+    def __init__(self, job: Job) -> None:
+        self.job = job
+        self.scene: SweptScene | None = None
+
+    def open(self, number: int) -> SweptScene:
+        """The scene with this number; loading it lets the one before go."""
+        if self.scene is None or self.scene.number != number:
+            self.scene = None
+            self.scene = SweptScene(self.job, number)
+        return self.scene
+
+    def named(self, name: str) -> SweptScene:
+        """The same by its number as text: see `advsearch.engine.journal.answering`."""
+        return self.open(int(name))
+
+    def picture(self, number: int) -> Tensor:
+        sent = self.job.queries(range(number, number + 1))
+        return self.named(sent[0][0]).pictures([query for _, _, query in sent])[0]
+
+
+def check_worst(
+    problem: Problem, config: SweepConfig, u: Tensor, run: RunDirectory | None, stages: Stages
+) -> WorstVerified | None:
+    """Render a configuration again, and say how often the model is wrong; None without trials. Those that the run has
+    stored already are not made again."""
+    if config.trials == 0:
+        return None
+    verifier = Verifier(Journal(run, Shared(problem)), ladder_of(config), stages, sought=False)
+    verifier.choose_spp({"worst": u})
+    verifier.begin("checking the worst configuration with fresh renders", config.trials)
+    spp, count = verifier.findings.spp, verifier.findings.sample_count
+    tried = run_trials(verifier.answers, u, spp=spp, seed=config.seed, trials=config.trials)
+    wrong = [trial for trial in tried if trial.success]
+    rate = rate_of(Trials(len(wrong), len(tried), spp), tried, wrong)
+    settled = len(verifier.ladder) == 1 or (count is not None and count.converged)
+    return WorstVerified(**vars(rate), converged=settled, renders=verifier.findings.verification_renders)

@@ -1,0 +1,408 @@
+"""The loop of a sweep: ask about every configuration, store and count what is answered, sum it up. They are numbered:
+scenes (beside an answer first all without it), then the grid with its last axis fastest, then draws, then models; a
+batch begins at a multiple of its size, so that a sweep that was stopped, or whose batches come in another order, ends
+bit for bit as any other."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+
+from advsearch.attacks import Evaluation, Query
+from advsearch.attacks.draws import batches
+from advsearch.attacks.units import most_shown
+from advsearch.cluster import Executor, InProcess
+from advsearch.engine.journal import Journal, Sent, Shared, answering, finite, lost, other_answers, same
+from advsearch.engine.loading import framed
+from advsearch.engine.record import LOST, Stages, judgement_of, lost_remarks
+from advsearch.interrupts import interruptible
+from advsearch.progress import Progress
+from advsearch.questions.attack.result import save_marked
+from advsearch.questions.sweep import summary as results
+from advsearch.questions.sweep.drives import Drives, time_axis
+from advsearch.questions.sweep.figures import sweep_figure
+from advsearch.questions.sweep.job import KIND, Job, Scenes, check_all, check_worst
+from advsearch.questions.sweep.page import write_sweep_page
+from advsearch.questions.sweep.predicting import combined
+from advsearch.questions.sweep.result import (
+    FINISHED,
+    INTERRUPTED,
+    Answers,
+    SweepResult,
+    SweptAxis,
+    counted_by_unit,
+    map_over,
+)
+from advsearch.questions.sweep.summary import WorstConfiguration, WorstVerified
+from advsearch.questions.sweep.surface import map_surface
+from advsearch.report.wording import count
+from advsearch.runs.directory import AOV_FOLDER, RunDirectory
+from advsearch.runs.files import write_bytes
+from advsearch.runs.images import write_layers
+from advsearch.runs.results import DescribedValue, Formation, LinearTransport, SharedWork
+from advsearch.runs.store import Row
+from advsearch.runs.tables import EDGES
+from advsearch.runs.units import NOTE
+from advsearch.tasks import Judgement
+from advsearch.viewer import thumbnails
+
+NOT_FINITE = "pictures not finite"
+"""The note under which the store keeps that there were some."""
+
+PICTURE_SPP = 64
+"""Samples a pixel of the picture that is kept, unless verification needed more."""
+
+ENOUGH_DRIVES = 20
+"""Of fewer, a sweep says what they could show at best."""
+
+TELL_SECONDS = 0.1
+
+MOST_METERED = 256
+"""Scenes whose gains a summary lists; of more it has none."""
+
+DRAWN_AT_ONCE = 4096
+"""Pictures whose draws are worked out at once for the tables."""
+
+
+class Sweep:
+    """One sweep, from its first configuration or from where it was stopped: `run` has the rows that are there already,
+    and None keeps it in memory. Without an executor all is answered here."""
+
+    def __init__(
+        self, job: Job, run: RunDirectory | None, progress: Progress, executor: Executor | None = None
+    ) -> None:
+        self.job, self.run, self.stages = job, run, Stages(progress)
+        self.stages.begin("setup", "preparing the scenes for rendering")
+        self.points, self._shown = check_all(job)
+        if run is not None:
+            run.store.set_note(EDGES, json.dumps({one.name: one.edges for one in self._shown if one.edges}))
+        self.per_scene, self.models = self.points.count, len(job.models)
+        self.units = replace(self.points.units, models=self.models)
+        if run is not None:
+            run.store.set_note(NOTE, json.dumps(self.units.noted))
+        self.total = len(job.places) * self.per_scene * self.models
+        self.samples = job.spp
+        self._scenes = Scenes(job)
+        self._executor = InProcess(answering(self._scenes.named)) if executor is None else executor
+        self.journal = Journal(run, Shared(None, executor))
+        self._rendered = self._traced = self._predicted = self._lost = 0
+        self._transport: dict[tuple[str, int], list[LinearTransport | None]] = {}
+        self._not_finite = run is not None and run.store.note(NOT_FINITE) is not None
+        self._told, self._untold, self._begun = 0.0, 0, 0.0
+        self._surface: results.SurfaceMap | None = None
+        self._drives: list[results.DriveRates] | None = None
+
+    def carry_out(self, first: int | None = None) -> SweepResult:
+        """Do what is left, or all from the configuration with a number on, and return the answer."""
+        answers = self._counted()
+        ending, worst = FINISHED, None
+        self._check_answers()
+        for text in self.job.warnings:
+            self.stages.progress.message(text)
+        try:
+            with interruptible():
+                left = [range(first, self.total)] if first is not None else self._left()
+                self._scenes.open((left[0].start if left else self.total - 1) // self.models // self.per_scene)
+                hint = f"{self.total} answers, pictures of {count(self.samples, 'sample')} a pixel; `resolution`, `spp`"
+                hint += " or fewer points shorten it"
+                if self.run is not None and self.job.config.keep_pictures != "none":
+                    hint += f"; pictures that are kept take {self._pictures_text()}"
+                self.stages.begin("sweep", "rendering and classifying", self.total, hint=hint)
+                self.stages.progress.advance(self.total - sum(map(len, left)))
+                self._go_through(left, answers)
+                worst = self._claimed(answers)
+                if worst is not None:
+                    worst = worst.model_copy(update=self._verified(worst))
+                if self.job.config.surface and self.run is not None:
+                    self.stages.begin("surface", "tracing the surface that was seen", self.total)
+                    rows = self.run.store.rows(KIND)
+                    self._surface = map_surface(self.job, rows, self._scenes.open, self.run, self.stages.progress)
+                self._drives = self._driven()
+        except KeyboardInterrupt:
+            ending = INTERRUPTED
+            answers = self._counted()
+            worst = self._claimed(answers)
+        self.stages.end()
+        return self._finish(answers, ending, worst)
+
+    # ---- the loop ---------------------------------------------------------------------------------------------------
+
+    def _left(self) -> list[range]:
+        return [range(self.total)] if self.run is None else list(self.run.store.missing(KIND, self.total))
+
+    def _go_through(self, left: Sequence[range], answers: Answers) -> None:
+        """Have what is left carried out, store and count it."""
+        self._begun = time.monotonic()
+        for done in self._executor.results(self._asked(left)):
+            queries = [query for _, _, query in done.items]
+            said = [lost(one, done.lost) for one in queries] if done.lost else done.value
+            self._take(queries, said, done.worker, done.machine)
+            for query, one in zip(queries, said, strict=True):
+                answers.add(query.number, one.said)
+            self._tell(len(queries), answers)
+        self.journal.rows.sort(key=lambda row: row.step)
+
+    def _asked(self, left: Sequence[range]) -> Iterator[list[Sent]]:
+        """Yield what is asked in batches, each about one scene."""
+        for part in left:
+            first, last = part.start // self.models, -(-part.stop // self.models)
+            while first < last:
+                before = first // self.per_scene * self.per_scene
+                for piece in batches(first - before, min(last - before, self.per_scene), self.job.config.batch):
+                    asked = self.job.queries(range(before + piece.start, before + piece.stop))
+                    yield [one for one in asked if part.start <= one[2].number < part.stop]
+                first = before + self.per_scene
+
+    def _take(self, queries: Sequence[Query], answers: Sequence[Evaluation], worker: str, machine: str | None) -> None:
+        answers = [replace(one, machine=machine) for one in answers]
+        if self.run is not None:
+            for query, answer in zip(queries, answers, strict=True):
+                number = query.number // self.models
+                if answer.small is not None:
+                    thumbnails.keep(self.run.path, number, answer.small)
+                if answer.layers is not None:
+                    write_layers(self.run.path / AOV_FOLDER / f"{number:06d}.exr", *answer.layers)
+        rows = self.journal.keep(list(zip(queries, answers, strict=True)), numbered=True)
+        self._spend(rows)
+        scene = queries[0].number // self.models // self.per_scene
+        self._rendered += sum(self.job.first_of_size[query.number % self.models] for query in queries)
+        self._transport[worker, scene] = answers[-1].light or []
+        if any(one.non_finite for one in answers) and not self._not_finite:
+            self._not_finite = True
+            if self.run is not None:
+                self.run.store.set_note(NOT_FINITE, "yes")
+
+    def _pictures_text(self) -> str:
+        """What the kept pictures take, said beforehand."""
+        height, width = self.job.sizes[0]
+        share = min(1.0, thumbnails.SIDE / max(height, width)) ** 2 * height * width / thumbnails.SIDE**2
+        megabytes = self.total // self.models * thumbnails.BYTES * share / 1e6
+        size = f"{megabytes / 1e3:.1f} GB" if megabytes >= 1e3 else f"{max(megabytes, 0.1):.1f} MB"
+        return f"about {size}" if self.job.config.keep_pictures == "all" else f"at most about {size}"
+
+    def _check_answers(self) -> None:
+        """Look again at the first picture that is stored, where there is more to come here."""
+        row = None if self.run is None else next(self.run.store.rows(KIND), None)
+        if row is None or self.run is None or self._executor.facts is not None or not any(map(len, self._left())):
+            return
+        number, model = divmod(row.step, self.models)
+        sent = self.job.queries(range(number, number + 1))
+        other = Scenes(self.job).named(sent[0][0])  # what is done here decides no row
+
+        def look() -> float | None:
+            return finite(other.answers([query for _, _, query in sent])[model].said.margin)
+
+        now = look()
+        if not same([row.margin], [now]) and same([now], [look()]):
+            raise other_answers(self.run, {"margin": (row.margin, now)})
+
+    def _tell(self, count: int, answers: Answers) -> None:
+        self._untold += count
+        now = time.monotonic()
+        if now - self._told >= TELL_SECONDS:
+            facts, told = self._executor.facts, dict[str, float | str]()
+            if seen := int(answers.seen.sum()):
+                told["accuracy"] = int(answers.right.sum()) / seen
+            if facts is not None:
+                told |= {**facts.told, "a second": self._rendered / max(1e-9, now - self._begun)}
+            self.stages.progress.advance(self._untold, **told)
+            self._told, self._untold = now, 0
+
+    # ---- counting ---------------------------------------------------------------------------------------------------
+
+    def _counted(self) -> Answers:
+        """What the rows say that are stored already, read one after the other."""
+        answers = Answers(self.total)
+        self._traced = self._predicted = self._lost = 0
+        for row in self.rows():
+            answers.add(row.step, judgement_of(row))
+            self._spend([row])
+        return answers
+
+    def rows(self) -> Iterable[Row]:
+        return self.journal.rows if self.run is None else self.run.store.rows(KIND)
+
+    def _spend(self, rows: Sequence[Row]) -> None:
+        """Count the pictures that rows took; old ones don't say it."""
+        for row in rows:
+            first = self.job.first_of_size[row.step % self.models]
+            self._traced += int(first) if row.renders is None else row.renders
+            self._predicted += row.seed is None and first
+            self._lost += row.label == LOST
+
+    def _axes(self, numbers: npt.NDArray[np.int64]) -> list[SweptAxis]:
+        """What the tables are by, with the places of configurations by their numbers (n,)."""
+        job, (pictures, model) = self.job, np.divmod(numbers, self.models)
+        scene, local = np.divmod(pictures, self.per_scene)
+        axes = []
+        for what in ("object", "environment", "answer"):
+            names = [getattr(place, what) for place in job.places]
+            several = list(dict.fromkeys(names))
+            axes.append(SweptAxis(what, "", several, np.array([several.index(name) for name in names])[scene]))
+        axes.append(SweptAxis("model", "", [one.name for one in job.models], model))
+        digits = np.unravel_index(local // job.samples, self.points.grid.sizes) if job.axes else ()
+        of_the_grid = zip(job.axes, digits, strict=True)
+        axes += [SweptAxis(one.name, one.unit, one.values, at, "grid") for one, at in of_the_grid]
+        if self._shown and len(numbers):
+            until = int(pictures[-1]) + 1
+            scenes = (range(first, first + self.per_scene) for first in range(0, until, self.per_scene))
+            blocks = [one[k : k + DRAWN_AT_ONCE] for one in scenes for k in range(0, len(one), DRAWN_AT_ONCE)]
+            drawn = [self.points.parts_of(one.start, len(one)) for one in blocks if one.start < until]
+            parts = zip(self._shown, np.concatenate(drawn)[pictures].T, strict=True)
+            axes += [SweptAxis(one.name, one.unit, one.parts, at, "drawn") for one, at in parts]
+        return [one for one in axes if len(one.values) > 1]
+
+    # ---- the worst configuration ------------------------------------------------------------------------------------
+
+    def _claimed(self, answers: Answers) -> WorstConfiguration | None:
+        """What the sweep saw at its worst."""
+        index = answers.worst
+        if index is None:
+            return None
+        rows = self.journal.rows if self.run is None else [self.run.store.row(KIND, index)]
+        row = next(one for one in rows if one is not None and one.step == index)
+        query, model = self._query(index)
+        task, scene = self.job.tasks[model], index // self.models // self.per_scene
+        if task.varies:
+            truth = self._scenes.open(scene).problems[model].truth(query.u, query.values)
+        else:
+            truth = self.job.truth(self.job.places[scene], model, query.values)
+        return WorstConfiguration(
+            configuration=index,
+            values={name: DescribedValue.of(value) for name, value in query.values.items()},
+            seed=query.seed,
+            label_set=list(task.truth_names(truth)),
+            claimed=_claim_of(judgement_of(row)),
+            verified=None,
+        )
+
+    def _verified(self, worst: WorstConfiguration) -> dict[str, object]:
+        """What fresh renders say of it, and what the model says of the picture that is kept."""
+        query, model = self._query(worst.configuration)
+        problem = self._scenes.open(worst.configuration // self.models // self.per_scene).problems[model]
+        checked = check_worst(problem, self.job.config, query.u, self.run, self.stages)
+        if self.run is None:
+            return {"verified": checked}
+        spp = max(PICTURE_SPP, checked.spp if checked else 0)
+        picture = problem.picture(query.u, worst.seed, spp)
+        self.run.save_image("worst", picture)
+        save_marked(self.run, "worst", picture, problem.marks(picture, query.u))
+        return {"verified": checked, "pictured": _claim_of(problem.judge(picture, query.u))}
+
+    def _query(self, index: int) -> tuple[Query, int]:
+        number, model = divmod(index, self.models)
+        return self.job.queries(range(number, number + 1))[model][2], model
+
+    def _driven(self) -> list[results.DriveRates] | None:
+        """What is said of whole drives, where frames of a path were swept; the worst of them is kept."""
+        if time_axis(self.job.axes) is None:
+            return None
+        self.stages.begin("drives", "rendering the frames of the worst drive")
+        drives = Drives(self.job, self.rows())
+        if self.run is not None:
+            drives.keep_worst(self._scenes, self.run)
+        return drives.rates()
+
+    # ---- the answer -------------------------------------------------------------------------------------------------
+
+    def _finish(self, answers: Answers, ending: str, worst: WorstConfiguration | None) -> SweepResult:
+        job, seconds = self.job, self.stages.seconds
+        view, checked = self._scenes.scene, worst.verified if worst else None
+        predicting = self._transport.values() or [[one.summary() for one in (view.predicted.values() if view else ())]]
+        swept = seconds.get("sweep", 0.0)
+        formation = Formation.of(next(iter(view.renderers.values())).formation) if view else None
+        gains = self._gains() if formation else {}
+        models, answer = [model.name for model in job.models], job.places[-1].answer
+        numbers = np.flatnonzero(answers.seen)
+        right, units, axes = answers.right[numbers], self.units.of(numbers), self._axes(numbers)
+        if formation is not None and len(set(gains.values())) != 1:
+            formation = formation.model_copy(update={"gain": None})
+        summary = results.SweepSummary(
+            run=None if self.run is None else str(self.run.path),
+            object=job.config.object,
+            model=",".join(models),
+            task=job.config.task_name,
+            environment=self.points.environment or job.config.lit_by,
+            controls=[control.name for control in job.controls],
+            ending=ending,
+            image_formation=formation,
+            gains=gains if len(gains) > 1 else None,
+            drawn={one.name: one.varied for one in self._shown},
+            planned=self.total,
+            **vars(counted_by_unit(right, units)),
+            units=len(np.unique(units)) if self.units.size > 1 and len(units) else None,
+            not_finite=answers.not_finite,
+            answers=answers.frequent,
+            axes=[row for axis in axes for row in axis.rows(right, units)],
+            cells=map_over(axes, right, answers.margin[numbers]),
+            beside=results.BesideAnswer(answer=answer, pairs=answers.beside(models, self.units)) if answer else None,
+            worst=worst,
+            grid={axis.name: len(axis.values) for axis in job.axes},
+            samples=job.samples,
+            sampler=job.config.sampler if self.points.draws else None,
+            spp=self.samples,
+            renders={
+                "sweep": self._traced,
+                "verification": checked.renders if checked else 0,
+                **({"products": self._predicted} if self._predicted else {}),
+            },
+            transport=combined([one for light in predicting for one in light]),
+            surface=self._surface,
+            drives=self._drives,
+            shared=SharedWork.of_facts(self._executor.facts, self.journal.machines.known),
+            renders_per_second=self._rendered / swept if self._rendered and swept else None,
+            seconds={**seconds, "total": self.stages.total},
+            seed=job.config.seed,
+            warnings=[*job.warnings, *self._remarks(answers, checked)],
+            command_line=job.config.command_line(),
+        )
+        if self.run is not None:
+            self.run.write_summary(summary)
+            for suffix, data in sweep_figure(summary).items():
+                write_bytes(self.run.path / "images" / f"sweep.{suffix}", data)
+            write_sweep_page(self.run.path, summary)
+        return SweepResult(summary, None if self.run is None else self.run.path, tuple(self.journal.rows))
+
+    def _gains(self) -> dict[str, float]:
+        """The gain of each scene, by object and environment, where there are not too many to meter."""
+        if len(self.job.places) > MOST_METERED:
+            return {}
+        size = self.job.sizes[0]
+        return {
+            f"{place.object}, {place.environment}": framed(place.scene.description, size).gain
+            for place in self.job.places
+        }
+
+    def _remarks(self, answers: Answers, checked: WorstVerified | None) -> list[str]:
+        remarks = lost_remarks(self._lost)
+        remarks += self.journal.machines.remarks
+        few = min((one.drives for one in self._drives or ()), default=ENOUGH_DRIVES)
+        if few < ENOUGH_DRIVES:
+            remarks.append(
+                f"{count(few, 'drive')} can show little: were the model right in all their frames, the interval of "
+                f"that share would begin at {100 * most_shown(few):.0f} %."
+            )
+        if answers.not_finite:
+            remarks.append(f"{answers.not_finite} answers of the model are not numbers; they count as not right.")
+        if self._not_finite:
+            remarks.append("Some values of pictures were not finite and were set to 0.")
+        if checked and not checked.converged:
+            remarks.append(
+                f"It is not shown that the worst margin keeps its side beyond {checked.spp} samples a pixel, the most "
+                "that a check takes: noise may take part in it."
+            )
+        return remarks
+
+
+def _claim_of(seen: Judgement) -> results.WorstClaim:
+    return results.WorstClaim(**vars(seen.answer), margin=seen.margin, payload=seen.payload)
+
+
+def carry_out(job: Job, run: RunDirectory | None, progress: Progress, executor: Executor | None = None) -> SweepResult:
+    """Sweep, check the worst configuration and write the summary; see `Sweep`."""
+    return Sweep(job, run, progress, executor).carry_out()

@@ -1,0 +1,292 @@
+"""The page of one or several sweeps: still pictures and tables that need no script, and the explorer over them.
+
+The same page is a file that needs no other (`write_sweep_page`), a page of `advsearch dashboard`, and one of a folder
+that any web server serves: only where its rows and pictures come from differs (`SweepSource`).
+"""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import shlex
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from advsearch.errors import AdvsearchError, InputError
+from advsearch.files import JsonObject, JsonValue
+from advsearch.questions.sweep import answer as sweeps
+from advsearch.questions.sweep.summary import SweepSummary
+from advsearch.report import wording
+from advsearch.report.markup import Html, element, join_html
+from advsearch.report.shown import shown
+from advsearch.report.wording import answer_text, beside_text, percent
+from advsearch.runs import directory
+from advsearch.runs.files import placed_by, write_bytes, write_text
+from advsearch.runs.summary import read_result
+from advsearch.settings import read_yaml
+from advsearch.viewer.columns import packed, read_columns
+from advsearch.viewer.document import (
+    data_script,
+    data_url,
+    document,
+    remarks_html,
+    subject_html,
+)
+from advsearch.viewer.pages import end_html, page_of, part_html
+from advsearch.viewer.thumbnails import Kept, kept_pictures, path_of, read_thumbnail
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+MOST_EMBEDDED = 3_000_000
+"""Bytes of pictures that a page which needs no other file takes along; the worst answers first."""
+
+MOST_ROWS = 200_000
+"""Rows that such a page takes along; more are for `advsearch dashboard`."""
+
+
+@dataclass(frozen=True)
+class SweepSource:
+    """Where the page of a run gets what it shows.
+
+    Attributes:
+        name: of the run.
+        rows: columns for a page that needs no other file; else the address they are fetched from; None where they are
+            too many for such a page, which then has the tables only.
+        parts: whether the address gives them in parts (``?after=ID``), as those of a sweep that goes on.
+        pictures: which thumbnails there are; None for none.
+        folder: address of the thumbnails; None puts them into the page.
+    """
+
+    name: str
+    rows: pd.DataFrame | str | None
+    parts: bool = False
+    pictures: Kept | None = None
+    folder: str | None = None
+
+    @property
+    def embedded(self) -> bool:
+        return self.rows is not None and not isinstance(self.rows, str)
+
+
+def write_sweep_page(run: Path, summary: SweepSummary) -> Path:
+    """Write `report.html` of a sweep that has ended, and its rows as columns, into its folder; return the page's path.
+
+    Raises:
+        FileFormatError: the results are damaged.
+        StorageError: it cannot be written.
+    """
+    columns = read_columns(run)
+    write_bytes(run / directory.COLUMNS, packed(columns), durable=False)
+    return write_text(run / directory.REPORT, page(run, summary, columns), durable=False)
+
+
+def page(run: Path, summary: SweepSummary, columns: pd.DataFrame | None = None) -> str:
+    """Return the page of a sweep that needs no other file, with its rows unless they are too many."""
+    columns = read_columns(run) if columns is None else columns
+    rows = columns if len(columns) <= MOST_ROWS else None
+    return sweep_page_html([(run, summary)], [SweepSource(run.name, rows, pictures=kept_pictures(run))])
+
+
+def sweep_page_html(runs: Sequence[tuple[Path, SweepSummary | None]], sources: Sequence[SweepSource]) -> str:
+    """Return the page of sweeps as HTML, of each its folder, its result (None where it has none yet) and what its
+    explorer reads."""
+    connects = any(isinstance(one.rows, str) for one in sources)
+    summaries = [(path, summary) for path, summary in runs if summary is not None]
+    title = ", ".join(path.name for path, _ in runs)
+    described, data, left_out = [], [], []
+    shown = [(one, *run) for one, run in zip(sources, runs, strict=True) if one.rows is not None]
+    for number, (source, path, summary) in enumerate(shown):
+        described.append(_described(source, number) | (_going_on(path) if summary is None else _judged(summary)))
+        if source.embedded:
+            zipped = base64.b64encode(gzip.compress(packed(source.rows), 6, mtime=0)).decode()
+            data.append(element("script", Html(zipped), type="application/octet-stream", id=f"rows-{number}"))
+            left_out.append(_left_out(described[-1], source))
+    main = element(
+        "main",
+        element("div", id="explorer", hidden="hidden") if shown else _too_many(runs),
+        *left_out,
+        *(_still(path, summary) for path, summary in summaries),
+        *(join_html(*_parts(path, summary)) for path, summary in summaries),
+    )
+    return document(
+        title,
+        _header(runs),
+        main,
+        data=[data_script(described, "runs"), *data],
+        scripts=["sweep.js"],
+        connects=connects,
+    )
+
+
+def _described(source: SweepSource, number: int) -> JsonObject:
+    described: JsonObject = {"name": source.name, "parts": source.parts}
+    described |= {"embedded": f"rows-{number}"} if source.embedded else {"rows": source.rows}
+    kept = source.pictures
+    if kept is None:
+        return described
+    pictures: JsonObject = {"models": kept.models}
+    if source.folder is not None:
+        pictures |= {"folder": source.folder, "suffix": kept.suffix, "kept": list(kept.numbers) if kept.some else None}
+    elif source.embedded:
+        pictures["embedded"] = dict(kept.embedded(source.rows, MOST_EMBEDDED))
+    return {**described, "pictures": pictures}
+
+
+def _going_on(run: Path) -> JsonObject:
+    """The task of a sweep that has no result yet, as far as its settings can be read."""
+    with suppress(AdvsearchError):
+        given = read_yaml(run / directory.CONFIG).get("task")
+        return {"task": str(given.get("name") if isinstance(given, Mapping) else given).partition("=")[0]}
+    return {}
+
+
+def _judged(summary: SweepSummary) -> JsonObject:
+    """The task, the axes of the grid, and height and width in pixels of what was judged, where that is one size: boxes
+    are told in them."""
+    formed = summary.image_formation
+    size = None if formed is None or "," in summary.model else list[JsonValue](formed.resolution)
+    return {"task": summary.task, "size": size, "grid": list(dict.fromkeys(one.axis for one in summary.axes))}
+
+
+def _header(runs: Sequence[tuple[Path, SweepSummary | None]]) -> Html:
+    lines: list[Html] = []
+    for path, summary in runs:
+        title = "h1" if len(runs) == 1 else "h2"
+        if summary is None:
+            lines += [element(title, f"{path.name}: this sweep has not ended yet")]
+            continue
+        what = subject_html(("object", summary.object), ("environment", summary.environment), ("model", summary.model))
+        lines += [element("p", f"sweep {path.name}; ", what, class_="eyebrow"), element(title, sweep_verdict(summary))]
+        lines += [remarks_html(summary.warnings)]
+    return element("header", element("h1", "Sweeps side by side") if len(runs) > 1 else None, *lines)
+
+
+def _too_many(runs: Sequence[tuple[Path, SweepSummary | None]]) -> Html:
+    """What stands in the explorer's place in a file that would take more rows along than it may."""
+    served = shlex.join(["advsearch", "dashboard", *(directory.typed_name(path) for path, _ in runs)])
+    counts = ", ".join(f"{summary.configurations:,}" for _, summary in runs if summary is not None)
+    return element(
+        "p",
+        f"This file leaves out the {counts} rows, and what pictures they have: it takes {MOST_ROWS:,} along at most. ",
+        element("code", served),
+        " explores them all, and so does the folder that ",
+        element("code", "advsearch view"),
+        " makes with its option ",
+        element("code", "bundle"),
+        ".",
+        class_="soft",
+    )
+
+
+def _left_out(described: JsonObject, source: SweepSource) -> Html | None:
+    """What a file says of the pictures that it does not take along."""
+    pictures, kept = described.get("pictures"), source.pictures
+    taken = len(pictures["embedded"]) if isinstance(pictures, dict) and isinstance(pictures["embedded"], dict) else 0
+    if kept is None or taken == len(kept.numbers):
+        return None
+    said = f"This file has {taken:,} of the {len(kept.numbers):,} pictures that were kept, those of the worst margins."
+    return element("p", said, class_="soft")
+
+
+def sweep_verdict(summary: SweepSummary) -> str:
+    """Return what a sweep came to, in one sentence."""
+    if not summary.configurations:
+        return "No configuration was looked at."
+    if summary.beside and summary.beside.pairs:
+        return " ".join(beside_text(summary.beside.answer, one) for one in summary.beside.pairs)
+    over = sweeps.over_drives(summary)
+    share = f"{percent(summary.accuracy)}, 95 % interval {wording.interval_text(summary.interval)}{over}"
+    ended = "" if summary.configurations == summary.planned else f" so far, of {summary.planned} planned"
+    return f"Right in {summary.correct} of {summary.configurations} configurations{ended} ({share})."
+
+
+def _still(path: Path, summary: SweepSummary) -> Html:
+    """What a page without a script shows in the explorer's place."""
+    single = summary.cells is not None and max(map(max, summary.cells.configurations)) <= 1
+    axes = " and ".join(list(dict.fromkeys(row.axis for row in summary.axes))[:2]) or "all configurations"
+    figure = _figure(path / "images" / "sweep.png", f"{'Margin' if single else 'Accuracy'} over {axes}.")
+    worst = _figure(path / "images" / "worst.png", _worst_text(summary))
+    return join_html(
+        element("div", figure, class_="pictures", data_still="true") if figure else None,
+        element("h2", "The worst configuration") if worst else None,
+        element("div", worst, class_="pictures pair") if worst else None,
+    )
+
+
+def _parts(path: Path, summary: SweepSummary) -> Iterator[Html]:
+    """What is shown of a sweep on a page alone, and how it came about."""
+    given = shown(summary)
+    yield from (part_html(path, one, given.said) for one in given.sections if one.only == "page" and not one.empty)
+    yield end_html(path, summary, given)
+
+
+def _worst_text(summary: SweepSummary) -> str:
+    worst = summary.worst
+    if worst is None:
+        return ""
+    where = ", ".join(f"{name} {wording.number_text(one.value)}" for name, one in worst.values.items())
+    said = answer_text(summary.task, worst.pictured or worst.claimed)
+    told, rate = f"{where}: the model answers {said}", worst.verified
+    if rate is None:
+        return f"{told}."
+    return f"{told}; {wording.tally('wrong', rate.successes, rate.trials, rate.not_a_number)} fresh renders."
+
+
+def _figure(file: Path, caption: str) -> Html | None:
+    if not file.is_file():
+        return None
+    image = element("img", src=data_url(file.read_bytes(), "image/png"), alt=caption)
+    return element("figure", image, element("figcaption", caption))
+
+
+def result_of(run: Path) -> SweepSummary | None:
+    """Return the result of the sweep in a folder; None where it has none yet. Raises FileFormatError where it is
+    damaged, or that of another command."""
+    if not (run / "summary.json").is_file():
+        return None
+    found = read_result(run)
+    return found if isinstance(found, SweepSummary) else None
+
+
+INDEX = "index.html"
+
+
+def write_bundle(runs: Sequence[Path], folder: Path) -> Path:
+    """Write a folder with a page, the rows and the thumbnails of sweeps, or the page of another run; return the page.
+
+    Raises:
+        InputError: the folder is there and not empty, or runs of these commands have no common page.
+        FileFormatError: results are damaged.
+        StorageError: the folder cannot be written.
+    """
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise InputError(f"bundle: {folder} is there already and not empty; name another folder")
+    results = [(run, read_result(run)) for run in runs]
+    sweeps = [(run, result) for run, result in results if isinstance(result, SweepSummary)]
+    with placed_by("bundle"):
+        if len(results) == 1 and not sweeps:
+            run, result = results[0]
+            for page in sorted(
+                (run / directory.PARTS).glob(f"*/{directory.REPORT}")
+            ):  # made anew: what lies there may be anybody's
+                write_text(folder / page.relative_to(run), page_of(page.parent, read_result(page.parent)))
+            return write_text(folder / INDEX, page_of(run, result))
+        if len(sweeps) < len(results):
+            raise InputError("bundle: one run or several sweeps make a page; give one kind of them")
+        sources = [_copied(run, folder, number) for number, (run, _) in enumerate(sweeps)]
+        return write_text(folder / INDEX, sweep_page_html(sweeps, sources))
+
+
+def _copied(run: Path, folder: Path, number: int) -> SweepSource:
+    """Write rows and thumbnails of a sweep into the folder, and say where they are."""
+    rows, pictures = f"rows-{number}.bin", f"pictures-{number}"
+    write_bytes(folder / rows, packed(read_columns(run)))
+    kept = kept_pictures(run)
+    for one in kept.numbers if kept else ():
+        place = path_of(folder / pictures, one)
+        write_bytes(folder / pictures / place.parent.name / place.name, read_thumbnail(run, one))
+    return SweepSource(run.name, rows, pictures=kept, folder=pictures)

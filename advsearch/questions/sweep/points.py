@@ -1,0 +1,361 @@
+"""From the number of a picture to its configuration and what is stored of it: arithmetic, nothing is kept. Every
+picture has a draw of its own, so that pictures are independent; only pairs without and with an answer have the same
+ones."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.special import ndtri
+from torch import Tensor
+
+from advsearch.attacks import Block, Domain
+from advsearch.attacks.draws import Draws, Product
+from advsearch.controls import Control, NumberControl, Parameter, Space
+from advsearch.controls.base import Value
+from advsearch.controls.ranges import Range
+from advsearch.controls.values import Fixed, OneOf, to_value
+from advsearch.questions.sweep.axes import Axis
+from advsearch.runs.results import VariedValue
+from advsearch.runs.units import Units
+from advsearch.scene.description import ENVIRONMENT
+
+MOST_PARTS, FEWEST_PARTS = 10, 2
+LEAST_IN_A_CELL = 5
+"""Draws that a cell of the map over two drawn parameters has on average, at least, where there are enough."""
+
+MOST_QUASI = 64
+"""Numbers of a group up to which Sobol points are used; more (a texture) are drawn pseudo-randomly."""
+
+MOST_BINNED = 4
+"""Numbers of a parameter up to which the table shows them."""
+
+MOST_KEPT = 4096
+"""Descriptions of one control that are kept for points of the grid."""
+
+Doubles = NDArray[np.float64]
+Tell = Callable[[Tensor, "Picks"], list[Mapping[str, Value]]]
+
+
+@dataclass(frozen=True, eq=False)
+class Picks:
+    """Neighbouring pictures of a scene: the number of the first in the whole sweep; of each, its place on every axis of
+    the grid, and shares (n, k) float64 in [0, 1], the coordinates drawn for small parameters."""
+
+    number: int
+    digits: list[tuple[int, ...]]
+    shares: Doubles
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A drawn number, as the table shows it: its column of `Picks.shares`, and what equal parts of [0, 1] stand for:
+    pairs of ends, or values of a list; if `settled`, in every scene. Where values have weights, `shares` says which
+    part each of more equal shares stands for."""
+
+    name: str
+    unit: str
+    column: int
+    parts: tuple[Any, ...]
+    settled: bool = True
+    shares: tuple[int, ...] = ()
+
+    @property
+    def varied(self) -> VariedValue:
+        ends = [end for part in self.parts if isinstance(part, list) for end in part]
+        if ends:
+            return VariedValue(unit=self.unit, low=min(ends), high=max(ends))
+        return VariedValue(unit=self.unit, names=[str(one) for one in self.parts])
+
+    @property
+    def edges(self) -> list[float] | None:
+        """The ends of the parts, ascending; None of a list."""
+        if not self.settled or not all(isinstance(part, list) for part in self.parts):
+            return None
+        return sorted({end for part in self.parts for end in part})
+
+
+def parts_of_ranges(pictures: int) -> int:
+    """Return into how many equal parts the range of a drawn parameter is cut, by the pictures of the whole sweep.
+
+    The table, the map and the page (viewer/columns.py) show these parts.
+    """
+    return min(max(FEWEST_PARTS, math.isqrt(pictures // LEAST_IN_A_CELL)), MOST_PARTS)
+
+
+class Points:
+    """The configurations of one scene `among` several, so many samples at each point of the grid, from a start that is
+    the scene as it is. After so many scenes the draws come again, so that what is compared has the same; 0 for never.
+    `drawn` is what the table shows of the draws, in `parts` of each range; `drawn_numbers` is the same for all scenes.
+    """
+
+    def __init__(
+        self,
+        space: Space,
+        domain: Domain,
+        axes: Sequence[Axis],
+        samples: int,
+        sampler: str,
+        seed: int,
+        scenes: int = 0,
+        among: int = 1,
+    ) -> None:
+        self.grid = Product(tuple(len(axis.values) for axis in axes))
+        self.samples, self.count = samples, self.grid.count * samples
+        self.parts = parts_of_ranges(self.count * among)
+        frames = next((place for place, axis in enumerate(axes) if axis.is_time), None)
+        self.units = Units(self.grid.sizes, frames, samples, again=scenes * self.count)
+        self._space, self._domain, self._axes = space, domain, tuple(axes)
+        self._start = domain.start.numpy().astype(np.float64)
+        self._lower, self._upper = domain.lower.numpy(), domain.upper.numpy()
+        self._places: list[tuple[int, int, int]] = []
+        self._small: list[tuple[Block, slice, slice]] = []
+        self._large: list[tuple[Block, slice, slice]] = []
+        self.drawn = self._lay_out()
+        small, large = (chosen[-1][2].stop if chosen else 0 for chosen in (self._small, self._large))
+        self._columns = [one.column for one in self.drawn]
+        self._sizes = np.array([len(one.shares or one.parts) for one in self.drawn], dtype=np.int64)
+        self._draws = Draws(small, sampler, seed)
+        self._noise = Draws(large, "random", seed, "large draws")
+        shown = tuple((one.name, one.column, len(one.parts)) for one in self.drawn)
+        self.drawn_numbers = (small, shown)
+        self._tellers = [
+            _teller(
+                space,
+                control,
+                part,
+                [(number, axis) for number, axis in enumerate(axes) if axis.instance == control.name],
+            )
+            for control, part in zip(space.controls, _slices(space), strict=True)
+        ]
+
+    # ---- layout -----------------------------------------------------------------------------------------------------
+
+    def _lay_out(self) -> tuple[Drawn, ...]:
+        """Say of every coordinate of u whether it is an axis of the grid or drawn, and from which columns; return what
+        the table shows."""
+        number_of = {axis.name: number for number, axis in enumerate(self._axes)}
+        shown: list[Drawn] = []
+        controls = {control.name: control for control in self._space.controls}
+        for group, (block, part) in zip(self._space.groups, self._domain.parts(), strict=True):
+            control = controls[group.control]
+            if group.name in number_of:
+                number = number_of[group.name]
+                self._places.append((part.start, number, self.grid.sizes[number]))
+                continue
+            into = self._small if block.size <= MOST_QUASI else self._large
+            first = into[-1][2].stop if into else 0
+            columns = slice(first, first + block.size + (block.norm == "l2"))
+            into.append((block, part, columns))
+            if block.size <= MOST_BINNED and block.norm != "l2" and isinstance(control, NumberControl):
+                shown += self._shown(control, group.parameter, block, part, first)
+        return tuple(shown)
+
+    def _shown(self, control: NumberControl, name: str, block: Block, part: slice, first: int) -> list[Drawn]:
+        parameter, spec = _spec(control, name)
+        full = f"{control.name}.{name}"
+        if isinstance(spec, OneOf):
+            values = tuple(dict.fromkeys(spec.values))
+            shares = () if values == spec.values else tuple(map(values.index, spec.values))
+            return [Drawn(full, _unit(parameter), first, values, shares=shares)]
+        found = []
+        for number in range(block.size):
+            low, high = (float(ends[part.start + number]) for ends in (self._lower, self._upper))
+            edges = to_value(
+                spec, parameter.log, torch.linspace(low, high, self.parts + 1, dtype=torch.float64)
+            ).tolist()
+            parts = tuple([edges[k], edges[k + 1]] for k in range(self.parts))
+            found.append(Drawn(full + (f".{number}" if parameter.shape else ""), parameter.unit, first + number, parts))
+        return found
+
+    # ---- from numbers to configurations -----------------------------------------------------------------------------
+
+    def picks(self, first: int, count: int, before: int = 0) -> Picks:
+        """Return the pictures from number `first` of the scene on; `before` is how many the scenes before it have."""
+        digits = [self.digits(number) for number in range(first, first + count)]
+        return Picks(before + first, digits, self._drawn(self._draws, before + first, count))
+
+    def parts_of(self, first: int, count: int) -> NDArray[np.int64]:
+        """Return in which part of each of the `drawn` numbers neighbouring pictures of a scene lie, (count, k), by the
+        number of the first in the whole sweep."""
+        shares = self._drawn(self._draws, first, count)
+        parts = np.minimum((shares[:, self._columns] * self._sizes).astype(np.int64), self._sizes - 1)
+        for number, one in enumerate(self.drawn):
+            if one.shares:
+                parts[:, number] = np.take(one.shares, parts[:, number])
+        return parts
+
+    @property
+    def draws(self) -> bool:
+        """Whether anything is drawn: not where controls have all from the grid, as a path its time."""
+        return self._draws.dimensions + self._noise.dimensions > 0
+
+    def digits(self, number: int) -> tuple[int, ...]:
+        return self.grid.digits(number // self.samples)
+
+    def noise(self, number: int) -> int:
+        """Return the number of the noise of the picture with this number in the whole sweep."""
+        return number % self.units.again if self.units.again else number
+
+    def _drawn(self, draws: Draws, first: int, count: int) -> Doubles:
+        """The draws of neighbouring pictures of the whole sweep."""
+        if self.units.frames is None:
+            return draws.points(self.units.draw(first), count)
+        each = [draws.points(self.units.draw(number), 1) for number in range(first, first + count)]
+        return np.concatenate(each) if each else draws.points(0, 0)
+
+    def configurations(self, picks: Picks) -> Tensor:
+        u = np.repeat(self._start[None], len(picks.digits), axis=0)
+        for column, number, size in self._places:
+            u[:, column] = [(digits[number] + 0.5) / size for digits in picks.digits]
+        for block, part, columns in self._small:
+            u[:, part] = self._placed(block, part, picks.shares[:, columns])
+        if self._large:
+            noise = self._drawn(self._noise, picks.number, len(picks.digits))
+            for block, part, columns in self._large:
+                u[:, part] = self._placed(block, part, noise[:, columns])
+        return torch.from_numpy(np.clip(u.astype(np.float32), self._lower, self._upper))
+
+    def _placed(self, block: Block, part: slice, shares: Doubles) -> Doubles:
+        """Coordinates inside the budget from uniform shares: uniform in the box, or in the ball (Muller 1959)."""
+        if block.options:
+            return np.asarray((np.minimum(np.floor(shares * block.options), block.options - 1) + 0.5) / block.options)
+        if block.norm != "l2" or block.epsilon is None:
+            low, high = self._lower[part].astype(np.float64), self._upper[part].astype(np.float64)
+            return np.asarray(low + (high - low) * shares)
+        direction = ndtri(np.clip(shares[:, :-1], 1e-12, 1.0 - 1e-12))
+        length = block.epsilon * shares[:, -1:] ** (1.0 / block.size)
+        norm = np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-30)
+        return np.asarray(self._start[part] + direction * (length / norm))
+
+    @property
+    def environment(self) -> str | None:
+        """What lights all pictures in the place of the scene's environment; None if that does, or if it varies."""
+        varies = any(group.setting == ENVIRONMENT for group in self._space.groups)
+        return None if varies else self._space.environment
+
+    def lit_by(self, values: Mapping[str, Value]) -> str | None:
+        """Return what lights a picture in the place of the scene's environment, by what is stored of it."""
+        return self._space.lit_by(values)
+
+    def values(self, u: Tensor, picks: Picks) -> list[dict[str, Value]]:
+        """Return what is stored of the pictures: parameter to value and unit, as `Space.describe` says it.
+
+        A parameter of the grid has the value that was listed, not what single precision makes of it.
+        """
+        found: list[dict[str, Value]] = [{} for _ in picks.digits]
+        for tell in self._tellers:
+            for into, said in zip(found, tell(u, picks), strict=True):
+                into.update(said)
+        return found
+
+
+# ---- saying what a control does, fast -------------------------------------------------------------------------------
+
+
+def _slices(space: Space) -> list[slice]:
+    found, begin = [], 0
+    for control in space.controls:
+        found.append(slice(begin, begin + len(control.start)))
+        begin = found[-1].stop
+    return found
+
+
+def _unit(parameter: Parameter) -> str:
+    return "name" if parameter.options else parameter.unit
+
+
+def _spec(bound: NumberControl, name: str) -> tuple[Parameter, Range | OneOf]:
+    """A parameter that is not fixed, and what it is set to."""
+    slot = next(one for one in bound.slots if one.parameter.name == name)
+    assert not isinstance(slot.spec, Fixed)
+    return slot.parameter, slot.spec
+
+
+def _teller(space: Space, control: Control, part: slice, axes: Sequence[tuple[int, Axis]]) -> Tell:
+    """Return what says the values of one control for many configurations."""
+    if isinstance(control, NumberControl) and _says_its_numbers(type(control)):
+        return _by_column(control, part, axes)
+    if control.refines:
+        return _by_description(lambda u: space.describe(u, (control,)), axes, keep=False)
+    return _by_description(lambda u: control.describe(u[part]), axes, keep=len(axes) == len(control.groups))
+
+
+def _says_its_numbers(kind: type[NumberControl]) -> bool:
+    """Whether what a control says of a configuration is its parameters' values and nothing else."""
+    return (kind.describe, kind.measured) == (NumberControl.describe, NumberControl.measured)
+
+
+def _by_column(control: NumberControl, part: slice, axes: Sequence[tuple[int, Axis]]) -> Tell:
+    """Values of all configurations at once, parameter by parameter; the same numbers as `describe`."""
+    number_of = {axis.parameter.name: (number, axis) for number, axis in axes}
+    columns: list[Callable[[Tensor, Picks], list[tuple[str, Value]]]] = []
+    begin = part.start
+    for group in control.groups:
+        name = f"{control.name}.{group.parameter}"
+        if group.parameter in number_of:
+            number, axis = number_of[group.parameter]
+            listed: list[Value] = [{"value": value, "unit": axis.unit} for value in axis.values]
+            columns.append(_listed(name, listed, number))
+        else:
+            columns += _drawn(control, group.parameter, name, begin, group.size)
+        begin += group.size
+
+    def tell(u: Tensor, picks: Picks) -> list[Mapping[str, Value]]:
+        said = [column(u, picks) for column in columns]
+        return [dict(row) for row in zip(*said, strict=True)] if said else [{} for _ in picks.digits]
+
+    return tell
+
+
+def _listed(name: str, listed: list[Value], number: int) -> Callable[[Tensor, Picks], list[tuple[str, Value]]]:
+    pairs = [(name, value) for value in listed]
+    return lambda u, picks: [pairs[digits[number]] for digits in picks.digits]
+
+
+def _drawn(
+    control: NumberControl, parameter_name: str, name: str, begin: int, size: int
+) -> list[Callable[[Tensor, Picks], list[tuple[str, Value]]]]:
+    parameter, spec = _spec(control, parameter_name)
+    unit = _unit(parameter)
+    if isinstance(spec, OneOf):
+        pairs: list[tuple[str, Value]] = [(name, {"value": value, "unit": unit}) for value in spec.values]
+        return [lambda u, picks: [pairs[min(len(pairs) - 1, int(one * len(pairs)))] for one in u[:, begin].tolist()]]
+
+    def column(number: int) -> Callable[[Tensor, Picks], list[tuple[str, Value]]]:
+        full = f"{name}.{number}" if parameter.shape else name
+
+        def tell(u: Tensor, picks: Picks) -> list[tuple[str, Value]]:
+            values = to_value(spec, parameter.log, u[:, begin + number]).tolist()
+            return [(full, {"value": value, "unit": unit}) for value in values]
+
+        return tell
+
+    return [column(number) for number in range(size)]
+
+
+def _by_description(
+    describe: Callable[[Tensor], Mapping[str, Value]], axes: Sequence[tuple[int, Axis]], *, keep: bool
+) -> Tell:
+    """What the control itself says, one configuration after the other; kept for the next time if these axes are all
+    that it depends on."""
+    kept: dict[tuple[int, ...], dict[str, Value]] = {}
+
+    def one(u: Tensor, digits: tuple[int, ...]) -> Mapping[str, Value]:
+        key = tuple(digits[number] for number, _ in axes)
+        if keep and key in kept:
+            return kept[key]
+        said: dict[str, Value] = dict(describe(u))
+        for number, axis in axes:
+            said[axis.name] = {"value": axis.values[digits[number]], "unit": axis.unit}
+        if keep and len(kept) < MOST_KEPT:
+            kept[key] = said
+        return said
+
+    return lambda u, picks: [one(row, digits) for row, digits in zip(u, picks.digits, strict=True)]

@@ -1,0 +1,321 @@
+"""Counting what a sweep finds, its summary (docs/sweeps.md, "What it says"), and its answer as Python has it; sweeps
+that another program made are read into a run here, too. Counting takes some 15 bytes a configuration."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+from PIL import Image
+
+from advsearch.attacks import clopper_pearson
+from advsearch.attacks.units import paired_by_unit, per_unit, share_interval
+from advsearch.errors import FileFormatError
+from advsearch.pictures import FORMATS
+from advsearch.questions.sweep.figures import sweep_axes, sweep_figure
+from advsearch.questions.sweep.job import KIND
+from advsearch.questions.sweep.page import write_sweep_page
+from advsearch.questions.sweep.summary import AxisRow, CountedAnswers, MapAxis, PairedRates, SweepMap, SweepSummary
+from advsearch.report.figures import new_axes
+from advsearch.report.markup import answer_html
+from advsearch.report.shown import shown
+from advsearch.runs import store
+from advsearch.runs.directory import RunDirectory, default_name
+from advsearch.runs.export import read_threedb
+from advsearch.runs.tables import read_sweep, to_pandas
+from advsearch.runs.units import Units
+from advsearch.tasks import Judgement
+from advsearch.viewer import thumbnails
+
+FINISHED, INTERRUPTED = "finished", "interrupted"
+
+MOST_CELLS = 4096
+"""Cells of a map; with more pairs of values there is none."""
+
+MOST_ANSWERS = 20
+"""Wrong answers that the summary lists, the most frequent first."""
+
+
+def counted(right: npt.ArrayLike, of: npt.ArrayLike) -> CountedAnswers:
+    """Return count, accuracy and its 95 % interval, from right answers and answers of each unit (n,)."""
+    correct, seen = int(np.sum(right)), int(np.sum(of))
+    interval = share_interval(right, of) if seen else None
+    return CountedAnswers(
+        configurations=seen, correct=correct, accuracy=correct / seen if seen else None, interval=interval
+    )
+
+
+def counted_by_unit(right: npt.ArrayLike, units: npt.NDArray[np.int64]) -> CountedAnswers:
+    """Return that of answers (n,) that are of some units (n,)."""
+    right = np.asarray(right)
+    return counted(per_unit(right, units), per_unit(np.ones(len(right)), units))
+
+
+def rate(correct: int, seen: int) -> CountedAnswers:
+    """Return count, accuracy and its 95 % Clopper-Pearson interval, of answers that are independent; None where nothing
+    was seen."""
+    return CountedAnswers(
+        configurations=seen,
+        correct=correct,
+        accuracy=correct / seen if seen else None,
+        interval=clopper_pearson(correct, seen) if seen else None,
+    )
+
+
+class Answers:
+    """What is answered so far, by the number of the configuration (n,): whether there is an answer, whether it is right
+    and whether it is wrong, its margin, NaN where that is no number, and what it is."""
+
+    def __init__(self, total: int) -> None:
+        self.seen: npt.NDArray[np.bool_] = np.zeros(total, dtype=bool)
+        self.right, self._wrong = self.seen.copy(), self.seen.copy()
+        self.margin = np.full(total, np.nan)
+        self._labels, self._names = np.zeros(total, np.uint32), dict[str, int]()
+
+    def add(self, number: int, said: Judgement) -> None:
+        self.seen[number], self.right[number], self._wrong[number] = True, said.right, said.success
+        self.margin[number] = said.margin
+        self._labels[number] = self._names.setdefault(said.answer.label, len(self._names))
+
+    @property
+    def worst(self) -> int | None:
+        """The first configuration of the largest margin; None where none is a number."""
+        return None if np.isnan(self.margin).all() else int(np.nanargmax(self.margin))
+
+    @property
+    def not_finite(self) -> int:
+        """How many margins are no number; these answers count as not right."""
+        return int((self.seen & np.isnan(self.margin)).sum())
+
+    @property
+    def frequent(self) -> dict[str, int]:
+        """How often each of the most frequent wrong answers was given, the most frequent first."""
+        names = list(self._names)
+        answers = Counter(names[label] for label in self._labels[self._wrong])
+        return dict(sorted(answers.most_common(MOST_ANSWERS), key=lambda one: (-one[1], one[0])))
+
+    def beside(self, models: Sequence[str], units: Units) -> list[PairedRates]:
+        """Return both rates of each model without and with an answer, of the pairs of which both are known: the second
+        half of the configurations are the first with the answer."""
+        halves = (2, -1, len(models))
+        found = list[PairedRates]()
+        seen: npt.NDArray[np.bool_] = np.logical_and(*self.seen.reshape(halves))
+        for model, name in enumerate(models):
+            known = np.flatnonzero(seen[:, model])
+            before, after = self.right.reshape(halves)[:, known, model]
+            if not len(known):
+                continue
+            draws = units.draw(known)
+            difference, interval, _ = paired_by_unit(before, after, draws)
+            of = per_unit(np.ones(len(known)), draws)
+            found.append(
+                PairedRates(
+                    model=name,
+                    clean=counted(per_unit(before, draws), of),
+                    answer=counted(per_unit(after, draws), of),
+                    both=int((before & after).sum()),
+                    clean_only=int((before & ~after).sum()),
+                    answer_only=int((~before & after).sum()),
+                    neither=int((~before & ~after).sum()),
+                    difference=difference,
+                    interval=interval,
+                )
+            )
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class SweptAxis:
+    """Something that a table is by: an axis outside the scene (object, environment, model), of the grid, or a number
+    that is drawn; its values, or the ends of its parts; and the place of each configuration among them (n,)."""
+
+    name: str
+    unit: str
+    values: Sequence[Any]
+    places: npt.NDArray[np.integer[Any]]
+    kind: Literal["outside", "grid", "drawn"] = "outside"
+
+    def rows(self, right: npt.NDArray[np.bool_], units: npt.NDArray[np.int64]) -> list[AxisRow]:
+        """Return the table: right answers (n,), which are of units (n,), by value; values without any are left out."""
+        rows = pd.DataFrame({"right": right, "unit": units}).groupby(self.places)
+        return [
+            AxisRow(
+                axis=self.name, unit=self.unit, value=self.values[place], **vars(counted_by_unit(one.right, one.unit))
+            )
+            for place, one in rows
+        ]
+
+
+def map_over(
+    axes: Sequence[SweptAxis], right: npt.NDArray[np.bool_], margin: npt.NDArray[np.float64]
+) -> SweepMap | None:
+    """Return counts, and the mean of the margins, for every pair of values of two axes: the first of the grid and the
+    last outside, or drawn ones where there are none of these; None of fewer axes, or of too many values."""
+    outside, grid, drawn = ([one for one in axes if one.kind == kind] for kind in ("outside", "grid", "drawn"))
+    axes = [*grid, *reversed(outside)] or drawn
+    if len(axes) < 2 or len(axes[0].values) * len(axes[1].values) > MOST_CELLS:
+        return None
+    wide, high = (len(one.values) for one in axes[:2])
+    cell, told = axes[1].places * wide + axes[0].places, ~np.isnan(margin)
+
+    def table(cells: npt.NDArray[np.integer[Any]], weights: npt.NDArray[np.float64] | None = None) -> Any:
+        return np.bincount(cells, weights, minlength=wide * high).reshape(high, wide)
+
+    count, total = table(cell[told]), table(cell[told], margin[told])
+    mean = np.divide(total, count, out=np.full(count.shape, np.nan), where=count > 0)
+    first, second = (MapAxis(axis=one.name, unit=one.unit, values=list(one.values)) for one in axes[:2])
+    return SweepMap(
+        axes=(first, second),
+        over=[one.name for one in axes[2:]],
+        configurations=table(cell).tolist(),
+        correct=table(cell[right]).tolist(),
+        margin=[[None if math.isnan(one) else one for one in row] for row in mean.tolist()],
+    )
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class SweepResult:
+    """The answer of a sweep.
+
+    Attributes:
+        summary: what `summary.json` holds.
+        run: the run directory, or None if it was not kept.
+        in_memory: the rows, where there is no run directory.
+    """
+
+    summary: SweepSummary
+    run: Path | None
+    in_memory: tuple[store.Row, ...] = ()
+
+    @property
+    def accuracy(self) -> float | None:
+        """Share of the configurations that the model got right; None where there was none."""
+        return self.summary.accuracy
+
+    def rows(self) -> Iterator[store.Row]:
+        """Yield every configuration with its values and what the model said, in order."""
+        if self.run is None:
+            yield from self.in_memory
+            return
+        with store.Store(self.run / store.NAME, read_only=True) as results:
+            yield from results.rows(KIND)
+
+    def to_pandas(self) -> Any:
+        """Return every configuration as a row of a `pandas.DataFrame`.
+
+        Columns are those of an export (docs/runs.md) under plain names; `attrs["units"]` has the units.
+        """
+        return to_pandas(self.rows())
+
+    def plot(self, axes: Any = None) -> Any:
+        """Draw the map over two axes, or the accuracy along the only one, and return the matplotlib axes.
+
+        Args:
+            axes: to draw on; None makes new ones.
+        """
+        axes = new_axes() if axes is None else axes
+        sweep_axes(self.summary, axes)
+        return axes
+
+    def __repr__(self) -> str:
+        right = f"{self.summary.correct} of {self.summary.configurations} right"
+        place = None if self.run is None else str(self.run)
+        return f"SweepResult({self.summary.object!r}, {self.summary.model!r}, {right}, run={place!r})"
+
+    def _repr_html_(self) -> str:
+        return answer_html(shown(self.summary))
+
+    def _repr_png_(self) -> bytes | None:
+        return sweep_figure(self.summary).get("png")
+
+
+MOST_PIXELS = 1 << 22
+"""Of a picture that is read."""
+
+MOST_VALUES = 96
+"""Different values of a parameter that the result lists."""
+
+AT_ONCE = 1000
+"""Rows that are stored at once."""
+
+
+def import_threedb(folder: Path, run: str | Path | None = None, *, overwrite: bool = False) -> Path:
+    """Read a folder that 3DB wrote into a run, by default ``runs/NAME-3db-NNN``, and return its folder."""
+    with RunDirectory.create(run, overwrite=overwrite, default=default_name(folder.resolve().name, ["3db"])) as kept:
+        lines = read_threedb(folder)
+        while some := list(islice(lines, AT_ONCE)):
+            for one in some:
+                if one.picture is not None:
+                    thumbnails.keep(kept.path, one.row.step, thumbnails.thumbnail(read_picture(one.picture)))
+            kept.record(*(one.row for one in some))
+        rows = read_sweep(kept.path)
+        if rows.empty:
+            raise FileFormatError(f"{folder}: expected the log of 3DB with at least one line, got an empty one")
+        summary = _summary_of(rows, kept.path, folder)
+        kept.write_summary(summary)
+        write_sweep_page(kept.path, summary)
+        return kept.path
+
+
+def _summary_of(rows: pd.DataFrame, run: Path, folder: Path) -> SweepSummary:
+    """What rows that another program made come to."""
+    right, tables = np.asarray(rows["correct"] == 1), list[AxisRow]()
+    for name in rows.attrs["units"]:
+        values, places = np.unique(rows[name].astype(object), return_inverse=True)
+        if 1 < len(values) <= MOST_VALUES:
+            tables += SweptAxis(name, "", values.tolist(), places).rows(right, rows["unit"])
+    called = dict.fromkeys(("object", "environment", "model"), "unknown")
+    for name in called:
+        names = rows[name].unique().tolist() if name in rows else []
+        more = f" and {len(names) - 20} more" if len(names) > 20 else ""
+        called[name] = ",".join(map(str, names[:20])) + more or "unknown"
+    return SweepSummary(
+        run=str(run),
+        **called,
+        task="classification",
+        controls=[],
+        ending=FINISHED,
+        image_formation=None,
+        planned=len(rows),
+        **vars(rate(int(right.sum()), len(rows))),
+        not_finite=0,
+        answers=dict(Counter(rows["label"][~right]).most_common(MOST_ANSWERS)),
+        axes=tables,
+        cells=None,
+        worst=None,
+        grid={},
+        samples=1,
+        sampler=None,
+        spp=0,
+        renders={"sweep": len(rows)},
+        renders_per_second=None,
+        seconds={"total": 0.0},
+        seed=0,
+        warnings=[f"Read from {folder}, as 3DB wrote it; it was not rendered here."],
+        command_line="",
+    )
+
+
+def read_picture(path: Path) -> object:
+    """Return the picture (H, W, 3) in [0, 1] in a file."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", Image.DecompressionBombWarning)
+            opened = Image.open(path, formats=FORMATS)
+        with opened as image:
+            if image.width * image.height > MOST_PIXELS:
+                raise FileFormatError(
+                    f"{path}: expected at most {MOST_PIXELS} pixels, got {image.width} x {image.height}"
+                )
+            return np.asarray(image.convert("RGB"), dtype=np.float32) / np.float32(255.0)
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
+        raise FileFormatError(f"{path}: expected a picture, got {str(error)[:100]}") from None

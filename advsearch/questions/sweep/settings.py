@@ -1,0 +1,168 @@
+"""What `sweep` needs to know."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+from pydantic import field_validator
+
+from advsearch.config import ControlsByName, DerivativeConfig, RenderConfig, SceneConfig
+from advsearch.files import MESHES, either
+from advsearch.questions.attack.settings import FEWEST_TRIALS, AttackConfig
+from advsearch.settings import Clash, number_or_text, setting, setting_as_in, split_names
+
+Grid = dict[str, object]
+"""Values, or numbers of them, by the parameters of the grid."""
+
+
+class SweepConfig(SceneConfig):
+    """Everything that decides what `sweep` does: the average case over a grid, over random draws, or both."""
+
+    command: ClassVar[str] = "sweep"
+    free: ClassVar[tuple[str, ...]] = (*SceneConfig.free, "surface", "workers", "cluster", "log")
+    several: ClassVar[tuple[str, ...]] = ("object", "environment", "model")
+    # fmt: off
+    clashes: ClassVar[tuple[Clash, ...]] = (
+        *SceneConfig.clashes,
+        Clash(
+            "sampler", lambda one: not one.controls,
+            "is how `controls` are drawn, and none are; add `controls`, or leave `sampler` out",
+        ),
+        Clash("fps", lambda one: one.path is None, "is of a drive; add `path`, or leave `fps` out"),
+        Clash(
+            "verify_spp", lambda one: one.trials == 0, "is of the trials, and `trials` is 0; leave one of the two out"
+        ),
+    )
+
+    object: str = setting_as_in(
+        SceneConfig, "object", description="the object that the model should recognise; several, separated by commas",
+        expects=f"names of objects or {either(MESHES)} files",
+    )
+    environment: str | None = setting_as_in(
+        SceneConfig, "environment",
+        description="the environment map that lights the scene; several, separated by commas",
+        expects="names of environments or .hdr or .exr files",
+    )
+    model: str = setting_as_in(
+        SceneConfig, "model",
+        description="the network under test; several, separated by commas, are shown the same pictures",
+    )
+    grid: Grid = setting(
+        dict, "sweep", "one axis of the grid; may be repeated",
+        "PARAMETER=FIRST:LAST:COUNT, or values separated by commas", metavar="PARAMETER=VALUES", form="axes",
+    )
+    controls: ControlsByName = setting_as_in(
+        SceneConfig, "controls", default=dict, group="sweep",
+        description="controls that are drawn at random at each grid point, separated by commas", min_length=None,
+    )
+    answer_of: str | None = setting(
+        None, "sweep",
+        "sweep the answer of this attack beside the clean scene, under the same draws; scene and model come from that "
+        "run, and so does what its --over drew if nothing else varies",
+        "the name or the folder of a run", metavar="RUN", otherwise="none", min_length=1,
+    )
+    samples: int | None = setting(
+        None, "sweep", "number of random draws at each grid point", otherwise="1, or 100 without a grid", ge=1,
+        le=1_000_000_000,
+    )
+    sampler: Literal["sobol", "random"] = setting(
+        "sobol", "sweep", "how the draws are made, evenly spread or independent"
+    )
+    batch: int = setting(
+        16, "sweep", "pictures that are classified and stored together", unit="pictures", ge=1, le=1024
+    )
+    path: str | None = setting_as_in(
+        AttackConfig, "path", group="sweep",
+        description="sweep the frames of a drive, in which camera or object travel along this path",
+        otherwise="no path",
+    )
+    fps: float = setting(
+        2.0, "sweep", "frames of the drive that are looked at", unit="frames a second", gt=0.0, le=1000.0
+    )
+    keep_pictures: Literal["all", "wrong", "none"] = setting("none", "sweep", "keep small pictures of these answers")
+    specialise: bool = setting_as_in(
+        DerivativeConfig, "specialise", group="sweep", description="predict pictures that differ in light alone",
+        switched="render every picture, also those that differ in light alone",
+    )
+    aov: str | None = setting_as_in(
+        RenderConfig, "aov", group="sweep",
+        description="write ground truth of each pixel, names separated by commas, as layers of an EXR, for every "
+        "configuration",
+    )
+    surface: bool = setting(
+        False, "sweep", "map which parts of the object's surface, when visible, go with wrong answers"
+    )
+    spp: int | None = setting_as_in(
+        SceneConfig, "spp", group="sweep", description="samples per pixel of each picture", expects="", ge=1, le=65536
+    )
+    trials: int = setting(
+        20, "verification", "fresh renders that verify the worst configuration; 0 for none",
+        f"0, or a whole number from {FEWEST_TRIALS} to 100000", unit="renders", ge=0, le=100_000,
+    )
+    verify_spp: int | None = setting_as_in(AttackConfig, "verify_spp", description="samples per pixel of these trials")
+    run: str | None = setting_as_in(SceneConfig, "run", otherwise="runs/OBJECT-sweep-NNN")
+    metrics: dict[str, str] = setting_as_in(AttackConfig, "metrics")
+    log: Literal["mlflow", "tensorboard", "wandb"] | None = setting_as_in(AttackConfig, "log")
+    workers: int | None = setting_as_in(
+        AttackConfig, "workers",
+        description="worker processes that share the sweep, each with one thread unless `threads` says more",
+    )
+    # fmt: on
+    cluster: str | None = setting_as_in(AttackConfig, "cluster")
+
+    @property
+    def title(self) -> tuple[str, ...]:
+        return "-".join(Path(name).stem for name in self.objects), self.command
+
+    @property
+    def environments(self) -> tuple[str, ...]:
+        """The environments by name."""
+        return split_names(self.lit_by)
+
+    @classmethod
+    def of_answer(cls, theirs: AttackConfig, *, varies: bool) -> dict[str, Any]:
+        """Return the settings that a sweep of an attack's answer takes from the attack, where it says nothing else.
+        Unless it says itself what `varies`, that is what the attack was over."""
+        apart = ("controls", "texture_resolution", "spp", "seed", "threads", "deterministic")
+        kept = {name: value for name, value in cls.shared(theirs).items() if name not in apart}
+        return kept if varies else {**kept, "controls": theirs.over}
+
+    @field_validator("answer_of", mode="before")
+    @classmethod
+    def _run_as_text(cls, value: Any) -> Any:
+        return str(value) if isinstance(value, Path) else value
+
+    @field_validator("trials")
+    @classmethod
+    def _none_or_enough(cls, value: int) -> int:
+        if 0 < value < FEWEST_TRIALS:
+            raise ValueError("too few to verify anything")
+        return value
+
+    @field_validator("grid", mode="before")
+    @classmethod
+    def _grid_of_values(cls, value: Any) -> Any:
+        """Accept any sequence of values from Python (a range, an array), and ``a,b,c``; FIRST:LAST:COUNT stays text."""
+        if not isinstance(value, Mapping):
+            return value
+        return {str(name): _grid_values(given) for name, given in value.items()}
+
+
+def _grid_values(given: Any) -> Any:
+    """The values of one axis as a list, or FIRST:LAST:COUNT as text."""
+    if isinstance(given, Mapping) and set(given) == {"choices"}:
+        given = given["choices"]
+    if isinstance(given, str):
+        text = given.strip().removeprefix("[").removesuffix("]")
+        if ":" in text and "," not in text:
+            return text
+        given = [part.strip() for part in text.split(",") if part.strip()]
+    given = given.tolist() if hasattr(given, "tolist") else given
+    sequence = isinstance(given, (range, tuple, list))
+    values = [one.item() if hasattr(one, "item") else one for one in given] if sequence else given
+    values = values if isinstance(values, list) else [values]
+    if not values or any(one is None or isinstance(one, (bool, list, Mapping)) for one in values):
+        raise ValueError("not values")
+    return [number_or_text(one) for one in values]

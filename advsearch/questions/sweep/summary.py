@@ -1,0 +1,248 @@
+"""The result of `sweep`: what `summary.json` holds of it."""
+
+from __future__ import annotations
+
+from typing import Annotated, ClassVar
+
+from pydantic import Field
+
+from advsearch.runs.results import (
+    DescribedValue,
+    Fields,
+    Formation,
+    Interval,
+    JsonFloat,
+    LinearTransport,
+    Payload,
+    RunResult,
+    SharedWork,
+    VariedValue,
+    VerifiedRate,
+    as_fact,
+    having,
+)
+
+AxisValue = int | float | str | tuple[float, float]
+"""A number, a name, or both ends of a part of a range."""
+
+
+class CountedAnswers(Fields):
+    """Configurations, and in how many of them the model is right."""
+
+    configurations: int = Field(description="how many were looked at")
+    correct: int = Field(description="right answers")
+    accuracy: float | None = Field(description="their share; null where there is no configuration")
+    interval: Interval | None = Field(description="of that share")
+
+
+class AxisRow(CountedAnswers):
+    """Every configuration with one value of an axis."""
+
+    axis: str
+    unit: str
+    value: AxisValue
+
+
+class MapAxis(Fields):
+    """An axis of the map, with all its values."""
+
+    axis: str
+    unit: str
+    values: list[AxisValue]
+
+
+class SweepMap(Fields):
+    """Counts and margins over two axes, in rows of the second one."""
+
+    axes: tuple[MapAxis, MapAxis]
+    over: list[str] = Field(description="the axes beyond")
+    configurations: list[list[int]]
+    correct: list[list[int]]
+    margin: list[list[JsonFloat | None]] = Field(description="the mean, in logits; null where there is none")
+
+
+class WorstClaim(Fields):
+    """What the model says of one picture of the worst configuration."""
+
+    label: str
+    index: int | None
+    probability: JsonFloat | None
+    margin: JsonFloat
+    payload: Payload = Field(default=None, description="what else the task keeps of it; absent without")
+
+
+class WorstVerified(VerifiedRate):
+    """What fresh renders of the worst configuration say; a success is a wrong answer."""
+
+    converged: bool = Field(description="whether the margin stood still with the samples")
+    renders: int
+
+
+class WorstConfiguration(Fields):
+    """The configuration with the largest margin."""
+
+    configuration: int = Field(description="its number")
+    values: Annotated[dict[str, DescribedValue], having("object", "model")]
+    seed: int
+    label_set: list[str] = Field(description="the names that count as right there")
+    claimed: WorstClaim = Field(description="of the sweep's own picture")
+    verified: WorstVerified | None = Field(description="null where it was not rendered again")
+    pictured: WorstClaim | None = Field(default=None, description="of the picture that is kept; absent without")
+
+
+class SurfacePart(Fields):
+    """A part of an object's surface, and the answers by whether it was seen."""
+
+    face: int = Field(description="number of the triangle in its middle")
+    u: float = Field(description="its middle, across the map")
+    v: float = Field(description="its middle, up the map, whose bottom row is 0")
+    place: tuple[float, float, float] = Field(description="its middle, in the mesh's coordinates, z up")
+    seen: CountedAnswers = Field(description="pictures that see it")
+    hidden: CountedAnswers = Field(description="the other ones")
+    difference: float = Field(description="share of wrong answers where it is seen, less that where it is not")
+    interval: Interval = Field(
+        description="of that difference, 95 %, for the part by itself; null where pictures share a draw, as frames of "
+        "a drive do"
+    )
+    p: float = Field(description="how likely it is that by chance any part stands out as far")
+
+
+class SurfaceTable(Fields):
+    """What goes with wrong answers on the surface of one object, for one model."""
+
+    object: str
+    model: str
+    part: str = Field(description="what is counted: a `cell` of the map, or a `face`")
+    unwrapped: bool = Field(description="whether the map is a new one, and not that of the object's texture")
+    seen: int = Field(description="how many were seen at all")
+    compared: int = Field(description="how many were seen often enough, and hidden often enough")
+    worse: int = Field(description="how many of these go with wrong answers, told from chance")
+    better: int = Field(description="likewise, with right answers")
+    strongest: list[SurfacePart] = Field(
+        description="those told most clearly, none close to another; `worse` ones first"
+    )
+
+
+class SurfaceMap(Fields):
+    """Which parts of the surface, when seen, go with wrong answers."""
+
+    file: str = Field(description="the counts, in the folder")
+    cells: int = Field(description="along each side of the map")
+    least: int = Field(description="pictures with and without a part that a comparison takes")
+    tables: list[SurfaceTable] = Field(description="for every object, model and kind of part")
+
+
+class PairedRates(Fields):
+    """The same configurations without and with an answer, which one model was shown with the same noise."""
+
+    model: str
+    clean: CountedAnswers = Field(description="without the answer")
+    answer: CountedAnswers = Field(description="with it")
+    both: int = Field(description="pairs that are right in both")
+    clean_only: int = Field(description="pairs that are right without it alone")
+    answer_only: int = Field(description="pairs that are right with it alone")
+    neither: int = Field(description="pairs that are right in none")
+    difference: float = Field(description="accuracy with the answer less that without")
+    interval: Interval = Field(description="of that difference, 95 %, of pairs, over draws where some share one")
+
+
+class BesideAnswer(Fields):
+    """The clean scene and the answer of a run under the same draws."""
+
+    answer: str = Field(description="the run")
+    pairs: list[PairedRates] = Field(description="for each model")
+
+
+class OverDrives(Fields):
+    """A number of each drive."""
+
+    mean: float = Field(description="over drives")
+    interval: Interval | None = Field(description="of the mean, 95 %, over drives; null of one")
+    worst: float = Field(description="of the worst drive")
+
+
+class DriveRates(Fields):
+    """What a model says along whole drives; intervals are over drives, not over frames."""
+
+    model: str
+    answer: str | None = Field(description="the answer of a run that is in the scene; null without")
+    drives: int = Field(description="how many there are with all their frames")
+    frames: int = Field(description="of each drive")
+    seconds: float = Field(description="from the first frame to the last")
+    right: OverDrives = Field(description="share of frames in which the model is right")
+    longest_gap: OverDrives = Field(description="seconds of the longest run of frames in which it is not")
+    first_seen: OverDrives | None = Field(
+        description="distance at the first frame in which it is right, of drives that have one"
+    )
+    unit: str = Field(default="object sizes", description="of that distance")
+    never_seen: int = Field(description="drives without a frame in which it is right")
+    flicker: OverDrives = Field(description="changes between right and wrong a second")
+
+
+class SweepSummary(CountedAnswers, RunResult):
+    """How often the model is right over configurations that were not searched for."""
+
+    command: ClassVar[str] = "sweep"
+
+    object: str
+    model: str
+    task: str = Field(description="what judges the answers")
+    image_formation: Formation | None
+    planned: int = Field(description="how many configurations there are")
+    not_finite: int = Field(description="answers that were not numbers; they count as not right")
+    answers: dict[str, int] = Field(description="how often each wrong answer was given, the 20 most frequent")
+    axes: list[AxisRow] = Field(description="a row for every value of every axis")
+    cells: SweepMap | None = Field(
+        description="over the first two axes with several values; null where there are fewer, or more than 4096 pairs"
+    )
+    beside: BesideAnswer | None = Field(
+        default=None,
+        description="the clean scene beside [an answer](sweeps.md#an-answer-beside-the-clean-scene); absent without",
+    )
+    worst: WorstConfiguration | None
+    drives: list[DriveRates] | None = Field(
+        default=None, description="of [whole drives](drives.md); absent where no frames of a path are swept"
+    )
+    units: int | None = Field(
+        default=None,
+        description="draws that the configurations are of, such as [drives](drives.md), and intervals over; absent "
+        "where none share one",
+    )
+    grid: dict[str, int] = Field(description="how many values each axis of the grid has")
+    gains: dict[str, float] | None = Field(
+        default=None, description="the gain of each scene, by object and environment; absent of one scene"
+    )
+    drawn: dict[str, VariedValue] = Field(
+        default={}, description="what each value was drawn from, of parameters of few numbers"
+    )
+    samples: int = Field(description="draws at each point of the grid")
+    sampler: str | None = Field(description="of the draws; null without any")
+    spp: int = Field(description="samples a pixel")
+    renders: Annotated[dict[str, int], having("sweep")] = Field(
+        description="of the sweep and of the verification; `products`: predicted instead"
+    )
+    transport: LinearTransport | None = Field(
+        default=None,
+        description="whether [basis pictures](transport.md#light) or [light on surfaces](surface-light.md#sweeps) "
+        "predicted pictures; absent where neither light nor camera moves",
+    )
+    surface: SurfaceMap | None = Field(
+        default=None,
+        description="which parts of the [surface](sweeps.md#the-surface), when seen, go with wrong answers; absent "
+        "unless asked",
+    )
+    shared: SharedWork | None = Field(
+        default=None, description="how [workers](cluster.md) did that shared the work; absent without"
+    )
+    renders_per_second: float | None = Field(
+        description="pictures of the sweep; null where nothing was rendered now", json_schema_extra=as_fact("{:.3g}")
+    )
+    warnings: list[str] = Field(description="sentences that a reader has to know")
+
+    @property
+    def brief(self) -> str:
+        """How many are right; beside an answer, that without and with it."""
+        if self.beside and self.beside.pairs:
+            rates = self.beside.pairs[0]
+            return f"accuracy {rates.clean.accuracy:.1%}, {rates.answer.accuracy:.1%} with {self.beside.answer}"
+        return f"right in {self.correct} of {self.configurations}" if self.configurations else ""

@@ -1,0 +1,340 @@
+"""Which parts of an object's surface, when seen, go with wrong answers (docs/sweeps.md, "The surface"): the interval of
+a difference is Newcombe's (1998, Statistics in Medicine 17, method 10) of Wilson's (1927); what is chance comes from
+sharing the wrong answers out anew, each time with the part that stands out most (Westfall and Young 1993, the
+single-step maximum) by the likelihood ratio. Where pictures share a draw (frames of a drive), draws are exchanged
+whole, and no interval is told."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from math import ceil
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from scipy.special import xlogy
+
+from advsearch import seeds
+from advsearch.attacks.draws import batches
+from advsearch.attacks.trials import wilson
+from advsearch.engine.loading import framed, load_scene
+from advsearch.engine.record import judgement_of
+from advsearch.progress import Progress
+from advsearch.questions.sweep.figures import MapView, SurfacePanel, surface_figure
+from advsearch.questions.sweep.job import Job, SweptScene
+from advsearch.questions.sweep.result import rate
+from advsearch.questions.sweep.summary import SurfaceMap, SurfacePart, SurfaceTable
+from advsearch.runs.directory import RunDirectory
+from advsearch.runs.files import write_bytes
+from advsearch.runs.store import Row
+from advsearch.scene.assets import ObjectAsset
+from advsearch.scene.description import OBJECT
+from advsearch.scene.geometry import camera_to_world
+from advsearch.scene.mitsuba_backend.scene import MitsubaScene
+from advsearch.scene.surface_parts import CELLS, SurfaceParts
+from advsearch.scene.surfaces import Surfaces
+
+Counts = npt.NDArray[np.int64]
+Doubles = npt.NDArray[np.float64]
+
+SHARINGS = 199
+"""How often the wrong answers are shared out anew, so that no p-value is under 0.005."""
+
+LEVEL = 0.05
+"""Where no part has to do with the answers, the chance that any is told from chance."""
+
+
+class PartCounts:
+    """Counts of n parts over so many pictures, of which some are `failures`: those that show each (`seen`), and of
+    these the failures (`wrong`), both (n,); `chance` (SHARINGS, n) is the same for failures that are shared out: each
+    by itself, or as `exchanged` says, bits of (SHARINGS, pictures) packed along the first axis."""
+
+    def __init__(
+        self, parts: int, pictures: int, failures: int, seed: int, exchanged: npt.NDArray[np.uint8] | None = None
+    ) -> None:
+        self.exchanged = exchanged
+        self.pictures, self.failures = pictures, failures
+        self.seen, self.wrong = np.zeros((2, parts), np.int64)
+        self.chance = np.zeros((SHARINGS, parts), np.uint32)
+        self._left, self._to_go = pictures, np.full(SHARINGS, failures)
+        self._random = np.random.default_rng(seed)
+
+    def add(self, parts: Counts, failed: bool) -> None:
+        """Count a picture, by the numbers of the parts that hold in it, each once."""
+        self.seen[parts] += 1
+        self.wrong[parts] += failed
+        if self.exchanged is not None:
+            drawn = np.unpackbits(self.exchanged[:, self.pictures - self._left], count=SHARINGS).astype(bool)
+        else:  # so that each choice of pictures is equally likely
+            drawn = self._random.random(SHARINGS) * self._left < self._to_go
+        self._left, self._to_go = self._left - 1, self._to_go - drawn
+        self.chance[np.ix_(np.flatnonzero(drawn), parts)] += 1
+
+
+@dataclass(frozen=True, eq=False)
+class Association:
+    """What n parts have to do with the answers, (n,) each, NaN where a part was not compared: the share of wrong
+    answers where it holds less that where it does not, both ends of the 95 % interval for the part by itself, and how
+    likely it is that by chance any part stands out as far."""
+
+    compared: npt.NDArray[np.bool_]
+    difference: Doubles
+    low: Doubles
+    high: Doubles
+    p: Doubles
+
+    @property
+    def told(self) -> npt.NDArray[np.bool_]:
+        """(n,): which parts are told from chance."""
+        return np.nan_to_num(self.p, nan=1.0) <= LEVEL
+
+    @property
+    def strength(self) -> Doubles:
+        """(n,) the end of the interval that is nearer to 0, without its sign; 0 where the interval contains 0. Without
+        an interval, how large the difference is."""
+        nearer = np.where(np.isnan(self.low), np.abs(self.difference), np.maximum(self.low, -self.high))
+        return np.nan_to_num(np.maximum(nearer, 0.0), nan=0.0)
+
+
+def association(tally: PartCounts, some: slice, least: int) -> Association:
+    """Compare the answers where each of some parts holds with those where it does not; at least so many pictures of
+    either kind."""
+    seen, wrong, pictures, failures = tally.seen[some], tally.wrong[some], tally.pictures, tally.failures
+    compared = (seen >= least) & (pictures - seen >= least)
+    low, high, difference, p = np.full((4, len(seen)), np.nan)
+    if compared.any():
+        n, k = seen[compared], wrong[compared]
+        difference[compared], low[compared], high[compared] = _newcombe(k, n, failures - k, pictures - n)
+        own = _likelihood_ratio(k, n, failures, pictures)
+        shared = (one[some][compared].astype(np.int64) for one in tally.chance)
+        most = np.sort([_likelihood_ratio(one, n, failures, pictures).max() for one in shared])
+        if tally.exchanged is not None:
+            low[compared] = high[compared] = np.nan
+        p[compared] = (1 + len(most) - np.searchsorted(most, own - 1e-9)) / (1 + len(most))
+    return Association(compared, difference, low, high, p)
+
+
+def _likelihood_ratio(k: Counts, n: Counts, failures: int, pictures: int) -> Doubles:
+    """Twice the log of how much likelier k of n, and the rest of the failures beside them, are with shares of their own
+    than with one share: 0 or more."""
+    counts = (k, n - k, failures - k, pictures - n - failures + k)
+    sums = (n, pictures - n, np.array(failures), np.array(pictures - failures))
+    told = xlogy(pictures, pictures) + sum(xlogy(one, one) for one in counts) - sum(xlogy(one, one) for one in sums)
+    result: Doubles = 2.0 * told
+    return result
+
+
+def _newcombe(k: Counts, n: Counts, others: Counts, rest: Counts) -> tuple[Doubles, Doubles, Doubles]:
+    one, two = k / n, others / rest
+    (below, above), (under, over), difference = wilson(one, n), wilson(two, rest), one - two
+    low = difference - np.hypot(one - below, over - two)
+    high = difference + np.hypot(above - one, two - under)
+    return difference, low, high
+
+
+LEAST = 5
+"""Pictures that have to see a part, and as many that do not, before its answers are compared."""
+
+RAYS = 4 * CELLS
+"""Least number of rays along each side of a picture: in smaller ones, many cells would lie between two pixels."""
+
+STRONGEST = 5
+"""Parts of each kind that the summary lists: so many that go with wrong answers, and so many with right ones."""
+
+APART = 0.1
+"""Distance of two listed parts, in units of the object's largest extent, so that one spot is listed once."""
+
+FILE = "artifacts/surface.npz"
+
+SIDES = ((0.0, 20.0), (90.0, 20.0), (180.0, 20.0), (270.0, 20.0), (0.0, 80.0), (0.0, -60.0))
+"""Azimuth and elevation of the cameras that show the object in colours, degrees."""
+
+SIDE_PIXELS = 240
+
+UNKNOWN = -1
+"""Stands for the answer to a picture of which there is no row."""
+
+AT_ONCE = 16
+"""Pictures whose places are worked out at once."""
+
+
+class SurfaceCounts:
+    """How often each part of an object's surface was seen, and how often the answers of each model were wrong then."""
+
+    def __init__(self, parts: SurfaceParts, tallies: Sequence[PartCounts]) -> None:
+        self.parts, self.tallies = parts, tuple(tallies)
+
+    def add(self, shown: Surfaces, wrong: Mapping[int, bool]) -> None:
+        """Count a picture, by what it shows and the models whose answers are wrong."""
+        there = shown.seen(OBJECT)
+        face, uv = shown.face[there].numpy(), shown.uv[there].numpy().astype(np.float64)
+        seen = np.unique(self.parts.cells(face, uv))
+        if self.parts.by_face:
+            seen = np.concatenate([seen, np.unique(face) + CELLS * CELLS])
+        for model, failed in wrong.items():
+            self.tallies[model].add(seen, failed)
+
+    def compared(self, model: int) -> dict[str, Association]:
+        """Return what a model's answers have to do with each part that is seen, by the kind of part."""
+        return {kind: association(self.tallies[model], some, LEAST) for kind, some in self.parts.kinds.items()}
+
+    def table(self, name: str, model: str, tally: PartCounts, kind: str, found: Association) -> SurfaceTable:
+        some = self.parts.kinds[kind]
+        return SurfaceTable(
+            object=name,
+            model=model,
+            part=kind,
+            unwrapped=self.parts.unwrapped,
+            seen=int((tally.seen[some] > 0).sum()),
+            compared=int(found.compared.sum()),
+            worse=int((found.told & (found.difference > 0)).sum()),
+            better=int((found.told & (found.difference < 0)).sum()),
+            strongest=[self._part(some.start + one, one, tally, found) for one in self._strongest(some.start, found)],
+        )
+
+    def _strongest(self, first: int, found: Association) -> list[int]:
+        """The parts that are told from chance most clearly, none close to another: those that go with wrong answers,
+        and then those that go with right ones."""
+        extent = float(np.ptp(self.parts.mesh.vertices, axis=0).max())
+        order = np.argsort(-found.strength, kind="stable")
+        listed: list[int] = []
+        for side in (found.difference > 0.0, found.difference < 0.0):
+            mine: list[int] = []
+            for number in order[(found.told & side)[order]]:
+                places = self.parts.place[[first + one for one in mine]]
+                away = np.linalg.norm(places - self.parts.place[first + number], axis=1)
+                if away.min(initial=np.inf) >= APART * extent:
+                    mine.append(int(number))
+                if len(mine) == STRONGEST:
+                    break
+            listed += mine
+        return listed
+
+    def _part(self, part: int, number: int, tally: PartCounts, found: Association) -> SurfacePart:
+        seen, wrong = int(tally.seen[part]), int(tally.wrong[part])
+        hidden, others = tally.pictures - seen, tally.failures - wrong
+        x, y, z = self.parts.place[part].tolist()
+        u, v = self.parts.at[part].tolist()
+        return SurfacePart(
+            face=int(self.parts.face[part]),
+            u=u,
+            v=v,
+            place=(x, y, z),
+            seen=rate(seen - wrong, seen),
+            hidden=rate(hidden - others, hidden),
+            difference=float(found.difference[number]),
+            interval=(float(found.low[number]), float(found.high[number])),
+            p=float(found.p[number]),
+        )
+
+
+def map_surface(
+    job: Job, rows: Iterable[Row], opened: Callable[[int], SweptScene], run: RunDirectory, progress: Progress
+) -> SurfaceMap:
+    """Count over the surface of each object, write the counts and their figure, and return what the summary says."""
+    per_scene, models = opened(0).points[job.sizes[0]].count, len(job.models)
+    wrong: npt.NDArray[np.int8] = np.full((len(job.places), per_scene, models), UNKNOWN, np.int8)
+    for row in rows:
+        wrong.flat[row.step] = not judgement_of(row).right
+    draws = np.asarray(opened(0).points[job.sizes[0]].units.draw(np.arange(wrong[..., 0].size)))
+    counts = _empty(job, wrong, draws.reshape(wrong.shape[:2]))
+    for scene, answers in enumerate(wrong):
+        view, mine = opened(scene), counts[job.places[scene].object]
+        for some in batches(0, per_scene, AT_ONCE):
+            for size in dict.fromkeys(job.sizes):
+                asked = [model for model in range(models) if job.sizes[model] == size]
+                picks = view.points[size].picks(some.start, len(some), scene * per_scene)
+                us, fineness = view.points[size].configurations(picks), ceil(RAYS / min(size))
+                seen = (view.renderers[size].surfaces(u, fineness) for u in us)
+                for said, shown in zip(answers[some.start : some.stop], seen, strict=True):
+                    mine.add(shown, {model: bool(said[model]) for model in asked if said[model] != UNKNOWN})
+            progress.advance(len(some) * models)
+    return _told(job, counts, run)
+
+
+def _empty(job: Job, wrong: npt.NDArray[np.int8], draws: Counts) -> dict[str, SurfaceCounts]:
+    """Counts of each object, by its name, that know how many answers (scenes, pictures, models) there will be, and of
+    which draw (scenes, pictures) each is."""
+    counts, models = {}, len(job.models)
+    for number, (name, asset) in enumerate(_assets(job).items()):
+        parts, tallies = SurfaceParts(asset.mesh), []
+        here = [place.object == name for place in job.places]
+        mine = wrong[here]
+        for model in range(models):
+            seed = seeds.stream(job.config.seed, "surface", number * models + model)
+            answers, failures = (int((mine[..., model] >= least).sum()) for least in (0, 1))
+            exchanged = exchange(mine[..., model].ravel(), draws[here].ravel(), seed)
+            tallies.append(PartCounts(parts.count, answers, failures, seed, exchanged))
+        counts[name] = SurfaceCounts(parts, tallies)
+    return counts
+
+
+def exchange(wrong: npt.NDArray[np.int8], draws: Counts, seed: int) -> npt.NDArray[np.uint8] | None:
+    """Return the answers of whole draws dealt out to draws anew, as `PartCounts` takes them; None where each picture
+    has a draw of its own. Both (n,), answers that are not known are left out."""
+    known, (_, of) = wrong != UNKNOWN, np.unique(draws, return_counts=True)
+    if of.max(initial=1) == 1:
+        return None
+    order = np.argsort(draws, kind="stable").reshape(len(of), -1)  # each has as many pictures
+    generator, found = np.random.default_rng(seed), np.zeros((SHARINGS, len(wrong)), bool)
+    for one in found:
+        one[order] = (wrong == 1)[order[generator.permutation(len(order))]]
+    return np.packbits(found[:, known], axis=0)
+
+
+def _assets(job: Job) -> dict[str, ObjectAsset]:
+    return {place.object: place.scene.description.object for place in job.places}
+
+
+def _told(job: Job, counts: Mapping[str, SurfaceCounts], run: RunDirectory) -> SurfaceMap:
+    assets, models = _assets(job), [model.name for model in job.models]
+    tables, panels = [], []
+    arrays: dict[str, Any] = {"objects": np.array(list(counts)), "models": np.array(models)}
+    for number, (name, mine) in enumerate(counts.items()):
+        views = _views(assets[name], mine.parts)
+        found = [mine.compared(model) for model in range(len(models))]
+        for what in ("pictures", "failures", "seen", "wrong"):
+            arrays[f"{what}_{number}"] = np.stack([getattr(one, what) for one in mine.tallies])
+        for what in ("difference", "low", "high", "p"):
+            joined = [np.concatenate([getattr(one, what) for one in kinds.values()]) for kinds in found]
+            arrays[f"{what}_{number}"] = np.stack(joined).astype(np.float32)
+        arrays[f"map_{number}"] = mine.parts.corners.astype(np.float32)
+        for model, tally, kinds in zip(models, mine.tallies, found, strict=True):
+            panels.append(_panel(name, model, mine.parts, tally, kinds["cell"], views))
+            tables += [mine.table(name, model, tally, kind, one) for kind, one in kinds.items()]
+    stream = io.BytesIO()
+    np.savez_compressed(stream, **arrays)
+    write_bytes(run.path / FILE, stream.getvalue())
+    for suffix, data in surface_figure(panels).items():
+        write_bytes(run.path / "images" / f"surface.{suffix}", data)
+    return SurfaceMap(file=FILE, cells=CELLS, least=LEAST, tables=tables)
+
+
+def _panel(
+    name: str, model: str, parts: SurfaceParts, tally: PartCounts, found: Association, views: Sequence[MapView]
+) -> SurfacePanel:
+    square = (CELLS, CELLS)
+    return SurfacePanel(
+        object=name,
+        model=model,
+        surface=parts.covered | (tally.seen[parts.kinds["cell"]] > 0).reshape(square),
+        compared=found.compared.reshape(square),
+        difference=np.where(found.told, found.difference, np.nan).reshape(square),
+        views=tuple(views),
+    )
+
+
+def _views(asset: ObjectAsset, parts: SurfaceParts) -> list[MapView]:
+    alone = framed(load_scene(asset, settings={"ground.size": 0.0}).description, SIDE_PIXELS)
+    scene, views = MitsubaScene(alone, (SIDE_PIXELS, SIDE_PIXELS)), []
+    for azimuth, elevation in SIDES:
+        camera = camera_to_world(alone.with_values(camera__azimuth=azimuth, camera__elevation=elevation), 1.0)
+        shown = scene.surfaces({"camera.to_world": torch.from_numpy(camera.astype(np.float32))})
+        there = shown.seen(OBJECT).numpy()
+        cells = np.full(there.shape, -1, np.int64)
+        cells[there] = parts.cells(shown.face.numpy()[there], shown.uv.numpy()[there].astype(np.float64))
+        views.append(MapView(f"{azimuth:g}°, {elevation:g}° up", cells, shown.normal.numpy()))
+    return views

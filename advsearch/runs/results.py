@@ -1,0 +1,508 @@
+"""What every result is made of: named fields, checked when they are put in, written as JSON and read back.
+
+And what several questions answer with: studies, how derivatives are obtained, how long light paths are, pictures.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, JsonValue
+from pydantic.fields import ComputedFieldInfo, FieldInfo
+
+from advsearch import rooms
+from advsearch.files import JsonObject
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+
+SCHEMA = 1
+
+INTERRUPTED, OUT_OF_TIME = "interrupted", "out of time"
+"""Endings of a run that can go on."""
+
+END = ("warnings", "seconds", "seed", "command_line")
+"""Fields that are written last, in this order."""
+
+JsonFloat = Annotated[float, BeforeValidator(lambda value: math.nan if value is None else value)]
+"""A number that may be NaN or infinite: null in JSON, which is read as NaN."""
+
+Interval = tuple[JsonFloat, JsonFloat]
+"""Both ends of a 95 % interval."""
+
+
+def having(*names: str) -> AfterValidator:
+    """Return the check that a mapping has these names."""
+
+    def check(values: Mapping[str, object]) -> Mapping[str, object]:
+        missing = [name for name in names if name not in values]
+        if missing:
+            raise ValueError(f"expected {', '.join(missing)} among its names")
+        return values
+
+    return AfterValidator(check)
+
+
+def as_fact(form: str = "{}") -> dict[str, JsonValue]:
+    """Return the `json_schema_extra` of a field that terminal, page and notebook show under its name, as in
+
+        speed: float | None = Field(default=None, description="pictures a second", json_schema_extra=as_fact("{:.3g}"))
+
+    Args:
+        form: how its value becomes a text.
+    """
+    return {"fact": form}
+
+
+class Fields(BaseModel):
+    """Named fields of a result.
+
+    A field without a default is always there, if need be as null. One with a default is left out where it has it: it
+    belongs to what was not asked for. Fields that a file has and the class has not are passed over.
+    """
+
+    model_config = ConfigDict(frozen=True, from_attributes=True, populate_by_name=True)
+
+    @classmethod
+    def of(cls, source: object) -> Self:
+        """Return the fields with the values that the attributes, or the keys, of something have."""
+        return cls.model_validate(source)
+
+    @classmethod
+    def described(cls) -> dict[str, FieldInfo | ComputedFieldInfo]:
+        """Return the fields by name, and behind them those that are computed from others (`computed_field`)."""
+        return {**cls.model_fields, **cls.model_computed_fields}
+
+    def to_dict(self) -> JsonObject:
+        """Return the fields as JSON values; NaN and infinity are None."""
+        values: JsonObject = plain(self.model_dump(exclude_defaults=True, by_alias=True))
+        return values
+
+
+class Result(Fields):
+    """The answer of a command."""
+
+    command: ClassVar[str]
+
+    def to_dict(self) -> JsonObject:
+        return {"schema": SCHEMA, "command": self.command, **super().to_dict()}
+
+    def facts(self) -> dict[str, str]:
+        """Return the fields that are declared with `as_fact`, as texts by their names; None and NaN are left out."""
+        found = {}
+        for name, about in self.described().items():
+            extra, value = about.json_schema_extra, getattr(self, name)
+            if isinstance(extra, dict) and "fact" in extra and value is not None and value == value:
+                found[name.replace("_", " ")] = str(extra["fact"]).format(value)
+        return found
+
+    @property
+    def goes_on(self) -> bool:
+        """Whether it was stopped before its end, so that a run can be resumed."""
+        return getattr(self, "ending", None) in (INTERRUPTED, OUT_OF_TIME)
+
+    @property
+    def brief(self) -> str:
+        """What came out, in a few words; empty where there are none."""
+        return ""
+
+
+class RunResult(Result):
+    """The answer of a command that keeps a run."""
+
+    run: str | None = Field(description="the folder; null if nothing was kept")
+    environment: str
+    controls: list[str]
+    ending: str = Field(description="how it ended")
+    seconds: Annotated[dict[str, JsonFloat], having("total")] = Field(description="by part of the work, and in `total`")
+    seed: int = Field(description="the root seed")
+    command_line: str = Field(description="the command that asks the same again")
+
+    def to_dict(self) -> JsonObject:
+        """Return the fields as JSON values, what a reader looks for first in front."""
+        values = super().to_dict()
+        for name in END:
+            if name in values:
+                values[name] = values.pop(name)
+        return values
+
+
+Payload = Annotated[JsonValue, BeforeValidator(lambda value: plain(value))]
+"""What a task keeps of an answer beside its words."""
+
+
+class SceneResult(RunResult):
+    """The answer of a command about one object, one model and one task."""
+
+    object: str
+    model: str
+    task: str = Field(description="what judges the answers")
+
+
+class MovedValue(Fields):
+    """A value of the scene that a control leaves out, so that the clean scene has another."""
+
+    parameter: str
+    unit: str
+    scene: float | str = Field(description="the value of the scene as it was described")
+    used: float | str = Field(description="the value that the clean scene has instead")
+
+
+class VariedValue(Fields):
+    """What a value was drawn from by chance."""
+
+    unit: str
+    low: float | None = Field(default=None, description="the least; absent of names")
+    high: float | None = Field(default=None, description="the most; absent of names")
+    names: list[str] | None = Field(default=None, description="of which one was drawn; absent of numbers")
+
+
+class CleanScene(Fields):
+    """The scene that a search starts from."""
+
+    moved: list[MovedValue] = Field(description="the values that had to move")
+
+
+class Formation(Fields):
+    """How radiance became pictures."""
+
+    denoiser: str
+    filter: str = Field(description="reconstruction filter of pixels")
+    sampler: str = Field(description="sampler of pixels")
+    exposure: float = Field(description="stops over the metered one")
+    resolution: tuple[int, int] = Field(description="[height, width], pixels")
+    gain: float | None = Field(
+        description="from radiance to display-linear values; null where scenes have gains of their own"
+    )
+
+
+def plain(value: Any) -> Any:
+    """Return `value` made of what JSON has: numbers of numpy and torch become Python's, NaN and infinity become None.
+
+    Raises:
+        TypeError: there is something in it that has no JSON form.
+    """
+    if isinstance(value, enum.Enum):
+        return plain(value.value)
+    if value is None or isinstance(value, (str, bool, int)):
+        return value
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, Fields):
+        return value.to_dict()
+    if isinstance(value, Mapping):
+        return {str(name): plain(inner) for name, inner in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(inner) for inner in value]
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {one.name: plain(getattr(value, one.name)) for one in dataclasses.fields(value)}
+    if hasattr(value, "tolist"):
+        return plain(value.tolist())
+    raise TypeError(f"expected something that JSON can hold, got {type(value).__name__}")
+
+
+class ConditionRow(Fields):
+    """A part of the values of one parameter."""
+
+    parameter: str
+    unit: str
+    over: float | None = Field(description="values are larger; null without that bound, and for names")
+    at_most: float | None = Field(description="values are no larger; null without that bound, and for names")
+    options: list[str] = Field(description="the names it is about; empty for numbers")
+    text: str
+
+
+class StudyResult(RunResult):
+    """What several attacks found; each is a run of its own in the folder `parts`."""
+
+    objects: list[str]
+    model: str
+    task: str = Field(description="what judges the answers")
+    policy: str
+    parts: list[str] = Field(description="the attacks in the folder `parts`")
+    warnings: list[str] = Field(description="sentences that a reader has to know")
+
+
+GradientStatus = Literal["ok", "biased", "noisy", "reference unusable"]
+
+
+class GroupDerivative(Fields):
+    """How the derivative of one parameter is obtained."""
+
+    control: str
+    parameter: str
+    size: int = Field(description="how many numbers it has")
+    estimator: str
+    valid: list[str] = Field(description="the estimators that are valid")
+    step: float = Field(description="half-width of a difference in u")
+    step_reason: str = Field(description="why it is as wide; empty where none is taken")
+    reason: str = Field(description="why this estimator")
+    variance_x_seconds: dict[str, JsonFloat] = Field(
+        description="squared error x time of each estimator that was measured"
+    )
+    step_in_unit: float | None = Field(description="the step in `unit`; null where that is no single number")
+    unit: str
+
+    @property
+    def name(self) -> str:
+        """``control.parameter``."""
+        return f"{self.control}.{self.parameter}"
+
+
+class PlannedGradient(Fields):
+    """How every derivative is obtained."""
+
+    renders_per_gradient: int = Field(description="beside the picture itself; adjoints are not counted")
+    spp: int | None = Field(description="samples a pixel of differences; null: that of the search")
+    groups: list[GroupDerivative]
+
+
+class PathCut(Fields):
+    """What paths of at most so many segments leave out, the worst over the configurations looked at."""
+
+    depth: int = Field(description="longest path in segments")
+    light: float = Field(description="share of the radiance that is missing")
+    levels: float = Field(description="root-mean-square bias of the displayed picture in 8-bit levels")
+
+
+class PathLength(Fields):
+    """The longest light path of the search, and why."""
+
+    depth: int = Field(description="of the search, in segments")
+    full: int = Field(description="of the verification")
+    cuts: list[PathCut] = Field(description="what was measured, longest paths first")
+    configurations: int = Field(description="how many the measurement looked at")
+    reason: str
+
+
+class Measured(Fields):
+    """A picture, a margin, a gradient or a derivative beside its reference, which took far more renders.
+
+    Errors and noise are relative to the size of the reference. What was not measured is absent.
+    """
+
+    quantity: str = Field(
+        description="`picture`, `margin` of the model, `gradient` of a control, or `derivative` along a parameter"
+    )
+    control: str = Field(default="", description="whose gradient")
+    parameter: str = Field(default="", description="along which the derivative is")
+    estimator: str = Field(description="what computes it: a sampler, or an estimator of derivatives")
+    factor: float = Field(default=1.0, description="step as a multiple of the plan's")
+    spp: int = Field(description="samples a pixel")
+    repeats: int = Field(description="how often it was computed, each time with other noise")
+    seconds: float = Field(description="of one, median")
+    status: GradientStatus = Field(description="whether it agrees with its reference")
+    error: JsonFloat | None = Field(
+        default=None, description="of one, root mean square; an upper limit where the reference is unusable"
+    )
+    interval: Interval | None = Field(default=None, description="of `error`")
+    bias: JsonFloat | None = Field(default=None, description="error of the mean")
+    doubt: JsonFloat | None = Field(default=None, description="how much of `bias` the noise explains")
+    noise: JsonFloat | None = Field(default=None, description="standard deviation of one")
+    cosine: JsonFloat | None = Field(default=None, description="of a gradient with its reference, mean")
+    value: JsonFloat | None = Field(default=None, description="of a derivative, mean")
+    reference: JsonFloat | None = Field(default=None, description="what `value` should be")
+    reference_error: JsonFloat | None = Field(default=None, description="the reference's own")
+    reference_cosine: JsonFloat | None = Field(
+        default=None, description="smallest of two converged gradients, of which the reference is the mean"
+    )
+
+    @property
+    def name(self) -> str:
+        """``control.parameter``, or what there is of it; else the quantity."""
+        return ".".join(filter(None, (self.control, self.parameter))) or self.quantity
+
+    @property
+    def excess(self) -> float:
+        """What of the bias noise does not explain."""
+        return max(0.0, (self.bias or 0.0) - (self.doubt or 0.0))
+
+
+class ClassAnswer(Fields):
+    """One answer to a picture."""
+
+    label: str = Field(description="in words")
+    index: int | None = Field(description="its number among the model's classes; null where there are none")
+    probability: float | None = Field(description="null where the model gives none")
+
+
+class ThingSeen(Fields):
+    """What a picture shows of the object, or of a thing beside it."""
+
+    label: str | None = Field(description="what a model should call it")
+    box: tuple[int, int, int, int] | None = Field(
+        description="the smallest round what is seen of it, [x0, y0, x1, y1] in pixels; null where nothing is"
+    )
+    pixels: int = Field(description="in which it is what is seen first")
+    share: float | None = Field(
+        description="of all that there would be of it if nothing stood before it and the picture went on, 0 to 1; null "
+        "where it is not known"
+    )
+    truncated: bool | None = Field(description="whether it goes on beyond the picture; null where it is not known")
+    distance: float | None = Field(description="of the nearest point that is seen from the camera, metres")
+
+
+class ViewAnswers(Fields):
+    """What the model says of one view."""
+
+    azimuth: float = Field(description="of the camera, degrees")
+    answers: list[ClassAnswer] = Field(description="the likeliest first")
+    things: dict[str, ThingSeen] | None = Field(
+        default=None, description="what is seen of `object` and of each thing beside it; absent without any"
+    )
+
+
+class MeshUp(Fields):
+    """The axis of a mesh file that was taken for up, and why."""
+
+    axis: str
+    reason: str
+
+
+class RenderResult(Result):
+    """A picture of a scene, and what the model says of it."""
+
+    command: ClassVar[str] = "render"
+
+    out: str = Field(description="the file that was written")
+    answered: str | None = Field(
+        default=None, description="that with boxes and masks drawn in; absent where the task draws none"
+    )
+    size: tuple[int, int] = Field(description="of the file, [height, width] in pixels")
+    object: str
+    environment: str
+    model: str
+    task: str = Field(description="what judges the answers")
+    spp: int = Field(description="samples a pixel")
+    image_formation: Formation
+    up: MeshUp | None = Field(description="null for an object without a mesh file")
+    views: list[ViewAnswers]
+    warnings: list[str] = Field(description="sentences that a reader has to know")
+
+
+class DescribedValue(Fields):
+    """One value of a configuration, with its unit."""
+
+    value: int | float | str | list[float]
+    unit: str
+
+
+class ControlGroup(Fields):
+    """Trials of the clean scene: how many are right."""
+
+    correct: int
+    trials: int
+    rate: float
+    interval: Interval
+    not_a_number: int = Field(default=0, description="trials whose answer is NaN or infinity; absent without")
+
+
+class VerifiedRate(Fields):
+    """Trials with fresh seeds, and how many of them are a success."""
+
+    successes: int
+    trials: int = Field(description="that count: over conditions that vary, those whose clean scene is right")
+    rate: float
+    interval: Interval
+    spp: int = Field(description="samples a pixel")
+    labels: dict[str, int] = Field(description="answers of the successes, and how often each was given")
+    margin: JsonFloat = Field(description="mean over these trials, in logits; of a detector in log-odds")
+    not_a_number: int = Field(default=0, description="trials whose answer is NaN or infinity; absent without")
+    stopped: str | None = Field(
+        default=None,
+        description="why there are no more: `asked for` (as many as were) or `decided` (the verdict stands); absent of "
+        "trials that are no verdict",
+    )
+
+
+class AverageCase(Fields):
+    """Configurations drawn from the whole space and budget."""
+
+    configurations: int
+    correct: int = Field(description="how many the model got right")
+    accuracy: float
+    interval: Interval
+    margin: JsonFloat = Field(description="the mean, in logits")
+    worst_margin: JsonFloat = Field(description="the largest, in logits")
+
+
+class PredictionError(Fields):
+    """How far predicted pictures were from traced ones, at the last comparison."""
+
+    levels: JsonFloat = Field(description="of 255, over the object's pixels, root mean square")
+    logits: JsonFloat = Field(description="of the margin, the mean over the pictures that were compared")
+
+
+class BankOfConditions(Fields):
+    """The conditions that matrices were made for."""
+
+    made: int = Field(description="how many")
+    dropped: int = Field(description="of them made room for newer ones")
+    grown: int = Field(description="comparisons with unseen conditions after which there had to be more")
+    gap: float | None = Field(description="objective under them over that under unseen ones, at the last comparison")
+
+
+class LinearTransport(Fields):
+    """What predicted the pictures of the searches."""
+
+    used: bool
+    way: str | None = Field(
+        default=None, description="by what: `matrix`, `basis pictures` (of a sweep), or `surface light`"
+    )
+    reason: str | None = Field(
+        default=None,
+        description="why pictures were rendered, all or from some evaluation on, or not predicted by surface light",
+    )
+    conditions: BankOfConditions | None = Field(default=None, description="with `over`")
+    entries: int | None = Field(default=None, description="of the matrix")
+    bytes: int | None = Field(default=None, description="of its memory")
+    seconds: float | None = Field(default=None, description="that it and the comparisons took")
+    renewed: int | None = Field(default=None, description="how often it was made again")
+    error: PredictionError | None = Field(default=None, description="of the last comparison")
+
+
+class PrintTerms(Fields):
+    """How far colours are from what can be printed, without weights, summed over textures and patches."""
+
+    variation: float = Field(description="mean length of the step from a pixel to its neighbours, in sRGB")
+    off_print: float = Field(description="mean distance in sRGB from the nearest printable colour")
+
+
+class SharedWork(Fields):
+    """How the workers did that shared the work, in this sitting."""
+
+    most: int = Field(description="workers that were ready at once, at most")
+    lost: int = Field(description="that went away")
+    refused: int = Field(description="that could not do it")
+    retried: int = Field(description="batches that were given out again")
+    batches: int = Field(description="batches that came back")
+    busy: JsonFloat = Field(description="seconds that workers were at batches")
+    loading: JsonFloat = Field(description="seconds that they loaded scenes and models")
+    alive: JsonFloat = Field(description="seconds that they were there and ready")
+    utilisation: JsonFloat | None = Field(description="`busy` over `alive`")
+    machines: dict[str, dict[str, str]] = Field(description="what rows call by a name, where machines are not alike")
+
+    @classmethod
+    def of_facts(cls, facts: Any, machines: Mapping[str, Mapping[str, str]]) -> SharedWork | None:
+        """Return the fields from what an executor says; None where it says nothing."""
+        if facts is None:
+            return None
+        share = min(1.0, facts.busy / facts.alive) if facts.alive else None
+        return cls.model_validate({**vars(facts), "utilisation": share, "machines": machines})
+
+
+def kind_of(values: JsonObject) -> type[Result] | None:
+    """Return the result that the values of a `summary.json` are of; None if there is none of that command."""
+    room = rooms.room(str(values.get("command")))
+    if room is None:
+        return None
+    kind: type[Result] | None = next((kind for name, kind in room.others.items() if name in values), room.result)
+    return kind

@@ -1,0 +1,237 @@
+"""A street as geometry: 300 m of road between pavements and houses, with trees and lamps. Lengths are metres.
+
+It runs along x. The object stands at the origin, in the lane of those who drive towards +x. At both ends it meets
+another street, whose houses close the view; beyond them lies a plain to the horizon.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+
+import numpy as np
+
+from advsearch.scene.assets import Doubles, Floats, Material
+from advsearch.scene.color import linear_to_srgb
+from advsearch.scene.parts import MeshPart
+from advsearch.scene.places import paint, road
+from advsearch.scene.places.houses import Row
+from advsearch.scene.places.quads import FRONT, SHOWN, Frame, Quads
+
+END, CROSSING, FAR = 150.0, 12.0, 4000.0
+"""Where the street ends, how wide the one is that it meets, and how far the plain goes."""
+KERB, KERB_WIDE = 0.12, 0.16
+TREES = (-118.0, -97.0, -76.0, -55.0, -34.0, -15.0, 22.0, 43.0, 64.0, 85.0, 106.0, 127.0)
+"""x of the trees on the right; those on the left stand 9 m on."""
+POSTS = tuple(range(-135, 150, 30))
+"""x of the lamp posts, to the right and to the left in turn."""
+POST_AT, TREE_AT = (-3.05, 6.55), (-4.4, 7.9)
+"""y of the posts and of the trees, on the right and on the left."""
+LAMP_HEIGHT, ARM = 7.5, 1.7
+LAMP_SIZE = (0.36, 0.22)
+"""Of the area that shines, level."""
+
+WALL, PANE, LEAF, IRON = (
+    Material(roughness=0.85, specular=0.25), Material(roughness=0.06, specular=0.6),
+    Material(roughness=0.7, specular=0.25), Material(roughness=0.45, specular=0.5),
+)  # fmt: skip
+WET_WALL = Material(roughness=0.5, specular=0.4)
+
+
+@lru_cache(maxsize=4)
+def avenue(wet: bool, metres: float) -> tuple[MeshPart, ...]:
+    """Return the meshes of the street.
+
+    Args:
+        wet: whether the road is dark and reflects.
+        metres: of one object size, the scene's unit of length.
+    """
+    rows, ground = _houses(), road.WET if wet else road.DRY
+    grey, white = np.full((2, 2, 3), 0.25, np.float32), np.full((2, 2, 3), 0.9, np.float32)
+    made = (
+        (road.ROAD, _ground(), _display(paint.road, wet), ground),
+        ("houses", rows.walls, _display(paint.walls), WET_WALL if wet else WALL),
+        ("windows", rows.dark, _display(paint.panes), PANE),
+        ("lit-windows", rows.lit, _display(paint.panes), PANE),
+        ("shops", rows.shops, _display(paint.panes), PANE),
+        ("trees", _trees(), _leaves(), LEAF),
+        ("posts", _posts(), grey, IRON),
+        ("street-lamps", _lamps(), white, PANE),
+        ("plain", _plain(), _grass(), WALL),
+    )
+    return tuple(MeshPart(name, quads.mesh(metres), base, finish, laid=True) for name, quads, base, finish in made)
+
+
+@lru_cache(maxsize=8)
+def _display(texture: object, *arguments: bool) -> Floats:
+    """A painted texture as display-referred multiples of 1/255."""
+    shown = linear_to_srgb(np.asarray(texture(*arguments), np.float32))  # type: ignore[operator]
+    return np.asarray(np.round(shown * np.float32(255.0)) / np.float32(255.0), np.float32)
+
+
+@lru_cache(maxsize=1)
+def _houses() -> Row:
+    """Both sides of the street, and the houses that close it at either end."""
+    row, (right, left) = Row(), paint.FRONTS
+    row.build(Frame((0.0, right, KERB), (0.0, 1.0, 0.0)), -END, END, 1)
+    row.build(Frame((0.0, left, KERB), (0.0, -1.0, 0.0)), -END, END, 2)
+    away = END + CROSSING + 4.0
+    row.build(Frame((away, 0.0, KERB), (-1.0, 0.0, 0.0)), -62.0, 62.0, 3)
+    row.build(Frame((-away, 0.0, KERB), (1.0, 0.0, 0.0)), -62.0, 62.0, 4)
+    return row
+
+
+def _ground() -> Quads:
+    quads = Quads()
+    low, high = paint.FRONTS
+    right, left = road.KERBS
+
+    def level(x: Sequence[float], y: Sequence[float], z: float, v: tuple[float, float] | None = None) -> None:
+        """A level rectangle; `v` are the y whose ground it shows, its own unless given."""
+        (x0, x1), (y0, y1) = sorted(x), sorted(y)
+        shown = np.array(v or (y0, y1))
+        rows = (shown - low) / (high - low)
+        corners = np.array([[(x0, y0, z), (x1, y0, z), (x1, y1, z), (x0, y1, z)]])
+        u = np.array([x0, x1, x1, x0]) / paint.GROUND_PERIOD
+        quads.add(corners, np.stack([u, rows[[0, 0, 1, 1]]], axis=-1)[None])
+
+    level((-END, END), (right, left), 0.0)
+    for edge, wall, out in ((right, low, 1.0), (left, high, -1.0)):
+        level((-END, END), (edge, wall), KERB)
+        corners = [(-END, edge, 0.0), (END, edge, 0.0), (END, edge, KERB), (-END, edge, KERB)]
+        v = (edge - out * np.array([0.02, 0.02, 0.1, 0.1]) - low) / (high - low)
+        uvs = np.stack([np.array([-END, END, END, -END]) / paint.GROUND_PERIOD, v], axis=-1)
+        quads.add(np.array([corners])[:, :: int(-out)], uvs[None, :: int(-out)])
+    for sign in (-1.0, 1.0):
+        level((sign * END, sign * (END + CROSSING)), (-64.0, 64.0), 0.0, (2.4, 5.2))
+        level((sign * (END + CROSSING), sign * (END + CROSSING + 4.0)), (-64.0, 64.0), KERB, (-9.9, -6.0))
+    return quads
+
+
+def _plain() -> Quads:
+    quads = Quads()
+    corners = FAR * np.array([[(-1.0, -1.0, 0.0), (1.0, -1.0, 0.0), (1.0, 1.0, 0.0), (-1.0, 1.0, 0.0)]])
+    quads.add(corners - [0.0, 0.0, 0.05], corners[..., :2] / 50.0)
+    return quads
+
+
+def _grass() -> Floats:
+    tone = 1.0 + 0.25 * paint._clouds(128, 128, 32, 400) + 0.2 * paint._grain(128, 128, 401)
+    return linear_to_srgb(np.clip(paint.tint((0.075, 0.095, 0.045)) * tone[..., None], 0.0, 1.0))
+
+
+# ---- trees ----------------------------------------------------------------------------------------------------------
+
+
+@lru_cache(maxsize=1)
+def _trees() -> Quads:
+    quads = Quads()
+    trees = [_tree(seed) for seed in range(3)]
+    for side, y in enumerate(TREE_AT):
+        for number, x in enumerate(TREES):
+            kind = trees[(number + side) % len(trees)]
+            turn, size = 2.4 * number + side, 0.9 + 0.2 * ((5 * number + 3 * side) % 7) / 7.0
+            matrix = size * np.array(
+                [[np.cos(turn), -np.sin(turn), 0.0], [np.sin(turn), np.cos(turn), 0.0], [0, 0, 1.0]]
+            )
+            for corners, uvs, normals in zip(kind.corners, kind.uvs, kind.normals, strict=True):
+                quads.add(corners @ matrix.T + [x + 9.0 * side, y, KERB], uvs, normals @ (matrix / size).T)
+    return quads
+
+
+LEAVES, CLUMPS = 3800, 40
+
+
+def _tree(seed: int) -> Quads:
+    """A trunk, some boughs and leaves in clumps, which are shaded as the clump is round."""
+    rng, quads = np.random.Generator(np.random.PCG64(500 + seed)), Quads()
+    _limb(quads, np.array([0.0, 0.0, 0.0]), np.array([0.05, 0.03, 3.0]), 0.17, 0.12)
+    way = rng.normal(size=(CLUMPS, 3))
+    way *= rng.uniform(0.55, 1.0, (CLUMPS, 1)) / np.linalg.norm(way, axis=1, keepdims=True)
+    middle = np.array([0.0, 0.0, 5.2]) + way * [1.75, 1.75, 2.3]
+    for at in middle[:9]:
+        _limb(quads, np.array([0.05, 0.03, 2.8]), at, 0.08, 0.025)
+    clump = rng.integers(CLUMPS, size=LEAVES)
+    away = rng.normal(size=(LEAVES, 3))
+    away *= rng.random((LEAVES, 1)) ** 0.4 / np.linalg.norm(away, axis=1, keepdims=True)
+    place = middle[clump] + away * [0.85, 0.85, 0.7]
+    along, aside = rng.normal(size=(2, LEAVES, 3))
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    aside -= (aside * along).sum(axis=1, keepdims=True) * along
+    aside /= np.linalg.norm(aside, axis=1, keepdims=True)
+    size = rng.uniform(0.075, 0.135, (LEAVES, 1))
+    corners = place[:, None] + np.stack([-along, -0.5 * aside, along, 0.5 * aside], axis=1) * size[:, None]
+    round_ = 0.7 * away + 0.5 * (place - [0.0, 0.0, 4.9]) / [1.75, 1.75, 2.3] + [0.0, 0.0, 0.25]
+    round_ /= np.linalg.norm(round_, axis=1, keepdims=True)
+    flat = np.cross(along, aside)
+    flat *= np.sign((flat * round_).sum(axis=1, keepdims=True))
+    turned = np.where((np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1]) * flat).sum(1) < 0.0)[0]
+    corners[turned] = corners[turned, ::-1]
+    shading = 0.75 * round_ + 0.5 * flat
+    shading /= np.linalg.norm(shading, axis=1, keepdims=True)
+    u = rng.random((LEAVES, 1, 1)) * 0.5 + 0.48
+    uvs = np.concatenate([u + 0.0 * corners[..., :1], 0.5 + 0.0 * corners[..., :1]], axis=-1)
+    quads.add(corners, uvs, np.repeat(shading[:, None], 4, axis=1))
+    return quads
+
+
+def _leaves() -> Floats:
+    """Bark on the left, leaves of different greens to the right."""
+    t = np.linspace(0.0, 1.0, 16, dtype=np.float32)[None, :, None]
+    green = paint.tint((0.055, 0.105, 0.022)) * (1.0 - t) + paint.tint((0.13, 0.19, 0.04)) * t
+    bark = paint.tint((0.085, 0.065, 0.048)) * (1.0 + 0.3 * t)
+    return linear_to_srgb(np.concatenate([bark, green], axis=1).repeat(2, axis=0))
+
+
+def _limb(
+    quads: Quads, start: Doubles, end: Doubles, thick: float, thin: float, sides: int = 7, u: float = 0.2
+) -> None:
+    """A tapering round limb from one place to another."""
+    ahead = (end - start) / np.linalg.norm(end - start)
+    aside = np.cross(ahead, np.eye(3)[np.abs(ahead).argmin()])
+    aside /= np.linalg.norm(aside)
+    above = np.cross(ahead, aside)
+    turn = np.linspace(0.0, 2.0 * np.pi, sides + 1)
+    ring = np.cos(turn)[:, None] * aside + np.sin(turn)[:, None] * above
+    low, high = start + thick * ring, end + thin * ring
+    corners = np.stack([low[:-1], low[1:], high[1:], high[:-1]], axis=1)
+    normals = np.stack([ring[:-1], ring[1:], ring[1:], ring[:-1]], axis=1)
+    uvs = np.broadcast_to([u, 0.5], (sides, 4, 2)) + np.array([0.08, 0.0]) * np.arange(sides)[:, None, None] / sides
+    quads.add(corners, uvs, normals)
+
+
+# ---- lamps ----------------------------------------------------------------------------------------------------------
+
+
+def lamp_places() -> Doubles:
+    """Return where the middle of each shining area is, (N, 3) metres."""
+    sides = np.arange(len(POSTS)) % 2
+    y = np.where(sides == 0, POST_AT[0] + ARM, POST_AT[1] - ARM)
+    return np.column_stack([POSTS, y, np.full(len(POSTS), KERB + LAMP_HEIGHT - 0.07)])
+
+
+def _posts() -> Quads:
+    quads = Quads()
+    for x, y, z in lamp_places():
+        foot = np.array([x, POST_AT[0] if y < 1.75 else POST_AT[1], KERB])
+        top = foot + np.array([0.0, 0.0, LAMP_HEIGHT])
+        _limb(quads, foot, foot + np.array([0.0, 0.0, 1.1]), 0.11, 0.1, 10)
+        _limb(quads, foot + np.array([0.0, 0.0, 1.0]), top, 0.07, 0.045, 10)
+        _limb(quads, top - [0.0, 0.0, 0.06], np.array([x, y, top[2] + 0.02]), 0.04, 0.03, 8)
+        head = Frame((x, y, z), (0.0, -1.0 if y < 1.75 else 1.0, 0.0))
+        half, wide = LAMP_SIZE[0] / 2 + 0.06, LAMP_SIZE[1] / 2 + 0.05
+        box = np.array([[-wide, wide, -half - 0.1, half, 0.004, 0.12]])
+        quads.boxes(head, box, np.zeros((1, 4)), SHOWN)
+        back = Frame((x, y, z), tuple(-np.array(head.out)))
+        quads.boxes(back, np.array([[-wide, wide, 0.0, half + 0.1, 0.004, 0.12]]), np.zeros((1, 4)), (FRONT,))
+    return quads
+
+
+def _lamps() -> Quads:
+    """The areas that shine, facing down."""
+    quads, places = Quads(), lamp_places()
+    half = np.array(LAMP_SIZE[::-1]) / 2.0
+    signs = np.array([[-1, -1], [-1, 1], [1, 1], [1, -1]])
+    corners = places[:, None] + np.concatenate([signs * half, np.zeros((4, 1))], axis=1)
+    quads.add(corners, np.zeros((len(places), 4, 2)) + 0.5)
+    return quads

@@ -1,0 +1,234 @@
+"""Houses of a street: fronts with recessed windows, doors, shops, cornices and roofs. Lengths are metres."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from advsearch.scene.assets import Bools, Doubles
+from advsearch.scene.places.paint import (
+    BAY,
+    DARK,
+    FLOOR,
+    GREEN,
+    GREY,
+    GROUND_FLOOR,
+    PANES,
+    PERIOD,
+    RED,
+    STONE,
+    TRIMS,
+    WALLS,
+    WHITE,
+    tile_rows,
+    trim_rows,
+    wall_row,
+)  # fmt: skip
+from advsearch.scene.places.quads import BOTTOM, FRONT, SIDES, TOP, Frame, Quads
+
+DEPTH = 11.0
+REVEAL, SHOP_REVEAL = 0.17, 0.32
+"""How far windows stand back."""
+ATTIC = 0.75
+"""Of the front above the last floor."""
+LIT = 0.3
+"""Share of windows that are lit by night."""
+
+
+@dataclass(eq=False)
+class Row:
+    """Fronts in a row, collected before they are built.
+
+    Attributes:
+        walls: masonry, frames and roofs.
+        dark, lit, shops: panes of dwellings without and with light behind them by night, and of shops.
+    """
+
+    walls: Quads = field(default_factory=Quads)
+    dark: Quads = field(default_factory=Quads)
+    lit: Quads = field(default_factory=Quads)
+    shops: Quads = field(default_factory=Quads)
+
+    def build(self, frame: Frame, begin: float, end: float, seed: int) -> None:
+        """Build houses from `begin` to `end` along a wall, the last of them as wide as fits."""
+        rng = np.random.Generator(np.random.PCG64(seed))
+        before = -1
+        while end - begin > BAY:
+            bays = min(int(rng.integers(3, 7)), int((end - begin) / BAY))
+            kind = int(rng.integers(len(WALLS)))
+            kind = (kind + (kind == before)) % len(WALLS)
+            self._house(frame, begin, bays, int(rng.integers(3, 6)), kind, rng)
+            begin, before = begin + bays * BAY, kind
+
+    def _house(self, frame: Frame, at: float, bays: int, floors: int, kind: int, rng: np.random.Generator) -> None:
+        wide, high = bays * BAY, GROUND_FLOOR + FLOOR * (floors - 1) + ATTIC
+        shop, door = bool(rng.random() < 0.55), int(rng.integers(bays))
+        trim, paint = int(rng.choice([STONE, WHITE, GREY])), int(rng.choice([WHITE, WHITE, DARK, GREEN]))
+        sign = int(rng.integers(RED, len(TRIMS)))
+        cells: list[tuple[float, ...]] = []
+        openings: list[tuple[float, ...]] = []
+        for floor in range(floors):
+            low = 0.0 if floor == 0 else GROUND_FLOOR + FLOOR * (floor - 1)
+            top = low + (GROUND_FLOOR if floor == 0 else FLOOR + ATTIC * (floor == floors - 1))
+            for bay in range(bays):
+                left = at + BAY * bay
+                cells.append((left, left + BAY, low, top))
+                if floor == 0 and bay == door:
+                    openings.append((left + 0.7, left + 1.9, 0.0, 2.75))
+                elif floor == 0 and shop:
+                    openings.append((left + 0.25, left + 2.35, 0.5, 2.95))
+                elif floor == 0:
+                    openings.append((left + 0.7, left + 1.9, 1.05, 2.85))
+                else:
+                    tall = 1.75 if floor == 1 else 1.55
+                    openings.append((left + 0.72, left + 1.88, low + 0.8, low + 0.8 + tall))
+        holes = np.array(openings)
+        deep = np.where(np.arange(len(holes)) < bays, SHOP_REVEAL, REVEAL)
+        self._masonry(frame, np.array(cells), holes, deep, kind)
+        is_door = np.arange(len(holes)) == door
+        is_shop = (np.arange(len(holes)) < bays) & ~is_door & shop
+        self._windows(frame, holes[~is_door], deep[~is_door], is_shop[~is_door], paint, rng)
+        self._door(frame, holes[door], int(rng.choice([GREEN, RED, 5, DARK, WHITE])), trim)
+        upper = holes[bays:]
+        sills = np.column_stack(
+            [
+                upper[:, 0] - 0.1,
+                upper[:, 1] + 0.1,
+                0 * upper[:, 0],
+                0 * upper[:, 0] + 0.13,
+                upper[:, 2] - 0.09,
+                upper[:, 2],
+            ]
+        )
+        heads = np.column_stack(
+            [
+                upper[:, 0] - 0.14,
+                upper[:, 1] + 0.14,
+                0 * upper[:, 0],
+                0 * upper[:, 0] + 0.05,
+                upper[:, 3],
+                upper[:, 3] + 0.2,
+            ]
+        )
+        self._trim(frame, np.concatenate([sills, heads]), trim)
+        right, mould = at + wide, [(0.16, 3.72, 3.95), (0.09, 3.60, 3.72)]
+        mould += [(0.22, high - 0.50, high - 0.36), (0.34, high - 0.36, high - 0.2), (0.46, high - 0.2, high)]
+        self._trim(frame, np.array([(at, right, 0.0, out, low, top) for out, low, top in mould]), trim)
+        self._trim(frame, np.array([(at, right, 0.0, 0.06, 0.0, 0.35)]), GREY, faces=(FRONT, TOP))
+        if shop:
+            first = at + BAY * (door + 1) if door < bays / 2 else at
+            last = right if door < bays / 2 else at + BAY * door
+            if last - first > 1.0:
+                self._trim(frame, np.array([(first + 0.2, last - 0.2, 0.0, 0.14, 3.02, 3.52)]), sign)
+                if rng.random() < 0.5:
+                    self._awning(frame, first + 0.25, last - 0.25, int(rng.integers(RED, len(TRIMS))))
+        self._roof(frame, at, right, high, kind, rng)
+
+    def _masonry(self, frame: Frame, cells: Doubles, holes: Doubles, deep: Doubles, kind: int) -> None:
+        left, right, low, high = cells.T
+        in_left, in_right, in_low, in_high = holes.T
+        around = np.concatenate(
+            [
+                np.stack([left, in_left, low, high], 1), np.stack([in_right, right, low, high], 1),
+                np.stack([in_left, in_right, low, in_low], 1), np.stack([in_left, in_right, in_high, high], 1),
+            ]
+        )  # fmt: skip
+        around = around[around[:, 3] - around[:, 2] > 1e-6]
+        self.walls.wall(frame, around, 0.0, _of_wall(around, kind))
+        zero, u = 0.0 * in_left, np.stack([in_left, in_left + deep], 1) / PERIOD
+        for at, turn in ((in_left, 1), (in_right, -1)):  # the reveals
+            out, up = np.stack([zero, zero, -deep, -deep], 1), np.stack([in_low, in_high, in_high, in_low], 1)
+            corners = frame.world(at[:, None] + 0.0 * out, out, up)
+            uvs = np.stack([u[:, [0, 0, 1, 1]], wall_row(kind, up)], axis=-1)
+            self.walls.add(corners[:, ::-turn], uvs[:, ::-turn])
+        for at, turn in ((in_low, 1), (in_high, -1)):
+            out, along = np.stack([zero, zero, -deep, -deep], 1), np.stack([in_left, in_right, in_right, in_left], 1)
+            corners = frame.world(along, out, at[:, None] + 0.0 * out)
+            uvs = np.stack([along / PERIOD, wall_row(kind, at[:, None] + 0.3 * out)], axis=-1)
+            self.walls.add(corners[:, ::turn], uvs[:, ::turn])
+
+    def _windows(
+        self, frame: Frame, holes: Doubles, deep: Doubles, shop: Bools, paint: int, rng: np.random.Generator
+    ) -> None:
+        kinds = np.where(shop, rng.integers(PANES // 2, PANES, len(holes)), rng.integers(0, PANES // 2, len(holes)))
+        uvs = np.column_stack([kinds / PANES + 0.004, (kinds + 1) / PANES - 0.004, 0 * kinds + 0.01, 0 * kinds + 0.99])
+        lit = ~shop & (rng.random(len(holes)) < LIT)
+        for panes, chosen in ((self.shops, shop), (self.lit, lit), (self.dark, ~shop & ~lit)):
+            if chosen.any():
+                panes.wall(frame, holes[chosen], -deep[chosen], uvs[chosen])
+        left, right, low, high = holes.T
+        middle, bar = (left + right) / 2.0, np.where(shop, 0.05, 0.065)
+        across = low + 0.7 * (high - low)
+        bars = [
+            (left, left + bar, low, high), (right - bar, right, low, high), (left, right, low, low + bar),
+            (left, right, high - bar, high), (middle - bar / 2, middle + bar / 2, low, high),
+            (left, right, across - bar / 2.5, across + bar / 2.5),
+        ]  # fmt: skip
+        rows = np.concatenate([np.column_stack([one[0], one[1], -deep, 0.045 - deep, one[2], one[3]]) for one in bars])
+        self._trim(frame, rows, paint, faces=(FRONT,))
+
+    def _door(self, frame: Frame, hole: Doubles, paint: int, trim: int) -> None:
+        left, right, low, high = hole
+        back = 0.01 - SHOP_REVEAL
+        boxes = [(left, right, back - 0.05, back, low, high)]
+        for row, top in ((0.25, 0.95), (1.1, 2.0)):
+            for at in (left + 0.14, left + 0.66):
+                boxes.append((at, at + 0.4, back, back + 0.025, low + row, low + top))
+        self._trim(frame, np.array(boxes), paint)
+        around = [(left - 0.16, left, 0.0, 0.07, low, high + 0.16), (right, right + 0.16, 0.0, 0.07, low, high + 0.16)]
+        around += [
+            (left - 0.24, right + 0.24, 0.0, 0.2, high + 0.16, high + 0.32),
+            (left, right, 0.0, 0.07, high, high + 0.16),
+        ]
+        self._trim(frame, np.array([*around, (left - 0.2, right + 0.2, 0.0, 0.34, low, low + 0.13)]), trim)
+
+    def _awning(self, frame: Frame, left: float, right: float, kind: int) -> None:
+        along, out = np.array([[left, right, right, left]]), np.array([[1.15, 1.15, 0.14, 0.14]])
+        up = np.array([[2.45, 2.45, 2.98, 2.98]])
+        low, high = trim_rows(kind, 0.5)
+        uvs = np.stack([along / PERIOD, np.array([[low, low, high, high]])], axis=-1)
+        corners = frame.world(along, out, up)
+        self.walls.add(corners, uvs)
+        self.walls.add(corners[:, ::-1] - [0.0, 0.0, 0.01], uvs)
+        self._trim(frame, np.array([(left, right, 1.14, 1.15, 2.25, 2.45)]), kind, faces=(FRONT,))
+
+    def _roof(self, frame: Frame, left: float, right: float, high: float, kind: int, rng: np.random.Generator) -> None:
+        ridge = high + float(rng.uniform(2.0, 3.4))
+        low, top = tile_rows(5.0)
+        for sign in (0, 1):
+            along = np.array([[left, right, right, left]])
+            edge, middle = (0.46, -DEPTH / 2.0) if sign == 0 else (-DEPTH, -DEPTH / 2.0)
+            out, up = np.array([[edge, edge, middle, middle]]), np.array([[high, high, ridge, ridge]])
+            uvs = np.stack([along / PERIOD, np.array([[low, low, top, top]])], axis=-1)
+            turn = 1 if sign == 0 else -1
+            self.walls.add(frame.world(along, out, up)[:, ::turn], uvs[:, ::turn])
+        for at, turn in ((left, -1), (right, 1)):  # gables, down to the ground
+            out = np.array([[0.0, -DEPTH, -DEPTH, 0.0], [0.0, -DEPTH, -DEPTH / 2.0, 0.0]])
+            up = np.array([[0.0, 0.0, high, high], [high, high, ridge, high]])
+            uvs = np.stack([-out / PERIOD, wall_row(kind, np.minimum(0.4 * up + GROUND_FLOOR, 16.9))], axis=-1)
+            self.walls.add(frame.world(at + 0.0 * out, out, up)[:, ::turn], uvs[:, ::turn])
+        back = np.array([[right, left, left, right]])
+        up = np.array([[0.0, 0.0, high, high]])
+        uvs = np.stack([back / PERIOD, wall_row(kind, 0.7 * up + GROUND_FLOOR)], axis=-1)
+        self.walls.add(frame.world(back, 0.0 * back - DEPTH, up), uvs)
+        for place in rng.uniform(left + 1.0, right - 1.0, 2):
+            self._trim(
+                frame,
+                np.array([(place - 0.45, place + 0.45, -6.2, -5.4, ridge - 0.6, ridge + 1.1)]),
+                RED,
+                (FRONT, SIDES, TOP),
+            )
+
+    def _trim(
+        self, frame: Frame, rows: Doubles, kind: int, faces: tuple[str, ...] = (FRONT, SIDES, TOP, BOTTOM)
+    ) -> None:
+        low, high = trim_rows(kind, rows[:, 5] - rows[:, 4])
+        self.walls.boxes(
+            frame, rows, np.column_stack([rows[:, 0] / PERIOD, rows[:, 1] / PERIOD, low + 0.0 * high, high]), faces
+        )
+
+
+def _of_wall(rows: Doubles, kind: int) -> Doubles:
+    """Texture coordinates of rectangles of a front."""
+    return np.column_stack([rows[:, :2] / PERIOD, wall_row(kind, rows[:, 2:])])

@@ -1,0 +1,109 @@
+"""Meshes of many flat quadrilaterals, collected by the thousand."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from advsearch.scene.assets import Doubles, Mesh
+
+FRONT, SIDES, TOP, BOTTOM = "front", "sides", "top", "bottom"
+SHOWN = (FRONT, SIDES, TOP, BOTTOM)
+"""Faces of a box that stands at a wall: all but its back."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A wall's own coordinates: along it, out of it, and up, in metres.
+
+    Attributes:
+        origin: (3,) where all three are 0.
+        out: (3,) unit vector, level, that the wall faces.
+    """
+
+    origin: tuple[float, float, float]
+    out: tuple[float, float, float]
+
+    def world(self, along: Doubles, out: Doubles, up: Doubles) -> Doubles:
+        """Return places (..., 3) from coordinates of the wall; seen from outside, `along` runs to the right."""
+        away = np.array(self.out)
+        right = np.array([-away[1], away[0], 0.0])
+        along, out, up = np.broadcast_arrays(along, out, up)
+        return np.asarray(
+            np.array(self.origin) + along[..., None] * right + out[..., None] * away + up[..., None] * [0.0, 0.0, 1.0]
+        )
+
+
+@dataclass(eq=False)
+class Quads:
+    """Quadrilaterals, counter-clockwise seen from outside, with texture coordinates."""
+
+    corners: list[Doubles] = field(default_factory=list)
+    uvs: list[Doubles] = field(default_factory=list)
+    normals: list[Doubles] = field(default_factory=list)
+
+    def add(self, corners: Doubles, uvs: Doubles, normals: Doubles | None = None) -> None:
+        """Add (N, 4, 3) corners with (N, 4, 2) texture coordinates and, unless they are flat, (N, 4, 3) normals."""
+        self.corners.append(corners)
+        self.uvs.append(np.broadcast_to(uvs, (*corners.shape[:2], 2)))
+        self.normals.append(np.zeros_like(corners) if normals is None else normals)
+
+    def wall(self, frame: Frame, rows: Doubles, out: Doubles | float, uvs: Doubles) -> None:
+        """Add upright rectangles.
+
+        Args:
+            frame: of the wall.
+            rows: (N, 4) left, right, low and high.
+            out: (N,) how far out of the wall.
+            uvs: (N, 4) texture coordinates: left, right, low, high.
+        """
+        left, right, low, high = rows.T
+        along, up = np.stack([left, right, right, left], axis=1), np.stack([low, low, high, high], axis=1)
+        self.add(frame.world(along, np.reshape(out, (-1, 1)) + 0.0 * along, up), _around(uvs))
+
+    def boxes(self, frame: Frame, rows: Doubles, uvs: Doubles, faces: Sequence[str] = SHOWN) -> None:
+        """Add boxes.
+
+        Args:
+            frame: of the wall that they stand at.
+            rows: (N, 6) left, right, back, front, low, high.
+            uvs: (N, 4) as of `wall`, for the front; the other faces show a part of it.
+            faces: those that are there.
+        """
+        left, right, back, front, low, high = rows.T
+        shown = _around(uvs)
+        if FRONT in faces:
+            self.wall(frame, rows[:, [0, 1, 4, 5]], front, uvs)
+        for face, up, turn in ((TOP, high, 1), (BOTTOM, low, -1)):
+            if face in faces:
+                along, out = np.stack([left, right, right, left], 1), np.stack([front, front, back, back], 1)
+                placed = frame.world(along, out, up[:, None] + 0.0 * along)
+                self.add(placed[:, ::turn], shown[:, ::turn])
+        if SIDES in faces:
+            for at, turn in ((left, -1), (right, 1)):
+                out, up = np.stack([front, back, back, front], 1), np.stack([low, low, high, high], 1)
+                placed = frame.world(at[:, None] + 0.0 * out, out, up)
+                narrow = shown * [0.15, 1.0] + shown[:, :1] * [0.85, 0.0]
+                self.add(placed[:, ::turn], narrow[:, ::turn])
+
+    def mesh(self, metres: float) -> Mesh:
+        """Return all of them as one mesh, in units of `metres`."""
+        corners, uvs, normals = (np.concatenate(part) for part in (self.corners, self.uvs, self.normals))
+        across = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
+        across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-12)
+        normals = np.where((np.abs(normals).sum(axis=(1, 2)) > 0.0)[:, None, None], normals, across[:, None])
+        first = 4 * np.arange(len(corners))[:, None]
+        return Mesh(
+            (corners.reshape(-1, 3) / metres).astype(np.float32),
+            np.concatenate([first + np.array(three) for three in ((0, 1, 2), (0, 2, 3))]).astype(np.uint32),
+            normals.reshape(-1, 3).astype(np.float32),
+            uvs.reshape(-1, 2).astype(np.float32),
+        )
+
+
+def _around(uvs: Doubles) -> Doubles:
+    """(N, 4, 2) the corners of rectangles (N, 4) of texture coordinates: left, right, low, high."""
+    left, right, low, high = np.atleast_2d(uvs).T
+    return np.stack([np.stack(one, axis=1) for one in ((left, low), (right, low), (right, high), (left, high))], axis=1)

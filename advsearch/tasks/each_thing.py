@@ -1,0 +1,124 @@
+"""One task, asked of the object and of every thing beside it: an answer is right where it is right about all of them.
+
+A search is after a wrong answer about any of them: margin and score are the largest of the things' own.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from advsearch.errors import InputError
+from advsearch.tasks.base import Answer, Facts, Judgement, Mark, Output, Task, Truth, mean
+from advsearch.tasks.together import Together
+
+Truths = Mapping[str, Truth]
+"""What is true of each thing, by name."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EachThing(Task):
+    """Made by `each_thing`.
+
+    Args:
+        part: the task, on its model.
+    """
+
+    name = "each thing"
+    varies = True
+
+    part: Task
+
+    @property
+    def looks(self) -> bool:
+        return self.part.looks
+
+    def seeing(self, output: Output, truth: Truths | None) -> EachThing:
+        first = None if truth is None else next(iter(truth.values()))
+        return replace(self, part=self.part.seeing(output, first))
+
+    def check(self, facts: Facts) -> None:
+        for one in facts.each.values():
+            self.part.check(one)
+
+    def truth(self, facts: Facts) -> Truths:
+        return {name: self.part.truth(one) for name, one in facts.each.items()}
+
+    def truth_names(self, truth: Truths) -> tuple[str, ...]:
+        return tuple(dict.fromkeys(name for one in truth.values() for name in self.part.truth_names(one)))
+
+    @property
+    def target_names(self) -> tuple[str, ...]:
+        return self.part.target_names
+
+    def margin(self, output: Output, truth: Truths) -> Tensor:
+        return self._largest(self.part.margin, output, truth)
+
+    def score(self, output: Output, truth: Truths) -> Tensor:
+        return -self.margin(output, truth) if self.minimise else self._largest(self.part.score, output, truth)
+
+    def pixel_margin(self, output: Output, truth: Truths) -> Tensor:
+        """Return that of the thing where it is largest, (N,); of segmentation."""
+        return self._largest(self.part.pixel_margin, output, truth)  # type: ignore[attr-defined]
+
+    @staticmethod
+    def _largest(value: Callable[[Output, Truth], Tensor], output: Output, truth: Truths) -> Tensor:
+        return torch.stack([value(output, one) for one in truth.values()]).amax(dim=0)
+
+    def answers(self, output: Output, count: int = 1) -> list[tuple[Answer, ...]]:
+        return self.part.answers(output, count)
+
+    def judge(self, output: Output, truth: Truths) -> list[Judgement]:
+        """See `Task.judge`: the answer about the thing that is worst, and in the payload what is said of each."""
+        each = zip(*(self.part.judge(output, one) for one in truth.values()), strict=True)
+        with torch.no_grad():
+            scores, margins = self.score(output, truth).tolist(), self.margin(output, truth).tolist()
+        return [
+            self._judged(dict(zip(truth, said, strict=True)), *at)
+            for said, at in zip(each, zip(scores, margins, strict=True), strict=True)
+        ]
+
+    @staticmethod
+    def _judged(said: Mapping[str, Judgement], score: float, margin: float) -> Judgement:
+        if any(one.not_a_number for one in said.values()):
+            return Judgement.of(score, math.nan, Answer(""))
+        worst = max(said, key=lambda name: said[name].margin)
+        things = {
+            name: {"right": one.right, "margin": one.margin, "answer": one.answer.label} for name, one in said.items()
+        }
+        kept = said[worst].payload if isinstance(said[worst].payload, dict) else {}
+        average = mean([one.margin for one in said.values()])
+        payload: Any = {**kept, "worst": worst, "mean_margin": average, "things": things}
+        return Judgement.of(score, margin, said[worst].answer, payload)
+
+    def marks(self, output: Output, truth: Truths) -> list[list[Mark]]:
+        """See `Task.marks`: what is true of each thing, and the answer once."""
+        found: list[list[Mark]] = []
+        for marks in zip(*(self.part.marks(output, one) for one in truth.values()), strict=True):
+            said = [mark for mark in marks[0] if not mark.true]
+            found.append([mark for listed in marks for mark in listed if mark.true] + said)
+        return found
+
+
+def each_thing(task: Task) -> EachThing:
+    """Return a task on its model as one that judges every thing.
+
+    Raises:
+        InputError: its models say one thing of a whole picture, or are several.
+    """
+    if isinstance(task, Together) or task.name not in JUDGES:
+        raise InputError(
+            f"judge: all is for {' and '.join(JUDGES)}, got task {task.name}; judge one thing, by its name"
+        )
+    kind: Any = type("EachThing", (EachThing,), {"name": task.name, "objective": task.objective})
+    made: EachThing = kind(part=task, minimise=task.minimise, target=task.target)
+    return made
+
+
+JUDGES: Sequence[str] = ("detection", "segmentation", "depth")
+"""Tasks whose answer to a picture says something of each thing in it."""

@@ -1,0 +1,86 @@
+"""The avenue: a street as geometry, to scale in metres, which comes and goes with its ground."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from advsearch.engine.loading import load_scene
+from advsearch.scene.description import SceneDescription, describe
+from advsearch.scene.grounds import enclosed, paved
+from advsearch.scene.places.avenue import END, KERB, LAMP_HEIGHT, lamp_places
+from advsearch.scene.places.paint import FRONTS
+from advsearch.scene.places.quads import SHOWN, Frame, Quads
+from advsearch.scene.places.road import KERBS, ROAD
+
+
+def laid(scene: SceneDescription) -> set[str]:
+    return {name for name, part in scene.around.items() if part.laid}
+
+
+def test_an_avenue_comes_and_goes_with_its_ground() -> None:
+    scene = load_scene("car", "avenue")
+    assert {ROAD, "houses", "trees", "posts"} <= laid(scene.description)
+    assert paved(scene.description)
+    assert enclosed(scene.description)
+    assert laid(scene.with_settings({"ground.kind": "road"}).description) == {ROAD}
+    assert not laid(scene.with_settings({"ground.size": 0.0}).description)
+    assert not enclosed(describe("car", "street"))
+    assert enclosed(describe("mug", "noon", given={"ground.kind": "avenue"}))
+
+
+@pytest.mark.parametrize("name", ["car", "stop-sign"])
+def test_an_avenue_has_its_size_in_metres_whatever_stands_in_it(name: str) -> None:
+    scene = describe(name, "avenue")
+    places = {one: part.mesh.vertices * scene.metres for one, part in scene.around.items()}
+    assert np.ptp(places[ROAD][:, 0]) > 2 * END
+    assert places["houses"][:, 2].max() < 25.0
+    assert places["houses"][:, 2].min() == pytest.approx(KERB, abs=1e-4)
+    assert places["posts"][:, 2].max() == pytest.approx(KERB + LAMP_HEIGHT, abs=0.15)
+    assert places[ROAD][:, 2].max() == pytest.approx(KERB, abs=1e-4)
+    inside = places["houses"][np.abs(places["houses"][:, 0]) < 100.0][:, 1]
+    assert not ((inside > FRONTS[0] + 1.5) & (inside < FRONTS[1] - 1.5)).any(), "something of a house is in the street"
+    lamps = lamp_places()
+    assert ((lamps[:, 1] > KERBS[0]) & (lamps[:, 1] < KERBS[1])).all()
+    assert (np.hypot(lamps[:, 0], lamps[:, 1]) > 10.0).all(), "a lamp in the way of a camera around the object"
+
+
+def test_what_stands_in_an_avenue_faces_outwards_and_rests_on_the_ground() -> None:
+    for part in describe("car", "avenue").around.values():
+        corners = part.mesh.vertices.astype(np.float64)[part.mesh.faces]
+        faces = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        agree = (faces * part.mesh.normals[part.mesh.faces].mean(axis=1)).sum(axis=1) >= 0.0
+        assert agree.mean() > 0.97, part.name
+        np.testing.assert_allclose(np.linalg.norm(part.mesh.normals, axis=1), 1.0, atol=1e-4)
+
+
+def test_boxes_at_a_wall_face_outwards() -> None:
+    frame, quads = Frame((1.0, 2.0, 0.0), (-1.0, 0.0, 0.0)), Quads()
+    quads.boxes(frame, np.array([[0.0, 2.0, 0.0, 0.5, 1.0, 1.3]]), np.array([[0.0, 1.0, 0.0, 1.0]]), SHOWN)
+    mesh = quads.mesh(1.0)
+    middle = mesh.vertices.mean(axis=0)
+    away = mesh.vertices[mesh.faces].mean(axis=1) - middle
+    assert ((mesh.normals[mesh.faces[:, 0]] * away).sum(axis=1) > 0.0).all()
+
+
+def test_the_horizon_is_closed_and_the_road_reaches_far() -> None:
+    given = {"camera.azimuth": 0.0, "camera.elevation": 0.5, "camera.distance": 100.0}
+    renderer = load_scene("car", "avenue", settings=given).renderer(["pose"], resolution=33, denoise="none")
+    seen = renderer.surfaces(renderer.start)
+    assert not bool((seen.id[17:] == 0).any()), "sky below the horizon"
+    assert float(seen.depth[-1].max()) * 4.3 < 20.0
+
+
+@pytest.mark.slow
+def test_a_gradient_among_houses_is_that_of_differences() -> None:
+    scene = load_scene("car", "avenue", settings={"camera.distance": 12.0})
+    renderer = scene.renderer({"texture": {}, "environment": {"exposure": [-1, 1]}}, resolution=16, denoise="none")
+    _, slope = renderer.gradient(torch.mean, renderer.start, 0, 1024)
+    for group in renderer.space.groups:
+        step = torch.zeros_like(renderer.start)
+        step[group.coordinates] = 0.05
+        with torch.no_grad():
+            high, low = (renderer((renderer.start + way * step).clamp(0, 1), 1, 4096).mean() for way in (1.0, -1.0))
+        # the texture is clamped where it is dark or bright, and the tone curve bends
+        assert float(slope[group.coordinates].sum()) == pytest.approx(float(high - low) / 0.1, rel=0.1), group.name

@@ -1,0 +1,160 @@
+"""How large objects are in metres: what is said of them, what their files say, and what is asked."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from advsearch.controls.path import PathControl
+from advsearch.engine.loading import load_scene, scene_as_settings
+from advsearch.errors import InputError
+from advsearch.scene import library
+from advsearch.scene.description import SceneDescription, describe
+from advsearch.scene.geometry import camera_to_world
+from advsearch.scene.glb import glb, posed
+from advsearch.scene.importing.objects import import_object
+from advsearch.scene.importing.scenes import import_scene
+from advsearch.scene.places.road import ROAD
+
+
+def box(folder: Path, name: str, longest: float) -> Path:
+    """A box of 1 x 0.4 x 0.3 times its longest side, as .obj."""
+    x, y, z = longest, 0.4 * longest, 0.3 * longest
+    corners = [(a, b, c) for a in (0, x) for b in (0, y) for c in (0, z)]
+    faces = [(1, 2, 4, 3), (5, 7, 8, 6), (1, 5, 6, 2), (3, 4, 8, 7), (1, 3, 7, 5), (2, 6, 8, 4)]
+    lines = [f"v {a:g} {b:g} {c:g}" for a, b, c in corners] + ["f " + " ".join(map(str, one)) for one in faces]
+    path = folder / f"{name}.obj"
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def glb_of(folder: Path, name: str, longest: float) -> Path:
+    part = describe(str(box(folder, name, 1.0)), up="z").meshes["object"]
+    found = posed(part, {})
+    path = folder / f"{name}.glb"
+    path.write_bytes(glb([replace(found, mesh=replace(found.mesh, vertices=found.mesh.vertices * longest))]))
+    return path
+
+
+def test_gltf_is_in_metres_and_other_files_say_no_unit(tmp_path: Path) -> None:
+    assert import_object(glb_of(tmp_path, "car", 4.9)).metres == pytest.approx(4.9, rel=1e-5)
+    loose = import_object(box(tmp_path, "sedan", 490.0))
+    assert loose.metres is None
+    assert loose.extent == pytest.approx(490.0)
+
+
+@pytest.mark.parametrize(
+    ("longest", "said"),
+    [
+        (4.9, {"unit": "m"}),
+        (490.0, {"unit": "cm"}),
+        (4900.0, {"unit": "mm"}),
+        (4.9 / 0.0254, {"unit": "in"}),
+        (1.0, {"size": 4.9}),
+    ],
+)
+def test_a_car_stands_in_its_lane_at_its_size(tmp_path: Path, longest: float, said: dict[str, object]) -> None:
+    scene = load_scene(str(box(tmp_path, "sedan", longest)), "street", up="z", **said)  # type: ignore[arg-type]
+    own = scene.description
+    assert own.metres == pytest.approx(4.9, rel=1e-5)
+    road = own.around[ROAD].mesh.vertices
+    assert np.ptp(road[:, 0]) * own.metres == pytest.approx(120.0)
+    assert np.ptp(own.base_vertices, axis=0) / np.ptp(road, axis=0)[0] * 120.0 == pytest.approx(
+        [4.9, 1.96, 1.47], rel=1e-4
+    )
+    assert not own.notes
+    assert {name: scene_as_settings(scene)[name] for name in said} == said
+
+
+def test_what_is_said_of_a_size_wins_over_what_a_file_says(tmp_path: Path) -> None:
+    path = str(glb_of(tmp_path, "car", 4.9))
+    assert describe(path, unit="cm").metres == pytest.approx(0.049, rel=1e-5)
+    assert describe(path, size=4.1).metres == 4.1
+    assert describe("mug", size=0.1).metres == 0.1
+    assert describe("mug").object.metres is None
+
+
+@pytest.mark.parametrize(
+    ("name", "environment", "said", "words"),
+    [
+        ("sedan", "studio", {}, "size in metres is not known; it is 490 in its file.*`unit=cm`, which makes it 4.9 m"),
+        ("my-car", "studio", {"unit": "m"}, "longest side is 490 m; a car's is 2.5 to 6 m. If that is wrong"),
+        ("thing", "studio", {"unit": "m"}, "longest side is 490 m. If that is wrong"),
+        ("thing", "studio", {}, ""),
+        ("thing", "street", {}, "it is taken for 1 m, as the road is in metres. Give its longest side"),
+        ("sedan", "studio", {"size": 9.0}, ""),
+    ],
+)
+def test_a_size_that_is_unlike_its_name_is_asked_for(
+    tmp_path: Path, name: str, environment: str, said: dict[str, object], words: str
+) -> None:
+    notes = " ".join(describe(str(box(tmp_path, name, 490.0)), environment, up="z", **said).notes)  # type: ignore[arg-type]
+    if words:
+        with pytest.raises(AssertionError, match=words):
+            raise AssertionError(notes)
+    else:
+        assert not notes
+
+
+def test_what_cannot_be_a_size_is_refused(tmp_path: Path) -> None:
+    path = str(box(tmp_path, "sedan", 1.0))
+    for said, words in (
+        ({"size": 4.9, "unit": "cm"}, "both say how large"),
+        ({"unit": "yd"}, "expected one of mm, cm, m, in"),
+        ({"size": 0.0}, "expected a longest side of 0.0001 to 10000 metres"),
+        ({"size": float("nan")}, "expected a longest side of"),
+    ):
+        with pytest.raises(InputError, match=words):
+            describe(path, **said)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="mug is no mesh file"):
+        describe("mug", unit="cm")
+    huge = describe(str(glb_of(tmp_path, "planet", 1e6)))
+    assert huge.object.metres is None  # nothing that has a size in metres
+
+
+def test_a_node_has_the_size_that_it_has_in_its_scene(tmp_path: Path) -> None:
+    part = posed(describe(str(box(tmp_path, "seat", 1.0)), up="z").meshes["object"], {})
+    both = [
+        replace(part, name="seat"),
+        replace(part, name="far", mesh=replace(part.mesh, vertices=part.mesh.vertices + 3)),
+    ]
+    (tmp_path / "room.glb").write_bytes(glb(both))
+    assert import_scene(tmp_path / "room.glb", "seat").object.metres == pytest.approx(1.0, rel=1e-5)
+    assert import_object(tmp_path / "room.glb").metres == pytest.approx(4.0, rel=1e-5)
+
+
+def away(scene: SceneDescription) -> float:
+    return float(np.linalg.norm(camera_to_world(scene)[:3, 3] - scene.base_vertices.mean(axis=0)))
+
+
+def test_a_path_of_a_file_is_in_metres(tmp_path: Path) -> None:
+    way = tmp_path / "way.csv"
+    way.write_text("time,x,y,z,look_x,look_y,look_z\n0,20,0,1,0,0,1\n2,10,0,1,0,0,1\n")
+    scene = describe(str(box(tmp_path, "sedan", 1.0)), "street", up="z", size=5.0)
+    path = PathControl(path=str(way)).bind(scene)
+    place = path.inputs(torch.tensor([0.0]))["camera.to_world"][:3, 3].double().numpy()
+    middle = (scene.base_vertices.min(axis=0) + scene.base_vertices.max(axis=0)) / 2.0
+    assert (place - middle) * 5.0 == pytest.approx([20.0, 0.0, 1.0], abs=1e-4)
+    said = path.describe(torch.tensor([0.0]))["path.distance"]
+    assert (said["value"], said["unit"]) == (pytest.approx(401.0**0.5, abs=1e-3), "metres")
+
+
+def test_the_floor_of_a_photograph_is_seen_from_a_tripod(tmp_path: Path) -> None:
+    path = str(box(tmp_path, "sedan", 1.0))
+    for said, given, height in (
+        ({"size": 5.0}, {}, 1.6 / 5.0),
+        ({"size": 5.0}, {"ground.height": 2.0}, 2.0 / 5.0),
+        ({}, {}, 3.0),
+        ({}, {"ground.height": 2.0}, 2.0),
+    ):
+        assert describe(path, given=given, up="z", **said).capture_height == pytest.approx(height)  # type: ignore[arg-type]
+
+
+def test_bundled_objects_are_as_large_as_they_were() -> None:
+    assert {name: library.load_object(name).metres is not None for name in ("mug", "chair", "car", "stop-sign")} == {
+        "mug": False, "chair": False, "car": True, "stop-sign": True
+    }  # fmt: skip

@@ -1,0 +1,191 @@
+"""Things beside the object: how they are asked for, where they stand, and what is true of each."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy import ndimage
+
+import advsearch
+from advsearch.errors import InputError, UnknownNameError
+from advsearch.options import things_as_text
+from advsearch.scene import library
+from advsearch.scene.geometry import standing
+from advsearch.scene.outlines import seen_things
+from advsearch.scene.surface.renderer import why_not
+from advsearch.scene.things import AskedThing, asked_things, overlapping
+from advsearch.scene.transport.matrix import LinearRenderer
+
+pytestmark = pytest.mark.usefixtures("two_threads")
+
+VIEW = {"camera.distance": 16.0, "camera.azimuth": 20.0, "camera.elevation": 20.0, "camera.fov": 50.0}
+THREE = "car@-7,3.5,heading=160; stop-sign@3,-3,heading=-30; chair@3,2.5,size=1.1,heading=75"
+SIDE = 200
+
+
+def test_text_list_and_mapping_say_the_same() -> None:
+    text = "car@12,3.5,heading=180; chair@6,-2,size=0.9"
+    listed = [{"object": "car", "x": 12, "y": 3.5, "heading": 180}, "chair@6,-2,size=0.9"]
+    assert things_as_text(text) == things_as_text(listed) == text
+    assert things_as_text(None) is None and things_as_text(" ; ") is None
+    assert asked_things(text) == (
+        AskedThing("car", 12.0, 3.5, 180.0, None, "car"), AskedThing("chair", 6.0, -2.0, 0.0, 0.9, "chair")
+    )  # fmt: skip
+
+
+def test_every_thing_has_a_name_of_its_own() -> None:
+    found = asked_things("car@5,0; car@10,0; car@15,0; object.glb@1,1,size=1; car@9,9,name=taxi,label=cab")
+    assert [one.name for one in found] == ["car", "car-2", "car-3", "object-2", "taxi"]
+    assert found[-1].label == "cab"
+
+
+@pytest.mark.parametrize(
+    ("text", "error", "said"),
+    [
+        ("car@1", InputError, "expected WHAT@X,Y in metres"),
+        ("car@1,two", InputError, "y: expected a number from -1000 to 1000, got 'two'"),
+        ("car@1,nan", InputError, "y: expected a number"),
+        ("car@1,2,head=3", UnknownNameError, "Did you mean 'heading'"),
+        ("car@1,2,size=0", InputError, "size: expected a number from 0.0001"),
+        ("car@1,2; chair@3,3,name=car", InputError, "another thing of the scene is called car"),
+        ("caar@1,2", UnknownNameError, "Did you mean 'car'"),
+        ("mug@4,2", InputError, r"the size of mug in metres is not known; say it: mug@4,2,size=METRES"),
+        (";".join(["car@1,2"] * 65), InputError, "expected at most 64, got 65"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_is_refused(text: str, error: type[InputError], said: str) -> None:
+    with pytest.raises(error, match=said):
+        advsearch.load_scene("car", things=text)
+
+
+def test_an_object_without_metres_has_nothing_beside_it() -> None:
+    with pytest.raises(InputError, match="whose size in metres is not known"):
+        advsearch.load_scene("mug", things="car@1,2")
+    with pytest.raises(InputError, match="expected an object, x and y"):
+        advsearch.load_scene("car", things=[{"object": "car", "x": 1}])
+
+
+def test_what_stands_in_another_thing_is_said() -> None:
+    notes = advsearch.load_scene("car", things="car@1,0.5; stop-sign@6,6; chair@6,6,size=1").description.notes
+    assert [one for one in notes if "stand in each other" in one] == [
+        "The object and car stand in each other: their outlines on the ground overlap.",
+        "Stop-sign and chair stand in each other: their outlines on the ground overlap.",
+    ]
+    assert not any("stand in" in one for one in advsearch.load_scene("car", things=THREE).description.notes)
+
+
+def test_outlines_overlap_where_squares_do() -> None:
+    square = np.array([[x, y, z] for x in (0.0, 1.0) for y in (0.0, 1.0) for z in (0.0, 1.0)])
+    turned = square @ np.array([[0.7, 0.7, 0.0], [-0.7, 0.7, 0.0], [0.0, 0.0, 1.0]])
+    shift = np.array
+    assert overlapping(square, turned) and overlapping(square, square + shift((0.9, 0.9, 0.0)))
+    assert not overlapping(square, square + shift((1.1, 0.0, 0.0)))
+    assert not overlapping(square, square + shift((0.0, 0.0, 1.1)))
+    # boxes along the axes overlap, and these do not: a square on its corner beside the corner of another
+    assert not overlapping(square, turned + shift((1.55, 0.9, 0.0)))
+
+
+def projected_box(thing: str, x: float, y: float, heading: float, size: float) -> tuple[float, ...]:
+    """Where a pinhole at `VIEW` sees a bundled thing, worked out in metres: x0, y0, x1, y1 in pixels."""
+    car = library.load_object("car")
+    metres = float(car.metres or 0.0)
+    vertices = library.load_object(thing).mesh.vertices.astype(np.float64)
+    vertices = vertices - [*(vertices[:, :2].min(axis=0) + vertices[:, :2].max(axis=0)) / 2, vertices[:, 2].min()]
+    vertices *= size / np.ptp(vertices, axis=0).max()
+    a = math.radians(heading)
+    points = np.stack([
+        x + math.cos(a) * vertices[:, 0] - math.sin(a) * vertices[:, 1],
+        y + math.sin(a) * vertices[:, 0] + math.cos(a) * vertices[:, 1],
+        vertices[:, 2],
+    ], axis=1)  # fmt: skip
+    azimuth, elevation = math.radians(VIEW["camera.azimuth"]), math.radians(VIEW["camera.elevation"])
+    back = np.array([
+        math.cos(elevation) * math.cos(azimuth), math.cos(elevation) * math.sin(azimuth), math.sin(elevation)
+    ])  # fmt: skip
+    target = np.array([0.0, 0.0, np.ptp(car.mesh.vertices[:, 2]) * metres / 2.0])
+    right = np.array([-math.sin(azimuth), math.cos(azimuth), 0.0])
+    up = np.cross(back, right)
+    relative = points - (target + VIEW["camera.distance"] * back)
+    focal = SIDE / 2.0 / math.tan(math.radians(VIEW["camera.fov"]) / 2.0)
+    depth = -relative @ back
+    column, row = SIDE / 2.0 + focal * (relative @ right) / depth, SIDE / 2.0 - focal * (relative @ up) / depth
+    return column.min(), row.min(), column.max(), row.max()
+
+
+def test_boxes_are_those_of_an_independent_projection() -> None:
+    scene = advsearch.load_scene("car", "street", settings=VIEW, things=THREE)
+    renderer = scene.renderer({"pose": {}}, resolution=SIDE, denoise="none")
+    found = {one.name: one for one in seen_things(renderer, renderer.start)}
+    metres = {name: float(library.load_object(name).metres or 0.0) for name in ("car", "stop-sign")}
+    for name, what, *place in (
+        ("object", "car", 0.0, 0.0, 0.0, metres["car"]),
+        ("car", "car", -7.0, 3.5, 160.0, metres["car"]),
+        ("stop-sign", "stop-sign", 3.0, -3.0, -30.0, metres["stop-sign"]),
+        ("chair", "chair", 3.0, 2.5, 75.0, 1.1),
+    ):
+        wanted = projected_box(what, *place)
+        assert np.abs(np.array(found[name].box) - wanted).max() <= 1.0, (name, found[name].box, wanted)
+        assert found[name].share is not None and found[name].share > 0.97 and found[name].truncated is False
+
+
+def test_a_thing_hides_is_hidden_and_casts_a_shadow() -> None:
+    behind = {**VIEW, "camera.azimuth": 0.0, "camera.elevation": 14.0}
+    pictures, seen = [], []
+    for things in (None, "car@-7,0; stop-sign@5,0.3,size=1.5"):
+        scene = advsearch.load_scene("car", "noon", settings=behind, things=things)
+        renderer = scene.renderer({"pose": {}}, resolution=96, denoise="none")
+        pictures.append(renderer(renderer.start, seed=1, spp=16))
+        seen.append({one.name: one for one in seen_things(renderer, renderer.start)})
+    hidden, hiding = seen[1]["object"], seen[1]["stop-sign"]
+    assert seen[1]["car"].share is not None and seen[1]["car"].share < 0.8  # behind the object
+    assert hidden.share is not None and hiding.share is not None and hidden.share < 0.95 < hiding.share
+    assert hiding.distance < hidden.distance < seen[1]["car"].distance
+    covered = torch.zeros(96, 96, dtype=torch.bool)
+    for one in (*seen[0].values(), *seen[1].values()):
+        covered |= torch.from_numpy(one.mask)
+    darker = (pictures[0] - pictures[1]).mean(dim=2)[~covered]
+    assert (darker > 0.05).sum() > 10  # shadows on the ground
+
+
+def test_the_settings_of_a_scene_name_its_things() -> None:
+    scene = advsearch.load_scene("car", "street", settings=VIEW, things=["chair@3,2,size=0.9"])
+    assert scene.description.things_spec == "chair@3,2,size=0.9"
+    moved = scene.with_settings({"pose:chair.yaw": 90.0}).description
+    assert not np.allclose(moved.meshes["chair"].to_world, scene.description.meshes["chair"].to_world)
+    with pytest.raises(UnknownNameError, match="mesh around the object"):
+        scene.with_settings({"pose:char.yaw": 90.0})
+
+
+def test_a_matrix_of_transport_knows_what_stands_beside() -> None:
+    """What hides the object and shades it is in the matrix; a predicted change of its paint is the traced one."""
+    scene = advsearch.load_scene("car", "street", settings=VIEW, things="stop-sign@3,0.6,size=1.6; chair@-2,2,size=1")
+    renderer = scene.renderer({"texture": {"resolution": 32}}, resolution=48)
+    predicted = LinearRenderer(renderer, renderer.start, seed=1)
+    darker = (renderer.start - 0.2).clamp(0.0, 1.0)
+    with torch.no_grad():
+        after, before = (renderer(one, seed=11, spp=64) for one in (darker, renderer.start))
+        change = predicted(darker) - predicted(renderer.start)
+    hiding = next(one.mask for one in seen_things(renderer, renderer.start) if one.name == "stop-sign")
+    assert float(((change - (after - before)) ** 2).mean().sqrt()) < 0.15 * float(
+        (after - before).square().mean().sqrt()
+    )
+    inside = torch.from_numpy(ndimage.binary_erosion(hiding))
+    assert inside.any() and float(change[inside].abs().mean()) < 0.01  # light from the paint, and no paint itself
+
+
+def test_light_on_surfaces_refuses_things_by_its_own_rule() -> None:
+    def reason(things: str | None) -> str | None:
+        scene = advsearch.load_scene("mug", size=0.1, things=things)
+        return why_not(scene.renderer({"camera": {}}, resolution=16, denoise="oidn"), ["camera"])
+
+    assert reason(None) is None
+    assert "more in the scene than the object" in str(reason("bowl@0.2,0.1,size=0.15"))
+
+
+def test_a_thing_on_the_pavement_stands_on_it() -> None:
+    description = advsearch.load_scene("car", "avenue", things="chair@0,-4,size=1; stop-sign@9,0.5").description
+    low = {name: standing(part)[:, 2].min() * description.metres for name, part in description.things.items()}
+    assert low == {"chair": pytest.approx(0.12, abs=1e-4), "stop-sign": pytest.approx(0.0, abs=1e-4)}

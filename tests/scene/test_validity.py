@@ -1,0 +1,165 @@
+"""How far a street's picture and a photograph fit the ground before them: the formula, against rendered pictures."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from advsearch.controls import make_control, make_space
+from advsearch.engine.loading import Scene, framed, load_scene
+from advsearch.scene.assets import EnvironmentAsset
+from advsearch.scene.description import SceneDescription, describe
+from advsearch.scene.library import load_environment
+from advsearch.scene.places.road import EDGES, EYE, LENGTH
+from advsearch.scene.validity import Surroundings, View, past, surroundings_of, valid, view_of
+
+SIDE = 96
+FAR_SIDE = 90.0
+"""The azimuth of a camera that stands at +y."""
+
+
+def street(away: float, height: float, azimuth: float = FAR_SIDE, **given: float) -> Scene:
+    """The car, which stands in the street with black ground and white houses."""
+    rows, columns = (320, 640)
+    elevation = math.pi * (0.5 - (np.arange(rows) + 0.5) / rows)[:, None]
+    around = math.pi * (0.5 - 2.0 * (np.arange(columns) + 0.5)[None] / columns)
+    across = np.abs(np.sin(around)) * np.cos(elevation) + 0.0 * around
+    # the two fronts are 12 m away here, so that either half of the map is right for a camera at +y or at -y
+    houses = np.where(across > 1e-6, EYE + 12.0 / np.maximum(across, 1e-6) * np.sin(elevation), -1.0) > 0.0
+    coded = np.repeat(np.where(houses, 1.0, 0.0)[..., None], 3, axis=2).astype(np.float32)
+    lit = replace(load_environment("street"), radiance=coded)
+    middle = 0.73  # metres, of the car
+    up = math.degrees(math.asin((height - middle) / away))
+    settings = {"camera.azimuth": azimuth, "camera.distance": away, "camera.elevation": up, **given}
+    return load_scene("car", lit, settings=settings)
+
+
+def seen(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    """Where houses are seen (H, W), and where the road or the car is; row 0 on top."""
+    renderer = scene.renderer({"texture": {}}, resolution=SIDE, denoise="none")
+    u = renderer.start
+    surfaces = renderer.surfaces(u)
+    picture = renderer.radiance(u, 0, 16)
+    things = np.isfinite(surfaces.depth.numpy())
+    return (picture.mean(dim=-1).numpy() > 0.5) & ~things, things
+
+
+def depression(scene: Scene) -> float:
+    """Degrees below the horizon at which houses begin in the middle of the picture."""
+    houses, _ = seen(scene)
+    view = view_of(framed(scene.description, SIDE))
+    row = SIDE - int(np.argmax(houses[::-1, 3]))  # the lowest of the first columns, beside the car
+    half = math.radians(scene.description.number("camera.fov")) / 2.0
+    slope = (2.0 * row / SIDE - 1.0) * math.tan(half)
+    return view.lowest - math.degrees(half) + math.degrees(math.atan(slope))
+
+
+@pytest.mark.parametrize("away", [6.0, 12.0, 24.0])
+def test_houses_are_as_much_too_large_as_the_formula_says(away: float) -> None:
+    shown = math.tan(math.radians(depression(street(away, EYE, **{"ground.size": 0.0}))))
+    true = EYE / (away + 12.0)
+    assert shown / true == pytest.approx(1.0 + away / 12.0, rel=0.08)
+
+
+@pytest.mark.parametrize("height", [1.5, 3.0, 4.5])
+def test_houses_are_as_much_too_high_as_the_formula_says(height: float) -> None:
+    shown = math.tan(math.radians(depression(street(8.0, height, **{"ground.size": 0.0, "camera.fov": 60.0}))))
+    assert (height / 12.0) / shown == pytest.approx(height / EYE, rel=0.08)
+
+
+@pytest.mark.parametrize("side", [90.0, 270.0])
+def test_the_road_ends_in_sight_where_the_formula_says(side: float) -> None:
+    scene = street(10.0, 1.6, side).description
+    border = EDGES[1] if side == 90.0 else -EDGES[0]
+    limit = border + 1.6 / math.tan(math.radians(view_of(framed(scene, SIDE)).lowest))
+    free = replace(surroundings_of(scene) or Surroundings(1.0, 1.0, 1.0), stands=math.inf)
+    assert valid(free, view_of(scene))[0] == pytest.approx(limit, rel=0.02)
+    _, inside = seen(street(limit - 1.0, 1.6, side))
+    _, outside = seen(street(limit + 1.0, 1.6, side))
+    assert inside[-1].all()
+    assert not outside[-1].any()
+
+
+def test_from_60_m_the_houses_stand_below_the_road() -> None:
+    def below(away: float) -> bool:
+        houses, things = seen(street(away, 1.6))
+        return bool(houses[:, 3].any()) and int(np.flatnonzero(houses[:, 3]).max()) > int(
+            np.flatnonzero(things[:, 3]).max()
+        )
+
+    assert not below(11.5)
+    assert below(60.0)
+    assert valid(surroundings_of(street(60.0, 1.6).description), view_of(street(60.0, 1.6).description))[0] < 20.0  # type: ignore[arg-type]
+
+
+def test_along_a_street_it_fits_as_far_as_its_road() -> None:
+    scene = describe("car", "street", given={"camera.azimuth": 0.0, "camera.elevation": 2.0, "camera.distance": 40.0})
+    far, high = valid(surroundings_of(scene), view_of(scene))  # type: ignore[arg-type]
+    assert LENGTH / 2.0 < far < LENGTH / 2.0 + 10.0
+    assert high == 2.0 * EYE
+    assert not past(scene, [view_of(scene)])
+
+
+def photographed(height: float | None = None, radius: float | None = None, **said: float) -> SceneDescription:
+    given = {"ground.height": height, "ground.radius": radius}
+    lit = EnvironmentAsset("hall", np.ones((8, 16, 3), np.float32), photographed=True)
+    return describe("mug", lit, given={name: one for name, one in given.items() if one is not None}, **said)  # type: ignore[arg-type]
+
+
+def test_a_photograph_fits_by_its_height_and_its_empty_floor() -> None:
+    for scene, far, high in (
+        (photographed(size=0.1), 8.0, 3.2),
+        (photographed(2.0, size=0.1), 10.0, 4.0),
+        (photographed(2.0, 3.0, size=0.1), 3.0, 4.0),
+        (photographed(), 15.0, 6.0),
+    ):
+        assert valid(surroundings_of(scene), view_of(scene)) == pytest.approx((far, high))  # type: ignore[arg-type]
+        assert not past(scene, [view_of(scene)])
+    away = replace(photographed(size=0.1), values={**photographed(size=0.1).values, "camera.distance": 9.0})
+    assert (
+        "a picture, which fits a camera up to 8 m away and 3.2 m high; the camera is 8."
+        in past(away, [view_of(away)])[0]
+    )
+
+
+def test_what_has_no_ground_to_fit_has_no_bound() -> None:
+    for scene in (
+        describe("mug", "studio"),
+        describe("car", "noon"),
+        describe("mug", "street", given={"ground.size": 0.0}),
+    ):
+        assert surroundings_of(scene) is None
+    noon = describe("car", "noon", given={"ground.kind": "road"})
+    assert valid(surroundings_of(noon), view_of(noon))[1] == math.inf  # type: ignore[arg-type]
+    assert valid(Surroundings(1.5, 12.0, math.inf), View(0.0, 180.0, 0.0, 1.0, -3.0)) == (12.0, 3.0)
+
+
+@pytest.mark.parametrize(
+    ("controls", "words"),
+    [
+        (
+            {"camera": {"azimuth": [0, 360], "elevation": 3.0, "distance": [8, 40]}},
+            r"\d\d % of the views are past that, up to",
+        ),
+        ({"camera": {"azimuth": [0, 10], "elevation": 3.0, "distance": [8, 30]}}, ""),
+        ({"path": {"path": "approach"}}, "100 % of the views are past"),
+        ({"texture": {}}, "the camera is 6.75 m away and 3.88 m high"),
+        ({"environment": {}}, "`environment.rotation` turns against the road"),
+    ],
+)
+def test_a_search_that_goes_past_it_says_so(controls: dict[str, dict[str, object]], words: str) -> None:
+    scene = describe("car", "street")
+    notes = make_space([make_control(name, said) for name, said in controls.items()], scene).notes(scene)
+    assert len(notes) == bool(words)
+    if words:
+        with pytest.raises(AssertionError, match=words):
+            raise AssertionError(notes[0])
+
+
+def test_a_street_that_is_turned_fits_nowhere() -> None:
+    scene = describe("car", "street", given={"environment.rotation": 30.0, "camera.elevation": 3.0})
+    assert valid(surroundings_of(scene), view_of(scene)) == (0.0, 0.0)  # type: ignore[arg-type]
+    assert "turns against the road" in past(scene, [view_of(scene)])[0]

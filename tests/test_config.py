@@ -1,0 +1,613 @@
+"""The typed configuration: what every wrong value says, and that YAML, flags and Python mean the same."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any, TypeVar
+
+import pytest
+from hostile import HOSTILE, shown
+from hypothesis import given
+from hypothesis import settings as examples
+from hypothesis import strategies as st
+
+from advsearch.cli import flags
+from advsearch.cli.main import main
+from advsearch.config import CONFIGS, RenderConfig, SceneConfig
+from advsearch.errors import FileFormatError, InputError, UnknownNameError
+from advsearch.questions.attack.settings import TRIALS, TRIALS_OVER, AttackConfig
+from advsearch.questions.check.answer import CheckConfig
+from advsearch.questions.gap import GapConfig
+from advsearch.questions.precision.answer import QUANTITIES, PrecisionConfig
+from advsearch.questions.region.answer import RegionConfig
+from advsearch.questions.stability.answer import StabilityConfig
+from advsearch.questions.sweep.settings import SweepConfig
+from advsearch.questions.test.settings import SuiteConfig
+from advsearch.settings import Config, Setting, all_finite, parse_assignment, read_yaml, settings
+
+WRONG: dict[str, tuple[Any, str]] = {
+    "object": ("", "expected the name of an object or a .obj, .ply, .stl, .gltf, .glb or .blend file, got ''"),
+    "path": ("", "expected approach, pass, orbit, a .csv file, or two of them, the camera's and the object's, as in"),
+    "environment": ([], "expected the name of an environment, a .hdr or .exr file, or none, got "),
+    "up": ("x", "expected y or z, got x"),
+    "size": (0, "expected a number of metres from 1e-4 to 1e4, got 0"),
+    "things": (3, "expected a text such as 'car@12,3.5', a mapping or a list of these, got 3"),
+    "judge": ("", "expected object, the name of a thing beside it, or all, got ''"),
+    "unit": ("ft", "expected mm, cm, m or in, got ft"),
+    "camera": (
+        "",
+        "expected a name that advsearch import lists, orbit, dashcam, robot, fisheye, equirectangular, or a camera "
+        "file of OpenCV, Kalibr, ROS, COLMAP or nerfstudio, got ''",
+    ),
+    "set_": ({"camera.azimuth": math.nan}, "got camera.azimuth=nan"),
+    "exposure": (99, "expected a number from -10 to 10, got 99"),
+    "resolution": ("4x4", "expected SIDE or HEIGHTxWIDTH, each from 8 to 4096, got 4x4"),
+    "model": (
+        "a\0b",
+        "expected reference, a .pt2, TorchScript or .onnx file, torchvision:NAME, timm:NAME, hf:REPOSITORY, "
+        "or package.module:callable",
+    ),
+    "labels": (["tench, Tinca tinca", "goldfish"], "expected a JSON or text file, imagenet, "),
+    "prompt": ("a photo of a {} | ", "expected a text, for CLIP with {} where the name goes, or several with |"),
+    "task": ("  ", "expected the name of a task, or NAME={OPTION: VALUE}, got '  '"),
+    "label": ("  ", "expected names of classes or their numbers, such as \"coffee mug,cup\" or #504, got '  '"),
+    "controls": (
+        {"texture": 3},
+        "expected names of controls, or NAME={PARAMETER: VALUE or [LOW, HIGH]}, got texture=3",
+    ),
+    "epsilon": ("nan", "expected a number greater than 0 and at most 1e+06, got nan"),
+    "seconds": (0, "expected a number greater than 0 and at most 1e9, got 0"),
+    "target": ([3.5], "expected names of classes or their numbers, separated by commas, got [3.5]"),
+    "minimise": ("maybe", "expected true or false, got maybe"),
+    "smallest": (2, "expected true or false, got 2"),
+    "over": ({"camera": 3}, "expected names of controls, or NAME={PARAMETER: VALUE or [LOW, HIGH]}, got camera=3"),
+    "draws": (0, "expected a whole number from 1 to 1000, got 0"),
+    "average": (-1, "expected a whole number from 0 to 1000000, got -1"),
+    "norm": ("l3", "expected linf or l2, got l3"),
+    "texture_resolution": (0, "expected a whole number from 2 to 4096, got 0"),
+    "estimators": ({"pose": 3}, "expected NAME for all controls, or CONTROL=NAME or CONTROL.PARAMETER=NAME"),
+    "printable": (2, "expected true or false, got 2"),
+    "metrics": ("feature", "expected NAME=package.module:function of image, output and truth, got feature"),
+    "log": ("excel", "expected mlflow, tensorboard or wandb, got excel"),
+    "aov": (3, "expected names among mask, depth, normal, uv, id, got 3"),
+    "ensemble": ("median", "expected mean or worst, got median"),
+    "measure": ("some", "expected no, quick or full, got some"),
+    "policy": (None, "expected the name of a policy, or NAME={OPTION: VALUE}, got None"),
+    "steps": (2.5, "expected a whole number from 1 to 1000000, got 2.5"),
+    "objective": ({}, "expected the name of an objective, got {}"),
+    "spp": ("many", "expected a whole number from 1 to 65536, or auto, got many"),
+    "denoise": (False, "expected oidn or none, got False"),
+    "pixel_sampler": ("sobol", "expected independent or multijitter, got sobol"),
+    "specialise": ("maybe", "expected true or false, got maybe"),
+    "baseline": ("maybe", "expected true or false, got maybe"),
+    "verify_spp": (0, "expected a whole number from 1 to 65536, got 0"),
+    "trials": (
+        5,
+        "expected a whole number from 6 to 100000 (with fewer, nothing can be called found), got 5",
+    ),
+    "seed": (-1, "expected a whole number from 0 to 2**63 - 1, got -1"),
+    "threads": (0, "expected a whole number from 1 to 1024, got 0"),
+    "deterministic": (3, "expected true or false, got 3"),
+    "run": ("", "expected a name (kept in runs/) or the path of a folder, got ''"),
+    "workers": (0, "expected a whole number from 1 to 100000, got 0"),
+    "cluster": ("", "expected the address of a Dask scheduler, local, or a .yaml file, got ''"),
+    "overwrite": ([], "expected true or false, got []"),
+}
+
+GIVEN: dict[str, Any] = {
+    "object": "mug.obj", "environment": "room.hdr", "up": "y", "size": 4.9, "unit": "cm", "camera": "front",
+    "things": "car@1,2", "judge": "car",
+    "set": {"camera.azimuth": 130.0, "camera.target": (0.0, 0.5, 1.0), "material": "felt"},
+    "exposure": -1.5, "resolution": (96, 128), "model": "net.pt2,other.pt2", "ensemble": "mean",
+    "labels": "labels.json", "prompt": "a photo of a {}", "task": "detection", "label": "coffee mug,cup",
+    "controls": {"texture": {}, "pose": {"yaw": [0, 90]}}, "epsilon": {"texture": 0.03, "pose": 2.0},
+    "seconds": 20.0, "target": "bowl", "minimise": False, "smallest": False, "over": {"camera": {}}, "draws": 2,
+    "path": "orbit",
+    "average": 50, "printable": True, "aov": "mask,uv", "metrics": {"feature": "own.metrics:seen"}, "log": "wandb",
+    "norm": "l2", "texture_resolution": 64,
+    "estimator": {"pose": "differences", "*": "adjoint"}, "measure": "no",
+    "policy": {"name": "pgd", "momentum": 0.9},
+    "steps": 3, "objective": "cross_entropy", "spp": 4, "denoise": "none",
+    "pixel_sampler": "independent",
+    "specialise": False,
+    "baseline": False, "verify_spp": 32, "trials": 7, "seed": 9, "threads": 1, "deterministic": True, "run": "x/y",
+    "overwrite": True, "workers": None, "cluster": None,
+}  # fmt: skip
+
+
+Given = TypeVar("Given", bound=Config)
+
+
+def of_command_line(line: str, config: type[Given] = AttackConfig) -> Given:  # type: ignore[assignment]
+    """Return the configuration of a shell command ``advsearch attack ...``, or of another one's."""
+    parser = argparse.ArgumentParser(allow_abbrev=False)
+    flags.add_settings(parser, config=config)
+    args = parser.parse_args(shlex.split(line)[2:])
+    return flags.config_from(args, config)
+
+
+def test_a_run_of_an_older_version_says_its_draws_also_where_there_are_none(tmp_path: Path) -> None:
+    (tmp_path / "run.yaml").write_text("object: mug\nsteps: 40\ndraws: 4\nover: {}\n")
+    assert AttackConfig.from_yaml(tmp_path / "run.yaml").steps == 40
+
+
+@pytest.mark.parametrize("flag", ["control", "over"])
+def test_several_controls_with_settings_may_stand_in_one_flag(flag: str) -> None:
+    written = 'pose, camera={azimuth: [0, 90], elevation: 20}, environment={which: [a, "b, {c"]},texture'
+    config: AttackConfig = of_command_line(
+        f"advsearch attack --object mug --control light --{flag} {shlex.quote(written)}"
+    )
+    expected = {
+        "pose": {},
+        "camera": {"azimuth": [0, 90], "elevation": 20},
+        "environment": {"which": ["a", "b, {c"]},
+        "texture": {},
+    }
+    assert (config.over if flag == "over" else config.controls) == (
+        expected if flag == "over" else {"light": {}, **expected}
+    )
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "camera={azimuth: [0, 90]} pose={yaw: 20}",
+        "camera={azimuth: [0, 90]; pose={yaw: 20}",
+        "pose,camera={azimuth=[0, 90]},texture",
+        "camera={azimuth: [0, 90],pose={yaw: 20}",
+    ],
+)
+def test_settings_in_braces_that_cannot_be_read_say_how_they_are_written(text: str) -> None:
+    with pytest.raises(InputError, match=r"--control camera: expected \{PARAMETER: .* a colon and a space behind each"):
+        of_command_line(f"advsearch attack --object mug --control {shlex.quote(text)}")
+
+
+@pytest.mark.parametrize("setting", settings(AttackConfig), ids=lambda setting: setting.name)
+def test_every_wrong_value_names_its_flag_and_what_was_expected(setting: Any) -> None:
+    value, message = WRONG[setting.field]
+    data = {"object": "mug", setting.field: value}
+    with pytest.raises(InputError) as error:
+        AttackConfig(**data)
+    assert str(error.value).startswith(f"{setting.name}: expected ") and message in str(error.value)
+    assert flags.with_flags(str(error.value)).startswith(f"{setting.flag}: expected ")
+
+
+@pytest.mark.parametrize(
+    "value", [0, -1, -0.5, "nan", math.nan, math.inf, "inf", "-inf", True, "much", "0.1,0", "texture=0"]
+)
+def test_epsilon_is_a_number_greater_than_zero(value: Any) -> None:
+    with pytest.raises(InputError, match=r"^epsilon: expected a number greater than 0 and at most 1e\+06, got "):
+        AttackConfig(object="mug", epsilon=value)
+
+
+def test_all_problems_are_told_at_once() -> None:
+    with pytest.raises(InputError) as error:
+        AttackConfig.model_validate({"epsilon": -1, "steps": 0})
+    assert flags.with_flags(str(error.value)) == (
+        "--object: expected the name of an object or a .obj, .ply, .stl, .gltf, .glb or .blend file, got nothing; "
+        "--epsilon: expected a number greater than 0 and at most 1e+06, got -1; "
+        "--steps: expected a whole number from 1 to 1000000, got 0"
+    )
+
+
+def test_an_unknown_setting_has_near_matches() -> None:
+    with pytest.raises(UnknownNameError, match=r"unknown setting 'epsilonn'\. Did you mean 'epsilon'") as error:
+        AttackConfig.model_validate({"object": "mug", "epsilonn": 0.1})
+    assert error.value.near[0] == "epsilon"
+
+
+def test_a_configuration_does_not_change() -> None:
+    config = AttackConfig(object="mug")
+    with pytest.raises(ValueError, match="frozen"):
+        config.epsilon = 0.1  # type: ignore[misc]
+
+
+def test_every_setting_is_documented_and_has_a_flag_of_its_own() -> None:
+    known = settings(AttackConfig)
+    assert {setting.field for setting in known} == set(AttackConfig.model_fields) == set(WRONG)
+    assert {setting.name for setting in known} == set(GIVEN)
+    assert len({setting.flag for setting in known}) == len(known)
+    assert {one.flag for one in known} >= {"--texture-resolution", "--set", "--control", "--no-baseline"}
+
+
+@pytest.mark.parametrize("config", CONFIGS.values(), ids=lambda config: config.command)
+def test_every_setting_of_every_command_says_what_it_is(config: type[Config]) -> None:
+    known = settings(config)
+    assert {setting.field for setting in known} == set(config.model_fields) - {*config.without}
+    assert len({setting.flag for setting in known}) == len(known)
+    for setting in known:
+        assert setting.description and setting.expects and setting.group
+        assert setting.required or setting.default is not None or setting.otherwise
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        AttackConfig(object="mug,bowl", workers=2, cluster="local"),
+        GapConfig(object="mug,bowl", controls=["pose", "camera"], average=50, run="x", steps=9),
+        RegionConfig(
+            object="mug", controls="pose", vary="pose.yaw,pose.pitch", map=24, samples=50, around="mug-pose-001"
+        ),
+        SweepConfig(object="mug", grid={"pose.yaw": "0:360:24", "camera.elevation": [5, 50]}, samples=3, batch=2),
+        PrecisionConfig(object="mug", controls="pose", quantities="image", seconds=9.0, samplers="independent"),
+        StabilityConfig(case=["ties", "saturated"], group="stiff", seconds=9.0, run="x", overwrite=True),
+    ],
+    ids=lambda config: config.command,
+)
+def test_every_command_has_the_same_form_in_yaml_and_in_flags(config: Config, tmp_path: Path) -> None:
+    path = tmp_path / "run.yaml"
+    path.write_text(config.to_yaml())
+    assert type(config).from_yaml(path, {one.name: one.value for one in config.powers}) == config
+    assert read_yaml(path)["command"] == config.command
+    again = of_command_line(config.command_line(), type(config))
+    assert again == config.model_copy(update={"run": None, "overwrite": False})
+    assert shlex.split(config.command_line())[:2] == ["advsearch", config.command]
+
+
+@pytest.mark.parametrize(
+    ("config", "field", "value", "message"),
+    [
+        (GapConfig, "average", 0, "expected a whole number from 1 to 1000000, got 0"),
+        (RegionConfig, "around", 3.5, "expected the name or the folder of a run, got 3.5"),
+        (RegionConfig, "vary", [1], "expected names such as pose.yaw,camera.elevation, got [1]"),
+        (RegionConfig, "samples", 7, "expected a whole number from 8 to 1000000, got 7"),
+        (
+            GapConfig,
+            "trials",
+            1,
+            "expected a whole number from 6 to 100000 (with fewer, nothing can be called found), got 1",
+        ),
+        (SweepConfig, "trials", 1, "expected 0, or a whole number from 6 to 100000, got 1"),
+        (SweepConfig, "trials", -1, "expected 0, or a whole number from 6 to 100000, got -1"),
+        (RegionConfig, "map", 513, "expected a whole number from 0 to 512, got 513"),
+        (RegionConfig, "verify_spp", 0, "expected a whole number from 1 to 65536, got 0"),
+    ],
+)
+def test_a_wrong_value_of_other_commands_names_its_flag(
+    config: type[Config], field: str, value: Any, message: str
+) -> None:
+    with pytest.raises(InputError) as error:
+        config(**{"object": "mug", field: value})
+    assert flags.with_flags(str(error.value)) == f"--{field.replace('_', '-')}: {message}"
+
+
+def own_settings(config: type[Config]) -> list[Setting]:
+    """The settings that no command before has in the very same words."""
+    before = list(CONFIGS.values())[: list(CONFIGS.values()).index(config)]
+    told = {repr(one) for other in before for one in settings(other)}
+    return [one for one in settings(config) if repr(one) not in told]
+
+
+@pytest.mark.parametrize("config", CONFIGS.values(), ids=lambda config: config.command)
+def test_no_value_of_any_setting_ends_in_a_traceback(config: type[Config]) -> None:
+    """Refused in one line that names the setting, or accepted and then the same in every form."""
+    needed = {one.field: "a.png" for one in settings(config) if one.required}
+    for setting in own_settings(config):
+        for value in HOSTILE:
+            try:
+                made = config(**{**needed, setting.field: value})
+            except InputError as error:
+                assert len(str(error)) < 500 and str(error).isprintable(), (setting.name, shown(value))
+                continue
+            given = getattr(made, setting.field)
+            assert all_finite(given if isinstance(given, (list, tuple, dict)) else [given]), (
+                setting.name,
+                shown(value),
+            )
+            assert made.to_yaml() and made.command_line() and made.deciding(), (setting.name, shown(value))
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("--epsilon ''", "--epsilon: expected a number greater than 0 and at most 1e+06, got ''"),
+        ("--epsilon 1e308", "--epsilon: expected a number greater than 0 and at most 1e+06, got 1e308"),
+        ("--epsilon 0.1,0.10", "--epsilon: 0.1 is given twice; leave one of them out"),
+        ("--epsilon texture=0.1,texture=0.2", "--epsilon: texture is given twice; leave one of them out"),
+        (
+            "--epsilon 'texture={a: 1}'",
+            "--epsilon: expected a number greater than 0 and at most 1e+06, got texture={a: 1}",
+        ),
+        ("--seconds 1e308", "--seconds: expected a number greater than 0 and at most 1e9, got 1e308"),
+        ("--control pose --control pose", "--control: pose is given twice; leave one of them out"),
+        ("--control texture,texture", "--control: texture is given twice; leave one of them out"),
+        ("--over camera --over 'camera={fov: 30}'", "--over: camera is given twice; leave one of them out"),
+        (
+            "--set camera.azimuth=1 --set camera.azimuth=2",
+            "--set: camera.azimuth is given twice; leave one of them out",
+        ),
+        ("--estimator adjoint --estimator differences", "--estimator: * is given twice; leave one of them out"),
+        ("--policy 'pgd={momentum: .nan}'", "--policy: expected the name of a policy, or NAME={OPTION: VALUE}, got {"),
+        ("--over 'camera={azimuth: [0, .inf]}'", "--over: expected names of controls, or NAME={PARAMETER: VALUE or "),
+        ("--object ,", "--object: expected the name of an object or a .obj, .ply, .stl, .gltf, .glb or .blend file"),
+    ],
+)
+def test_slips_on_the_command_line_are_refused_in_one_sentence(line: str, message: str) -> None:
+    with pytest.raises(InputError) as error:
+        of_command_line(f"advsearch attack {'' if '--object' in line else '--object mug'} {line}")
+    assert flags.with_flags(str(error.value)).startswith(message)
+
+
+CLASHES: tuple[tuple[type[Config], dict[str, Any], str], ...] = (
+    (AttackConfig, {"deterministic": True, "threads": 4}, "threads: `deterministic` works on one thread"),
+    (SweepConfig, {"overwrite": True}, "overwrite: replaces the run that `run` names, and none is named"),
+    (AttackConfig, {"smallest": True, "epsilon": "0.1,0.2"}, "smallest: finds one epsilon by itself"),
+    (CheckConfig, {"loss": "linear", "objective": "logit-gap"}, "objective: is of the model's loss, which"),
+    (AttackConfig, {"smallest": True, "object": "mug,bowl"}, "smallest: is about one object"),
+    (AttackConfig, {"model": "a.pt2,b.pt2", "object": "mug,bowl"}, "model: several make a matrix"),
+    (AttackConfig, {"ensemble": "mean"}, "ensemble: is of several models"),
+    (AttackConfig, {"smallest": True, "printable": True}, "smallest: cannot be combined with `printable`"),
+    (AttackConfig, {"smallest": True, "seconds": 5}, "smallest: takes several searches"),
+    (AttackConfig, {"smallest": True, "over": "camera"}, "smallest: cannot be combined with `over` yet"),
+    (AttackConfig, {"minimise": True, "object": "mug,bowl"}, "minimise: has no robust accuracy"),
+    (AttackConfig, {"minimise": True, "target": "bowl"}, "minimise: makes the right answer easier to give"),
+    (AttackConfig, {"minimise": True, "smallest": True}, "minimise: has no smallest change"),
+    (AttackConfig, {"over": "camera", "controls": "camera.fov"}, "over: names a control that is searched already"),
+    (AttackConfig, {"draws": 8}, "draws: is how many conditions of `over` a step looks at, and there are none"),
+    (AttackConfig, {"over": "camera", "estimators": {"camera.fov": "secant"}}, "estimators: names a control that"),
+    (AttackConfig, {"average": 10, "epsilon": "0.1,0.2"}, "average: is not part of a curve"),
+    (GapConfig, {"smallest": True}, "smallest: `advsearch gap` has no such setting; leave it out"),
+    (RegionConfig, {"spp": 4}, "spp: `advsearch region` has no such setting; leave it out"),
+    (RenderConfig, {"out": "a.png", "run": "it"}, "run: `advsearch render` has no such setting; leave it out"),
+    (GapConfig, {"epsilon": "0.1,0.2"}, "epsilon: several make a curve, which only `advsearch attack` draws"),
+    (SweepConfig, {"sampler": "random", "grid": {"pose.yaw": "0,90"}}, "sampler: is how `controls` are drawn"),
+    (SweepConfig, {"fps": 5, "grid": {"pose.yaw": "0,90"}}, "fps: is of a drive; add `path`, or leave `fps` out"),
+    (SweepConfig, {"trials": 0, "verify_spp": 8}, "verify_spp: is of the trials, and `trials` is 0"),
+    *(
+        (PrecisionConfig, {name: value, "quantities": ",".join({*QUANTITIES} - {left})}, f"{name}: is of the {left}, ")
+        for name, value, left in (
+            ("samplers", "independent", "image"), ("loss", "model", "gradient"),
+        )
+    ),
+    (SuiteConfig, {"suite": "a.yaml", "fresh": True, "seed": 1}, "fresh: draws a seed, and `seed` says one"),
+    (SuiteConfig, {"suite": "a.yaml", "update": True, "add": "run"}, "update: renews what claims are expected to say"),
+    (SuiteConfig, {"suite": "a.yaml", "only": "a", "add": "run"}, "only: names claims, and `add` tries the new"),
+    (CheckConfig, {"all": True, "controls": "pose"}, "all: takes scenes and controls of its own; leave `object`"),
+)  # fmt: skip
+"""Every pair of settings that excludes each other, or of which one would be ignored."""
+
+
+@pytest.mark.parametrize(("config", "given", "message"), CLASHES)
+def test_settings_that_would_be_ignored_or_exclude_each_other_are_refused(
+    config: type[Config], given: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(InputError) as error:
+        config(**{**({"object": "mug"} if "object" in config.model_fields else {}), **given})
+    assert str(error.value).startswith(message)
+
+
+def test_every_clash_has_its_example() -> None:
+    every = {(clash.setting, clash.why) for config in CONFIGS.values() for clash in config.clashes}
+    seen = [message.partition(": ") for _, _, message in CLASHES]
+    for setting, why in every:
+        assert any(name == setting and why.startswith(begun) for name, _, begun in seen), (setting, why)
+
+
+def test_yaml_round_trip_of_everything(tmp_path: Path) -> None:
+    config = AttackConfig(**GIVEN)
+    assert all(getattr(config, setting.field) == GIVEN[setting.name] for setting in settings(AttackConfig))
+    path = tmp_path / "run.yaml"
+    path.write_text(config.to_yaml())
+    assert AttackConfig.from_yaml(path, {one.name: one.value for one in config.powers}) == config
+    assert read_yaml(path)["schema"] == 1 and read_yaml(path)["command"] == "attack"
+
+
+def test_the_command_line_says_the_same() -> None:
+    config = AttackConfig(**GIVEN)
+    again: AttackConfig = of_command_line(config.command_line())
+    assert again == config.model_copy(update={"run": None, "overwrite": False})
+    assert AttackConfig(object="mug").command_line() == "advsearch attack --object mug"
+
+
+@examples(max_examples=60, deadline=None)
+@given(
+    epsilon=st.none() | st.floats(1e-20, 1e6), exposure=st.floats(-10, 10), seed=st.integers(0, 2**63 - 1),
+    name=st.text(st.characters(codec="utf-8", exclude_categories=("Cc", "Cs"))).filter(lambda text: text.strip(" ,")),
+    value=st.floats(allow_nan=False, allow_infinity=False),
+)  # fmt: skip
+def test_any_values_go_round(
+    tmp_path_factory: pytest.TempPathFactory, epsilon: float | None, exposure: float, seed: int, name: str, value: float
+) -> None:
+    config = AttackConfig(object=name, label=name, epsilon=epsilon, exposure=exposure, seed=seed, set_={"a.b": value})
+    path = tmp_path_factory.getbasetemp() / "any.yaml"
+    path.write_text(config.to_yaml(), encoding="utf-8")
+    assert AttackConfig.from_yaml(path) == config
+    if not name.startswith("-"):
+        assert of_command_line(config.command_line()) == config
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (None, r"study\.yaml: expected a YAML file, got No such file or directory; check the path"),
+        ("", r"study\.yaml: expected settings and values such as 'object: mug', got an empty file"),
+        ("- a\n", r"study\.yaml: expected settings and values such as 'object: mug', got list"),
+        ("1: 2\n", r"study\.yaml: expected settings and values such as 'object: mug', got dict"),
+        ("a: [1,\n", r"study\.yaml: expected YAML, got .*line 2"),
+        ("schema: 7\nobject: mug\n", r"study\.yaml: expected schema 1, got 7; it is of another advsearch"),
+        (
+            "object: mug\nepsilon: yes\n",
+            r"study\.yaml: epsilon: expected a number greater than 0 and at most 1e\+06, got True",
+        ),
+        ("object: mug\nset:\n  a: .inf\n", r"study\.yaml: set: expected PARAMETER=VALUE .*, got a=inf"),
+        ("object: mug\nseed:\n", r"study\.yaml: seed: expected a whole number from .*, got None"),
+        ("objekt: mug\n", r"unknown setting 'objekt'\. Did you mean 'object'"),
+    ],
+)
+def test_a_bad_file_is_named(tmp_path: Path, text: str | None, message: str) -> None:
+    path = tmp_path / "study.yaml"
+    if text is not None:
+        path.write_text(text)
+    with pytest.raises(InputError, match=message):
+        AttackConfig.from_yaml(path)
+
+
+def test_a_file_that_is_not_text_is_named(tmp_path: Path) -> None:
+    (tmp_path / "x.yaml").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(FileFormatError, match=r"x\.yaml: expected a YAML file in UTF-8, got bytes that are not text"):
+        AttackConfig.from_yaml(tmp_path / "x.yaml")
+
+
+def test_yaml_as_a_person_writes_it(tmp_path: Path) -> None:
+    path = tmp_path / "study.yaml"
+    path.write_text(
+        "object: mug\nup: y\ndenoise: none\ncontrols: [texture, pose]\nlabel: [coffee mug, cup]\n"
+        "labels: [coffee mug, cup, bowl]\nprompt: ['a photo of a {}, big', 'the {}']\n"
+        "epsilon: 1e-3\nresolution: 224\nset: {camera.azimuth: 130, camera.elevation: 2e1}\n"
+    )
+    config = AttackConfig.from_yaml(path)
+    assert (config.up, config.denoise, config.label) == ("y", "none", "coffee mug,cup")
+    assert (config.labels, config.prompt) == ("coffee mug,cup,bowl", "a photo of a {}, big | the {}")
+    assert (config.epsilon, config.resolution) == (1e-3, (224, 224))
+    assert config.controls == {"texture": {}, "pose": {}}
+    assert config.set_ == {"camera.azimuth": 130.0, "camera.elevation": 20.0}
+
+
+def test_overrides_reach_inside(tmp_path: Path) -> None:
+    path = tmp_path / "study.yaml"
+    path.write_text("object: mug\nset: {camera.azimuth: 1}\ncontrols: [texture]\n")
+    changes = {"steps": 80, "set.camera.elevation": 25, "controls.texture.resolution": 64, "controls.pose.yaw": [0, 9]}
+    config = AttackConfig.from_yaml(path, changes)
+    assert config.steps == 80
+    assert config.set_ == {"camera.azimuth": 1.0, "camera.elevation": 25.0}
+    assert config.controls == {"texture": {"resolution": 64}, "pose": {"yaw": [0, 9]}}
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("camera.azimuth=130", ("camera.azimuth", 130)),
+        (" a = [1, 2.5] ", ("a", [1, 2.5])),
+        ("a=", ("a", "")),
+        ("a={b: c=d}", ("a", {"b": "c=d"})),
+        ("a=[1", ("a", "[1")),
+    ],
+)
+def test_assignments(text: str, expected: tuple[str, Any]) -> None:
+    assert parse_assignment(text, "--set") == expected
+
+
+@pytest.mark.parametrize("text", ["camera.azimuth", "=3", ""])
+def test_what_is_no_assignment(text: str) -> None:
+    with pytest.raises(InputError, match=r"^--set: expected NAME=VALUE such as camera\.azimuth=130, got '"):
+        parse_assignment(text, "--set")
+
+
+def test_the_module_stays_light() -> None:
+    code = "import sys, advsearch.config; print(sorted({'torch', 'mitsuba', 'drjit', 'numpy'} & set(sys.modules)))"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        ("0.05", 0.05),
+        ("0.01, 0.02", (0.01, 0.02)),
+        ([0.3], 0.3),
+        ("texture=0.05,geometry=0.01", {"texture": 0.05, "geometry": 0.01}),
+    ],
+)
+def test_epsilon_is_one_number_one_for_each_control_or_a_curve(given: Any, expected: Any) -> None:
+    config = AttackConfig(object="mug", epsilon=given)
+    assert config.epsilon == expected
+    assert of_command_line(config.command_line()) == config
+
+
+@pytest.mark.parametrize("given", ["pgd={momentum: 0.9, steps: 80}", {"name": "pgd", "momentum": 0.9, "steps": 80}])
+def test_a_policy_has_options_and_its_steps_are_the_runs(given: Any) -> None:
+    config = AttackConfig(object="mug", policy=given)
+    assert (config.policy_name, config.policy_options, config.steps) == ("pgd", {"momentum": 0.9}, 80)
+    assert of_command_line(config.command_line()) == config
+
+
+@pytest.mark.parametrize("given", ["yaw={tolerance: 5}", {"name": "yaw", "tolerance": 5}])
+@pytest.mark.parametrize("config", [AttackConfig, SweepConfig, GapConfig, RegionConfig, RenderConfig])
+def test_a_task_has_options_as_a_policy_has(given: Any, config: type[SceneConfig], tmp_path: Path) -> None:
+    needed: dict[Any, dict[str, Any]] = {SweepConfig: {"grid": {"pose.yaw": [0, 1]}}, RenderConfig: {"out": "a.png"}}
+    own = needed.get(config, {})
+    made = config(object="mug", task=given, **own)
+    assert (made.task_name, made.task) == ("yaw", {"name": "yaw", "tolerance": 5})
+    (tmp_path / "run.yaml").write_text(made.to_yaml())
+    assert config.from_yaml(tmp_path / "run.yaml") == made
+    assert config.from_yaml(tmp_path / "run.yaml", {"task.tolerance": 7}).task == {"name": "yaw", "tolerance": 7}
+    assert made.deciding()["task"] == made.task, "a run with other options is not gone on with"
+    assert of_command_line(made.command_line(), config) == made
+    plain = config(object="mug", task="yaw={}", **own)
+    assert (plain.task_name, plain.task) == ("yaw", "yaw")
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        ({"smallest": True, "epsilon": "0.1,0.2"}, "smallest: finds one epsilon by itself"),
+        ({"smallest": True, "seconds": 3}, "smallest: takes several searches"),
+        ({"smallest": True, "over": "camera"}, "smallest: cannot be combined with `over`"),
+        ({"minimise": True, "target": "bowl"}, "minimise: makes the right answer easier to give"),
+        ({"minimise": True, "smallest": True}, "minimise: has no smallest change"),
+        ({"controls": "pose", "over": "pose"}, "over: names a control that is searched already"),
+    ],
+)
+def test_settings_that_exclude_each_other(data: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        AttackConfig(object="mug", **data)
+
+
+def test_a_file_is_laid_over_its_bases(tmp_path: Path) -> None:
+    (tmp_path / "far.yaml").write_text("object: bowl\nseed: 3\ncontrols: {pose: {yaw: [0, 90], pitch: 3}}\n")
+    (tmp_path / "near.yaml").write_text("base: far.yaml\nseed: 4\ncontrols: {pose: {yaw: [0, 45]}}\n")
+    path = tmp_path / "study.yaml"
+    path.write_text("base: [near.yaml]\nobject: mug\npolicy: pgd\n")
+    config = AttackConfig.from_yaml(path, {"policy.steps": 80, "policy.momentum": 0.9})
+    assert (config.object, config.seed, config.steps) == ("mug", 4, 80)
+    assert config.controls == {"pose": {"yaw": [0, 45], "pitch": 3}}
+    assert config.policy == {"name": "pgd", "momentum": 0.9}
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("base: gone.yaml\n", r"gone\.yaml: expected a YAML file, got No such file"),
+        ("base: 3\n", r"study\.yaml: base: expected a file or a list of files, got 3"),
+        ("base: study.yaml\n", r"study\.yaml: base: the file is a base of itself"),
+    ],
+)
+def test_a_bad_base_is_named(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "study.yaml"
+    path.write_text(text)
+    with pytest.raises(InputError, match=message):
+        AttackConfig.from_yaml(path)
+
+
+@pytest.mark.parametrize("command", ["attack", "gap", "region", "check", "render", "precision"])
+@pytest.mark.parametrize("name", ["object", "environment", "model"])
+def test_several_of_a_kind_are_for_a_sweep(
+    command: str, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    if (name, command) in (("object", "attack"), ("object", "gap"), ("model", "attack")):
+        return
+    monkeypatch.chdir(tmp_path)
+    flags = {"object": "mug", "environment": "noon", "model": "reference"} | {name: "one,two"}
+    words = [word for flag, value in flags.items() for word in (f"--{flag}", value)]
+    assert main([command, *words, *(["--out", "a.png"] if command == "render" else [])]) == 2
+    expected = f"error: --{name}: expected one {name}, got one,two; give one, or compare several with advsearch sweep\n"
+    assert capsys.readouterr().err.endswith(expected)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_file_with_a_comma_in_its_name_is_one(tmp_path: Path) -> None:
+    file = tmp_path / "a,b.pt2"
+    file.touch()
+    assert AttackConfig(object="mug", model=file).model == str(file)
+    assert SweepConfig(object="mug,bowl", environment="noon,loft", model="a,b").models == ("a", "b")
+    assert AttackConfig(object="mug,bowl").objects == ("mug", "bowl")
+
+
+def test_an_answer_for_many_conditions_is_tried_more_often() -> None:
+    assert AttackConfig(object="mug").trial_count == TRIALS == 20
+    assert AttackConfig(object="mug", over={"light": {}}).trial_count == TRIALS_OVER == 200
+    assert AttackConfig(object="mug", over={"light": {}}, trials=7).trial_count == 7
