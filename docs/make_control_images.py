@@ -48,6 +48,7 @@ SCENES: Mapping[str, tuple[str, str | None, dict[str, float]]] = {
     "camera": ("teapot", "day-room", {}),
     "path": ("teapot", "day-room", {}),
     "occlusion": ("teapot", "kitchen", {}),
+    "body": ("person", "street", {"camera.elevation": 6.0, "camera.azimuth": 30.0}),
 }
 """Object, environment and settings where the mug in the studio does not show it well."""
 
