@@ -108,7 +108,8 @@ class MakeHuman:
                 kept = rig[kept]["parent"] if kept in rig and rig[kept]["parent"] else "pelvis"
             for point, weight in pairs:
                 found[point, list(BONES).index(kept)] += weight
-        return found / found.sum(axis=1, keepdims=True)
+        shares: Array = found / found.sum(axis=1, keepdims=True)
+        return shares
 
     def joints(self) -> Array:
         """The mean (J, V) of points that each bone begins at."""
@@ -133,7 +134,8 @@ def point_normals(points: Array, faces: Indices) -> Array:
     a, b, c = (points[faces[:, corner]] for corner in range(3))
     summed = np.zeros_like(points)
     np.add.at(summed, faces.reshape(-1), np.repeat(np.cross(b - a, c - a), 3, axis=0))
-    return summed / np.maximum(np.linalg.norm(summed, axis=1, keepdims=True), 1e-12)
+    normals: Array = summed / np.maximum(np.linalg.norm(summed, axis=1, keepdims=True), 1e-12)
+    return normals
 
 
 def smooth(value: Array, low: float, high: float) -> Array:
@@ -145,7 +147,8 @@ def pieces(faces: Indices) -> Indices:
     """Number of the connected piece of each face (F,)."""
     i, j = faces[:, [0, 1]].reshape(-1), faces[:, [1, 2]].reshape(-1)
     graph = sparse.coo_matrix((np.ones(len(i)), (i, j)), shape=(int(faces.max()) + 1,) * 2)
-    return connected_components(graph, directed=False)[1][faces[:, 0]]
+    piece: Indices = connected_components(graph, directed=False)[1][faces[:, 0]]
+    return piece
 
 
 def longest_rim(points: Array, faces: Indices) -> Indices:
@@ -213,7 +216,8 @@ def flattened(points: Array, faces: Indices) -> Array:
     # upright: the direction in which height grows
     rise = np.linalg.lstsq(np.column_stack([chart, np.ones(len(chart))]), points[:, 2], rcond=None)[0][:2]
     rise /= np.linalg.norm(rise)
-    return chart @ np.array([[rise[1], rise[0]], [-rise[0], rise[1]]])
+    level: Array = chart @ np.array([[rise[1], rise[0]], [-rise[0], rise[1]]])
+    return level
 
 
 # ---- cutting and sewing ----------------------------------------------------------------------------------------------
@@ -318,7 +322,8 @@ class Tailor:
         side = np.where(places[:, 1] > 0, "l", "r")
         begin = np.array([self.joints[f"upperarm_{one}"] for one in side])
         end = np.array([self.joints[f"lowerarm_{one}"] for one in side])
-        return ((places - begin) * (end - begin)).sum(axis=1) / ((end - begin) ** 2).sum(axis=1)
+        along: Array = ((places - begin) * (end - begin)).sum(axis=1) / ((end - begin) ** 2).sum(axis=1)
+        return along
 
     def let_out(self, piece: Piece, by: Array, smoothing: int) -> Piece:
         """The piece smoothed, but for its rim, and moved outwards by distances (P,)."""
@@ -360,7 +365,7 @@ class Tailor:
         out = np.where(armed, out, out * (0.5 + 0.5 * smooth(self.from_neck(places), 0.0, 0.06)))
         shirt = self.let_out(shirt, out, 8)
         _, normal = self.of_faces(shirt)
-        self.sew("shirt", shirt, normal[:, 0] > 0.0)
+        self.sew("shirt", shirt, (normal[:, 0] > 0.0).astype(np.int64))
 
     def cut_trousers(self, tights: Piece) -> None:
         places = self.places(tights)
@@ -391,6 +396,7 @@ class Tailor:
         self.sew("shoes", shoes, half + 3 * (middle[:, 1] > 0.0))
 
     def cut_skin(self, body: Piece) -> None:
+        assert body.charts is not None
         chart = body.charts[body.faces].mean(axis=1)
         inside = (np.abs(chart - [0.841, 0.074]) < [0.09, 0.07]).all(axis=1)  # of the mouth
         inside |= (chart[:, 0] < 0.16) & (np.abs(chart[:, 1] - 0.59) < 0.05)  # behind the eyes
@@ -411,13 +417,16 @@ class Tailor:
     def from_neck(self, places: Array) -> Array:
         """How far places (P, 3) are from the shirt's opening, in metres; below 0 within it."""
         beside = 0.085 * (np.linalg.norm((places[:, :2] - NECK[0]) / NECK[1], axis=1) - 1.0)
-        return np.maximum(beside, np.interp(places[:, 0], *np.transpose(COLLAR)) - places[:, 2])
+        far: Array = np.maximum(beside, np.interp(places[:, 0], *np.transpose(COLLAR)) - places[:, 2])
+        return far
 
     def hairy(self, head: Piece) -> Array:
         """How far points (P,) are above the hairline and from the ears, in metres; hair is where that is over 0."""
         places = self.places(head)
+        assert head.charts is not None
         ear = np.min([np.linalg.norm(head.charts - one, axis=1) for one in EARS], axis=0) - 0.035
-        return np.minimum(places[:, 2] - np.interp(places[:, 0], *np.transpose(HAIRLINE)), ear)
+        above: Array = np.minimum(places[:, 2] - np.interp(places[:, 0], *np.transpose(HAIRLINE)), ear)
+        return above
 
     def of_faces(self, piece: Piece) -> tuple[Array, Array]:
         """Middle and unit normal of each face."""
@@ -489,7 +498,8 @@ def made(folder: Path) -> dict[str, npt.NDArray[np.generic]]:
     a, b, c = (bodies[:, body[:, corner]] for corner in range(3))
     top, sole = (of(human.base[:13380, 2]) for of in (np.argmax, np.argmin))
     steps = np.abs(basis).max(axis=1) / 32767.0
-    chart = np.concatenate([(one.charts - one.charts.min(axis=0)) / np.ptp(one.charts, axis=0) for _, one in sewn])
+    charts = [piece.charts for _, piece in sewn if piece.charts is not None]  # all have, once they are sewn
+    chart = np.concatenate([(places - places.min(axis=0)) / np.ptp(places, axis=0) for places in charts])
     starts = np.cumsum([0, *(piece.mix.shape[0] for _, piece in sewn)])
     faces = np.concatenate([index.reshape(-1)[piece.faces + at] for (_, piece), at in zip(sewn, starts, strict=False)])
     own = hanging(np.asarray(mix[first] @ weights), faces, names[first])
@@ -497,7 +507,7 @@ def made(folder: Path) -> dict[str, npt.NDArray[np.generic]]:
         "tags": np.array([tag for tag, _ in sewn]),
         "points": np.array([piece.mix.shape[0] for _, piece in sewn]),
         "triangles": np.array([len(piece.faces) for _, piece in sewn]),
-        "sizes": np.round([np.ptp(piece.charts, axis=0) for _, piece in sewn], 4),
+        "sizes": np.round([np.ptp(places, axis=0) for places in charts], 4),
         "charts": chart.astype(np.float32),
         "faces": np.concatenate([piece.faces for _, piece in sewn]).astype(np.uint16),
         "index": index.reshape(-1).astype(np.uint16),
@@ -527,7 +537,8 @@ def hanging(weights: Array, faces: Indices, names: npt.NDArray[np.str_]) -> Arra
     for number in range(12):
         cloth = shirt if number >= 3 else shirt | (names == "trousers")
         found[cloth] = (0.5 * found + 0.5 * np.asarray(links @ found) / count)[cloth]
-    return found
+    whole: Array = found
+    return whole
 
 
 def few(bodies: Array) -> tuple[Array, Array, Array]:

@@ -260,4 +260,5 @@ def least_turn(begin: Tensor, end: Tensor) -> Tensor:
     x, y, z = torch.linalg.cross(a, b)
     zero = torch.zeros_like(x)
     skew = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
-    return torch.eye(3).to(a) + skew + skew @ skew / (1.0 + a @ b)
+    rotation: Tensor = torch.eye(3).to(a) + skew + skew @ skew / (1.0 + a @ b)
+    return rotation

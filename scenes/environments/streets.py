@@ -235,7 +235,8 @@ def _open_day(rays: Array) -> Array:
     blue = np.array([0.13, 0.27, 0.62]) + np.array([0.50, 0.48, 0.30]) * np.exp(-up / 0.2)
     cover = 0.8 * _cumulus(rays)[:, None]
     sky = blue * (1.0 - cover) + cover * (0.75 + 0.35 * up) * np.array([1.0, 1.0, 1.03])
-    return _open(rays, sky, 1.6) + _spot(rays, -42.0, 55.0, 1.2)[:, None] * np.array([5.6, 5.2, 4.6])
+    radiance: Array = _open(rays, sky, 1.6) + _spot(rays, -42.0, 55.0, 1.2)[:, None] * np.array([5.6, 5.2, 4.6])
+    return radiance
 
 
 def _open_grey(rays: Array) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -76,7 +77,7 @@ def test_all_things_have_to_be_right() -> None:
     masks["object"][:, :2], masks["sign"][:, 2:] = True, True
     own = each_thing(Segmentation(labels=("car", "sign"), accuracy=1.0))
     each = {
-        name: Facts(name, name if name == "sign" else "car", look=lambda m=mask: Sight(m, m.float(), m.float()))
+        name: Facts(name, name if name == "sign" else "car", look=partial(Sight, mask, mask.float(), mask.float()))
         for name, mask in masks.items()
     }
     truth = own.truth(Facts("car", "car", each=each))

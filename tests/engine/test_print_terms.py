@@ -15,10 +15,9 @@ from advsearch.cli.output import shown_text as answer
 from advsearch.engine.objective import off_print, variation
 from advsearch.engine.record import Stages
 from advsearch.errors import InputError
-from advsearch.questions.attack.answer import print_cost_text, renders_text
 from advsearch.questions.attack.carry_out import attack_once
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.attack.wording import method_facts
+from advsearch.questions.attack.wording import method_facts, print_cost_text, renders_text
 
 SHORT: dict[str, Any] = {
     "controls": {"texture": {"epsilon": 0.3}}, "steps": 30, "trials": 6, "verify_spp": 4, "spp": 2, "denoise": "none",

@@ -24,6 +24,7 @@ from advsearch.progress import NullProgress
 from advsearch.question import Question
 from advsearch.questions.attack.parts import executor_for, problem_of
 from advsearch.questions.attack.settings import AttackConfig
+from advsearch.questions.harden import answer as harden_answer
 from advsearch.questions.harden import carry_out as hardening
 from advsearch.questions.harden import harden as asked
 from advsearch.questions.harden import scenes as harden_scenes
@@ -53,8 +54,8 @@ def attacks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[tuple[str, 
 
     monkeypatch.setattr(harden_scenes, "attacked", attacked)
     monkeypatch.setattr(harden_scenes, "CLEAN_SCENES", 1)
-    monkeypatch.setattr(hardening.answer, "PLAIN_SCENES", 1)
-    monkeypatch.setattr(hardening.answer, "RENDERED_SCENES", 2)
+    monkeypatch.setattr(harden_answer, "PLAIN_SCENES", 1)
+    monkeypatch.setattr(harden_answer, "RENDERED_SCENES", 2)
     return done
 
 

@@ -131,7 +131,7 @@ def test_the_control_refuses_what_has_no_joints_and_angles_past_their_limits() -
     with pytest.raises(InputError, match=r"body\.left_elbow"):
         make_control("body", {"left_elbow": [0, 170]})
     space = make_space([make_control("body", {"left_elbow": [0, 140]})], describe("person"))
-    assert len(space.start) == 1 and 40 < space.describe(space.start)["body.mass"]["value"] < 90
+    assert len(space.start) == 1 and 40 < float(space.describe(space.start)["body.mass"]["value"]) < 90
 
 
 def test_clothes_are_areas_that_can_be_painted_alone() -> None:

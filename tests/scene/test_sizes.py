@@ -109,7 +109,7 @@ def test_what_cannot_be_a_size_is_refused(tmp_path: Path) -> None:
         ({"size": float("nan")}, "expected a longest side of"),
     ):
         with pytest.raises(InputError, match=words):
-            describe(path, **said)  # type: ignore[arg-type]
+            describe(path, **said)
     with pytest.raises(InputError, match="mug is no mesh file"):
         describe("mug", unit="cm")
     huge = describe(str(glb_of(tmp_path, "planet", 1e6)))
@@ -140,7 +140,7 @@ def test_a_path_of_a_file_is_in_metres(tmp_path: Path) -> None:
     middle = (scene.base_vertices.min(axis=0) + scene.base_vertices.max(axis=0)) / 2.0
     assert (place - middle) * 5.0 == pytest.approx([20.0, 0.0, 1.0], abs=1e-4)
     said = path.describe(torch.tensor([0.0]))["path.distance"]
-    assert (said["value"], said["unit"]) == (pytest.approx(401.0**0.5, abs=1e-3), "metres")
+    assert said["unit"] == "metres" and said["value"] == pytest.approx(401.0**0.5, abs=1e-3)
 
 
 def test_the_floor_of_a_photograph_is_seen_from_a_tripod(tmp_path: Path) -> None:

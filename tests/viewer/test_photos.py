@@ -36,8 +36,8 @@ from advsearch.questions.photographs.answer import (
 from advsearch.questions.photographs.carry_out import Photographs, photo_agreement
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Store
-from advsearch.viewer.clients import https_context, reachable
-from advsearch.viewer.server import LARGEST_SENT, Dashboard
+from advsearch.viewer.clients import LARGEST_SENT, https_context, reachable
+from advsearch.viewer.server import Dashboard
 
 
 def picture(size: tuple[int, int] = (64, 48), format: str = "JPEG", level: int = 128) -> bytes:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 
-from advsearch.scene.assets import Material
+from advsearch.scene.assets import Ints, Material
 from advsearch.scene.people import Person, body_data
 
 from .curves import Array
@@ -57,13 +57,14 @@ def _patches(person: Person) -> list[Patch]:
     return found
 
 
-def _normals(vertices: Array, faces: Array, index: Array) -> Array:
+def _normals(vertices: Array, faces: Ints, index: Ints) -> Array:
     """Unit normals (V, 3), smooth across the seams of charts."""
     a, b, c = (vertices[faces[:, corner]] for corner in range(3))
     summed = np.zeros((int(index.max()) + 1, 3))
     np.add.at(summed, index[faces].reshape(-1), np.repeat(np.cross(b - a, c - a), 3, axis=0))
     normals: Array = summed[index]
-    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    return normals
 
 
 def _woven(color: Array, depth: float) -> Paint:

@@ -39,9 +39,9 @@ WET_WALL = Material(roughness=0.5, specular=0.4)
 
 
 LIT = {
-    "street-lamps": np.float32((10650.0 * 1.16, 10650.0 * 0.98, 10650.0 * 0.73)),
-    "lit-windows": np.float32((36.0, 23.5, 10.0)),
-    "shops": np.float32((62.0, 48.0, 31.0)),
+    "street-lamps": np.array((10650.0 * 1.16, 10650.0 * 0.98, 10650.0 * 0.73), np.float32),
+    "lit-windows": np.array((36.0, 23.5, 10.0), np.float32),
+    "shops": np.array((62.0, 48.0, 31.0), np.float32),
 }
 """Luminance by night, cd/m2: a lamp puts 15 lux on the road below it (7.5 m, 0.36 x 0.22 m)."""
 
