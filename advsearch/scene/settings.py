@@ -156,16 +156,16 @@ CAMERA = (
     Parameter(
         "exposure", (), "stops", -10.0, 10.0, 0.0, "Brightness over the metered exposure.", estimators=("image",)
     ),
-    Parameter(
-        "ev",
-        (),
-        "EV at ISO 100",
-        -10.0,
-        24.0,
-        "metered",
-        "Absolute exposure in place of the metered one, in the avenue: 14 is for sun, 5 for lit streets.",
-        estimators=(),
-    ),
+)
+EV = Parameter(
+    "ev",
+    (),
+    "EV at ISO 100",
+    -10.0,
+    24.0,
+    "metered",
+    "Absolute exposure in place of the metered one, in the avenue: 14 is for sun, 5 for lit streets.",
+    estimators=(),
 )
 ENVIRONMENT = (
     Parameter(
@@ -231,7 +231,7 @@ MATERIAL = (
     _surface("specular", "Strength of the reflection off what is not metal.", (0.0, 1.0)),
     _surface("clearcoat", "Strength of a clear coat on top.", (0.0, 1.0)),
 )
-FAMILIES = {"camera": CAMERA, "pose": POSE, "environment": ENVIRONMENT, "ground": GROUND, "material": MATERIAL}
+FAMILIES = {"camera": (*CAMERA, EV), "pose": POSE, "environment": ENVIRONMENT, "ground": GROUND, "material": MATERIAL}
 
 SETTINGS: Mapping[str, Parameter] = {
     f"{family}.{one.name}": one for family, parameters in FAMILIES.items() for one in parameters
