@@ -17,6 +17,7 @@ import check_docs
 import pytest
 import reference_calibration as calibration
 import torch
+import yaml
 from check_docs import DOCS, PAGES, ROOT, blocks, name_of, script
 from PIL import Image
 from samples import attack
@@ -218,7 +219,9 @@ def test_every_yaml_example_is_a_configuration(page: Path, tmp_path: Path) -> No
     for block in blocks(page, "yaml"):
         if re.search(r"^ *(runs-on|script):", block, re.M):  # of a machine that runs jobs
             commands = re.findall(r"^.*?(?:- |run: )(advsearch .*)$", block, re.M)
-            assert commands
+            given = re.search(r"advsearch@.*\n +with: (\{.*\})", block)
+            inputs = yaml.safe_load((Path(__file__).parents[1] / "action.yml").read_text("utf-8"))["inputs"]
+            assert commands or (given and yaml.safe_load(given[1]).keys() <= inputs.keys())
             for one in commands:
                 check_advsearch(shlex.split(one)[1:], tmp_path)
             continue
