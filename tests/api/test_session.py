@@ -202,7 +202,7 @@ def forms(value: Any, other: Any) -> list[Any]:
 def holds(kept: Any, value: Any) -> bool:
     """Whether a value is in what a setting came to."""
     if isinstance(kept, str):
-        return str(value) in re.split(r",|\+| \| ", kept) or kept.endswith(f"/{value}")
+        return str(value) in re.split(r",|; |\+| \| ", kept) or kept.endswith(f"/{value}")
     inner = kept.values() if isinstance(kept, dict) else kept if isinstance(kept, tuple) else [kept]
     return any(one == value for one in inner) or (isinstance(kept, dict) and value in kept)
 
