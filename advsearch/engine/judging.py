@@ -311,7 +311,7 @@ class KnownTruths:
 
     def things(self, whole: Tensor) -> JsonObject | None:
         """Return what the picture at (d,) of the whole space shows of each thing, see `things_seen`."""
-        if not self.renderer.scene.made[0].things:
+        if self.space.scene is None or not self.space.scene.things:
             return None
         key = whole.detach()[self._rest].numpy().tobytes()
         if key not in self._seen:

@@ -122,7 +122,7 @@ READING = {
 
 ALONE = (
     *("attack", "gap", "harden", "render", "list", "labels", "check", "precision", "stability", "doctor"),
-    *("import", "import-3db"),
+    *("import", "import-3db", "completion"),
 )
 """Those that are told everything, and the dashboard, which is tried below."""
 

@@ -100,7 +100,7 @@ def test_what_varies_by_chance_takes_all_but_the_budget(monkeypatch: pytest.Monk
     assert job.over[0].settings() == {"kind": "texture", "norm": "l2", "resolution": 16}
 
 
-@pytest.mark.parametrize("asked", ["texture", "texture:label", {"label": {"kind": "texture"}}])
+@pytest.mark.parametrize("asked", ["texture", "texture:object", {"label": {"kind": "texture"}}])
 def test_a_sweep_and_a_render_give_every_texture_its_resolution(asked: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     job = job_of(SweepConfig(object="mug", controls=asked, texture_resolution=16))
     assert [one.chosen["resolution"] for one in job.controls if isinstance(one, TextureControl)] == [16]

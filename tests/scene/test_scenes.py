@@ -282,7 +282,8 @@ def test_a_scene_seen_by_a_camera_of_its_file_is_kept_by_its_name(file: Path, tm
 def test_a_camera_that_is_none_or_says_otherwise_is_refused(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
     asked = ["sweep", "--object", f"{file}#crate", "--grid", "pose.yaw=0,90", "--label", "ball", "--camera"]
     for more, words in {
-        ("fronts",): "unknown camera 'fronts'. Did you mean 'front'? Known: dashcam, equirectangular, fisheye, front, orbit, robot.",
+        ("fronts",): "unknown camera 'fronts'. Did you mean 'front'? Known: dashcam, equirectangular, fisheye, front, "
+        "orbit, robot.",
         ("front", "--set", "camera.azimuth=9"): "--camera front and --set camera.azimuth contradict each other",
         ("front", "--control", "camera", "--samples", "2"): "--control camera: moves along an orbit",
     }.items():
