@@ -541,7 +541,8 @@ def test_the_commands_of_the_jobs_in_the_docs_do_what_the_jobs_want(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """All but what installs: on a small suite that stands where the page's does."""
-    page = (Path(__file__).resolve().parents[3] / "docs" / "testing.md").read_text("utf-8")
+    root = Path(__file__).resolve().parents[3]
+    page = (root / "docs" / "testing.md").read_text("utf-8")
     github, gitlab = (
         yaml.safe_load(text) for text in re.findall(r"^```yaml\n((?:name: )?robustness:?\n.*?)^```$", page, re.M | re.S)
     )
@@ -552,6 +553,7 @@ def test_the_commands_of_the_jobs_in_the_docs_do_what_the_jobs_want(
     (tmp_path / "advsearch").write_text(f'#!/bin/sh\nexec {program} "$@" --code {EASY} --quiet\n')
     (tmp_path / "advsearch").chmod(0o755)
     here = {**os.environ, "PATH": f"{tmp_path}{os.pathsep}{os.environ['PATH']}", "GITHUB_STEP_SUMMARY": "shown.md"}
+    here |= {"GITHUB_OUTPUT": "outputs", "MODEL": "", "CODE": "", "ARGUMENTS": ""}
     here["PYTHONPATH"] = os.pathsep.join(path for path in sys.path if path)
 
     def ran(line: str) -> int:
@@ -560,15 +562,19 @@ def test_the_commands_of_the_jobs_in_the_docs_do_what_the_jobs_want(
         ).returncode
 
     steps = github["jobs"]["robustness"]["steps"]
-    lines = [one["run"] for one in steps if "run" in one and not one["run"].startswith("pip ")]
-    assert [ran(line) for line in lines] == [1, 0], "a claim failed, and the summary is shown all the same"
+    (asked,) = (one["with"] for one in steps if one.get("id") == "test")
+    here["SUITE"] = asked["suite"]
+    action = yaml.safe_load((root / "action.yml").read_text("utf-8"))
+    (step,) = (one["run"] for one in action["runs"]["steps"] if one.get("id") == "test")
+    assert ran(step) == 1, "a claim failed, and the summary is shown all the same"
     assert "| behind | failed |" in Path("shown.md").read_text("utf-8")
     uploads = {one["uses"].partition("@")[0]: one["with"] for one in steps if "with" in one and "uses" in one}
-    check_sarif(json.loads(Path(uploads["github/codeql-action/upload-sarif"]["sarif_file"]).read_text("utf-8")))
+    outputs = dict(line.split("=") for line in Path("outputs").read_text("utf-8").split())
+    assert uploads["github/codeql-action/upload-sarif"]["sarif_file"] == "${{ steps.test.outputs.sarif }}"
+    check_sarif(json.loads(Path(outputs["sarif"]).read_text("utf-8")))
     assert len(list(Path(uploads["actions/upload-artifact"]["path"]).glob("*/report.html"))) == 1
     job = gitlab["robustness"]
     (line,) = (one for one in job["script"] if not one.startswith("pip "))
-    Path("junit.xml").unlink()
     assert ran(line) == 1 and ElementTree.parse(job["artifacts"]["reports"]["junit"]).getroot().get("failures") == "1"
     seeds = {json.loads(path.read_text("utf-8"))["seed"] for path in Path("runs").glob("*/summary.json")}
     assert len(seeds) == 2, "the night's is a fresh one"
@@ -617,7 +623,8 @@ def test_a_search_and_a_suite_can_be_asserted(tmp_path: Path, monkeypatch: pytes
 @pytest.mark.docs
 def test_the_pytest_file_of_the_docs_passes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Every test in it, beside the suite of the same page; with fewer steps, and less to show, than on the page."""
-    page = (Path(__file__).resolve().parents[3] / "docs" / "testing.md").read_text("utf-8")
+    root = Path(__file__).resolve().parents[3]
+    page = (root / "docs" / "testing.md").read_text("utf-8")
     monkeypatch.chdir(tmp_path)
     (suite,) = re.findall(r"^```yaml\n(# suite\.yaml\n.*?)^```$", page, re.M | re.S)
     Path("suite.yaml").write_text(suite.replace("at_least: 0.95", "at_least: 0.6").replace("64", "48"))
