@@ -253,6 +253,7 @@ def render(
     scene = scene if texture is None else scene.with_texture(texture)
     made = make_task(task)
     model = load_model(model, task=made)
+    check_judged(scene.description, judge)
     asked = made.on(model) if judge != ALL else each_thing(made.on(model))
     instances = as_controls(controls)
     if around is not None and any(one.kind == "camera" and "azimuth" in one.settings() for one in instances):
@@ -308,6 +309,14 @@ def _configuration(at: Tensor, space: Space) -> Tensor:
     return u
 
 
+def check_judged(description: SceneDescription, judge: str) -> None:
+    """Refuse what no thing of a scene is called. Raises UnknownNameError, or InputError for all of nothing."""
+    if judge not in (OBJECT, ALL, *description.things):
+        raise UnknownNameError("thing to judge:", judge, (OBJECT, ALL, *description.things), "It stands in `judge`.")
+    if judge == ALL and not description.things:
+        raise InputError("judge: all, and nothing stands beside the object; add `things`, or leave it out")
+
+
 def facts_about(
     description: SceneDescription,
     name: str,
@@ -336,10 +345,7 @@ def facts_about(
         return {key: float(v) for key, v in said.items() if isinstance(v, (int, float))}
 
     things = description.things
-    if judge not in (OBJECT, ALL, *things):
-        raise UnknownNameError("thing to judge:", judge, (OBJECT, ALL, *things), "It stands in `judge`.")
-    if judge == ALL and not things:
-        raise InputError("judge: all, and nothing stands beside the object; add `things`, or leave it out")
+    check_judged(description, judge)
     looked = None if look is None else cache(look)
 
     def of(mesh: str, label: str | None) -> Facts:

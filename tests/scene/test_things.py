@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import torch
 from scipy import ndimage
 
 import advsearch
+from advsearch.cli.main import main
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.options import things_as_text
 from advsearch.scene import library
@@ -189,3 +191,12 @@ def test_a_thing_on_the_pavement_stands_on_it() -> None:
     description = advsearch.load_scene("car", "avenue", things="chair@0,-4,size=1; stop-sign@9,0.5").description
     low = {name: standing(part)[:, 2].min() * description.metres for name, part in description.things.items()}
     assert low == {"chair": pytest.approx(0.12, abs=1e-4), "stop-sign": pytest.approx(0.0, abs=1e-4)}
+
+
+def test_a_render_refuses_to_judge_what_is_not_there(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    for judge, words in {
+        "person": "unknown thing to judge: 'person'. Known: all, object.",
+        "all": "nothing stands",
+    }.items():
+        assert main(["render", "--object", "mug", "--judge", judge, "--out", str(tmp_path / "a.png")]) == 2
+        assert words in capsys.readouterr().err and not (tmp_path / "a.png").exists()
