@@ -7,6 +7,7 @@ from typing import Any
 
 from advsearch.cli import output
 from advsearch.cli.commands import COMMANDS, Command
+from advsearch.cli.main import add_command, without_commands
 from advsearch.cli.show import REGISTRIES, list_names
 from advsearch.errors import InputError
 
@@ -35,9 +36,6 @@ def _completion(args: argparse.Namespace) -> int:
         import shtab  # an optional extra
     except ImportError as error:
         raise InputError("completion needs the package shtab; install it with: pip install shtab") from error
-    # late: it imports this module
-    from advsearch.cli.main import add_command, without_commands
-
     parser, commands = without_commands()
     names = {kind: sorted(list_names(kind)) for kind in NAMED.values() if kind in REGISTRIES}
     for command in COMMANDS:

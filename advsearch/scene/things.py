@@ -23,6 +23,7 @@ from advsearch.scene.assets import Doubles, ObjectAsset
 from advsearch.scene.geometry import middle, rotation, standing
 from advsearch.scene.importing.files import safe_name
 from advsearch.scene.parts import MeshPart, mesh_part
+from advsearch.scene.places.road import ROAD
 from advsearch.scene.sizes import LARGEST, SMALLEST, doubts, sized
 
 if TYPE_CHECKING:
@@ -35,8 +36,6 @@ MOST = 64
 OPTIONS = ("heading", "size", "name", "label")
 ALL = "all"
 """What stands for the object and every thing beside it."""
-ROAD = "road"
-"""The mesh that they stand on, where there is one (`advsearch.scene.grounds`)."""
 TAKEN = ("object", "environment", "ground", "camera", ROAD, ALL)
 """What a thing can't be called."""
 

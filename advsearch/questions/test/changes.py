@@ -38,4 +38,4 @@ OTHER_SCENE = {"away": {"pose.y": 1000.0}}
 its shadow is out of the picture."""
 
 ALIKE = 0.1
-"""A prediction is the same where it has the same label, and its probability has changed by at most so much."""
+"""How far the probability of one label may move, and nothing has changed for `must_change`."""
