@@ -277,6 +277,13 @@ MOST_NUMBERS, MOST = 64, 512
 """Numbers, beside base colours, of a configuration whose truth is remembered; and truths that are."""
 
 
+def _keep(kept: dict[bytes, Any], key: bytes, value: Any) -> None:
+    """Remember a value in place of the oldest ones."""
+    while len(kept) >= MOST:
+        del kept[next(iter(kept))]
+    kept[key] = value
+
+
 @dataclass
 class KnownTruths:
     """What is true of configurations; `facts` come from what describes one and what looks at it."""
@@ -304,9 +311,7 @@ class KnownTruths:
         facts = self.facts(values, lambda: self.renderer.surfaces(whole))
         truth = self.task.truth(facts)
         if not listed and len(rest) <= MOST_NUMBERS and "numbers" not in vars(facts):
-            while len(self._kept) >= MOST:
-                del self._kept[next(iter(self._kept))]
-            self._kept[key] = truth
+            _keep(self._kept, key, truth)
         return truth
 
     def things(self, whole: Tensor) -> JsonObject | None:
@@ -315,9 +320,7 @@ class KnownTruths:
             return None
         key = whole.detach()[self._rest].numpy().tobytes()
         if key not in self._seen:
-            while len(self._seen) >= MOST:
-                del self._seen[next(iter(self._seen))]
-            self._seen[key] = things_seen(self.renderer, whole)
+            _keep(self._seen, key, things_seen(self.renderer, whole))
         return self._seen[key]
 
     @cached_property
