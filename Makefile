@@ -69,7 +69,7 @@ docs: $(STAMP) ## run what the pages say and build them into build/site; fails o
 	@$(BIN)/python -m pip install -qq --disable-pip-version-check --no-build-isolation -c constraints.txt -e '.[docs]'
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
-# what compares answers and not times, and takes long
+# what compares results and not times, and takes long
 STUDIES := searches every_control rotation close_calls closed_form policies precision kill harden kill_cluster detached sequential verdict_flow over_seeds verdicts drives
 
 bench: $(STAMP) ## the benchmarks: ratios against a floor measured in the same run

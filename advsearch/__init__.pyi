@@ -16,19 +16,19 @@ from advsearch.engine.rendering import render as render
 from advsearch.models.model import Model as Model
 from advsearch.progress import Watched
 from advsearch.questions.attack.result import AttackResult as AttackResult
-from advsearch.questions.check.answer import CheckResult
-from advsearch.questions.compare.answer import CompareResult
-from advsearch.questions.explain.answer import ExplainResult
+from advsearch.questions.check.result import CheckResult
+from advsearch.questions.compare.result import CompareResult
+from advsearch.questions.explain.result import ExplainResult
 from advsearch.questions.gap import GapResult
-from advsearch.questions.harden.answer import HardenResult
+from advsearch.questions.harden.result import HardenResult
 from advsearch.questions.harden.training import Examples
 from advsearch.questions.harden.training import MakeOptimiser
 from advsearch.questions.photographs.carry_out import photo_agreement as photo_agreement
-from advsearch.questions.precision.answer import PrecisionResult
-from advsearch.questions.recipe.answer import RecipeResult
-from advsearch.questions.region.answer import RegionResult
-from advsearch.questions.replay.answer import ReplayResult
-from advsearch.questions.stability.answer import StabilityResult
+from advsearch.questions.precision.result import PrecisionResult
+from advsearch.questions.recipe.result import RecipeResult
+from advsearch.questions.region.result import RegionResult
+from advsearch.questions.replay.result import ReplayResult
+from advsearch.questions.stability.result import StabilityResult
 from advsearch.questions.sweep.carry_out import AnyScene
 from advsearch.questions.sweep.result import SweepResult as SweepResult
 from advsearch.registry import allow_code as allow_code
@@ -400,7 +400,7 @@ def region(
 ) -> RegionResult: ...
 
 def replay(
-    answer: str | Path | AttackResult,
+    attack: str | Path | AttackResult,
     *,
     progress: Watched = ...,
     ways: Path | Names | None = ...,
@@ -429,7 +429,7 @@ def sweep(
     task: AnyTask = ...,
     samples: int | None = ...,
     controls: Controls = ...,
-    answer_of: str | Path | AttackResult | None = ...,
+    adversarial_of: str | Path | AttackResult | None = ...,
     metrics: Mapping[str, str | Metric] | None = ...,
     run: str | Path | None = ...,
     progress: Watched = ...,

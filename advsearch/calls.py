@@ -40,6 +40,8 @@ SYNONYMS = {
     "seconds": "timeout time_limit time max_time",
     "minimise": "minimize",
     "settings": "set",
+    "adversarial_of": "answer_of",
+    "attack": "answer",
     "set": "settings",
     "denoise": "denoiser",
     "input_size": "size image_size img_size resolution",

@@ -156,7 +156,7 @@ class SceneConfig(Config):
         flag="--with", otherwise="nothing",
     )
     judge: str = setting(
-        "object", "model", "which thing the answers are judged by", "object, the name of a thing beside it, or all",
+        "object", "model", "which thing the predictions are judged by", "object, the name of a thing beside it, or all",
         min_length=1,
     )
     exposure: float = setting(
@@ -187,11 +187,12 @@ class SceneConfig(Config):
     )
     task: str | dict[str, JsonValue] = setting(
         "classification", "model",
-        "what the model does, and how its answers are judged; for several models one task each, with + between them",
+        "what the model does, and how its predictions are judged; for several models one task each, with + between "
+        "them",
         "the name of a task, or NAME={OPTION: VALUE}",
     )
     label: str | None = setting(
-        None, "model", "the answers that count as right, separated by commas",
+        None, "model", "the labels that count as right, separated by commas",
         'names of classes or their numbers, such as "coffee mug,cup" or #504', otherwise="the object's own",
     )
 

@@ -13,4 +13,4 @@ class Value(TypedDict):
 
 
 NOT_A_NUMBER = "not a number"
-"""What an answer of a model is called that has NaN or infinity in it: it has said nothing."""
+"""What an output of a model is called that has NaN or infinity in it: it has said nothing."""

@@ -1,6 +1,6 @@
 """Ctrl-C, counted: what a handler raises inside a destructor, a callback or native code may come to nothing, and
 modules that are being imported make other errors of it. So all that renders, asks a model, waits for workers or tells
-how far it is looks (`INTERRUPTS.look`) whether there was one that nobody has answered."""
+how far it is looks (`INTERRUPTS.look`) whether there was one that nobody has handled."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Interrupts:
     nothing is left to interrupt."""
 
     def __init__(self) -> None:
-        self.count = self.answered = 0
+        self.count = self.handled = 0
         self.ended = False
         self._last = -ONE
 
@@ -37,11 +37,11 @@ class Interrupts:
 
     @property
     def waiting(self) -> bool:
-        """Whether one has come that nobody has answered."""
-        return self.count > self.answered
+        """Whether one has come that nobody has handled."""
+        return self.count > self.handled
 
     def look(self) -> None:
-        """Raise an interrupt that has come already and was not answered; in the main thread, where it belongs."""
+        """Raise an interrupt that has come already and was not handled; in the main thread, where it belongs."""
         if self.waiting and threading.current_thread() is threading.main_thread():
             raise KeyboardInterrupt
 
@@ -52,18 +52,18 @@ INTERRUPTS = Interrupts()
 
 @contextmanager
 def interruptible() -> Iterator[None]:
-    """Raise an interrupt that comes inside the block, whatever was made of it, once: what follows the block answers it.
+    """Raise an interrupt that comes inside the block, whatever was made of it, once: what follows the block handles it.
     Raises KeyboardInterrupt where one waits at the end of the block, and in place of any error inside it."""
     with _counted():
         try:
             yield
             INTERRUPTS.look()
         except KeyboardInterrupt:
-            INTERRUPTS.answered = INTERRUPTS.count
+            INTERRUPTS.handled = INTERRUPTS.count
             raise
         except Exception as error:
             if INTERRUPTS.waiting:
-                INTERRUPTS.answered = INTERRUPTS.count
+                INTERRUPTS.handled = INTERRUPTS.count
                 raise KeyboardInterrupt from error
             raise
 
@@ -75,7 +75,7 @@ def _counted() -> Iterator[None]:
     if handler is not signal.default_int_handler or threading.current_thread() is not threading.main_thread():
         yield
         return
-    INTERRUPTS.answered = INTERRUPTS.count
+    INTERRUPTS.handled = INTERRUPTS.count
     signal.signal(signal.SIGINT, INTERRUPTS)
     try:
         yield

@@ -4,7 +4,7 @@
         return losses.margin(logits, labels) - 10.0 * losses.total_variation(texture)
 
 Those of logits are **maximised**. Each takes logits (N, C) and labels: (N,) int64, or the indices of a label set of
-which every answer is right; each is an objective by itself. Those of colours are a **cost**. All return (N,) and are
+which every label is right; each is an objective by itself. Those of colours are a **cost**. All return (N,) and are
 differentiable; formulas are in `advsearch.attacks.objective_functions` and `advsearch.engine.objective`.
 """
 
@@ -26,19 +26,20 @@ __all__ = [
 ]  # fmt: skip
 
 Labels = Tensor | Sequence[int]
-"""(N,) int64, the right answer of each picture; or indices, each of which is right for all pictures."""
+"""(N,) int64, the right label of each picture; or indices, each of which is right for all pictures."""
 
 
 # ---- of logits (N, C), to be maximised ------------------------------------------------------------------------------
 
 
 def margin(logits: Tensor, labels: Labels) -> Tensor:
-    """The largest wrong logit minus the largest right one, (N,): over 0 exactly where the answer is wrong."""
+    """The largest wrong logit minus the largest right one, (N,): over 0 exactly where the prediction is wrong."""
     return _by_label(of_logits.margin, logits, labels)
 
 
 def targeted_margin(logits: Tensor, target: Labels) -> Tensor:
-    """The largest logit of the target minus the largest other one, (N,): over 0 exactly where the answer is there."""
+    """The largest logit of the target minus the largest other one, (N,): over 0 exactly where the prediction is
+    there."""
     return _by_label(of_logits.targeted_margin, logits, target)
 
 
@@ -54,7 +55,7 @@ def targeted_carlini_wagner(logits: Tensor, target: Labels, *, confidence: float
 
 
 def cross_entropy(logits: Tensor, labels: Labels) -> Tensor:
-    """Minus the logarithm of the probability of the right answers, (N,), in nats; that of torch for one right answer,
+    """Minus the logarithm of the probability of the right labels, (N,), in nats; that of torch for one right label,
     but with a gradient where the model is sure."""
     return _by_label(of_logits.cross_entropy, logits, labels)
 
@@ -65,7 +66,7 @@ def targeted_cross_entropy(logits: Tensor, target: Labels) -> Tensor:
 
 
 def log_odds(logits: Tensor, labels: Labels) -> Tensor:
-    """The log-odds of a wrong answer over all classes, (N,)."""
+    """The log-odds of a wrong prediction over all classes, (N,)."""
     return _by_label(of_logits.log_odds, logits, labels)
 
 
@@ -145,7 +146,7 @@ def check_aim(objective: object, *, targeted: bool) -> None:
 
 
 def _by_label(loss: Callable[..., Tensor], logits: Tensor, labels: Labels) -> Tensor:
-    """A loss of a label set; row by row where rows have different right answers."""
+    """A loss of a label set; row by row where rows have different right labels."""
     if not isinstance(labels, (Tensor, Sequence)):
         raise InputError(
             f"labels: expected (N,) int64 or the indices of a label set, got {type(labels).__name__}, the truth of "

@@ -21,16 +21,16 @@ from typing import Any, Generic, TypeVar, get_args, get_type_hints
 
 from advsearch.interrupts import interruptible
 from advsearch.progress import NullProgress, Progress, watcher
-from advsearch.report.markup import figure_of_answer
+from advsearch.report.markup import result_figure
 from advsearch.report.shown import shown
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.files import write_bytes
 from advsearch.runs.results import INTERRUPTED, Result
 from advsearch.settings import Config
-from advsearch.viewer.pages import keep_answer
+from advsearch.viewer.pages import keep_result
 
 Settings = TypeVar("Settings", bound=Config, covariant=True)
-Answer = TypeVar("Answer", bound=Result)
+AnyResult = TypeVar("AnyResult", bound=Result)
 Made = TypeVar("Made", bound=Result)
 
 SAID = {
@@ -84,25 +84,25 @@ class Asked(Generic[Settings]):
         return kind(**{**said, "command_line": self.config.command_line(), **fields})
 
 
-def answered(answer: Callable[[Asked[Settings]], Answer], asked: Asked[Settings]) -> Answer:
-    """Return what a function answers, which is kept in its run with its page and its figure, unless the function has
+def carried_out(function: Callable[[Asked[Settings]], AnyResult], asked: Asked[Settings]) -> AnyResult:
+    """Return the result of a function, which is kept in its run with its page and its figure, unless the function has
     kept it itself."""
     with asked:
-        result = answer(asked)
+        result = function(asked)
         if "run" not in vars(asked):
             return result
-        for suffix, data in figure_of_answer(shown(result)).items():
+        for suffix, data in result_figure(shown(result)).items():
             write_bytes(asked.run.path / "images" / f"{asked.config.command}.{suffix}", data)
-        return keep_answer(asked.run, result)
+        return keep_result(asked.run, result)
 
 
 @dataclass(frozen=True)
-class Question(Generic[Answer]):
+class Question(Generic[AnyResult]):
     """A question. Attributes as for `question`; `config` and `result` are the classes of settings and result."""
 
-    answer: Callable[..., Answer]
+    function: Callable[..., AnyResult]
     config: type[Config]
-    result: type[Answer]
+    result: type[AnyResult]
     examples: tuple[str, ...]
     place: tuple[str, ...]
     about: str
@@ -115,14 +115,14 @@ class Question(Generic[Answer]):
 
     def from_config(
         self, config: Any, *, progress: Progress | None = None, resumed: Path | None = None, **more: Any
-    ) -> Answer:
+    ) -> AnyResult:
         """Do what a configuration describes, and keep it in its run; `more` is for the function alone."""
-        return answered(partial(self.answer, **more), Asked(config, progress, resumed))
+        return carried_out(partial(self.function, **more), Asked(config, progress, resumed))
 
-    def __call__(self, *args: Any, **settings: Any) -> Answer:
+    def __call__(self, *args: Any, **settings: Any) -> AnyResult:
         """Ask it from Python."""
-        answer: Answer = self.python(*args, **settings)
-        return answer
+        made: AnyResult = self.python(*args, **settings)
+        return made
 
     @cached_property
     def python(self) -> Callable[..., Any]:
@@ -133,7 +133,7 @@ class Question(Generic[Answer]):
             return made
         from advsearch.api.keywords import asks, configured  # imports torch
 
-        def function(*args: Any, progress: Any = None, **settings: Any) -> Answer:
+        def function(*args: Any, progress: Any = None, **settings: Any) -> AnyResult:
             given = dict(zip(self.place, args, strict=False))
             return self.from_config(configured(self.config, **given, **settings), progress=watcher(progress))
 
@@ -154,8 +154,8 @@ class Question(Generic[Answer]):
         function.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
             parameters, return_annotation=self.result.__name__
         )
-        function.__name__, function.__doc__ = self.config.command, self.answer.__doc__
-        function.__qualname__, function.__module__ = function.__name__, self.answer.__module__
+        function.__name__, function.__doc__ = self.config.command, self.function.__doc__
+        function.__qualname__, function.__module__ = function.__name__, self.function.__module__
         return asks(self.config)(function)
 
 
@@ -169,7 +169,7 @@ def question(
     more: str = "",
     short: Callable[[Any], bool] = lambda result: False,
     listed: str = "",
-) -> Callable[[Callable[..., Answer]], Question[Answer]]:
+) -> Callable[[Callable[..., AnyResult]], Question[AnyResult]]:
     """Make a question of a function ``(asked: Asked[NameConfig]) -> NameResult``, called as its command.
 
     Args:
@@ -185,11 +185,13 @@ def question(
         listed: ``module:function`` that returns what that setting may be, with a line about each: `list` prints it.
     """
 
-    def decorate(answer: Callable[..., Answer]) -> Question[Answer]:
-        hints = get_type_hints(answer)
-        first, result = next(iter(inspect.signature(answer).parameters)), hints["return"]
+    def decorate(function: Callable[..., AnyResult]) -> Question[AnyResult]:
+        hints = get_type_hints(function)
+        first, result = next(iter(inspect.signature(function).parameters)), hints["return"]
         result = (*get_args(result), result)[0]  # the first of several kinds
         (config,) = get_args(hints[first])
-        return Question(answer, config, result, examples, place, about, expected, brought, called, more, short, listed)
+        return Question(
+            function, config, result, examples, place, about, expected, brought, called, more, short, listed
+        )
 
     return decorate

@@ -3,7 +3,7 @@
 What is below them (the list of settings, of results, of pages) asks here, by name, so that it imports none of them. A
 question is an object of its own name, which `advsearch.question.question` has made; beside it may stand `shown`,
 `claims` and `page`. An older form is a folder that is the command (`COMMAND`) and has `settings.CONFIG`,
-`carry_out.NAME_from_config`, `answer.RESULT` and the rest in modules. The tool works without those that are missing.
+`carry_out.NAME_from_config`, `result.RESULT` and the rest in modules. The tool works without those that are missing.
 """
 
 from __future__ import annotations
@@ -71,12 +71,12 @@ class Room:
     def result(self) -> Any:
         """The class of its result."""
         made = made_question(self.name)
-        return made.result if made else in_room(self.name, "answer", "RESULT")
+        return made.result if made else in_room(self.name, "result", "RESULT")
 
     @property
     def others(self) -> Mapping[str, Any]:
         """Other classes of its result, by a field that they alone have."""
-        return self._own("answer", "BY_FIELD") or {}
+        return self._own("result", "BY_FIELD") or {}
 
     @property
     def from_config(self) -> Any:
@@ -87,12 +87,12 @@ class Room:
     @property
     def shown(self) -> Any:
         """What makes of its result what a person is shown of it."""
-        return self._own("answer", "shown")
+        return self._own("result", "shown")
 
     @property
     def claims(self) -> Any:
         """What yields the sentences that its result stands for."""
-        return self._own("answer", "claims")
+        return self._own("result", "claims")
 
     @property
     def page(self) -> Any:

@@ -53,7 +53,7 @@ LEAST_GAP = 0.1
 
 def observed(rows: pd.DataFrame, names: Iterable[str]) -> pd.DataFrame:
     """Return a sweep's rows (`runs.tables`) as a table of those of some parameters that vary and that all rows have;
-    an answer that was not judged is not right."""
+    a prediction that was not judged is not right."""
     table, units = dict[str, pd.Series](), dict[str, str]()
     for name in names:
         column, is_names = rows[name], rows[name].dtype == "category"
@@ -72,7 +72,7 @@ def is_independent(table: pd.DataFrame) -> bool:
 
 
 def interval_of(table: pd.DataFrame) -> tuple[float, float]:
-    """Return the 95 % interval of the share of right answers, over units; 0 to 1 where there is no row."""
+    """Return the 95 % interval of the share of right predictions, over units; 0 to 1 where there is no row."""
     if table.empty:
         return 0.0, 1.0
     return share_interval(per_unit(table["correct"], table["unit"]), per_unit(np.ones(len(table)), table["unit"]))
@@ -109,7 +109,7 @@ class RuleCondition:
 
     @property
     def row(self) -> ConditionRow:
-        """It as answers have it."""
+        """It as results have it."""
         unit = f" {self.unit}" if self.unit not in ("", "1") else ""
         names, over, at_most = sorted(self.options or ()), f"over {self.low:g}", f"at most {self.high:g}"
         bounds = [text for text, end in ((over, self.low), (at_most, self.high)) if np.isfinite(end)]
@@ -153,7 +153,7 @@ class CountedRule:
 
     @cached_property
     def chance(self) -> float:
-        """The probability of so few right answers under it, or fewer, if they were spread by chance."""
+        """The probability of so few right predictions under it, or fewer, if they were spread by chance."""
         return self._chance(1.0)
 
     @property

@@ -23,7 +23,7 @@ from advsearch.registry import allow_named
 if TYPE_CHECKING:
     from advsearch.engine.loading import Scene
     from advsearch.engine.naming import AnyModel
-    from advsearch.questions.test.answer import ClaimAnswer, SuiteResult
+    from advsearch.questions.test.result import ClaimResult, SuiteResult
 
 __all__ = ["assert_no_worse", "assert_not_broken", "assert_right", "assert_suite"]
 
@@ -146,7 +146,7 @@ def _asserted(
     seed: int,
     run: str | Path | None,
 ) -> SuiteResult:
-    """Try a suite of one claim, and raise what its answer says."""
+    """Try a suite of one claim, and raise what its verdict says."""
     __tracebackhide__ = True
     # late: torch takes long to import
     from advsearch.engine import loading
@@ -177,15 +177,15 @@ def _asserted(
         only_here = [f"the call of {title}", *(f"the model {model_name(m)}" for m in models.values() if exists_here(m))]
         config = SuiteConfig(suite=title, run=None if run is None else str(run)).with_only_here(only_here)
         result = test_from_config(config, suite=suite)
-    (answer,) = result.claims
-    if answer.answer != "held":
+    (claimed,) = result.claims
+    if claimed.answer != "held":
         test = os.environ.get("PYTEST_CURRENT_TEST", "").rpartition(" ")[0]
         again = f"pytest {shlex.quote(test)}" if test else "call the same function with the same arguments"
-        raise AssertionError(_told(result, answer, again))
+        raise AssertionError(_told(result, claimed, again))
     return result
 
 
-def _told(result: SuiteResult, one: ClaimAnswer, again: str) -> str:
+def _told(result: SuiteResult, one: ClaimResult, again: str) -> str:
     run = Path(result.run or "")
     lines = [f"{one.name}: {one.answer}: {one.reason}", f"  claimed: {one.statement}"]
     lines += [f"  picture: {(run / one.picture).resolve()}"] if one.picture else []

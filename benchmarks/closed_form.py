@@ -169,7 +169,7 @@ def reached(policy: Policy[object], objective: str, d: int, renders: int, seed: 
     """Return whether a search comes within the ratio of the optimum; a policy that refuses does not.
 
     Raises:
-        RuntimeError: the answer lies outside the domain, or is better than the optimum.
+        RuntimeError: the result lies outside the domain, or is better than the optimum.
     """
     problem = OBJECTIVES[objective](d, seed)
     try:

@@ -13,7 +13,7 @@ matrices of a bank of conditions.
 
 Simulated: workers of 0.5 s a picture (exponential around it, with a fixed seed) and an answer that takes 5 ms to come,
 in simulated time, to which the time is added that the coordinator really takes: it gives out, takes back, makes rows
-and writes them to a real `results.sqlite`. Nothing is rendered; rows have real values and answers. Asked: 0.95 of
+and writes them to a real `results.sqlite`. Nothing is rendered; rows have real values and predictions. Asked: 0.95 of
 linear up to 1,000 workers, 4,000 rows a second stored, memory that stays (`--rows 1000000`). Each worker has 40 batches
 to do, since some wait at the end for the last ones. The question is that of 3DB (Leclerc et al. 2021, appendix F.7).
 What is not in it: Dask's own scheduler and network; a task is 16 pictures, so 1,000 workers make 125 tasks a second.
@@ -53,7 +53,7 @@ from advsearch.questions.sweep.loop import Sweep  # noqa: E402
 from advsearch.questions.sweep.settings import SweepConfig  # noqa: E402
 from advsearch.runs.directory import RunDirectory  # noqa: E402
 from advsearch.runs.store import NAME, Store  # noqa: E402
-from advsearch.tasks import Answer, Judgement  # noqa: E402
+from advsearch.tasks import Judgement, Prediction  # noqa: E402
 
 SECONDS, LAG = 0.5, 0.005
 """Of a picture, and until an answer has come."""
@@ -171,7 +171,7 @@ def swept(workers: int, pictures: int, watch: Any = None) -> tuple[float, float,
     side = max(1, round(pictures / 10))
     grid = {"pose.yaw": f"0:360:{side}", "camera.elevation": "5:60:10"}
     config = SweepConfig(object="mug", grid=grid, trials=0, resolution=64)
-    answer = Judgement(-3.2, -3.2, right=True, answer=Answer("mug", 3, 0.93))
+    answer = Judgement(-3.2, -3.2, right=True, prediction=Prediction("mug", 3, 0.93))
 
     def seen(sent: Sequence[Sent]) -> list[Evaluation]:
         return [Evaluation.of(answer, seconds=0.03) for _ in sent]

@@ -9,7 +9,7 @@ its own, or changes once, at a random time. Four tables:
   they have the truth (95 % at least), and how wide they are;
 - two models that are right equally often: how often they are told apart (5 % at most), also where one gains a little in
   most drives and loses much in few;
-- a rule of no effect: how often few right answers under it are told from chance (1 % at most), and how often one of
+- a rule of no effect: how often few right predictions under it are told from chance (1 % at most), and how often one of
   effect is;
 - `explain`: how often it tells a rule (1 %), or that a parameter decides (2.5 % each), where nothing has any effect;
   how often the interval of what decides has the truth, where something has.
@@ -53,7 +53,7 @@ ANSWERS: dict[str, Callable[[Random, int, float], Flags]] = {
         np.arange(FRAMES) < rng.random((n, 1)) * FRAMES, rng.random((n, 1)) < p, rng.random((n, 1)) < p
     ),
 }
-"""Answers (drives, frames), of which a share p is right at each frame."""
+"""Predictions (drives, frames), of which a share p is right at each frame."""
 
 SIDES: dict[str, Callable[[Random, int], Flags]] = {
     "a quarter of the drives": lambda rng, n: np.repeat(rng.random((n, 1)) < 0.25, FRAMES, axis=1),
@@ -121,7 +121,7 @@ def pairs(runs: int) -> int:
 
 def rules(runs: int) -> int:
     print(
-        "\n| under the rule | answers | drives | told where there is none, % | 40 points: told, % |\n"
+        "\n| under the rule | predictions | drives | told where there is none, % | 40 points: told, % |\n"
         + "| --- " * 5
         + "|"
     )
@@ -146,7 +146,7 @@ def rules(runs: int) -> int:
 
 
 def observed(rng: Random, right: Flags) -> pd.DataFrame:
-    """Answers (drives, frames) with two numbers that a drive has, and the time."""
+    """Predictions (drives, frames) with two numbers that a drive has, and the time."""
     drives = len(right)
     yaw, elevation = np.repeat(rng.random((drives, 2)), FRAMES, axis=0).T
     times = np.tile(np.linspace(0.0, 1.0, FRAMES), drives)

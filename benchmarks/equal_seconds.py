@@ -6,8 +6,8 @@
 Each seed searches twice, turn by turn in one process: with a matrix, whose making and comparisons count, and with
 rendered pictures and the adjoint. Both use the default policy and plan as many steps as fit, by the time that a few
 take; the noisy search ranks its best four beyond the budget. CPU seconds of the process are what is equal, so that
-others on the machine disturb it little. Each answer is then traced with fresh seeds, rounded to 8 bits, and its mean
-margin is the result. Printed are the quartiles of both.
+others on the machine disturb it little. Each configuration is then traced with fresh seeds, rounded to 8 bits, and its
+mean margin is the result. Printed are the quartiles of both.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ def main() -> None:
 
 
 def searched(problem: Problem, predicted: bool, seconds: float) -> tuple[Tensor, int]:
-    """Search for so many CPU seconds; returns the answer and the evaluations that it took."""
+    """Search for so many CPU seconds; returns the configuration and the evaluations that it took."""
     end = time.process_time() + seconds
     evaluate = problem.evaluate
     if predicted:
@@ -101,7 +101,7 @@ def searched(problem: Problem, predicted: bool, seconds: float) -> tuple[Tensor,
 
 
 def verified(problem: Problem, u: Tensor) -> float:
-    """Mean margin of an answer in traced pictures with fresh seeds."""
+    """Mean margin of a configuration in traced pictures with fresh seeds."""
     queries = [Query(u, seeds.stream(problem.seed, "trial", one), spp=TRIAL_SPP) for one in range(TRIALS)]
     return statistics.fmean(problem.evaluate(query).said.margin for query in queries)
 

@@ -2,7 +2,7 @@
 
     python benchmarks/every_control.py [--controls pose texture,pose] [--seed 0] [-- more flags of `advsearch attack`]
 
-Every one has to end in a verified answer, found or not, and never in one that is worse than the random search's with as
+Every one has to end in a verified result, found or not, and never in one that is worse than the random search's with as
 many renders: it fools the model in at least as many fresh renders, and its verified margin is as large, or smaller by
 less than noise and chance make of it (`TIE` logits). The exit status is 3 if one falls short.
 """
@@ -27,7 +27,7 @@ DECLARED = [kind for kind in CONTROLS if CONTROLS[kind].parameters]
 TIE = 0.3
 """Logits by which two verified margins of one configuration can differ."""
 VERIFIED = frozenset(one.value for one in (Ending.FOUND, Ending.NOT_VERIFIED, Ending.BUDGET_SPENT, Ending.STALLED))
-"""Endings with a verified answer."""
+"""Endings with a verified result."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -59,7 +59,7 @@ def attacked(controls: str, seed: int, flags: Sequence[str]) -> dict[str, Any]:
 
 
 def judged(summary: dict[str, Any]) -> tuple[bool, str]:
-    """Return whether an answer is verified and not worse than random's, and its row."""
+    """Return whether a result is verified and not worse than random's, and its row."""
     ours, theirs = summary["verified"], summary["baseline"]["verified"]
     good = (
         summary["ending"] in VERIFIED

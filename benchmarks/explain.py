@@ -2,10 +2,10 @@
 
     python benchmarks/explain.py [--seeds 10] [--rows 10000] [--noise 0.05] [--samples 300]
 
-Each law makes a model wrong; a share of the answers is turned round. A law counts as told where the rules name its
+Each law makes a model wrong; a share of the predictions is turned round. A law counts as told where the rules name its
 parameters, no other one, and its bounds to a twentieth of their range.
 
-Then answers, yes or no, are drawn from known accuracies, and it is counted in how many samples the interval of what
+Then predictions, yes or no, are drawn from known accuracies, and it is counted in how many samples the interval of what
 decides has the true share, of the parameters that decide and of one that does not.
 """
 

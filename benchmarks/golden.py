@@ -1,4 +1,4 @@
-"""Answers of small runs, kept and compared bit for bit, so that a change of form is seen to change nothing.
+"""Results of small runs, kept and compared bit for bit, so that a change of form is seen to change nothing.
 
     python benchmarks/golden.py keep FOLDER [--only texture]      before a change
     python benchmarks/golden.py compare FOLDER [--only texture]   after it
@@ -272,7 +272,7 @@ SHARED: Mapping[str, Sequence[str]] = {
 
 
 def answers(name: str, folder: Path) -> list[dict[str, Any]]:
-    """Run a command, and those before it, in this process; returns their rows and the numbers of their answers."""
+    """Run a command, and those before it, in this process; returns their rows and the numbers of their results."""
     make_files(folder)
     here = Path.cwd()
     os.chdir(folder)
@@ -286,7 +286,7 @@ def answers(name: str, folder: Path) -> list[dict[str, Any]]:
 
 
 def answer(command: Sequence[str], run: str) -> dict[str, Any]:
-    """Run one command; returns its rows, the numbers of its answer and the digest of its picture, where it has them."""
+    """Run one command; returns its rows, the numbers of its result and the digest of its picture, where it has them."""
     shared = SHARED.get(command[0], SMALL)
     twice = shared[:2] == SMALL[:2] and "--object" in command
     where = {"render": (), "report": ("--out", run)}.get(command[0], ("--run", str(Path.cwd() / run)))
@@ -345,7 +345,7 @@ def passing(key: str) -> bool:
 
 
 def differences(kept: Any, found: Any, place: str = "") -> Iterator[str]:
-    """Yield where two answers differ, with both values."""
+    """Yield where two results differ, with both values."""
     if isinstance(kept, dict) and isinstance(found, dict):
         for key in sorted({*kept, *found}):
             inside = f"{place}.{key}" if place else key

@@ -53,7 +53,7 @@ def main() -> None:
     if args.over or args.transport:
         predictor = light if args.over else Transport(problem, args.steps)
         predictor.prepare()
-        answered = partial(predictor.answered, traced=traced)
+        answered = partial(predictor.evaluate_all, traced=traced)
     state = policy.start(problem.domain, torch.Generator().manual_seed(0), args.steps)
     ratios, seconds, memory = [], [], []
     yardstick = torch.rand(16, args.size, args.size, 3)

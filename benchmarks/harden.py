@@ -21,7 +21,7 @@ threads.configure()
 
 from advsearch.progress import watched  # noqa: E402
 from advsearch.questions.harden import harden  # noqa: E402
-from advsearch.questions.harden.answer import HardenConfig, HardenResult, Share, shown  # noqa: E402
+from advsearch.questions.harden.result import HardenConfig, HardenResult, Share, shown  # noqa: E402
 from advsearch.runs.directory import CONFIG, is_run  # noqa: E402
 from advsearch.settings import parse_assignment  # noqa: E402
 

@@ -20,8 +20,8 @@ import torch  # noqa: E402
 
 from advsearch.models import Model, load_model  # noqa: E402
 from advsearch.models.reference import Trainable, trainable  # noqa: E402
-from advsearch.questions.harden.answer import HardenConfig  # noqa: E402
 from advsearch.questions.harden.lessons import Lesson  # noqa: E402
+from advsearch.questions.harden.result import HardenConfig  # noqa: E402
 from advsearch.questions.harden.scenes import (  # noqa: E402
     TRAINING,
     Drawing,

@@ -137,7 +137,7 @@ class Looks:
                 part = rows[first : first + BATCH]
                 asked = view.job.queries(range(part[0], part[0] + len(part)))
                 queries = [replace(query, seed=seeds(query.number)) for _, _, query in asked]
-                self.judgements += [one.said for one in view.answers(queries)]
+                self.judgements += [one.said for one in view.evaluate_all(queries)]
         spent = time.perf_counter() - begun
         self.seconds, self.without = spent / len(rows), (spent - model) / len(rows)
 

@@ -1,9 +1,9 @@
-"""What answers that were searched on one model do to others: the matrix of several models, control by control.
+"""What scenes that were searched on one model do to others: the matrix of several models, control by control.
 
     python benchmarks/matrix.py --model A,B,C --object mug.obj --label "coffee mug,cup" [--controls texture pose]
                                 [--keep FOLDER] [more flags of advsearch attack]
 
-Prints a table in Markdown: successes, of how many trials, with their 95 % interval; * where the answer is `found` on
+Prints a table in Markdown: successes, of how many trials, with their 95 % interval; * where the scene is `found` on
 that model too. Weights of MobileNetV2 in torchvision's names, without torchvision: `_mobilenet:MobileNetV2@FILE`.
 """
 

@@ -1,4 +1,5 @@
-"""What one answer for many conditions comes to, over several seeds: how often it is found, and how far rates spread.
+"""What one configuration for many conditions comes to, over several seeds: how often it is found, and how far rates
+spread.
 
     python benchmarks/over_seeds.py [--epsilons 0.2 0.3] [--seeds 0 1 2 3 4] [--more steps=150 baseline=false]
 

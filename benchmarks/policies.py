@@ -4,7 +4,7 @@
 
 Objectives stand for what is met over poses, lights and choices: a bowl, a ramp, bumps, waves of several lengths down to
 that of a pixel, a saturated margin, angles, and choices. Each is divided by its standard deviation over the domain, and
-noise of a given size in that unit is added to what a policy sees. The answers are compared without noise: "not worse"
+noise of a given size in that unit is added to what a policy sees. The results are compared without noise: "not worse"
 means better than random's or within 0.05.
 """
 
@@ -59,7 +59,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def gap(policy: Policy[object], kind: str, d: int, renders: int, noise: float, seed: int) -> float:
-    """How much better a policy's answer is than random search's, without noise, in standard deviations."""
+    """How much better what a policy finds is than what random search finds, without noise, in standard deviations."""
     rng = np.random.default_rng([seed, d, zlib.crc32(kind.encode())])
     domain, function = KINDS[kind](rng, d)
     sample = domain.sample(torch.Generator().manual_seed(99), 500).double().numpy()

@@ -9,7 +9,7 @@
 
 The first prints, for each space and policy, the median over seeds of the verified margin (the mean of fresh trials at a
 high sample count, in logits; above 0 the model is wrong), how far `auto` is below the best single policy, and which
-share of a dense sample of the space, ten times as many configurations, has a lower margin than `auto`'s answer. Those
+share of a dense sample of the space, ten times as many configurations, has a lower margin than what `auto` finds. Those
 are verified by `--dense-trials` trials each: the best of many noisy values is a noisy one. `--spp` is what the searches
 render with; the trials always have 64 samples.
 

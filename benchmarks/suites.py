@@ -4,7 +4,7 @@
 
 Prints the seconds of the whole command over what was asked for on two cores (180, and 30 for the light one), after a
 first run of the light one, so that kernels are warm. Exits with 1 if a suite has another number of claims, no claim of
-each answer, or takes longer.
+each verdict, or takes longer.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from pathlib import Path
 
 SUITES = Path(__file__).resolve().parent.parent / "suites"
 ASKED = {"mug": (10, 180.0, {"held", "failed", "undecided"}), "light": (1, 30.0, {"failed"})}
-"""Claims of each suite, its seconds, and the answers that are among them."""
+"""Claims of each suite, its seconds, and the verdicts that are among them."""
 
 
 def main() -> int:
@@ -38,7 +38,7 @@ def main() -> int:
 
 
 def tried(name: str) -> tuple[float, list[str]]:
-    """Return the seconds of a suite, from the start of the process to its end, and its claims' answers."""
+    """Return the seconds of a suite, from the start of the process to its end, and its claims' verdicts."""
     only = ["--only", "counterexamples"] if name == "light" else ["--all"]
     with tempfile.TemporaryDirectory() as folder:
         begun = time.perf_counter()

@@ -23,7 +23,7 @@ accuracy; and in how many rows the verdict is not that of the rendered ones, and
 With `--rule`, how often the comparison before a search accepts predictions (`engine.acceptance`): by simulation; and as
 they are, and with mistakes planted in them, for `--views` searches, near and from afar, where the object is small.
 
-With `--viewpoints`, the search of the recipe of that name up to its verified answer, predicted, and rendered where the
+With `--viewpoints`, the search of the recipe of that name up to its verified result, predicted, and rendered where the
 object moves in place of the shift of the picture; with `--region`, a region over azimuth and elevation with its map,
 and one over more of both and the distance, predicted and rendered: processor seconds and seconds (asked for, of the
 first: a quarter).
@@ -58,8 +58,8 @@ from advsearch.models import Model, load_model  # noqa: E402
 from advsearch.progress import NullProgress  # noqa: E402
 from advsearch.questions.attack.carry_out import attack_once  # noqa: E402
 from advsearch.questions.attack.settings import AttackConfig  # noqa: E402
-from advsearch.questions.recipe.answer import RecipeConfig  # noqa: E402
 from advsearch.questions.recipe.description import planned, read_recipe  # noqa: E402
+from advsearch.questions.recipe.result import RecipeConfig  # noqa: E402
 from advsearch.questions.sweep.carry_out import job_of  # noqa: E402
 from advsearch.questions.sweep.loop import Sweep  # noqa: E402
 from advsearch.questions.sweep.result import SweepResult  # noqa: E402

@@ -1,13 +1,14 @@
-"""How often whole checks of answers are wrong: the code that runs, with margins in place of pictures.
+"""How often whole checks of results are wrong: the code that runs, with margins in place of pictures.
 
     python benchmarks/verdict_flow.py [--runs 2000] [--over-runs 300]
 
-Everything that an attack does after its searches is carried out: the sample count, the control group, the answer's
+Everything that an attack does after its searches is carried out: the sample count, the control group, its
 trials, the random search's, its second chance in fresh trials, and the trials of different failures. Only the renderer
-is replaced: a picture's margin is drawn, so that the true rate of wrong answers is known.
+is replaced: a picture's margin is drawn, so that the true rate of wrong predictions is known.
 
-- one scene: how often an answer of some rate is found, alone and beside a random search whose answer has the same rate;
-  how often the interval that is printed covers the rate; how often one of the different failures is said to hold;
+- one scene: how often a configuration of some rate is found, alone and beside a random search whose configuration has
+  the same rate; how often the interval that is printed covers the rate; how often one of the different failures is said
+  to hold;
 - over conditions: the same;
 - the sample count over conditions: how far the rate is off that of many samples, and which count is chosen.
 
@@ -39,7 +40,7 @@ from advsearch.engine.record import Findings, Stages
 from advsearch.progress import NullProgress
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.stages import Attack
-from advsearch.tasks import Answer, Judgement
+from advsearch.tasks import Judgement, Prediction
 
 RATE, OVER_RATE = 0.75, 0.85
 """Rates that are too low to be found, for one scene and over conditions."""
@@ -55,8 +56,8 @@ Array = npt.NDArray[np.float64]
 
 @dataclass
 class Drawn:
-    """A problem whose margins are normal: the clean scene is right, and answers are wrong in this share of pictures.
-    Half of the variance is that of conditions, where these vary; the noise does not fall with the samples."""
+    """A problem whose margins are normal: the clean scene is right, and adversarial ones are wrong in this share of
+    pictures. Half of the variance is that of conditions, where these vary; the noise does not fall with the samples."""
 
     rate: float
     root: int
@@ -84,7 +85,7 @@ class Drawn:
             return _judged(self._middle + math.sqrt(0.5) * (shared + float(drawn[0])))
         return _judged(self._middle + float(drawn[0]))
 
-    def answers(self, queries: Sequence[Query]) -> Iterator[Evaluation]:
+    def evaluate_all(self, queries: Sequence[Query]) -> Iterator[Evaluation]:
         return map(self.evaluate, queries)
 
     def describe(self, u: Tensor, draw: int | None = None) -> dict[str, Any]:
@@ -95,11 +96,11 @@ class Drawn:
 
 
 def _judged(margin: float) -> Evaluation:
-    return Evaluation(margin, None, margin > 0.0, judgement=Judgement(margin, margin, margin <= 0.0, Answer("")))
+    return Evaluation(margin, None, margin > 0.0, judgement=Judgement(margin, margin, margin <= 0.0, Prediction("")))
 
 
 def claimed(at: float, failures: Failures | None = None) -> SearchResult:
-    """Return what a search claims that has found a wrong answer."""
+    """Return what a search claims that has found a wrong prediction."""
     nothing = (0.0, 0.0, 1.0, Ending.FOUND, Ending.FOUND, (), (), 108, 100, 0, 0, 0.0)
     return SearchResult(torch.full((1,), at), *nothing, failures=failures)
 

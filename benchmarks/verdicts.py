@@ -61,7 +61,7 @@ from advsearch.attacks.verification import (
 from advsearch.questions.attack.parts import problem_from_config
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.seeds import stream
-from advsearch.tasks import Answer, Judgement
+from advsearch.tasks import Judgement, Prediction
 
 Array = npt.NDArray[np.float64]
 
@@ -72,7 +72,7 @@ OVER_RATES = (0.5, 0.8, 0.85, 0.9, 0.95, 0.97, 0.98, 0.99, 1.0)
 WEAK_OVER = 0.85
 """The rate at which the interval of 180 of 200 begins."""
 CALLS = (-0.5, -0.1, 0.0, 0.1, 0.25, 0.5, 1.0, 3.0)
-"""Margins of the answer without noise; over 0 is a success."""
+"""Margins of the adversarial configuration without noise; over 0 is a success."""
 
 
 # ---- the rule, exactly
@@ -93,7 +93,7 @@ def ended(script: str) -> Verification:
             if answer is None:
                 raise Unknown
             margin = 1.0 if answer == "1" else -1.0
-            yield Evaluation.of(Judgement(margin, margin, margin <= 0.0, Answer("")))
+            yield Evaluation.of(Judgement(margin, margin, margin <= 0.0, Prediction("")))
 
     domain = Domain(torch.zeros(1), (Block(1, "linf", 1.0),))
     return verify(evaluate, domain, torch.ones(1), claim=Ending.NOT_VERIFIED, spp=1, seed=0, trials=TRIAL_LOOKS)
@@ -292,7 +292,7 @@ class Counted:
 
 
 def verdict(evaluate: Evaluate, domain: Domain, u: Tensor, seed: int, *, before: bool) -> Verification:
-    """Return the verdict on an answer, with what is asked of `evaluate`, as it was before or as it is."""
+    """Return the verdict on what was found, with what is asked of `evaluate`, as it was before or as it is."""
     at = {"adversarial": domain.project(u), "clean": domain.start}
     margins = {name: margins_of(evaluate, name, place) for name, place in at.items()}
     trials: tuple[int, ...] = (20,) if before else TRIAL_LOOKS
@@ -304,15 +304,15 @@ def verdict(evaluate: Evaluate, domain: Domain, u: Tensor, seed: int, *, before:
 
 
 def drawn(clean: float, answer: float, lift: float) -> tuple[Counted, Domain, Tensor]:
-    """Return margins of a clean scene and an answer: noise of a deviation of 0.4 at 16 samples, which also moves them
-    by `lift` there; both are half as much at four times the samples."""
+    """Return margins of a clean scene and an adversarial one: noise of a deviation of 0.4 at 16 samples, which also
+    moves them by `lift` there; both are half as much at four times the samples."""
     domain = Domain(torch.zeros(1), (Block(1, "linf", 1.0),))
 
     def asked(query: Query) -> Evaluation:
         place = clean if float(query.u[0]) == 0.0 else answer
         noise = float(np.random.default_rng([query.seed, query.spp, int(query.u[0])]).normal())
         margin = place + math.sqrt(16 / query.spp) * (lift + 0.4 * noise)
-        judged = Judgement(margin, margin, margin <= 0.0, Answer(""))
+        judged = Judgement(margin, margin, margin <= 0.0, Prediction(""))
         return Evaluation(margin, None, margin > 0.0, judgement=judged)
 
     return Counted(asked), domain, torch.ones(1)
@@ -320,7 +320,7 @@ def drawn(clean: float, answer: float, lift: float) -> tuple[Counted, Domain, Te
 
 def drawn_table(runs: int) -> int:
     """Print how often close calls are found; return where more is found that is none."""
-    print("| clean | answer | moved at 16 | found before, % | now, % | the same, % | samples before | now |")
+    print("| clean | adversarial | moved at 16 | found before, % | now, % | the same, % | samples before | now |")
     print("| --- | --- | --- | --- | --- | --- | --- | --- |")
     wrong = 0
     for clean, answer, lift in [*((-3.0, one, lift) for one in CALLS for lift in (0.0, 0.3)), (-0.46, 30.0, -0.1)]:

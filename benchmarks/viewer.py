@@ -52,7 +52,7 @@ CHANGES = {
     "another parameter across": "() => choose('parameter-2', across = across === 'across' ? 'up' : 'across')",
     "another value on a slider": "() => slide('parameter-0-value', value = 1 - value)",
     "a cell": "() => document.querySelectorAll('[data-cell]')[place = (place + 7) % 40].click()",
-    "wrong answers only": "() => pick('Show', shown = shown === 'wrong' ? 'all' : 'wrong')",
+    "wrong predictions only": "() => pick('Show', shown = shown === 'wrong' ? 'all' : 'wrong')",
     "maps side by side": "() => pick('Side by side', by = by === '' ? 'object' : '')",
 }
 HELPERS = """() => {

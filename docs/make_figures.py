@@ -28,16 +28,16 @@ from advsearch.config import CONFIGS
 from advsearch.controls import OWN
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.summary import AttackSummary, CurveResult, MatrixResult
-from advsearch.questions.compare.answer import CompareResult
-from advsearch.questions.explain.answer import ExplainResult
+from advsearch.questions.compare.result import CompareResult
+from advsearch.questions.explain.result import ExplainResult
 from advsearch.questions.gap import GapResult
-from advsearch.questions.harden.answer import HardenResult
+from advsearch.questions.harden.result import HardenResult
 from advsearch.questions.recipe.description import recipe_names as recipe_names
-from advsearch.questions.region.answer import RegionResult
-from advsearch.questions.replay.answer import ReplayResult
-from advsearch.questions.stability.answer import CaseRow
+from advsearch.questions.region.result import RegionResult
+from advsearch.questions.replay.result import ReplayResult
+from advsearch.questions.stability.result import CaseRow
 from advsearch.questions.sweep.summary import SweepSummary
-from advsearch.questions.test.answer import SuiteResult
+from advsearch.questions.test.result import SuiteResult
 from advsearch.runs.results import (
     CleanScene,
     Fields,
@@ -305,14 +305,14 @@ PARTS_OF_SEVERAL: dict[str, type[Fields]] = {
 """What is in fields of several results, by the name that most of these have; told once."""
 
 
-def every_answer(record: Record) -> str:
+def every_result(record: Record) -> str:
     """The fields that all results have."""
     asked = ", ".join(f"`{name}`" for name in ("schema", "command", *ASKED))
     rows = [[f"`{name}`", _field(one)] for name, one in EVERYWHERE.items() if one is not None and name not in ASKED]
     return _wrapped(f"What was asked for, and of what: {asked}.") + "\n" + table(["field", "holds"], rows)
 
 
-def several_answers(record: Record) -> str:
+def several_results(record: Record) -> str:
     """What is in fields of several results."""
     rows = [[f"`{name}`", f"{_first_sentence(kind)}: {_inside(kind)}"] for name, kind in PARTS_OF_SEVERAL.items()]
     return table(["field", "holds"], rows)
@@ -508,19 +508,19 @@ PARTS: dict[tuple[str, str], Callable[[Record], str]] = {
     **{(f"controls/{kind}.md", kind): control(kind) for kind in OWN if (DOCS / "controls" / f"{kind}.md").is_file()},
     ("policies/pgd.md", "pgd"): policy("pgd"),
     ("design.md", "endings"): endings,
-    ("answers.md", "every-answer"): every_answer,
-    ("answers.md", "several-answers"): several_answers,
-    ("answers.md", "attack-fields"): result_fields(AttackSummary),
-    ("answers.md", "curve-fields"): result_fields(CurveResult),
-    ("answers.md", "matrix-fields"): result_fields(MatrixResult),
-    ("answers.md", "sweep-fields"): result_fields(SweepSummary),
-    ("answers.md", "gap-fields"): result_fields(GapResult),
-    ("answers.md", "region-fields"): result_fields(RegionResult),
-    ("answers.md", "replay-fields"): result_fields(ReplayResult),
-    ("answers.md", "explain-fields"): result_fields(ExplainResult),
-    ("answers.md", "compare-fields"): result_fields(CompareResult),
-    ("answers.md", "harden-fields"): result_fields(HardenResult),
-    ("answers.md", "test-fields"): result_fields(SuiteResult),
+    ("results.md", "every-result"): every_result,
+    ("results.md", "several-results"): several_results,
+    ("results.md", "attack-fields"): result_fields(AttackSummary),
+    ("results.md", "curve-fields"): result_fields(CurveResult),
+    ("results.md", "matrix-fields"): result_fields(MatrixResult),
+    ("results.md", "sweep-fields"): result_fields(SweepSummary),
+    ("results.md", "gap-fields"): result_fields(GapResult),
+    ("results.md", "region-fields"): result_fields(RegionResult),
+    ("results.md", "replay-fields"): result_fields(ReplayResult),
+    ("results.md", "explain-fields"): result_fields(ExplainResult),
+    ("results.md", "compare-fields"): result_fields(CompareResult),
+    ("results.md", "harden-fields"): result_fields(HardenResult),
+    ("results.md", "test-fields"): result_fields(SuiteResult),
     ("stability.md", "case-fields"): result_fields(CaseRow),
     ("reference-model.md", "reference"): reference,
     ("recipe-results.md", "recipe-results"): recipe_results,

@@ -3,7 +3,7 @@
     python docs/make_images.py RUN
 
 RUN is the folder of a run with the control `texture`. Written are `docs/images/attack-mug.png` (the clean picture, the
-adversarial one and the texture, side by side) and, in README.md, the answer that the run printed.
+adversarial one and the texture, side by side) and, in README.md, the result that the run printed.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from pathlib import Path
 
 from PIL import Image, ImageDraw, ImageFont
 
-from advsearch.cli.output import shown_text as answer
-from advsearch.questions.attack.summary import AttackSummary, PicturedAnswer, attack_of
-from advsearch.report.wording import CLASSIFICATION, answer_text
+from advsearch.cli.output import shown_text as text_of
+from advsearch.questions.attack.summary import AttackSummary, PicturedPrediction, attack_of
+from advsearch.report.wording import CLASSIFICATION, prediction_text
 from advsearch.runs.directory import default_name
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -34,13 +34,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     summary = attack_of(run)
     side_by_side(run, summary).save(PICTURE, optimize=True)
     readme = ROOT / "README.md"
-    readme.write_text(with_answer(readme.read_text(encoding="utf-8"), summary), encoding="utf-8")
+    readme.write_text(with_adversarial(readme.read_text(encoding="utf-8"), summary), encoding="utf-8")
     print(f"written: {PICTURE.relative_to(ROOT)}, {readme.relative_to(ROOT)}", file=sys.stderr)
     return 0
 
 
 def side_by_side(run: Path, summary: AttackSummary) -> Image.Image:
-    """Return the clean and the adversarial picture with the model's answers, and the texture, on white."""
+    """Return the clean and the adversarial picture with the model's predictions, and the texture, on white."""
     panels = [
         ("images/clean.png", f"clean: {_said(summary.clean)}"),
         ("images/adversarial.png", f"adversarial: {_said(summary.adversarial)}"),
@@ -66,12 +66,12 @@ def _fitted(picture: Image.Image) -> Image.Image:
     return square
 
 
-def _said(answer: PicturedAnswer | None) -> str:
-    return answer_text(CLASSIFICATION, answer) if answer else "no answer"
+def _said(prediction: PicturedPrediction | None) -> str:
+    return prediction_text(CLASSIFICATION, prediction) if prediction else "no prediction"
 
 
-def with_answer(readme: str, summary: AttackSummary) -> str:
-    """Return the text of README.md with the run's answer in the marked place; the run gets its usual name in `runs/`.
+def with_adversarial(readme: str, summary: AttackSummary) -> str:
+    """Return the text of README.md with the run's result in the marked place; the run gets its usual name in `runs/`.
 
     Raises:
         ValueError: there is no such place, or more than one.
@@ -80,7 +80,7 @@ def with_answer(readme: str, summary: AttackSummary) -> str:
         raise ValueError("README.md: expected one part made by docs/make_images.py")
     place = f"runs/{default_name(summary.object, summary.controls)}-001"
     before, rest = readme.split(BEGIN)
-    block = f"```text\n{answer(summary.model_copy(update={'run': place}))}\n```\n"
+    block = f"```text\n{text_of(summary.model_copy(update={'run': place}))}\n```\n"
     return f"{before}{BEGIN}{block}{END}{rest.split(END)[1]}"
 
 

@@ -18,9 +18,9 @@ from typing import Any
 
 import advsearch
 from advsearch.questions.recipe import recipe
-from advsearch.questions.recipe.answer import RecipeConfig, RecipeResult, told_once
 from advsearch.questions.recipe.carry_out import NOTE
 from advsearch.questions.recipe.description import read_recipe
+from advsearch.questions.recipe.result import RecipeConfig, RecipeResult, told_once
 from advsearch.runs.directory import CONFIG
 from advsearch.runs.store import NAME as STORE
 from advsearch.runs.store import Store

@@ -11,11 +11,11 @@ import OpenEXR
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.summary import AttackSummary, CurveResult, MatrixResult, attack_of
 from advsearch.questions.gap import GapResult
-from advsearch.questions.region.answer import RegionResult
+from advsearch.questions.region.result import RegionResult
 from advsearch.questions.sweep.summary import SweepSummary
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row
-from advsearch.runs.summary import write_answer
+from advsearch.runs.summary import write_configuration
 from advsearch.viewer.pages import write_page
 
 
@@ -228,11 +228,11 @@ def make_run(path: Path, summary: AttackSummary = SUMMARY, *, pictures: bool = T
     return path
 
 
-def make_answered(path: Path, config: AttackConfig, u: np.ndarray) -> Path:
+def make_attacked(path: Path, config: AttackConfig, u: np.ndarray) -> Path:
     """Return the directory of an attack that nobody has made, with a configuration (d,) as its answer."""
     with RunDirectory.create_for(config.model_copy(update={"run": str(path)})) as run:
         run.write_summary(attack(run=str(path), object=config.object, controls=list(config.controls)))
-    write_answer(path, np.asarray(u, dtype=np.float32))
+    write_configuration(path, np.asarray(u, dtype=np.float32))
     return path
 
 

@@ -21,7 +21,7 @@ from advsearch.engine.problem import Problem
 from advsearch.engine.record import Findings, Stages
 from advsearch.progress import NullProgress
 from advsearch.questions.attack import parts as attacking
-from advsearch.questions.attack.carry_out import attack_answers
+from advsearch.questions.attack.carry_out import attack_worker
 from advsearch.questions.attack.parts import search_size
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.stages import Attack
@@ -68,7 +68,7 @@ class StandInProblem:
         value = 0.05 - (u - torch.linspace(0.3, 0.8, 6)).square().sum() + noise[0]
         return torch.stack([-value, value])
 
-    def answers(self, queries: Sequence[Query], prepared: Any = None) -> Iterator[Evaluation]:
+    def evaluate_all(self, queries: Sequence[Query], prepared: Any = None) -> Iterator[Evaluation]:
         return map(self.evaluate, queries)
 
     def evaluate(self, query: Query) -> Evaluation:
@@ -196,7 +196,7 @@ class StandInWorkers:
 
 
 def shared(
-    monkeypatch: pytest.MonkeyPatch, settings: dict[str, Any], call: Callable[[Any], Any] = attack_answers, **more: Any
+    monkeypatch: pytest.MonkeyPatch, settings: dict[str, Any], call: Callable[[Any], Any] = attack_worker, **more: Any
 ) -> StandInWorkers:
     """Let stand-ins carry out a call wherever it is asked for of these settings; all else is done in this process."""
     ready = StandInWorkers(InProcess(call(settings)), **more)

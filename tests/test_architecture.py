@@ -207,14 +207,14 @@ def questions() -> Iterator[tuple[str, str, Path, list[str]]]:
             yield parts[2], ".".join(parts[3:]), path, [one for one in imports(module, path) if one.startswith("advs")]
 
 
-def test_a_question_knows_another_only_by_what_carries_it_out_and_its_answer() -> None:
+def test_a_question_knows_another_only_by_what_carries_it_out_and_its_result() -> None:
     """But attacks and sweeps, on which the others stand; these know no other."""
     broken = []
     for question, _, path, names in questions():
         below = BASES[: BASES.index(question)] if question in BASES else BASES
         for parts in (name.split(".") for name in names if name.startswith("advsearch.questions.")):
             known = parts[2] == question or parts[2] in below
-            seen = question not in BASES and parts[3:4] in (["carry_out"], ["answer"])
+            seen = question not in BASES and parts[3:4] in (["carry_out"], ["result"])
             if not known and not seen:
                 broken.append(
                     f"{path.relative_to(ROOT)} imports {'.'.join(parts)}: take what both need out of the room"
@@ -234,7 +234,7 @@ def test_nothing_below_the_questions_imports_one_of_them() -> None:
     assert broken == []
 
 
-def test_an_answer_is_read_and_shown_without_what_renders() -> None:
+def test_a_result_is_read_and_shown_without_what_renders() -> None:
     heavy = ("advsearch.engine", "advsearch.scene", "advsearch.api", "advsearch.models", "advsearch.tasks")
     broken = [
         f"{path.relative_to(ROOT)} imports {name}"

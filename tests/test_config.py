@@ -21,11 +21,11 @@ from advsearch.cli.main import main
 from advsearch.config import CONFIGS, RenderConfig, SceneConfig
 from advsearch.errors import FileFormatError, InputError, UnknownNameError
 from advsearch.questions.attack.settings import TRIALS, TRIALS_OVER, AttackConfig
-from advsearch.questions.check.answer import CheckConfig
+from advsearch.questions.check.result import CheckConfig
 from advsearch.questions.gap import GapConfig
-from advsearch.questions.precision.answer import QUANTITIES, PrecisionConfig
-from advsearch.questions.region.answer import RegionConfig
-from advsearch.questions.stability.answer import StabilityConfig
+from advsearch.questions.precision.result import QUANTITIES, PrecisionConfig
+from advsearch.questions.region.result import RegionConfig
+from advsearch.questions.stability.result import StabilityConfig
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.questions.test.settings import SuiteConfig
 from advsearch.settings import Config, Setting, all_finite, parse_assignment, read_yaml, settings
@@ -607,7 +607,7 @@ def test_a_file_with_a_comma_in_its_name_is_one(tmp_path: Path) -> None:
     assert AttackConfig(object="mug,bowl").objects == ("mug", "bowl")
 
 
-def test_an_answer_for_many_conditions_is_tried_more_often() -> None:
+def test_a_configuration_for_many_conditions_is_tried_more_often() -> None:
     assert AttackConfig(object="mug").trial_count == TRIALS == 20
     assert AttackConfig(object="mug", over={"light": {}}).trial_count == TRIALS_OVER == 200
     assert AttackConfig(object="mug", over={"light": {}}, trials=7).trial_count == 7

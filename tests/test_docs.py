@@ -39,13 +39,13 @@ from advsearch.files import MESHES
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.compare import CompareConfig
 from advsearch.questions.explain import ExplainConfig
-from advsearch.questions.harden.answer import ALL, HardenConfig
-from advsearch.questions.recipe.answer import RecipeConfig
+from advsearch.questions.harden.result import ALL, HardenConfig
 from advsearch.questions.recipe.description import planned, read_recipe
 from advsearch.questions.recipe.description import recipe_names as recipes
-from advsearch.questions.replay.answer import WAYS, ReplayConfig
-from advsearch.questions.stability.answer import StabilityConfig
+from advsearch.questions.recipe.result import RecipeConfig
+from advsearch.questions.replay.result import WAYS, ReplayConfig
 from advsearch.questions.stability.carry_out import chosen
+from advsearch.questions.stability.result import StabilityConfig
 from advsearch.questions.sweep.axes import read_axes
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.questions.test.settings import SuiteConfig, read_suite
@@ -177,7 +177,7 @@ def check_advsearch(words: list[str], folder: Path) -> None:
     """Parse a command with the real parser, and read its settings."""
     args = _parse(words, words[0])
     if args.command in CONFIGS:
-        brought = args.command in ("region", "sweep") and ("around" in args or "answer_of" in args)
+        brought = args.command in ("region", "sweep") and ("around" in args or "adversarial_of" in args)
         otherwise = {"object": "mug"} if brought else {}
         check_names(config_from(args, CONFIGS[args.command], **otherwise))
     if args.command in ("run", "resume"):
@@ -342,7 +342,7 @@ def test_a_part_is_exchanged_and_nothing_else() -> None:
         replaced(page, "y", "new\n")
 
 
-def test_the_picture_and_the_answer_in_the_readme_are_made_from_a_run(tmp_path: Path) -> None:
+def test_the_picture_and_the_result_in_the_readme_are_made_from_a_run(tmp_path: Path) -> None:
     run = tmp_path / "run"
     for name, grey in (("images/clean", 40), ("images/adversarial", 120), ("artifacts/texture", 200)):
         (run / name).parent.mkdir(parents=True, exist_ok=True)
@@ -352,6 +352,6 @@ def test_the_picture_and_the_answer_in_the_readme_are_made_from_a_run(tmp_path: 
     sheet = images.side_by_side(run, summary)
     centres = [sheet.getpixel((images.SIDE // 2 + number * (images.SIDE + images.GAP), 9)) for number in range(3)]
     assert centres == [(40, 40, 40), (120, 120, 120), (200, 200, 200)]
-    readme = images.with_answer(PAGES[0].read_text("utf-8"), summary)
+    readme = images.with_adversarial(PAGES[0].read_text("utf-8"), summary)
     assert "The model calls this mug a vase in 20 of 20 fresh renders" in readme
     assert "runs/mug-texture-001/report.html\n```\n<!-- end -->" in readme

@@ -55,7 +55,7 @@ def in_a_library() -> None:
 def alone(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Handler, hook and counts are as before afterwards."""
     monkeypatch.setattr(sys, "unraisablehook", unless_interrupted)
-    for name in ("count", "answered", "ended", "_last"):
+    for name in ("count", "handled", "ended", "_last"):
         monkeypatch.setattr(INTERRUPTS, name, vars(Interrupts())[name])
     yield
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler

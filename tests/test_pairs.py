@@ -133,7 +133,7 @@ def test_a_row_of_a_sweep_is_true_of_its_own_picture(pair: tuple[str, ...], mode
         assert_close(said, space.describe(u))
         renderer = make_renderer(description, space, SIZE, "none", 3)
         picture = to_8_bit(renderer(u, seed=row.seed, spp=1)[None])
-        ((seen,),) = Classification().answers(model(picture))
+        ((seen,),) = Classification().predictions(model(picture))
         assert row.label_index == seen.index and row.probability == pytest.approx(seen.probability, rel=1e-4)
         assert_true_of_fixed_values(scene, drawn, said, picture[0], row.seed)
 
@@ -201,9 +201,9 @@ def test_a_row_of_an_attack_is_true_of_its_own_picture(pair: tuple[str, ...]) ->
         alone, _ = problem_from_config(config)
         assert_close(values, alone.describe(u))
         again = alone.evaluate(Query(u, 7)).said
-        assert trial.answer.index == again.answer.index
-        assert (trial.margin, trial.answer.probability) == pytest.approx(
-            (again.margin, again.answer.probability), rel=1e-3, abs=1e-3
+        assert trial.prediction.index == again.prediction.index
+        assert (trial.margin, trial.prediction.probability) == pytest.approx(
+            (again.margin, again.prediction.probability), rel=1e-3, abs=1e-3
         )
         assert_close_pictures(picture, searched_picture(alone, u))
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import plant
 import pytest
-from plant import FAULTS, ROOT, Answer, Fault, found_by, rooms, write
+from plant import FAULTS, ROOT, Fault, Outcome, found_by, rooms, write
 
 EVERY_ROOM = {
     *("attacks", "cli", "cluster", "config", "controls", "engine", "explain", "exporting", "hardening"),
@@ -50,12 +50,12 @@ def test_a_test_that_fails_without_the_fault_finds_nothing(
     file, failing = tmp_path / "a.py", set[str]()
     file.write_text("x = 1\n")
 
-    def answered(root: Path, tests: Sequence[str], without: Collection[str] = ()) -> Answer:
+    def answered(root: Path, tests: Sequence[str], without: Collection[str] = ()) -> Outcome:
         fault = file.read_text() == "x = 2\n"
         fails = ["t.py::test_a[0]"] if "t.py::test_a" not in without else []
         fails += ["t.py::test_b[1]"] if fault and finds else []
-        return Answer(next((one for one in fails if one.startswith(tuple(tests))), None), 2.0)
+        return Outcome(next((one for one in fails if one.startswith(tuple(tests))), None), 2.0)
 
-    monkeypatch.setattr(plant, "answer", answered)
+    monkeypatch.setattr(plant, "outcome", answered)
     assert found_by(tmp_path, Fault("scene: x", "a.py", "1", "2", ("t.py",)), failing) == words
     assert failing == {"t.py::test_a"} and file.read_text() == "x = 1\n"

@@ -20,11 +20,11 @@ from advsearch.cli.output import shown_text as check_text
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Findings, Stages
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.check.answer import CheckConfig
 from advsearch.questions.check.carry_out import check_from_config
-from advsearch.questions.precision.answer import PrecisionConfig
+from advsearch.questions.check.result import CheckConfig
+from advsearch.questions.precision.result import PrecisionConfig
 from advsearch.questions.region import growing as region
-from advsearch.questions.region.answer import RegionConfig
+from advsearch.questions.region.result import RegionConfig
 from advsearch.questions.sweep.carry_out import sweep_from_config
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.runs.directory import RunDirectory
@@ -85,7 +85,7 @@ def attacked(config: AttackConfig, problem: Any = None) -> tuple[Recorded, Findi
 def test_an_attack_counts_what_it_says(policy: str) -> None:
     progress, findings = attacked(configuration(policy).model_copy(update={"verify_spp": None}))
     progress.check()
-    (checking,) = progress.named("checking the answer")
+    (checking,) = progress.named("checking what was found")
     beside = findings.baseline_verification
     assert checking.total == 6 * (2 if policy == "random" else 3) and checking.at_most
     assert checking.done == 12 + (len(beside.adversarial_trials) if beside else 0)

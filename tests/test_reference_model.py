@@ -111,7 +111,7 @@ def test_augmentation_turns_and_shrinks() -> None:
     torch.testing.assert_close(shares, torch.full((16,), 1 / 1.25**2), rtol=0.05, atol=0.0)
 
 
-def test_figures_of_known_answers() -> None:
+def test_figures_of_known_predictions() -> None:
     logits = torch.tensor([[2.0, 0.0], [2.0, 0.0], [0.0, 2.0], [0.0, 2.0]])
     got = calibration.report(logits, [0, 1, 1, 1], bins=10)
     confidence = float(torch.tensor([2.0, 0.0]).softmax(0)[0])

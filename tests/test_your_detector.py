@@ -59,4 +59,4 @@ def test_the_steps_can_be_typed(
     assert main(commands[-1][1:]) == 0
     missed = json.loads(Path("missed/annotations.json").read_text("utf-8"))
     assert 0 < len(missed["images"]) < 12 and [one["name"] for one in missed["categories"]] == ["cup", "bowl", "dog"]
-    assert Path("mug-answer.png").is_file() and Path("runs/first/report.html").is_file()
+    assert Path("mug-prediction.png").is_file() and Path("runs/first/report.html").is_file()

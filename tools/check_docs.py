@@ -37,7 +37,7 @@ from advsearch.questions.attack.settings import FEWEST_TRIALS, TRIALS, TRIALS_OV
 from advsearch.questions.attack.summary import AttackSummary, CurveResult, MatrixResult
 from advsearch.questions.gap import GapResult
 from advsearch.questions.region import growing as mapping
-from advsearch.questions.region.answer import RegionConfig
+from advsearch.questions.region.result import RegionConfig
 from advsearch.questions.sweep.summary import SweepSummary
 from advsearch.questions.test import counterexamples as tested
 from advsearch.runs import directory, export, store
@@ -244,7 +244,7 @@ def _exceptions(samples: int) -> float:
 
 
 def _draws(mean: float, value: float = 1.0) -> int:
-    """Pictures that decide a claim where all answers are alike."""
+    """Pictures that decide a claim where all predictions are alike."""
     return trials.draws_needed(mean, confidence=trials.CONFIDENCE, value=value)
 
 
@@ -275,8 +275,8 @@ MADE_BY_HAND = [
     ("questions.md", f"Then {RegionConfig.model_fields['samples'].default} fresh samples"),
     ("questions.md", f"at most {100 * _exceptions(200):.1f} % of the box has another verdict"),
     ("testing.md", "takes {} of them, *at least 0.99* {}, and".format(*map(_draws, (0.95, 0.99)))),
-    ("testing.md", f"*no worse by 5 points* {_draws(0.475, 0.5)} where both models answer alike"),
-    ("testing.md", "in all {} trials ({} for an answer".format(*(tested.TRIALS[over] for over in (False, True)))),
+    ("testing.md", f"*no worse by 5 points* {_draws(0.475, 0.5)} where both models predict alike"),
+    ("testing.md", "in all {} trials ({} for one".format(*(tested.TRIALS[over] for over in (False, True)))),
     ("testing.md", f"6 of 6 show a share of at least {100 * clopper_pearson(6, 6)[0]:.0f} %"),
     ("design.md", f"are rendered under {rate_samples.CONDITIONS} conditions at 4, 16 and 64 samples"),
     ("design.md", f"carry at most {100 * rate_samples.MOVED:.0f} % of the conditions over zero"),

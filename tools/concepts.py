@@ -1,6 +1,6 @@
 """Counts what a stranger has to learn: python tools/concepts.py [CHECKOUT] [--names] [--inner]
 
-Lines of the package and its modules; lines with an untyped answer (`dict[str, Any]`, `Mapping[str, Any]`); class names
+Lines of the package and its modules; lines with an untyped result (`dict[str, Any]`, `Mapping[str, Any]`); class names
 and file names that occur several times; imports that go in a circle, those inside functions included; modules that take
 a run's settings (a parameter or a field annotated with a `...Config`); and the classes of ours that a new control has
 to import or subclass, from the worked example of docs/controls/writing.md.
@@ -26,7 +26,7 @@ from pathlib import Path
 UNTYPED = re.compile(r"(?:dict|Mapping)\[str, Any\]")
 Modules = Mapping[str, Path]
 
-ENTRIES = {"cli": {"add_arguments", "answer", "run"}, "models": {"load", "source"}}
+ENTRIES = {"cli": {"add_arguments", "text", "run"}, "models": {"load", "source"}}
 """Functions that every module of a room defines so that it is found: commands, and libraries of networks."""
 
 OF_COMMANDS = tuple(f"advsearch.{room}." for room in ("api", "cli"))
@@ -223,7 +223,7 @@ def main() -> int:
             print(f"{modules[name].relative_to(root)}:{line}")
         return 0
     print(f"lines of the package          {sum(lines):6d}   in {len(lines)} modules, median {lines[len(lines) // 2]}")
-    print(f"lines with an untyped answer  {untyped:6d}")
+    print(f"lines with an untyped result  {untyped:6d}")
     print(f"class names that come again   {len(classes):6d}   {', '.join(classes)}")
     print(f"file names that come again    {len(files):6d}   {', '.join(files)}")
     print(f"names with several meanings   {len(names):6d}   (--names lists them)")

@@ -161,7 +161,7 @@ FAULTS = (
         "advsearch/tasks/boxes.py",
         "return boxes[..., [1, 0, 3, 2]]",
         "return boxes",
-        ("tests/tasks/test_detector_answers.py",),
+        ("tests/tasks/test_detector_outputs.py",),
     ),
     Fault(
         "attacks: a projection is left out",
@@ -342,7 +342,7 @@ FAULTS = (
 
 
 @dataclass(frozen=True)
-class Answer:
+class Outcome:
     """What tests said.
 
     Attributes:
@@ -374,7 +374,7 @@ def write(path: Path, text: str) -> None:
         old.unlink()
 
 
-def answer(root: Path, tests: Sequence[str], without: Collection[str] = ()) -> Answer:
+def outcome(root: Path, tests: Sequence[str], without: Collection[str] = ()) -> Outcome:
     """Run tests in a copy, without some of them, until the first failure.
 
     Raises:
@@ -393,14 +393,14 @@ def answer(root: Path, tests: Sequence[str], without: Collection[str] = ()) -> A
             timeout=PATIENCE,
         )
     except subprocess.TimeoutExpired:
-        return Answer(None, time.perf_counter() - begun, late=True)
+        return Outcome(None, time.perf_counter() - begun, late=True)
     seconds = time.perf_counter() - begun
     found = re.search(r"^(?:FAILED|ERROR) (\S+)", ran.stdout, re.MULTILINE)
     if ran.returncode == 0:
-        return Answer(None, seconds)
+        return Outcome(None, seconds)
     if found is None:
         raise RuntimeError(f"pytest ended with {ran.returncode} and no failed test:\n{ran.stdout}{ran.stderr}")
-    return Answer(found[1], seconds)
+    return Outcome(found[1], seconds)
 
 
 def found_by(root: Path, fault: Fault, failing: set[str], *, all_tests: bool = False) -> str | None:
@@ -414,25 +414,25 @@ def found_by(root: Path, fault: Fault, failing: set[str], *, all_tests: bool = F
     """
     for tests in (fault.tests, ("tests",)) if all_tests else (fault.tests,):
         while True:
-            said = planted_answer(root, fault, tests, failing)
+            said = planted_prediction(root, fault, tests, failing)
             if said.late:
                 return f"tests that did not end within {PATIENCE:.0f} s"
             if said.failed is None:
                 break
             test = said.failed.partition("[")[0]
-            if answer(root, [test]).failed is None:
+            if outcome(root, [test]).failed is None:
                 return f"{said.failed} ({said.seconds:.0f} s)"
             failing.add(test)
     return None
 
 
-def planted_answer(root: Path, fault: Fault, tests: Sequence[str], failing: Collection[str]) -> Answer:
+def planted_prediction(root: Path, fault: Fault, tests: Sequence[str], failing: Collection[str]) -> Outcome:
     """Return what tests say of a copy with a fault in it."""
     path = root / fault.file
     whole = path.read_text("utf-8")
     try:
         write(path, fault.planted(root))
-        return answer(root, tests, failing)
+        return outcome(root, tests, failing)
     finally:
         write(path, whole)
 

@@ -33,7 +33,7 @@ TEXTURE = [*ATTACK, "--epsilon", "0.001", "--control", "texture", "--steps", "60
 WALKS = {
     "an evaluation with its gradient, rendered": [*TEXTURE, "--denoise", "none"],
     "the same by the matrix of light transport": TEXTURE,
-    "a pose without gradient, from u to the answer": [
+    "a pose without gradient, from u to the result": [
         *ATTACK,
         "--control",
         "pose",

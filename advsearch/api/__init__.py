@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 def carry_out(config: Config, *, progress: Progress | None = None, resumed: Path | None = None) -> Result:
-    """Answer the question that a configuration asks, and keep the run in a directory.
+    """Ask the question that a configuration asks, and keep the run in a directory.
 
     Args:
         config: of any command.
@@ -40,6 +40,6 @@ def carry_out(config: Config, *, progress: Progress | None = None, resumed: Path
         own = room.from_config if room else None
         if own is None:
             own = getattr(import_module(f"advsearch.api.{config.command}"), f"{config.command}_from_config")
-        answer = own(config, progress=progress, **({} if folder is None else {"resumed": folder}))
-    result: Result = answer if isinstance(answer, Result) else answer.summary
+        made = own(config, progress=progress, **({} if folder is None else {"resumed": folder}))
+    result: Result = made if isinstance(made, Result) else made.summary
     return result

@@ -20,7 +20,7 @@ from advsearch.config import SceneConfig
 from advsearch.described import Value
 from advsearch.engine.loading import Scene
 from advsearch.engine.rendering import facts_about
-from advsearch.engine.verifier import kept_answer
+from advsearch.engine.verifier import kept_configuration
 from advsearch.errors import FileFormatError, InputError
 from advsearch.files import JsonObject
 from advsearch.models import find_label_set
@@ -49,7 +49,7 @@ IMAGES, LABELS, COCO, YOLO = "images", "labels", "annotations.json", "data.yaml"
 """What is in the folder of a dataset."""
 
 CLEAN = ("first control", "control")
-"""Kinds of rows of an attack that look at the scene without its answer."""
+"""Kinds of rows of an attack that look at the clean scene."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,13 +201,13 @@ def _swept(folder: Path, categories: Categories, every: bool, progress: Progress
 
 
 def _attacked(folder: Path, categories: Categories, every: bool, progress: Progress) -> Iterator[Shown]:
-    """The trials of an attack's answer, and of the scene without it; where nothing varies, the first of each."""
+    """The trials of an attack's adversarial scene, and of the clean one; where nothing varies, the first of each."""
     summary, parts = attack_of(folder), parts_in(folder)
     problem, _ = problem_of_parts(parts)
-    answered = summary.adversarial is not None
+    attacked = summary.adversarial is not None
     kinds = dict.fromkeys(CLEAN, problem.domain.start)
-    if answered:
-        kinds["baseline verification" if summary.answer_from else "verification"] = kept_answer(folder, problem)
+    if attacked:
+        kinds["baseline verification" if summary.answer_from else "verification"] = kept_configuration(folder, problem)
     with Store(folder / NAME, read_only=True) as store:
         tried = {kind: [row for row in store.rows(kind) if every or not row.correct] for kind in kinds}
     chosen = [row for rows in tried.values() for row in (rows if problem.conditions else rows[:1])]
@@ -250,7 +250,7 @@ def _coco(categories: Categories, images: list[JsonObject], things: list[JsonObj
 
 def _image(number: int, shown: Shown) -> JsonObject:
     height, width = shown.picture.shape[:2]
-    answers: list[dict[str, Any]] = [
+    predictions: list[dict[str, Any]] = [
         {
             "row": row.id, "kind": row.kind, "step": row.step, "right": row.correct, "label": row.label,
             "probability": row.probability, "margin": row.margin,
@@ -259,7 +259,7 @@ def _image(number: int, shown: Shown) -> JsonObject:
         for row in shown.rows
     ]  # fmt: skip
     extras: dict[str, Any] = {
-        "right": all(row.correct for row in shown.rows), "answers": answers,
+        "right": all(row.correct for row in shown.rows), "answers": predictions,
         "configuration": {name: dict(one) for name, one in shown.values.items() if name != "model"},
     }  # fmt: skip
     return {"id": number, "file_name": f"{shown.name}.png", "height": height, "width": width, "advsearch": extras}

@@ -1,4 +1,4 @@
-"""The answer of a run for other programs and for print.
+"""The adversarial scene of a run for other programs and for print.
 
 Other programs get the adversarial scene. Printed are patches, and textures unwrapped into pieces, in true millimetres.
 """
@@ -25,7 +25,7 @@ from advsearch.controls.space import file_name
 from advsearch.controls.texture import TextureControl
 from advsearch.engine.loading import Scene, as_controls, load_scene
 from advsearch.engine.problem import Problem
-from advsearch.engine.verifier import kept_answer
+from advsearch.engine.verifier import kept_configuration
 from advsearch.errors import FileFormatError, InputError
 from advsearch.questions.attack.parts import judged_alone, problem_from_config
 from advsearch.questions.attack.settings import AttackConfig
@@ -47,9 +47,9 @@ GLB, XML = ".glb", ".xml"
 
 
 @dataclass(frozen=True, eq=False)
-class AnsweredRun:
-    """A run's folder, its problem as it had it, and its answer: u (d,), the configuration of the whole space; what
-    varies by chance is as in the clean scene."""
+class AdversarialRun:
+    """A run's folder, its problem as it had it, and its adversarial configuration: u (d,), the configuration of the
+    whole space; what varies by chance is as in the clean scene."""
 
     folder: Path
     problem: Problem
@@ -70,28 +70,30 @@ class AnsweredRun:
             return renderer.scene.assembly(renderer.space.inputs(self.u))
 
 
-def answer_of(run: str | Path) -> AnsweredRun:
-    """Load a run's scene and its answer.
+def adversarial_of(run: str | Path) -> AdversarialRun:
+    """Load a run's scene and its adversarial configuration.
 
     Args:
         run: name or folder of a run of `attack` that has ended.
 
     Raises:
-        InputError: the run has no answer, or its scene is another one now.
+        InputError: the run has no adversarial configuration, or its scene is another one now.
         FileFormatError: the run did not end, or is of another command.
     """
     folder = find_run(run)
     summary = attack_of(folder)
     if summary.adversarial is None:
-        raise InputError(f"{folder}: ended with {summary.ending!r}, so that there is no answer to export")
+        raise InputError(
+            f"{folder}: ended with {summary.ending!r}, so that there is no adversarial configuration to export"
+        )
     problem, _ = problem_from_config(judged_alone(AttackConfig.from_yaml(folder / CONFIG)))
     trial = summary.adversarial.trial  # where conditions vary, those of the picture that the run keeps
     draw = None if trial is None else seeds.stream(problem.seed, "verification", trial)
-    return AnsweredRun(folder, problem, problem.whole(kept_answer(folder, problem), draw))
+    return AdversarialRun(folder, problem, problem.whole(kept_configuration(folder, problem), draw))
 
 
 def write_mitsuba(run: str | Path, out: Path) -> list[str]:
-    """Write the scene of a run's answer as XML with its meshes and pictures beside it.
+    """Write the adversarial scene of a run as XML with its meshes and pictures beside it.
 
     Args:
         run: name or folder of a run of `attack` that has ended.
@@ -101,7 +103,8 @@ def write_mitsuba(run: str | Path, out: Path) -> list[str]:
         Sentences about how its picture becomes that of the run, and what is no part of it.
 
     Raises:
-        InputError: the run has no answer, files of these names are there, or stock Mitsuba has no such scene.
+        InputError: the run has no adversarial configuration, files of these names are there, or stock Mitsuba has no
+            such scene.
         FileFormatError: the run did not end, or is of another command.
     """
     path = out if out.suffix.lower() == XML else out / NAME
@@ -109,15 +112,15 @@ def write_mitsuba(run: str | Path, out: Path) -> list[str]:
     there = [one for one in taken if one.exists()]
     if there or path.parent.is_file():
         raise InputError(f"out: {(there or [path.parent])[0]} is there already; choose another name")
-    answer = answer_of(run)
-    renderer = answer.problem.renderer
-    inputs = answer.inputs
+    adversarial = adversarial_of(run)
+    renderer = adversarial.problem.renderer
+    inputs = adversarial.inputs
     on_picture = {name: inputs.pop(name) for name in ON_PICTURE if name in inputs}
     backdrop = on_picture.get("backdrop.color")
     hazes = [part.name for part in renderer.scene.made[0].parts if isinstance(part, HazePart)]
     hazy = any(float(inputs[f"{name}.density"]) > 0.0 for name in hazes)
     if hazy and backdrop is not None:
-        raise InputError(f"{answer.folder}: haze before a plain background is no part of a Mitsuba scene")
+        raise InputError(f"{adversarial.folder}: haze before a plain background is no part of a Mitsuba scene")
     gain = renderer.formation.gain
     if "camera.exposure" in on_picture:
         gain *= float(torch.exp2(on_picture["camera.exposure"]))
@@ -133,9 +136,9 @@ def write_mitsuba(run: str | Path, out: Path) -> list[str]:
         notes.append(f"Haze scatters light, which Mitsuba counts as a segment: {SCATTERINGS} more are for that.")
     if renderer.formation.denoiser != "none":
         notes.append("Not in it: the denoiser. Take many samples a pixel.")
-    if answer.on_picture:
-        notes.append(f"Not in it: what the control {', '.join(answer.on_picture)} did to the finished picture.")
-    if answer.problem.conditions is not None:
+    if adversarial.on_picture:
+        notes.append(f"Not in it: what the control {', '.join(adversarial.on_picture)} did to the finished picture.")
+    if adversarial.problem.conditions is not None:
         notes.append("What varied by chance in the run is as in the clean scene.")
     with placed_by("out"), storage_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -143,13 +146,16 @@ def write_mitsuba(run: str | Path, out: Path) -> list[str]:
             write_scene(renderer.scene, inputs, Path(made) / path.name, " ".join(notes), hide=backdrop is not None)
             for one in sorted(Path(made).iterdir()):
                 os.replace(one, path.parent / one.name)
-        text = f"The answer of {answer.folder.name} as a scene for Mitsuba 3 (advsearch {advsearch.__version__}).\n"
+        text = (
+            f"The adversarial scene of {adversarial.folder.name} as a scene for Mitsuba 3 (advsearch "
+            f"{advsearch.__version__}).\n"
+        )
         write_text(path.with_name(f"{path.stem}-README.txt"), "\n".join([text, *notes, ""]), durable=False)
     return notes
 
 
 def write_gltf(run: str | Path, out: Path) -> list[str]:
-    """Write the object of a run's answer as binary glTF: displaced and in its pose, with its texture.
+    """Write the object of a run's adversarial scene as binary glTF: displaced and in its pose, with its texture.
 
     Args:
         run: name or folder of a run of `attack` that has ended.
@@ -159,16 +165,16 @@ def write_gltf(run: str | Path, out: Path) -> list[str]:
         Sentences about what is not as in the run.
 
     Raises:
-        InputError: the run has no answer, or the file is called otherwise.
+        InputError: the run has no adversarial configuration, or the file is called otherwise.
         FileFormatError: the run did not end, or is of another command.
     """
     if out.suffix.lower() != GLB:
         raise InputError(f"out: expected the name of a .glb file, got {out}")
-    answer = answer_of(run)
-    description = answer.problem.space.scene
+    adversarial = adversarial_of(run)
+    description = adversarial.problem.space.scene
     assert description is not None
     part = description.meshes[OBJECT]
-    found, metres = posed(part, answer.inputs), description.object.metres
+    found, metres = posed(part, adversarial.inputs), description.object.metres
     if metres is not None:
         found = replace(found, mesh=replace(found.mesh, vertices=found.mesh.vertices * np.float32(metres)))
     with placed_by("out"):
@@ -216,7 +222,7 @@ def _alone(config: AttackConfig) -> Scene:
 
 
 def printable(run: str | Path, size: float) -> list[Piece]:
-    """Return what of a run's answer can be printed.
+    """Return what of a run's adversarial scene can be printed.
 
     A patch is one piece. A texture has one for each connected part of the unwrapped surface, stretched along both sides
     to the mean size that its texels have on the object; what is left of distortion within a piece is in its name.

@@ -1,4 +1,4 @@
-"""`render`: pictures of a scene, with what the model says of them; `load_run`, the answer of a run from its folder.
+"""`render`: pictures of a scene, with what the model says of them; `load_run`, the result of a run from its folder.
 
 And `load_model`, to which a task may be named.
 """
@@ -36,7 +36,7 @@ from advsearch.registry import allow_named, names_code
 from advsearch.runs.directory import ARTIFACTS, IMAGES, find_run
 from advsearch.runs.images import read_png
 from advsearch.runs.results import RenderResult, Result
-from advsearch.runs.summary import read_answer, read_result
+from advsearch.runs.summary import read_configuration, read_result
 from advsearch.scene.importing.files import LARGEST_FILE
 from advsearch.scene.importing.hdr import read_exr
 from advsearch.scene.surfaces import aovs_of
@@ -50,7 +50,7 @@ if TYPE_CHECKING:
 
 @helped
 def load_run(run: str | Path) -> AttackResult | SweepResult | Result:
-    """Return the answer of a run from its folder, of the type that the function of its question returns.
+    """Return the result of a run from its folder, of the type that the function of its question returns.
 
     An attack's is an `AttackResult`, a sweep's a `SweepResult`, `gap`'s a `GapResult`, and so on; of several epsilons
     or models, which only a command attacks, it is the table of them. `search` of a loaded attack is None:
@@ -82,7 +82,7 @@ def _attack(path: Path, summary: AttackSummary) -> AttackResult:
     return AttackResult(
         summary=summary,
         run=path,
-        u=torch.from_numpy(read_answer(path)),
+        u=torch.from_numpy(read_configuration(path)),
         clean=clean,
         adversarial=adversarial,
         artifacts={one.stem: _layer(one) for one in sorted((path / ARTIFACTS).glob("*.exr"))},
@@ -166,4 +166,4 @@ def render_from_config(config: RenderConfig, *, progress: Progress | None = None
         progress.message(text)
     if aovs:
         rendering.save_aov(out, aovs)
-    return rendering.result(out, rendering.save(out), warnings, rendering.save_answers(out))
+    return rendering.result(out, rendering.save(out), warnings, rendering.save_predictions(out))

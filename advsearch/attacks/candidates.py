@@ -1,4 +1,4 @@
-"""What a search may answer with: the few best configurations, rendered again with seeds it has not used, as the largest
+"""What a search may end with: the few best configurations, rendered again with seeds it has not used, as the largest
 of many noisy values is mostly a lucky one (the winner's curse); many different failures; and the smallest change, a
 bracket of scales of all budgets, whose upper end passed the trials, and at whose lower end a search found nothing."""
 
@@ -163,7 +163,7 @@ def failure_share(weights: Tensor, bounds: Tensor, failed: Tensor, unknown: Tens
 
 
 MOST = 24
-"""Failures that an answer lists, at most."""
+"""Failures that a result lists, at most."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,10 +222,10 @@ ATTEMPTS = 6
 """Steps outwards that the confirmation of the upper end takes at most."""
 
 SHORTENED = 1.0 + (RATIO - 1.0) / 5.0
-"""An answer's length is bisected until the ends are within this: a fifth of the bracket's ratio."""
+"""A configuration's length is bisected until the ends are within this: a fifth of the bracket's ratio."""
 
 MOST_CHECKS = 1 + math.ceil(math.log2(math.log(1.0 / SMALLEST_SCALE) / math.log(SHORTENED)))
-"""Configurations that go through the trials after a search, at most: its answer, and those of the bisection."""
+"""Configurations that go through the trials after a search, at most: what it found, and those of the bisection."""
 
 Search = Callable[[Domain, int], Tensor]
 """(domain, round) -> the best configuration a search finds there; round numbers its seeds."""
@@ -279,11 +279,12 @@ def shrunk(domain: Domain, u: Tensor, scale: float) -> Tensor:
 def smallest(search: Search, passes: Passes, domain: Domain, likely: Likely | None = None) -> Bracket:
     """Bracket the smallest scale of the domain's budgets at which a configuration passes.
 
-    1. A search in the whole budget. If its answer fails the trials, there is nothing to shrink.
-    2. The answer is moved towards the start, by bisection in the logarithm of its length, to the shortest that passes:
-       a handful of trials, no search.
-    3. A search at half the scale reached, then at the geometric mean of the bracket's ends; each answer that passes is
-       shortened as in 2, each that fails raises the lower end; until it is closed or `ROUNDS` searches are done.
+    1. A search in the whole budget. If what it finds fails the trials, there is nothing to shrink.
+    2. The configuration is moved towards the start, by bisection in the logarithm of its length, to the shortest that
+       passes: a handful of trials, no search.
+    3. A search at half the scale reached, then at the geometric mean of the bracket's ends; each configuration that
+       passes is shortened as in 2, each that fails raises the lower end; until it is closed or `ROUNDS` searches are
+       done.
 
     For a linear model and a gradient policy the first search points the right way and 2 ends within its own step of the
     optimum, so that the result is within `RATIO` of the closed form.

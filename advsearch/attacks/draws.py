@@ -126,10 +126,10 @@ class Product:
         """Return the place of a point on every axis."""
         if not 0 <= index < self.count:
             raise IndexError(f"expected a point from 0 to {self.count - 1}, got {index}")
-        found = [0] * len(self.sizes)
+        digits = [0] * len(self.sizes)
         for place in range(len(self.sizes) - 1, -1, -1):
-            index, found[place] = divmod(index, self.sizes[place])
-        return tuple(found)
+            index, digits[place] = divmod(index, self.sizes[place])
+        return tuple(digits)
 
     def index(self, digits: Sequence[int]) -> int:
         number = 0

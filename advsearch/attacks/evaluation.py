@@ -1,4 +1,4 @@
-"""What passes between a scene, a search and a trial: one question, its answer, and the contract of a policy: three
+"""What passes between a scene, a search and a trial: one question, its evaluation, and the contract of a policy: three
 functions over a state that is passed and never kept, so that it can be shared, wrapped, replayed and resumed."""
 
 from __future__ import annotations
@@ -46,19 +46,20 @@ class Query:
     Attributes:
         u: (d,) float32 in [0, 1], the configuration; must not be written to.
         seed: of the noise, and of the conditions that are drawn. Equal seeds mean equal noise.
-        kind: which rows the answer belongs to, such as "search" or "verification".
+        kind: which rows the evaluation belongs to, such as "search" or "verification".
         number: its place among these rows, from 0.
         phase: of a search; None for a trial.
         gradient: whether the derivative is wanted. "free" only ever comes where the domain has `partial_gradients`.
-        samples: of a search: how many times its own samples per pixel to render with, at least 1. The answer costs as
+        samples: of a search: how many times its own samples per pixel to render with, at least 1. The evaluation costs
+            as
             many times its renders: samples * (1 + gradient_cost) with a gradient, samples without.
         spp: of a trial: samples a pixel.
         drawn: of a trial: whether conditions are drawn; otherwise the scene has those it comes with.
         values: of a trial: what its row says of the configuration, which trials of one kind may have in common.
-        sought: of a trial: whether a search seeks some answer there, so that there is a success.
-        wanted: what the answer is: a judgement; a picture alone; or "light", from which pictures can be predicted
+        sought: of a trial: whether a search seeks some prediction there, so that there is a success.
+        wanted: what the evaluation is: a judgement; a picture alone; or "light", from which pictures can be predicted
             (`advsearch.scene.transport`), at u of the whole space.
-        keep: whether the answer has the picture, too; of a row of a sweep, the bytes of a small one.
+        keep: whether the evaluation has the picture, too; of a row of a sweep, the bytes of a small one.
     """
 
     u: Tensor
@@ -83,7 +84,7 @@ class Evaluation:
     Attributes:
         objective: what is maximised; a noisy number, because a render is.
         gradient: (d,) float32 derivative of the objective with respect to u, or None where it was not asked for.
-        success: the model's answer is what is sought, by the task. Never derived from the objective.
+        success: the model's prediction is what is sought, by the task. Never derived from the objective.
         non_finite: gradient elements that were NaN or infinite and were set to zero where they arose.
         cost: pictures that were rendered for it, at least 1: one, and those that differences took, each times
             `samples`. An adjoint is not a picture and counts 0; `SearchResult.gradients` counts it. 0 of a row of a
@@ -125,10 +126,10 @@ class Evaluation:
         """What the task says.
 
         Raises:
-            RuntimeError: there is no task, or another answer was wanted.
+            RuntimeError: there is no task, or something else was wanted.
         """
         if self.judgement is None:
-            raise RuntimeError("this answer has no judgement")
+            raise RuntimeError("this evaluation has no judgement")
         return self.judgement
 
     @property
@@ -231,7 +232,7 @@ class Policy(ABC, Generic[State]):
     @property
     @abstractmethod
     def uses_gradient(self) -> bool:
-        """Whether it ever asks for a gradient. A class with a fixed answer just sets the attribute."""
+        """Whether it ever asks for a gradient. A class where that is fixed just sets the attribute."""
 
     @abstractmethod
     def start(self, domain: Domain, generator: torch.Generator, steps: int) -> State:
@@ -277,8 +278,8 @@ class Policy(ABC, Generic[State]):
         """Return what the policy did about the evaluations so far; nothing where it takes them as they come."""
         return NO_COUNTS
 
-    def answer(self, state: State) -> Distribution | None:
-        """Return the distribution that the search has reached, where that is its answer beside the best configuration
+    def distribution(self, state: State) -> Distribution | None:
+        """Return the distribution that the search has reached, where that is its result beside the best configuration
         that it met; None where there is none (yet)."""
         return None
 

@@ -2,7 +2,7 @@
 
 Each of logits comes in two forms over label sets, both to be *maximised*:
 
-- plain, `f(logits, images, labels)`: away from the label set Y of right answers;
+- plain, `f(logits, images, labels)`: away from the label set Y of right labels;
 - targeted, `targeted_f(logits, images, target)`: towards a target T, which is a label set as well.
 
 Arguments are logits (N, C), images (N, H, W, 3), which none of these look at, and class indices. Values are (N,), of
@@ -44,12 +44,12 @@ def margin(logits: Tensor, images: Tensor, labels: Labels) -> Tensor:
 
 
 def targeted_margin(logits: Tensor, images: Tensor, target: Labels) -> Tensor:
-    """max over t in T of z_t, minus max over j not in T of z_j: over 0 exactly where the answer is in T."""
+    """max over t in T of z_t, minus max over j not in T of z_j: over 0 exactly where the prediction is in T."""
     return target_lead(logits, target)
 
 
 def log_odds(logits: Tensor, images: Tensor, labels: Labels) -> Tensor:
-    """The log-odds of a wrong answer: like cross-entropy all classes count, and the gradient never fades.
+    """The log-odds of a wrong prediction: like cross-entropy all classes count, and the gradient never fades.
 
     log((1 - p) / p) with p the total probability of Y, as logsumexp over j not in Y minus logsumexp over Y. A growing
     function of `cross_entropy`, so the two rank configurations alike; between it and `margin` lies at most the
@@ -65,7 +65,7 @@ def targeted_log_odds(logits: Tensor, images: Tensor, target: Labels) -> Tensor:
 
 
 def cross_entropy(logits: Tensor, images: Tensor, labels: Labels) -> Tensor:
-    """Minus the logarithm of the probability of the right answers, in nats.
+    """Minus the logarithm of the probability of the right labels, in nats.
 
     -log p = softplus(l) with l the `log_odds`: that form neither overflows for logits of thousands nor cancels where p
     is near 1. Its slope in l is 1 - p and would be lost where the model is sure. So below l = `SUREST`, where the value
@@ -97,7 +97,7 @@ def dlr(logits: Tensor, images: Tensor, labels: Labels) -> Tensor:
     ties leave it finite and the value within 1 / `RELIEF`; where all logits are the same, it is 1.
 
     Without scale there is no way to say *how far* beyond the others a logit lies. So the value is no measure of
-    confidence: with p_2 = p_3 behind a right answer it is -1, however sure the model is.
+    confidence: with p_2 = p_3 behind a right prediction it is -1, however sure the model is.
 
     Raises:
         InputError: fewer than two wrong classes. Of two numbers only the order is left without scale and offset.
@@ -187,8 +187,8 @@ def feature_distance(features: ReadFeatures, clean: Tensor) -> Callable[[Tensor,
 
     The idea is that of Sabour et al. 2016, who lead a picture's features to those of another one; here they lead away.
 
-    It looks at no label: it needs no right answer, leads to no class in particular, and what counts as success is
-    checked by the answer as ever. Where f0 is zero its length counts as 1.
+    It looks at no label: it needs no right label, leads to no class in particular, and what counts as success is
+    checked by the prediction as ever. Where f0 is zero its length counts as 1.
 
     Args:
         features: differentiable; called once here, and once more per evaluation, which costs one more run of the
@@ -252,12 +252,12 @@ def _away(reference: Tensor) -> Tensor:
 def _reference(features: ReadFeatures, clean: Tensor) -> Tensor:
     """Return the mean features (F,) of the clean pictures."""
     with torch.no_grad():
-        found = features(clean if clean.dim() == 4 else clean[None])
-    if found.dim() != 2:
-        raise InputError(f"objective: expected features of shape (N, F), got {tuple(found.shape)}")
-    if not bool(torch.isfinite(found).all()):
+        reference = features(clean if clean.dim() == 4 else clean[None])
+    if reference.dim() != 2:
+        raise InputError(f"objective: expected features of shape (N, F), got {tuple(reference.shape)}")
+    if not bool(torch.isfinite(reference).all()):
         raise InputError(
             "objective: expected finite features of the clean picture, got NaN or infinity; check that the "
-            "model answers it"
+            "model predicts it"
         )
-    return found.mean(dim=0)
+    return reference.mean(dim=0)

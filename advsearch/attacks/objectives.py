@@ -5,7 +5,7 @@ An objective is a callable `(output, images, truth) -> values`, the larger the n
 - output: of the model for N pictures, as its task takes it; in classification logits (N, C) float32;
 - images: (N, H, W, 3) float32 that the model saw, display-referred sRGB in [0, 1];
 - truth: what is true of the scene, as the task has it; in classification the indices of the label set Y, every one of
-  which is a right answer;
+  which is a right label;
 - values: (N,), differentiable.
 
 What `get_objective` returns is called with a fourth argument where there is a configuration: `more`, which gives what a
@@ -41,7 +41,7 @@ ASKED = ("u", "texture", "textures", "inputs", "configuration")
 """What a function may ask for by the names of further parameters."""
 
 TRUTHS = ("target", "targets", "labels", "label", "truth")
-"""What the second of two parameters is called in a loss of outputs and right answers alone."""
+"""What the second of two parameters is called in a loss of outputs and right labels alone."""
 
 IMAGES = ("images", "image")
 """What the second of two parameters is called in a function that forgot the third."""
@@ -87,8 +87,10 @@ def form_of(function: Callable[..., Any]) -> Form:
     asked = tuple(
         one.name for one in signature.parameters.values() if one.name in ASKED and one.name not in by_position[:2]
     )
-    own = [name for name in by_position if name not in asked]
-    images = not (len(own) >= 2 and (own[1] in TRUTHS or (len(own) == 2 and own[1] not in (*IMAGES, *ASKED))))
+    unnamed = [name for name in by_position if name not in asked]
+    images = not (
+        len(unnamed) >= 2 and (unnamed[1] in TRUTHS or (len(unnamed) == 2 and unnamed[1] not in (*IMAGES, *ASKED)))
+    )
     images = images or any(one.kind is one.VAR_POSITIONAL for one in signature.parameters.values())
     try:
         signature.bind(*([None] * (3 if images else 2)), **dict.fromkeys(asked))
@@ -119,7 +121,7 @@ def checked(function: Callable[..., Tensor]) -> Objective:
             if not (isinstance(given[2], tuple) and "not tuple" in str(error)):
                 raise
             raise InputError(
-                f"objective {name!r}: expected one right answer for a loss of torch, got {len(truth)} (indices "
+                f"objective {name!r}: expected one right label for a loss of torch, got {len(truth)} (indices "
                 f"{truth}); use those of advsearch.losses, or name one with `label`"
             ) from error
         if isinstance(values, Tensor) and values.ndim == 0 and count > 1:
@@ -179,13 +181,13 @@ def _values(name: str, values: Any, count: int) -> Tensor:
             f"objective {name!r}: expected floating-point values, got {values.dtype}; a count or a comparison has "
             "no gradient"
         )
-    found: Tensor = values.reshape(1) if values.ndim == 0 and count == 1 else values
-    if found.shape != (count,):
+    by_picture: Tensor = values.reshape(1) if values.ndim == 0 and count == 1 else values
+    if by_picture.shape != (count,):
         raise InputError(
-            f"objective {name!r}: expected one value per image, shape ({count},), got {tuple(found.shape)}; "
+            f"objective {name!r}: expected one value per image, shape ({count},), got {tuple(by_picture.shape)}; "
             "reduce over everything but the first axis"
         )
-    return found
+    return by_picture
 
 
 def labels_of(truth: Any, output: Any, count: int) -> Any:
@@ -212,7 +214,7 @@ class ObjectiveKind:
     """What is known about a named objective.
 
     Args:
-        plain: the function of the right answers, which may ask for more as a user's own does; None for one that has to
+        plain: the function of the right labels, which may ask for more as a user's own does; None for one that has to
             be made for a run.
         targeted: the same, of a target in their place; None if it has no such form.
         task: name of the task whose outputs it takes, and of those tasks that are kinds of it; None for any.
@@ -275,8 +277,8 @@ _OWN = {
             ObjectiveKind(name, summary, unit, getattr(functions, name), getattr(functions, f"targeted_{name}"))
             for name, summary, unit in (
                 ("margin", "the largest wrong logit minus the largest right one", "logits (log-odds)"),
-                ("log_odds", "the log-odds of a wrong answer, over all classes", "logits (log-odds)"),
-                ("cross_entropy", "minus the logarithm of the probability of the right answers", "nats"),
+                ("log_odds", "the log-odds of a wrong prediction, over all classes", "logits (log-odds)"),
+                ("cross_entropy", "minus the logarithm of the probability of the right labels", "nats"),
                 ("dlr", "the margin over a distance between logits: independent of their scale", "none (a ratio)"),
             )
         ),
@@ -289,7 +291,7 @@ _OWN = {
             task=Similarity.name, of_features=functions.cosine_distance,
         ),
         ObjectiveKind(
-            "score", "the task's own score, over 0 where an answer is a success; in classification the margin",
+            "score", "the task's own score, over 0 where a prediction is a success; in classification the margin",
             "that of the task", task=None, of_task=_score_of,
         ),
         *(
@@ -348,7 +350,7 @@ def get_objective(
 
     Args:
         objective: a name, or a function of (output, images, truth) or of (output, labels), which may ask for more.
-        task: judges the model; classification of any wrong answer if None.
+        task: judges the model; classification of any wrong prediction if None.
         features: for an objective that `needs_features`: `advsearch.models.features.features_of(model)`.
         clean: likewise: the clean picture (H, W, 3), or renders of it (N, H, W, 3).
 
@@ -358,9 +360,9 @@ def get_objective(
     task = task or Classification()
     targeted = task.target is not None
     check_objective(objective, task.name, targeted=targeted, minimise=task.minimise)
-    kind, of_answers = _kind_of(objective), False
+    kind, by_task = _kind_of(objective), False
     if kind is None:
-        found = checked(objective)  # type: ignore[arg-type]
+        function = checked(objective)  # type: ignore[arg-type]
     elif kind.of_task is not None:
         return kind.of_task(task) if _OWN.get(kind.name) is kind else _handed(kind.of_task(task))
     elif kind.of_features is not None:
@@ -369,19 +371,19 @@ def get_objective(
                 f"objective {kind.name!r}: expected the model's features and a clean picture, got none; use "
                 "get_objective(name, features=advsearch.models.features.features_of(model), clean=picture)"
             )
-        found = _plain(kind.of_features(features, clean))
-        found = found if _OWN.get(kind.name) is kind else _handed(found)
+        function = _plain(kind.of_features(features, clean))
+        function = function if _OWN.get(kind.name) is kind else _handed(function)
     else:
         form = kind.form(targeted=targeted)
-        found = _plain(form) if _OWN.get(kind.name) is kind else checked(form)
-        of_answers = isinstance(task, Similarity) or (isinstance(task, ClassTask) and bool(task.nothing))
+        function = _plain(form) if _OWN.get(kind.name) is kind else checked(form)
+        by_task = isinstance(task, Similarity) or (isinstance(task, ClassTask) and bool(task.nothing))
 
     looks = kind is None and targeted
 
     def sought(output: Any, images: Tensor, truth: Any, more: More = nothing_more, /) -> Tensor:
         nonlocal looks
         wanted = task.target if targeted else truth
-        value = found(task.answerable(output, wanted) if of_answers else output, images, wanted, more)
+        value = function(task.as_logits(output, wanted) if by_task else output, images, wanted, more)
         if looks and value.requires_grad and isinstance(output, Tensor) and output.ndim == 2 and output.requires_grad:
             looks = False
             _warn_of_direction(name_of(objective), value, output, wanted)  # type: ignore[arg-type]
@@ -410,7 +412,7 @@ def check_objective(
     Args:
         task: name of the task whose outputs it will get.
         targeted: whether there is a target.
-        minimise: whether a right answer is sought.
+        minimise: whether a right prediction is sought.
 
     Raises:
         UnknownNameError: no such name.

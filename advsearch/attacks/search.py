@@ -83,11 +83,11 @@ class SearchResult:
     """What a search claims. Only `verify` turns a claim into a finding (docs/design.md, "Verification").
 
     Attributes:
-        best_u: (d,) float32, the answer; the start if nothing could be evaluated.
-        best_objective: mean objective of the answer in its new renders; its raw one if it had none. NaN if nothing
+        best_u: (d,) float32, the configuration that the search found; the start if nothing could be evaluated.
+        best_objective: mean objective of `best_u` in its new renders; its raw one if it had none. NaN if nothing
             could be evaluated, or one of these renders was not finite.
-        claimed_objective: the answer's raw objective in the search, biased upwards.
-        success_rate: fraction of the answer's new renders (else of its one raw render) that the model got wrong.
+        claimed_objective: the raw objective in the search, biased upwards.
+        success_rate: fraction of its new renders (else of its one raw render) that the model got wrong.
         ending: FOUND if that fraction is at least a half; else why the search stopped. INTERRUPTED takes precedence.
         stopped: why the loop stopped, whatever it had found.
         history: one record per evaluation of the search itself.
@@ -100,7 +100,7 @@ class SearchResult:
         agreement: cosines of gradients with those before them, in their order: what noise and the way between left of
             them; none for gradients of zero.
         counts: what the policy had to do about gradients and steps.
-        distribution: what the policy answers beside `best_u`, if it is one that answers with a distribution.
+        distribution: what the policy found beside `best_u`, if it is one that finds a distribution.
         failures: what the policy knows of different failures, if it is one that looks for them.
     """
 
@@ -152,10 +152,10 @@ def search(
        `samples` of the proposal. What cannot be paid is not asked for (`affordable`): no more samples than there are
        renders left, and no gradient after which none would be left to use it, so never in the last evaluation.
     2. The `candidates` best distinct configurations are each evaluated `repeats` times more, with new seeds
-       that are the same for all, without gradient. The best by these renders is the answer (see `candidates`). With
-       `candidates=0`, for an objective without noise, the raw best is the answer. Where evaluations draw conditions
-       (`Domain.drawn`), the raw best had easy ones, and the last configuration, to which all of them led, takes the
-       place of the worst candidate. Those that are not clearly worse
+       that are the same for all, without gradient. The best by these renders is what the search found (see
+       `candidates`). With `candidates=0`, for an objective without noise, the raw best is what it found. Where
+       evaluations draw conditions (`Domain.drawn`), the raw best had easy ones, and the last configuration, to which
+       all of them led, takes the place of the worst candidate. Those that are not clearly worse
        than the best by then are rendered again, up to `close` times more (see `candidates.contenders`).
 
     A policy that does not handle discrete choices is wrapped in `Choices` where the domain has some.
@@ -248,7 +248,7 @@ class _Log:
         ]
         for proposal, query, raw in zip(proposals, queries, self.evaluate(queries), strict=True):
             seconds = time.perf_counter() - begun
-            _check_answer(raw, proposal, self.domain)
+            _check_evaluation(raw, proposal, self.domain)
             evaluation = usable(raw)
             self.gradients += bool(proposal.gradient)
             self.renders += raw.cost
@@ -256,8 +256,8 @@ class _Log:
                 self.non_finite += 1
             elif phase == "search":
                 self.best = max(evaluation.objective, self.best) if self.best == self.best else evaluation.objective
-                found = Candidate(proposal.u, evaluation.objective, evaluation.success)
-                self.pool, self.last = admit(self.pool, found, self.size), found
+                candidate = Candidate(proposal.u, evaluation.objective, evaluation.success)
+                self.pool, self.last = admit(self.pool, candidate, self.size), candidate
             self.records.append(
                 StepRecord(
                     step=query.number,
@@ -306,12 +306,12 @@ def _explore(log: _Log, policy: Policy[Any], steps: int, seed: int, late: Late) 
         for proposal in proposals:
             _check_inside(proposal, log.domain, name)
             if left > 0:
-                own = replace(proposal, u=proposal.u.clone())  # a policy may write into its own later
-                batch.append(affordable(own, log.domain, left))
+                copied = replace(proposal, u=proposal.u.clone())  # a policy may write into its own later
+                batch.append(affordable(copied, log.domain, left))
                 left -= batch[-1].cost(log.domain)
         log.state, log.told, over, first = state, [], False, len(log.records)
-        answers = log.evaluated(batch, range(first, first + len(batch)), "search")
-        for proposal, evaluation in zip(batch, answers, strict=True):
+        evaluations = log.evaluated(batch, range(first, first + len(batch)), "search")
+        for proposal, evaluation in zip(batch, evaluations, strict=True):
             log.told.append((proposal.u, evaluation))
             in_a_row = 0 if evaluation.finite else in_a_row + 1
             if in_a_row == NON_FINITE_LIMIT:
@@ -338,28 +338,28 @@ def _rank(log: _Log, first_index: int, repeats: int, close: int) -> None:
 def _look(log: _Log, indices: Sequence[int]) -> None:
     """Render every candidate again with the same seeds."""
     pool = log.pool
-    answers = log.evaluated([Proposal(one.u) for one in pool for _ in indices], [*indices] * len(pool), "ranking")
+    evaluations = log.evaluated([Proposal(one.u) for one in pool for _ in indices], [*indices] * len(pool), "ranking")
     for place, candidate in enumerate(pool):
         again, successes = candidate.again, candidate.successes
-        for answer in islice(answers, len(indices)):
-            again, successes = (*again, answer.objective), successes + answer.success
+        for evaluation in islice(evaluations, len(indices)):
+            again, successes = (*again, evaluation.objective), successes + evaluation.success
             seen = replace(candidate, again=again, successes=successes)
             log.pool = (*log.pool[:place], seen, *pool[place + 1 :])
 
 
 def _result(log: _Log, stopped: Ending, seconds: float) -> SearchResult:
     nothing = Candidate(log.domain.start, math.nan, False)
-    answer = best(log.pool) if log.pool else nothing
-    found = answer.rate >= 0.5 and stopped is not Ending.INTERRUPTED
+    chosen = best(log.pool) if log.pool else nothing
+    found = chosen.rate >= 0.5 and stopped is not Ending.INTERRUPTED
     ending = Ending.FOUND if found else stopped
     policy, state = (log.policy, log.state) if log.state is not None else (None, None)
     if policy is not None and log.told:  # a batch that was cut
         state = policy.update(state, log.told)
     return SearchResult(
-        best_u=answer.u,
-        best_objective=answer.believed if math.isfinite(answer.believed) else math.nan,
-        claimed_objective=answer.objective,
-        success_rate=answer.rate,
+        best_u=chosen.u,
+        best_objective=chosen.believed if math.isfinite(chosen.believed) else math.nan,
+        claimed_objective=chosen.objective,
+        success_rate=chosen.rate,
         ending=ending,
         stopped=stopped,
         history=tuple(r for r in log.records if r.phase == "search"),
@@ -371,7 +371,7 @@ def _result(log: _Log, stopped: Ending, seconds: float) -> SearchResult:
         seconds=seconds,
         agreement=tuple(log.agreement),
         counts=NO_COUNTS if policy is None else policy.counts(state),
-        distribution=None if policy is None else policy.answer(state),
+        distribution=None if policy is None else policy.distribution(state),
         failures=None if policy is None else policy.failures(state),
     )
 
@@ -391,7 +391,7 @@ def _check_inside(proposal: Proposal, domain: Domain, name: str) -> None:
         raise RuntimeError(f"policy {name!r} left its budget by {outside:.3g}; it must project what it proposes")
 
 
-def _check_answer(evaluation: Evaluation, proposal: Proposal, domain: Domain) -> None:
+def _check_evaluation(evaluation: Evaluation, proposal: Proposal, domain: Domain) -> None:
     """Raise RuntimeError unless a gradient came as it was asked for, at the cost that the domain said: the budget rests
     on that."""
     gradient, least, most = evaluation.gradient, proposal.samples, proposal.cost(domain)

@@ -251,7 +251,7 @@ def margins_of(
             Query(u, seed, kind, row, spp=spp, drawn=drawn, sought=sought, keep=number < keep)
             for row, (seed, number) in asked
         ]
-        return [answer.said.score for answer in evaluate(queries)]
+        return [evaluation.said.score for evaluation in evaluate(queries)]
 
     return margins
 

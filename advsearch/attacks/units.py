@@ -1,15 +1,17 @@
-"""Shares of answers that are not independent: frames of a drive, and what several models say of a picture, share one
-draw. What was drawn, the *unit*, is independent of others, so that intervals and tests are over units.
+"""Shares of predictions that are not independent: frames of a drive, and what several models say of a picture, share
+one draw. What was drawn, the *unit*, is independent of others, so that intervals and tests are over units.
 
-Of units with o_u answers each, of which k_u count, the share is sum k_u / sum o_u. With m for the true one and O for
-the largest o_u, a gambler who stakes a share c of what he has, at each unit, on "more than m" has a game in which he
+Of units with o_u predictions each, of which k_u count, the share is sum k_u / sum o_u. With m for the true one and O
+for the largest o_u, a gambler who stakes a share c of what he has, at each unit, on "more than m" has a game in which
+he
 wins nothing on average:
 
     K(m, c) = prod_u (1 - c o_u / O + c k_u / (O m))
 
 So K exceeds 2 / a with a probability of a / 2 at most (Markov), whatever units are like and however few there are, also
 where each has a share of its own (the product's mean is at most 1, by the inequality of the means). These are the bets
-of `trials.ConfidenceSequence`, whose stakes they take (Waudby-Smith and Ramdas 2024). Where each unit has one answer,
+of `trials.ConfidenceSequence`, whose stakes they take (Waudby-Smith and Ramdas 2024). Where each unit has one
+prediction,
 the exact tests of independent ones are taken, which are sharper: Clopper and Pearson, Newcombe, McNemar.
 """
 
@@ -42,16 +44,17 @@ def per_unit(values: npt.ArrayLike, units: Units) -> Numbers:
 
 
 def share_interval(counted: npt.ArrayLike, of: npt.ArrayLike, confidence: float = CONFIDENCE) -> tuple[float, float]:
-    """Return the interval of a share of answers, from the counts of independent units; it holds at any number of them.
+    """Return the interval of a share of predictions, from the counts of independent units; it holds at any number of
+    them.
 
     Args:
         counted: (n,) of each unit, from 0 to `of`.
-        of: (n,) answers of each unit, from 0; one of them is over 0 at least.
+        of: (n,) predictions of each unit, from 0; one of them is over 0 at least.
         confidence: between 0 and 1.
     """
     k, o = np.asarray(counted, dtype=np.float64), np.asarray(of, dtype=np.float64)
     if k.shape != o.shape or not o.size or o.max() <= 0 or (k < 0).any() or (k > o).any():
-        raise InputError("share: expected counts from 0 to the answers of each unit, and one answer at least")
+        raise InputError("share: expected counts from 0 to the predictions of each unit, and one prediction at least")
     if o.max() == 1.0:
         return clopper_pearson(round(k.sum()), round(o.sum()), confidence)
     return _by_bets(k, o, confidence)
@@ -107,7 +110,7 @@ def _capital(mean: float, counted: Numbers, of: Numbers, times: npt.NDArray[Any]
 
 
 SHARES = np.linspace(0.0, 1.0, 402)[1:-1]
-"""Of right answers on both sides, at which two shares are compared."""
+"""Of right predictions on both sides, at which two shares are compared."""
 
 EXCHANGES = 9_999
 """How often units are dealt out anew, so that no probability is under 0.0001."""
@@ -116,15 +119,16 @@ EXCHANGES = 9_999
 def fewer_by_chance(
     inside: npt.ArrayLike, of: npt.ArrayLike, beside: npt.ArrayLike, rest: npt.ArrayLike, times: float = 1.0
 ) -> float:
-    """Return how likely it is, in (0, 1], that so few answers or fewer are right on one side of a rule, if as many are
-    right on the other.
+    """Return how likely it is, in (0, 1], that so few predictions or fewer are right on one side of a rule, if as many
+    are right on the other.
 
-    Where each unit has one answer that is Fisher's exact test, one-sided. Where all units have as many and lie on one
-    side each, units are dealt out to the sides anew. Where the rule cuts through units, it is one over the least that
-    bets on "fewer here than m, more there" have made of 1, of all m: a bound, also where sides of a unit are alike.
+    Where each unit has one prediction that is Fisher's exact test, one-sided. Where all units have as many and lie on
+    one side each, units are dealt out to the sides anew. Where the rule cuts through units, it is one over the least
+    that bets on "fewer here than m, more there" have made of 1, of all m: a bound, also where sides of a unit are
+    alike.
 
     Args:
-        inside, of: (n,) of each unit, right answers and answers under the rule.
+        inside, of: (n,) of each unit, right predictions and predictions under the rule.
         beside, rest: (n,) those elsewhere.
         times: how many times there are each of these units.
     """
@@ -141,9 +145,9 @@ def fewer_by_chance(
         drawn = rng.multivariate_hypergeometric(copies, min(dealt, int(copies.sum())), EXCHANGES, method="marginals")
         return float((1 + (drawn @ values <= times * k.sum() + 1e-9).sum()) / (1 + EXCHANGES))
     rows, copies = np.unique(np.stack([a - k, a, r, b], axis=1), axis=0, return_counts=True)
-    wrong, own, right, others = rows.T
-    half = np.where((own > 0) & (others > 0), 0.5, 1.0)[:, None]
-    bets = half * (wrong[:, None] / (1.0 - SHARES) - own[:, None]) / a.max()
+    wrong, under, right, others = rows.T
+    half = np.where((under > 0) & (others > 0), 0.5, 1.0)[:, None]
+    bets = half * (wrong[:, None] / (1.0 - SHARES) - under[:, None]) / a.max()
     bets += half * (right[:, None] / SHARES - others[:, None]) / b.max()
     with np.errstate(divide="ignore"):
         won = [times * (copies[:, None] * np.log(np.maximum(1.0 + stake * bets, 0.0))).sum(axis=0) for stake in STAKES]

@@ -1,5 +1,5 @@
-"""The independent re-check of a search's answer (docs/design.md, "Verification"): fresh seeds, enough samples, 8 bits,
-a task that judges, and a control group of the clean configuration. A verdict's rule stands here only."""
+"""The independent re-check of what a search found (docs/design.md, "Verification"): fresh seeds, enough samples, 8
+bits, a task that judges, and a control group of the clean configuration. A verdict's rule stands here only."""
 
 from __future__ import annotations
 
@@ -39,9 +39,9 @@ class Ending(Enum):
 
 
 _EXPLANATIONS = {
-    Ending.FOUND: "A configuration inside the budget makes the model answer wrongly.",
-    Ending.BUDGET_SPENT: "All renders were spent and no configuration made the model answer wrongly.",
-    Ending.NOT_VERIFIED: "The search claimed a wrong answer, but it did not hold in the trials with fresh seeds.",
+    Ending.FOUND: "A configuration inside the budget makes the model wrong.",
+    Ending.BUDGET_SPENT: "All renders were spent and no configuration made the model wrong.",
+    Ending.NOT_VERIFIED: "The search claimed a wrong prediction, but it did not hold in the trials with fresh seeds.",
     Ending.ALREADY_WRONG: "The model is wrong on the clean configuration already, so there is nothing to attack.",
     Ending.STALLED: "The policy had nothing more to propose before the budget was spent.",
     Ending.NON_FINITE: "The objective was NaN or infinite several times in a row.",
@@ -168,7 +168,7 @@ class Verification:
         ending: the run's ending; FOUND only if `Rule.verdict` says so.
         reason: one sentence with the numbers behind it.
         u: (d,) the configuration verified, projected into its budget again.
-        clean: right answers of the control group.
+        clean: right predictions of the control group.
         adversarial: successes, by `Rule.succeeded`.
         clean_trials, adversarial_trials: every single trial, in the order of their seeds; of curtailed ones the second
             group is the shorter.
@@ -244,8 +244,8 @@ def run_trials(
         Query(u, trial_seed(seed, number), kind, number, spp=spp, keep=number < begin + keep)
         for number in range(begin + first, begin + trials)
     ]
-    for answer in evaluate(queries):
-        done.append(answer.said)
+    for evaluation in evaluate(queries):
+        done.append(evaluation.said)
         if until is not None and until(done):
             return tuple(done)
     if len(done) != len(queries):
@@ -254,7 +254,7 @@ def run_trials(
 
 
 def count_right(trials: Sequence[Judgement], spp: int) -> Trials:
-    """Count the right answers of a control group."""
+    """Count the right predictions of a control group."""
     return Trials(sum(trial.right for trial in trials), len(trials), spp)
 
 
@@ -275,11 +275,11 @@ def verify(
     curtailed: bool = False,
     begin: int = 0,
 ) -> Verification:
-    """Check a search's answer in fresh trials against the clean configuration as control group.
+    """Check what a search found in fresh trials against the clean configuration as control group.
 
     See `Rule` for what counts as a success, and for the ending. KeyboardInterrupt passes through.
 
-    Several numbers of trials, such as `TRIAL_LOOKS`, are looks: the trials end at the first at which the answer is
+    Several numbers of trials, such as `TRIAL_LOOKS`, are looks: the trials end at the first at which that is
     found. Over conditions, those that count are looked at (`OVER_LOOKS`), and the last look is at all.
 
     Curtailed trials end with the first failure that is one more than the rule allows of all of them. The verdict is
@@ -292,7 +292,7 @@ def verify(
     Args:
         evaluate: answers the queries; see `Query`.
         domain: the budget; the clean configuration is its start.
-        u: (d,) the answer; projected into the domain again.
+        u: (d,) the adversarial configuration; projected into the domain again.
         claim: the search's ending.
         spp: samples per pixel, from `choose_spp`.
         seed: root seed. Must not be one that the search rendered with through the same stream.
@@ -300,11 +300,11 @@ def verify(
         clean: the first trials of the clean configuration, where `run_trials` has run them with the same spp and seed
             (one control group serves the attack and its baseline); what is missing is run here.
         rule: when the claim counts.
-        kind: of the rows of the answer's trials.
+        kind: of the rows of its trials.
         control: of the rows of those of the clean configuration.
         keep: the pictures of so many of them are wanted.
-        curtailed: see above; for an answer of which only the verdict matters.
-        begin: the number of the first trial: of an answer that was chosen by its trials, that of fresh ones.
+        curtailed: see above; where of what was found only the verdict matters.
+        begin: the number of the first trial: of a configuration that was chosen by its trials, that of fresh ones.
 
     Raises:
         InputError: trials or spp under 1.

@@ -58,8 +58,8 @@ class QuestionCommand:
     """A command that asks a question.
 
     Attributes:
-        name: of the command; `advsearch.config.CONFIGS` has its settings, and `advsearch.api.carry_out` answers them.
-        answer: makes a text for a person of its result; what is shown of it where it has no other.
+        name: of the command; `advsearch.config.CONFIGS` has its settings, and `advsearch.api.carry_out` asks with them.
+        text: makes a text for a person of its result; what is shown of it where it has no other.
         short: whether a result falls short of what was checked.
         about: the setting that names runs, or a file, which the question is about; `--code` allows Python code that
             these name.
@@ -70,7 +70,7 @@ class QuestionCommand:
     """
 
     name: str
-    answer: Callable[[Any], str] = output.shown_text
+    text: Callable[[Any], str] = output.shown_text
     short: Callable[[Any], bool] = lambda result: False
     about: str = ""
     place: Positional | None = None
@@ -146,13 +146,13 @@ class QuestionCommand:
         return config_from(args, config, **over)
 
     def carry_out(self, config: Config, *, as_json: bool, quiet: bool, resumed: Path | None = None) -> int:
-        """Ask what `config` describes, or go on with it; print the answer and return the exit status."""
+        """Ask what `config` describes, or go on with it; print the result and return the exit status."""
         with at_work(as_json=as_json, quiet=quiet) as progress:
             # late, so that --help answers at once
             from advsearch.api import carry_out
 
             result = carry_out(config, progress=progress, resumed=resumed)
-        status = output.finish(result, self.answer, as_json=as_json)
+        status = output.finish(result, self.text, as_json=as_json)
         return status or (output.FELL_SHORT if self.short(result) else 0)
 
 
@@ -169,7 +169,7 @@ GROUPS = {
         "recipe": "",
         "harden": "",
     },
-    "look: at scenes, names and answers": {
+    "look: at scenes, names and predictions": {
         "render": "advsearch.cli.show:RENDER render a picture of a scene, and say what the model sees in it",
         "show": "advsearch.cli.show:SHOW "
         "show what a run found, or the details of a control, a policy, a task or a recipe",
@@ -180,7 +180,7 @@ GROUPS = {
         "list all names: objects, environments, controls, policies, tasks, objectives, models and recipes",
         "labels": "advsearch.cli.show:LABELS find the names of a model's classes, as --label takes them",
     },
-    "trust: does an answer hold, and is the tool right?": {
+    "trust: does a result hold, and is the tool right?": {
         "test": "",
         "replay": "",
         "check": "",

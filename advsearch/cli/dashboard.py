@@ -21,8 +21,8 @@ from advsearch.viewer.pages import renewed
 from advsearch.viewer.server import Dashboard
 
 if TYPE_CHECKING:
-    from advsearch.questions.photographs.answer import PhotoAgreement
     from advsearch.questions.photographs.carry_out import Photographs
+    from advsearch.questions.photographs.result import PhotoAgreement
 
 PORT = 8265
 

@@ -72,8 +72,8 @@ def told(as_json: bool = False) -> int:
     parts = diagnose()
     good = all(part.status in (OK, WARNING) for part in parts)
     if as_json:
-        answer = {"schema": 1, "command": "doctor", "ok": good, "parts": [asdict(part) for part in parts]}
-        print(json.dumps(answer, indent=2))
+        outcome = {"schema": 1, "command": "doctor", "ok": good, "parts": [asdict(part) for part in parts]}
+        print(json.dumps(outcome, indent=2))
     else:
         _print_table(parts, good)
     return 0 if good else output.FELL_SHORT
@@ -111,8 +111,8 @@ def run_probe(command: Sequence[str] = PROBE) -> dict[str, tuple[bool, str]]:
     tried = {}
     for line in output.splitlines():
         try:
-            answer = json.loads(line)
-            tried[answer["name"]] = (bool(answer["ok"]), str(answer["detail"]))
+            outcome = json.loads(line)
+            tried[outcome["name"]] = (bool(outcome["ok"]), str(outcome["detail"]))
         except (ValueError, KeyError, TypeError):  # a library's own words
             continue
     tried[""] = (status == 0, _ending(status, errors))

@@ -83,10 +83,10 @@ def main() -> int:
         printed = io.StringIO()
         try:
             with contextlib.redirect_stdout(printed):
-                answer = {"name": name, "ok": True, "detail": trial()}
+                outcome = {"name": name, "ok": True, "detail": trial()}
         except Exception as error:
-            answer = {"name": name, "ok": False, "detail": f"{type(error).__name__}: {error}"}
-        print(json.dumps(answer), flush=True)
+            outcome = {"name": name, "ok": False, "detail": f"{type(error).__name__}: {error}"}
+        print(json.dumps(outcome), flush=True)
     return 0
 
 

@@ -154,7 +154,7 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--paper", help="print: a4, a3 or letter (default: a4)")
     parser.add_argument(
         "--all", action="store_true", default=None,
-        help="coco, yolo: right answers too (default: pictures that a model is wrong about)",
+        help="coco, yolo: right predictions too (default: pictures that a model is wrong about)",
     )  # fmt: skip
     output.add_code_flag(parser)
     parser.add_argument("--icc", metavar="FILE", help="print: ICC profile of an RGB printer (default: sRGB)")

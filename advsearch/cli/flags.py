@@ -58,6 +58,9 @@ def add_settings(
             add(action="store_const", const=not setting.default)
         else:
             add(action="store" if setting.form == "text" else "append", metavar=setting.metavar)
+        for old in (old for old, new in config.formerly.items() if new == setting.field):
+            flag, hidden = f"--{old.replace('_', '-')}", argparse.SUPPRESS
+            headings[setting.group].add_argument(flag, dest=setting.field, default=hidden, help=hidden)
 
 
 def config_from(args: argparse.Namespace, config: type[AnyConfig], **otherwise: Any) -> AnyConfig:

@@ -168,13 +168,13 @@ def print_json(value: Any) -> None:
     print(text.replace("\x7f", "\\u007f"))  # JSON escapes all others that a terminal would not show
 
 
-def finish(result: Result, answer: Callable[[Any], str], *, as_json: bool) -> int:
-    """Print the last word of a command, as JSON or as the text for a person that `answer` makes, and return its exit
+def finish(result: Result, text: Callable[[Any], str], *, as_json: bool) -> int:
+    """Print the last word of a command, as JSON or as the text for a person that `text` makes, and return its exit
     status."""
     if as_json:
         print_json(result)
     else:
-        print(answer(result) + go_on_text(result))
+        print(text(result) + go_on_text(result))
     stopped = getattr(result, "ending", None) == "interrupted"
     return INTERRUPTED if stopped else OK
 
@@ -226,7 +226,7 @@ def output_kept_clean() -> Iterator[None]:
 
 
 def shown_text(result: Result) -> str:
-    """Return what is shown of an answer as text: what it says, its parts, by what it came about, and notes."""
+    """Return what is shown of a result as text: what it says, its parts, by what it came about, and notes."""
     # late, so that --help answers at once
     from advsearch.cli.flags import with_flags
     from advsearch.report.shown import facts_of, remarks_of, shown
@@ -295,7 +295,7 @@ class LookingProgress:
         self._progress = progress
 
     def stage(self, name: str, total: int | None = None, *, hint: str = "", at_most: bool = False) -> None:
-        """See `Progress.stage`. Raises KeyboardInterrupt where one came that nobody has answered."""
+        """See `Progress.stage`. Raises KeyboardInterrupt where one came that nobody has handled."""
         INTERRUPTS.look()
         self._progress.stage(name, total, hint=hint, at_most=at_most)
 

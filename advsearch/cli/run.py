@@ -79,7 +79,7 @@ def _resume_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _resume(args: argparse.Namespace) -> int:
-    """Do what is left of the run and print its answer; of a run that is done, its answer."""
+    """Do what is left of the run and print its result; of a run that is done, its result."""
     path, changes = find_run(args.run), changes_in(args.change)
     if not (path / CONFIG).is_file():
         raise InputError(f"{path}: expected a run with its {CONFIG}, got none; it was stopped before it began")
@@ -130,7 +130,7 @@ def _runs(args: argparse.Namespace) -> int:
     if not runs:
         print(f"no runs in {folder}/ yet; advsearch attack makes one")
         return 0
-    heads = ["run", "command", "object", "controls", "rows", "state", "answer"]
+    heads = ["run", "command", "object", "controls", "rows", "state", "result"]
     rows = [
         [one.name, one.command, one.object, _several(one.controls), str(one.rows), one.state, one.answer]
         for one in runs

@@ -1,6 +1,6 @@
 """`advsearch show`: what a run found, what a control can vary, the options of a policy or a task, or a recipe.
 
-And what `advsearch render` says: a picture of a scene, or a sheet of views around it, with the model's answers.
+And what `advsearch render` says: a picture of a scene, or a sheet of views around it, with the model's predictions.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from advsearch.runs.summary import NAME, read_result
 
 if TYPE_CHECKING:
     from advsearch.controls import Choice, Parameter
-    from advsearch.questions.photographs.answer import PhotoAgreement
+    from advsearch.questions.photographs.result import PhotoAgreement
 
 
 def _show_arguments(parser: argparse.ArgumentParser) -> None:
@@ -46,9 +46,9 @@ def _show_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _show(args: argparse.Namespace) -> int:
-    """Print the answer of a run, a control's parameters, or the options of a policy or a task."""
+    """Print the result of a run, a control's parameters, or the options of a policy or a task."""
     if args.picture and (args.json or len(args.what) > 1):
-        raise InputError("--picture: draws a run's pictures beside its answer in words; leave out the rest")
+        raise InputError("--picture: draws a run's pictures beside its result in words; leave out the rest")
     match args.what:
         case ["control", name]:
             return _show_control(name, args.json)
@@ -75,17 +75,17 @@ def _show(args: argparse.Namespace) -> int:
 
 
 def show_run(name: str, as_json: bool, *, picture: bool = False) -> int:
-    """Print the answer of a run, or how far one has come that has none yet, and draw its pictures if wanted."""
+    """Print the result of a run, or how far one has come that has none yet, and draw its pictures if wanted."""
     path = find_run(name)
     if not (path / NAME).is_file():
         return _show_unfinished(listed_run(path), as_json)
     result = read_result(path)
-    answer = commands.found(result.command).answer
+    text = commands.found(result.command).text
     photos = photos_of(path)
     if as_json:
         output.print_json({**result.to_dict(), "photos": photos.to_dict()} if photos else result)
     else:
-        print(answer(result) + output.go_on_text(result) + (_photos_text(photos) if photos else ""))
+        print(text(result) + output.go_on_text(result) + (_photos_text(photos) if photos else ""))
     if picture:
         show_pictures(best_pictures(path))
     return 0
@@ -93,7 +93,7 @@ def show_run(name: str, as_json: bool, *, picture: bool = False) -> int:
 
 def photos_of(run: Path) -> PhotoAgreement | None:
     """Return how photographs agree with the run's renderings; None where there are none."""
-    from advsearch.questions.photographs.answer import FOLDER  # works without that room
+    from advsearch.questions.photographs.result import FOLDER  # works without that room
 
     if not (run / IMAGES / FOLDER).is_dir():
         return None
@@ -277,10 +277,10 @@ SHOW = Command(_show_arguments, _show)
 
 
 def render_text(result: RenderResult) -> str:
-    """Return what was written, and the model's answers view by view."""
+    """Return what was written, and the model's predictions view by view."""
     height, width = result.size
     lines = [f"{result.out}: {width} x {height} pixels"]
-    lines += [f"{result.answered}: with the answers drawn in"] if result.answered else []
+    lines += [f"{result.answered}: with the predictions drawn in"] if result.answered else []
     lines += [""]
     if len(result.views) == 1:
         rows = [seen_cells(result.task, one) for one in result.views[0].answers]

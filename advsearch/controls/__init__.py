@@ -61,20 +61,20 @@ def make_control(asked: str, settings: Mapping[str, object] | None = None) -> Co
         UnknownNameError: no such control, or no such setting.
         InputError: a setting is out of range.
     """
-    given: dict[str, Any] = {name: value for name, value in (settings or {}).items() if value is not None}
-    kind, name, parameter = _read_name(asked, given)
+    options: dict[str, Any] = {name: value for name, value in (settings or {}).items() if value is not None}
+    kind, name, parameter = _read_name(asked, options)
     if kind not in CONTROLS:
         raise UnknownNameError("control", kind, CONTROLS)
     control = CONTROLS[kind]
     if parameter is not None:
-        given.setdefault(parameter, _default_range(control, parameter))
-    known = [one.name for one in control.choices] + [one.name for one in control.declared(given)]
-    for setting in given:
+        options.setdefault(parameter, _default_range(control, parameter))
+    known = [one.name for one in control.choices] + [one.name for one in control.declared(options)]
+    for setting in options:
         if setting not in known:
             raise UnknownNameError(f"setting of control {kind}", setting, known)
     if name != kind:
-        given["name"] = name
-    return control(**given)
+        options["name"] = name
+    return control(**options)
 
 
 def names_of(asked: str, given: Mapping[str, object]) -> tuple[str, str]:
@@ -113,16 +113,18 @@ def check_instance(where: str, name: str, colon: str = ":") -> None:
 
 
 def _default_range(control: type[Control], parameter: str) -> object:
-    for one in control.parameters:
-        if one.name == parameter:
-            if one.options:
-                return {"choices": list(one.options)}
-            return list(one.search or (one.low, one.high))
+    for declared in control.parameters:
+        if declared.name == parameter:
+            if declared.options:
+                return {"choices": list(declared.options)}
+            return list(declared.search or (declared.low, declared.high))
     if not control.parameters:
         raise InputError(
             f"`controls` {control.kind}.{parameter}: expected a range, as in {control.kind}:{parameter}=[0.2, 0.8]"
         )
-    raise UnknownNameError(f"parameter of control {control.kind}", parameter, [one.name for one in control.parameters])
+    raise UnknownNameError(
+        f"parameter of control {control.kind}", parameter, [declared.name for declared in control.parameters]
+    )
 
 
 def settings_by_name(asked: Mapping[str, object]) -> dict[str, Mapping[str, object]]:
@@ -131,12 +133,12 @@ def settings_by_name(asked: Mapping[str, object]) -> dict[str, Mapping[str, obje
     Raises:
         InputError: one has something else than settings.
     """
-    found: dict[str, Mapping[str, object]] = {}
+    by_name: dict[str, Mapping[str, object]] = {}
     for name, given in by_key(asked).items():
         if given is not None and not isinstance(given, Mapping):
             raise InputError(f"`controls` {name}: expected {{PARAMETER: VALUE}}, got {given!r}")
-        found[name] = given or {}
-    return found
+        by_name[name] = given or {}
+    return by_name
 
 
 def gathered(asked: Mapping[str, object]) -> dict[str, dict[str, object]]:
@@ -147,17 +149,17 @@ def gathered(asked: Mapping[str, object]) -> dict[str, dict[str, object]]:
     Args:
         asked: settings by name; a name may be "kind", "kind:name", "kind.parameter" or "kind:name.parameter".
     """
-    found: dict[str, dict[str, object]] = {}
+    by_control: dict[str, dict[str, object]] = {}
     for name, given in settings_by_name(asked).items():
         head, dot, rest = name.partition(".")
         kind = head.partition(":")[0]
         if not dot or kind not in CONTROLS:
-            found.setdefault(name, {}).update(given)
+            by_control.setdefault(name, {}).update(given)
             continue
         parameter, colon, instance = rest.partition(":")
-        into = found.setdefault(head + colon + instance, {})
+        into = by_control.setdefault(head + colon + instance, {})
         into.update({parameter: _default_range(CONTROLS[kind], parameter), **given})
-    return found
+    return by_control
 
 
 def make_space(controls: Sequence[Control], scene: SceneDescription) -> Space:

@@ -208,13 +208,13 @@ class Control(ABC):
         """
         asked = []
         for parameter, form in zip(self.parameters, forms, strict=True):
-            given = self._given.get(parameter.name)
-            if given not in (None, [parameter.low, parameter.high], (parameter.low, parameter.high)):
+            chosen = self._given.get(parameter.name)
+            if chosen not in (None, [parameter.low, parameter.high], (parameter.low, parameter.high)):
                 raise InputError(
                     f"{self.name}.{parameter.name}: expected no value but [{parameter.low:g}, {parameter.high:g}], got "
-                    f"{given!r}; set how far it may go with {self.name}.epsilon"
+                    f"{chosen!r}; set how far it may go with {self.name}.epsilon"
                 )
-            asked += [] if given is None else [form]
+            asked += [] if chosen is None else [form]
         if "form" in self._given:
             asked.append(str(self._given["form"]))
             if asked[-1] not in forms:

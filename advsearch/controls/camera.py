@@ -153,13 +153,13 @@ class CameraControl(NumberControl):
 
     def _numbers(self, model: CameraModel, values: Values, fov: Tensor) -> Tensor:
         """The numbers (17,) of the camera's model."""
-        found = {name: torch.tensor(value) for name, value in model.values.items()}
+        numbers = {name: torch.tensor(value) for name, value in model.values.items()}
         if not model.name:
             aspect, focal = self.scene.aspect, 0.5 / torch.tan(torch.deg2rad(fov) / 2.0)
-            found |= {"fx": focal * max(1.0, 1.0 / aspect), "fy": focal * max(1.0, aspect)}
-        found |= {name: values[name] for name in COEFFICIENTS if name in self.specs}
-        found |= {"cx": found["cx"] + values["shift_x"], "cy": found["cy"] + values["shift_y"]}
-        return torch.stack([found[name].to(fov) for name in NUMBERS])
+            numbers |= {"fx": focal * max(1.0, 1.0 / aspect), "fy": focal * max(1.0, aspect)}
+        numbers |= {name: values[name] for name in COEFFICIENTS if name in self.specs}
+        numbers |= {"cx": numbers["cx"] + values["shift_x"], "cy": numbers["cy"] + values["shift_y"]}
+        return torch.stack([numbers[name].to(fov) for name in NUMBERS])
 
     def _described(self) -> SceneDescription:
         """The scene with a fixed lens, for which the distance is worked out as for the same setting."""

@@ -328,13 +328,13 @@ class ContentsControl(NumberControl):
     def cuts(self, shares: Mapping[str, float]) -> dict[str, float]:
         """Return the coordinates whose shares are nearest to some, one ingredient after the other."""
         bounds = self._bounds(torch.device("cpu"))
-        left, found = torch.ones_like(bounds[0][0]), {}
+        left, cuts = torch.ones_like(bounds[0][0]), {}
         for number, name in enumerate(INGREDIENTS):
             low, high = (float(one) for one in self._range(bounds, number, left))
             share = min(max(shares[name], low), max(low, high))
-            found[name] = (share - low) / (high - low) if high > low else 0.0
+            cuts[name] = (share - low) / (high - low) if high > low else 0.0
             left = left - share
-        return found
+        return cuts
 
     def _bounds(self, device: torch.device) -> list[tuple[Tensor, Tensor]]:
         """The least and the most of every ingredient, each ()."""
@@ -353,13 +353,13 @@ class ContentsControl(NumberControl):
     # ---- the vessel -------------------------------------------------------------------------------------------------
 
     def _vessel(self, scene: SceneDescription) -> Vessel:
-        found = interior(scene.object)
-        if found is None:
+        vessel = interior(scene.object)
+        if vessel is None:
             raise InputError(
                 f"`controls` {self.name}: expected a vessel, open at the top and closed around and below (a mug, a "
                 f"bowl, a glass), got {scene.object.name!r}; choose another object or leave the control out"
             )
-        return found
+        return vessel
 
 
 def _said(low: float, high: float) -> str:

@@ -87,12 +87,12 @@ class EnvironmentControl(NumberControl):
         scene's own is none of them."""
         spec, allowed = self.specs.get("which"), self.allowed("which", OWN_MAP)
         files = [str(one) for one in allowed if _is_file(one)]
-        found = {name: _loaded(name) for name in files}
-        notes = [note for one in found.values() for note in one.warnings]
+        maps = {name: _loaded(name) for name in files}
+        notes = [note for one in maps.values() for note in one.warnings]
         if OWN_MAP in allowed or self._own_name(scene) is not None or not (isinstance(spec, Fixed) or files):
             lit = scene.environment_for(f"`controls` {self.name}")
-            if found and scene.photograph is None and not lit.photographed and scene.number("ground.size") > 0.0:
-                names = ", ".join(Path(name).name for name in found)
+            if maps and scene.photograph is None and not lit.photographed and scene.number("ground.size") > 0.0:
+                names = ", ".join(Path(name).name for name in maps)
                 notes.append(
                     f"{names}: the object stands on the scene's table there, too; ground.kind=photograph shows the "
                     "floor of each picture instead"

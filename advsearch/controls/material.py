@@ -68,13 +68,13 @@ class MaterialControl(NumberControl):
 
     def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
         which = (OWN, *PATTERNS)[int(values["which"])]
-        own = self._own(which)
+        material = self._own(which)
         inputs: dict[str, Tensor] = {}
         for name in NUMBERS:
             if self._varies(name):
                 inputs[f"{self.mesh}.{name}"] = values[name].reshape(1)
             elif self._names != (OWN,):
-                inputs[f"{self.mesh}.{name}"] = values["which"].new_tensor([float(getattr(own, name))])
+                inputs[f"{self.mesh}.{name}"] = values["which"].new_tensor([float(getattr(material, name))])
         if self._colours():
             tint = torch.stack([values[name] for name in CHANNELS])
             inputs[self._base_color] = srgb_to_linear(tint) * self._reflectance(which, so_far).to(tint.device)

@@ -44,14 +44,14 @@ class MitsubaControl(NumberControl):
 
     def laid_out(self) -> tuple[Slot, ...]:
         slots: list[Slot] = []
-        for one in self._numbers():
-            whole = self.specs.get(one.key)
-            if isinstance(whole, OneOf) and len(one.values) > 1:
+        for number in self._numbers():
+            whole = self.specs.get(number.key)
+            if isinstance(whole, OneOf) and len(number.values) > 1:
                 raise InputError(
-                    f"`controls` {self.name}:{one.key}: expected a range, because it is a colour; values one by one "
-                    f"are for one channel, such as {self.name}:{one.key}.{CHANNELS[0]}"
+                    f"`controls` {self.name}:{number.key}: expected a range, because it is a colour; values one by one "
+                    f"are for one channel, such as {self.name}:{number.key}.{CHANNELS[0]}"
                 )
-            for parameter, value in zip(_channels(one), one.values, strict=True):
+            for parameter, value in zip(_channels(number), number.values, strict=True):
                 spec = self.specs.get(parameter.name, whole or Fixed(value))
                 slots.append(Slot(replace(parameter, default=value), spec, 1, sum(slot.width for slot in slots), value))
         return tuple(slots)

@@ -245,20 +245,20 @@ class NumberControl(Control):
         """Return every parameter's value at a slice of u: float32 of the parameter's shape, or the number of an option.
         Fixed ones are there too.
         """
-        found: dict[str, Tensor] = {}
+        values: dict[str, Tensor] = {}
         every = self._low.to(u) + self._span.to(u) * u  # at once, but for what is searched on a logarithmic scale
         for slot in self.slots:
             parameter, spec, place = slot.parameter, slot.spec, slice(slot.begin, slot.begin + slot.size)
             if isinstance(spec, Range):
                 mapped = parameter.log or type(spec) is not Range
                 value = to_value(spec, log=parameter.log, u=u[place]) if mapped else every[place]
-                found[parameter.name] = value if parameter.shape else value.reshape(())
+                values[parameter.name] = value if parameter.shape else value.reshape(())
                 continue
             one = spec.value if isinstance(spec, Fixed) else spec.values[option_index(len(spec.values), u[slot.begin])]
             shape = (slot.size,) if parameter.shape and not isinstance(one, str) else ()
             number = parameter.options.index(one) if isinstance(one, str) else one
-            found[parameter.name] = torch.full(shape, float(number), dtype=torch.float32, device=u.device)
-        return found
+            values[parameter.name] = torch.full(shape, float(number), dtype=torch.float32, device=u.device)
+        return values
 
     def numbers(self, u: Tensor) -> Mapping[str, Tensor]:
         values = self.values(u)
@@ -274,19 +274,21 @@ class NumberControl(Control):
 
     def describe(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Value]:
         values = self.values(u.detach())
-        said: dict[str, Value] = {}
+        described: dict[str, Value] = {}
         for slot in self.slots:
             parameter, value = slot.parameter, values[slot.parameter.name]
             if isinstance(slot.spec, Fixed) or len(parameter.shape) > 1:
                 continue
             name = f"{self.name}.{parameter.name}"
             if parameter.options:
-                said[name] = {"value": parameter.options[int(value)], "unit": "name"}
+                described[name] = {"value": parameter.options[int(value)], "unit": "name"}
             elif value.ndim == 0:
-                said[name] = {"value": float(value), "unit": parameter.unit}
+                described[name] = {"value": float(value), "unit": parameter.unit}
             else:
-                said |= {f"{name}.{k}": {"value": float(one), "unit": parameter.unit} for k, one in enumerate(value)}
-        return said | {f"{self.name}.{name}": one for name, one in self.measured(values, so_far).items()}
+                described |= {
+                    f"{name}.{k}": {"value": float(one), "unit": parameter.unit} for k, one in enumerate(value)
+                }
+        return described | {f"{self.name}.{name}": one for name, one in self.measured(values, so_far).items()}
 
     def artifacts(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Tensor]:
         return self.kept_pictures(self.values(u.detach()), so_far)

@@ -159,16 +159,16 @@ class OcclusionControl(NumberControl):
     )
 
     def check_choices(self) -> None:
-        given = self.chosen["object"]
-        if given is None:
+        occluder = self.chosen["object"]
+        if occluder is None:
             return
-        if not isinstance(given, (str, Path)) or not str(given).strip():
+        if not isinstance(occluder, (str, Path)) or not str(occluder).strip():
             raise InputError(
-                f"{self.name}.object: expected the name of a bundled object or a path to a mesh file, got {given!r}"
+                f"{self.name}.object: expected the name of a bundled object or a path to a mesh file, got {occluder!r}"
             )
         if "which" in self._given:
             raise InputError(f"{self.name}: object and which both say what the occluder is; leave one of them out")
-        self._given["object"] = self.chosen["object"] = str(given)
+        self._given["object"] = self.chosen["object"] = str(occluder)
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         away = _put_away(torch.from_numpy(camera_to_world(scene))).numpy()

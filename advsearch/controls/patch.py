@@ -187,11 +187,11 @@ class PatchControl(NumberControl):
         return {BASE_COLOR: self._sticker.paint(so_far.get(BASE_COLOR), values["pixels"], values)}
 
     def describe(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Value]:
-        said = super().describe(u, so_far)
+        described = super().describe(u, so_far)
         if not self._free:
-            return said
+            return described
         here, start = (self.values(at)["pixels"] for at in (u.detach(), self.start.to(u.device)))
-        return {**change_in_colour(self.name, here - start), **said}
+        return {**change_in_colour(self.name, here - start), **described}
 
     def printed(self, u: Tensor) -> Tensor | None:
         return self.values(u)["pixels"] if self._free else None
@@ -300,11 +300,11 @@ class Sticker:
         index = row * side + column
         sums = torch.zeros(side * side, 3).index_add(0, index, color)
         counts = torch.zeros(side * side).index_add(0, index, torch.ones(len(index)))
-        found = sums / counts.clamp_min(1.0)[:, None]
+        colors = sums / counts.clamp_min(1.0)[:, None]
         centres = torch.stack(torch.meshgrid(*[torch.arange(side) + 0.5] * 2, indexing="ij"), dim=-1).reshape(-1, 2)
         nearest = spatial.cKDTree(place.flip(1).numpy()).query(centres.numpy() / side)[1]
-        found = torch.where(counts[:, None] > 0.0, found, color[torch.from_numpy(nearest)])
-        return linear_to_srgb(found).reshape(side, side, 3)
+        colors = torch.where(counts[:, None] > 0.0, colors, color[torch.from_numpy(nearest)])
+        return linear_to_srgb(colors).reshape(side, side, 3)
 
     def _find_spot(self, azimuth: float, height: float, size: float) -> Spot:
         middle, radius, half = self._shape

@@ -1,8 +1,8 @@
 """The `path` control: the camera, the object or both travel, and `time` says where along the way they are.
 
-A frame of a drive is one time. So `--over path` finds one answer for a whole drive, and a grid over `path.time` has its
-frames in order. Where the scene as it is described is a frame, that is the clean one: the end of `approach`, the middle
-of `pass`, the beginning of `orbit`.
+A frame of a drive is one time. So `--over path` finds one configuration for a whole drive, and a grid over `path.time`
+has its frames in order. Where the scene as it is described is a frame, that is the clean one: the end of `approach`,
+the middle of `pass`, the beginning of `orbit`.
 """
 
 from __future__ import annotations
@@ -216,21 +216,21 @@ class PathControl(NumberControl):
 
     def _camera(self, begin: Start, time: Tensor, shift: Tensor) -> tuple[Tensor, Tensor]:
         """Where the camera is, and what it looks at: an object that is shifted, unless a file says something else."""
-        own, center, way = begin.camera, begin.middle, self._ways.get(CAMERA)
-        start = own[:3, 3]
+        pose, center, way = begin.camera, begin.middle, self._ways.get(CAMERA)
+        start = pose[:3, 3]
         if way is None:
             return start, center
         if isinstance(way, Waypoints):
             target = center + (shift if way.targets is None else way.at(time, way.targets) / self.scene.metres)
             return center + way.at(time, way.places) / self.scene.metres, target
-        along, away, reach = own[:3, 2], (start - center).norm(), float(self.chosen["reach"])
-        ahead = torch.stack([along[0], along[1], own.new_zeros(())])  # the camera keeps its height, as a car's does
+        along, away, reach = pose[:3, 2], (start - center).norm(), float(self.chosen["reach"])
+        ahead = torch.stack([along[0], along[1], pose.new_zeros(())])  # the camera keeps its height, as a car's does
         ahead = ahead / ahead.norm().clamp_min(1e-6)
         share = self._share(time)
         if way == APPROACH:
             return start - ahead * away * (reach - 1.0) * (1.0 - share)[..., None], center + shift
         if way == PASS:
-            return start + own[:3, 0] * away * reach * (1.0 - 2.0 * share)[..., None], center + shift
+            return start + pose[:3, 0] * away * reach * (1.0 - 2.0 * share)[..., None], center + shift
         angle = 2.0 * math.pi * share
         x, y, z = start - center
         cos, sin = angle.cos(), angle.sin()

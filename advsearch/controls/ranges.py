@@ -61,11 +61,11 @@ class DrawnRange(Range):
 
     def at(self, u: Tensor) -> Tensor:
         """Return the values at coordinates in [0, 1]; differentiable, by the slope of the quantiles."""
-        found = self._values(u.detach())
+        values = self._values(u.detach())
         if u.requires_grad:
             up, down = (u.detach() + NEAR).clamp(max=1.0), (u.detach() - NEAR).clamp(min=0.0)
-            found = found + (self._values(up) - self._values(down)) / (up - down) * (u - u.detach())
-        return found
+            values = values + (self._values(up) - self._values(down)) / (up - down) * (u - u.detach())
+        return values
 
     def _values(self, u: Tensor) -> Tensor:
         shares = self.least + (self.most - self.least) * u.double().cpu().numpy()

@@ -71,13 +71,13 @@ class Space:
             or scene.emits
             or any(part.volumetric for part in scene.parts)
         )
-        found, begin = [], 0
+        groups, begin = [], 0
         for control in self.controls:
             for group in control.groups:
                 valid = tuple(one for one in group.valid if not (unknown and one == "material"))
-                found.append(replace(group, control=control.name, begin=begin, valid=valid))
+                groups.append(replace(group, control=control.name, begin=begin, valid=valid))
                 begin += group.size
-        return tuple(found)
+        return tuple(groups)
 
     @cached_property
     def sizes(self) -> list[int]:
@@ -106,28 +106,28 @@ class Space:
         parts, merged, set_by = u.split(self.sizes), dict[str, Tensor](), dict[str, str]()
         for number in self._turns:
             control = self.controls[number]
-            own = control.inputs(parts[number], merged)
+            more = control.inputs(parts[number], merged)
             if not is_ours(type(control)):
-                _check_inputs(control.name, own)
-            for name in own:
+                _check_inputs(control.name, more)
+            for name in more:
                 if name in merged and name not in control.refines:
                     both = f"{set_by[name]} and {control.name}"
                     hint = "; one `texture` takes several materials" if name.endswith(".base_color") else ""
                     raise InputError(f"controls: two controls set {name}, {both}; leave one of them out{hint}")
                 set_by.setdefault(name, control.name)
-            merged = {**merged, **own}
+            merged = {**merged, **more}
         return merged
 
     def _among_others(self, u: Tensor) -> list[tuple[Control, Tensor, Mapping[str, Tensor]]]:
         """Each control with its slice of u and the inputs of those before it, if it takes any."""
-        parts, so_far, found = u.detach().split(self.sizes), NOTHING, dict[int, Mapping[str, Tensor]]()
+        parts, so_far, inputs_before = u.detach().split(self.sizes), NOTHING, dict[int, Mapping[str, Tensor]]()
         last = max((turn for turn, number in enumerate(self._turns) if self.controls[number].refines), default=0)
         for turn, number in enumerate(self._turns):
             control = self.controls[number]
-            found[number] = so_far if control.refines else NOTHING
+            inputs_before[number] = so_far if control.refines else NOTHING
             if turn < last:
                 so_far = {**so_far, **control.inputs(parts[number], so_far)}
-        return [(control, parts[number], found[number]) for number, control in enumerate(self.controls)]
+        return [(control, parts[number], inputs_before[number]) for number, control in enumerate(self.controls)]
 
     def picture(self, u: Tensor, image: Tensor) -> Tensor:
         """Apply what controls do to the finished picture (H, W, 3) sRGB, in their order; differentiable in both."""
@@ -137,11 +137,11 @@ class Space:
 
     def describe(self, u: Tensor, controls: Sequence[Control] | None = None) -> dict[str, Value]:
         """Say a configuration in a few named values with units: what some of the controls say of it, or else all."""
-        found: dict[str, Value] = {}
+        values: dict[str, Value] = {}
         for control, part, so_far in self._among_others(u):
             if controls is None or control in controls:
-                found.update(control.describe(part, so_far))
-        return found
+                values.update(control.describe(part, so_far))
+        return values
 
     def printed(self, u: Tensor) -> dict[str, Tensor]:
         """Return the searched colours that a printer would print, by control; see `Control.printed`."""

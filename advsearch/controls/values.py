@@ -232,11 +232,11 @@ class Moved:
 
 def sentences(moved: Sequence[Moved]) -> list[str]:
     """Return what is said of the values that had to move: one sentence a control."""
-    found = []
+    lines = []
     for control, several in groupby(moved, key=lambda one: one.control):
         values = " and ".join(map(_instead, several))
-        found.append(f"The clean scene has {values}, which the control {control} leaves out.")
-    return found
+        lines.append(f"The clean scene has {values}, which the control {control} leaves out.")
+    return lines
 
 
 def check_prepared(control: str, before: SceneDescription, after: SceneDescription) -> Iterator[Moved]:

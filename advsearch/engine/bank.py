@@ -70,9 +70,9 @@ class Condition:
 class Bank(PredictedSearch):
     """The matrices of a run whose searches look at conditions that vary by chance. After the comparisons `grown`, by
     evaluation, the bank went on growing; `gaps` are by how much the objective was larger in it than under unseen
-    conditions. `answers` makes matrices, by workers where there are some."""
+    conditions. `trace` makes matrices, by workers where there are some."""
 
-    answers: Evaluate
+    trace: Evaluate
     drawn: bool = field(default=True, kw_only=True)
     renewed: int | None = field(default=None, kw_only=True)
     grown: list[int] = field(default_factory=list)
@@ -116,13 +116,13 @@ class Bank(PredictedSearch):
 
     def evaluate(self, query: Query) -> Evaluation:
         self.passed(query)
-        answer = self._evaluated(self._drawn(query.kind, query.number), query.u, query.gradient)
-        return replace(answer, picture=to_8_bit(self._picture(query.u))) if query.keep else answer
+        evaluation = self._evaluated(self._drawn(query.kind, query.number), query.u, query.gradient)
+        return replace(evaluation, picture=to_8_bit(self._picture(query.u))) if query.keep else evaluation
 
     def _evaluated(self, chosen: Sequence[Condition], u: Tensor, gradient: WhichGradient) -> Evaluation:
         wholes = [torch.cat([u, one.numbers]) for one in chosen]
-        answer = self.problem.mean_under(lambda s, at: self._pictures(chosen[s], at), wholes, u, gradient, TOGETHER)
-        return replace(answer, predicted=1)
+        evaluation = self.problem.mean_under(lambda s, at: self._pictures(chosen[s], at), wholes, u, gradient, TOGETHER)
+        return replace(evaluation, predicted=1)
 
     def _drawn(self, kind: str, index: int) -> list[Condition]:
         """The conditions that an evaluation looks at: what is new, and a random choice of the rest."""
@@ -177,7 +177,7 @@ class Bank(PredictedSearch):
         with self.timed():
             if self._until <= first:  # as far as the next comparison
                 self._until = self._wanted((index // EVERY + 1) * EVERY - 1)
-                self._coming = iter(self.answers([self._query(number) for number in range(first, self._until)]))
+                self._coming = iter(self.trace([self._query(number) for number in range(first, self._until)]))
             for number in range(first, wanted):
                 self._held.append(self._condition(number))
                 self._bytes += self._held[-1].renderer.bytes

@@ -417,7 +417,7 @@ def derivatives(
             measure = partial(measure, factors=reference_factors)
             references[probe.name] = value(f"reference {probe.name}", Reference, measure)
             tick()
-        sets: dict[tuple[tuple[str, ...], str], list[Probe]] = {}  # each is answered by one gradient
+        sets: dict[tuple[tuple[str, ...], str], list[Probe]] = {}  # each comes from one gradient
         for probe in mine:
             sets.setdefault((probe.group.valid, probe.group.estimator), []).append(probe)
         stage(f"gradients for {control}", sum(len(tried(members[0].group)) for members in sets.values()))

@@ -32,23 +32,23 @@ from advsearch.models import Model
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row, Told
 from advsearch.scene.formation import levels_of
-from advsearch.tasks import Answer, Judgement
+from advsearch.tasks import Judgement, Prediction
 from advsearch.tasks.together import Ensemble
 
 Sent: TypeAlias = tuple[str, Prepared | None, Query]
 """The name of the problem, what it has been prepared with, and what is asked."""
 
 
-class Answering(Protocol):
+class Evaluator(Protocol):
     """What answers queries: a `Problem`, or a scene of a sweep."""
 
-    def answers(self, queries: Sequence[Query], prepared: Prepared | None = None) -> Iterable[Evaluation]:
+    def evaluate_all(self, queries: Sequence[Query], prepared: Prepared | None = None) -> Iterable[Evaluation]:
         """See `advsearch.attacks.evaluation.Evaluate`; with what the problem that asks has been prepared with."""
 
 
 @dataclass
 class Shared:
-    """Answers queries of a problem: several at once by an executor of `answering`, where there is one, and all others
+    """Answers queries of a problem: several at once by an executor of `worker_call`, where there is one, and all others
     here. Its `name` tells it from others that workers hold. A sweep asks scenes, and has none."""
 
     own: Problem | None
@@ -85,15 +85,15 @@ class Shared:
         with closing(results):
             for done in results:
                 number = numbers[id(done.items[0])]
-                answer = lost(queries[number], done.lost) if done.lost else done.value[0]
-                early[number] = replace(answer, machine=done.machine)
+                evaluation = lost(queries[number], done.lost) if done.lost else done.value[0]
+                early[number] = replace(evaluation, machine=done.machine)
                 while turn in early:
                     self.problem.renderer.non_finite += early[turn].non_finite
                     yield early.pop(turn)
                     turn += 1
 
 
-def answering(named: Callable[[str], Answering]) -> Call:
+def worker_call(named: Callable[[str], Evaluator]) -> Call:
     """Return what answers queries that were sent: what a worker does."""
 
     def call(sent: Sequence[Sent]) -> list[Evaluation]:
@@ -101,20 +101,20 @@ def answering(named: Callable[[str], Answering]) -> Call:
         for name, some in groupby(sent, lambda one: one[0]):
             listed = list(some)
             prepared = listed[0][1]  # the same of all that are sent together
-            found += named(name).answers([query for _, _, query in listed], prepared)
+            found += named(name).evaluate_all([query for _, _, query in listed], prepared)
         return found
 
     return call
 
 
 def lost(query: Query, why: str) -> Evaluation:
-    """Return what stands for an answer that nobody could give."""
+    """Return what stands for an evaluation that nobody could make."""
     if query.wanted != "judgement":
         what = "a picture" if query.wanted == "picture" else "the light of a condition"
         raise ClusterError(f"{what}: {why}; `advsearch resume RUN workers=null` makes it here")
     gradient = torch.zeros_like(query.u) if query.gradient else None
     cost = 0 if query.phase is None else query.samples
-    said = Judgement(math.nan, math.nan, right=False, answer=Answer(LOST, None, None), payload={"lost": why})
+    said = Judgement(math.nan, math.nan, right=False, prediction=Prediction(LOST, None, None), payload={"lost": why})
     return Evaluation(math.nan, gradient, False, cost=cost, judgement=said, lost=True)
 
 
@@ -285,7 +285,7 @@ class Journal:
 
     # ---- queries ----------------------------------------------------------------------------------------------------
 
-    def answers(
+    def evaluate_all(
         self,
         queries: Sequence[Query],
         evaluate: Evaluate | None = None,
@@ -315,7 +315,7 @@ class Journal:
                 step: Evaluation.of(judgement_of(row), predicted=0 if row.seed is not None else row.spp or 1)
                 for step, row in stored.items()
             }
-            self.lost += sum(one.said.answer.label == LOST for one in self._trials[kind].values())
+            self.lost += sum(one.said.prediction.label == LOST for one in self._trials[kind].values())
         return self._trials[kind]
 
     def _holds(self, query: Query) -> bool:
@@ -347,22 +347,22 @@ class Journal:
             picture=None if beside.picture is None else torch.from_numpy(beside.picture.copy()).float() / 255.0,
         )
 
-    def keep(self, answered: Sequence[tuple[Query, Evaluation]], *, numbered: bool = False) -> list[Row]:
-        """Write answers in one transaction, a row each; what a search was told goes beside it. If `numbered`, the place
-        of a row in the store is the query's number, in whatever order they come."""
+    def keep(self, evaluated: Sequence[tuple[Query, Evaluation]], *, numbered: bool = False) -> list[Row]:
+        """Write evaluations in one transaction, a row each; what a search was told goes beside it. If `numbered`, the
+        place of a row in the store is the query's number, in whatever order they come."""
         rows, told = list[Row](), None
-        for query, answer in answered:
-            self.lost += answer.lost
-            if answer.machine is not None:
-                self.machines.meet(answer.machine, self.traced.facts)
+        for query, evaluation in evaluated:
+            self.lost += evaluation.lost
+            if evaluation.machine is not None:
+                self.machines.meet(evaluation.machine, self.traced.facts)
             if query.phase is None:
-                row = self._row_of_trial(query, answer)
+                row = self._row_of_trial(query, evaluation)
                 if not numbered:
-                    self._trials_of(query.kind)[query.number] = replace(answer, picture=None)
+                    self._trials_of(query.kind)[query.number] = replace(evaluation, picture=None)
             elif self._holds(query):  # of a run that was done
                 continue
             else:
-                row, told = self._row_of_search(query, answer)
+                row, told = self._row_of_search(query, evaluation)
             rows.append(replace(row, id=query.number + 1) if numbered else row)
         if self.run is None:
             for row in rows:
@@ -371,39 +371,42 @@ class Journal:
             self.run.record(*rows, told=told)
         return rows
 
-    def _row_of_trial(self, query: Query, answer: Evaluation) -> Row:
+    def _row_of_trial(self, query: Query, evaluation: Evaluation) -> Row:
         values = dict(query.values)
         if query.drawn:
             values |= self.problem.conditions_of(query.u, query.seed)
-        seed = None if answer.predicted else query.seed  # it has no noise of its own
-        spp = answer.predicted or query.spp
-        said, told = answer.said, {"machine": answer.machine, "renders": answer.cost, "seconds": answer.seconds}
+        seed = None if evaluation.predicted else query.seed  # it has no noise of its own
+        spp = evaluation.predicted or query.spp
+        said, told = (
+            evaluation.said,
+            {"machine": evaluation.machine, "renders": evaluation.cost, "seconds": evaluation.seconds},
+        )
         return trial_row(query.kind, query.number, seed, spp, said, values, sought=query.sought, **told)
 
-    def _row_of_search(self, query: Query, answer: Evaluation) -> tuple[Row, Told]:
+    def _row_of_search(self, query: Query, evaluation: Evaluation) -> tuple[Row, Told]:
         problem = self.problem
         row = Row(
             kind=query.kind,
             step=query.number,
             seed=query.seed,
-            spp=None if answer.predicted else problem.spp * query.samples,
-            objective=answer.objective if (finite := answer.finite) else math.nan,
-            success=answer.success and finite,
+            spp=None if evaluation.predicted else problem.spp * query.samples,
+            objective=evaluation.objective if (finite := evaluation.finite) else math.nan,
+            success=evaluation.success and finite,
             values=problem.describe(query.u),
-            seconds=answer.seconds,
-            renders=0 if answer.predicted else answer.cost * problem.draws,
+            seconds=evaluation.seconds,
+            renders=0 if evaluation.predicted else evaluation.cost * problem.draws,
             phase=query.phase,
-            machine=answer.machine,
+            machine=evaluation.machine,
         )
         told = Told(
             number=query.number,
             u=digest(query.u),
-            non_finite=answer.non_finite,
-            cost=answer.cost,
-            gradient=None if answer.gradient is None else answer.gradient.detach().numpy(),
-            picture=None if answer.picture is None else levels_of(answer.picture).numpy(),
+            non_finite=evaluation.non_finite,
+            cost=evaluation.cost,
+            gradient=None if evaluation.gradient is None else evaluation.gradient.detach().numpy(),
+            picture=None if evaluation.picture is None else levels_of(evaluation.picture).numpy(),
         )
-        return row if answer.judgement is None else judged(row, answer.judgement), told
+        return row if evaluation.judgement is None else judged(row, evaluation.judgement), told
 
     def clock(self, kind: str, seconds: float | None) -> Callable[[int], bool] | None:
         """Return what says whether the time of a search is over, that of its earlier lives included.
@@ -437,7 +440,7 @@ class Journal:
             self.run.store.set_note(key, json.dumps(value))
 
 
-def other_answers(run: RunDirectory | None, values: Mapping[str, tuple[float | None, float | None]]) -> InputError:
+def other_numbers(run: RunDirectory | None, values: Mapping[str, tuple[float | None, float | None]]) -> InputError:
     """Return the error of a run that goes on with another model or objective, from what these said and say."""
     told = ", ".join(
         f"{name} was {before} and is {now}" for name, (before, now) in values.items() if not same([before], [now])

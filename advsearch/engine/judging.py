@@ -34,7 +34,7 @@ from advsearch.scene.renderer import Renderer
 from advsearch.scene.surfaces import Surfaces
 from advsearch.scene.things import ALL
 from advsearch.scene.transport.matrix import linear_inputs
-from advsearch.tasks import Answer, Facts, Judgement, Task
+from advsearch.tasks import Facts, Judgement, Prediction, Task
 from advsearch.tasks.base import Output, Truth, mean
 
 Metric = Callable[[Tensor, Any, Any], Any]
@@ -200,24 +200,24 @@ def facts_of(scene: Scene, name: str, config: SceneConfig, describe: Described, 
 
 
 def shown(task: Task, model: Model, scenes: Sequence[Scene], config: SceneConfig) -> Task:
-    """Return the task after it has seen what its model answers to clean pictures, where it asks for that (`looks`). The
-    next scene is shown where those before leave open how answers are to be read."""
-    if not task.looks:
+    """Return the task after it has seen what its model predicts of clean pictures, where it asks for that
+    (`calibrates`). The next scene is shown where those before leave open how predictions are to be read."""
+    if not task.calibrates:
         return task
     for scene in scenes:
         judge = OBJECT if config.judge == ALL else config.judge
         view = render(
             scene, model, task=task, label=config.label, judge=judge, spp=LOOK_SPP, **pictures_of(config)
         ).views[0]
-        task = task.seeing(view.output, view.truth)
-        if not task.unsaid:
+        task = task.after_calibration(view.output, view.truth)
+        if not task.ambiguities:
             return task
-    raise InputError(f"model {model.name}: {task.unsaid}")
+    raise InputError(f"model {model.name}: {task.ambiguities}")
 
 
 def check_truth(task: Task, model: Model, scene: Scene, facts: Facts, config: SceneConfig) -> None:
     """Refuse a scene of which the task cannot say what is right, before anything is prepared; where no label was given,
-    with the model's first answers to a clean picture."""
+    with the model's first predictions of a clean picture."""
     try:
         for one in facts.each.values() or (facts,):
             task.check(one)
@@ -236,7 +236,7 @@ def one_label_for_several(models: Sequence[Model], label: str | None, objects: M
     if not others:
         return []
     return [
-        f"The label {label!r} is taken as the right answer for every object, also for {', '.join(others)}; without a "
+        f"The label {label!r} is taken as the right label for every object, also for {', '.join(others)}; without a "
         "label, each object has its own."
     ]
 
@@ -254,23 +254,25 @@ def _differs(models: Sequence[Model], label: str, own: str) -> bool:
 
 
 def _advice(task: Task, model: Model, scene: Scene, config: SceneConfig) -> str:
-    """What the model answers to a clean picture, and how to take the first of these for right."""
+    """What the model predicts of a clean picture, and how to take the first of these for right."""
     looked = render(scene, model, task=task, spp=LOOK_SPP, **pictures_of(config))
-    answers = looked.views[0].answers
-    listed = ", ".join(seen_text(task.name, replace(answer, label=repr(answer.label))) for answer in answers)
+    predictions = looked.views[0].predictions
+    listed = ", ".join(
+        seen_text(task.name, replace(prediction, label=repr(prediction.label))) for prediction in predictions
+    )
     return (
         f"model {model.name} calls a clean picture of it {listed}; name what is right, such as "
-        f'`label="{_term(model, answers[0])}"`'
+        f'`label="{_term(model, predictions[0])}"`'
     )
 
 
-def _term(model: Model, answer: Answer) -> str:
-    """What names the class of an answer and no other: its label, or else its number."""
+def _term(model: Model, prediction: Prediction) -> str:
+    """What names the class of a prediction and no other: its label, or else its number."""
     try:
-        known = model.label_set(answer.label).indices == (answer.index,)
+        known = model.label_set(prediction.label).indices == (prediction.index,)
     except InputError:
         known = False
-    return answer.label if known else f"#{answer.index}"
+    return prediction.label if known else f"#{prediction.index}"
 
 
 MOST_NUMBERS, MOST = 64, 512

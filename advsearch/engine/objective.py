@@ -195,7 +195,7 @@ def objective_for(
         return of_ensemble(each, ensemble or ("worst" if own else "mean")), ""
     if not of_features:
         return get_objective(wanted, task), ""
-    features = features_of(model) if task.reads_logits else None  # otherwise they are what the model answers with
+    features = features_of(model) if task.reads_logits else None  # otherwise they are what the model returns
     with torch.no_grad():
         clean = renderer(renderer.start, seed=seed, spp=CLEAN_SPP)
     note = "" if features is None or features.penultimate else features.source

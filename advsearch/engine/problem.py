@@ -66,7 +66,7 @@ class Problem:
         search_depth: longest light path in segments of a search's renders; None for the scene's. Verification always
             renders the scene's.
         metrics: numbers of every picture that rows have beside what the task says.
-        aovs: layers of ground truth that are kept of the clean scene and the answer (`scene.surfaces.AOVS`).
+        aovs: layers of ground truth that are kept of the clean scene and the adversarial scene (`scene.surfaces.AOVS`).
         domain: where a search may look: the searched controls.
         conditions: where the others are drawn from; None where there are none.
     """
@@ -170,7 +170,8 @@ class Problem:
             truths = [self.truth()] if not self.task.varies else list(map(self.truth, wholes, listed))
             said = self._judged(output, pictures, truths, wholes)
         return [
-            replace(Judgement.of(one.score, one.margin, one.answer, one.payload), metrics=one.metrics) for one in said
+            replace(Judgement.of(one.score, one.margin, one.prediction, one.payload), metrics=one.metrics)
+            for one in said
         ]
 
     def _judged(
@@ -194,11 +195,11 @@ class Problem:
         return view_of(self.renderer, predicted, whole, seed, spp, lambda *at: self.judge(*at).margin, before)
 
     def marks(self, picture: Tensor, whole: Tensor) -> list[Mark]:
-        """Return what shows the model's answer to a picture (H, W, 3) of the whole space at `whole`."""
+        """Return what shows the model's prediction of a picture (H, W, 3) of the whole space at `whole`."""
         return self.seen(picture, whole)[1]
 
     def seen(self, picture: Tensor, whole: Tensor) -> tuple[bool, list[Mark]]:
-        """Return whether the model's answer to a picture (H, W, 3) of the whole space at `whole` is right, and what
+        """Return whether the model's prediction of a picture (H, W, 3) of the whole space at `whole` is right, and what
         shows it."""
         with torch.no_grad():
             output, truth = self.model(picture), self.truth(whole)
@@ -255,7 +256,7 @@ class Problem:
 
     # ---- evaluations ------------------------------------------------------------------------------------------------
 
-    def answers(self, queries: Sequence[Query], prepared: Prepared | None = None) -> Iterator[Evaluation]:
+    def evaluate_all(self, queries: Sequence[Query], prepared: Prepared | None = None) -> Iterator[Evaluation]:
         """Answer queries, each when it is asked for (see `advsearch.attacks.evaluation.Evaluate`), as another process
         has prepared the same problem."""
         if prepared is not None:
@@ -267,9 +268,9 @@ class Problem:
     def evaluate(self, query: Query) -> Evaluation:
         """Answer one query: the only place where a run renders, asks and judges."""
         before = self.renderer.non_finite
-        answer = self._answer(query)
+        evaluation = self._evaluation(query)
         lost = self.renderer.non_finite - before
-        return replace(answer, non_finite=lost) if lost else answer
+        return replace(evaluation, non_finite=lost) if lost else evaluation
 
     def _values(self, outputs: Output, pictures: Tensor, truth: Truth, asked: ConfigurationInputs) -> Tensor:
         """The objective of pictures (N, H, W, 3), (N,)."""
@@ -277,7 +278,7 @@ class Problem:
             raise RuntimeError("a sweep has no objective")
         return self.objective(outputs, pictures, truth, asked)
 
-    def _answer(self, query: Query) -> Evaluation:
+    def _evaluation(self, query: Query) -> Evaluation:
         u, seed = query.u, query.seed
         if query.wanted == "light":
             return Evaluation(math.nan, None, False, light=self.linearised(u, seed, query.spp).collected)
@@ -290,8 +291,8 @@ class Problem:
         if self.conditions is None:
             return self.evaluated(query, u, seed)[0]
         draws = [seeds.stream(seed, "draw", number) for number in range(self.draws)]
-        answer = self.mean([self.evaluated(replace(query, keep=False), self.whole(u, d), d) for d in draws], u)
-        return replace(answer, picture=self.picture(u, seed, self.spp, drawn=False)) if query.keep else answer
+        evaluation = self.mean([self.evaluated(replace(query, keep=False), self.whole(u, d), d) for d in draws], u)
+        return replace(evaluation, picture=self.picture(u, seed, self.spp, drawn=False)) if query.keep else evaluation
 
     def linearised(self, whole: Tensor, seed: int, spp: int, collected: Linearised | None = None) -> LinearRenderer:
         """Return what predicts pictures near a configuration of the whole space, from light that was collected there or
@@ -423,7 +424,7 @@ class Problem:
     def _usual(each: Sequence[Judgement]) -> Judgement:
         score, margin = (mean(values) for values in ([one.score for one in each], [one.margin for one in each]))
         usual = typical(each)
-        return Judgement.of(score, margin, usual.answer, usual.payload)
+        return Judgement.of(score, margin, usual.prediction, usual.payload)
 
     def loss(self, image: Tensor) -> Tensor:
         """The objective of a picture (H, W, 3) sRGB near the start, as a number with a graph."""
@@ -435,8 +436,8 @@ def hard_first(values: Tensor) -> Tensor:
     """Return how much each of several conditions counts in a derivative (n,), by its objective: the smaller that is
     among the others, the more. All count 1 on average.
 
-    The mean of all would be raised most easily where the answer is wrong already. Weights of exp(-z), where z is the
-    objective in standard deviations, raise it where that is not so (Li et al. 2021, *Tilted Empirical Risk
+    The mean of all would be raised most easily where the prediction is wrong already. Weights of exp(-z), where z is
+    the objective in standard deviations, raise it where that is not so (Li et al. 2021, *Tilted Empirical Risk
     Minimization*, section 2, with a tilt of the opposite sign).
     """
     known = values.detach()

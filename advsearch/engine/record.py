@@ -24,9 +24,9 @@ from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results import INTERRUPTED, OUT_OF_TIME, ControlGroup, Fields, Result, VerifiedRate
 from advsearch.runs.store import Row
 from advsearch.runs.summary import NAME, read_result
-from advsearch.tasks import Answer, Judgement
+from advsearch.tasks import Judgement, Prediction
 from advsearch.tasks.base import mean
-from advsearch.viewer.pages import keep_answer
+from advsearch.viewer.pages import keep_result
 
 KEPT = 4
 """Pictures of each group of trials that are kept."""
@@ -42,13 +42,13 @@ class Findings:
         baseline: what the random search claims.
         sample_count: how the sample count of the verification was chosen.
         clean: the control group's trials.
-        verification: of the policy's answer.
+        verification: of what the policy found.
         baseline_verification: of the random search's.
         unprinted: what the policy claims without print terms, where the search has them.
         unprinted_verification: of that.
-        beaten: verification of the policy's own answer, where the random search's turned out worse for the model and is
-            the run's answer instead.
-        failures: verification of the first of the different failures that the policy answers with.
+        beaten: verification of what the policy found, where the random search's turned out worse for the model and is
+            the run's adversarial scene instead.
+        failures: verification of the first of the different failures that the policy found.
         average: trials of configurations drawn from the whole space.
         pictures: of the first trials, (H, W, 3) with 8-bit values in [0, 1], by kind and number; of a run that goes on
             only those that it made itself.
@@ -117,7 +117,7 @@ class Stages:
 
 
 LOST = "(no answer)"
-"""The answer to a picture that nobody could make; what the row keeps beside it says why."""
+"""The label of a picture that nobody could make; what the row keeps beside it says why."""
 
 
 def lost_remarks(lost: int) -> list[str]:
@@ -140,7 +140,7 @@ def trial_row(
     **more: Any,
 ) -> Row:
     """Return what the store keeps of a trial; the seed is None of a picture that was predicted. There is a success only
-    where a search sought some answer."""
+    where a search sought some prediction."""
     return Row(
         kind=kind,
         step=number,
@@ -159,14 +159,14 @@ def judged(row: Row, judgement: Judgement) -> Row:
 
 
 def _said(judgement: Judgement) -> dict[str, Any]:
-    answer = judgement.answer
+    prediction = judgement.prediction
     return {
         "score": _number(judgement.score),
         "correct": judgement.right,
         "margin": _number(judgement.margin),
-        "label": None if judgement.not_a_number else answer.label,
-        "label_index": answer.index,
-        "probability": answer.probability,
+        "label": None if judgement.not_a_number else prediction.label,
+        "label_index": prediction.index,
+        "probability": prediction.probability,
         "payload": judgement.payload,
         "metrics": judgement.metrics or {},
     }
@@ -177,21 +177,21 @@ def _number(value: float | None) -> float | None:
 
 
 def judgement_of(row: Row) -> Judgement:
-    """Return what was said of a trial from its row: nothing where it has no label, for the answer was not a number."""
+    """Return what was said of a trial from its row: nothing where it has no label, for the output was not a number."""
     score, margin = (math.nan if one is None else one for one in (row.score, row.margin))
-    answer = Answer(row.label or NOT_A_NUMBER, row.label_index, row.probability)
-    return Judgement(score, margin, bool(row.correct), answer, row.payload, row.objective, row.metrics or None)
+    prediction = Prediction(row.label or NOT_A_NUMBER, row.label_index, row.probability)
+    return Judgement(score, margin, bool(row.correct), prediction, row.payload, row.objective, row.metrics or None)
 
 
 def verified_rate(checked: Verification) -> VerifiedRate:
-    """Return the rate of a success, with how often each such answer was given and the mean score of the trials."""
+    """Return the rate of a success, with how often each such prediction was given and the mean score of the trials."""
     rated = rate_of(checked.adversarial, checked.counting, checked.successes)
     return rated.model_copy(update={"stopped": checked.stopped})
 
 
 def rate_of(rate: Trials, trials: Sequence[Judgement], successes: Sequence[Judgement]) -> VerifiedRate:
-    """Return a rate with the answers of its successes and the mean score of those that are a number."""
-    labels = Counter(trial.answer.label for trial in successes)
+    """Return a rate with the predictions of its successes and the mean score of those that are a number."""
+    labels = Counter(trial.prediction.label for trial in successes)
     return VerifiedRate(
         successes=rate.successes,
         trials=rate.trials,
@@ -294,10 +294,10 @@ def kept_rows(
         pass
     except OutOfTime:
         ending = OUT_OF_TIME
-    answer = result(taken, ending)
+    made = result(taken, ending)
     if run is None:
-        return answer
+        return made
     if ending == INTERRUPTED and not results.made and (run.path / NAME).is_file():
         before = read_result(run.path)
-        return before if isinstance(before, type(answer)) else answer
-    return keep_answer(run, answer)
+        return before if isinstance(before, type(made)) else made
+    return keep_result(run, made)

@@ -26,7 +26,7 @@ from advsearch.report.marks import contact_sheet, marked
 from advsearch.report.wording import seen_text
 from advsearch.runs.files import placed_by
 from advsearch.runs.images import png_bytes, write_exr, write_layers, write_png
-from advsearch.runs.results import Formation, MeshUp, RenderResult, ViewAnswers
+from advsearch.runs.results import Formation, MeshUp, RenderResult, ViewPredictions
 from advsearch.scene.description import OBJECT, SceneDescription
 from advsearch.scene.formation import SAMPLER, ImageFormation, to_8_bit
 from advsearch.scene.outlines import seen_things
@@ -35,11 +35,11 @@ from advsearch.scene.settings import ORBIT_CAMERA
 from advsearch.scene.surfaces import Surfaces
 from advsearch.scene.things import ALL
 from advsearch.settings import as_python
-from advsearch.tasks import Answer, AnyTask, Facts, Mark, Sight, make_task
+from advsearch.tasks import AnyTask, Facts, Mark, Prediction, Sight, make_task
 from advsearch.tasks.each_thing import each_thing
 
-MOST_ANSWERS = 5
-"""Answers of the model that are kept of a picture."""
+MOST_PREDICTIONS = 5
+"""Predictions of the model that are kept of a picture."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -50,8 +50,8 @@ class View:
         azimuth: of the camera, degrees.
         picture: (H, W, 3) display-referred sRGB in [0, 1], rounded to 8 bits: what the model sees.
         linear: (H, W, 3) linear radiance times the gain, before what controls do to the finished picture.
-        answers: what the model says, the likeliest first.
-        marks: what shows its answer, and what is true, in the picture; empty where words say it all.
+        predictions: what the model says, the likeliest first.
+        marks: what shows its prediction, and what is true, in the picture; empty where words say it all.
         surfaces: what is seen in each pixel; None where nobody asked.
         output: of the model, for its task.
         truth: of the scene; None where the task does not depend on what is seen, or nobody says it.
@@ -61,7 +61,7 @@ class View:
     azimuth: float
     picture: Tensor
     linear: Tensor
-    answers: tuple[Answer, ...]
+    predictions: tuple[Prediction, ...]
     marks: tuple[Mark, ...] = ()
     surfaces: Surfaces | None = None
     output: Any = None
@@ -69,7 +69,7 @@ class View:
     things: JsonObject | None = None
 
     def __repr__(self) -> str:
-        said = self.answers[0].label if self.answers else None
+        said = self.predictions[0].label if self.predictions else None
         return f"View(azimuth={self.azimuth:g}, {said!r})"
 
 
@@ -96,7 +96,7 @@ class Rendering:
     warnings: tuple[str, ...] = ()
 
     def save(self, path: str | Path) -> tuple[int, int]:
-        """Write the picture, whole or not at all; several views become one sheet with the answers under each.
+        """Write the picture, whole or not at all; several views become one sheet with the predictions under each.
 
         Args:
             path: a .png holds what the model sees, an .exr linear radiance times the gain; an older file is replaced.
@@ -134,11 +134,11 @@ class Rendering:
             return write_layers(Path(path).with_suffix(".aov.exr"), surfaces.layers(aovs, OBJECT), surfaces.notes(aovs))
 
     def sheet(self) -> Any:
-        """Return all views side by side, (h, w, 3) float32 sRGB in [0, 1], with azimuth and answers under each."""
+        """Return all views side by side, (h, w, 3) float32 sRGB in [0, 1], with azimuth and predictions under each."""
         return contact_sheet([view.picture.numpy() for view in self.views], self._captions)
 
-    def save_answers(self, path: str | Path) -> Path | None:
-        """Write the picture, or the sheet, with boxes and masks drawn in beside that of `save`, as NAME-answer.png.
+    def save_predictions(self, path: str | Path) -> Path | None:
+        """Write the picture, or the sheet, with boxes and masks drawn in beside that of `save`, as NAME-prediction.png.
 
         Args:
             path: of the picture.
@@ -152,7 +152,7 @@ class Rendering:
         if not any(view.marks for view in self.views):
             return None
         drawn = [marked(view.picture.numpy(), view.marks) for view in self.views]
-        file = Path(path).with_name(f"{Path(path).stem}-answer.png")
+        file = Path(path).with_name(f"{Path(path).stem}-prediction.png")
         with placed_by("out"):
             write_png(file, contact_sheet(drawn, self._captions) if len(drawn) > 1 else drawn[0])
         return file
@@ -163,7 +163,7 @@ class Rendering:
         return self.sheet() if len(self.views) > 1 else self.views[0].picture.numpy()
 
     def __repr__(self) -> str:
-        said = [view.answers[0].label if view.answers else None for view in self.views]
+        said = [view.predictions[0].label if view.predictions else None for view in self.views]
         height, width = self.formation.resolution
         of = f"{self.scene.object_name!r}, {self.scene.environment_name!r}, {self.model!r}"
         return f"Rendering({of} says {', '.join(map(repr, said))}, {height} x {width} pixels)"
@@ -174,7 +174,8 @@ class Rendering:
     @property
     def _captions(self) -> list[list[str]]:
         return [
-            [f"azimuth {view.azimuth:g}", *(seen_text(self.task, one) for one in view.answers)] for view in self.views
+            [f"azimuth {view.azimuth:g}", *(seen_text(self.task, one) for one in view.predictions)]
+            for view in self.views
         ]
 
     def result(
@@ -186,7 +187,7 @@ class Rendering:
             out: the file that was written.
             size: its height and width in pixels.
             warnings: all that were said.
-            answered: the file with the answers drawn in.
+            answered: the file with the predictions drawn in.
         """
         return RenderResult(
             out=str(out),
@@ -199,7 +200,7 @@ class Rendering:
             spp=self.spp,
             image_formation=Formation.of(self.formation),
             up=None if self.scene.object.up is None else MeshUp.of(self.scene.object.up),
-            views=[ViewAnswers.of(view) for view in self.views],
+            views=[ViewPredictions.of(view) for view in self.views],
             warnings=list(warnings),
         )
 
@@ -229,8 +230,9 @@ def render(
     Args:
         scene: from `load_scene`, or what that takes.
         model: from `load_model`, or what that takes.
-        task: what says the model's answers: a name, a mapping with a `name` and options, an instance, or a function.
-        label: the right answers, for a task that draws what is true; None for the object's own.
+        task: what says the model's predictions: a name, a mapping with a `name` and options, an instance, or a
+            function.
+        label: the right labels, for a task that draws what is true; None for the object's own.
         judge: the thing of which that is drawn: "object", the name of one beside it, or "all".
         controls: what differs from the scene: names, instances, or a mapping from names to settings. A parameter with
             a range stays where a search would start.
@@ -284,14 +286,16 @@ def render(
                     truth = asked.truth(facts)
                 except InputError as error:
                     untold = [f"Nothing is drawn into the picture: {error}"]
-            asked = asked.seeing(output, truth)
-            answers = asked.answers(output, MOST_ANSWERS)[0]
+            asked = asked.after_calibration(output, truth)
+            predictions = asked.predictions(output, MOST_PREDICTIONS)[0]
             marks = () if truth is None else tuple(asked.marks(output, truth)[0])
         remarks = remarks or asked.remarks
         azimuth = description.number("camera.azimuth")
         surfaces = renderer.surfaces(u) if aov else None
         things = things_seen(renderer, u)
-        views.append(View(azimuth, picture, radiance * formation.gain, answers, marks, surfaces, output, truth, things))
+        views.append(
+            View(azimuth, picture, radiance * formation.gain, predictions, marks, surfaces, output, truth, things)
+        )
         progress.advance(1)
     assert formation is not None
     own = scene.description

@@ -151,7 +151,7 @@ class SurfaceLight(PredictedSearch):
 
     # ---- evaluations ------------------------------------------------------------------------------------------------
 
-    def answered(self, queries: Sequence[Query], traced: Evaluate) -> Iterator[Evaluation]:
+    def evaluate_all(self, queries: Sequence[Query], traced: Evaluate) -> Iterator[Evaluation]:
         """Answer queries of one search, or trials, by what else answers them from the first that is not predicted."""
         ahead: dict[int, Tensor] = {}
         for place, query in enumerate(queries):
@@ -175,9 +175,9 @@ class SurfaceLight(PredictedSearch):
             kept = shown if query.keep else None
             return Evaluation.of(problem.judge(shown, whole), cost=0, predicted=RAYS, picture=kept)
         if picture is not None:
-            ((answer, _),), _ = problem.judged(lambda at: picture[None], [query.u], query.u, False)
+            ((evaluation, _),), _ = problem.judged(lambda at: picture[None], [query.u], query.u, False)
             kept = to_8_bit(picture) if query.keep else None
-            return replace(answer, cost=query.samples, predicted=RAYS, picture=kept)
+            return replace(evaluation, cost=query.samples, predicted=RAYS, picture=kept)
         again = query.kind == "baseline" and problem.conditions is not None and not self._moves
         number = query.number % AGAIN if again else query.number
         wholes = [torch.cat([query.u, numbers]) for numbers in self._drawn(query.kind, number, problem.draws)]
@@ -185,12 +185,12 @@ class SurfaceLight(PredictedSearch):
         def predicted(some: slice, at: Tensor) -> Tensor:
             return self._pictures(wholes[some], at, (number, some.start) if again else None)
 
-        answer = problem.mean_under(predicted, wholes, query.u, query.gradient, TOGETHER)
-        answer = replace(answer, cost=query.samples, predicted=RAYS)
+        evaluation = problem.mean_under(predicted, wholes, query.u, query.gradient, TOGETHER)
+        evaluation = replace(evaluation, cost=query.samples, predicted=RAYS)
         if not query.keep:
-            return answer
+            return evaluation
         with torch.no_grad():
-            return replace(answer, picture=to_8_bit(self._pictures([problem.whole(query.u)], query.u)[0]))
+            return replace(evaluation, picture=to_8_bit(self._pictures([problem.whole(query.u)], query.u)[0]))
 
     def _drawn(self, kind: str, number: int, count: int) -> list[Tensor]:
         """The conditions of an evaluation: fresh cameras under environments of the bank."""

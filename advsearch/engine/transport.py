@@ -108,13 +108,13 @@ class PredictedSearch(ABC):
 
     @abstractmethod
     def passed(self, query: Query) -> None:
-        """Remember a query that was read back: compare, and make anew, what an answer would have."""
+        """Remember a query that was read back: compare, and make anew, what an evaluation would have."""
 
     @abstractmethod
     def evaluate(self, query: Query) -> Evaluation:
         """Answer one query of the search itself."""
 
-    def answered(self, queries: Sequence[Query], traced: Evaluate) -> Iterator[Evaluation]:
+    def evaluate_all(self, queries: Sequence[Query], traced: Evaluate) -> Iterator[Evaluation]:
         """Answer queries of a search itself, each when it is asked for; `traced` answers what is not predicted."""
         return map(self.evaluate, queries)
 

@@ -1,4 +1,5 @@
-"""Trials of configurations, kept as rows: of answers, of different failures, of answers on other models or pictures."""
+"""Trials of configurations, kept as rows: of what was found, of different failures, of it on other models or
+pictures."""
 
 from __future__ import annotations
 
@@ -35,7 +36,7 @@ from advsearch.errors import InputError
 from advsearch.progress import Progress
 from advsearch.report.wording import count as plural
 from advsearch.runs.directory import RunDirectory
-from advsearch.runs.summary import read_answer
+from advsearch.runs.summary import read_configuration
 from advsearch.scene.formation import next_count, to_8_bit
 from advsearch.tasks import Judgement
 
@@ -52,10 +53,10 @@ def ladder_of(config: SceneConfig) -> Sequence[int]:
 
 @dataclass
 class Verifier:
-    """Makes the trials of one run: sample count (of a ladder; a single one is taken as it is), control group, answers,
-    and configurations one at a time. Each group has as many trials as the last of `looks`; after those before, the
-    verdict may stand. What comes of them, pictures and the count of renders are in `findings`. Rows say of a success
-    where some answer is `sought`."""
+    """Makes the trials of one run: sample count (of a ladder; a single one is taken as it is), control group,
+    adversarial configurations, and configurations one at a time. Each group has as many trials as the last of
+    `calibrates`; after those before, the verdict may stand. What comes of them, pictures and the count of renders are
+    in `findings`. Rows say of a success where some prediction is `sought`."""
 
     journal: Journal
     ladder: Sequence[int]
@@ -74,23 +75,23 @@ class Verifier:
     def count(self) -> int:
         return self.looks[-1]
 
-    def answers(
+    def evaluate_all(
         self, queries: Sequence[Query], *, in_samples: bool = False, predictor: PredictedSearch | None = None
     ) -> Iterator[Evaluation]:
         """Answer trials, keep their pictures, and count each once; the bar counts them, or their samples a pixel. A
         `predictor` answers what it can in place of renders, which alone are counted."""
-        made = None if predictor is None else partial(predictor.answered, traced=self.journal.traced)
+        made = None if predictor is None else partial(predictor.evaluate_all, traced=self.journal.traced)
         queries = queries if self.sought else [replace(query, sought=False) for query in queries]
-        for query, answer in zip(queries, self.journal.answers(queries, made), strict=True):
-            if answer.picture is not None:
-                self.findings.pictures[query.kind, query.number] = answer.picture
-            if answer.predicted:
+        for query, evaluation in zip(queries, self.journal.evaluate_all(queries, made), strict=True):
+            if evaluation.picture is not None:
+                self.findings.pictures[query.kind, query.number] = evaluation.picture
+            if evaluation.predicted:
                 self.findings.predicted_trials += 1
             else:
                 self._asked.add((query.kind, query.number))
             self.findings.verification_renders = len(self._asked)
             self.stages.progress.advance(query.spp if in_samples else 1, **self.journal.traced.told)
-            yield answer
+            yield evaluation
 
     def choose_spp(self, candidates: dict[str, Tensor], searched: int | None = None) -> None:
         """Raise the samples until more would not change the verdict: under the conditions that the scene comes with, or
@@ -107,13 +108,13 @@ class Verifier:
                 "verification",
                 "finding how many samples the check needs",
                 most,
-                hint="more and more samples a pixel until noise no longer moves the answer (counted in samples a "
+                hint="more and more samples a pixel until noise no longer moves the result (counted in samples a "
                 "pixel); `verify_spp=NUMBER` leaves it out",
                 at_most=True,
             )
-        answers = partial(self.answers, in_samples=True)
+        evaluate = partial(self.evaluate_all, in_samples=True)
         margins = {
-            name: margins_of(answers, f"sample count {name}", u, keep=KEPT, drawn=over)
+            name: margins_of(evaluate, f"sample count {name}", u, keep=KEPT, drawn=over)
             for name, u in candidates.items()
         }
         seed = self.problem.seed
@@ -133,7 +134,7 @@ class Verifier:
         self._clean_spp = self.findings.spp
         self._clean_kind = "first control" if self.findings.search is None else "control"
         self.findings.clean = run_trials(
-            self.answers,
+            self.evaluate_all,
             self.problem.domain.start,
             spp=self.findings.spp,
             seed=self.problem.seed,
@@ -148,11 +149,11 @@ class Verifier:
         return bool(self.findings.clean) and self._clean_spp == self.findings.spp
 
     def verified(self, kind: str, found: SearchResult, *, curtailed: bool = False, again: bool = False) -> Verification:
-        """Verify one search's answer against the control group; `curtailed` where only the verdict matters. A control
+        """Verify what one search found against the control group; `curtailed` where only the verdict matters. A control
         group that has too few trials gets more. `again`: in trials after all others, both groups anew."""
         clean = () if again else self.findings.clean
         checked = verify(
-            self.answers,
+            self.evaluate_all,
             self.problem.domain,
             found.best_u,
             claim=found.ending,
@@ -180,14 +181,14 @@ class Verifier:
         predictor: PredictedSearch | None = None,
     ) -> Iterator[Judgement]:
         """Try configurations once each, every one with a seed of its own, by their numbers among those of a kind; a
-        `predictor` as for `answers`."""
+        `predictor` as for `evaluate_all`."""
         problem, queries = self.problem, list[Query]()
         for number, u in configurations.items():
             seed = seeds.stream(problem.seed, kind, number)
             values = problem.describe(u, seed) if problem.domain.dim <= MANY else {}
             queries.append(Query(u, seed, kind, number, spp=self.findings.spp, values=values, sought=sought))
-        for answer in self.answers(queries, predictor=predictor):
-            yield answer.said
+        for evaluation in self.evaluate_all(queries, predictor=predictor):
+            yield evaluation.said
 
     def average(self, count: int) -> None:
         """Try configurations drawn from the whole space and budget: how often the model is wrong on average."""
@@ -220,9 +221,9 @@ def unchanged(picture: Tensor, seed: int) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class RetrialCondition:
-    """What an answer is tried under. Conditions of equal source are shown the same picture before it is changed: (H, W,
-    3) sRGB in [0, 1], by the seed of its trial; those of equal light get theirs from one linear radiance, as their
-    scenes are the same and only tone curves or models differ (None: this one renders by itself)."""
+    """What a configuration is tried under. Conditions of equal source are shown the same picture before it is changed:
+    (H, W, 3) sRGB in [0, 1], by the seed of its trial; those of equal light get theirs from one linear radiance, as
+    their scenes are the same and only tone curves or models differ (None: this one renders by itself)."""
 
     name: str
     problem: Problem
@@ -233,9 +234,9 @@ class RetrialCondition:
 
 
 class Retrials:
-    """Tries the clean scene and answers under conditions, each in so many trials; what the run has stored already is
-    read back. Trial k has the same seed, of a root that nothing else uses, for all of them. An executor's workers hold
-    the problems by the names of their conditions; without, pictures are made here."""
+    """Tries the clean scene and adversarial ones under conditions, each in so many trials; what the run has stored
+    already is read back. Trial k has the same seed, of a root that nothing else uses, for all of them. An executor's
+    workers hold the problems by the names of their conditions; without, pictures are made here."""
 
     def __init__(
         self,
@@ -261,7 +262,7 @@ class Retrials:
     def clean(self, condition: RetrialCondition) -> tuple[Judgement, ...]:
         if condition.name not in self._clean:
             self._clean[condition.name] = run_trials(
-                partial(self._answers, "clean", condition),
+                partial(self._evaluations, "clean", condition),
                 condition.problem.domain.start,
                 spp=condition.spp,
                 seed=self._seed,
@@ -270,11 +271,11 @@ class Retrials:
             )
         return self._clean[condition.name]
 
-    def answer(self, kind: str, u: Tensor, condition: RetrialCondition) -> Verification:
-        """Try an answer (d,) under one condition, beside the clean scene; a claim of nothing is never confirmed. Its
-        rows are called "KIND under CONDITION"."""
+    def adversarial(self, kind: str, u: Tensor, condition: RetrialCondition) -> Verification:
+        """Try a configuration (d,) under one condition, beside the clean scene; a claim of nothing is never confirmed.
+        Its rows are called "KIND under CONDITION"."""
         return verify(
-            partial(self._answers, kind, condition),
+            partial(self._evaluations, kind, condition),
             condition.problem.domain,
             u,
             claim=Ending.NOT_VERIFIED,
@@ -286,11 +287,11 @@ class Retrials:
             kind=f"{kind} under {condition.name}",
         )
 
-    def _answers(self, kind: str, condition: RetrialCondition, queries: Sequence[Query]) -> Iterator[Evaluation]:
+    def _evaluations(self, kind: str, condition: RetrialCondition, queries: Sequence[Query]) -> Iterator[Evaluation]:
         changed = partial(self._changed, kind, condition)
-        for answer in self._journals[condition.name].answers(queries, changed):
+        for evaluation in self._journals[condition.name].evaluate_all(queries, changed):
             self._progress.advance(1)
-            yield answer
+            yield evaluation
 
     def _changed(self, kind: str, condition: RetrialCondition, queries: Sequence[Query]) -> Iterator[Evaluation]:
         """Judge pictures as the condition changes them; those of the configuration that is tried now are kept for other
@@ -319,9 +320,9 @@ class Retrials:
             for query in queries:
                 yield self._rendered(condition, query.u, query.seed), None
             return
-        for answer in shared(queries):
-            assert answer.picture is not None
-            yield answer.picture, answer.machine
+        for evaluation in shared(queries):
+            assert evaluation.picture is not None
+            yield evaluation.picture, evaluation.machine
 
     def _rendered(self, condition: RetrialCondition, u: Tensor, seed: int) -> Tensor:
         """As `Problem.picture`, from the radiance of other conditions with the same light where there are any."""
@@ -335,12 +336,12 @@ class Retrials:
             return to_8_bit(renderer.space.picture(whole, renderer.formation.display(self._lights[key])))
 
 
-def kept_answer(folder: Path, problem: Problem) -> torch.Tensor:
-    """Return the configuration (d,) that a run answers with, of its problem loaded again."""
-    u = torch.from_numpy(read_answer(folder))
+def kept_configuration(folder: Path, problem: Problem) -> torch.Tensor:
+    """Return the configuration (d,) that a run found, of its problem loaded again."""
+    u = torch.from_numpy(read_configuration(folder))
     if u.shape != problem.domain.start.shape:
         raise InputError(
-            f"{folder}: its answer has {len(u)} numbers, and its scene has {problem.domain.dim} now: the object or "
-            "advsearch has changed since; do the run again"
+            f"{folder}: its configuration has {len(u)} numbers, and its scene has {problem.domain.dim} now: the "
+            "object or advsearch has changed since; do the run again"
         )
     return u

@@ -1,7 +1,7 @@
 """What a network sees before it decides: the numbers that its last layer turns into logits.
 
 It is found by running the network once: a hook on the last `nn.Linear` or convolution of an `nn.Module`, or the last
-such operator of a graph (`torch.export`), reads its input where it answers with one value per class, else its output.
+such operator of a graph (`torch.export`), reads its input where it returns one value per class, else its output.
 For any other network it is the logits less their mean. Maps and sequences are averaged over their positions.
 """
 

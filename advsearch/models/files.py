@@ -1,7 +1,7 @@
 """Models in files: `torch.export` archives (.pt2) and TorchScript, told apart by content; and ONNX, by its suffix.
 
 No Python object is ever unpickled: archives that need it are refused. A model file is a program all the same; open only
-files whose makers you trust. ONNX files are run by onnxruntime, which gives answers and no gradients.
+files whose makers you trust. ONNX files are run by onnxruntime, which gives predictions and no gradients.
 """
 
 from __future__ import annotations

@@ -57,7 +57,7 @@ def load_model(
     task: Any = None,
     read: Read | None = None,
 ) -> Model:
-    """Load a model, look at its answers once, and return it as a function from images to logits.
+    """Load a model, look at its outputs once, and return it as a function from images to logits.
 
     Options left at None take what the model says of itself, else the defaults named here.
 
@@ -78,16 +78,16 @@ def load_model(
         layout: ``"NCHW"`` (default) or ``"NHWC"``.
         channels: ``"RGB"`` (default) or ``"BGR"``.
         max_batch: the most images at once; default 64, or what the program allows.
-        read: what finds the output in the network's answer to so many images, where it is not logits: a tensor (N, ...)
-            or a list of N things.
+        read: what finds the output in what the network returns for so many images, where it is not logits: a tensor (N,
+            ...) or a list of N things.
         task: what the model is to do, as in `attack`: its name ("detection"), a mapping with its name and options, or
-            the task itself. It says how answers are read. Default: classification, unless there is `read`.
+            the task itself. It says how outputs are read. Default: classification, unless there is `read`.
 
     Raises:
         UnknownNameError: `spec` is a name that means nothing; near matches are given.
         FileFormatError: a model or label file is missing, empty, truncated, a pickle, or of another kind.
         InputError: an option is out of range, or the number of labels is not the number of classes.
-        ModelError: the model cannot be built or run, or does not answer with finite logits (N, classes).
+        ModelError: the model cannot be built or run, or does not return finite logits (N, classes).
 
     Warns:
         ModelWarning: see `advsearch.models.probe.probe`.

@@ -29,7 +29,7 @@ PRESETS: dict[str, tuple[Triple, Triple]] = {
 }
 
 Read = Callable[[Any, int], Any]
-"""From what a network answered to so many images, to its output; ValueError says what was expected."""
+"""From what a network returned to so many images, to its output; ValueError says what was expected."""
 
 #: Probabilities below this count as this before the logarithm is taken (its derivative stays finite in float32).
 SMALLEST_PROBABILITY = 1e-30
@@ -44,7 +44,7 @@ GIVEN_BY = {
     "depth": "a number for each pixel is what a model of depth gives",
     "similarity": "features are what a network without a head gives",
 }
-"""What networks of a task answer with, by task, for messages."""
+"""What networks of a task return, by task, for messages."""
 
 
 class ModelWarning(UserWarning):
@@ -106,21 +106,21 @@ class Preprocessing:
 @final
 @dataclass(frozen=True, eq=False, repr=False)
 class Model:
-    """A network with everything that is needed to show it an image and read its answer. Made by `load_model`.
+    """A network with everything that is needed to show it an image and read its output. Made by `load_model`.
 
     Args:
-        module: the network. It takes what `preprocessing` returns and answers as `logits_of` describes.
+        module: the network. It takes what `preprocessing` returns and returns what `logits_of` describes.
         name: what to call it in messages and results.
         labels: one name per class, in index order.
         preprocessing: what happens to an image first.
         batch_limits: (fewest, most) images that the network takes at once. Larger batches are cut, smaller ones padded.
-        probabilities: the network answers with probabilities; their logarithm is returned: differences are log-odds.
+        probabilities: the network returns probabilities; their logarithm is returned: differences are log-odds.
         differentiable: a gradient of the logits reaches the image.
-        attached: its gradient is that of its answers only where `detach` does nothing, see `Detaching`.
+        attached: its gradient is that of its outputs only where `detach` does nothing, see `Detaching`.
         named: False if `labels` are placeholders.
         dtype: the type of the network's floating-point input.
         device: where the network lives. Images go there, the output comes back.
-        read: from what the network answers to so many images, to its output: a tensor (N, ...), or a list with one
+        read: from what the network returns for so many images, to its output: a tensor (N, ...), or a list with one
             thing for each; None for logits.
         asked: what `load_model` was given, where that says all of it; None for what exists in this session only.
     """
@@ -163,11 +163,11 @@ class Model:
 
         Returns:
             Logits (N, classes), float32, on the device of the images; N is 1 for a single image. Of a network that
-            answers with probabilities p, log p. Where there is `read`, what that returns.
+            returns probabilities p, log p. Where there is `read`, what that returns.
 
         Raises:
             InputError: not an image, or values that are clearly not in [0, 1].
-            ModelError: the network's answer is not (N, classes), or `read` finds no output in it.
+            ModelError: the network's output is not (N, classes), or `read` finds no output in it.
         """
         images = checked_images(images)
         parts = [
@@ -197,23 +197,23 @@ class Model:
         INTERRUPTS.look()
         mode = Detaching(ignored=True) if self.attached and torch.is_grad_enabled() else nullcontext()
         with mode, torch.set_grad_enabled(torch.is_grad_enabled()):  # a network may switch gradients off as it runs
-            answer = self.module(x)
+            returned = self.module(x)
         if raw:
-            return answer
+            return returned
         if self.read is not None:
-            return read_by(self.read, answer, len(x), self.name)
-        logits = logits_of(answer, len(x), len(self.labels), self.name)
+            return read_by(self.read, returned, len(x), self.name)
+        logits = logits_of(returned, len(x), len(self.labels), self.name)
         return logits.clamp_min(SMALLEST_PROBABILITY).log() if self.probabilities else logits
 
 
 def _kept(output: Tensor, device: torch.device) -> Tensor:
-    """An answer on a device; a copy, for a network may answer into the same memory again."""
+    """An output on a device; a copy, for a network may write into the same memory again."""
     moved = output.to(device)
     return moved.clone() if moved is output and not output.requires_grad else moved
 
 
 class Detaching(TorchFunctionMode):
-    """Looks on as a network detaches something, which it may be kept from: then gradients are those of its answers.
+    """Looks on as a network detaches something, which it may be kept from: then gradients are those of its outputs.
 
     RT-DETR and its like choose queries by the scores of their encoder, and cut these off from their decoder, in
     evaluation too: that makes training stable (Zhu et al. 2020, arXiv 2010.04159, appendix A.4), and hides from a
@@ -256,25 +256,25 @@ def checked_images(images: Tensor) -> Tensor:
     return images if images.dim() == 4 else images.unsqueeze(0)
 
 
-def read_by(read: Read, answer: Any, count: int, name: str) -> Any:
-    """Return the output that a reader finds in a network's answer. Raises ModelError where it finds none, or another
-    number than `count`."""
+def read_by(read: Read, returned: Any, count: int, name: str) -> Any:
+    """Return the output that a reader finds in what a network returned. Raises ModelError where it finds none, or
+    another number than `count`."""
     try:
-        output = read(answer, count)
+        output = read(returned, count)
     except ValueError as error:
-        meant, own = _task_of(answer), getattr(getattr(read, "__self__", None), "name", None)
+        meant, own = _task_of(returned), getattr(getattr(read, "__self__", None), "name", None)
         other = _other_task(meant) if meant and meant != own else "wrap the network, or ask for another task"
-        advice = _no_scores(answer) or other
-        raise ModelError(f"model {name}: {error}, got {described(answer)}; {advice}") from None
+        advice = _no_scores(returned) or other
+        raise ModelError(f"model {name}: {error}, got {described(returned)}; {advice}") from None
     if len(output) != count:
         raise ModelError(f"model {name}: expected an output for each of {count} images, got {len(output)}")
     mend_batch_norms(output)
     return output
 
 
-def described(answer: Any) -> str:
-    """Return what an answer of a network is: its type, and the shape of a tensor."""
-    return f"one of shape {tuple(answer.shape)}" if isinstance(answer, Tensor) else type(answer).__name__
+def described(returned: Any) -> str:
+    """Return what an output of a network is: its type, and the shape of a tensor."""
+    return f"one of shape {tuple(returned.shape)}" if isinstance(returned, Tensor) else type(returned).__name__
 
 
 def joined(parts: Sequence[Any]) -> Any:
@@ -294,7 +294,7 @@ def each_tensor(output: Any, function: Callable[[Tensor], Tensor]) -> Any:
 
 
 def logits_of(output: Any, count: int, classes: int | None, name: str) -> Tensor:
-    """Return the logits (count, classes) float32 in what a network answered.
+    """Return the logits (count, classes) float32 in what a network returned.
 
     Accepted are a tensor, an object with a tensor `logits`, a mapping with a tensor ``"logits"``, and a tuple or list
     whose first element is a tensor.
@@ -370,41 +370,41 @@ def _tensor_in(output: Any) -> Tensor | None:
     return output if isinstance(output, Tensor) else None
 
 
-def _no_scores(answer: Any) -> str:
-    """What to do with an answer that has no scores: the classes that it chose, or losses; "" of any other."""
-    parts = list(answer.values()) if isinstance(answer, Mapping) else [answer]
+def _no_scores(returned: Any) -> str:
+    """What to do with an output that has no scores: the classes that it chose, or losses; "" of any other."""
+    parts = list(returned.values()) if isinstance(returned, Mapping) else [returned]
     if parts and all(isinstance(one, Tensor) and one.ndim == 0 for one in parts):
-        return "one number for all pictures is what a loss is: give the network as it answers outside of training"
-    tensor = answer.get("out") if isinstance(answer, Mapping) and "out" in answer else _tensor_in(answer)
-    listed = isinstance(answer, (list, tuple))  # whose first part may be the labels of boxes
+        return "one number for all pictures is what a loss is: give the network as it is outside of training"
+    tensor = returned.get("out") if isinstance(returned, Mapping) and "out" in returned else _tensor_in(returned)
+    listed = isinstance(returned, (list, tuple))  # whose first part may be the labels of boxes
     if tensor is None or listed or tensor.is_floating_point() or tensor.ndim not in (1, 3):
         return ""
     return f"these are the classes that it chose ({tensor.dtype}): return its scores, as they are before the argmax"
 
 
-def _task_of(answer: Any) -> str | None:
-    """Return the task whose networks answer like that: boxes, features, numbers for each pixel, or rows of scores.
+def _task_of(returned: Any) -> str | None:
+    """Return the task whose networks return such a thing: boxes, features, numbers for each pixel, or rows of scores.
 
     None where it is none of these.
     """
-    if _has_boxes(answer):
+    if _has_boxes(returned):
         return "detection"
-    if isinstance(answer, Mapping) and any(word in str(key) for key in answer for word in ("depth", "disparity")):
+    if isinstance(returned, Mapping) and any(word in str(key) for key in returned for word in ("depth", "disparity")):
         return "depth"
-    if hasattr(answer, "last_hidden_state") and not hasattr(answer, "logits"):
+    if hasattr(returned, "last_hidden_state") and not hasattr(returned, "logits"):
         return "similarity"
-    tensor = answer.get("out") if isinstance(answer, Mapping) and "out" in answer else _tensor_in(answer)
+    tensor = returned.get("out") if isinstance(returned, Mapping) and "out" in returned else _tensor_in(returned)
     kinds = {2: "classification", 4: "segmentation"}
     if (
-        isinstance(answer, (list, tuple))
-        and len({one.shape[2:] for one in answer if isinstance(one, Tensor) and one.ndim == 4}) > 1
+        isinstance(returned, (list, tuple))
+        and len({one.shape[2:] for one in returned if isinstance(one, Tensor) and one.ndim == 4}) > 1
     ):
         return None  # maps of several sizes
     return kinds.get(tensor.dim()) if isinstance(tensor, Tensor) else None
 
 
 def _has_boxes(output: Any) -> bool:
-    """Whether an answer is a detector's: (boxes (N, K, 4), scores ...), or mappings or objects with "boxes"."""
+    """Whether an output is a detector's: (boxes (N, K, 4), scores ...), or mappings or objects with "boxes"."""
     first = output[0] if isinstance(output, (tuple, list)) and output else output
     names = first if isinstance(first, Mapping) else dir(first)
     if not isinstance(first, Tensor) and ("boxes" in names or "pred_boxes" in names):

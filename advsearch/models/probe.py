@@ -1,4 +1,4 @@
-"""Look at a network once, before anyone trusts its answers: two images, a repetition, a pair, a gradient."""
+"""Look at a network once, before anyone trusts its outputs: two images, a repetition, a pair, a gradient."""
 
 from __future__ import annotations
 
@@ -33,25 +33,25 @@ ODD_ADVICE = (
     "Return what stands before the last function"
 )
 
-#: Two answers are the same if they differ by less than this times the largest logit (float32 kernels differ by 1e-6).
+#: Two outputs are the same if they differ by less than this times the largest logit (float32 kernels differ by 1e-6).
 REPEAT_TOLERANCE = 1e-3
 
 ROUNDING = 4.0
-"""Steps between neighbouring numbers of the network's type by which its pictures are changed at least, and answers may
+"""Steps between neighbouring numbers of the network's type by which its pictures are changed at least, and outputs may
 differ: a network in bfloat16 tells 0.50 from 0.51 and no less."""
 
 STEP = 1e-3
 """Change of each value of an image, in [0, 1], along the gradient that is checked."""
 
 MASKED = 0.9
-"""Share of a change by which answers may miss what the gradient foretells: a sign that is wrong is a miss of 2, a step
+"""Share of a change by which outputs may miss what the gradient foretells: a sign that is wrong is a miss of 2, a step
 function one of 1; kinks of ordinary networks stay under a half."""
 
 AGREES = 0.5
-"""Share of a change by which answers may miss what a gradient foretells that takes the place of the network's own."""
+"""Share of a change by which outputs may miss what a gradient foretells that takes the place of the network's own."""
 
 SMALLEST = 1e-5
-"""Smallest change that is looked at, as a share of the answers: what is less may be rounding."""
+"""Smallest change that is looked at, as a share of the outputs: what is less may be rounding."""
 
 PROGRAMS = (torch.fx.GraphModule, torch.jit.ScriptModule)
 """What torch makes of a model file. Others that are made of one have a method `stop`, which ends what they run."""
@@ -72,12 +72,12 @@ def probe(model: Model, labels: tuple[str, ...] | None, labels_source: str) -> M
         labels_source: where the labels came from, for the message when their number is wrong.
 
     Raises:
-        ModelError: it takes more than `LARGEST`, cannot be run on such an image, answers something other than logits,
+        ModelError: it takes more than `LARGEST`, cannot be run on such an image, returns something other than logits,
             or with NaN or infinity.
         InputError: the number of labels is not the number of classes.
 
     Warns:
-        ModelWarning: it answers with probabilities (a segmenter's too), differently every time, differently in a batch,
+        ModelWarning: it returns probabilities (a segmenter's too), differently every time, differently in a batch,
             or no gradient reaches the image.
     """
     grey, noise = _test_images(model)
@@ -98,19 +98,19 @@ def probe(model: Model, labels: tuple[str, ...] | None, labels_source: str) -> M
     if probabilities:
         kind = "percentages that sum to 100" if percentages else "probabilities"
         _warn(
-            f"model {model.name} answers with {kind}. Their logarithm is used, so that margins are log-odds, "
+            f"model {model.name} returns {kind}. Their logarithm is used, so that margins are log-odds, "
             "but gradients vanish where a probability rounds to 0 or 1: remove the final softmax if you can"
         )
     if not logits and _pixel_probabilities(model, noise):
         _warn(
-            f"model {model.name} answers with probabilities for each pixel: margins are differences of these and no "
+            f"model {model.name} returns probabilities for each pixel: margins are differences of these and no "
             "log-odds, and gradients vanish where one rounds to 0 or 1: remove the final softmax if you can"
         )
     repeatable = _same(model, rows[:1], again)
     if repeatable and logits and not probabilities and (odd := _odd_scores(model, rows)):
-        _warn(f"model {model.name} answers with {odd}. {ODD_ADVICE}")
+        _warn(f"model {model.name} returns {odd}. {ODD_ADVICE}")
     if not repeatable:
-        _warn(f"model {model.name} answers the same image differently each time: results hold for single draws only")
+        _warn(f"model {model.name} differs each time on the same image: results hold for single draws only")
     return dataclasses.replace(
         _with_gradient(model, noise, repeatable),
         labels=found,
@@ -134,18 +134,18 @@ def _test_images(model: Model) -> tuple[Tensor, Tensor]:
 
 
 def _run(model: Model, images: Tensor) -> Tensor:
-    """Return the raw answer of the network for images (N, H, W, 3) as (N, classes) float32 on the CPU.
+    """Return the raw output of the network for images (N, H, W, 3) as (N, classes) float32 on the CPU.
 
     An output of another kind comes as three numbers of each image, (N, 3); see `_numbers`.
     """
-    output, count = _answer(model, images)
+    output, count = _returned(model, images)
     if model.read is None:
         return logits_of(output, count, None, model.name)[: len(images)].cpu()
     outputs = read_by(model.read, output, count, model.name)[: len(images)]
     return torch.stack([_numbers(one) for one in outputs]).cpu()
 
 
-def _answer(model: Model, images: Tensor) -> tuple[Any, int]:
+def _returned(model: Model, images: Tensor) -> tuple[Any, int]:
     """Return what the network gives for images (N, H, W, 3), and for how many: no fewer than it takes at once."""
     x = model.prepared(images)
     with torch.set_grad_enabled(torch.is_grad_enabled()):
@@ -188,7 +188,7 @@ def _guarded(model: Model, call: Callable[[], Any]) -> Any:
 
 
 TRUTHS = {"target", "targets", "label", "labels", "annotations", "ground_truth"}
-"""What a network in its form for training calls the right answers."""
+"""What a network in its form for training calls the right labels."""
 
 
 def _unlike_pictures(network: object, error: str) -> str:
@@ -243,10 +243,10 @@ def _odd_scores(model: Model, rows: Tensor) -> str:
 
 
 def _pixel_probabilities(model: Model, images: Tensor) -> bool:
-    """Whether what is read in the network's answer is (N, classes, h, w) of probabilities, two classes at least."""
+    """Whether what is read in the network's output is (N, classes, h, w) of probabilities, two classes at least."""
     assert model.read is not None
     with torch.no_grad():
-        output = read_by(model.read, *_answer(model, images), model.name)
+        output = read_by(model.read, *_returned(model, images), model.name)
     if not isinstance(output, Tensor) or output.ndim != 4 or output.shape[1] < 2:
         return False
     return _probabilities(output.movedim(1, -1).reshape(-1, output.shape[1]))
@@ -269,15 +269,15 @@ def _batch_limits(model: Model, pair: Tensor, rows: Tensor | None) -> tuple[int,
         return 1, 1
     if rows is not None and not _same(model, rows, together):
         _warn(
-            f"model {model.name} answers an image differently in a batch: was it exported in training mode? "
+            f"model {model.name} sees an image differently in a batch: was it exported in training mode? "
             "Call .eval() before exporting"
         )
     return low, high
 
 
 def _with_gradient(model: Model, images: Tensor, repeatable: bool) -> Model:
-    """Return the model with `differentiable` and `attached` set; warn if no gradient of its answers reaches the image,
-    and if answers do not follow it."""
+    """Return the model with `differentiable` and `attached` set; warn if no gradient of its outputs reaches the image,
+    and if outputs do not follow it."""
     try:
         with Detaching() as detaching:
             rows, gradient = _slope(model, images)
@@ -315,7 +315,7 @@ def _told(rows: Tensor) -> Tensor:
 
 
 def _is_better(model: Model, images: Tensor, whole: Tensor, own: Tensor) -> bool:
-    """Return whether answers change as a gradient without `detach` says, and less so as the network's own does.
+    """Return whether outputs change as a gradient without `detach` says, and less so as the network's own does.
 
     Changes are taken along the signs of the difference of the two. Networks that round behind a `detach` keep their
     own: the other one is zero.
@@ -332,7 +332,7 @@ def _is_better(model: Model, images: Tensor, whole: Tensor, own: Tensor) -> bool
 
 
 def _check_gradient(model: Model, images: Tensor, gradient: Tensor, detached: bool) -> None:
-    """Warn if a network's answers do not move as its gradient says: it is masked, cut off, or not of this network."""
+    """Warn if a network's outputs do not move as its gradient says: it is masked, cut off, or not of this network."""
     sizes = (STEP,) if model.read is None else (STEP, STEP / 8.0)  # what suppression leaves may jump in the first only
     told_apart = ROUNDING * torch.finfo(model.dtype).eps
     if told_apart > STEP:
@@ -341,19 +341,19 @@ def _check_gradient(model: Model, images: Tensor, gradient: Tensor, detached: bo
         step = size * gradient.sign()
         ends = (images + step).clamp(0.0, 1.0), (images - step).clamp(0.0, 1.0)
         with torch.no_grad():
-            answers = [_run(model, end) for end in ends]
+            outputs = [_run(model, end) for end in ends]
             if model.read is not None and len({_choices(model, one) for one in (images, *ends)}) > 1:
                 return  # nothing can be said of what jumps
-        seen = float(_told(answers[0] - answers[1]))
+        seen = float(_told(outputs[0] - outputs[1]))
         expected = float(((ends[0] - ends[1]) * gradient).sum())
         change = max(abs(seen), abs(expected))
-        if change <= SMALLEST * float(answers[0].abs().sum()) or abs(seen - expected) <= MASKED * change:
+        if change <= SMALLEST * float(outputs[0].abs().sum()) or abs(seen - expected) <= MASKED * change:
             return
     why = "Steps that round, or a defence that masks gradients?"
     if detached:
         why = "It detaches a part of what it computes, where it rounds or for another reason."
     _warn(
-        f"the gradient of model {model.name} does not say how its answers change: {expected:.3g} expected, "
+        f"the gradient of model {model.name} does not say how its outputs change: {expected:.3g} expected, "
         f"{seen:.3g} seen for a small step along it. {why} A search "
         "that follows them may find nothing: try a policy without gradients beside it"
     )
@@ -362,8 +362,8 @@ def _check_gradient(model: Model, images: Tensor, gradient: Tensor, detached: bo
 def _choices(model: Model, images: Tensor) -> str:
     """What an output has that no gradient moves: how many numbers, which of them are whole, and texts.
 
-    A detector that has suppressed boxes finds more or fewer of them, or others, after a small step, and what answers in
-    words goes on otherwise after another word.
+    A detector that has suppressed boxes finds more or fewer of them, or others, after a small step, and what is
+    returned in words goes on otherwise after another word.
     """
     assert model.read is not None
     found: list[Any] = []
@@ -373,7 +373,7 @@ def _choices(model: Model, images: Tensor) -> str:
         found.append((one.shape, columns[(columns == columns.round()).all(dim=1)].tolist()))
         return one
 
-    outputs = read_by(model.read, *_answer(model, images), model.name)[: len(images)]
+    outputs = read_by(model.read, *_returned(model, images), model.name)[: len(images)]
     if not isinstance(outputs, Tensor):
         each_tensor(outputs, keep)
         found += [text for one in outputs if isinstance(one, Mapping) for text in one.values() if type(text) is str]

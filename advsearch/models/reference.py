@@ -215,10 +215,10 @@ def trainable(model: Model, layers: str = "all") -> Trainable:
 
     Raises:
         ModelError: the network is no `nn.Module` that can be copied, is a program that was exported or scripted, or
-            answers with something other than logits.
+            returns something other than logits.
     """
     if model.probabilities or model.read is not None:
-        raise ModelError(f"model {model.name}: only a classifier that answers with logits can be hardened")
+        raise ModelError(f"model {model.name}: only a classifier that returns logits can be hardened")
     net = _copied(model)
     net.eval().requires_grad_(True)
     if layers == "last":

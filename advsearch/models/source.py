@@ -47,7 +47,7 @@ class Purpose:
 
     def check(self, model: str, what: str, *tasks: str) -> None:
         """Raise a ModelError where a network cannot do the task: `what` it does, such as "compares a picture with
-        texts", is good for `tasks`, and for a user's own, which may read its answer in any way."""
+        texts", is good for `tasks`, and for a user's own, which may read its output in any way."""
         if self.task in (*GIVEN_BY, "answer") and self.task not in tasks:
             instead = " or ".join(f"`task={task}`" for task in tasks)
             raise ModelError(f"model {model} {what} and cannot do task {self.task}; use {instead}")

@@ -13,7 +13,7 @@ from advsearch.questions.attack.settings import AttackConfig
 from advsearch.report import wording
 from advsearch.report.figures import BLUE, GREY, RED
 from advsearch.report.markup import InNotebook
-from advsearch.report.shown import AnswerPart, Claim, Column, ShownAnswer, average_claim, case_claim, searches_text
+from advsearch.report.shown import Claim, Column, ResultPart, ShownResult, average_claim, case_claim, searches_text
 from advsearch.report.wording import margin_text, percent
 from advsearch.runs.results import AverageCase, Fields, JsonFloat, StudyResult, VerifiedRate
 from advsearch.settings import setting_as_in
@@ -81,7 +81,7 @@ def gap(asked: Asked[GapConfig]) -> GapResult:
     return asked.result(GapResult, table=rows, parts=study.names, warnings=study.warnings)
 
 
-def shown(result: GapResult) -> ShownAnswer:
+def shown(result: GapResult) -> ShownResult:
     """Return the average and the worst case of each object and control."""
     columns: dict[str, Column] = {
         "object": "{0.object}",
@@ -96,11 +96,11 @@ def shown(result: GapResult) -> ShownAnswer:
     }
     rows, facts = result.table, {"model": result.model, "policy": result.policy}
     if not rows:
-        return ShownAnswer("Nothing was compared to its end.", [], facts)
+        return ShownResult("Nothing was compared to its end.", [], facts)
     chart = {"height": 110 + 34 * len(rows), "size": (6.4, 1.6 + 0.36 * len(rows)), "parts": [row.run for row in rows]}
     title = "The worst case beside the average"
-    table = AnswerPart.table(rows, columns, title=title, note=NOTE, draw=lambda axes: draw(result, axes), **chart)
-    meaning = AnswerPart(text=[f"Margin: {margin_text(result.task)}, in the trials of the worst case."])
+    table = ResultPart.table(rows, columns, title=title, note=NOTE, draw=lambda axes: draw(result, axes), **chart)
+    meaning = ResultPart(text=[f"Margin: {margin_text(result.task)}, in the trials of the worst case."])
     shares = [percent(share) for share in sorted(row.average.accuracy for row in rows)]
     said = f"The model is right in {' to '.join(dict.fromkeys((shares[0], shares[-1])))} of random configurations"
     found = sum(row.ending == "found" for row in rows)
@@ -108,7 +108,7 @@ def shown(result: GapResult) -> ShownAnswer:
         said += f", {'yet one' if found else 'and none'} is found that it gets wrong."
     else:
         said += f", yet in {found} of {len(rows)} cases one is found that it gets wrong."
-    return ShownAnswer(said, [table, meaning], facts)
+    return ShownResult(said, [table, meaning], facts)
 
 
 def draw(result: GapResult, axes: Any) -> None:

@@ -1,7 +1,7 @@
 """Figures: how they are drawn, those of studies, and of a surface. matplotlib with one style, into the bytes of files.
 
 Of studies: robust accuracy against epsilon, worst case and average, maps of the margin and of a sweep. Of
-`sweep --surface`: which parts of an object go with wrong answers, on its map and from some sides.
+`sweep --surface`: which parts of an object go with wrong predictions, on its map and from some sides.
 """
 
 from __future__ import annotations

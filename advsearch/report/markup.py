@@ -1,6 +1,6 @@
 """HTML that is escaped by construction: text becomes markup only through `element`.
 
-And answers as a notebook shows them (what is said, pictures or a figure, and tables, without styles), and charts that
+And results as a notebook shows them (what is said, pictures or a figure, and tables, without styles), and charts that
 stand inline in a page; their colours come from its style sheet, so that they follow its scheme.
 """
 
@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from advsearch.errors import InputError
 from advsearch.report.figures import BLUE, GREY, RED, Figures, drawn, new_axes
-from advsearch.report.shown import AnswerPart, ShownAnswer, shown
+from advsearch.report.shown import ResultPart, ShownResult, shown
 from advsearch.runs.images import png_bytes
 from advsearch.runs.results import Result
 
@@ -73,7 +73,7 @@ class InNotebook:
     """The field that is its table."""
 
     def plot(self, axes: Any = None) -> Any:
-        """Draw the figure of the answer and return the matplotlib axes; nothing is drawn where it has none.
+        """Draw the figure of the result and return the matplotlib axes; nothing is drawn where it has none.
 
         Args:
             axes: to draw on; None makes new ones.
@@ -97,38 +97,38 @@ class InNotebook:
         return json_normalize([row.to_dict() for row in rows])
 
     def _repr_html_(self) -> str:
-        return answer_html(_shown(self))
+        return result_html(_shown(self))
 
     def _repr_png_(self) -> bytes | None:
-        return figure_of_answer(_shown(self)).get("png")
+        return result_figure(_shown(self)).get("png")
 
 
-def _shown(result: object) -> ShownAnswer:
+def _shown(result: object) -> ShownResult:
     assert isinstance(result, Result)
     return shown(result)
 
 
-def answer_html(given: ShownAnswer, pictures: Mapping[str, ArrayLike] | None = None) -> str:
-    """Return an answer as a cell of a notebook, with pictures (H, W, 3), sRGB in [0, 1]."""
+def result_html(given: ShownResult, pictures: Mapping[str, ArrayLike] | None = None) -> str:
+    """Return a result as a cell of a notebook, with pictures (H, W, 3), sRGB in [0, 1]."""
     figures = [
         element(
             "figure", _picture(png_bytes(image), SHOWN, name), element("figcaption", name), style="display:inline-block"
         )
         for name, image in (pictures or {}).items()
     ]
-    figure = figure_of_answer(given)
+    figure = result_figure(given)
     chart = _picture(figure["png"], 2 * SHOWN, "the numbers of the table") if figure else None
     parts = [_part(one) for one in given.sections if one.only in ("", "notebook") and not one.empty]
     return element("div", element("p", given.said), *figures, chart, *parts)
 
 
-def drawn_part(given: ShownAnswer) -> AnswerPart | None:
-    """Return the first part of an answer that is drawn."""
+def drawn_part(given: ShownResult) -> ResultPart | None:
+    """Return the first part of a result that is drawn."""
     return next((one for one in given.sections if one.draw is not None), None)
 
 
-def figure_of_answer(given: ShownAnswer) -> Figures:
-    """Return the figure of an answer as files; none where nothing of it is drawn."""
+def result_figure(given: ShownResult) -> Figures:
+    """Return the figure of a result as files; none where nothing of it is drawn."""
     part = drawn_part(given)
     if part is None or part.draw is None:
         return {}
@@ -143,7 +143,7 @@ def side_by_side(pictures: Sequence[ArrayLike]) -> bytes:
     return png_bytes(np.concatenate([part for one in arrays for part in (one, gap)][:-1], axis=1))
 
 
-def _part(one: AnswerPart) -> Html:
+def _part(one: ResultPart) -> Html:
     head = element("thead", element("tr", *(element("th", cell) for cell in one.heads))) if one.heads else None
     body = (element("tr", *(element("td", cell) for cell in row)) for row in one.rows)
     inside = [

@@ -1,12 +1,12 @@
-"""What a person is shown of an answer: said once, and set as text, as a page and in a notebook by whoever shows it.
+"""What a person is shown of a result: said once, and set as text, as a page and in a notebook by whoever shows it.
 
-A question has `shown(result)` in its `answer`; of one that has not, the fields of its result are shown as they are
+A question has `shown(result)` in its `result`; of one that has not, the fields of its result are shown as they are
 called and described. All rules of wording claims are here too: sentences that a run stands for, and no more than that.
 A claim is one of four kinds:
 
 - `found`: the search ended as `found` and fresh renders confirm it. It says that such a configuration exists.
-- `not found`: the search ran to its end and its best answer was rendered afresh. It says how many renders of which
-  policy found none, and that this shows no absence.
+- `not found`: the search ran to its end and its best configuration was rendered afresh. It says how many renders of
+  which policy found none, and that this shows no absence.
 - `measured`: a share that was counted to the end, with its interval and what was counted.
 - `nothing claimed`: everything else: interrupted, wrong already, not verified, broken off, of an unknown ending, or a
   run that says nothing about how often a model is right.
@@ -48,8 +48,8 @@ class Picture:
 
 
 @dataclass(frozen=True)
-class AnswerPart:
-    """A part of an answer; what is empty is left out.
+class ResultPart:
+    """A part of a result; what is empty is left out.
 
     Attributes:
         title: of the part.
@@ -90,7 +90,7 @@ class AnswerPart:
     only: str = ""
 
     @classmethod
-    def table(cls, rows: Iterable[Any], columns: Mapping[str, Column], **more: Any) -> AnswerPart:
+    def table(cls, rows: Iterable[Any], columns: Mapping[str, Column], **more: Any) -> ResultPart:
         """Return a table, a row for each of some values, with columns by their heads, and `more` of its attributes."""
         made = [[made(row) if callable(made) else made.format(row) for made in columns.values()] for row in rows]
         return cls(heads=tuple(columns), rows=made, **more)
@@ -102,40 +102,40 @@ class AnswerPart:
 
 
 @dataclass(frozen=True)
-class ShownAnswer:
-    """An answer: what a reader should know first, in a sentence or two, the other sections, and by name what it was
+class ShownResult:
+    """A result: what a reader should know first, in a sentence or two, the other sections, and by name what it was
     done with, beside what all questions have (environment, renders, time and seed). Cautions have to be known beside
     the warnings; `about` is what it is of, in a few names, and empty: the object, the controls and the model."""
 
     said: str
-    sections: Sequence[AnswerPart] = ()
+    sections: Sequence[ResultPart] = ()
     facts: Mapping[str, str] = field(default_factory=dict)
     about: Sequence[str] = ()
     cautions: Sequence[str] = ()
 
 
-def shown(result: Result) -> ShownAnswer:
+def shown(result: Result) -> ShownResult:
     """Return what a person is shown of the result of any question."""
     room = rooms.room(result.command)
-    made: ShownAnswer = room.shown(result) if room and room.shown else fields_shown(result)
+    made: ShownResult = room.shown(result) if room and room.shown else fields_shown(result)
     return made
 
 
-def remarks_of(result: Result, given: ShownAnswer) -> list[str]:
-    """Return what has to be known beside an answer."""
+def remarks_of(result: Result, given: ShownResult) -> list[str]:
+    """Return what has to be known beside a result."""
     unsaid = getattr(result, "ending", "") == INTERRUPTED and "nterrupted" not in given.said
     stopped = ["Interrupted before its end."] if unsaid else []
     return [*stopped, *given.cautions, *getattr(result, "warnings", ())]
 
 
-def subject_of(result: Result, given: ShownAnswer) -> list[str]:
-    """Return what an answer is about: objects, controls, model."""
+def subject_of(result: Result, given: ShownResult) -> list[str]:
+    """Return what a result is about: objects, controls, model."""
     found = [getattr(result, name, None) or () for name in ("object", "objects", "controls", "model")]
     return [*given.about] or [", ".join([one] if isinstance(one, str) else one) for one in found if one]
 
 
-def facts_of(result: Result, given: ShownAnswer) -> dict[str, str]:
-    """Return by what an answer came about, without what is not known."""
+def facts_of(result: Result, given: ShownResult) -> dict[str, str]:
+    """Return by what a result came about, without what is not known."""
     renders, seconds = getattr(result, "renders", None), getattr(result, "seconds", None)
     spent = sum(renders.values()) if isinstance(renders, Mapping) else renders
     own = {
@@ -152,14 +152,14 @@ def facts_of(result: Result, given: ShownAnswer) -> dict[str, str]:
 # ---- fields as they are ---------------------------------------------------------------------------------------------
 
 
-def fields_shown(result: Result) -> ShownAnswer:
+def fields_shown(result: Result) -> ShownResult:
     """Return the lists of a result as tables, its other fields as facts, and what their names mean."""
     values = {name: getattr(result, name) for name in type(result).described()}
     tables = {name: found for name, value in values.items() if (found := _rows(value))}
     elsewhere = (*_ELSEWHERE, *tables, *(name.replace(" ", "_") for name in result.facts()))
     plain = {_words(name): _text(one) for name, one in values.items() if name not in elsewhere}
     sections = [
-        AnswerPart(
+        ResultPart(
             _words(name),
             heads=[_words(one) for one in _columns(rows)],
             rows=[[_text(getattr(row, one, None)) for one in _columns(rows)] for row in rows],
@@ -168,9 +168,9 @@ def fields_shown(result: Result) -> ShownAnswer:
         for name, rows in tables.items()
     ]
     meanings = list(_meanings(result, {name for name, text in plain.items() if text}, list(tables.values())).items())
-    sections.append(AnswerPart("What these words mean", rows=meanings, folded=True, only="page"))
+    sections.append(ResultPart("What these words mean", rows=meanings, folded=True, only="page"))
     said = result.brief or str(values.get("ending", "done"))
-    return ShownAnswer(said[:1].upper() + said[1:] + ".", sections, plain)
+    return ShownResult(said[:1].upper() + said[1:] + ".", sections, plain)
 
 
 def _meanings(result: Result, plain: set[str], tables: Sequence[Sequence[Fields]]) -> dict[str, str]:
@@ -247,7 +247,7 @@ NO_PROOF = "This does not show that there is none."
 
 
 ENDED = ("budget spent", "stalled")
-"""Endings of a search that ran to its end without an answer."""
+"""Endings of a search that ran to its end without finding anything."""
 
 
 WHY = {
@@ -260,14 +260,17 @@ WHY = {
 
 
 def case_claim(name: str, ending: str, rate: VerifiedRate | None, spent: str | None) -> Claim:
-    """One answer of many. `spent` is what was searched; None where nothing was, and an answer was only tried again."""
+    """One adversarial scene of many. `spent` is what was searched; None where nothing was, and a scene was only tried
+    again."""
     extent = extent_of("fresh renders that count as a success", rate)
     if ending == "found" and rate is not None and rate.successes:
-        return claim("found", f"{name}: an answer holds in {wording.rate_text(rate)}.", extent)
+        return claim("found", f"{name}: an adversarial scene holds in {wording.rate_text(rate)}.", extent)
     if rate is not None and spent is None and ending in (*ENDED, "not verified"):
-        return claim("measured", f"{name}: the answer is not confirmed, in {wording.rate_text(rate)}.", extent)
+        return claim(
+            "measured", f"{name}: the adversarial scene is not confirmed, in {wording.rate_text(rate)}.", extent
+        )
     if rate is not None and ending in ENDED:
-        text = f"{name}: no failure was found; the best answer counts in {wording.rate_text(rate)}."
+        text = f"{name}: no failure was found; the best configuration counts in {wording.rate_text(rate)}."
         return claim("not found", f"{text} Searched were {spent}. {NO_PROOF}", extent)
     return nothing_claimed(WHY.get(ending, f"it ended as {ending!r}"), f"This is about {name}.")
 

@@ -1,4 +1,4 @@
-"""Numbers and results in plain words, and what a task's answers are called in sentences and tables, by its name."""
+"""Numbers and results in plain words, and what a task's predictions are called in sentences and tables, by its name."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ if TYPE_CHECKING:
 
 CLASSIFICATION, DETECTION, SEGMENTATION = "classification", "detection", "segmentation"
 DEPTH, SIMILARITY = "depth", "similarity"
-"""Tasks whose answers have words of their own; others are quoted."""
+"""Tasks whose predictions have words of their own; others are quoted."""
 
 _MARGINS = {
-    CLASSIFICATION: "how far the wrong answer leads the right one, in logits",
+    CLASSIFICATION: "how far the wrong prediction leads the right one, in logits",
     DETECTION: "how far the best right box is under the score that counts, in log-odds; over 0 where none is found",
     SEGMENTATION: "the lead of wrong classes at the pixel that decides, in logits; over 0 where too few are right",
     DEPTH: "the logarithm of the factor by which the object's distance is off, less that of the tolerance",
@@ -40,7 +40,7 @@ _WANTED = {
     "gone": "makes the model judge {} to be as far as what is behind it",
 }
 SUCCESS_ABOVE_ZERO = ("margin", "score", "vanish", *_WANTED)
-"""Objectives that are over 0 exactly where an answer is what is sought."""
+"""Objectives that are over 0 exactly where a prediction is what is sought."""
 
 _UNITS = {
     "logits": ("margin", "log_odds", "pixel_margin"),
@@ -58,16 +58,16 @@ PROBABILITY_DECIMALS = 1
 """Of a probability that a model gives."""
 
 WHOLE = ("background", "itself", "something else")
-"""Answers without an article."""
+"""Labels without an article."""
 
 _NONE, _ELSEWHERE = "no ", " elsewhere"
 
 _DOING = {"calls": "calling", "finds": "finding", "sees": "seeing", "takes": "taking", "judges": "judging"}
-_DOING |= {"answers": "answering"}
+_DOING |= {"predicts": "predicting"}
 
 
 Said = Any
-"""An answer of a model: `advsearch.tasks.Answer`, or what a result holds of one."""
+"""A prediction of a model: `advsearch.tasks.Prediction`, or what a result holds of one."""
 
 
 def percent(share: float | None, most: int = MOST_DECIMALS) -> str:
@@ -105,8 +105,8 @@ def with_article(name: str) -> str:
     return f"{'an' if name[:1].lower() in 'aeiou' else 'a'} {name}"
 
 
-def beside_text(answer: str, pair: Any) -> str:
-    """Return what a model does without and with the answer of a run (`PairedRates`), in sentences."""
+def beside_text(run: str, pair: Any) -> str:
+    """Return what a model does without and with the adversarial scene of a run (`PairedRates`), in sentences."""
     sides = [
         f"{one.correct} of {one.configurations} ({percent(one.accuracy)}, 95 % interval "
         f"{percent_number(one.interval[0])}-{percent_number(one.interval[1])} %)"
@@ -116,16 +116,16 @@ def beside_text(answer: str, pair: Any) -> str:
     ends = f"{-high:.0f} to {-low:.0f}" if pair.difference < 0 else f"{low:.0f} to {high:.0f}"
     shown = "" if low > 0.0 or high < 0.0 else "; that there is a difference is not shown"
     return (
-        f"{pair.model} is right in {sides[0]} of the clean scene, and in {sides[1]} with the answer of {answer}: "
-        f"{abs(100.0 * pair.difference):.0f} points {'fewer' if pair.difference < 0 else 'more'} (95 % interval of "
-        f"pairs {ends}){shown}. Right in the clean one alone are {pair.clean_only} pairs, with the answer alone "
-        f"{pair.answer_only}."
+        f"{pair.model} is right in {sides[0]} of the clean scene, and in {sides[1]} with the adversarial scene of "
+        f"{run}: {abs(100.0 * pair.difference):.0f} points {'fewer' if pair.difference < 0 else 'more'} (95 % "
+        f"interval of pairs {ends}){shown}. Right in the clean one alone are {pair.clean_only} pairs, with the "
+        f"adversarial one alone {pair.answer_only}."
     )
 
 
 def margin_text(task: str) -> str:
     """Return what the margin of a task is, as a clause."""
-    return _MARGINS.get(task, "over 0 where the answer is wrong")
+    return _MARGINS.get(task, "over 0 where the prediction is wrong")
 
 
 def is_command(text: str) -> bool:
@@ -139,8 +139,8 @@ def objective_label(objective: str) -> str:
 
 
 def marks_text(task: str) -> str:
-    """Return what is drawn into the pictures of a task's answers, in a sentence."""
-    return _MARKS.get(task, "Blue is true of the scene, orange is the model's answer.")
+    """Return what is drawn into the pictures of a task's predictions, in a sentence."""
+    return _MARKS.get(task, "Blue is true of the scene, orange is the model's prediction.")
 
 
 def wanted(objective: str, thing: str) -> str:
@@ -148,15 +148,15 @@ def wanted(objective: str, thing: str) -> str:
     return _WANTED.get(objective, "makes the model miss {}").format(thing)
 
 
-def answer_cells(task: str, answer: Said) -> list[str]:
-    """Return an answer and its number, for a table: ``["vase", "84 %"]``, ``["no cup found", "best score of cup
+def prediction_cells(task: str, prediction: Said) -> list[str]:
+    """Return a prediction and its number, for a table: ``["vase", "84 %"]``, ``["no cup found", "best score of cup
     0.12"]``.
     """
-    label, share = answer.label, answer.probability
+    label, share = prediction.label, prediction.probability
     if share is None:
         return [label, ""]
     if task == SIMILARITY:
-        return [label, _similar(percent(share, PROBABILITY_DECIMALS), getattr(answer, "payload", None))]
+        return [label, _similar(percent(share, PROBABILITY_DECIMALS), getattr(prediction, "payload", None))]
     if task == DETECTION:
         if label.startswith(_NONE):
             return [f"{label} found", f"best score of {label.removeprefix(_NONE)} {share:.2f}"]
@@ -164,13 +164,13 @@ def answer_cells(task: str, answer: Said) -> list[str]:
     return [label, f"accuracy {percent(share)}" if task == SEGMENTATION else percent(share, PROBABILITY_DECIMALS)]
 
 
-def answer_text(task: str, answer: Said) -> str:
-    """Return an answer on one line: ``vase, 91 %``, ``no cup found (best score of cup 0.12)``."""
-    label, number = answer_cells(task, answer)
+def prediction_text(task: str, prediction: Said) -> str:
+    """Return a prediction on one line: ``vase, 91 %``, ``no cup found (best score of cup 0.12)``."""
+    label, number = prediction_cells(task, prediction)
     if task == SEGMENTATION and number and label.startswith(_NONE):
-        return f"{label} found, accuracy over the object's pixels {percent(answer.probability)}"
+        return f"{label} found, accuracy over the object's pixels {percent(prediction.probability)}"
     if task == SEGMENTATION and number:
-        return f"accuracy over the object's pixels {percent(answer.probability)}, most often {label}"
+        return f"accuracy over the object's pixels {percent(prediction.probability)}, most often {label}"
     if task == DETECTION and number:
         return f"{label} ({number})"
     return f"{label}, {number}" if number else label
@@ -190,26 +190,26 @@ def things_rows(things: Mapping[str, Any]) -> list[list[str]]:
     return rows
 
 
-def seen_cells(task: str, answer: Said) -> list[str]:
-    """Return one of the answers to a whole picture, for a table: ``["cup", "score 0.77"]``, ``["mug", "91 %"]``."""
-    if answer.probability is None:
-        return [answer.label, ""]
+def seen_cells(task: str, prediction: Said) -> list[str]:
+    """Return one of the predictions of a whole picture, for a table: ``["cup", "score 0.77"]``, ``["mug", "91 %"]``."""
+    if prediction.probability is None:
+        return [prediction.label, ""]
     if task == DETECTION:
-        return [answer.label, f"score {answer.probability:.2f}"]
-    share = percent(answer.probability, PROBABILITY_DECIMALS)
-    return [answer.label, f"{share} of the picture" if task == SEGMENTATION else share]
+        return [prediction.label, f"score {prediction.probability:.2f}"]
+    share = percent(prediction.probability, PROBABILITY_DECIMALS)
+    return [prediction.label, f"{share} of the picture" if task == SEGMENTATION else share]
 
 
-def seen_text(task: str, answer: Said) -> str:
+def seen_text(task: str, prediction: Said) -> str:
     """Return the same on one line: ``cup (score 0.77)``, ``mug 91 %``."""
-    label, number = seen_cells(task, answer)
+    label, number = seen_cells(task, prediction)
     return f"{label} ({number})" if task == DETECTION and number else f"{label} {number}".rstrip()
 
 
 def calls(task: str, thing: str, label: str) -> str:
     """Return what a model does to a thing, as a clause: ``calls this mug a vase``, ``finds no cup``."""
     if label == NOT_A_NUMBER:
-        return f"answers nothing for {thing}, for its answer is not a number"
+        return f"predicts nothing for {thing}, for its output is not a number"
     if task in (SEGMENTATION, DETECTION) and label.startswith(_NONE):
         return f"finds {label}"
     if task == DETECTION and label.endswith(_ELSEWHERE):
@@ -220,7 +220,7 @@ def calls(task: str, thing: str, label: str) -> str:
         return f"judges {thing} {label}"
     if task in (DETECTION, SEGMENTATION, SIMILARITY):
         return f"takes {thing} for {label if label in WHOLE and task != DETECTION else with_article(label)}"
-    return f'answers "{label}" for {thing}'
+    return f'predicts "{label}" for {thing}'
 
 
 def calling(task: str, label: str) -> str:
@@ -230,7 +230,7 @@ def calling(task: str, label: str) -> str:
 
 
 def _similar(share: str, kept: Any) -> str:
-    """Return how sure an answer of similarity is, and where the right one stands or how like the clean one it is."""
+    """Return how sure a prediction of similarity is, and where the right one stands or how like the clean one it is."""
     if not isinstance(kept, dict) or "cosine" not in kept:
         return share
     if "rank" not in kept:
@@ -271,8 +271,8 @@ def interval_text(interval: Interval | None) -> str:
 
 
 def rate_text(rated: VerifiedRate) -> str:
-    """Return ``20 of 20 fresh renders (95 % interval 83-100 %)``; and how many answers are not numbers."""
-    nothing = f"in {rated.not_a_number} its answer is not a number" if rated.not_a_number else ""
+    """Return ``20 of 20 fresh renders (95 % interval 83-100 %)``; and how many outputs are not numbers."""
+    nothing = f"in {rated.not_a_number} its output is not a number" if rated.not_a_number else ""
     if nothing and not rated.successes:
         return f"none of {rated.trials} fresh renders: {nothing}"
     rate = f"{rated.successes} of {rated.trials} fresh renders (95 % interval {interval_text(rated.interval)})"
@@ -280,12 +280,12 @@ def rate_text(rated: VerifiedRate) -> str:
 
 
 def no_numbers(count: int) -> str:
-    """Return what a table adds to a rate where answers are not numbers."""
+    """Return what a table adds to a rate where outputs are not numbers."""
     return f", {count} not a number" if count else ""
 
 
 def tally(what: str, number: int, trials: int, not_a_number: int = 0) -> str:
-    """Return ``wrong in 20 of 20``; of answers that are not numbers, how many."""
+    """Return ``wrong in 20 of 20``; of outputs that are not numbers, how many."""
     nothing = f"not a number in {not_a_number} of {trials}"
     if not not_a_number:
         return f"{what} in {number} of {trials}"

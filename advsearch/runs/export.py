@@ -161,8 +161,8 @@ _PLACED = ("environment", "object")
 
 def write_threedb(rows: Callable[[], Iterable[Row]], out: Path, picture: Callable[[int], bytes | None]) -> int:
     """Write the rows of a sweep as such a folder, made or empty, with the PNG of each, where one was kept, and return
-    how many there were. ``loss`` holds the margin: how wrong an answer is, over 0 where it is not right. The parameter
-    ``network`` tells what several networks answer apart."""
+    how many there were. ``loss`` holds the margin: how wrong a prediction is, over 0 where it is not right. The
+    parameter ``network`` tells what several networks predict apart."""
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"out: {out} is there already and not empty; name another folder")
     names, classes = dict[str, None](), dict[str, int | None]()

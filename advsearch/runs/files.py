@@ -229,14 +229,14 @@ SCHEMA = f"""
         seed         INTEGER,             -- of the render
         spp          INTEGER,             -- samples per pixel of the render
         objective    REAL,                -- what was maximised; NULL when it was not a number, or nothing is maximised
-        score        REAL,                -- what the task says of the answer, over 0 where it is what is sought
-        success      INTEGER,             -- 1 when the answer is what is sought, 0 when not, NULL in a sweep
-        correct      INTEGER,             -- 1 when the answer was a right one, else 0
+        score        REAL,                -- what the task says of the prediction, over 0 where it is what is sought
+        success      INTEGER,             -- 1 when the prediction is what is sought, 0 when not, NULL in a sweep
+        correct      INTEGER,             -- 1 when the prediction was a right one, else 0
         margin       REAL,                -- largest logit of a wrong class minus largest of a right one
-        label        TEXT,                -- the class that the model answered
+        label        TEXT,                -- the class that the model predicted
         label_index  INTEGER,             -- its number
         probability  REAL,                -- the model's probability for it, in [0, 1]
-        payload_json TEXT,                -- what a task keeps of an answer beside its words: boxes, masks
+        payload_json TEXT,                -- what a task keeps of a prediction beside its words: boxes, masks
         values_json  TEXT    NOT NULL,    -- {{"camera.azimuth": {{"value": 130.0, "unit": "degrees"}}, ...}}
         seconds      REAL,                -- that the evaluation took
         renders      INTEGER,             -- pictures that it took; more than one where derivatives are differences

@@ -20,7 +20,7 @@ FAULT = "it cannot be read, which is a fault of advsearch"
 @dataclass(frozen=True)
 class Listed:
     """One run in its folder: the command that made it, what the model should recognise, what could change, rows by
-    kind; ``"running"`` where a process works on it, ``"stopped"`` where it can be resumed, else its ending; the answer
+    kind; ``"running"`` where a process works on it, ``"stopped"`` where it can be resumed, else its ending; the result
     in a few words; whether it has begun, so that it can be resumed; when, seconds since 1970 (UTC), if known; and what
     is wrong with it, empty where nothing is."""
 

@@ -1,6 +1,6 @@
 """What every result is made of: named fields, checked when they are put in, written as JSON and read back.
 
-And what several questions answer with: studies, how derivatives are obtained, how long light paths are, pictures.
+And what several questions end with: studies, how derivatives are obtained, how long light paths are, pictures.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, JsonValue
+from pydantic import AfterValidator, AliasChoices, BaseModel, BeforeValidator, ConfigDict, Field, JsonValue
 from pydantic.fields import ComputedFieldInfo, FieldInfo
 
 from advsearch import rooms
@@ -86,7 +86,7 @@ class Fields(BaseModel):
 
 
 class Result(Fields):
-    """The answer of a command."""
+    """The result of a command."""
 
     command: ClassVar[str]
 
@@ -114,7 +114,7 @@ class Result(Fields):
 
 
 class RunResult(Result):
-    """The answer of a command that keeps a run."""
+    """The result of a command that keeps a run."""
 
     run: str | None = Field(description="the folder; null if nothing was kept")
     environment: str
@@ -134,15 +134,15 @@ class RunResult(Result):
 
 
 Payload = Annotated[JsonValue, BeforeValidator(lambda value: plain(value))]
-"""What a task keeps of an answer beside its words."""
+"""What a task keeps of a prediction beside its words."""
 
 
 class SceneResult(RunResult):
-    """The answer of a command about one object, one model and one task."""
+    """The result of a command about one object, one model and one task."""
 
     object: str
     model: str
-    task: str = Field(description="what judges the answers")
+    task: str = Field(description="what judges the predictions")
 
 
 class MovedValue(Fields):
@@ -225,7 +225,7 @@ class StudyResult(RunResult):
 
     objects: list[str]
     model: str
-    task: str = Field(description="what judges the answers")
+    task: str = Field(description="what judges the predictions")
     policy: str
     parts: list[str] = Field(description="the attacks in the folder `parts`")
     warnings: list[str] = Field(description="sentences that a reader has to know")
@@ -326,8 +326,8 @@ class Measured(Fields):
         return max(0.0, (self.bias or 0.0) - (self.doubt or 0.0))
 
 
-class ClassAnswer(Fields):
-    """One answer to a picture."""
+class ClassPrediction(Fields):
+    """One prediction of a picture."""
 
     label: str = Field(description="in words")
     index: int | None = Field(description="its number among the model's classes; null where there are none")
@@ -350,11 +350,13 @@ class ThingSeen(Fields):
     distance: float | None = Field(description="of the nearest point that is seen from the camera, metres")
 
 
-class ViewAnswers(Fields):
+class ViewPredictions(Fields):
     """What the model says of one view."""
 
     azimuth: float = Field(description="of the camera, degrees")
-    answers: list[ClassAnswer] = Field(description="the likeliest first")
+    answers: list[ClassPrediction] = Field(
+        validation_alias=AliasChoices("answers", "predictions"), description="the likeliest first"
+    )
     things: dict[str, ThingSeen] | None = Field(
         default=None, description="what is seen of `object` and of each thing beside it; absent without any"
     )
@@ -380,11 +382,11 @@ class RenderResult(Result):
     object: str
     environment: str
     model: str
-    task: str = Field(description="what judges the answers")
+    task: str = Field(description="what judges the predictions")
     spp: int = Field(description="samples a pixel")
     image_formation: Formation
     up: MeshUp | None = Field(description="null for an object without a mesh file")
-    views: list[ViewAnswers]
+    views: list[ViewPredictions]
     warnings: list[str] = Field(description="sentences that a reader has to know")
 
 
@@ -402,7 +404,7 @@ class ControlGroup(Fields):
     trials: int
     rate: float
     interval: Interval
-    not_a_number: int = Field(default=0, description="trials whose answer is NaN or infinity; absent without")
+    not_a_number: int = Field(default=0, description="trials whose output is NaN or infinity; absent without")
 
 
 class VerifiedRate(Fields):
@@ -413,9 +415,9 @@ class VerifiedRate(Fields):
     rate: float
     interval: Interval
     spp: int = Field(description="samples a pixel")
-    labels: dict[str, int] = Field(description="answers of the successes, and how often each was given")
+    labels: dict[str, int] = Field(description="predictions of the successes, and how often each was given")
     margin: JsonFloat = Field(description="mean over these trials, in logits; of a detector in log-odds")
-    not_a_number: int = Field(default=0, description="trials whose answer is NaN or infinity; absent without")
+    not_a_number: int = Field(default=0, description="trials whose output is NaN or infinity; absent without")
     stopped: str | None = Field(
         default=None,
         description="why there are no more: `asked for` (as many as were) or `decided` (the verdict stands); absent of "

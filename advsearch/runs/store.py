@@ -51,16 +51,17 @@ class Row:
         seed: of the render.
         spp: samples per pixel of the render; None of a search where the picture was predicted.
         objective: what is maximised, of this picture; stored as None when it is not a number, or nothing is maximised.
-        score: what the run's task says of the answer: over 0 where it is what is sought; stored as None when it is not
-            a number.
-        success: whether the answer is what the attack is after; None where nothing is sought, as in a sweep.
-        correct: whether the answer is right.
+        score: what the run's task says of the prediction: over 0 where it is what is sought; stored as None when it is
+            not a number.
+        success: whether the prediction is what the attack is after; None where nothing is sought, as in a sweep.
+        correct: whether the prediction is right.
         margin: how wrong it is, by the run's task, over 0 where it is not right; in classification the largest logit of
             a wrong class minus the largest of a right one; stored as None when it is not a number.
-        label: what the model answered, in words.
+        label: what the model predicted, in words.
         label_index: the number of that class; None where there are no classes.
         probability: the model's probability for it, in [0, 1]; None where it gives none.
-        payload: what the run's task keeps of the answer beside its words, as JSON values; None where there is nothing.
+        payload: what the run's task keeps of the prediction beside its words, as JSON values; None where there is
+            nothing.
         values: parameter to ``{"value": ..., "unit": ...}``.
         seconds: that the evaluation took.
         renders: pictures that it took; 0 where they were predicted, None where that was not counted.

@@ -1,5 +1,6 @@
-"""The answer of a run: `summary.json` (docs/answers.md), and `artifacts/answer.npy`, the configuration, so that it can
-be rendered again elsewhere. And what a run is made with: versions, and digests of the files that its settings name."""
+"""The result of a run: `summary.json` (docs/results.md), and `artifacts/adversarial.npy`, the configuration, so that it
+can be rendered again elsewhere. And what a run is made with: versions, and digests of the files that its settings
+name."""
 
 from __future__ import annotations
 
@@ -69,10 +70,12 @@ def other_summary(path: Path, got: str) -> FileFormatError:
     return FileFormatError(f"{path}: expected the summary of a run, got {got}")
 
 
-ANSWER = "answer.npy"
+CONFIGURATION = "adversarial.npy"
+FORMERLY = "answer.npy"
+"""What runs that were made before call it."""
 FOLDER = "artifacts"
 
-LARGEST_ANSWER = 1 << 30
+LARGEST_CONFIGURATION = 1 << 30
 
 MAGIC = b"\x93NUMPY\x01\x00"
 """How a file of numpy's begins, of version 1.0."""
@@ -85,24 +88,32 @@ HEADER = re.compile(
 Python, which ends in errors of any kind."""
 
 
-def write_answer(run: Path, u: NDArray[np.float32]) -> Path:
+def write_configuration(run: Path, u: NDArray[np.float32]) -> Path:
     """Keep a configuration (d,) of the unit box, whole or not at all, and return where."""
     buffer = io.BytesIO()
     np.save(buffer, np.ascontiguousarray(u, dtype=np.float32), allow_pickle=False)
-    return write_bytes(run / FOLDER / ANSWER, buffer.getvalue())
+    return write_bytes(run / FOLDER / CONFIGURATION, buffer.getvalue())
 
 
-def read_answer(run: Path) -> NDArray[np.float32]:
-    """Return the configuration (d,) float32 in [0, 1] that a run answers with, or raise a FileFormatError."""
-    path = run / FOLDER / ANSWER
+def read_configuration(run: Path) -> NDArray[np.float32]:
+    """Return the configuration (d,) float32 in [0, 1] that a run found, or raise a FileFormatError."""
+    path, older = run / FOLDER / CONFIGURATION, run / FOLDER / FORMERLY
+    if older.is_file() and not path.exists():
+        path = older
     try:
-        data = read_bytes(path, "the answer of a run", LARGEST_ANSWER)
+        data = read_bytes(path, "the adversarial configuration of a run", LARGEST_CONFIGURATION)
     except FileNotFoundError:
-        raise FileFormatError(f"{path}: expected the answer of a run, got no such file; did the run end?") from None
+        raise FileFormatError(
+            f"{path}: expected the adversarial configuration of a run, got no such file; did the run end?"
+        ) from None
     except OSError as error:
-        raise FileFormatError(f"{path}: expected the answer of a run, got {str(error)[:120]}") from None
+        raise FileFormatError(
+            f"{path}: expected the adversarial configuration of a run, got {str(error)[:120]}"
+        ) from None
     if not data.startswith(MAGIC) or b"\n" not in data[: len(MAGIC) + MOST]:
-        raise FileFormatError(f"{path}: expected the answer of a run, got something else, or the beginning of one")
+        raise FileFormatError(
+            f"{path}: expected the adversarial configuration of a run, got something else, or the beginning of one"
+        )
     header = HEADER.match(data)
     count = -1 if header is None else int(header[1])
     if header is None or len(data) != header.end() + 4 * count:

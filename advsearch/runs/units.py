@@ -1,5 +1,6 @@
 """Which rows of a sweep are independent: those of different *units*, each of one draw. A unit is a drive with all its
-frames, or a picture, with the answers of all models and, where one was swept, without and with the answer of a run."""
+frames, or a picture, with the predictions of all models and, where one was swept, without and with the adversarial
+scene of a run."""
 
 from __future__ import annotations
 

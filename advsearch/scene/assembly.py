@@ -110,20 +110,20 @@ class Assembly:
 
     def __call__(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return the inputs with poses, displacements and maps worked out; differentiable torch operations."""
-        found = dict(inputs)
+        parameters = dict(inputs)
         for name, mesh in self.meshes.items():
-            to_world, offsets = found.pop(f"{name}.to_world", None), found.pop(f"{name}.offsets", None)
+            to_world, offsets = parameters.pop(f"{name}.to_world", None), parameters.pop(f"{name}.offsets", None)
             if to_world is not None or offsets is not None:
-                found[f"{name}.vertices"], found[f"{name}.normals"] = mesh.place(to_world, offsets)
-        if "camera.shift" in found:
-            shift = found.pop("camera.shift")
-            found["camera.shift_x"], found["camera.shift_y"] = shift[:1], shift[1:]
-        if "environment.data" in found:
-            data = found.pop("environment.data")
+                parameters[f"{name}.vertices"], parameters[f"{name}.normals"] = mesh.place(to_world, offsets)
+        if "camera.shift" in parameters:
+            shift = parameters.pop("camera.shift")
+            parameters["camera.shift_x"], parameters["camera.shift_y"] = shift[:1], shift[1:]
+        if "environment.data" in parameters:
+            data = parameters.pop("environment.data")
             if self._photograph is not None:
-                found["ground.reflectance"] = self._photograph.reflectance(data)
-            found["environment.padded"] = torch.cat([data[:, -1:], data, data[:, :1]], dim=1)
-        return found
+                parameters["ground.reflectance"] = self._photograph.reflectance(data)
+            parameters["environment.padded"] = torch.cat([data[:, -1:], data, data[:, :1]], dim=1)
+        return parameters
 
 
 Value = Callable[[Tensor], Tensor]

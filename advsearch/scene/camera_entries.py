@@ -122,7 +122,7 @@ class Entries:
         Raises:
             FileFormatError: one of them changes the picture.
         """
-        found = [within + one for one in self._odd]
+        unread = [within + one for one in self._odd]
         for name, spelled in self._spelled.items():
             value = self._given[name]
             if name in self._used or QUIET.fullmatch(name):
@@ -135,8 +135,8 @@ class Entries:
                         " picture and is not read; calibrate with one of the models in docs/cameras.md"
                     )
                 continue
-            found.append(within + spelled)
-        return found
+            unread.append(within + spelled)
+        return unread
 
 
 def nothing(value: object) -> bool:

@@ -272,7 +272,7 @@ class CameraModel:
     def _half_widths(self) -> tuple[float, float]:
         """The tangents at which the picture ends to the nearer side, along its row and its column through the axis."""
         middle, _ = self.project(torch.tensor([[0.0, 0.0, 1.0]]))
-        found = []
+        widths = []
         for axis in (0, 1):
             line = middle.repeat(512, 1)
             tangents = []
@@ -282,8 +282,8 @@ class CameraModel:
                 seen = (inside > 0.0) & (directions[:, 2] > 0.1)
                 aside = directions[:, axis].abs() / directions[:, 2].clamp_min(0.1)
                 tangents.append(float(torch.where(seen, aside, torch.zeros_like(aside)).max()))
-            found.append(min(WIDEST, *tangents))
-        return max(found[0], 1e-3), max(found[1], 1e-3)
+            widths.append(min(WIDEST, *tangents))
+        return max(widths[0], 1e-3), max(widths[1], 1e-3)
 
     @cached_property
     def black(self) -> float:

@@ -176,30 +176,32 @@ class Cycles:
     def _told(self, inputs: Mapping[str, Tensor]) -> tuple[dict[str, object], bytes, np.ndarray | None]:
         """What Blender is told beside the meshes, the meshes, and the environment's map."""
         scene, (height, width) = self._description, self._resolution
-        given = {name: one.detach().cpu() for name, one in inputs.items()}
-        meshes = [posed(part, given) for part in scene.meshes.values()]
-        meshes += _ground(scene, given.get("ground.reflectance"))
-        camera = given.get("camera.to_world", torch.from_numpy(camera_to_world(scene, width / height))).double().numpy()
-        fov = float(given.get("camera.fov", torch.tensor([scene.number("camera.fov")]))[0])
-        shift = [float(given.get(f"camera.shift_{axis}", torch.zeros(1))[0]) for axis in "xy"]
+        values = {name: one.detach().cpu() for name, one in inputs.items()}
+        meshes = [posed(part, values) for part in scene.meshes.values()]
+        meshes += _ground(scene, values.get("ground.reflectance"))
+        camera = (
+            values.get("camera.to_world", torch.from_numpy(camera_to_world(scene, width / height))).double().numpy()
+        )
+        fov = float(values.get("camera.fov", torch.tensor([scene.number("camera.fov")]))[0])
+        shift = [float(values.get(f"camera.shift_{axis}", torch.zeros(1))[0]) for axis in "xy"]
         lamps: list[dict[str, object]] = []
         for lamp in scene.lamps.values():
             ball, place = np.eye(4), np.eye(4)
             if isinstance(lamp, BallLamp):
                 ball[:3, :3] *= lamp.radius
                 ball[:3, 3] = lamp.place
-                ball = given.get(f"{lamp.name}.ball", torch.from_numpy(ball)).double().numpy()
-                color = given.get(f"{lamp.name}.radiance", torch.tensor(lamp.radiance))
+                ball = values.get(f"{lamp.name}.ball", torch.from_numpy(ball)).double().numpy()
+                color = values.get(f"{lamp.name}.radiance", torch.tensor(lamp.radiance))
             else:
-                place[:3, 3] = given.get(f"{lamp.name}.position", torch.tensor(lamp.position)).numpy()
-                color = given.get(f"{lamp.name}.intensity", torch.tensor(lamp.intensity))
+                place[:3, 3] = values.get(f"{lamp.name}.position", torch.tensor(lamp.position)).numpy()
+                color = values.get(f"{lamp.name}.intensity", torch.tensor(lamp.intensity))
             if bool((color > 0.0).any()):
                 shape = ball.tolist() if isinstance(lamp, BallLamp) else None
                 lamps.append({"ball": shape, "place": place.tolist(), "color": color.tolist()})
         radiance = None if scene.environment is None else np.asarray(scene.environment.radiance, np.float32)
-        if "environment.padded" in given:
-            radiance = given["environment.padded"][:, 1:-1].numpy()
-        told: dict[str, object] = {
+        if "environment.padded" in values:
+            radiance = values["environment.padded"][:, 1:-1].numpy()
+        message: dict[str, object] = {
             "width": width,
             "height": height,
             "camera": (camera @ np.diag([-1.0, 1.0, -1.0, 1.0])).tolist(),  # Blender's look along their own -z
@@ -212,7 +214,7 @@ class Cycles:
             "bounces": max(0, self._depth - 2),
             "denoise": self._denoise,
         }
-        return told, glb(meshes), radiance
+        return message, glb(meshes), radiance
 
 
 def _ground(scene: SceneDescription, reflectance: Tensor | None) -> list[Shape]:

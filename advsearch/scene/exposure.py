@@ -89,18 +89,18 @@ def irradiance(scene: SceneDescription, normals: Doubles) -> Doubles:
     hits = on_table & ~upper & (reach <= scene.number("ground.size") / 2.0).all(axis=1)
     power = np.where(hits[:, None], bounced * solid[:, None], power)
     facing = np.maximum(np.einsum("nk,wk->nw", normals, directions), 0.0)
-    found = np.asarray(np.einsum("nw,wc->nc", facing, power))  # no BLAS, whose last bits depend on its threads
+    irradiances = np.asarray(np.einsum("nw,wc->nc", facing, power))  # no BLAS, whose last bits depend on its threads
     for lamp in scene.lamps.values():
         way, faced = lamp.lighting(middle)
         if faced.any():  # the lamps of controls are dark as they come
             length = max(float(np.linalg.norm(way)), 1e-12)
-            found = found + np.maximum(normals @ (way / length), 0.0)[:, None] * faced
+            irradiances = irradiances + np.maximum(normals @ (way / length), 0.0)[:, None] * faced
     for part in (scene.meshes[name] for name in scene.around):  # what the object emits belongs to what it is made of
         if part.emission is not None:
             ways, faced = _emitted(part, part.emission, middle)
             facing = np.maximum(np.einsum("nk,fk->nf", normals, ways), 0.0)
-            found = found + np.einsum("nf,fc->nc", facing, faced)
-    return found
+            irradiances = irradiances + np.einsum("nf,fc->nc", facing, faced)
+    return irradiances
 
 
 def _emitted(part: MeshPart, emission: Floats, place: Doubles) -> tuple[Doubles, Doubles]:

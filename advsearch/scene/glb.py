@@ -73,17 +73,17 @@ def glb(meshes: Sequence[Shape]) -> bytes:
     return made.file(_described(made, meshes, _png))
 
 
-def web_glb(answer: Sequence[Shape], clean: Sequence[Shape], camera: Doubles, note: str = "") -> bytes:
-    """Return a small file with two scenes, the answer and "clean": what is the same in both is there once.
+def web_glb(adversarial: Sequence[Shape], clean: Sequence[Shape], camera: Doubles, note: str = "") -> bytes:
+    """Return a small file with two scenes, the adversarial one and "clean": what is the same in both is there once.
 
     Args:
-        answer: the meshes of the answer.
+        adversarial: the meshes of the adversarial scene.
         clean: the same before.
-        camera: (4, 4) pose of the camera that sees the answer; it looks along its own +z.
+        camera: (4, 4) pose of the camera that sees that; it looks along its own +z.
         note: what a reader has to know, in `asset.extras`.
     """
-    made, count = _Buffer(), len(answer)
-    header = _described(made, [*answer, *clean], _jpeg)
+    made, count = _Buffer(), len(adversarial)
+    header = _described(made, [*adversarial, *clean], _jpeg)
     ours = camera[:3].T.astype(np.float32)  # rows: its axes, then its place
     columns = np.eye(4)
     columns[:, :3] = _y_up(ours * np.array([[-1.0], [1.0], [-1.0], [1.0]], np.float32))  # glTF's look along their -z
@@ -104,15 +104,15 @@ def _described(made: _Buffer, meshes: Sequence[Shape], picture: Callable[[Floats
         "asset": {"version": "2.0", "generator": "advsearch"},
         "scene": 0,
         "scenes": [{"nodes": list(range(len(meshes)))}],
-        "nodes": [{"name": one.name, "mesh": number} for number, one in enumerate(meshes)],
+        "nodes": [{"name": shape.name, "mesh": number} for number, shape in enumerate(meshes)],
         "meshes": [],
         "materials": [],
         "textures": [],
         "samplers": [{"magFilter": 9729, "minFilter": 9729, "wrapS": 10497, "wrapT": 10497}],
         "images": [],
     }
-    for number, one in enumerate(meshes):
-        mesh = one.mesh
+    for number, shape in enumerate(meshes):
+        mesh = shape.mesh
         corners = {
             "POSITION": made.accessor(_y_up(mesh.vertices), "VEC3", bounds=True),
             "NORMAL": made.accessor(_y_up(_unit(mesh.normals)), "VEC3"),
@@ -121,16 +121,16 @@ def _described(made: _Buffer, meshes: Sequence[Shape], picture: Callable[[Floats
         whole = np.uint32 if len(mesh.vertices) > np.iinfo(np.uint16).max else np.uint16
         indices = made.accessor(mesh.faces.reshape(-1).astype(whole), "SCALAR")
         header["meshes"].append(
-            {"name": one.name, "primitives": [{"attributes": corners, "indices": indices, "material": number}]}
+            {"name": shape.name, "primitives": [{"attributes": corners, "indices": indices, "material": number}]}
         )
-        encoded = picture(one.base_color) if one.opacity is None else _cut_out_png(one.base_color, one.opacity)
-        material = _material(one, _texture(header, made.view(encoded), encoded))
-        if one.normal_map is not None:
-            encoded = picture(one.normal_map)
+        encoded = picture(shape.base_color) if shape.opacity is None else _cut_out_png(shape.base_color, shape.opacity)
+        material = _material(shape, _texture(header, made.view(encoded), encoded))
+        if shape.normal_map is not None:
+            encoded = picture(shape.normal_map)
             material["normalTexture"] = {"index": _texture(header, made.view(encoded), encoded)}
-        if one.emission is not None:
-            most = float(one.emission.max())
-            share = linear_to_srgb(one.emission / np.float32(most))
+        if shape.emission is not None:
+            most = float(shape.emission.max())
+            share = linear_to_srgb(shape.emission / np.float32(most))
             material["emissiveFactor"] = [1.0, 1.0, 1.0]
             encoded = picture(share)
             material["emissiveTexture"] = {"index": _texture(header, made.view(encoded), encoded)}

@@ -156,5 +156,5 @@ def past(scene: SceneDescription, views: Sequence[View], *, turns: bool = False)
     return (
         f"{name}: the place around the object is a picture, which fits a camera up to {which} away{high}; {there} "
         f"{reach:.3g} {unit} away and {top:.3g} {unit} high. There what stands around is more than twice too large or "
-        "too high, or the ground ends in sight: answers from there are about the picture, not about a real place",
+        "too high, or the ground ends in sight: predictions from there are about the picture, not about a real place",
     )

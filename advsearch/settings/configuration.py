@@ -242,6 +242,8 @@ class Config(BaseModel):
     without: ClassVar[tuple[str, ...]] = ()
     """Settings of a class above that the command does not have."""
     clashes: ClassVar[tuple[Clash, ...]] = ()
+    formerly: ClassVar[Mapping[str, str]] = {}
+    """Names that settings had before, with those of now; files and flags may still have them."""
     free: ClassVar[tuple[str, ...]] = (*PLACE, "threads")
     """Settings that decide no number, so that they may be changed before a run goes on."""
 
@@ -251,6 +253,7 @@ class Config(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=True, allow_inf_nan=False)
 
     def __init__(self, **data: Any) -> None:
+        data = {self.formerly.get(name, name): value for name, value in data.items()}
         deep = {name: value for name, value in data.items() if not written.is_shallow(value)}
         if deep:
             raise _settings_error(type(self), [{"loc": (name,), "input": deep[name], "type": ""} for name in deep])

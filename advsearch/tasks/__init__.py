@@ -14,7 +14,7 @@ from advsearch.models import Model
 from advsearch.options import FROM_RUN, JOINED, check_options, check_takes, told
 from advsearch.registry import Registry
 from advsearch.tasks.answers import FreeAnswer
-from advsearch.tasks.base import Answer, Facts, Judgement, Mark, Sight, Task
+from advsearch.tasks.base import Facts, Judgement, Mark, Prediction, Sight, Task
 from advsearch.tasks.classification import Classification
 from advsearch.tasks.depth import Depth
 from advsearch.tasks.detection import Detection
@@ -60,17 +60,17 @@ class OwnTask(Task):
             "wrong logit less the right one"
         )
 
-    def answers(self, output: Any, count: int = 1) -> list[tuple[Answer, ...]]:
+    def predictions(self, output: Any, count: int = 1) -> list[tuple[Prediction, ...]]:
         """Return the largest class of each output where classes have names, else its numbers."""
-        return [(self._answer(one),) for one in output.detach()]
+        return [(self._prediction(one),) for one in output.detach()]
 
-    def _answer(self, one: Tensor) -> Answer:
+    def _prediction(self, one: Tensor) -> Prediction:
         if one.ndim == 1 and len(one) == len(self.labels):
             index = int(one.argmax())
-            return Answer(self.labels[index], index)
+            return Prediction(self.labels[index], index)
         if one.numel() <= MOST_NUMBERS:
-            return Answer(", ".join(f"{value:.3g}" for value in one.flatten().tolist()))
-        return Answer(f"{' x '.join(map(str, one.shape))} numbers, mean {float(one.double().mean()):.3g}")
+            return Prediction(", ".join(f"{value:.3g}" for value in one.flatten().tolist()))
+        return Prediction(f"{' x '.join(map(str, one.shape))} numbers, mean {float(one.double().mean()):.3g}")
 
     def truth_names(self, truth: Facts) -> tuple[str, ...]:
         return (truth.label or truth.own_label or truth.object,)
@@ -150,6 +150,22 @@ def _together(names: Sequence[str], options: Mapping[str, Any]) -> Together:
 
 
 __all__ = [
-    "TASKS", "Answer", "AnyTask", "Classification", "Depth", "Detection", "Facts", "FreeAnswer", "Judgement", "Mark",
-    "OwnTask", "Segmentation", "Sight", "Similarity", "Task", "function_of", "make_task", "own_task",
+    "TASKS",
+    "AnyTask",
+    "Classification",
+    "Depth",
+    "Detection",
+    "Facts",
+    "FreeAnswer",
+    "Judgement",
+    "Mark",
+    "OwnTask",
+    "Prediction",
+    "Segmentation",
+    "Sight",
+    "Similarity",
+    "Task",
+    "function_of",
+    "make_task",
+    "own_task",
 ]  # fmt: skip

@@ -14,7 +14,7 @@ from torch.nn import functional
 from advsearch.errors import InputError
 from advsearch.models import Model
 from advsearch.options import FROM_RUN
-from advsearch.tasks.base import Answer, Facts, Task
+from advsearch.tasks.base import Facts, Prediction, Task
 
 Words = tuple[str, ...]
 
@@ -67,10 +67,12 @@ class FreeAnswer(Task):
             raise InputError("minimise: makes the right answer easier to give; leave `target` out")
         return replace(self, target=None if target is None else _words("target", target), minimise=minimise)
 
-    def read(self, answer: Any, count: int) -> list[Utterance]:
+    def read(self, returned: Any, count: int) -> list[Utterance]:
         keys = Utterance.__required_keys__
-        if isinstance(answer, (list, tuple)) and all(isinstance(one, Mapping) and keys <= one.keys() for one in answer):
-            return list(answer)
+        if isinstance(returned, (list, tuple)) and all(
+            isinstance(one, Mapping) and keys <= one.keys() for one in returned
+        ):
+            return list(returned)
         raise ValueError("expected a mapping with text, logits and begins for each picture, as answers in words have")
 
     def check(self, facts: Facts) -> None:
@@ -96,10 +98,10 @@ class FreeAnswer(Task):
     def margin(self, output: Sequence[Utterance], truth: Words) -> Tensor:
         return torch.stack([_margin(one, truth) for one in output])
 
-    def answers(self, output: Sequence[Utterance], count: int = 1) -> list[tuple[Answer, ...]]:
+    def predictions(self, output: Sequence[Utterance], count: int = 1) -> list[tuple[Prediction, ...]]:
         """Return the text of each picture, in one line without signs that steer a terminal."""
         shown = ("".join(sign if sign.isprintable() else " " for sign in one["text"]) for one in output)
-        return [(Answer(" ".join(text.split()) or SILENCE),) for text in shown]
+        return [(Prediction(" ".join(text.split()) or SILENCE),) for text in shown]
 
 
 def _words(setting: str, text: str) -> Words:

@@ -25,7 +25,7 @@ from advsearch.models import Model
 from advsearch.options import FROM_RUN
 
 Output = Any
-"""What a model answers to N pictures: a tensor (N, ...), or a list with one thing for each picture."""
+"""What a model returns for N pictures: a tensor (N, ...), or a list with one thing for each picture."""
 
 Truth = Any
 """What is true of a scene, as its task needs it: the right classes, a number, boxes."""
@@ -33,9 +33,16 @@ Truth = Any
 Own = TypeVar("Own", bound="Task")
 
 
+FORMERLY = {
+    "answers": "predictions", "answerable": "as_logits", "looks": "calibrates", "seeing": "after_calibration",
+    "unsaid": "ambiguities",
+}  # fmt: skip
+"""What parts of a task were called before."""
+
+
 @dataclass(frozen=True)
-class Answer:
-    """One answer of a model to a picture.
+class Prediction:
+    """One prediction of a model about a picture.
 
     Attributes:
         label: in words.
@@ -54,9 +61,9 @@ class Judgement:
 
     Attributes:
         score: over 0 where it is a success, which is what is sought. NaN is none.
-        margin: how wrong the answer is, whatever is sought: over 0 exactly where it is not right.
-        right: whether the answer is right. NaN is not right.
-        answer: what the model says.
+        margin: how wrong the prediction is, whatever is sought: over 0 exactly where it is not right.
+        right: whether the prediction is right. NaN is not right.
+        prediction: what the model says.
         payload: what else is kept of it in the run's rows, as JSON values (boxes, masks); None where there is nothing.
         objective: what a search maximises, of this picture; None where nothing is searched.
         metrics: numbers that the run's metrics say of this picture, by name, or None in the place of one that is none;
@@ -66,17 +73,17 @@ class Judgement:
     score: float
     margin: float
     right: bool
-    answer: Answer
+    prediction: Prediction
     payload: JsonValue = None
     objective: float | None = None
     metrics: Mapping[str, float | None] | None = None
 
     @classmethod
-    def of(cls, score: float, margin: float, answer: Answer, payload: JsonValue = None) -> Judgement:
+    def of(cls, score: float, margin: float, prediction: Prediction, payload: JsonValue = None) -> Judgement:
         """Return the judgement of an output; where its margin is NaN or infinite, that it is not a number."""
         if not math.isfinite(margin):
-            return cls(math.nan, math.nan, right=False, answer=Answer(NOT_A_NUMBER))
-        return cls(score, margin, margin <= 0.0, answer, payload)
+            return cls(math.nan, math.nan, right=False, prediction=Prediction(NOT_A_NUMBER))
+        return cls(score, margin, margin <= 0.0, prediction, payload)
 
     @property
     def success(self) -> bool:
@@ -85,17 +92,17 @@ class Judgement:
 
     @property
     def not_a_number(self) -> bool:
-        """Whether the model answered with NaN or infinity, which is neither right nor a success."""
-        return self.answer.label == NOT_A_NUMBER
+        """Whether the model returned NaN or infinity, which is neither right nor a success."""
+        return self.prediction.label == NOT_A_NUMBER
 
 
-Said = tuple[Answer, JsonValue]
+Said = tuple[Prediction, JsonValue]
 """What a model says of a picture, and what else is kept of it."""
 
 
 @dataclass(frozen=True)
 class Mark:
-    """What a picture shows of an answer, or of what is true: a box, or the pixels of a mask.
+    """What a picture shows of a prediction, or of what is true: a box, or the pixels of a mask.
 
     Attributes:
         text: that stands beside it.
@@ -229,11 +236,11 @@ class Task(ABC):
     works with.
 
     Attributes:
-        minimise: success is a right answer: the object is to be made easier to recognise.
-        target: what is sought in place of any wrong answer, as if it were the truth; None for any.
+        minimise: success is a right prediction: the object is to be made easier to recognise.
+        target: what is sought in place of any wrong prediction, as if it were the truth; None for any.
         name: on the command line.
         objective: name of the objective where none is asked for; "score" is the task's own score.
-        reads_logits: whether its models answer with logits (N, classes). Then their answers are checked as such, and
+        reads_logits: whether its models return logits (N, classes). Then their outputs are checked as such, and
             the objectives of classification take them.
         labelled: whether it takes a label; with one that takes none, others get it (`together`).
         names_from: where its names come from, if neither from the model nor from the setting `labels`.
@@ -252,7 +259,20 @@ class Task(ABC):
 
     def __init_subclass__(cls, **more: Any) -> None:
         super().__init_subclass__(**more)
-        asked = ("margin", "score", "answers", "payloads", "marks", "judge", "said", "average", "seeing", "answerable")
+        for old in FORMERLY.keys() & vars(cls).keys():
+            raise InputError(f"task {cls.__name__}: `{old}` is called `{FORMERLY[old]}` now; rename it")
+        asked = (
+            "margin",
+            "score",
+            "predictions",
+            "payloads",
+            "marks",
+            "judge",
+            "said",
+            "average",
+            "after_calibration",
+            "as_logits",
+        )
         hand_copies(cls, truth_names=slice(None), **dict.fromkeys(asked, slice(None)))
 
     def check_numbers(self, fits: Callable[[float], bool], expected: str, *names: str) -> None:
@@ -270,41 +290,42 @@ class Task(ABC):
         """Return what is true of the scene.
 
         Raises:
-            InputError: the facts do not say it, or the model cannot answer it.
+            InputError: the facts do not say it, or the model cannot predict it.
         """
 
     @abstractmethod
     def margin(self, output: Output, truth: Truth) -> Tensor:
         """Return how wrong each of N outputs is, (N,): over 0 exactly where it is not right; differentiable.
 
-        It is maximised where no other objective is asked for, so it should rise towards a wrong answer from afar.
+        It is maximised where no other objective is asked for, so it should rise towards a wrong prediction from afar.
         """
 
     @abstractmethod
-    def answers(self, output: Output, count: int = 1) -> list[tuple[Answer, ...]]:
-        """Return what the model says of each of N pictures: at most `count` answers, the likeliest first."""
+    def predictions(self, output: Output, count: int = 1) -> list[tuple[Prediction, ...]]:
+        """Return what the model says of each of N pictures: at most `count` predictions, the likeliest first."""
 
     # ---- what it may say --------------------------------------------------------------------------------------------
 
-    def read(self, answer: Any, count: int) -> Output:
-        """Return the output in what a network answered to `count` pictures.
+    def read(self, returned: Any, count: int) -> Output:
+        """Return the output in what a network returned for `count` pictures.
 
         Not called where the task `reads_logits`. What a network returns for each picture is kept in this order.
 
         Raises:
             ValueError: there is none; the text says what was expected.
         """
-        if isinstance(answer, Tensor) and answer.shape[:1] == (count,):
-            return answer.float()
+        if isinstance(returned, Tensor) and returned.shape[:1] == (count,):
+            return returned.float()
         raise ValueError(f"expected a tensor with {count} rows, one for each picture")
 
     @property
-    def looks(self) -> bool:
-        """Whether the task is to be shown an answer to a clean picture of the scene (`seeing`) before it judges."""
+    def calibrates(self) -> bool:
+        """Whether the task is to be shown an output for a clean picture of the scene (`after_calibration`) before it
+        judges."""
         return False
 
-    def seeing(self: Own, output: Output, truth: Truth | None) -> Own:
-        """Return the task with what its model's answer to a clean picture of the scene shows of how answers are read.
+    def after_calibration(self: Own, output: Output, truth: Truth | None) -> Own:
+        """Return the task with what its model's output for a clean picture of the scene shows of how outputs are read.
 
         Args:
             output: of one picture.
@@ -313,13 +334,13 @@ class Task(ABC):
         return self
 
     @property
-    def unsaid(self) -> str:
-        """What has to be said for its model's answers to be read, as a message; empty where nothing has."""
+    def ambiguities(self) -> str:
+        """What has to be said for its model's outputs to be read, as a message; empty where nothing has."""
         return ""
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """Sentences that a reader has to know about how answers are read."""
+        """Sentences that a reader has to know about how outputs are read."""
         return ()
 
     @property
@@ -332,8 +353,8 @@ class Task(ABC):
 
         Args:
             model: whose output it will judge.
-            target: the answer that the model should give; None for any wrong one.
-            minimise: a right answer is sought.
+            target: the label that the model should predict; None for any wrong one.
+            minimise: a right prediction is sought.
 
         Raises:
             InputError: there is no such target, or the task has none.
@@ -362,8 +383,8 @@ class Task(ABC):
         margin = self.margin(output, truth)
         return -margin if self.minimise else margin
 
-    def answerable(self, output: Output, truth: Truth) -> Output:
-        """Return the output as objectives of logits take it: without what is no answer."""
+    def as_logits(self, output: Output, truth: Truth) -> Output:
+        """Return the output as objectives of logits take it: without what is no prediction."""
         return output
 
     def payloads(self, output: Output) -> Sequence[Any]:
@@ -371,7 +392,7 @@ class Task(ABC):
         return [None] * len(output)
 
     def marks(self, output: Output, truth: Truth) -> list[list[Mark]]:
-        """Return what is drawn into each of N pictures to show the answer; empty where words say it all."""
+        """Return what is drawn into each of N pictures to show the prediction; empty where words say it all."""
         return [[] for _ in range(len(output))]
 
     def average(self, outputs: Sequence[Output]) -> Output:
@@ -390,11 +411,11 @@ class Task(ABC):
 
     @property
     def target_names(self) -> tuple[str, ...]:
-        """The answers that are sought; empty where any wrong one is."""
+        """The labels that are sought; empty where any wrong one is."""
         return () if self.target is None else self.truth_names(self.target)
 
     def truth_names(self, truth: Truth) -> tuple[str, ...]:
-        """Return the right answers in words."""
+        """Return the right labels in words."""
         return (str(truth),)
 
     # ---- the judgement ----------------------------------------------------------------------------------------------
@@ -407,23 +428,25 @@ class Task(ABC):
             return [Judgement.of(score, margin, *said) for score, margin, said in each]
 
     def said(self, output: Output, truth: Truth, margins: Sequence[float]) -> list[Said]:
-        """Return the answer to each of N pictures, and what is kept beside it; `margins` are theirs."""
-        return [(first, kept) for (first, *_), kept in zip(self.answers(output), self.payloads(output), strict=True)]
+        """Return the prediction of each of N pictures, and what is kept beside it; `margins` are theirs."""
+        return [
+            (first, kept) for (first, *_), kept in zip(self.predictions(output), self.payloads(output), strict=True)
+        ]
 
 
 def typical(judgements: Sequence[Judgement]) -> Judgement:
-    """Return what the model usually says: the most frequent answer (the lowest index of equals), with the mean score,
-    margin and probability of the judgements that have it."""
+    """Return what the model usually says: the most frequent prediction (the lowest index of equals), with the mean
+    score, margin and probability of the judgements that have it."""
     counts: dict[tuple[str, int | None], int] = {}
     for one in judgements:
-        key = one.answer.label, one.answer.index
+        key = one.prediction.label, one.prediction.index
         counts[key] = counts.get(key, 0) + 1
     label, index = min(counts, key=lambda key: (-counts[key], key[1] or 0))
-    chosen = [one for one in judgements if (one.answer.label, one.answer.index) == (label, index)]
-    sure = [one.answer.probability for one in chosen if one.answer.probability is not None]
-    answer = Answer(label, index, mean(sure) if sure else None)
+    chosen = [one for one in judgements if (one.prediction.label, one.prediction.index) == (label, index)]
+    sure = [one.prediction.probability for one in chosen if one.prediction.probability is not None]
+    prediction = Prediction(label, index, mean(sure) if sure else None)
     margins, scores = [one.margin for one in chosen], [one.score for one in chosen]
-    return Judgement(mean(scores), mean(margins), chosen[0].right, answer, chosen[0].payload)
+    return Judgement(mean(scores), mean(margins), chosen[0].right, prediction, chosen[0].payload)
 
 
 def mean(values: Sequence[float]) -> float:

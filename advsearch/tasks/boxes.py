@@ -1,6 +1,6 @@
 """Boxes round what a detector sees, x0, y0, x1, y1 from the top left: how far two overlap, and how they are read.
 
-Answers in one tensor, as YOLO's networks give them, are (A, B) for each picture: "channels first" (places are columns,
+Outputs in one tensor, as YOLO's networks give them, are (A, B) for each picture: "channels first" (places are columns,
 v8 to v12 and YOLO11) or "channels last" (v5 to v7, YOLOX, RT-DETR). The numbers of a place are a box (middle, width,
 height), in older ones objectness, with which scores are multiplied, a score of each class, and mask coefficients.
 """
@@ -19,7 +19,7 @@ from advsearch.models.labels import sets_of
 Labels = tuple[int, ...]
 Box = tuple[float, float, float, float]
 Detections = Mapping[str, Tensor]
-"""What is found in a picture, see `advsearch.tasks.detector_answers`."""
+"""What is found in a picture, see `advsearch.tasks.detector_outputs`."""
 
 FORMS = ("xyxy", "xywh", "cxcywh", "yxyx")
 """How a box may be given: corners; a corner or the middle with width and height; corners with y first."""
@@ -313,17 +313,17 @@ def names_head(order: str) -> bool:
     return _ORDER.fullmatch(order) is not None
 
 
-def head_in(answer: Tensor, beside: Collection[int], classes: int, order: str = "") -> tuple[str, ...]:
-    """Return the orders that an answer (A, B) to one picture may have, such as "boxes scores channels first"; what is
+def head_in(returned: Tensor, beside: Collection[int], classes: int, order: str = "") -> tuple[str, ...]:
+    """Return the orders that an output (A, B) for one picture may have, such as "boxes scores channels first"; what is
     said of it already narrows them. Sides tell (`beside`: the channels of maps that came with it), and scores, which
     lie in [0, 1]. Raises ValueError where it has none of them; the text says what it seems to be."""
     found, outside = list[str](), ""
-    for layout, length in zip(LAYOUTS, answer.shape, strict=True):
+    for layout, length in zip(LAYOUTS, returned.shape, strict=True):
         for head, start in HEADS.items():
             name, masks = f"{head} {layout}", length - start - classes
             if order not in ("", head, name) or (masks and masks not in beside):
                 continue
-            scores = split(answer, classes, name, multiplied=False)[1].detach()
+            scores = split(returned, classes, name, multiplied=False)[1].detach()
             far = (scores < -TOLERANCE) | (scores > 1.0 + TOLERANCE)
             if not bool((far & scores.isfinite()).any()):
                 found.append(name)
@@ -342,7 +342,7 @@ def head_in(answer: Tensor, beside: Collection[int], classes: int, order: str = 
     if outside and not found:
         raise ValueError(f"it has {outside}")
     if not found:
-        raise ValueError(_unfitting(answer, classes))
+        raise ValueError(_unfitting(returned, classes))
     return tuple(found)
 
 
@@ -352,9 +352,9 @@ _WITH_ANGLE = f"boxes objectness scores {LAYOUTS[0]}"
 _UNREAD = "which are not read"
 
 
-def _unfitting(answer: Tensor, classes: int) -> str:
-    """What an answer is that has not as many numbers as the classes ask for."""
-    length, last = min(answer.shape), answer.shape[0] >= answer.shape[1]
+def _unfitting(returned: Tensor, classes: int) -> str:
+    """What an output is that has not as many numbers as the classes ask for."""
+    length, last = min(returned.shape), returned.shape[0] >= returned.shape[1]
     over = {length - 4 - classes, length - 6 if last else 0}
     of = f"{classes} class{'es' * (classes > 1)}"
     said = f"expected 4 + {classes} or 5 + {classes} numbers of a box for {of}, got {length}"
@@ -370,10 +370,10 @@ def _unfitting(answer: Tensor, classes: int) -> str:
     return f"{said}; give the `labels` of the model's classes"
 
 
-def split(answer: Tensor, classes: int, order: str, *, multiplied: bool = True) -> tuple[Tensor, Tensor]:
-    """Return the boxes (D, 4) and scores (D, classes) of an answer (A, B) to one picture; differentiable. Its order has
-    a layout. Unless objectness is `multiplied` with the scores, it is the first of (D, 1 + classes)."""
-    places = answer.T if order.endswith(LAYOUTS[0]) else answer
+def split(returned: Tensor, classes: int, order: str, *, multiplied: bool = True) -> tuple[Tensor, Tensor]:
+    """Return the boxes (D, 4) and scores (D, classes) of an output (A, B) for one picture; differentiable. Its order
+    has a layout. Unless objectness is `multiplied` with the scores, it is the first of (D, 1 + classes)."""
+    places = returned.T if order.endswith(LAYOUTS[0]) else returned
     scores = places[:, 4 : 4 + classes]
     if order.startswith("boxes objectness"):
         objectness, scores = places[:, 4:5], places[:, 5 : 5 + classes]

@@ -1,6 +1,6 @@
 """Tasks whose models know classes by number, and the plainest of them: which class a picture is of.
 
-Names of classes, softmax, argmax and the lead of an answer stand here.
+Names of classes, softmax, argmax and the lead of a prediction stand here.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from advsearch.errors import InputError
 from advsearch.models import Model, find_label_set
 from advsearch.models.labels import fitting_labels, names_nothing
 from advsearch.options import FROM_RUN
-from advsearch.tasks.base import Answer, Facts, Judgement, Output, Task
+from advsearch.tasks.base import Facts, Judgement, Output, Prediction, Task
 
 Labels = tuple[int, ...]
 Own = TypeVar("Own", bound="ClassTask")
 
 NO = "no "
-"""How an answer says that the object is not found."""
+"""How a prediction says that the object is not found."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,7 +51,7 @@ class ClassTask(Task):
 
     def on(self: Own, model: Model, *, target: str | None = None, minimise: bool = False) -> Own:
         """See `Task.on`: the target is one of the model's classes, or several. Raises InputError where there is no such
-        class, or the model's answers are not what the task reads."""
+        class, or the model's outputs are not what the task reads."""
         if self.reads_logits != (model.read is None):
             other = f'it was loaded for its logits; load it with task="{self.name}"'
             if self.reads_logits:
@@ -65,7 +65,7 @@ class ClassTask(Task):
         return replace(self, labels=labels, named=named, target=wanted, minimise=minimise)
 
     def _names(self, model: Model) -> tuple[tuple[str, ...], bool]:
-        """The names of the classes that a model answers with, and whether they are names."""
+        """The names of the classes that a model predicts, and whether they are names."""
         with torch.no_grad():
             count = self.classes_in(model(torch.full((1, *model.input_size, 3), 0.5)))
         given = model.labels or None
@@ -84,7 +84,7 @@ class ClassTask(Task):
         where the model has no such class, the object has no label, or a target is right."""
         text = facts.own_label if facts.label is None else facts.label
         if text is None:
-            raise InputError(f"label: expected the right answers for {facts.object}, got none")
+            raise InputError(f"label: expected the right labels for {facts.object}, got none")
         try:
             right = find_label_set(text, self.labels, named=self.named).indices
         except InputError as error:
@@ -93,12 +93,12 @@ class ClassTask(Task):
             raise InputError(f"label: the label of {facts.object} itself does not fit the model ({error})") from None
         both = sorted(set(right) & set(self.target or ()))
         if both:
-            raise InputError(f"target: expected classes that are not right answers, got {both}, which `label` has too")
+            raise InputError(f"target: expected classes that are not right labels, got {both}, which `label` has too")
         return right
 
     @cached_property
     def nothing(self) -> Labels:
-        """Indices of classes that stand for no thing, such as "background", but for what is sought: no answers."""
+        """Indices of classes that stand for no thing, such as "background", but for what is sought: no predictions."""
         if not self.named:
             return ()
         sought = self.target or ()
@@ -131,8 +131,8 @@ class Classification(ClassTask):
     def truth(self, facts: Facts) -> Labels:
         return self.right_classes(facts)
 
-    def answerable(self, output: Tensor, truth: Labels) -> Tensor:
-        """See `Task.answerable`: a class that stands for no thing has a logit of minus infinity, unless it is right or
+    def as_logits(self, output: Tensor, truth: Labels) -> Tensor:
+        """See `Task.as_logits`: a class that stands for no thing has a logit of minus infinity, unless it is right or
         there is no other wrong one."""
         nothing = set(self.nothing) - set(truth)
         if not nothing or len(nothing) + max(1, len(truth)) >= output.shape[1]:
@@ -140,18 +140,18 @@ class Classification(ClassTask):
         return output.index_fill(1, torch.tensor(sorted(nothing), device=output.device), -math.inf)
 
     def margin(self, output: Tensor, truth: Labels) -> Tensor:
-        return wrong_lead(self.answerable(output, truth), truth)
+        return wrong_lead(self.as_logits(output, truth), truth)
 
     def score(self, output: Tensor, truth: Labels) -> Tensor:
         if self.target is not None:
-            return target_lead(self.answerable(output, truth), self.target)
+            return target_lead(self.as_logits(output, truth), self.target)
         return super().score(output, truth)
 
-    def answers(self, output: Tensor, count: int = 1) -> list[tuple[Answer, ...]]:
+    def predictions(self, output: Tensor, count: int = 1) -> list[tuple[Prediction, ...]]:
         """Return the likeliest classes of each picture; with a count of 1, the first of equal ones."""
-        return self._likeliest(self.answerable(output, ()), count)
+        return self._likeliest(self.as_logits(output, ()), count)
 
-    def _likeliest(self, output: Tensor, count: int) -> list[tuple[Answer, ...]]:
+    def _likeliest(self, output: Tensor, count: int) -> list[tuple[Prediction, ...]]:
         probabilities = output.detach().softmax(dim=1)
         if count == 1:
             indices = probabilities.argmax(dim=1, keepdim=True)
@@ -160,12 +160,12 @@ class Classification(ClassTask):
             values, indices = probabilities.topk(min(count, output.shape[1]), dim=1)
         found = []
         for row in zip(indices.tolist(), values.tolist(), strict=True):
-            listed = [Answer(self.name_of(i), i, p) for i, p in zip(*row, strict=True) if p > 0.0 or count == 1]
-            found.append(tuple(listed) if math.isfinite(row[1][0]) else (Answer(NOT_A_NUMBER),))
+            listed = [Prediction(self.name_of(i), i, p) for i, p in zip(*row, strict=True) if p > 0.0 or count == 1]
+            found.append(tuple(listed) if math.isfinite(row[1][0]) else (Prediction(NOT_A_NUMBER),))
         return found
 
     def judge(self, output: Tensor, truth: Labels) -> list[Judgement]:
-        logits, own = self.answerable(output, truth), type(self)
+        logits, own = self.as_logits(output, truth), type(self)
         margins = wrong_lead(logits, truth) if own.margin is Classification.margin else self.margin(output, truth)
         if own.score is not Classification.score or self.target is not None:
             scores = self.score(output, truth)
@@ -182,14 +182,14 @@ class Classification(ClassTask):
 
 
 def wrong_lead(logits: Tensor, right: Labels) -> Tensor:
-    """Return the largest wrong logit minus the largest right one, (N,): over 0 exactly where the answer is wrong.
+    """Return the largest wrong logit minus the largest right one, (N,): over 0 exactly where the prediction is wrong.
     Raises InputError as for `members`."""
     inside = members(logits, right)
     return logits.masked_fill(inside, -math.inf).amax(dim=1) - logits.masked_fill(~inside, -math.inf).amax(dim=1)
 
 
 def target_lead(logits: Tensor, targets: Labels) -> Tensor:
-    """Return the largest logit of the targets minus the largest other one, (N,): over 0 exactly where one is answered.
+    """Return the largest logit of the targets minus the largest other one, (N,): over 0 exactly where one is predicted.
     Raises InputError as for `members`."""
     inside = members(logits, targets, "target")
     return logits.masked_fill(~inside, -math.inf).amax(dim=1) - logits.masked_fill(inside, -math.inf).amax(dim=1)
@@ -208,7 +208,7 @@ def members(logits: Tensor, labels: Labels | Tensor, setting: str = "label") -> 
     found = torch.zeros(classes, dtype=torch.bool, device=logits.device)
     found[list(labels)] = True
     if bool(found.all()):
-        outcome = "no answer could be wrong" if setting == "label" else "every answer would be a hit"
+        outcome = "no prediction could be wrong" if setting == "label" else "every prediction would be a hit"
         raise InputError(f"{setting}: the label set holds all {classes} classes, so {outcome}")
     return found
 

@@ -23,7 +23,7 @@ from advsearch.errors import InputError
 from advsearch.files import JsonValue
 from advsearch.models import Model
 from advsearch.options import FROM_RUN
-from advsearch.tasks.base import Answer, Facts, Mark, Said, Task
+from advsearch.tasks.base import Facts, Mark, Prediction, Said, Task
 
 ASIDE = 0.1
 """Cosine of the angle to the camera's axis from which on z-depth is no distance any more."""
@@ -60,7 +60,7 @@ LARGEST = 100.0
 """The largest factor by which a pixel counts as too near or too far."""
 
 Map = Mapping[str, Tensor]
-"""What a model answers to one picture: (h, w), by one of `KINDS`, or by "" where it does not say."""
+"""What a model returns for one picture: (h, w), by one of `KINDS`, or by "" where it does not say."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,15 +114,15 @@ class Distances:
 class Depth(Task):
     """A model judges how far the object is: off by a factor of less than 1 + `tolerance`, its pixels' geometric mean.
 
-    Where nothing of the object is seen, every answer is right.
+    Where nothing of the object is seen, every prediction is right.
 
     Args:
         tolerance: 0.25 for a factor of 1.25, the first threshold of Eigen et al. 2014 (arXiv 1406.2283).
         kind: of the model's numbers, one of `KINDS`; "" for what the network says.
-        size: of the real object, its longest side in metres, for a model that answers in metres.
+        size: of the real object, its longest side in metres, for a model that predicts metres.
         seek: what an attack is after, one of `GOALS`; "" for any wrong distance.
         seen_kind: what the network says; "" where it has not yet.
-        missing: what its user has to say before answers can be judged; empty where nothing is missing.
+        missing: what its user has to say before predictions can be judged; empty where nothing is missing.
 
     Raises:
         InputError: a value that is none of these.
@@ -148,29 +148,29 @@ class Depth(Task):
 
     # ---- what is read -----------------------------------------------------------------------------------------------
 
-    def read(self, answer: Any, count: int) -> list[Map]:
-        """Return the map (h, w) of each picture in what a network answered, by what its numbers are.
+    def read(self, returned: Any, count: int) -> list[Map]:
+        """Return the map (h, w) of each picture in what a network returned, by what its numbers are.
 
         Raises:
             ValueError: there is none.
         """
         kind = ""
-        if isinstance(answer, Mapping):
-            kind = next((one for one in KINDS if one in answer), "")
-            answer = answer[kind] if kind else answer.get("predicted_depth", answer.get("depth"))
-        elif hasattr(answer, "predicted_depth"):
-            answer = answer.predicted_depth
-        elif isinstance(answer, (list, tuple)) and answer:
-            boxes = isinstance(answer[0], Tensor) and answer[0].shape[-1:] == (4,)
-            answer = None if boxes and len(answer) > 1 else answer[0]
-        if isinstance(answer, Tensor) and answer.ndim == 4 and answer.shape[1] == 1:
-            answer = answer[:, 0]
-        if not isinstance(answer, Tensor) or answer.ndim != 3 or len(answer) != count or 0 in answer.shape:
+        if isinstance(returned, Mapping):
+            kind = next((one for one in KINDS if one in returned), "")
+            returned = returned[kind] if kind else returned.get("predicted_depth", returned.get("depth"))
+        elif hasattr(returned, "predicted_depth"):
+            returned = returned.predicted_depth
+        elif isinstance(returned, (list, tuple)) and returned:
+            boxes = isinstance(returned[0], Tensor) and returned[0].shape[-1:] == (4,)
+            returned = None if boxes and len(returned) > 1 else returned[0]
+        if isinstance(returned, Tensor) and returned.ndim == 4 and returned.shape[1] == 1:
+            returned = returned[:, 0]
+        if not isinstance(returned, Tensor) or returned.ndim != 3 or len(returned) != count or 0 in returned.shape:
             raise ValueError(
                 "expected a number for each pixel, (N, height, width) or (N, 1, height, width), or a mapping with "
                 f"these under predicted_depth or {', '.join(KINDS)}"
             )
-        return [{kind: one} for one in answer.float()]
+        return [{kind: one} for one in returned.float()]
 
     def on(self, model: Model, *, target: str | None = None, minimise: bool = False) -> Depth:
         """See `Task.on`.
@@ -190,10 +190,10 @@ class Depth(Task):
         return replace(self, seek=objective) if objective in GOALS else self
 
     @property
-    def looks(self) -> bool:
+    def calibrates(self) -> bool:
         return True
 
-    def seeing(self, output: Sequence[Map], truth: Distances | None) -> Depth:
+    def after_calibration(self, output: Sequence[Map], truth: Distances | None) -> Depth:
         kind = self.kind or next(iter(output[0]))
         return replace(self, seen_kind=kind, missing=self._missing(kind, truth))
 
@@ -205,19 +205,19 @@ class Depth(Task):
             )
         if kind == METRIC and not self.size:
             return (
-                "size: it answers in metres, and scenes are in object sizes; give the longest side of the real object "
+                "size: it predicts metres, and scenes are in object sizes; give the longest side of the real object "
                 "in metres, `task='depth={size: 0.1}'`, say"
             )
         if kind != METRIC and truth is not None and truth.seen and not truth.anchored:
             return (
-                "it answers up to a scale and a shift, which are found on what is seen beside the object: expected "
+                "it predicts up to a scale and a shift, which are found on what is seen beside the object: expected "
                 f"{FEWEST} pixels at distances that differ by a factor of {SPREAD:g}, got {int(truth.beside.sum())}; "
                 "give a scene with a ground or a room, and a camera that sees it from the side"
             )
         return ""
 
     @property
-    def unsaid(self) -> str:
+    def ambiguities(self) -> str:
         return self.missing
 
     @property
@@ -328,14 +328,14 @@ class Depth(Task):
 
     # ---- in words ---------------------------------------------------------------------------------------------------
 
-    def answers(self, output: Sequence[Map], count: int = 1) -> list[tuple[Answer, ...]]:
+    def predictions(self, output: Sequence[Map], count: int = 1) -> list[tuple[Prediction, ...]]:
         """Return between which numbers each map is."""
-        found: list[tuple[Answer, ...]] = []
+        found: list[tuple[Prediction, ...]] = []
         for one in output:
             ((said, values),) = one.items()
             low, high = (float(end) for end in values.detach().aminmax())
             text = f"{self.kind or said or 'numbers'} from {low:.3g} to {high:.3g}"
-            found.append((Answer(text if math.isfinite(low + high) else NOT_A_NUMBER),))
+            found.append((Prediction(text if math.isfinite(low + high) else NOT_A_NUMBER),))
         return found
 
     def said(self, output: Sequence[Map], truth: Distances, margins: Sequence[float]) -> list[Said]:
@@ -346,11 +346,11 @@ class Depth(Task):
 
     def _said(self, one: Map, truth: Distances, *, right: bool) -> Said:
         if not truth.seen:
-            return Answer("out of view"), None
+            return Prediction("out of view"), None
         factors = self._factors(one, truth)
         mean, relief = float(factors.mean()), float(self._relief(factors, truth))
         if not math.isfinite(mean):
-            return Answer(NOT_A_NUMBER), None
+            return Prediction(NOT_A_NUMBER), None
         distance = float(truth.z[truth.mask].double().log().mean().exp())
         payload: dict[str, JsonValue] = {
             "distance": round(distance, 4),
@@ -363,7 +363,7 @@ class Depth(Task):
         holds = {"nearer": -mean > self._bar, "farther": mean > self._bar, "gone": relief < 0.5}
         names = sorted(("gone", "nearer", "farther"), key=lambda name: name != self.seek)
         wrong = next((LABELS[name] for name in names if holds[name]), OUT_OF_SHAPE)
-        return Answer(AS_FAR if right else wrong), payload
+        return Prediction(AS_FAR if right else wrong), payload
 
     def marks(self, output: Sequence[Map], truth: Distances) -> list[list[Mark]]:
         """See `Task.marks`: the object, its pixels of which the distance is right, and the disparity of everything."""

@@ -20,7 +20,7 @@ from advsearch.errors import InputError
 from advsearch.models import Model
 from advsearch.models.labels import names_nothing
 from advsearch.options import FROM_RUN
-from advsearch.tasks.base import Answer, Facts, Mark, Said
+from advsearch.tasks.base import Facts, Mark, Prediction, Said
 from advsearch.tasks.boxes import (
     FORMS,
     HEADS,
@@ -44,7 +44,7 @@ from advsearch.tasks.boxes import (
     unit_in,
 )
 from advsearch.tasks.classification import NO, ClassTask, Labels
-from advsearch.tasks.detector_answers import (
+from advsearch.tasks.detector_outputs import (
     ORDERS,
     QUERIES,
     ask_order,
@@ -67,14 +67,14 @@ MOST, LEAST = 8, 0.1
 """Most boxes that are kept of a picture; the least score of one, and of one that is suppressed."""
 
 ELSEWHERE = "elsewhere"
-"""How an answer says that a box is not where the object is."""
+"""How a prediction says that a box is not where the object is."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Detection(ClassTask):
     """A model finds the object: one of its boxes has a right name, a score of `confidence` and overlaps the true box.
 
-    Where the object is not seen at all there is nothing to find, and every answer is right.
+    Where the object is not seen at all there is nothing to find, and every prediction is right.
 
     Args:
         iou: least intersection over union with the true box.
@@ -90,12 +90,12 @@ class Detection(ClassTask):
             thing; "" for what types and numbers show.
         seek: what an attack is after, one of `GOALS`.
         input_size: (height, width) of the model's input in pixels.
-        seen_unit, seen_order: what the model's own answers show; "" where they have not yet.
-        undecided: whether only numbers tell scores from classes in its answers.
-        shape: (A, B) of an answer that is read as a YOLO's head; None of others.
-        masks: whether mask coefficients stand in its answers, which are left out.
+        seen_unit, seen_order: what the model's own outputs show; "" where they have not yet.
+        undecided: whether only numbers tell scores from classes in its outputs.
+        shape: (A, B) of an output that is read as a YOLO's head; None of others.
+        masks: whether mask coefficients stand in its outputs, which are left out.
         told: whether its network says that its boxes are corners in pixels, as those of libraries do (`KNOWN`).
-        fills_with_nan: whether rows of NaN stand where nothing is found, and not for an answer that is not a number.
+        fills_with_nan: whether rows of NaN stand where nothing is found, and not for an output that is not a number.
         doubts: what is odd about these.
 
     Raises:
@@ -149,10 +149,10 @@ class Detection(ClassTask):
         return replace(found, input_size=model.input_size, fills_with_nan=blank, told=told)._having_seen(output)
 
     @property
-    def looks(self) -> bool:
+    def calibrates(self) -> bool:
         return not (self.told or (self.boxes and self.unit)) or (self.undecided and not self.order)
 
-    def seeing(self, output: Sequence[Detections], truth: Place | None) -> Detection:
+    def after_calibration(self, output: Sequence[Detections], truth: Place | None) -> Detection:
         found = self._having_seen(output)
         output = found._boxed(output)
         reading = found._reading
@@ -167,14 +167,14 @@ class Detection(ClassTask):
         return replace(found, doubts=reading.fault(boxes) and f"{reading.fault(boxes)}{reading.instead(boxes)}")
 
     def _having_seen(self, output: Sequence[Detections]) -> Detection:
-        """The task with what an answer of its model shows of orders and units."""
+        """The task with what an output of its model shows of orders and units."""
         grids = [one["raw"] for one in output if "raw" in one]
         last = any("logits" in one for one in output) and self.named and names_nothing(self.labels[-1])
         head = self._head or (QUERIES[1] if last else "")
         try:
             order = order_in(output, len(self.labels) if self.named else None, head)
         except ValueError as error:
-            what = f"the model's answer is {tuple(grids[0].shape)}: " if grids else ""
+            what = f"the model's output is {tuple(grids[0].shape)}: " if grids else ""
             asked = f"; {ask_order()}" if any("either" in one for one in output) else ""
             raise InputError(f"task detection: {what}{error}{asked}") from None
         found = replace(
@@ -199,13 +199,13 @@ class Detection(ClassTask):
         return length > len(self.labels) + next(start for head, start in HEADS.items() if order.startswith(head))
 
     def _boxed(self, output: Sequence[Detections]) -> Sequence[Detections]:
-        """What the model answered, with the boxes of YOLO's heads and the scores of DETR's found."""
+        """What the model returned, with the boxes of YOLO's heads and the scores of DETR's found."""
         return self._settled(output) if any("raw" in one or "logits" in one for one in output) else output
 
     @property
-    def unsaid(self) -> str:
+    def ambiguities(self) -> str:
         if self.undecided and not (self.order or self.seen_order):
-            return f"order: expected what tells scores from classes, and no answer of the model does; {ask_order()}"
+            return f"order: expected what tells scores from classes, and no output of the model does; {ask_order()}"
         if not (self.unit or self.seen_unit):
             return (
                 "unit: expected the unit of the model's boxes, and it finds nothing in noise and in the clean scene "
@@ -219,9 +219,9 @@ class Detection(ClassTask):
         said = []
         order = as_option(f"order: {self.seen_order}")
         if self.shape and not self.order:
-            said.append(f"The detector's answer of {self.shape} is read as a YOLO's: {order}.")
+            said.append(f"The detector's output of {self.shape} is read as a YOLO's: {order}.")
         if self.seen_order in QUERIES and not self.order:
-            said.append(f"The detector's answer is read as a DETR's: {order}.")
+            said.append(f"The detector's output is read as a DETR's: {order}.")
         if self.masks:
             said.append("The detector's masks are left out: its boxes and scores are read.")
         if self.undecided and self.seen_order and not self.order:
@@ -245,8 +245,8 @@ class Detection(ClassTask):
     def seeking(self, objective: str) -> Detection:
         return replace(self, seek=objective) if objective in GOALS else self
 
-    def read(self, answer: Any, count: int) -> list[Detections]:
-        return detections_in(answer, count, self.order)
+    def read(self, prediction: Any, count: int) -> list[Detections]:
+        return detections_in(prediction, count, self.order)
 
     def classes_in(self, output: Sequence[Detections]) -> int | None:
         scores = output[0].get("scores")
@@ -320,14 +320,14 @@ class Detection(ClassTask):
     # ---- boxes and scores of one picture ----------------------------------------------------------------------------
 
     def _settled(self, output: Sequence[Detections]) -> list[Detections]:
-        """What the model answered, with scores and classes told apart, boxes as they came."""
+        """What the model returned, with scores and classes told apart, boxes as they came."""
         try:
             return [settled(one, self.seen_order, len(self.labels) or None) for one in output]
         except ValueError as error:
             raise InputError(f"task detection: {error}") from None
 
     def _read(self, output: Sequence[Detections]) -> list[Detections]:
-        """What the model answered, with boxes as shares of the picture; what names no thing has a score of 0."""
+        """What the model returned, with boxes as shares of the picture; what names no thing has a score of 0."""
         found, reading = list[Detections](), self._reading
         nothing = torch.tensor(self.nothing, dtype=torch.long)
         for one in self._settled(output):
@@ -379,27 +379,29 @@ class Detection(ClassTask):
 
     # ---- in words ---------------------------------------------------------------------------------------------------
 
-    def answers(self, output: Sequence[Detections], count: int = 1) -> list[tuple[Answer, ...]]:
+    def predictions(self, output: Sequence[Detections], count: int = 1) -> list[tuple[Prediction, ...]]:
         found = []
         for one in self._read(output):
-            said = [Answer(self.name_of(label), label, score) for _, label, score in self._listed(one, count, SMALLEST)]
-            found.append(tuple(said) or (Answer(NOT_A_NUMBER if self._broken(one) else "nothing"),))
+            said = [
+                Prediction(self.name_of(label), label, score) for _, label, score in self._listed(one, count, SMALLEST)
+            ]
+            found.append(tuple(said) or (Prediction(NOT_A_NUMBER if self._broken(one) else "nothing"),))
         return found
 
     def said(self, output: Sequence[Detections], truth: Place, margins: Sequence[float]) -> list[Said]:
-        """See `Task.said`; the answer is what the model says of the object, the payload its boxes in pixels."""
+        """See `Task.said`; the prediction is what the model says of the object, the payload its boxes in pixels."""
         return [
-            (Answer(NOT_A_NUMBER), None) if self._broken(one)
-            else (self._answer(self._left(one), truth), self._payload(one, truth))
+            (Prediction(NOT_A_NUMBER), None) if self._broken(one)
+            else (self._prediction(self._left(one), truth), self._payload(one, truth))
             for one in self._read(output)
         ]  # fmt: skip
 
-    def _answer(self, one: Detections, truth: Place) -> Answer:
+    def _prediction(self, one: Detections, truth: Place) -> Prediction:
         """What a model says of the object, with the score of the box that says so."""
         if self.seek == "create" and float(self._create(one, truth)) > 0.0:
             return self._named(one, self._rivals(one, ()), self._elsewhere(one, truth), f"{{}} {ELSEWHERE}")
         if truth.box is None:
-            return Answer("out of view")
+            return Prediction("out of view")
         near, right, wrong = self._at(one, truth), self._of(one, truth.labels), self._rivals(one, truth.labels)
         best = float(best_of(right, near))
         if best >= self.confidence:
@@ -408,17 +410,17 @@ class Detection(ClassTask):
             return self._named(one, wrong, near)
         if float(best_of(right)) >= self.confidence:
             return self._named(one, right, ~near, f"{{}} {ELSEWHERE}")
-        return Answer(f"{NO}{self.name_of(truth.labels[0])}", None, best if math.isfinite(best) else None)
+        return Prediction(f"{NO}{self.name_of(truth.labels[0])}", None, best if math.isfinite(best) else None)
 
-    def _named(self, one: Detections, scores: Tensor, among: Tensor, form: str = "{}") -> Answer:
+    def _named(self, one: Detections, scores: Tensor, among: Tensor, form: str = "{}") -> Prediction:
         """The class of the best box among some."""
         place = int(torch.where(among, scores, -1.0).argmax())
         score = float(scores[place])
         label = int(one["labels"][place] if "labels" in one else (one["scores"][place] == score).nonzero()[0])
-        return Answer(form.format(self.name_of(label)), label if form == "{}" else None, score)
+        return Prediction(form.format(self.name_of(label)), label if form == "{}" else None, score)
 
     def _listed(self, one: Detections, count: int, least: float) -> list[tuple[Box, int, float]]:
-        """See `listed`; none of an answer that is not a number."""
+        """See `listed`; none of an output that is not a number."""
         return [] if self._broken(one) else listed(one, count, least, self.suppression)
 
     def _payload(self, one: Detections, truth: Place) -> Any:

@@ -1,6 +1,7 @@
-"""One task, asked of the object and of every thing beside it: an answer is right where it is right about all of them.
+"""One task, asked of the object and of every thing beside it: a prediction is right where it is right about all of
+them.
 
-A search is after a wrong answer about any of them: margin and score are the largest of the things' own.
+A search is after a wrong prediction about any of them: margin and score are the largest of the things' own.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import torch
 from torch import Tensor
 
 from advsearch.errors import InputError
-from advsearch.tasks.base import Answer, Facts, Judgement, Mark, Output, Task, Truth, mean
+from advsearch.tasks.base import Facts, Judgement, Mark, Output, Prediction, Task, Truth, mean
 from advsearch.tasks.together import Together
 
 Truths = Mapping[str, Truth]
@@ -35,12 +36,12 @@ class EachThing(Task):
     part: Task
 
     @property
-    def looks(self) -> bool:
-        return self.part.looks
+    def calibrates(self) -> bool:
+        return self.part.calibrates
 
-    def seeing(self, output: Output, truth: Truths | None) -> EachThing:
+    def after_calibration(self, output: Output, truth: Truths | None) -> EachThing:
         first = None if truth is None else next(iter(truth.values()))
-        return replace(self, part=self.part.seeing(output, first))
+        return replace(self, part=self.part.after_calibration(output, first))
 
     def check(self, facts: Facts) -> None:
         for one in facts.each.values():
@@ -70,11 +71,11 @@ class EachThing(Task):
     def _largest(value: Callable[[Output, Truth], Tensor], output: Output, truth: Truths) -> Tensor:
         return torch.stack([value(output, one) for one in truth.values()]).amax(dim=0)
 
-    def answers(self, output: Output, count: int = 1) -> list[tuple[Answer, ...]]:
-        return self.part.answers(output, count)
+    def predictions(self, output: Output, count: int = 1) -> list[tuple[Prediction, ...]]:
+        return self.part.predictions(output, count)
 
     def judge(self, output: Output, truth: Truths) -> list[Judgement]:
-        """See `Task.judge`: the answer about the thing that is worst, and in the payload what is said of each."""
+        """See `Task.judge`: the prediction about the thing that is worst, and in the payload what is said of each."""
         each = zip(*(self.part.judge(output, one) for one in truth.values()), strict=True)
         with torch.no_grad():
             scores, margins = self.score(output, truth).tolist(), self.margin(output, truth).tolist()
@@ -86,18 +87,19 @@ class EachThing(Task):
     @staticmethod
     def _judged(said: Mapping[str, Judgement], score: float, margin: float) -> Judgement:
         if any(one.not_a_number for one in said.values()):
-            return Judgement.of(score, math.nan, Answer(""))
+            return Judgement.of(score, math.nan, Prediction(""))
         worst = max(said, key=lambda name: said[name].margin)
         things = {
-            name: {"right": one.right, "margin": one.margin, "answer": one.answer.label} for name, one in said.items()
+            name: {"right": one.right, "margin": one.margin, "answer": one.prediction.label}
+            for name, one in said.items()
         }
         kept: Any = said[worst].payload if isinstance(said[worst].payload, dict) else {}
         average = mean([one.margin for one in said.values()])
         payload: Any = {**kept, "worst": worst, "mean_margin": average, "things": things}
-        return Judgement.of(score, margin, said[worst].answer, payload)
+        return Judgement.of(score, margin, said[worst].prediction, payload)
 
     def marks(self, output: Output, truth: Truths) -> list[list[Mark]]:
-        """See `Task.marks`: what is true of each thing, and the answer once."""
+        """See `Task.marks`: what is true of each thing, and the prediction once."""
         found: list[list[Mark]] = []
         for marks in zip(*(self.part.marks(output, one) for one in truth.values()), strict=True):
             said = [mark for mark in marks[0] if not mark.true]
@@ -121,4 +123,4 @@ def each_thing(task: Task) -> EachThing:
 
 
 JUDGES: Sequence[str] = ("detection", "segmentation", "depth")
-"""Tasks whose answer to a picture says something of each thing in it."""
+"""Tasks whose prediction of a picture says something of each thing in it."""

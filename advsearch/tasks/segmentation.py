@@ -12,7 +12,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from advsearch.described import NOT_A_NUMBER
-from advsearch.tasks.base import Answer, Facts, Mark, Said
+from advsearch.tasks.base import Facts, Mark, Prediction, Said
 from advsearch.tasks.classification import NO, ClassTask, Labels, members, target_lead, wrong_lead
 
 EXPECTED = "expected logits (N, classes, height, width), or a mapping with these under 'out' or 'logits'"
@@ -44,7 +44,7 @@ class Region:
 class Segmentation(ClassTask):
     """A model gives at least `accuracy` of the object's pixels a right class. Pixels beside the object don't count.
 
-    Where the object is not seen at all there is nothing to segment, and every answer is right.
+    Where the object is not seen at all there is nothing to segment, and every prediction is right.
 
     Args:
         accuracy: least share of the object's pixels.
@@ -63,21 +63,21 @@ class Segmentation(ClassTask):
         super().__post_init__()
         self.check_numbers(lambda value: 0.0 < value <= 1.0, "a number over 0, up to 1", "accuracy")
 
-    def read(self, answer: Any, count: int) -> Tensor:
-        """Return the logits (N, classes, h, w) in what a network answered.
+    def read(self, returned: Any, count: int) -> Tensor:
+        """Return the logits (N, classes, h, w) in what a network returned.
 
         Raises:
             ValueError: there are none.
         """
-        if isinstance(answer, Mapping):
-            answer = answer.get("out", answer.get("logits"))
-        elif hasattr(answer, "logits"):
-            answer = answer.logits
-        elif isinstance(answer, (list, tuple)) and answer:
-            answer = answer[0]
-        if not isinstance(answer, Tensor) or answer.ndim != 4 or len(answer) != count or answer.shape[1] < 2:
+        if isinstance(returned, Mapping):
+            returned = returned.get("out", returned.get("logits"))
+        elif hasattr(returned, "logits"):
+            returned = returned.logits
+        elif isinstance(returned, (list, tuple)) and returned:
+            returned = returned[0]
+        if not isinstance(returned, Tensor) or returned.ndim != 4 or len(returned) != count or returned.shape[1] < 2:
             raise ValueError(EXPECTED)
-        return answer.float()
+        return returned.float()
 
     def classes_in(self, output: Tensor) -> int:
         return output.shape[1]
@@ -137,7 +137,7 @@ class Segmentation(ClassTask):
     def _unseen(output: Tensor) -> Tensor:
         return output.sum(dim=(1, 2, 3)) * 0.0 - 1.0
 
-    def answers(self, output: Tensor, count: int = 1) -> list[tuple[Answer, ...]]:
+    def predictions(self, output: Tensor, count: int = 1) -> list[tuple[Prediction, ...]]:
         """Return the things that most pixels of each picture are given, with the shares that they have."""
         found = []
         for one in output.detach():
@@ -146,24 +146,25 @@ class Segmentation(ClassTask):
             counts[list(self.nothing)] = 0
             shares, indices = counts.topk(min(count, len(one)))
             rows = zip(indices.tolist(), shares.tolist(), strict=True)
-            listed = tuple(Answer(self.name_of(i), i, n / one[0].numel()) for i, n in rows if n)
-            found.append(listed or (Answer("nothing" if len(said) else NOT_A_NUMBER),))
+            listed = tuple(Prediction(self.name_of(i), i, n / one[0].numel()) for i, n in rows if n)
+            found.append(listed or (Prediction("nothing" if len(said) else NOT_A_NUMBER),))
         return found
 
     def said(self, output: Tensor, truth: Region, margins: Sequence[float]) -> list[Said]:
         """See `Task.said`.
 
-        The answer is the class of most of the object's pixels; a wrong one where too few are right, and "no bottle"
+        The prediction is the class of most of the object's pixels; a wrong one where too few are right, and "no bottle"
         where most of these are background. Its probability is the share of the object's pixels that are right.
         """
         each = zip(output, margins, strict=True)
         return [self._said(one, truth, right=margin <= 0.0) for one, margin in each]
 
     def _said(self, logits: Tensor, truth: Region, *, right: bool) -> Said:
-        """The answer of one picture, and what else is kept: shares of the object's pixels by class, and the overlap."""
+        """The prediction of one picture, and what else is kept: shares of the object's pixels by class, and the
+        overlap."""
         pixels = self._pixels(logits[None], truth)
         if pixels is None:
-            return Answer("out of view"), None
+            return Prediction("out of view"), None
         correct = members(pixels, truth.labels)
         hits = self._correct(logits, truth)
         mask = truth.at((logits.shape[1], logits.shape[2])).to(hits.device)
@@ -172,14 +173,14 @@ class Segmentation(ClassTask):
         accuracy = float(hits[mask].float().mean())
         shares = {self.name_of(i): round(n / len(pixels), 4) for i, n in enumerate(counts.tolist()) if n}
         payload = {"accuracy": round(accuracy, 4), "iou": round(float((hits & mask).sum() / (hits | mask).sum()), 4)}
-        said = Answer(self.name_of(first), first, accuracy)
+        said = Prediction(self.name_of(first), first, accuracy)
         if not right and first in self.nothing:
-            said = Answer(f"{NO}{self.name_of(truth.labels[0])}", None, accuracy)
+            said = Prediction(f"{NO}{self.name_of(truth.labels[0])}", None, accuracy)
         return said, {**payload, "pixels": shares}
 
     @staticmethod
     def _correct(logits: Tensor, truth: Region) -> Tensor:
-        """Where the answer (C, h, w) is a right class, (h, w) bool; a tie is right, NaN is not."""
+        """Where the output (C, h, w) is a right class, (h, w) bool; a tie is right, NaN is not."""
         classes = logits.shape[0]
         return (wrong_lead(logits.permute(1, 2, 0).reshape(-1, classes), truth.labels) <= 0.0).reshape(logits.shape[1:])
 

@@ -1,6 +1,6 @@
 """Similarity: which reference pictures a network finds nearest, by the cosine of its features.
 
-With a gallery, one folder of pictures for each name, it is a classification among these names. Without, an answer is
+With a gallery, one folder of pictures for each name, it is a classification among these names. Without, a prediction is
 right where the picture is still the same thing as the clean one to the network.
 """
 
@@ -102,7 +102,7 @@ def embedded(folder: str, model: Model, *, linear: bool) -> Gallery:
 
     Args:
         folder: with a folder of pictures for each name.
-        model: that answers with features (N, D).
+        model: that returns features (N, D).
         linear: whether a head is fitted.
 
     Raises:
@@ -130,7 +130,7 @@ def embedded(folder: str, model: Model, *, linear: bool) -> Gallery:
     features = torch.cat(parts)
     broken = ~features.isfinite().all(dim=1)
     if bool(broken.any()):
-        raise InputError(f"references: model {model.name} answers {paths[int(broken.nonzero()[0])][1]} with NaN")
+        raise InputError(f"references: model {model.name} returns for {paths[int(broken.nonzero()[0])][1]} NaN")
     features = functional.normalize(features, dim=1)
     owners = torch.tensor([number for number, _ in paths])
     return Gallery(
@@ -215,7 +215,7 @@ TEMPERATURE = 0.07
 2104.14294, section 4.1)."""
 
 ITSELF, ELSE = "itself", "something else"
-"""The answers where there is a threshold."""
+"""The predictions where there is a threshold."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -227,7 +227,7 @@ class Similarity(Classification):
 
     - `nearest`: the mean cosine of the `k` nearest pictures of each name, over `TEMPERATURE`. Each name is judged by
       pictures of its own, so that one with many has no more votes than one with few, and every name has a gradient.
-      The mean, so that one odd picture decides nothing where `k` is over 1. With 1, the default, an answer is right
+      The mean, so that one odd picture decides nothing where `k` is over 1. With 1, the default, a prediction is right
       exactly where the nearest picture of all is.
     - `linear`: those of a logistic regression on the reference features, of length 1 (`fitted`).
 
@@ -300,18 +300,18 @@ class Similarity(Classification):
         return (0,)
 
     @property
-    def looks(self) -> bool:
+    def calibrates(self) -> bool:
         return not self.references and self.clean is None
 
-    def seeing(self, output: Tensor, truth: Labels | None) -> Similarity:
-        return replace(self, clean=functional.normalize(output.detach().float(), dim=1)[0]) if self.looks else self
+    def after_calibration(self, output: Tensor, truth: Labels | None) -> Similarity:
+        return replace(self, clean=functional.normalize(output.detach().float(), dim=1)[0]) if self.calibrates else self
 
-    def read(self, answer: Any, count: int) -> Tensor:
+    def read(self, returned: Any, count: int) -> Tensor:
         """Return features (count, D): a tensor, the first of a tuple, or the first of `PARTS` that is there.
 
         Of `last_hidden_state` that is the first token (CLS); a map is averaged over its positions.
         """
-        found = pooled(answer[0] if type(answer) in (tuple, list) and answer else answer, token=True)
+        found = pooled(returned[0] if type(returned) in (tuple, list) and returned else returned, token=True)
         if found is None or found.dim() != 2 or found.shape[0] != count:
             raise ValueError(f"expected features ({count}, D), or what has one of {', '.join(PARTS)}")
         return found.float()
@@ -330,15 +330,15 @@ class Similarity(Classification):
             scores = self.gallery.nearest(features, self.k)
         return scores / TEMPERATURE
 
-    def answerable(self, output: Tensor, truth: Labels) -> Tensor:
-        return super().answerable(self.logits(output), truth)
+    def as_logits(self, output: Tensor, truth: Labels) -> Tensor:
+        return super().as_logits(self.logits(output), truth)
 
     def judge(self, output: Tensor, truth: Labels) -> list[Judgement]:
         """See `Task.judge`; the payload has the cosine to the clean picture, or what `_ranked` says."""
         with torch.no_grad():
             judged, features = super().judge(output, truth), functional.normalize(output, dim=1)
             if self.gallery is not None:
-                kept = self._ranked(self.gallery, features, self.answerable(output, truth), truth)
+                kept = self._ranked(self.gallery, features, self.as_logits(output, truth), truth)
             else:
                 assert self.clean is not None
                 kept = [{"cosine": round(one, 4)} for one in (features @ self.clean.to(features)).tolist()]

@@ -1,4 +1,4 @@
-"""Several models at once, each with a task of its own: an answer counts where it is one for each of them."""
+"""Several models at once, each with a task of its own: a prediction counts where it does for each of them."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from advsearch.errors import InputError
 from advsearch.models import Model, Preprocessing
 from advsearch.models.model import joined
 from advsearch.options import FROM_RUN, JOINED
-from advsearch.tasks.base import Answer, Facts, Judgement, Mark, Task, Truth
+from advsearch.tasks.base import Facts, Judgement, Mark, Prediction, Task, Truth
 
 Outputs = tuple[Any, ...]
-"""What each of several models answers to one picture."""
+"""What each of several models returns for one picture."""
 
 
 @final
@@ -46,9 +46,9 @@ def together(models: Sequence[Model], size: tuple[int, int] | None = None) -> Mo
     )
 
 
-def by_picture(answer: list[Any], count: int) -> list[Outputs]:
+def by_picture(returned: list[Any], count: int) -> list[Outputs]:
     """Return the outputs by picture of `count` pictures, from those by model."""
-    return [tuple(output[k : k + 1] for output in answer) for k in range(count)]
+    return [tuple(output[k : k + 1] for output in returned) for k in range(count)]
 
 
 def of_each(outputs: Sequence[Outputs]) -> list[Any]:
@@ -63,8 +63,8 @@ Truths = tuple[Truth, ...]
 class Together(Task):
     """Several models, each of which judges by a task and labels of its own.
 
-    An answer is right where all models are right, and a success where it is one for every model. So the margin is the
-    largest of the models' margins, and the score the least of their scores.
+    A prediction is right where all models are right, and a success where it is one for every model. So the margin is
+    the largest of the models' margins, and the score the least of their scores.
 
     Args:
         parts: the task of each model, in the order of the outputs of `advsearch.tasks.together.together`.
@@ -85,8 +85,8 @@ class Together(Task):
         names = [one.title for one in self.parts]
         return JOINED.join(names) if len(set(names)) > 1 else self.name
 
-    def read(self, answer: Any, count: int) -> list[Outputs]:
-        return by_picture(answer, count)
+    def read(self, returned: Any, count: int) -> list[Outputs]:
+        return by_picture(returned, count)
 
     def on(self, model: Model, *, target: str | None = None, minimise: bool = False) -> Together:
         """See `Task.on`; a target is for the tasks that take a label, where some do and some do not. Raises InputError
@@ -118,17 +118,17 @@ class Together(Task):
             one.check(self.told(one, facts))
 
     @property
-    def looks(self) -> bool:
-        return any(one.looks for one in self.tasks)
+    def calibrates(self) -> bool:
+        return any(one.calibrates for one in self.tasks)
 
-    def seeing(self, output: Sequence[Outputs], truth: Truths | None) -> Together:
+    def after_calibration(self, output: Sequence[Outputs], truth: Truths | None) -> Together:
         each = zip(self.tasks, of_each(output), truth or [None] * len(self.tasks), strict=True)
-        return replace(self, tasks=tuple(one.seeing(own, true) for one, own, true in each))
+        return replace(self, tasks=tuple(one.after_calibration(own, true) for one, own, true in each))
 
     @property
-    def unsaid(self) -> str:
+    def ambiguities(self) -> str:
         pairs = zip(self.models, self.tasks, strict=True)
-        return "; ".join(f"{model.name}: {one.unsaid}" for model, one in pairs if one.unsaid)
+        return "; ".join(f"{model.name}: {one.ambiguities}" for model, one in pairs if one.ambiguities)
 
     @property
     def remarks(self) -> tuple[str, ...]:
@@ -151,8 +151,8 @@ class Together(Task):
     def score(self, output: Sequence[Outputs], truth: Truths) -> Tensor:
         return torch.stack([one.score(*own) for one, *own in self._each(output, truth)]).amin(dim=0)
 
-    def answers(self, output: Sequence[Outputs], count: int = 1) -> list[tuple[Answer, ...]]:
-        said = [one.answers(own) for one, own in zip(self.tasks, of_each(output), strict=True)]
+    def predictions(self, output: Sequence[Outputs], count: int = 1) -> list[tuple[Prediction, ...]]:
+        said = [one.predictions(own) for one, own in zip(self.tasks, of_each(output), strict=True)]
         return [(_joined([first for first, *_ in each]),) for each in zip(*said, strict=True)]
 
     def judge(self, output: Sequence[Outputs], truth: Truths) -> list[Judgement]:
@@ -161,8 +161,8 @@ class Together(Task):
             payloads = {model.name: one.payload for model, one in zip(self.models, each, strict=True)}
             payload = payloads if any(one is not None for one in payloads.values()) else None
             margin = math.nan if any(one.not_a_number for one in each) else max(one.margin for one in each)
-            answer = _joined([one.answer for one in each])
-            found.append(Judgement.of(min(one.score for one in each), margin, answer, payload))
+            prediction = _joined([one.prediction for one in each])
+            found.append(Judgement.of(min(one.score for one in each), margin, prediction, payload))
         return found
 
     def marks(self, output: Sequence[Outputs], truth: Truths) -> list[list[Mark]]:
@@ -179,5 +179,5 @@ class Together(Task):
         return list(zip(self.tasks, of_each(output), truth, strict=True))
 
 
-def _joined(answers: Sequence[Answer]) -> Answer:
-    return Answer("; ".join(one.label for one in answers))
+def _joined(predictions: Sequence[Prediction]) -> Prediction:
+    return Prediction("; ".join(one.label for one in predictions))

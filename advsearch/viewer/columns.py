@@ -20,10 +20,10 @@ if TYPE_CHECKING:
     import pandas as pd
 
 MOST_LEVELS = 65535
-"""Different names of one axis, or answers, that are told apart; further ones are one: "others"."""
+"""Different names of one axis, or predictions, that are told apart; further ones are one: "others"."""
 
 UNKNOWN = 2
-"""`right` of a row whose answer was not judged."""
+"""`right` of a row whose prediction was not judged."""
 
 NO_PROBABILITY = 65535
 
@@ -32,8 +32,8 @@ BOX_STEPS = 8
 
 NO_BOX = 65535
 
-CORNERS = tuple(f"{what} {end}" for what in ("true box", "answer's box") for end in ("x0", "y0", "x1", "y1"))
-"""Columns of detection: of the true box and of the one that the answer is about, in pixels of the rendering."""
+CORNERS = tuple(f"{what} {end}" for what in ("true box", "predicted box") for end in ("x0", "y0", "x1", "y1"))
+"""Columns of detection: of the true box and of the one that the prediction is about, in pixels of the rendering."""
 
 
 def read_columns(run: Path, after: int = 0, most: int | None = None) -> pd.DataFrame:
@@ -43,7 +43,8 @@ def read_columns(run: Path, after: int = 0, most: int | None = None) -> pd.DataF
     from advsearch.runs.tables import read_sweep  # pandas takes half a second
 
     def corners(row: Row) -> Mapping[str, float]:
-        """The true box of a detector's answer, and the best one with the label that the answer is, or misses."""
+        """The true box of a detector's prediction, and the best one with the label that the prediction is, or
+        misses."""
         payload: Any = row.payload
         if not isinstance(payload, dict) or "box" not in payload:
             return {}
@@ -69,12 +70,12 @@ def packed(rows: pd.DataFrame, *, more: bool = False, running: bool = False) -> 
     that each begins at a multiple of its size. Boxes are (n, 8) uint16 in `BOX_STEPS` of a pixel, `NO_BOX` where there
     is none.
     """
-    answers, labels = _levels(rows["label"])
+    predictions, labels = _levels(rows["label"])
     share = 10_000 * rows["probability"].clip(0.0, 1.0).to_numpy()
     columns = {
         "step": rows["step"].to_numpy(np.uint32),
         "margin": rows["margin"].to_numpy(np.float32),
-        "answer": answers,
+        "answer": predictions,
         "probability": np.where(np.isnan(share), NO_PROBABILITY, share.round()).astype(np.uint16),
         "right": rows["correct"].fillna(UNKNOWN).to_numpy(np.uint8),
         "unit": rows["unit"].to_numpy(np.uint32),

@@ -112,14 +112,14 @@ def progress_json(run: Path, after: int) -> bytes:
             for number, picture in results.pictures("search", after, last):
                 small = data_url(thumbnail(picture.astype("float32") / 255.0), "image/jpeg")
                 pictures.append({"step": number, "picture": small})
-    answer: dict[str, object] = {
+    news: dict[str, object] = {
         "rows": [_told(one) for one in rows],
         "pictures": pictures,
         "next": last,
         "running": running,
         "ended": ended,
     }
-    return json.dumps(plain(answer), allow_nan=False).encode()
+    return json.dumps(plain(news), allow_nan=False).encode()
 
 
 def _told(row: Row) -> dict[str, object]:

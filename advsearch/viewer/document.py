@@ -170,12 +170,12 @@ def asset(name: str) -> str:
 
 
 def heading(eyebrow: Html | str, text: str, remarks: Sequence[str]) -> Html:
-    """Return the header of a page: what was asked, the answer, and what has to be known beside it."""
+    """Return the header of a page: what was asked, the result, and what has to be known beside it."""
     return element("header", element("p", eyebrow, class_="eyebrow"), element("h1", text), remarks_html(remarks))
 
 
 def remarks_html(remarks: Sequence[str]) -> Html:
-    """Return what has to be known beside an answer, and below it, folded where it is much, how files were read."""
+    """Return what has to be known beside a result, and below it, folded where it is much, how files were read."""
     notes = [one for one in remarks if _OF_A_FILE.match(one)]
     listed, noted = (
         element("ul", *(element("li", one) for one in lines), class_=css) if lines else None
@@ -211,7 +211,7 @@ def study_table(
     bars: Sequence[tuple[float, float, float] | None] = (),
 ) -> Html:
     """Return a table whose rows begin with their name. Links, of the names, lead nowhere where they are empty or
-    missing. Shares and bars as those of `AnswerPart`."""
+    missing. Shares and bars as those of `ResultPart`."""
     lines = []
     for number, (first, *cells) in enumerate(rows):
         link = links[number] if number < len(links) else ""

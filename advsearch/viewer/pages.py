@@ -1,4 +1,4 @@
-"""`report.html` of any run: the page that its question has, or what it shows of its answer as a page.
+"""`report.html` of any run: the page that its question has, or what it shows of its result as a page.
 
 The object of an attack may be turned there: `object.js` draws the run's binary glTF.
 """
@@ -16,7 +16,7 @@ from advsearch import rooms
 from advsearch.errors import FileFormatError
 from advsearch.files import read_bytes
 from advsearch.report.markup import NARROW, WIDE, Html, element, join_html, study_chart
-from advsearch.report.shown import AnswerPart, Picture, ShownAnswer, facts_of, remarks_of, shown, subject_of
+from advsearch.report.shown import Picture, ResultPart, ShownResult, facts_of, remarks_of, shown, subject_of
 from advsearch.runs.directory import IMAGES, OBJECT_FILE, REPORT, RunDirectory
 from advsearch.runs.files import write_text
 from advsearch.runs.images import smaller_png
@@ -47,8 +47,8 @@ def kept(run: Path, name: str | Path, largest: int = LARGEST_FIGURE) -> Path | N
     return file if inside and file.stat().st_size <= largest else None
 
 
-def part_html(run: Path, one: AnswerPart, said: str) -> Html:
-    """A part of an answer, which says `said`; a folded one has its title as the handle."""
+def part_html(run: Path, one: ResultPart, said: str) -> Html:
+    """A part of a result, which says `said`; a folded one has its title as the handle."""
     chart = None
     if one.draw is not None:
         words = " ".join([f"{one.title}.", *(one.text or [said])])
@@ -111,14 +111,14 @@ def links_html(run: Path, parts: list[str]) -> Html:
     return element("details", element("summary", f"The runs ({len(parts)})"), element("ul", *lines))
 
 
-def end_html(run: Path, result: Result, given: ShownAnswer) -> Html:
-    """Return what stands at the end of a page: how the answer came about, and the commands that ask the same again."""
+def end_html(run: Path, result: Result, given: ShownResult) -> Html:
+    """Return what stands at the end of a page: how the result came about, and the commands that ask the same again."""
     facts = {name[:1].upper() + name[1:]: text for name, text in facts_of(result, given).items()}
     again = document.again(run, getattr(result, "command_line", ""), goes_on=result.goes_on)
     return join_html(element("h2", "Cost and conditions"), document.facts_table(facts), again)
 
 
-Answer = TypeVar("Answer", bound=Result)
+AnyResult = TypeVar("AnyResult", bound=Result)
 
 LARGEST = 2_700_000
 """Bytes of an object that a page takes along."""
@@ -135,13 +135,13 @@ def read_object(run: Path) -> bytes:
     return data if _header(data) else b""
 
 
-def object_part(data: bytes) -> AnswerPart:
+def object_part(data: bytes) -> ResultPart:
     """Return where the script puts the object; empty where there is none."""
     if not data:
-        return AnswerPart()
+        return ResultPart()
     extras = _header(data).get("asset", {}).get("extras", {})
     note = str(extras.get("note", "")) if isinstance(extras, dict) else ""
-    return AnswerPart("The object, to turn", note=" ".join(filter(None, (_WORDS, note))), live="object")
+    return ResultPart("The object, to turn", note=" ".join(filter(None, (_WORDS, note))), live="object")
 
 
 def object_data(data: bytes) -> list[Html]:
@@ -173,17 +173,17 @@ def page_of(run: Path, result: Result) -> str:
     return made or shown_page(run, result, shown(result))
 
 
-def keep_answer(run: RunDirectory, result: Answer) -> Answer:
-    """Write the summary and the page of an answer into the open directory of its run, and return it."""
+def keep_result(run: RunDirectory, result: AnyResult) -> AnyResult:
+    """Write the summary and the page of a result into the open directory of its run, and return it."""
     run.write_summary(result)
     write_page(run.path, result)
     return result
 
 
 def shown_page(
-    run: Path, result: Result, given: ShownAnswer, *, data: Sequence[Html] = (), scripts: Sequence[str] = ()
+    run: Path, result: Result, given: ShownResult, *, data: Sequence[Html] = (), scripts: Sequence[str] = ()
 ) -> str:
-    """Return what is shown of an answer as the page of the run in the folder `run`; data and scripts fill the parts
+    """Return what is shown of a result as the page of the run in the folder `run`; data and scripts fill the parts
     that are `live`."""
     parts = list(getattr(result, "parts", ()))
     drawn = any(one.draw or one.figure or one.pictures for one in given.sections)

@@ -27,7 +27,7 @@ from urllib.parse import parse_qs, unquote, urlsplit
 
 from advsearch.errors import AdvsearchError, InputError
 from advsearch.files import read_bytes
-from advsearch.questions.photographs import answer as photos
+from advsearch.questions.photographs import result as photos
 from advsearch.questions.sweep.page import SweepSource, result_of, sweep_page_html
 from advsearch.report.markup import element, join_html
 from advsearch.runs import files, listing
@@ -293,11 +293,11 @@ class _Handler(BaseHTTPRequestHandler):
             # Lax: a link on the page of a run, which has an origin of its own, leads back to the list
             cookie = f"{COOKIE}-{self.server.server_port}={self.server.token}"
             headers["Set-Cookie"] = f"{cookie}; HttpOnly; Secure; SameSite=Lax; Path=/"
-        for pattern, answer in routes:
+        for pattern, found in routes:
             match = re.fullmatch(pattern, address.path)
             if match:
                 names = (unquote(one, errors="surrogateescape") for one in match.groups())
-                return Served(*answer(self, query, *names)), headers
+                return Served(*found(self, query, *names)), headers
         raise Refused(HTTPStatus.NOT_FOUND, "there is no such page")
 
     def _page(self, _query: Query, name: str) -> Served:

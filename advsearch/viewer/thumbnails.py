@@ -52,7 +52,8 @@ def thumbnail(picture: object) -> bytes:
 
 
 def cover(run: Path) -> bytes:
-    """Return a small picture of a run as a JPEG: its worst answer, or else its first figure; grey where it has none."""
+    """Return a small picture of a run as a JPEG: its worst prediction, or else its first figure; grey where it has
+    none."""
     first = [run / IMAGES / f"{name}.png" for name in ("adversarial", "clean", "worst")]
     for file in (*first, *sorted((run / IMAGES).glob("*.png"))):
         if not file.is_file():

@@ -15,7 +15,7 @@ from stand_ins import interrupted
 from torch import Tensor, nn
 
 import advsearch
-from advsearch.cli.output import shown_text as answer_text
+from advsearch.cli.output import shown_text as text_of
 from advsearch.errors import InputError, RunExistsError, UnknownNameError
 from advsearch.progress import NullProgress
 from advsearch.questions.attack.parts import problem_from_config
@@ -76,7 +76,7 @@ def test_a_weakness_is_found_verified_and_kept(scene: advsearch.Scene, level: fl
     assert (tmp_path / "run" / "report.html").is_file()
 
 
-def test_the_answer_stays_in_its_budget_and_beats_its_start(scene: advsearch.Scene, level: float) -> None:
+def test_the_result_stays_in_its_budget_and_beats_its_start(scene: advsearch.Scene, level: float) -> None:
     result = advsearch.attack(
         scene, model(level + 0.03), controls={"texture": {"epsilon": 0.05}}, baseline=False, **FAST
     )
@@ -354,14 +354,15 @@ def test_a_search_over_conditions_says_how_long_it_is(scene: advsearch.Scene, le
     asked = {**small, "over": {"light": {"power": [0, 1]}}, "steps": 2}
     advsearch.attack(scene, model(level + 0.02), **asked, progress=Told())
     assert any(
-        text.startswith("One answer for many conditions: 2 steps, each over 4 conditions; `steps`") for text in told
+        text.startswith("One configuration for many conditions: 2 steps, each over 4 conditions; `steps`")
+        for text in told
     )
     told.clear()
     advsearch.attack(scene, model(level + 0.02), **asked, draws=1, progress=Told())
     assert not any("many conditions" in text for text in told)
 
 
-def test_an_answer_whose_check_is_interrupted_is_told_and_verified_later(
+def test_a_configuration_whose_check_is_interrupted_is_told_and_verified_later(
     scene: advsearch.Scene, level: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run, wrong = tmp_path / "run", model(level + 0.02)
@@ -373,9 +374,9 @@ def test_an_answer_whose_check_is_interrupted_is_told_and_verified_later(
     with monkeypatch.context() as patched:
         patched.setattr("advsearch.engine.verifier.choose_spp", stopped)
         first = advsearch.attack(scene, wrong, **asked)
-    said = "The answer so far is not verified: the model calls this mug a vase."
+    said = "What was found so far is not verified: the model calls this mug a vase."
     assert first.summary.ending == "interrupted" and first.summary.verified is None and first.search is not None
-    assert said in answer_text(first.summary) and said in (run / "report.html").read_text()
+    assert said in text_of(first.summary) and said in (run / "report.html").read_text()
     assert "advsearch resume" in (run / "report.html").read_text()
     assert listed_runs(tmp_path)[0].answer == "vase, unverified"
     done = advsearch.attack(scene, wrong, **asked, resume=True)

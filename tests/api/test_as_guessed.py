@@ -29,7 +29,7 @@ from advsearch.progress import BarProgress, LineProgress, NotebookProgress, Null
 from advsearch.questions.attack.result import AttackResult
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.gap import GapResult
-from advsearch.questions.region.answer import RegionResult
+from advsearch.questions.region.result import RegionResult
 from advsearch.questions.sweep.result import SweepResult
 from advsearch.runs.results import Result
 
@@ -124,7 +124,7 @@ def test_every_other_question_does_too(scene: advsearch.Scene, model: advsearch.
 # ---- an answer elsewhere --------------------------------------------------------------------------------------------
 
 
-def test_an_answer_is_rendered_under_another_view(attacked: AttackResult, tmp_path: Path) -> None:
+def test_an_adversarial_scene_is_rendered_under_another_view(attacked: AttackResult, tmp_path: Path) -> None:
     same, turned = attacked.render(spp=64), attacked.render(settings={"camera.azimuth": 200.0}, spp=64)
     texture, plain = attacked.artifacts["texture"], {**PICTURE, "spp": 64}
     del plain["threads"]
@@ -147,7 +147,7 @@ def test_an_answer_is_rendered_under_another_view(attacked: AttackResult, tmp_pa
         other.render()
 
 
-def test_an_answer_of_another_session_is_rendered_with_what_its_run_names(tmp_path: Path) -> None:
+def test_an_adversarial_scene_of_another_session_is_rendered_with_what_its_run_names(tmp_path: Path) -> None:
     asked: dict[str, Any] = {**FAST, "resolution": 32, "steps": 1}
     controls: list[Any] = ["pose.yaw", LightControl()]
     metrics = {"here": lambda image, output, truth: image.mean()}
@@ -159,7 +159,7 @@ def test_an_answer_of_another_session_is_rendered_with_what_its_run_names(tmp_pa
     assert torch.equal(one.views[0].picture, other.views[0].picture) and one.model == other.model == "reference"
 
 
-def test_the_answer_of_several_models_is_rendered(scene: advsearch.Scene) -> None:
+def test_the_adversarial_scene_of_several_models_is_rendered(scene: advsearch.Scene) -> None:
     """Each of them says what it sees, and a metric gets what each of them says."""
 
     def least(image: Tensor, output: tuple[Tensor, ...], truth: tuple[Tensor, ...]) -> Tensor:
@@ -171,13 +171,13 @@ def test_the_answer_of_several_models_is_rendered(scene: advsearch.Scene) -> Non
     asked: dict[str, Any] = {**FAST, "steps": 1, "policy": "random"}
     found = advsearch.attack(scene, both, ensemble="worst", controls="pose.yaw", metrics={"least": least}, **asked)
     assert all((row.metrics["least"] or 0.0) < 0.0 for row in found.rows()), "of the one that sees a vase"
-    assert found.render(spp=4).views[0].answers[0].label == "mug; vase"
-    assert found.render(both[1], spp=4).views[0].answers[0].label == "vase"
+    assert found.render(spp=4).views[0].predictions[0].label == "mug; vase"
+    assert found.render(both[1], spp=4).views[0].predictions[0].label == "vase"
 
 
-def test_what_an_answer_says_is_not_set_beside_it(scene: advsearch.Scene, model: advsearch.Model) -> None:
+def test_what_an_adversarial_scene_says_is_not_set_beside_it(scene: advsearch.Scene, model: advsearch.Model) -> None:
     found = advsearch.attack(scene, model, controls={"pose.yaw": np.array([0.0, 90.0])}, policy="random", **FAST)
-    with pytest.raises(InputError, match=r"settings: the answer says what pose.yaw is"):
+    with pytest.raises(InputError, match=r"settings: the adversarial configuration says what pose.yaw is"):
         found.render(settings={"pose.yaw": 3.0})
     with pytest.raises(InputError, match="expected an attack that was kept, got one that was not; give it a `run`"):
         advsearch.replay(found)
@@ -271,7 +271,7 @@ def _other() -> Callable[..., float]:
 
 def test_a_metric_has_a_name_that_workers_and_files_can_use(model: advsearch.Model) -> None:
     from advsearch.engine.judging import metrics_as_settings, only_here
-    from advsearch.questions.sweep.carry_out import job_of, sweep_answers
+    from advsearch.questions.sweep.carry_out import job_of, sweep_worker
     from advsearch.questions.sweep.settings import SweepConfig
 
     named = metrics_as_settings({"red": red, "own": lambda image, output, truth: 0.0})
@@ -280,7 +280,7 @@ def test_a_metric_has_a_name_that_workers_and_files_can_use(model: advsearch.Mod
     config = SweepConfig(object="mug", grid={"pose.yaw": [0, 90]}, metrics={"red": "math:hypot"}, **PICTURE)
     advsearch.allow_code("math:hypot")  # as the coordinator sends it along
     with pytest.raises(ValueError, match="only one element tensors"):  # a worker has math.hypot from its name
-        sweep_answers(config.plain())(job_of(config).queries(range(1)))
+        sweep_worker(config.plain())(job_of(config).queries(range(1)))
     refused: list[tuple[Any, str]] = [
         ({"f": 3}, "f: expected a function"),
         ({"f": lambda image, output: 0.0}, r"f: expected a function of \(image, output, truth\): too many"),

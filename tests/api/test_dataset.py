@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 import torch
-from samples import make_answered
+from samples import make_attacked
 from small_models import easy
 
 import advsearch
@@ -126,14 +126,14 @@ def test_boxes_are_where_vertices_are_projected(tmp_path: Path) -> None:
 
 def answered(path: Path, **more: Any) -> Path:
     config = AttackConfig(object="mug", model=EASY, controls={"pose": {}}, resolution=16, denoise="none", **more)
-    run = make_answered(path, config, np.full(6, 0.25))
+    run = make_attacked(path, config, np.full(6, 0.25))
     with RunDirectory.resume(run) as held:
         for kind, wrong in (("control", False), ("verification", True)):
             held.record(*(Row(kind, k, seed=k, spp=1, correct=not wrong, label="a") for k in range(3)))
     return run
 
 
-def test_an_attack_has_its_answer_and_the_clean_scene(tmp_path: Path) -> None:
+def test_an_attack_has_its_adversarial_scene_and_the_clean_scene(tmp_path: Path) -> None:
     run = answered(tmp_path / "run")
     assert [one["file_name"] for one in exported(run, tmp_path / "a")["images"]] == ["verification-00.png"]
     found = exported(run, tmp_path / "b", "--all")

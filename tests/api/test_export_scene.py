@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from samples import make_answered
+from samples import make_attacked
 from scipy.spatial import KDTree
 
 import advsearch
-from advsearch.api.export import answer_of
+from advsearch.api.export import adversarial_of
 from advsearch.cli.main import main
 from advsearch.controls import make_control, make_space
 from advsearch.questions.attack.result import write_object
@@ -37,7 +37,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     config = AttackConfig(object="mug", controls=CONTROLS, resolution=32)
     size = advsearch.load_scene("mug").renderer(CONTROLS, resolution=32).start.numel()
     u = torch.rand(size, generator=torch.Generator().manual_seed(4))
-    return make_answered(tmp_path_factory.mktemp("runs") / "mug-all-001", config, u.numpy())
+    return make_attacked(tmp_path_factory.mktemp("runs") / "mug-all-001", config, u.numpy())
 
 
 def test_stock_mitsuba_renders_the_adversarial_scene(
@@ -52,7 +52,7 @@ def test_stock_mitsuba_renders_the_adversarial_scene(
     assert main(command) == 2
     assert "is there already" in capsys.readouterr().err
 
-    answer = answer_of(run)
+    answer = adversarial_of(run)
     renderer = answer.problem.renderer.like(denoiser="none")
     ours, again = (renderer.radiance(answer.u, seed, 128).numpy() for seed in (0, 1))
     mi = mitsuba()
@@ -74,7 +74,7 @@ def answered_by(controls: dict[str, Any], path: Path) -> Path:
     """A small run over a mug with a configuration a little above the middle as its answer."""
     config = AttackConfig(object="mug", controls=controls, resolution=16, denoise="none")
     size = advsearch.load_scene("mug").renderer(controls, resolution=16).start.numel()
-    return make_answered(path, config, np.full(size, 0.6))
+    return make_attacked(path, config, np.full(size, 0.6))
 
 
 HAZE: dict[str, Any] = {"haze": {"density": [0.1, 0.3]}}
@@ -87,7 +87,7 @@ def test_stock_mitsuba_renders_haze_and_a_plain_background(
     run = answered_by(controls, tmp_path / "mug-001")
     assert main(["export", str(run), "--out", str(tmp_path / "scene.xml"), "--json"]) == 0
     note = json.loads(capsys.readouterr().out)["notes"][2]
-    answer = answer_of(run)
+    answer = adversarial_of(run)
     renderer = answer.problem.renderer
     ours, again = (renderer.radiance(answer.u, seed, 128).numpy() for seed in (0, 1))
     mi = mitsuba()
@@ -133,7 +133,7 @@ def test_the_adversarial_object_is_read_back(run: Path, tmp_path: Path, capsys: 
     out = tmp_path / "mug.glb"
     assert main(["export", str(run), "--out", str(out), "--json"]) == 0
     assert "8 bits" in json.loads(capsys.readouterr().out)["notes"][0]
-    answer = answer_of(run)
+    answer = adversarial_of(run)
     inputs, description = answer.inputs, answer.problem.space.scene
     assert description is not None
     texture = np.round(linear_to_srgb(inputs["object.base_color"]).numpy() * 255)
@@ -160,8 +160,8 @@ def test_the_adversarial_object_is_read_back(run: Path, tmp_path: Path, capsys: 
     assert float((back.mesh.normals[at] * normals).sum(axis=1).mean()) > 0.99
 
 
-def test_the_object_to_turn_is_the_answer_and_what_was_before(run: Path, tmp_path: Path) -> None:
-    answer = answer_of(run)
+def test_the_object_to_turn_is_the_adversarial_scene_and_what_was_before(run: Path, tmp_path: Path) -> None:
+    answer = adversarial_of(run)
     with RunDirectory.create_for(AttackConfig(object="mug", run=str(tmp_path / "kept"))) as kept:
         write_object(kept, answer.problem, answer.u)
     read = trimesh.load(tmp_path / "kept" / OBJECT_FILE, process=False, force="mesh")

@@ -116,7 +116,7 @@ def test_a_function_is_a_task(scene: advsearch.Scene) -> None:
 
     network = advsearch.load_model(Level(), input_size=16, read=make_task(judge).reader)
     shown = advsearch.render(scene, network, task=judge, controls={"pose": {"yaw": 0}}, spp=4)
-    level = float(shown.views[0].answers[0].label)
+    level = float(shown.views[0].predictions[0].label)
     assert 0.2 < level < 0.6 and shown.task == "judge"
     swept = advsearch.sweep(
         scene, Level(), {"pose.yaw": [0, 90]}, task=judge, resolution=16, spp=2, denoise="none", trials=0
@@ -138,8 +138,8 @@ def test_a_function_that_says_yes_or_no_is_no_task() -> None:
         make_task(lambda output, truth: output.sum().item()).margin(torch.zeros(2, 1), Facts("mug"))
     whole = make_task(lambda output, truth: output.sum())
     assert whole.judge(torch.tensor([[3.0, 1.0]]), Facts("mug", "cup"))[0].margin == 4.0
-    assert whole.answers(torch.tensor([[3.0, 1.0]]))[0][0].label == "3, 1"
-    assert whole.answers(torch.zeros(1, 4, 4))[0][0].label == "4 x 4 numbers, mean 0"
+    assert whole.predictions(torch.tensor([[3.0, 1.0]]))[0][0].label == "3, 1"
+    assert whole.predictions(torch.zeros(1, 4, 4))[0][0].label == "4 x 4 numbers, mean 0"
     assert whole.truth_names(Facts("mug", None, "cup")) == ("cup",)
 
 

@@ -22,7 +22,7 @@ from advsearch.errors import InputError
 from advsearch.questions.attack import attack
 from advsearch.questions.attack import studies as parts
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.attack.studies import models_answering
+from advsearch.questions.attack.studies import models_worker
 from advsearch.questions.attack.summary import MatrixResult
 from advsearch.questions.gap import GapConfig
 from advsearch.runs.store import Store
@@ -49,7 +49,9 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> MatrixResult:
     return carried_out(tmp_path_factory.mktemp("matrix") / "run")
 
 
-def test_every_answer_is_tried_on_every_model(whole: MatrixResult, capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_adversarial_scene_is_tried_on_every_model(
+    whole: MatrixResult, capsys: pytest.CaptureFixture[str]
+) -> None:
     """What misleads the hard one misleads the easy one too."""
     result, run = whole, Path(str(whole.run))
     names = ["small_models:easy", "small_models:hard"]
@@ -101,14 +103,14 @@ def test_workers_make_the_pictures_of_the_trials(
     """Of three configurations six for each model, whose input sizes differ; the rows stay."""
     run = tmp_path / "run"
     config = AttackConfig(**{**SHORT, "model": BOTH, "run": str(run)})
-    ready = shared(monkeypatch, config.plain(), models_answering)
+    ready = shared(monkeypatch, config.plain(), models_worker)
     monkeypatch.setattr(parts, "executor_of", lambda work, **_: nullcontext(None))
     result = carried_out(run, workers=2)
     assert isinstance(result, MatrixResult) and len(ready.given) == 3 * 2 * 6
     assert rows(run) == rows(Path(str(whole.run)))
 
 
-def test_one_answer_for_all_models(tmp_path: Path) -> None:
+def test_one_configuration_for_all_models(tmp_path: Path) -> None:
     result = carried_out(tmp_path / "run", ensemble="worst")
     (row,) = result.table
     assert row.attacked == "all" and [cell.ending for cell in row.tested] == ["found", "found"]
@@ -191,7 +193,7 @@ def test_objectives_are_put_together(way: Any, value: float, slopes: tuple[float
     ],
     ids=["both wrong", "one wrong", "both right"],
 )
-def test_an_answer_counts_where_it_does_for_each_model(logits: list[list[float]], score: float, right: bool) -> None:
+def test_a_prediction_counts_where_it_does_for_each_model(logits: list[list[float]], score: float, right: bool) -> None:
     """One model that errs is neither a success nor a right answer."""
     tasks = (Classification(labels=("mug", "vase")), Classification(labels=("cup", "jar")))
     task = Together(parts=tasks, models=(easy(), hard()), tasks=tasks)

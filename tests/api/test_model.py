@@ -11,7 +11,7 @@ from advsearch.errors import UnknownNameError
 
 
 @pytest.mark.parametrize("task", ["detection", {"name": "detection", "confidence": 0.3}])
-def test_a_task_says_how_answers_are_read(task: object) -> None:
+def test_a_task_says_how_outputs_are_read(task: object) -> None:
     model = advsearch.load_model(Finder(), task=task, labels=["cup", "bowl", "dog"], input_size=SIDE)  # type: ignore[arg-type]
     (found,) = model(torch.rand(1, SIDE, SIDE, 3))
     assert {"boxes", "scores"} <= set(found)

@@ -11,13 +11,13 @@ import pytest
 
 from advsearch.cluster import Done, Work, Workforce
 from advsearch.errors import ClusterError
-from advsearch.question import Asked, answered
+from advsearch.question import Asked, carried_out
 from advsearch.questions.attack import studies as parts
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.studies import chains_of, curve
 from advsearch.questions.gap import GapConfig, gap
 from advsearch.runs.store import NAME, Store
-from advsearch.runs.summary import read_answer
+from advsearch.runs.summary import read_configuration
 
 SMALL = GapConfig(
     object="mug",
@@ -72,7 +72,7 @@ def test_a_shared_gap_is_the_one_that_was_made_here(tmp_path: Path, monkeypatch:
     ]
     for name in (part.name for (part,) in chains_of(SMALL)):
         here, there = (tmp_path / one / "parts" / name for one in ("alone", "shared"))
-        assert rows(there) == rows(here) and (read_answer(there) == read_answer(here)).all()
+        assert rows(there) == rows(here) and (read_configuration(there) == read_configuration(here)).all()
         assert {one.name for one in there.iterdir()} >= {"run.yaml", "summary.json", "report.html", "images"}
         assert "advsearch-part-" not in (there / "summary.json").read_text()
         assert str(there) in [one.run for one in shared.table]
@@ -102,9 +102,9 @@ def test_a_shared_curve_tries_no_epsilon_more_than_one_that_was_made_here(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     small = AttackConfig.of(SMALL, controls={"texture": {"resolution": 2}}, epsilon="0.02,0.01", average=0)
-    alone = answered(curve, Asked(small.model_copy(update={"run": str(tmp_path / "alone")})))
+    alone = carried_out(curve, Asked(small.model_copy(update={"run": str(tmp_path / "alone")})))
     elsewhere(monkeypatch)
-    shared = answered(curve, Asked(small.model_copy(update={"run": str(tmp_path / "shared"), "workers": 2})))
+    shared = carried_out(curve, Asked(small.model_copy(update={"run": str(tmp_path / "shared"), "workers": 2})))
     assert shared.parts == alone.parts and shared.curve == alone.curve
     for name in alone.parts:
         assert rows(tmp_path / "shared" / "parts" / name) == rows(tmp_path / "alone" / "parts" / name)

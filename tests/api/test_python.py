@@ -38,7 +38,7 @@ def test_signatures_have_every_setting_as_it_is_declared(name: str) -> None:
     own = {
         "scene",
         "object",
-        "answer",
+        "attack",
         "recipe",
         "sweeps",
         "compared",

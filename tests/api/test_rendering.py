@@ -39,7 +39,7 @@ def refused(capsys: pytest.CaptureFixture[str], *words: str) -> str:
     return err
 
 
-def test_a_picture_and_the_five_first_answers(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_picture_and_the_five_first_predictions(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     png, exr = tmp_path / "new" / "a.png", tmp_path / "a.exr"
     found = render(capsys, "--object", "mug", "--out", str(png))
     assert (found["out"], found["size"], found["object"]) == (str(png), [16, 16], "mug")
@@ -132,7 +132,7 @@ def test_from_python_a_scene_or_a_name(tmp_path: Path) -> None:
     found = advsearch.render("bowl", controls={"camera": {"elevation": 60.0}}, resolution=(16, 24), spp=1)
     (view,) = found.views
     assert view.picture.shape == view.linear.shape == (16, 24, 3)
-    first, second = (one.probability for one in view.answers[:2])
+    first, second = (one.probability for one in view.predictions[:2])
     assert first is not None and second is not None and first >= second
     assert found.save(tmp_path / "a.png") == (16, 24)
     np.testing.assert_array_equal(read_png(tmp_path / "a.png"), view.picture.numpy())

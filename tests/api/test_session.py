@@ -37,7 +37,7 @@ from advsearch.questions.attack import carry_out as attacking
 from advsearch.questions.attack.parts import problem_from_config
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.wording import objective_text
-from advsearch.questions.region.answer import RegionConfig
+from advsearch.questions.region.result import RegionConfig
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.runs.directory import is_run
 from advsearch.runs.store import Store
@@ -214,7 +214,7 @@ def test_every_setting_takes_each_value_that_it_is_given_or_none(command: str) -
     needed = {
         "object": "mug",
         "out": "a.png",
-        "answer": "run",
+        "attack": "run",
         "recipe": "a.yaml",
         "sweeps": "run",
         "compared": "run,b",

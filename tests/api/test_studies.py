@@ -17,18 +17,18 @@ from samples import attack as attacked
 import advsearch
 from advsearch.api import carry_out
 from advsearch.cli.main import main
-from advsearch.cli.output import shown_text as answer
 from advsearch.cli.output import shown_text as region_text
+from advsearch.cli.output import shown_text as text_of
 from advsearch.engine.transport import CleanMatrix
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.question import Asked, answered
+from advsearch.question import Asked, carried_out
 from advsearch.questions.attack import studies as attacking
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.studies import curve
 from advsearch.questions.attack.summary import AttackSummary
 from advsearch.questions.gap import GapConfig, gap
 from advsearch.questions.region import growing, region
-from advsearch.questions.region.answer import RegionConfig
+from advsearch.questions.region.result import RegionConfig
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.listing import finished, listed_runs
 from advsearch.runs.summary import read_result
@@ -71,7 +71,7 @@ def summary_of(config: AttackConfig, run: str) -> AttackSummary:
 
 def test_a_curve_counts_robust_objects_at_each_epsilon(asked: list[AttackConfig]) -> None:
     config = AttackConfig(object="mug,bowl,vase,pan", epsilon="0.1,0.01,0.05", run="study")
-    summary = answered(curve, Asked(config))
+    summary = carried_out(curve, Asked(config))
     told = [(one.epsilon, one.robust, one.found, one.already_wrong) for one in summary.curve]
     assert told == [(0.01, 3, 0, 1), (0.05, 2, 1, 1), (0.1, 1, 2, 1)]
     low, high = summary.curve[1].interval
@@ -84,11 +84,11 @@ def test_a_curve_counts_robust_objects_at_each_epsilon(asked: list[AttackConfig]
     ]  # fmt: skip
     assert (Path("runs/study/images") / "attack.svg").is_file()
     assert json.loads(Path("runs/study/summary.json").read_text())["curve"] == summary.to_dict()["curve"]
-    assert "2/4" in answer(summary) and "already wrong" in answer(summary)
+    assert "2/4" in text_of(summary) and "already wrong" in text_of(summary)
 
 
 def test_a_label_for_several_objects_says_whose_own_it_is_not(asked: list[AttackConfig]) -> None:
-    summary = answered(curve, Asked(AttackConfig(object="mug,bowl", label="mug", run="curve")))
+    summary = carried_out(curve, Asked(AttackConfig(object="mug,bowl", label="mug", run="curve")))
     assert any("also for bowl (its own is 'bowl')" in text for text in summary.warnings)
 
 
@@ -104,7 +104,7 @@ def test_an_attack_on_several_objects_or_epsilons_is_a_curve(
 
 
 def test_several_objects_and_one_budget_make_one_row_each(asked: list[AttackConfig]) -> None:
-    summary = answered(curve, Asked(AttackConfig(object="mug,pan", run="study")))
+    summary = carried_out(curve, Asked(AttackConfig(object="mug,pan", run="study")))
     assert [row.ending for row in summary.table] == ["found", "budget spent"]
     assert [one.robust for one in summary.curve] == [1] and len(asked) == 2
 
@@ -130,7 +130,7 @@ def test_a_study_goes_on_with_the_part_at_which_it_was_stopped(
         ("mug", "texture"), ("mug", "geometry"), ("bowl", "texture"), ("bowl", "geometry"),
     ]  # fmt: skip
     assert len(asked) == 4, "two before the stop, two after it"
-    assert "45/50 (90 %)" in answer(summary) and "20/20" in answer(summary)
+    assert "45/50 (90 %)" in text_of(summary) and "20/20" in text_of(summary)
 
 
 def test_a_gap_gives_each_control_its_own_budget(asked: list[AttackConfig]) -> None:

@@ -39,7 +39,7 @@ from advsearch.models.model import Model, Preprocessing
 from advsearch.questions.stability.stiff import condition_number, hessian
 from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.formation import to_8_bit
-from advsearch.tasks import Answer, Classification, Judgement
+from advsearch.tasks import Classification, Judgement, Prediction
 
 LABELS, IMAGE = (0,), torch.zeros(1, 2, 2, 3)
 STEPS, LONG = 40, 10_000
@@ -157,14 +157,14 @@ def test_nan_is_counted_and_three_in_a_row_end_a_search(name: str, steps: tuple[
 
 
 @pytest.mark.parametrize("name", POLICIES)
-def test_nothing_is_found_in_a_model_whose_answer_never_changes(name: str) -> None:
+def test_nothing_is_found_in_a_model_whose_prediction_never_changes(name: str) -> None:
     result = found(partial(differentiable, lambda u: 0.0 * u.sum() - 1.0), box(0.2, 0.2), name)
     assert result.success_rate == 0.0
     assert name not in ("pgd", "adam") or result.ending is Ending.STALLED
 
 
 @pytest.mark.parametrize("rate", [0.1, 0.5, 0.9])
-def test_what_a_search_claims_of_random_answers_is_never_verified(rate: float) -> None:
+def test_what_a_search_claims_of_random_predictions_is_never_verified(rate: float) -> None:
     domain = box(0.5, 0.5)
     for run in range(100):
 
@@ -178,7 +178,7 @@ def test_what_a_search_claims_of_random_answers_is_never_verified(rate: float) -
         def trial(query: Query, run: int = run) -> Evaluation:
             # the picture decides, so another configuration gives another answer
             value = margin(seeds.stream(run, f"trial {query.u.tolist()}", query.seed))
-            return Evaluation.of(Judgement(value, value, value <= 0.0, Answer("wrong" if value > 0.0 else "right")))
+            return Evaluation.of(Judgement(value, value, value <= 0.0, Prediction("wrong" if value > 0.0 else "right")))
 
         result = found(noisy, domain, "random", seed=run, noise=run)
         checked = verify(partial(map, trial), domain, result.best_u, spp=1, seed=run, claim=result.ending)

@@ -281,7 +281,7 @@ def test_the_gradient_comes_through_a_network_that_answers_with_probabilities() 
         def forward(self, x: Tensor) -> Tensor:
             return (x.flatten(1) @ weight.T).softmax(dim=1)
 
-    with pytest.warns(UserWarning, match="answers with probabilities"):
+    with pytest.warns(UserWarning, match="returns probabilities"):
         model = load_model(Softmax(), input_size=1)
     leaf = image.clone().requires_grad_()
     logits = model(leaf)
@@ -392,7 +392,7 @@ def test_feature_distance_knows_no_class_and_no_way_back(asked: dict[str, Any], 
         ((), r"label: expected class indices from 0 to 3, got \(\)"),
         ((4,), "expected class indices from 0 to 3"),
         ((-1,), "expected class indices from 0 to 3"),
-        ((0, 1, 2, 3), "holds all 4 classes, so no answer could be wrong"),
+        ((0, 1, 2, 3), "holds all 4 classes, so no prediction could be wrong"),
     ],
 )
 @pytest.mark.parametrize("name", sorted(OBJECTIVES))
@@ -422,7 +422,7 @@ def test_unknown_objectives_name_their_neighbours() -> None:
         assert torch.equal(get_objective(same)(LOGITS, IMAGES, (0,)), margin(LOGITS, IMAGES, (0,)))
 
 
-def test_forms_are_called_with_the_right_answers() -> None:
+def test_forms_are_called_with_the_right_labels() -> None:
     targeted = get_objective("margin", Classification(target=(2,)))
     assert torch.equal(targeted(LOGITS, IMAGES, (0,)), targeted_margin(LOGITS, IMAGES, (2,)))
     assert torch.equal(
@@ -457,7 +457,7 @@ def test_a_loss_of_torch_is_an_objective(loss: Callable[..., Tensor]) -> None:
     assert torch.allclose(found, -LOGITS.log_softmax(dim=1)[:, 2])
 
 
-def test_several_right_answers_are_a_tuple_and_no_loss_of_torch_takes_them() -> None:
+def test_several_right_labels_are_a_tuple_and_no_loss_of_torch_takes_them() -> None:
     seen: list[Any] = []
 
     def keeps(logits: Tensor, images: Tensor, labels: Any) -> Tensor:
@@ -467,19 +467,19 @@ def test_several_right_answers_are_a_tuple_and_no_loss_of_torch_takes_them() -> 
     for labels in ((0, 2), (2,)):
         get_objective(keeps)(LOGITS, IMAGES, labels)
     assert seen[0] == (0, 2) and seen[1].tolist() == [2, 2] and seen[1].dtype == torch.int64
-    with pytest.raises(InputError, match=r"one right answer for a loss of torch, got 2 \(indices \(0, 2\)\); use"):
+    with pytest.raises(InputError, match=r"one right label for a loss of torch, got 2 \(indices \(0, 2\)\); use"):
         get_objective(F.cross_entropy)(LOGITS, IMAGES, (0, 2))
 
 
 @pytest.mark.parametrize(("named", "tuple_of"), [((0,), torch.tensor([0, 0])), ((0, 2), (0, 2))])
-def test_ours_take_right_answers_in_every_form(named: tuple[int, ...], tuple_of: Any) -> None:
+def test_ours_take_right_labels_in_every_form(named: tuple[int, ...], tuple_of: Any) -> None:
     for name in ("margin", "cross_entropy", "log_odds", "dlr", "targeted_margin", "targeted_dlr"):
         by_name = getattr(losses, name)(LOGITS, tuple_of)
         assert torch.equal(by_name, getattr(objective_functions, name)(LOGITS, IMAGES, named)), name
     assert torch.equal(margin(LOGITS, IMAGES, tuple_of), margin(LOGITS, IMAGES, named))
 
 
-def test_rows_may_have_right_answers_of_their_own() -> None:
+def test_rows_may_have_right_labels_of_their_own() -> None:
     assert losses.margin(LOGITS, torch.tensor([0, 1])).tolist() == [-1.0, -1.0]
     assert losses.carlini_wagner(LOGITS, torch.tensor([0, 0]), confidence=2.0).tolist() == [-1.0, 2.0]
     assert losses.targeted_carlini_wagner(LOGITS, (1,)).tolist() == [-2.0, 0.0]

@@ -7,13 +7,13 @@ import torch
 
 from advsearch.attacks import Block, Domain, Ending, Evaluation, Trials, verify
 from advsearch.attacks.verification import EASIER, OVER_CONDITIONS, WORST_CASE, Rule
-from advsearch.tasks import Answer, Judgement
+from advsearch.tasks import Judgement, Prediction
 
 DOMAIN = Domain(torch.zeros(1), (Block(1),))
 
 
 def trials(values: list[tuple[float, bool]]) -> list[Judgement]:
-    return [Judgement(score, -score, right, Answer("")) for score, right in values]
+    return [Judgement(score, -score, right, Prediction("")) for score, right in values]
 
 
 def run(rule: Rule, clean: list[tuple[float, bool]], found: list[tuple[float, bool]]) -> tuple[Ending, int, int]:
@@ -41,7 +41,7 @@ def test_over_conditions_those_count_in_which_the_clean_scene_is_right() -> None
     assert run(OVER_CONDITIONS, mostly_wrong, [wrong] * 20)[0] is Ending.ALREADY_WRONG
 
 
-def test_a_target_reached_where_the_clean_answer_was_wrong_does_not_count() -> None:
+def test_a_target_reached_where_the_clean_prediction_was_wrong_does_not_count() -> None:
     clean = [(-3.0, True)] * 19 + [(-1.0, False)]  # the last is wrong without being the target
     assert run(WORST_CASE, clean, [(1.0, False)] * 20) == (Ending.FOUND, 19, 20)
 

@@ -321,7 +321,7 @@ def test_a_policy_that_knows_no_choices_never_sees_one() -> None:
     assert result.distribution is None
 
 
-def test_a_distribution_is_the_policys_answer() -> None:
+def test_a_distribution_is_the_policys_result() -> None:
     """Configurations drawn from it are inside, and nearly as good as the best one."""
     domain = Domain(torch.full((4,), 0.5), (Block(2, "linf", 0.2), Block(2)))
 
@@ -454,7 +454,7 @@ def test_nothing_but_nan_returns_the_start() -> None:
     assert result.renders == 3
 
 
-def test_a_candidate_that_turns_nan_when_ranked_is_not_the_answer() -> None:
+def test_a_candidate_that_turns_nan_when_ranked_is_not_the_result() -> None:
     evaluate = objective_is(lambda u, index: math.nan if index >= 2 and float(u[0]) > 0.55 else float(u[0] - 0.5))
     result = search(evaluate, DOMAIN, Script((at(0.1), at(0.02))), steps=2, seed=0)
     assert torch.equal(result.best_u, at(0.02))

@@ -41,10 +41,10 @@ from advsearch.attacks.verification import (
 )
 from advsearch.errors import InputError
 from advsearch.questions.attack.settings import FEWEST_TRIALS
-from advsearch.questions.region.answer import FEWEST_SAMPLES
 from advsearch.questions.region.growing import GrownBox
+from advsearch.questions.region.result import FEWEST_SAMPLES
 from advsearch.seeds import stream
-from advsearch.tasks import Answer, Judgement
+from advsearch.tasks import Judgement, Prediction
 
 STUDY = Path(__file__).resolve().parents[2] / "benchmarks" / "verdicts.py"
 
@@ -54,7 +54,7 @@ WORST = DOMAIN.start + 0.1
 
 def judged(margin: float) -> Evaluation:
     """The answer with so large a margin, which is what is sought."""
-    return Evaluation(margin, None, margin > 0.0, judgement=Judgement(margin, margin, margin <= 0.0, Answer("")))
+    return Evaluation(margin, None, margin > 0.0, judgement=Judgement(margin, margin, margin <= 0.0, Prediction("")))
 
 
 def noisy(clean: float, adversarial: float, noise: float) -> Evaluate:
@@ -408,7 +408,7 @@ def test_a_lucky_claim_is_not_verified(seed: int) -> None:
     assert result.adversarial.interval[1] < 0.9
 
 
-def test_the_answer_is_projected_again() -> None:
+def test_the_configuration_is_projected_again() -> None:
     result = verify(noisy(-3.0, 3.0, 0.1), DOMAIN, DOMAIN.start + 0.4, claim=Ending.FOUND, spp=1, seed=0)
     assert torch.equal(result.u, DOMAIN.upper)
     beyond = verify(noisy(-3.0, -1.0, 0.0), DOMAIN, DOMAIN.start + 0.4, claim=Ending.FOUND, spp=1, seed=0)
@@ -460,7 +460,7 @@ def test_curtailed_trials_end_with_the_verdict_of_all(rule: Rule, seed: int) -> 
         assert short.adversarial == whole.adversarial, "a success is tried to the end"
 
 
-def test_a_curtailed_answer_that_never_succeeds_is_tried_twice() -> None:
+def test_a_curtailed_configuration_that_never_succeeds_is_tried_twice() -> None:
     made: list[str] = []
 
     def evaluate(queries: Sequence[Query]) -> Iterator[Evaluation]:
@@ -520,7 +520,7 @@ def test_trials_over_conditions_end_with_the_verdict(
     assert found.adversarial.interval[0] < clopper_pearson(*made)[0], "it allows for all looks"
 
 
-def test_an_answer_over_conditions_goes_on_where_a_control_group_of_another_has_more_trials() -> None:
+def test_a_configuration_over_conditions_goes_on_where_a_control_group_of_another_has_more_trials() -> None:
     """A random search beside it is tried last; what is looked at first are 30 that count all the same."""
     rule, told = OVER_CONDITIONS, "0" + "1" * 199
     first = verify(scripted(told), DOMAIN, WORST, claim=Ending.FOUND, spp=1, seed=0, trials=OVER_LOOKS, rule=rule)

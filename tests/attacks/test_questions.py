@@ -107,7 +107,7 @@ def test_a_range_has_no_smallest_epsilon() -> None:
         scaled(domain, 0.5)
 
 
-def test_a_region_fills_the_box_in_which_the_answer_stays() -> None:
+def test_a_region_fills_the_box_in_which_the_prediction_stays() -> None:
     low, high = torch.tensor([0.2, 0.0, 0.3]), torch.tensor([0.7, 1.0, 0.6])
     region = grow(lambda u, _: bool(((u >= low) & (u <= high)).all()), torch.tensor([0.5, 0.5, 0.4]), seed=1)
     assert bool((region.low >= low).all()) and bool((region.high <= high).all())

@@ -30,7 +30,7 @@ def drives(rng: np.random.Generator, count: int, share: float, alike: float) -> 
     return found
 
 
-def test_of_independent_answers_the_exact_intervals_and_tests_are_taken() -> None:
+def test_of_independent_predictions_the_exact_intervals_and_tests_are_taken() -> None:
     units = np.arange(20)
     first, second = units < 12, (units >= 3) & (units < 19)
     assert share_interval(first, np.ones(20)) == clopper_pearson(12, 20)
@@ -42,7 +42,7 @@ def test_of_independent_answers_the_exact_intervals_and_tests_are_taken() -> Non
     assert fewer_by_chance(right & under, under, right & ~under, ~under) == pytest.approx(exact)
 
 
-def test_of_units_it_is_the_interval_by_bets_and_units_of_equal_answers_are_draws() -> None:
+def test_of_units_it_is_the_interval_by_bets_and_units_of_equal_predictions_are_draws() -> None:
     counts = [8, 8, 6, 2, 0, 8]
     sequence = ConfidenceSequence()
     for one in counts:
@@ -53,7 +53,7 @@ def test_of_units_it_is_the_interval_by_bets_and_units_of_equal_answers_are_draw
     assert (low, high) == pytest.approx(tuple(2.0 + 8.0 * end for end in sequence.interval))
     assert share_interval([0, 3, 0], [2, 4, 0]) == share_interval([3, 0], [4, 2]), "a unit without answers says nothing"
     assert mean_interval([3.0, 3.0], 3.0, 3.0) == (3.0, 3.0)
-    with pytest.raises(InputError, match="one answer at least"):
+    with pytest.raises(InputError, match="one prediction at least"):
         share_interval([0, 0], [0, 0])
 
 
@@ -62,7 +62,7 @@ def test_few_units_show_little_and_more_show_more() -> None:
     assert shown == sorted(shown) and 0.3 < shown[2] < 0.45 and shown[-1] > 0.94
 
 
-def test_copies_of_an_answer_say_no_more_than_one() -> None:
+def test_copies_of_a_prediction_say_no_more_than_one() -> None:
     rng = np.random.default_rng(0)
     one, other = rng.random((2, 40)) < 0.5
     units = np.repeat(np.arange(40), 9)

@@ -29,7 +29,7 @@ def test_what_holds_too_seldom_is_seldom_found_whatever_chooses(study: dict[str,
     assert np.mean([low <= 0.5 <= high for low, high in covered]) >= 0.85
 
 
-def test_an_answer_that_is_chosen_by_its_trials_is_tried_in_others(study: dict[str, Any]) -> None:
+def test_a_configuration_that_is_chosen_by_its_trials_is_tried_in_others(study: dict[str, Any]) -> None:
     """The random search's answer is the run's only by trials that come after those by which it was chosen."""
     checks = [study["checked"](0.9, root) for root in range(20)]
     chosen = [one for one in checks if one.beaten is not None]
@@ -40,7 +40,7 @@ def test_an_answer_that_is_chosen_by_its_trials_is_tried_in_others(study: dict[s
         assert len(one.verification.clean_trials) >= TRIAL_LOOKS[0] and one.baseline_verification is one.verification
 
 
-def test_an_answer_that_wins_once_and_not_again_is_not_the_runs(study: dict[str, Any]) -> None:
+def test_a_configuration_that_wins_once_and_not_again_is_not_the_runs(study: dict[str, Any]) -> None:
     checks = [study["checked"](0.9, root) for root in range(20)]
     assert any(one.beaten is None and one.baseline_verification.begin > 0 for one in checks)
 

@@ -28,14 +28,14 @@ from advsearch.cli.commands import COMMANDS, help_of
 from advsearch.cli.flags import with_flags
 from advsearch.cli.main import main
 from advsearch.cli.output import aligned, finish
-from advsearch.cli.output import shown_text as answer
+from advsearch.cli.output import shown_text as text_of
 from advsearch.controls.base import Choice
 from advsearch.described import Value
 from advsearch.errors import InputError, StorageError
 from advsearch.progress import BarProgress, LineProgress, NullProgress, Progress, watched
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.gap import GapConfig
-from advsearch.questions.region.answer import RegionConfig
+from advsearch.questions.region.result import RegionConfig
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row
@@ -349,7 +349,7 @@ def test_attack_needs_only_an_object(asked: list[AttackConfig]) -> None:
 def test_attack_prints_the_table(asked: list[AttackConfig], capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["attack", "--object", "mug"]) == 0
     out, err = capsys.readouterr()
-    assert out == answer(SUMMARY) + "\n" and err == ""
+    assert out == text_of(SUMMARY) + "\n" and err == ""
 
 
 def test_json_is_all_that_stands_on_standard_output(
@@ -438,7 +438,7 @@ def test_several_objects_or_epsilons_are_a_curve(
         "  object   clean right   ending        epsilon   wrong   margin\n"
         "  mug      20/20         found         0.1       19/20   1.50\n"
         "  bowl                   not reached\n\n"
-        "Margin: how far the wrong answer leads the right one, in logits, in the trials of the worst case.\n\n"
+        "Margin: how far the wrong prediction leads the right one, in logits, in the trials of the worst case.\n\n"
         "  model         reference\n"
         "  policy        auto\n"
         "  environment   studio\n"
@@ -463,7 +463,7 @@ def test_gap_builds_its_configuration_and_prints_a_row_for_each_control(
         "The worst case beside the average\n"
         "  object   control   right on average   95 % interval   worst: wrong   margin   ending\n"
         "  mug      pose      150/200 (75 %)     35-97 %         20/20          3.25     found\n\n"
-        "Margin: how far the wrong answer leads the right one, in logits, in the trials of the worst case.\n\n"
+        "Margin: how far the wrong prediction leads the right one, in logits, in the trials of the worst case.\n\n"
         "  model         reference\n"
         "  policy        auto\n"
         "  environment   studio\n"
@@ -530,7 +530,7 @@ def test_region_takes_scene_and_controls_from_the_run_that_it_goes_around(
 
 
 @pytest.mark.parametrize("grid", [True, False])
-def test_a_sweep_takes_scene_and_model_from_the_run_whose_answer_it_sweeps(
+def test_a_sweep_takes_scene_and_model_from_the_run_whose_adversarial_scene_it_sweeps(
     api: Callable[..., None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, grid: bool
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -543,14 +543,16 @@ def test_a_sweep_takes_scene_and_model_from_the_run_whose_answer_it_sweeps(
     given: list[Any] = []
     api(noting(given, samples.sweep()))
     assert (
-        main(f"sweep --answer-of first --environment dusk {'--grid pose.yaw=0,90' if grid else ''} --quiet".split())
+        main(
+            f"sweep --adversarial-of first --environment dusk {'--grid pose.yaw=0,90' if grid else ''} --quiet".split()
+        )
         == 0
     )
     (config,) = given
     assert (config.object, config.environment, config.label, config.set_, config.spp) == (
         "bowl", "dusk", "bowl", {"camera.azimuth": 20.0}, None,
     )  # fmt: skip
-    assert config.answer_of == "first" and config.run is None
+    assert config.adversarial_of == "first" and config.run is None
     assert config.controls == ({} if grid else {"pose": {"yaw": [0, 90]}})
 
 
@@ -636,12 +638,12 @@ def test_resume_goes_on_with_what_was_stopped(
     assert found == [(config.command, Path("runs/stopped"))]
 
 
-def test_resume_of_a_run_that_is_done_shows_its_answer(
+def test_resume_of_a_run_that_is_done_shows_its_result(
     api: Callable[..., None], runs: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     api()
     assert main(["resume", "done"]) == 0
-    assert capsys.readouterr() == (answer(SUMMARY) + "\n", "advsearch: runs/done is done already\n")
+    assert capsys.readouterr() == (text_of(SUMMARY) + "\n", "advsearch: runs/done is done already\n")
     assert main(["resume", "done", "seconds"]) == 2
     assert "seconds" in capsys.readouterr().err
 
@@ -664,7 +666,7 @@ def test_what_cannot_be_resumed_is_told(
 def test_runs_are_listed(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["runs"]) == 0
     assert capsys.readouterr().out == (
-        "  run      command   object   controls   rows   state     answer\n"
+        "  run      command   object   controls   rows   state     result\n"
         "  done     attack    mug      texture    80     found     20/20\n"
         "  killed   attack    mug      pose       2      stopped\n"
     )
@@ -839,7 +841,7 @@ def test_show_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytes
     monkeypatch.chdir(tmp_path)
     make_run(tmp_path / "runs" / "first", pictures=False, rows=False)
     assert main(["show", "first"]) == 0
-    assert capsys.readouterr().out == answer(SUMMARY) + "\n"
+    assert capsys.readouterr().out == text_of(SUMMARY) + "\n"
     assert main(["show", "runs/first", "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == SUMMARY.to_dict()
 
@@ -880,9 +882,9 @@ def test_doctor_passes_its_status_on(flag: list[str], monkeypatch: pytest.Monkey
 
 
 def test_the_table_is_read_in_five_seconds() -> None:
-    assert answer(SUMMARY) == (
+    assert text_of(SUMMARY) == (
         "The model calls this mug a vase in 20 of 20 fresh renders (95 % interval 83-100 %).\n\n"
-        "                  answer        probability   rate                95 % interval\n"
+        "                  prediction    probability   rate                95 % interval\n"
         "  clean           mug           98 %          right in 20 of 20   83-100 %\n"
         "  adversarial     vase          91 %          wrong in 20 of 20   83-100 %\n"
         "  random search   40 pictures                 wrong in 1 of 20    0.1-25 %\n\n"
@@ -895,7 +897,7 @@ def test_the_table_is_read_in_five_seconds() -> None:
 
 
 def test_the_table_says_what_matters_beside_the_verdict() -> None:
-    text = answer(
+    text = text_of(
         samples.attack(
             warnings=["A texture is missing; use `task='depth'`."], baseline={**ATTACK["baseline"], "verified": rated()}
         )
@@ -905,15 +907,15 @@ def test_the_table_says_what_matters_beside_the_verdict() -> None:
 
 def test_the_table_has_the_average_the_bracket_the_target_and_the_conditions() -> None:
     summary = samples.attack(**TARGET, over=["camera"], average=AVERAGE, smallest=BRACKET)
-    assert answer(summary) == (
+    assert text_of(summary) == (
         "The model calls this mug a vase in 20 of 20 fresh renders (95 % interval 83-100 %), each with another"
         " camera.\n\n"
-        "                  answer               probability   rate                  95 % interval\n"
+        "                  prediction           probability   rate                  95 % interval\n"
         "  clean           mug                  98 %          right in 20 of 20     83-100 %\n"
         "  adversarial     vase                 91 %          target in 20 of 20    83-100 %\n"
         "  random search   40 pictures                        target in 1 of 20     0.1-25 %\n"
         "  average case    200 configurations                 right in 150 of 200   68-81 %\n\n"
-        "  wanted     the model should answer vase\n"
+        "  wanted     the model should predict vase\n"
         "  changed    texture within 0.1 (linf: the largest change of any value)\n"
         "  over       camera, drawn anew for every picture\n"
         "  smallest   0.0123; no search found one at 0.0118\n"
@@ -925,16 +927,16 @@ def test_the_table_has_the_average_the_bracket_the_target_and_the_conditions() -
 
 
 def test_easier_to_recognise_is_not_called_wrong() -> None:
-    text = answer(samples.attack(**EASIER))
+    text = text_of(samples.attack(**EASIER))
     assert "wanted    easier to recognise\n" in text
     assert "easier in 20 of 20" in text and "wrong in" not in text
 
 
 def test_a_table_of_almost_nothing() -> None:
     clean = {**ATTACK["clean"], "label": "vase", "probability": None, "control": None}
-    text = answer(samples.attack(ending="already wrong", clean=clean, adversarial=None, verified=None, baseline=None))
+    text = text_of(samples.attack(ending="already wrong", clean=clean, adversarial=None, verified=None, baseline=None))
     assert text.startswith("The model already calls this mug a vase")
-    assert "  clean   vase                   not verified\n" in text
+    assert "  clean   vase                       not verified\n" in text
 
 
 def test_columns() -> None:

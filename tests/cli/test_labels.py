@@ -119,7 +119,7 @@ def test_an_object_without_a_label_is_shown_to_the_model(question: str, tmp_path
     mesh.write_text(TRIANGLE, encoding="utf-8")
     model = advsearch.load_model(Always(), labels=["a", "coffee mug", "pan, pot", "c", "d", "e", "f"], input_size=16)
     message = (
-        r"^label: expected the right answers for .*thing\.obj, got none; model Always calls a clean picture of it "
+        r"^label: expected the right labels for .*thing\.obj, got none; model Always calls a clean picture of it "
         r"'coffee mug' 55 %, 'pan, pot' 20 %, 'a' 7 %, 'c' 7 %, 'd' 6 %; name what is right, such "
         r'as `label="coffee mug"`$'
     )
@@ -144,7 +144,7 @@ def test_the_command_line_says_which_flag_to_add(
     Path("thing.obj").write_text(TRIANGLE, encoding="utf-8")
     assert main(["attack", "--object", "thing.obj", "--control", "pose", "--resolution", "16", "--quiet"]) == 2
     err = capsys.readouterr().err
-    assert "--label: expected the right answers for thing.obj" in err and ' such as --label "' in err
+    assert "--label: expected the right labels for thing.obj" in err and ' such as --label "' in err
     assert not Path("runs").exists()
 
 

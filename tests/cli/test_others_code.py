@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from samples import make_answered
+from samples import make_attacked
 from stored_sweeps import make_sweep
 
 import advsearch
@@ -63,8 +63,8 @@ def sent(tmp_path_factory: pytest.TempPathFactory) -> Path:
     small = AttackConfig(object="mug", controls={"pose": {}}, resolution=16)
     runs = folder / "runs"
     runs.mkdir()
-    make_answered(runs / "theirs", small, np.full(3, 0.5))
-    make_answered(runs / "patched", small.model_copy(update={"controls": {"patch": {}}}), np.full(12288, 0.5))
+    make_attacked(runs / "theirs", small, np.full(3, 0.5))
+    make_attacked(runs / "patched", small.model_copy(update={"controls": {"patch": {}}}), np.full(12288, 0.5))
     with RunDirectory.create_for(small.model_copy(update={"run": str(runs / "stopped")})) as run:
         run.store.append([])
     names = ("noon", "studio", *(f"sky-{number}" for number in range(8)))
@@ -97,7 +97,7 @@ IMPORTING = {
     "run": ["run runs/theirs/run.yaml --run again"],
     "region": ["region --around theirs"],
     "replay": ["replay theirs", "replay theirs --model reference"],
-    "sweep": ["sweep --answer-of theirs --control light --samples 2"],
+    "sweep": ["sweep --adversarial-of theirs --control light --samples 2"],
     "export": [
         "export theirs --format gltf --out a.glb",
         "export theirs --format mitsuba --out folder",
@@ -174,7 +174,7 @@ def test_what_is_typed_behind_a_file_is_imported(typed: str) -> None:
 
 def in_a_worker() -> None:
     settings = AttackConfig(object="mug", model=NAME, controls={"pose": {}}).plain()
-    work = Work("advsearch.questions.attack.carry_out:attack_answers", settings)
+    work = Work("advsearch.questions.attack.carry_out:attack_worker", settings)
     failure = prepare("somebody's", work, Files({}, {}), version())
     assert isinstance(failure, Failure)
     raise InputError(failure.text)
@@ -186,7 +186,7 @@ def explained() -> None:
 
 PYTHON: dict[str, Callable[[], object]] = {
     "a loaded run": lambda: parts_in(Path("runs/theirs")),
-    "sweep": lambda: advsearch.sweep(answer_of="theirs", controls=["light"], samples=2),
+    "sweep": lambda: advsearch.sweep(adversarial_of="theirs", controls=["light"], samples=2),
     "replay": lambda: advsearch.replay("theirs"),
     "explain": explained,
     "recipe": lambda: advsearch.recipe("./recipe.yaml"),

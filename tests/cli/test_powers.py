@@ -44,7 +44,7 @@ HARMLESS: dict[str, Any] = {
 }  # fmt: skip
 """And one that has none."""
 
-NEEDED = {"answer": "theirs", "compared": "theirs", "recipe": "realism", "suite": "suite.yaml", "sweeps": "theirs"}
+NEEDED = {"attack": "theirs", "compared": "theirs", "recipe": "realism", "suite": "suite.yaml", "sweeps": "theirs"}
 CASES = [
     (command, one.name)
     for command in COMMANDS
@@ -77,7 +77,7 @@ def test_every_setting_that_reaches_beyond_the_run_says_so() -> None:
         for one in settings(CONFIGS[command]):
             text = f"{one.name} {one.description} {one.expects}"
             suspicious = ("folder that", "write ", "writes", "address", "replace ", "processes", "tracker", "keep the")
-            inside = ("aov", "suite", "answer", "keep_pictures", "compared", "sweeps")
+            inside = ("aov", "suite", "attack", "keep_pictures", "compared", "sweeps")
             if any(word in text for word in suspicious) and one.name not in inside:
                 assert one.power is not power.none, f"{command}: {text}"
 

@@ -176,7 +176,7 @@ def test_a_scheduler_that_went_and_came_back_between_two_looks_is_noticed() -> N
         pool.workers()
 
 
-class Answer:
+class Prediction:
     """A future of Dask that ends so."""
 
     def __init__(self, status: str, comes: Any) -> None:
@@ -194,7 +194,7 @@ class Answer:
         self.released = True
 
 
-def called(monkeypatch: pytest.MonkeyPatch, *answers: Answer) -> Any:
+def called(monkeypatch: pytest.MonkeyPatch, *answers: Prediction) -> Any:
     """What comes of a call whose answers come so, one for each time that it is asked."""
     monkeypatch.setattr("advsearch.cluster.dask_pool.LOOK", 0.0)
     left, pool = iter(answers), object.__new__(DaskPool)
@@ -221,7 +221,7 @@ ON_THE_WAY = [
 def test_what_is_lost_on_the_way_is_asked_again(
     monkeypatch: pytest.MonkeyPatch, status: str, error: BaseException
 ) -> None:
-    told = called(monkeypatch, Answer(status, error), Answer(status, error), Answer("finished", "value"))
+    told = called(monkeypatch, Prediction(status, error), Prediction(status, error), Prediction("finished", "value"))
     assert told == "value"
 
 
@@ -233,11 +233,11 @@ def test_what_a_worker_cannot_begin_is_told(monkeypatch: pytest.MonkeyPatch) -> 
         (ImportError("no advsearch"), True),
         (ValueError("a bug"), False),
     ):
-        told = called(monkeypatch, Answer("error", error))
+        told = called(monkeypatch, Prediction("error", error))
         assert told.unfit is unfit and str(error) in told.text
     killed = distributed.KilledWorker("a", SimpleNamespace(address="tcp://here"), 0)
     with pytest.raises(WorkerDiedError):
-        called(monkeypatch, Answer("error", killed))
+        called(monkeypatch, Prediction("error", killed))
 
 
 def test_a_scheduler_that_is_not_there_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

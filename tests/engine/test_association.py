@@ -1,4 +1,4 @@
-"""Shares of wrong answers with and without each of many parts, and what is told from chance."""
+"""Shares of wrong predictions with and without each of many parts, and what is told from chance."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def test_the_statistic_is_that_of_the_likelihood_ratio() -> None:
         assert one == pytest.approx(expected)
 
 
-def test_wrong_answers_are_shared_out_to_the_last() -> None:
+def test_wrong_predictions_are_shared_out_to_the_last() -> None:
     counts = PartCounts(2, 9, 4, seed=1)
     for number in range(9):
         counts.add(np.array([0] if number % 3 else [0, 1]), number < 4)
@@ -63,7 +63,7 @@ def test_a_part_that_decides_is_told_and_one_that_is_always_there_is_not_compare
     assert association(counts, slice(1, 2), 5).p.tolist() == [1 / (1 + SHARINGS)]
 
 
-def test_answers_of_a_drive_are_exchanged_whole() -> None:
+def test_predictions_of_a_drive_are_exchanged_whole() -> None:
     wrong, draws = np.array([1, 1, 0, 0, 1, 0], np.int8), np.array([0, 1, 2, 0, 1, 2])
     packed = exchange(wrong, draws, seed=0)
     assert packed is not None and exchange(wrong, np.arange(6), seed=0) is None

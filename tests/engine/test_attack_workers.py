@@ -11,7 +11,7 @@ import torch
 from stand_ins import shared
 
 import advsearch
-from advsearch.cli.output import shown_text as answer
+from advsearch.cli.output import shown_text as text_of
 from advsearch.errors import InputError
 from advsearch.questions.attack.carry_out import attack_once
 from advsearch.questions.attack.result import AttackResult
@@ -50,7 +50,7 @@ def test_workers_have_the_rows_of_none(alone: AttackResult, tmp_path: Path, monk
     with Store(tmp_path / "run" / "results.sqlite", read_only=True) as store:
         assert {row.machine for row in store.rows("verification")} == {None, "ab12"}
     assert any("machines that are not alike" in text for text in result.summary.warnings)
-    assert "2 at most, busy 50 %" in answer(result.summary) and result.summary.shared is not None
+    assert "2 at most, busy 50 %" in text_of(result.summary) and result.summary.shared is not None
     assert alone.summary.shared is None
 
 

@@ -22,7 +22,7 @@ from advsearch.engine.judging import judgements
 from advsearch.engine.loading import as_controls, load_scene
 from advsearch.errors import InputError
 from advsearch.models import Model, Preprocessing
-from advsearch.tasks import Answer, Classification, Facts, Sight, Task, make_task
+from advsearch.tasks import Classification, Facts, Prediction, Sight, Task, make_task
 
 LOGITS = torch.tensor([[3.0, 1.0, 0.0], [0.5, 2.0, 0.0]])
 PICTURES = torch.rand(2, 4, 4, 3, generator=torch.Generator().manual_seed(0))
@@ -59,8 +59,8 @@ class Vandal(Classification):
         destroy([output, truth])
         return found
 
-    def answers(self, output: Tensor, count: int = 1) -> list[tuple[Answer, ...]]:
-        found = super().answers(output, count)
+    def predictions(self, output: Tensor, count: int = 1) -> list[tuple[Prediction, ...]]:
+        found = super().predictions(output, count)
         destroy(output)
         return found
 
@@ -292,7 +292,7 @@ def test_a_network_that_writes_into_its_input_changes_no_picture(layout: str, pr
 
 UNTOUCHED: dict[Any, set[str]] = {
     Task: {"read", "on", "seeking", "check", "truth", "check_numbers"},
-    Policy: {"propose", "takes_differences", "counts", "answer", "failures"},
+    Policy: {"propose", "takes_differences", "counts", "distribution", "failures"},
     NumberControl: {
         *("declared", "setting", "settings", "chosen_form", "mesh_in", "within", "allowed", "searches", "in_scene"),
         *("default", "unchanged", "size", "spec", "search_range", "budget_of", "estimators", "left_out", "values"),

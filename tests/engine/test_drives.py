@@ -16,14 +16,14 @@ from torch import Tensor, nn
 import advsearch
 from advsearch.attacks import clopper_pearson
 from advsearch.attacks.units import share_interval
-from advsearch.cli.output import shown_text as answer
-from advsearch.engine.journal import answering
+from advsearch.cli.output import shown_text as text_of
+from advsearch.engine.journal import worker_call
 from advsearch.errors import InputError
 from advsearch.progress import NullProgress
 from advsearch.questions.sweep import job as swept_scene
-from advsearch.questions.sweep.answer import claims
-from advsearch.questions.sweep.answer import over_drives as told_over
 from advsearch.questions.sweep.carry_out import job_of
+from advsearch.questions.sweep.display import claims
+from advsearch.questions.sweep.display import over_drives as told_over
 from advsearch.questions.sweep.drives import longest, over_drives
 from advsearch.questions.sweep.job import Scenes
 from advsearch.questions.sweep.loop import Sweep
@@ -105,7 +105,7 @@ def test_frames_of_a_drive_of_both_have_their_distances_and_workers_have_the_sam
         set_={"camera.elevation": 0.0, "camera.distance": 2.0}, resolution=16, spp=1, trials=0, batch=2,
     )  # fmt: skip
     job = job_of(config)
-    executor = Disorder(answering(Scenes(job).named), seed=1) if workers else None
+    executor = Disorder(worker_call(Scenes(job).named), seed=1) if workers else None
     with RunDirectory.create(tmp_path / "run") as run:
         Sweep(job, run, NullProgress(), executor).carry_out()
         away = {row.values["path.time"]["value"]: row.values["path.distance"]["value"] for row in run.store.rows()}
@@ -140,7 +140,7 @@ def test_the_worst_of_several_drives_is_the_one_that_is_kept(tmp_path: Path, mon
     assert len(set(read_sweep(path)["unit"])) == 4
     (claim, *_) = claims(result.summary)
     assert "frames of 4 drives" in claim.statement and "sampler" not in claim.statement
-    text = answer(result.summary)
+    text = text_of(result.summary)
     assert "4 drives of 5 frames in 4 s, clock" in text and "75 %" in text and "40 %" in text and "drive.webp" in text
     assert "Whole drives" in (path / "report.html").read_text()
 
@@ -196,7 +196,7 @@ def test_resumed_and_shared_drives_are_those_of_one_who_did_it_alone(tmp_path: P
     for resumed in (False, True):
         job = job_of(CONFIG)
         with RunDirectory.resume(path) if resumed else RunDirectory.create(path) as run:
-            executor = Disorder(answering(Scenes(job).named), seed=3, stop=None if resumed else 4)
+            executor = Disorder(worker_call(Scenes(job).named), seed=3, stop=None if resumed else 4)
             found = Sweep(job, run, NullProgress(), executor).carry_out()
     assert rows(path) == rows(tmp_path / "alone") and len(rows(path)) == 2 * 3 * 3 * 2
     assert summary(found) == summary(alone) and alone.summary.drives is not None
@@ -244,7 +244,7 @@ def test_no_frames_no_drives_and_settings_that_need_a_path() -> None:
         advsearch.attack("mug", controls="texture", path="orbit")
 
 
-def test_an_attack_over_a_path_keeps_its_answer_along_the_drive(tmp_path: Path) -> None:
+def test_an_attack_over_a_path_keeps_its_adversarial_scene_along_the_drive(tmp_path: Path) -> None:
     path = tmp_path / "run"
     size: dict[str, Any] = {
         "resolution": 16,

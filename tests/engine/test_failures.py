@@ -15,10 +15,10 @@ from torch import Tensor
 from advsearch.attacks import Block, Domain, Ending, Evaluation, Query, SearchResult, make_policy
 from advsearch.attacks.candidates import Failures, FailureShare, FoundFailure
 from advsearch.attacks.verification import OVER_CONDITIONS, Rule
-from advsearch.cli.output import shown_text as answer
+from advsearch.cli.output import shown_text as text_of
 from advsearch.engine.record import Findings, Stages
 from advsearch.progress import NullProgress
-from advsearch.questions.attack.answer import failures_part, failures_text
+from advsearch.questions.attack.display import failures_part, failures_text
 from advsearch.questions.attack.outcome import described_failures
 from advsearch.questions.attack.stages import TRIED, Attack, check_failures
 from advsearch.questions.attack.summary import DifferentFailures
@@ -127,5 +127,5 @@ def test_the_page_and_the_table_have_them(tmp_path: Path) -> None:
     summary = attack(failures=known.to_dict())
     page = written_page(make_run(tmp_path / "run", summary)).read_text(encoding="utf-8")
     assert "Different failures" in page and "1 of the 2 that were tried hold" in page
-    assert "u.0 76.5 to 85.5 degrees, kind brass" in answer(summary)
-    assert "30 of 100 cells over u.0 and kind (50 were seen)" in answer(summary)
+    assert "u.0 76.5 to 85.5 degrees, kind brass" in text_of(summary)
+    assert "30 of 100 cells over u.0 and kind (50 were seen)" in text_of(summary)

@@ -30,8 +30,8 @@ from advsearch.engine.planning import TELLS, contested, cosines, measured_plan, 
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.questions.attack.parts import problem_from_config
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.check.answer import CheckConfig, shown
 from advsearch.questions.check.carry_out import check_from_config
+from advsearch.questions.check.result import CheckConfig, shown
 from advsearch.runs.results import Measured
 from advsearch.scene.formation import ImageFormation
 from advsearch.scene.gradients import ESTIMATORS, SEARCH_STEP, Group, first_plan

@@ -30,7 +30,7 @@ def test_ground_truth_of_every_configuration_is_that_of_its_scene(tmp_path: Path
     assert not np.array_equal(*masks)
 
 
-def test_an_attack_keeps_ground_truth_of_the_clean_scene_and_of_its_answer(tmp_path: Path) -> None:
+def test_an_attack_keeps_ground_truth_of_the_clean_scene_and_of_its_adversarial_scene(tmp_path: Path) -> None:
     names, scene = "mask,depth,normal,uv,id", advsearch.load_scene("mug")
     controls = {"pose": {"yaw": [0.0, 180.0]}}
     run = tmp_path / "run"

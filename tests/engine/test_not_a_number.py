@@ -17,11 +17,11 @@ from advsearch.engine.record import control_group, judgement_of, rate_of, trial_
 from advsearch.errors import InputError
 from advsearch.questions.attack import wording
 from advsearch.questions.attack.summary import AttackSummary
-from advsearch.report.wording import answer_cells, calls, tally
-from advsearch.tasks import Answer, Judgement
+from advsearch.report.wording import calls, prediction_cells, tally
+from advsearch.tasks import Judgement, Prediction
 
-NOTHING = Judgement.of(math.nan, math.nan, Answer("tench", 0, math.nan))
-RIGHT, WRONG = Judgement.of(-1.0, -1.0, Answer("mug", 1, 0.9)), Judgement.of(3.0, 3.0, Answer("vase", 2, 0.8))
+NOTHING = Judgement.of(math.nan, math.nan, Prediction("tench", 0, math.nan))
+RIGHT, WRONG = Judgement.of(-1.0, -1.0, Prediction("mug", 1, 0.9)), Judgement.of(3.0, 3.0, Prediction("vase", 2, 0.8))
 
 
 def test_a_row_has_no_name_and_comes_back_as_what_it_was() -> None:
@@ -29,7 +29,7 @@ def test_a_row_has_no_name_and_comes_back_as_what_it_was() -> None:
     assert (row.label, row.label_index, row.margin, row.objective, row.probability) == (None,) * 5
     assert row.correct is False and row.success is False
     again = judgement_of(row)
-    assert again.not_a_number and again.answer == NOTHING.answer == Answer("not a number")
+    assert again.not_a_number and again.prediction == NOTHING.prediction == Prediction("not a number")
     assert not judgement_of(trial_row("verification", 0, 1, 4, RIGHT)).not_a_number
 
 
@@ -53,10 +53,10 @@ def test_the_headline_never_calls_it_right_or_wrong() -> None:
         "in 0 of 20 fresh renders (95 % interval 0-20 %). The budget is spent."
     )
     all_of_them = wording.attack_verdict(told(0, 20))
-    assert "it is wrong in none of 20 fresh renders: in 20 its answer is not a number." in all_of_them
+    assert "it is wrong in none of 20 fresh renders: in 20 its output is not a number." in all_of_them
     assert "0 of 20 fresh" not in all_of_them.replace("none of 20", "")
     some = wording.attack_verdict(told(2, 5))
-    assert "in 2 of 20 fresh renders (95 % interval 0-20 %), and in 5 its answer is not a number." in some
+    assert "in 2 of 20 fresh renders (95 % interval 0-20 %), and in 5 its output is not a number." in some
     assert tally("wrong", 0, 20, 20) == "not a number in 20 of 20"
     assert tally("wrong", 2, 20, 5) == "wrong in 2, not a number in 5 of 20"
     assert tally("wrong", 2, 20) == "wrong in 2 of 20"
@@ -66,13 +66,15 @@ def test_a_clean_scene_without_a_number_is_said_as_such() -> None:
     clean = {**samples.ATTACK["clean"], "label": "not a number", "index": None, "probability": None, "correct": False}
     clean["control"] = {**clean["control"], "correct": 0, "rate": 0.0, "not_a_number": 20}
     verdict = wording.attack_verdict(samples.attack(ending="already wrong", clean=clean))
-    assert verdict.startswith("The model already answers nothing for this mug, for its answer is not a number")
+    assert verdict.startswith("The model already predicts nothing for this mug, for its output is not a number")
     clean["control"] = {**clean["control"], "correct": 17, "not_a_number": 2}
     (first, *_) = wording.remarks(samples.attack(clean=clean))
-    assert "fails 3 of its 20 trials; in 2 the answer is not a number." in first
+    assert "fails 3 of its 20 trials; in 2 the output is not a number." in first
     for task in ("classification", "detection", "segmentation", "depth"):
-        assert calls(task, "this mug", "not a number") == "answers nothing for this mug, for its answer is not a number"
-        assert answer_cells(task, Answer("not a number")) == ["not a number", ""]
+        assert (
+            calls(task, "this mug", "not a number") == "predicts nothing for this mug, for its output is not a number"
+        )
+        assert prediction_cells(task, Prediction("not a number")) == ["not a number", ""]
     assert calls("segmentation", "this bottle", "no bottle") == "finds no bottle"
 
 
@@ -89,7 +91,9 @@ def test_a_region_has_no_verdict_where_the_model_says_nothing(tmp_path: Path) ->
     labels = tmp_path / "labels.txt"
     labels.write_text("mug\nbowl\nvase\n")
     settings: Any = {"vary": "pose.yaw", "verify_spp": 1, "samples": 8, "resolution": 16, "labels": labels}
-    with pytest.raises(InputError, match=r"the model's answer is not a number in [0-9]+ of [0-9]+ trials at the cent"):
+    with pytest.raises(
+        InputError, match=r"the model's prediction is not a number in [0-9]+ of [0-9]+ trials at the cent"
+    ):
         advsearch.region(
             "mug", "test_not_a_number:Broken", controls={"pose": {}}, exposure=-8.0, run=tmp_path / "run", **settings
         )

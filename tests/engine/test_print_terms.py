@@ -11,7 +11,7 @@ from covering import only
 from small_models import easy
 
 import advsearch
-from advsearch.cli.output import shown_text as answer
+from advsearch.cli.output import shown_text as text_of
 from advsearch.engine.objective import off_print, variation
 from advsearch.engine.record import Stages
 from advsearch.errors import InputError
@@ -33,7 +33,7 @@ def test_one_colour_is_smooth_and_the_set_is_printable() -> None:
     assert float(variation(board)) == pytest.approx(0.5)  # half of the pixels have a neighbour of another colour
 
 
-def test_answers_are_nearer_to_ink() -> None:
+def test_predictions_are_nearer_to_ink() -> None:
     with_terms = advsearch.attack("mug", easy(), printable=True, **SHORT)
     without = advsearch.attack("mug", easy(), **SHORT)
     found = with_terms.summary.printability
@@ -57,13 +57,13 @@ def test_answers_are_nearer_to_ink() -> None:
     assert f"{spent['unprinted']} of the search without print terms" in renders_text(with_terms.summary)
     said = print_cost_text(with_terms.summary)
     assert said.endswith(f"(another search of 30 steps, 6 trials each): they cost {priced.cost:.3g} logits")
-    assert method_facts(with_terms.summary)["Cost of printability"] == said and said in answer(with_terms.summary)
+    assert method_facts(with_terms.summary)["Cost of printability"] == said and said in text_of(with_terms.summary)
     assert print_cost_text(without.summary) == ""
     assert found.clean.variation == pytest.approx(float(variation(clean)), rel=1e-4)
 
 
 @pytest.mark.parametrize(
-    "stage", only(["searching without print terms"], ["searching without print terms", "checking the answer"])
+    "stage", only(["searching without print terms"], ["searching without print terms", "checking what was found"])
 )
 def test_a_stopped_run_tells_the_same_cost(stage: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     settings = {**SHORT, "steps": 6, "object": "mug", "model": "small_models:easy", "printable": True}

@@ -27,8 +27,8 @@ from advsearch.engine.record import Stages
 from advsearch.errors import FileFormatError, InputError, RunExistsError
 from advsearch.progress import NullProgress
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.check.answer import CheckConfig
-from advsearch.questions.stability.answer import StabilityConfig
+from advsearch.questions.check.result import CheckConfig
+from advsearch.questions.stability.result import StabilityConfig
 from advsearch.runs import files
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.listing import can_resume
@@ -111,7 +111,7 @@ def test_what_was_evaluated_is_not_evaluated_again(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("trials", [5, 13, 16])
-def test_an_interrupt_of_the_check_keeps_the_answer_and_going_on_verifies_it(
+def test_an_interrupt_of_the_check_keeps_the_configuration_and_going_on_verifies_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, trials: int
 ) -> None:
     """In the first of what finds the samples, in the control group, and in the trials of the answer."""
@@ -144,12 +144,12 @@ def test_another_configuration_than_was_stored_is_refused(tmp_path: Path) -> Non
     with RunDirectory.create(tmp_path / "run") as run:
         problem: Any = StandInProblem()
         query = Query(torch.full((6,), 0.5), 1, phase="search")
-        (found,) = Journal(run, Shared(problem)).answers([query])
-        (again,) = Journal(run, Shared(problem)).answers([query])
+        (found,) = Journal(run, Shared(problem)).evaluate_all([query])
+        (again,) = Journal(run, Shared(problem)).evaluate_all([query])
         assert again.objective == found.objective
         for other in (replace(query, u=torch.full((6,), 0.4)), replace(query, seed=2)):
             with pytest.raises(InputError, match="cannot go on: evaluation 0 of the search is another one now"):
-                list(Journal(run, Shared(problem)).answers([other]))
+                list(Journal(run, Shared(problem)).evaluate_all([other]))
 
 
 CHANGES: dict[str, Any] = {
@@ -270,7 +270,7 @@ class Weaker(StandInProblem):
 
 
 @pytest.mark.parametrize(("policy", "beaten"), [(Sleeper(), True), (make_policy("pgd"), False)])
-def test_the_random_searchs_answer_is_taken_where_it_is_the_worse_one(policy: Policy[Any], beaten: bool) -> None:
+def test_the_random_searchs_configuration_is_taken_where_it_is_the_worse_one(policy: Policy[Any], beaten: bool) -> None:
     problem: Any = Weaker()
     config = configuration().model_copy(update={"steps": 200})
     attack = attack_on(problem, config, policy, Stages(NullProgress()))

@@ -15,7 +15,7 @@ from stand_ins import StandInProblem, StandInWorkers
 
 from advsearch.attacks import Query
 from advsearch.cluster import InProcess
-from advsearch.engine.journal import Journal, Shared, answering, lost
+from advsearch.engine.journal import Journal, Shared, lost, worker_call
 from advsearch.errors import ClusterError
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row, Told
@@ -29,7 +29,7 @@ def test_answers_come_in_the_order_of_the_queries_whoever_gives_them() -> None:
     here, there = StandInProblem(), StandInProblem()
     here.prepared, here.renderer = None, RendererCount()  # type: ignore[attr-defined]
     problem: Any = here
-    workers: Any = StandInWorkers(InProcess(answering(lambda name: there)))
+    workers: Any = StandInWorkers(InProcess(worker_call(lambda name: there)))
     alone, shared = (list(Shared(problem, executor)(queries(5))) for executor in (None, workers))
     assert [one.said for one in alone] == [one.said for one in shared] and len(workers.given) == 5
     assert [one.machine for one in shared] == [*["ab12"] * 4, None], "the last was answered first"
@@ -61,11 +61,11 @@ def test_what_is_in_the_journal_is_not_asked_again(tmp_path: Path) -> None:
             yield problem.evaluate(one)
 
     with RunDirectory.create(tmp_path / "run") as run:
-        first = list(Journal(run, Shared(problem)).answers(queries(3), evaluate))
+        first = list(Journal(run, Shared(problem)).evaluate_all(queries(3), evaluate))
         journal = Journal(run, Shared(problem))
-        again = list(journal.answers(queries(5), evaluate))
+        again = list(journal.evaluate_all(queries(5), evaluate))
         assert asked == [0, 1, 2, 3, 4] and [one.said for one in again[:3]] == [one.said for one in first]
-        stopped = journal.answers(queries(8), evaluate)
+        stopped = journal.evaluate_all(queries(8), evaluate)
         for _ in range(6):
             next(stopped)
         assert run.store.count("average") == 6, "a row is kept before its answer is seen, and no more is asked for"

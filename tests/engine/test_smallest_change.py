@@ -64,7 +64,7 @@ def test_on_the_way_a_few_trials_do_and_at_the_end_it_is_all() -> None:
 
 
 @pytest.mark.parametrize("stop", [1, 7, 30])
-def test_an_interrupt_on_the_way_keeps_the_smallest_answer_so_far(stop: int) -> None:
+def test_an_interrupt_on_the_way_keeps_the_smallest_configuration_so_far(stop: int) -> None:
     tried, passed = Counter[str](), [DOMAIN.project(torch.ones(2))]
 
     def trial(kind: str, number: int, u: Tensor) -> Any:

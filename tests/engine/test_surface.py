@@ -1,4 +1,4 @@
-"""`sweep --surface`: which parts of the surface, when seen, go with wrong answers."""
+"""`sweep --surface`: which parts of the surface, when seen, go with wrong predictions."""
 
 from __future__ import annotations
 
@@ -134,7 +134,7 @@ def test_a_patch_that_goes_with_failures_lights_up_and_no_other_model_s(tmp_path
     assert (found["wrong_0"] <= found["seen_0"]).all() and found["map_0"].shape == (5504, 3, 2)
     assert (run / "images" / "surface.png").read_bytes().startswith(b"\x89PNG")
     page = (run / "report.html").read_text()
-    assert "The surface that was seen" in page and "go with wrong answers" in page
+    assert "The surface that was seen" in page and "go with wrong predictions" in page
     assert "none of" in page and "told from chance" in page
 
 

@@ -35,7 +35,7 @@ from advsearch.attacks.draws import NET, Draws, Product, Seeds, batches
 from advsearch.cli.commands import QuestionCommand
 from advsearch.cli.flags import READERS, help_text, with_flags
 from advsearch.cli.main import main
-from advsearch.cli.output import shown_text as answer
+from advsearch.cli.output import shown_text as text_of
 from advsearch.controls import CONTROLS, make_control, make_space
 from advsearch.controls.base import Parameter
 from advsearch.engine.objective import domain_of
@@ -54,7 +54,7 @@ from advsearch.report.wording import formation_text
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results import plain
 from advsearch.runs.store import Row
-from advsearch.runs.summary import write_answer
+from advsearch.runs.summary import write_configuration
 from advsearch.runs.tables import read_sweep
 from advsearch.scene.formation import ImageFormation
 from advsearch.scene.gradients import GradientPlan
@@ -403,7 +403,7 @@ def test_the_fast_way_says_what_the_control_says(scene: advsearch.Scene, control
         (
             ["mug", "vase"],
             "mug",
-            "the right answer for every object, also for vase (its own is 'vase'); without a label",
+            "the right label for every object, also for vase (its own is 'vase'); without a label",
         ),
         (["mug", "vase"], None, None),
         (["vase"], "mug", None),
@@ -681,7 +681,7 @@ def test_nothing_but_outer_axes_is_fine_and_one_configuration_is_refused() -> No
         advsearch.sweep("mug", model())
 
 
-def test_answers_that_are_not_finite_are_counted_and_not_right() -> None:
+def test_outputs_that_are_not_finite_are_counted_and_not_right() -> None:
     class Fails(Brightness):
         def forward(self, images: Tensor) -> Tensor:
             logits = super().forward(images)
@@ -905,12 +905,12 @@ def test_the_command_explains_mistakes_and_leaves_nothing(
     assert not (tmp_path / "runs").exists() or not any((tmp_path / "runs").iterdir())
 
 
-def kept_answer(folder: Path, controls: dict[str, Any], answer: list[float]) -> Path:
+def kept_configuration(folder: Path, controls: dict[str, Any], answer: list[float]) -> Path:
     """Make a run of an attack whose answer is put in by hand."""
     config = AttackConfig(object="mug", controls=controls, over={"camera": {"elevation": [5, 60]}}, run=str(folder))
     with RunDirectory.create_for(config) as run:
         run.write_summary(attack_result(run=str(folder), ending="interrupted", verified=None))
-        write_answer(run.path, np.array(answer, dtype=np.float32))
+        write_configuration(run.path, np.array(answer, dtype=np.float32))
     return folder
 
 
@@ -933,7 +933,7 @@ def test_every_example_of_the_documentation_is_a_sweep(
     words: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    kept_answer(Path("runs/mug-texture-001"), {"texture": {"resolution": 4}}, [0.5] * 48)
+    kept_configuration(Path("runs/mug-texture-001"), {"texture": {"resolution": 4}}, [0.5] * 48)
     asked: list[SweepConfig] = []
     monkeypatch.setattr(QuestionCommand, "carry_out", lambda self, config, **rest: kept(asked, config, 0))
     assert main(words[1:]) == 0
@@ -956,13 +956,13 @@ def test_ctrl_c_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys:
     status, out, _ = command(capsys, "--grid", "pose.yaw=0:360:40")
     assert status == 130 and "Interrupted after 16 of 40 configurations" in out and "not verified" in out
     assert "How often it is right at each value" in out
-    assert "margin (how far the wrong answer leads the right one, in logits)" in out
+    assert "margin (how far the wrong prediction leads the right one, in logits)" in out
     assert out.rstrip().splitlines()[-1].startswith("Go on with: advsearch resume ")
 
 
 def test_the_table_of_nothing() -> None:
     summary = swept(ending="interrupted", configurations=0, planned=5, accuracy=None, interval=None)
-    assert answer(summary).startswith("Interrupted before the first configuration.")
+    assert text_of(summary).startswith("Interrupted before the first configuration.")
 
 
 # ---- with the renderer ----------------------------------------------------------------------------------------------
@@ -1010,12 +1010,13 @@ def test_pictures_without_a_run_have_no_place() -> None:
 @pytest.fixture(scope="module")
 def attacked(tmp_path_factory: pytest.TempPathFactory) -> Path:
     controls = {"pose": {"yaw": [0, 180]}, "light": {"power": [0, 40]}}
-    return kept_answer(tmp_path_factory.mktemp("runs") / "turned", controls, [0.5, 0.25])
+    return kept_configuration(tmp_path_factory.mktemp("runs") / "turned", controls, [0.5, 0.25])
 
 
-def test_an_answer_has_the_draws_and_the_noise_of_the_clean_scene(attacked: Path, tmp_path: Path) -> None:
+def test_an_adversarial_scene_has_the_draws_and_the_noise_of_the_clean_scene(attacked: Path, tmp_path: Path) -> None:
     result = advsearch.sweep(
-        model=model(), answer_of=attacked, grid={"camera.azimuth": [0, 90]}, controls="corruption", samples=3, batch=2,
+        model=model(), adversarial_of=attacked, grid={"camera.azimuth": [0, 90]}, controls="corruption", samples=3,
+        batch=2,
         sampler="random", trials=0, run=tmp_path / "run",
     )  # fmt: skip
     rows = list(result.rows())
@@ -1041,7 +1042,7 @@ def test_both_rates_stand_side_by_side_with_what_the_pairs_say(
 ) -> None:
     monkeypatch.setattr(swept_scene, "make_renderer", Turned)
     two = [model(0.5, "one"), model(0.55, "two")]
-    result = advsearch.sweep(model=two, answer_of=attacked, samples=40, trials=0, run=tmp_path / "run")
+    result = advsearch.sweep(model=two, adversarial_of=attacked, samples=40, trials=0, run=tmp_path / "run")
     beside, rows = result.summary.beside, list(result.rows())
     assert beside is not None and beside.answer == "turned" and [one.model for one in beside.pairs] == ["one", "two"]
     assert result.summary.controls == ["camera"], "what the attack was over"
@@ -1053,21 +1054,24 @@ def test_both_rates_stand_side_by_side_with_what_the_pairs_say(
         assert pair.clean.correct == sum(right[:40]) and pair.answer.correct == sum(right[40:])
         assert pair.difference == pytest.approx((sum(right[40:]) - sum(right[:40])) / 40)
     assert beside.pairs[0].clean_only > 0
-    said = answer(result.summary)
-    assert f"one is right in {beside.pairs[0].clean.correct} of 40" in said and "with the answer of turned" in said
+    said = text_of(result.summary)
+    assert (
+        f"one is right in {beside.pairs[0].clean.correct} of 40" in said
+        and "with the adversarial scene of turned" in said
+    )
     assert "two is right in" in (tmp_path / "run" / "report.html").read_text()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(FakeRenderer, "stops_at", FakeRenderer.calls + 60)
-        stopped = advsearch.sweep(model=two, answer_of=attacked, samples=40, trials=0, run=tmp_path / "stopped")
+        stopped = advsearch.sweep(model=two, adversarial_of=attacked, samples=40, trials=0, run=tmp_path / "stopped")
     assert stopped.summary.ending == "interrupted" and stopped.summary.beside is not None
-    again = advsearch.sweep(model=two, answer_of=attacked, samples=40, trials=0, run=tmp_path / "stopped")
+    again = advsearch.sweep(model=two, adversarial_of=attacked, samples=40, trials=0, run=tmp_path / "stopped")
     assert again.summary.beside == beside and rows_of(tmp_path / "stopped") == rows_of(tmp_path / "run")
 
 
-def test_what_is_rendered_with_an_answer_is_the_answer_really_rendered(attacked: Path) -> None:
+def test_what_is_rendered_with_an_adversarial_scene_is_the_adversarial_scene_really_rendered(attacked: Path) -> None:
     grid = {"camera.azimuth": [20, 110]}
     small: dict[str, Any] = {"resolution": SIZE, "spp": 4, "trials": 0, "denoise": "none"}
-    both = advsearch.sweep(model=model(), answer_of=attacked, grid=grid, **small)
+    both = advsearch.sweep(model=model(), adversarial_of=attacked, grid=grid, **small)
     margins = [row.margin or 0.0 for row in both.rows()]
     clean, answer = margins[:2], margins[2:]
     turned = advsearch.load_scene("mug", settings={"pose.yaw": 90.0})
@@ -1081,26 +1085,35 @@ def test_what_is_rendered_with_an_answer_is_the_answer_really_rendered(attacked:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"grid": {"pose.yaw": [0, 90]}}, "answer_of: the answer of .*turned says what pose is already; leave it out"),
-        ({"grid": {"camera.azimuth": [0]}, "answer_of": "nowhere"}, "unknown run 'nowhere'"),
+        (
+            {"grid": {"pose.yaw": [0, 90]}},
+            "adversarial_of: the configuration of .*turned says what pose is already; leave it out",
+        ),
+        ({"grid": {"camera.azimuth": [0]}, "adversarial_of": "nowhere"}, "unknown run 'nowhere'"),
     ],
 )
-def test_an_answer_that_cannot_be_swept_is_refused(attacked: Path, settings: dict[str, Any], message: str) -> None:
+def test_an_adversarial_scene_that_cannot_be_swept_is_refused(
+    attacked: Path, settings: dict[str, Any], message: str
+) -> None:
     with pytest.raises(AdvsearchError, match=message):
-        advsearch.sweep(model=model(), **{"answer_of": attacked, **settings})
+        advsearch.sweep(model=model(), **{"adversarial_of": attacked, **settings})
 
 
-def test_an_answer_needs_a_run_that_has_one(tmp_path: Path, attacked: Path) -> None:
+def test_an_adversarial_scene_needs_a_run_that_has_one(tmp_path: Path, attacked: Path) -> None:
     config = AttackConfig(object="mug", controls={"pose": {}}, run=str(tmp_path / "none"))
     with RunDirectory.create_for(config) as run:
         run.write_summary(attack_result(ending="already wrong", adversarial=None, verified=None))
-    with pytest.raises(InputError, match="none ended with 'already wrong', so that there is no answer to sweep"):
-        advsearch.sweep(model=model(), answer_of=tmp_path / "none", grid={"camera.azimuth": [0, 9]})
-    write_answer(attacked, np.array([0.5], dtype=np.float32))
+    with pytest.raises(
+        InputError, match="none ended with 'already wrong', so that there is no adversarial configuration to sweep"
+    ):
+        advsearch.sweep(model=model(), adversarial_of=tmp_path / "none", grid={"camera.azimuth": [0, 9]})
+    write_configuration(attacked, np.array([0.5], dtype=np.float32))
     try:
-        with pytest.raises(InputError, match="answer_of: the answer of turned has 1 numbers, and mug takes 2"):
-            advsearch.sweep(model=model(), answer_of=attacked, grid={"camera.azimuth": [0, 9]})
+        with pytest.raises(
+            InputError, match="adversarial_of: the adversarial configuration of turned has 1 numbers, and mug takes 2"
+        ):
+            advsearch.sweep(model=model(), adversarial_of=attacked, grid={"camera.azimuth": [0, 9]})
     finally:
-        write_answer(attacked, np.array([0.5, 0.25], dtype=np.float32))
+        write_configuration(attacked, np.array([0.5, 0.25], dtype=np.float32))
     with pytest.raises(InputError, match="scene: expected what load_scene returns or takes"):
         advsearch.sweep(grid={"camera.azimuth": [0, 9]})

@@ -71,7 +71,7 @@ def test_each_pose_has_basis_pictures_of_its_own_and_a_sweep_that_was_stopped_en
     whole = advsearch.sweep("mug", "reference", run=tmp_path / "whole", **settings).summary
     assert whole.transport is not None and whole.transport.used
     assert whole.renders["products"] == 36 and whole.renders["sweep"] == 2 * (2 + 3 * 2)
-    look, looked = SweptScene.answers, 0
+    look, looked = SweptScene.evaluate_all, 0
 
     def stopped(self: SweptScene, *given: Any) -> Any:
         nonlocal looked
@@ -80,10 +80,10 @@ def test_each_pose_has_basis_pictures_of_its_own_and_a_sweep_that_was_stopped_en
             raise KeyboardInterrupt
         return look(self, *given)
 
-    monkeypatch.setattr(SweptScene, "answers", stopped)
+    monkeypatch.setattr(SweptScene, "evaluate_all", stopped)
     first = advsearch.sweep("mug", "reference", run=tmp_path / "parts", **settings).summary
     assert first.ending == "interrupted" and first.configurations == 24
-    monkeypatch.setattr(SweptScene, "answers", look)
+    monkeypatch.setattr(SweptScene, "evaluate_all", look)
     again = advsearch.sweep("mug", "reference", run=tmp_path / "parts", **settings).summary
     assert rows(tmp_path / "parts") == rows(tmp_path / "whole") and again.renders == whole.renders
 

@@ -16,7 +16,7 @@ from advsearch.attacks.draws import Product
 from advsearch.cluster import Done, Workforce
 from advsearch.engine import acceptance
 from advsearch.engine.acceptance import Deviation
-from advsearch.engine.journal import answering
+from advsearch.engine.journal import worker_call
 from advsearch.progress import NullProgress
 from advsearch.questions.sweep import predicting
 from advsearch.questions.sweep.carry_out import job_of
@@ -112,7 +112,7 @@ class Two:
         pieces = list(batches)
         random.Random(1).shuffle(pieces)
         for number, items in enumerate(pieces):
-            yield Done(items, answering(self.scenes[number % 2].named)(items), f"worker {number % 2}")
+            yield Done(items, worker_call(self.scenes[number % 2].named)(items), f"worker {number % 2}")
 
 
 def test_a_sweep_that_was_stopped_and_goes_on_by_workers_has_the_same_rows(
@@ -120,7 +120,7 @@ def test_a_sweep_that_was_stopped_and_goes_on_by_workers_has_the_same_rows(
 ) -> None:
     """Each of them finds the same light."""
     grid = {"camera.azimuth": "0:360:4", "camera.distance": [2, 3, 4]}
-    whole, answers = swept(grid=grid, run=tmp_path / "whole").summary, SweptScene.answers
+    whole, answers = swept(grid=grid, run=tmp_path / "whole").summary, SweptScene.evaluate_all
     looked = iter(range(3))
 
     def stopped(self: SweptScene, *given: Any) -> Any:
@@ -129,7 +129,7 @@ def test_a_sweep_that_was_stopped_and_goes_on_by_workers_has_the_same_rows(
         return answers(self, *given)
 
     with monkeypatch.context() as patch:
-        patch.setattr(SweptScene, "answers", stopped)
+        patch.setattr(SweptScene, "evaluate_all", stopped)
         assert swept(grid=grid, run=tmp_path / "parts").summary.configurations == 4
     job = job_of(SweepConfig(object="mug", **SMALL, grid=grid))
     with RunDirectory.resume(tmp_path / "parts") as run:

@@ -14,9 +14,9 @@ from test_sweep import FakeRenderer
 
 import advsearch
 from advsearch.cli.main import main
-from advsearch.cli.output import shown_text as answer
+from advsearch.cli.output import shown_text as text_of
 from advsearch.cluster import Call, Done, Workforce
-from advsearch.engine.journal import answering
+from advsearch.engine.journal import worker_call
 from advsearch.engine.record import LOST
 from advsearch.errors import InputError
 from advsearch.progress import NullProgress
@@ -78,7 +78,7 @@ def summary(result: Any) -> dict[str, Any]:
 def shared(path: Path, resumed: bool = False, **given: Any) -> Any:
     job = job_of(CONFIG)
     with RunDirectory.resume(path) if resumed else RunDirectory.create(path) as run:
-        executor = Disorder(answering(Scenes(job).named), **given)
+        executor = Disorder(worker_call(Scenes(job).named), **given)
         return Sweep(job, run, NullProgress(), executor).carry_out()
 
 
@@ -121,7 +121,7 @@ def test_rows_of_another_machine_name_it_and_the_run_says_what_it_is(tmp_path: P
     job = job_of(CONFIG)
     facts = Workforce(machines={"ab12": {"processor": "another", "LLVM": "19.1"}})
     with RunDirectory.create(tmp_path / "run") as run:
-        executor = Two(answering(Scenes(job).named), facts=facts)
+        executor = Two(worker_call(Scenes(job).named), facts=facts)
         result = Sweep(job, run, NullProgress(), executor).carry_out()
         assert run.store.noted("machines") == {"ab12": {"processor": "another", "LLVM": "19.1"}}
     assert [row.machine for row in result.rows()] == ["ab12"] * 4 + [None] * 8
@@ -133,9 +133,9 @@ def test_rows_of_another_machine_name_it_and_the_run_says_what_it_is(tmp_path: P
 
 def test_what_is_shown_says_where_the_time_went() -> None:
     facts = Workforce(most=2, lost=1, refused=1, retried=3, batches=9, busy=9.0, loading=6.0, alive=10.0)
-    text = answer(swept().model_copy(update={"shared": SharedWork.of_facts(facts, {})}))
+    text = text_of(swept().model_copy(update={"shared": SharedWork.of_facts(facts, {})}))
     assert "2 at most, busy 90 % of 10" in text and "1 lost, 1 refused, 3 given out again" in text
-    assert "workers" not in answer(swept())
+    assert "workers" not in text_of(swept())
 
 
 def test_what_is_loaded_already_is_refused(tmp_path: Path) -> None:

@@ -204,9 +204,9 @@ def _page_faults(run: Path, *, compares: bool) -> list[str]:
 
 def load_answer(path: Path) -> None:
     """Read the answer of a run."""
-    from advsearch.runs.summary import read_answer
+    from advsearch.runs.summary import read_configuration
 
-    read_answer(path.parents[1])
+    read_configuration(path.parents[1])
 
 
 def load_blend(path: Path) -> None:

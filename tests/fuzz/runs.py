@@ -85,7 +85,7 @@ def answer(random: Random) -> Case:
         buffer = io.BytesIO()
         np.savez(buffer, u=ANSWER)
         what, data = "archive", buffer.getvalue()
-    return Case(f"answer: {what}", "answer", "artifacts/answer.npy", {"artifacts/answer.npy": data})
+    return Case(f"answer: {what}", "answer", "artifacts/adversarial.npy", {"artifacts/adversarial.npy": data})
 
 
 LINE = {

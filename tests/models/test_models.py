@@ -320,7 +320,7 @@ def test_usual_containers_of_logits_are_opened(answer: Any) -> None:
         (lambda z: z * float("nan"), "expected finite logits, got NaN or infinity for a grey image"),
     ],
 )
-def test_answers_that_are_not_logits(answer: Any, message: str) -> None:
+def test_outputs_that_are_not_logits(answer: Any, message: str) -> None:
     with pytest.raises(ModelError, match=message):
         load_model(Answering(answer), input_size=8)
 
@@ -340,7 +340,7 @@ def test_answers_that_are_not_logits(answer: Any, message: str) -> None:
         ("segmentation", lambda z: z[:, :1, None, None], r"expected logits .*1, 1, 1, 1\); wrap the network, or ask"),
     ],
 )
-def test_answers_of_another_task_name_it(task: str, answer: Any, message: str) -> None:
+def test_outputs_of_another_task_name_it(task: str, answer: Any, message: str) -> None:
     with pytest.raises(ModelError, match=message):
         load_model(Answering(answer), input_size=8, read=make_task(task).reader)
 
@@ -355,7 +355,7 @@ def test_wrong_input_size_says_what_to_pass() -> None:
 
 
 def test_probabilities_become_log_odds_with_one_warning() -> None:
-    with pytest.warns(ModelWarning, match=r"answers with probabilities") as caught:
+    with pytest.warns(ModelWarning, match=r"returns probabilities") as caught:
         model = load_model(Answering(lambda z: z.softmax(1)), input_size=8)
         logits = model(images())
     assert len(caught) == 1 and model.probabilities
@@ -376,7 +376,7 @@ def test_log_probabilities_are_logits_already() -> None:
 
 
 def test_percentages_are_probabilities_times_100() -> None:
-    with pytest.warns(ModelWarning, match=r"answers with percentages that sum to 100\. Their logarithm is used"):
+    with pytest.warns(ModelWarning, match=r"returns percentages that sum to 100\. Their logarithm is used"):
         model = load_model(Answering(lambda z: 100.0 * z.softmax(1)), input_size=8)
     torch.testing.assert_close(model(images()).softmax(1), tiny()(images()).softmax(1))
     with pytest.warns(ModelWarning, match=r"percentages"):
@@ -418,12 +418,12 @@ def test_a_sigmoid_is_told_where_colours_outside_of_a_picture_are_refused() -> N
 
 
 def test_a_random_model_is_named_as_such() -> None:
-    with pytest.warns(ModelWarning, match=r"answers the same image differently each time"):
+    with pytest.warns(ModelWarning, match=r"differs each time on the same image"):
         load_model(Answering(lambda z: z + torch.rand_like(z)), input_size=8)
 
 
 def test_a_model_that_mixes_its_batch_is_named_as_such() -> None:
-    with pytest.warns(ModelWarning, match=r"answers an image differently in a batch: was it exported in training mode"):
+    with pytest.warns(ModelWarning, match=r"sees an image differently in a batch: was it exported in training mode"):
         load_model(Answering(lambda z: z - 0.5 * z.mean(0)), input_size=8)
 
 

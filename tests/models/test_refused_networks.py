@@ -48,7 +48,7 @@ def test_chosen_classes_are_no_scores(form: Any, task: str) -> None:
 )
 def test_losses_are_no_scores(form: Any) -> None:
     for task in ("classification", "detection"):
-        with pytest.raises(ModelError, match="what a loss is: give the network as it answers outside of training"):
+        with pytest.raises(ModelError, match="what a loss is: give the network as it is outside of training"):
             load_model(Answers(form), input_size=8, task=task)
 
 

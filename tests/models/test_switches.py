@@ -94,7 +94,7 @@ def test_a_scene_is_rendered_and_searched_whatever_is_turned() -> None:
     with torch.no_grad():
         network.last.bias[0] += 5.0
     named = load_model(network, input_size=16, labels=["mug", "bowl", "vase"])
-    assert advsearch.render("mug", named, spp=1).views[0].answers[0].label == "mug"
+    assert advsearch.render("mug", named, spp=1).views[0].predictions[0].label == "mug"
     result = advsearch.attack("mug", named, steps=2, spp=1, trials=6, verify_spp=1, baseline=False)
     assert Switches.now() == TURNED["all"]
     assert result.summary.ending == "budget spent" and result.summary.renders["gradient"] > 0

@@ -182,7 +182,7 @@ def test_a_processor_that_can_be_neither_measured_nor_called_is_refused(
         (mixed, "mixes the channels .* and lets no gradient through"),
         (patches, r"shape \(1, 9, 64\)"),
         (padded, "pads a square picture"),
-        (rounded, "rounds or answers otherwise where a gradient goes"),
+        (rounded, "rounds or does otherwise where a gradient goes"),
     )
     for does, text in cases:
 

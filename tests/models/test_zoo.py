@@ -156,7 +156,7 @@ def test_torchvision_finds_objects_at_the_size_that_it_would_resize_to(
     found = model(IMAGES.repeat(3, 1, 1, 1))
     assert len(found) == 6 and found[0]["boxes"].tolist() == [[0.0, 0.0, size[1], size[0]]]
     torch.testing.assert_close(found[1]["scores"], IMAGES[1].mean()[None], atol=0.02, rtol=0.0)
-    assert Detection().on(model).answers(found)[0][0].label == "bowl"
+    assert Detection().on(model).predictions(found)[0][0].label == "bowl"
     assert load_model(f"torchvision:{name}", read=Detection().reader, input_size=8).input_size == (8, 8)
 
 
@@ -413,7 +413,7 @@ class Steps(nn.Module):
 
 
 def test_a_masked_gradient_is_told() -> None:
-    with pytest.warns(ModelWarning, match="does not say how its answers change"):
+    with pytest.warns(ModelWarning, match="does not say how its outputs change"):
         load_model(Steps(), input_size=8)
 
 

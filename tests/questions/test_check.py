@@ -22,10 +22,10 @@ from advsearch.engine.record import OutOfTime, Results
 from advsearch.errors import InputError
 from advsearch.interrupts import INTERRUPTS
 from advsearch.progress import NullProgress, Progress
-from advsearch.questions.check import answer as words
 from advsearch.questions.check import carry_out as checking
-from advsearch.questions.check.answer import CheckConfig, CheckedRow, CheckResult, GainRow
+from advsearch.questions.check import result as words
 from advsearch.questions.check.carry_out import check_from_config
+from advsearch.questions.check.result import CheckConfig, CheckedRow, CheckResult, GainRow
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.listing import finished, listed_runs
 from advsearch.runs.results import PathLength, Result

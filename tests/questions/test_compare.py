@@ -20,7 +20,7 @@ from advsearch.cli.main import main
 from advsearch.described import Value
 from advsearch.errors import FileFormatError, InputError
 from advsearch.questions.compare import CompareConfig
-from advsearch.questions.compare.answer import ComparedPair, CompareResult
+from advsearch.questions.compare.result import ComparedPair, CompareResult
 from advsearch.questions.report.evidence import claims_of
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.questions.sweep.summary import SweepSummary
@@ -67,7 +67,7 @@ def stored(
         **{"object": "mug", "controls": "camera", "samples": pictures, "run": str(path), "model": names, **asked}
     )
     draws = np.random.default_rng(config.seed).uniform(size=(pictures, 2))
-    halves = ("clean", Path(config.answer_of).name) if config.answer_of else ("",)
+    halves = ("clean", Path(config.adversarial_of).name) if config.adversarial_of else ("",)
     rows = []
     with RunDirectory.create_for(config) as run:
         run.store.set_note(EDGES, json.dumps({"camera.elevation": EDGES_OF_ELEVATION}))
@@ -160,12 +160,14 @@ def test_two_sweeps_of_the_same_draws_are_a_pair(
     assert ("of all of that together" in " ".join(result.warnings)) == (len(differ) > 1)
 
 
-def test_a_sweep_with_an_answer_is_compared_without_it_and_beside_others_only_with_it(tmp_path: Path) -> None:
-    paint = stored(tmp_path / "one", {"net": good}, answer_of="runs/paint")
+def test_a_sweep_with_an_adversarial_scene_is_compared_without_it_and_beside_others_only_with_it(
+    tmp_path: Path,
+) -> None:
+    paint = stored(tmp_path / "one", {"net": good}, adversarial_of="runs/paint")
     result, pair = compared(paint)
     assert [side.name for side in result.sides] == ["clean", "paint"] and pair.pairs == PICTURES
     assert pair.second_only == 0 and 0.4 * PICTURES < pair.first_only < 0.6 * PICTURES
-    other = stored(tmp_path / "two", {"net": good}, answer_of="runs/other")
+    other = stored(tmp_path / "two", {"net": good}, adversarial_of="runs/other")
     bare = stored(tmp_path / "three", {"net": good})
     result = advsearch.compare([bare, paint, other], pictures=0, run=tmp_path / "all")
     assert [side.name for side in result.sides] == ["as it is", "paint", "other"]
@@ -208,7 +210,7 @@ def test_sweeps_that_are_no_pairs_are_refused(tmp_path: Path) -> None:
         ([one, stored(tmp_path / "less", {"net": low}, pictures=9)], InputError, "same draws.*`samples` differ"),
         ([one, stored(tmp_path / "drawn", {"net": low}, controls="pose")], InputError, "same draws.*`controls` differ"),
         ([one, attack], FileFormatError, "expected the run of a sweep, got one of attack"),
-        ([one, few], FileFormatError, "a sweep that has ended, got one with 400 of 800 answers"),
+        ([one, few], FileFormatError, "a sweep that has ended, got one with 400 of 800 predictions"),
     ]
     for runs, error, said in refused:
         with pytest.raises(error, match=said):

@@ -18,8 +18,8 @@ import advsearch
 from advsearch.cli.main import main
 from advsearch.errors import FileFormatError, InputError
 from advsearch.questions.explain import renders as explaining
-from advsearch.questions.explain.answer import ExplainResult, pairs_text
 from advsearch.questions.explain.renders import along, can_be_given, sweep_inside
+from advsearch.questions.explain.result import ExplainResult, pairs_text
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.rules import CountedRule, RuleCondition, covered
 from advsearch.runs.directory import RunDirectory
@@ -116,7 +116,7 @@ def test_a_rule_is_confirmed_by_what_is_rendered_inside_it(
     assert asked[0].samples == 10 and asked[0].seed != 0 and asked[0].trials == 0
 
 
-def test_the_nearest_right_answer_differs_in_one_value(
+def test_the_nearest_right_prediction_differs_in_one_value(
     swept: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def rendered(self: Any, name: str, config: SweepConfig) -> pd.DataFrame:
@@ -175,7 +175,7 @@ TABLE = seen(
 )
 
 
-def test_of_answers_without_a_law_it_is_said_that_nothing_decides_and_how_many_rows_a_rule_takes(
+def test_of_predictions_without_a_law_it_is_said_that_nothing_decides_and_how_many_rows_a_rule_takes(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     faint = stored(tmp_path / "faint", lambda elevation: np.random.default_rng(int(1e6 * elevation)).random() < 0.5)

@@ -14,7 +14,7 @@ import torch
 import advsearch
 from advsearch.attacks import make_policy
 from advsearch.cli.main import main
-from advsearch.cli.output import shown_text as answer
+from advsearch.cli.output import shown_text as text_of
 from advsearch.engine.loading import Scene
 from advsearch.engine.surface_light import reason_against
 from advsearch.errors import InputError, ModelError
@@ -24,12 +24,12 @@ from advsearch.progress import NullProgress
 from advsearch.question import Question
 from advsearch.questions.attack.parts import executor_for, problem_of
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.harden import answer as harden_answer
 from advsearch.questions.harden import carry_out as hardening
 from advsearch.questions.harden import harden as asked
+from advsearch.questions.harden import result as harden_answer
 from advsearch.questions.harden import scenes as harden_scenes
-from advsearch.questions.harden.answer import QUICK, HardenConfig
 from advsearch.questions.harden.lessons import Lesson, RenderedLesson, TextureLesson
+from advsearch.questions.harden.result import QUICK, HardenConfig
 from advsearch.questions.harden.scenes import FURTHER, TRAINING, VALIDATION, Drawing, SceneWork
 from advsearch.questions.harden.training import ROUNDS, Course, Score
 from advsearch.runs.directory import RunDirectory
@@ -95,7 +95,7 @@ def test_a_run_trains_measures_and_goes_on(
     assert result.hardened == f"small_models:Colours@{result.weights}"
     assert advsearch.load_model(result.hardened, input_size=32).classes == 14
     assert len(list(Path(str(result.pictures)).glob("*/*.png"))) == 2 * (2 + 1 + 1)
-    assert "robust to texture" in answer(result)
+    assert "robust to texture" in text_of(result)
     page = Path("runs/run/report.html").read_text("utf-8")
     assert (
         "Of 2 held-out scenes the searches leave 1 right, before 1;" in page

@@ -28,7 +28,6 @@ from advsearch.models.reference import Trainable, trainable
 from advsearch.progress import NullProgress
 from advsearch.questions.attack.parts import problem_of
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.harden.answer import HardenConfig, TrainingRound
 from advsearch.questions.harden.lessons import (
     Disguise,
     Lesson,
@@ -41,6 +40,7 @@ from advsearch.questions.harden.lessons import (
     tried,
     write_archive,
 )
+from advsearch.questions.harden.result import HardenConfig, TrainingRound
 from advsearch.questions.harden.scenes import (
     HELD_OUT,
     TRAINING,
@@ -216,9 +216,9 @@ def test_programs_and_probabilities_are_refused() -> None:
     program = torch.fx.symbolic_trace(Colours())
     with pytest.raises(ModelError, match="an exported program cannot be trained"):
         trainable(load_model(program, input_size=16))
-    with pytest.warns(UserWarning, match="answers with probabilities"):
+    with pytest.warns(UserWarning, match="returns probabilities"):
         model = load_model(nn.Sequential(Colours(), nn.Softmax(dim=1)), input_size=16)
-    with pytest.raises(ModelError, match="only a classifier that answers with logits"):
+    with pytest.raises(ModelError, match="only a classifier that returns logits"):
         trainable(model)
 
 

@@ -13,14 +13,14 @@ from covering import only
 
 from advsearch import attack, load_scene
 from advsearch.attacks import Query
-from advsearch.cli.output import shown_text as answer
+from advsearch.cli.output import shown_text as text_of
 from advsearch.controls import CameraControl, LightControl, MaterialControl, TextureControl
 from advsearch.engine.gradients import inside, smooth_loss
 from advsearch.engine.planning import BOUND, measured_bounces
 from advsearch.questions.attack.parts import problem_from_config
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.check.answer import CheckConfig
 from advsearch.questions.check.carry_out import ALL, WHAT, check_from_config, measured_gains, resolved_texels
+from advsearch.questions.check.result import CheckConfig
 from advsearch.scene.formation import EVERYTHING, ITEMS, NOTHING
 from advsearch.scene.renderer import Renderer
 
@@ -171,7 +171,7 @@ def test_a_check_shows_what_is_left_out(specialise: bool, tmp_path: Path) -> Non
         run=str(tmp_path / "run"),
     )
     found = check_from_config(config)
-    said = answer(found)
+    said = text_of(found)
     if specialise:
         assert {row.item for row in found.gains} >= {*ITEMS, ALL}
         assert found.bounces is not None and found.bounces.reason in said and "texels of texture" in said

@@ -21,17 +21,6 @@ from advsearch.progress import NullProgress
 from advsearch.questions.attack.parts import problem_from_config
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.precision import carry_out as measuring
-from advsearch.questions.precision.answer import (
-    SAMPLERS,
-    WARM_UP,
-    PrecisionConfig,
-    PrecisionPoint,
-    PrecisionResult,
-    Recommended,
-    cautions,
-    headline,
-    precision_figures,
-)
 from advsearch.questions.precision.benches import (
     COUNTS,
     LEAST,
@@ -43,6 +32,17 @@ from advsearch.questions.precision.benches import (
     in_rounds,
 )
 from advsearch.questions.precision.carry_out import Measurement, precision_from_config, recommended, timing_machine
+from advsearch.questions.precision.result import (
+    SAMPLERS,
+    WARM_UP,
+    PrecisionConfig,
+    PrecisionPoint,
+    PrecisionResult,
+    Recommended,
+    cautions,
+    headline,
+    precision_figures,
+)
 from advsearch.questions.precision.rule import (
     FURTHEST,
     ReferenceValue,

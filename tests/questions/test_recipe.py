@@ -20,14 +20,14 @@ from advsearch.errors import AdvsearchError, FileFormatError, InputError, Unknow
 from advsearch.questions.attack import studies
 from advsearch.questions.attack.parts import parts_of, problem_of_parts
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.attack.summary import AnswerDistribution, FoundValue
+from advsearch.questions.attack.summary import FoundValue, SearchDistribution
 from advsearch.questions.recipe import carry_out as carrying_out
 from advsearch.questions.recipe import recipe as asked
-from advsearch.questions.recipe.answer import RecipeConfig, RecipeFigure, RecipeResult, told_once
 from advsearch.questions.recipe.description import Recipe, planned, read_recipe, recipe_names, titles
 from advsearch.questions.recipe.figures import FIGURES, check_figures, files_of, make, read_options
 from advsearch.questions.recipe.frame import MadeFigure, Rows, Tally, frame_of
 from advsearch.questions.recipe.given import CuesOptions, all_triangles, fitting, predicted, triangle_of
+from advsearch.questions.recipe.result import RecipeConfig, RecipeFigure, RecipeResult, told_once
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.questions.sweep.summary import SurfaceMap
 from advsearch.runs.images import write_png
@@ -273,7 +273,7 @@ def test_every_bundled_recipe_takes_a_detector_or_says_why_not(name: str) -> Non
     if name != "texture-shape":
         carrying_out.check_described(described, config)
         return
-    with pytest.raises(InputError, match="task: texture-shape asks whether answers are classes of the texture"):
+    with pytest.raises(InputError, match="task: texture-shape asks whether predictions are classes of the texture"):
         carrying_out.check_described(described, config)
 
 
@@ -419,7 +419,7 @@ def test_what_is_drawn_has_the_mean_and_the_deviation_that_a_search_answers_with
         "camera.roll": {"value": 0.0, "unit": "degrees", "low": -30.0, "high": 30.0},
         "camera.distance": {"value": 2.0, "unit": "object sizes", "low": 1.0, "high": 4.0},
     }
-    found = AnswerDistribution.of({"mean": searched, "deviation": [0.1, 0.05, 2.0, 0.1]})
+    found = SearchDistribution.of({"mean": searched, "deviation": [0.1, 0.05, 2.0, 0.1]})
     ranges = {name: FoundValue.of(value) for name, value in searched.items()}
     drawn = carrying_out.around(SweepConfig(object="mug"), found, ranges)
     assert isinstance(drawn, SweepConfig) and drawn.sampler == "random"
@@ -517,7 +517,7 @@ def told_by(answer: Any, shapes: int, textures: int, seed: int) -> str:
     ]
     made = figure({"figure": "cues"}, answered)
     assert sum(given for given, _, _ in predicted(tabled(answered), CuesOptions())) == len(answered)
-    (text,) = [one for one in made.text if "most frequent answer about the same object" in one]
+    (text,) = [one for one in made.text if "most frequent prediction about the same object" in one]
     return next(
         kind for kind in ("by shape than by texture", "by texture than by shape", "no difference") if kind in text
     )
@@ -553,7 +553,7 @@ def test_a_mixture_lies_in_its_triangle() -> None:
             assert weights.min() > -1e-9 and weights.sum() == pytest.approx(1.0)
 
 
-def test_an_answer_is_counted_by_what_most_of_a_mixture_is() -> None:
+def test_a_prediction_is_counted_by_what_most_of_a_mixture_is() -> None:
     """An answer that is given where most is milk, and nowhere else."""
     shares = [(a / 9, b / 9, (9 - a - b) / 9) for a in range(10) for b in range(10 - a)]
     answered = [
@@ -566,7 +566,7 @@ def test_an_answer_is_counted_by_what_most_of_a_mixture_is() -> None:
     assert not any("things" in text for text in made.text)
 
 
-def test_where_a_mixture_has_one_answer_it_is_shown_how_far_that_leads() -> None:
+def test_where_a_mixture_has_one_prediction_it_is_shown_how_far_that_leads() -> None:
     """A lead of 1 where most is milk and of 5 elsewhere, a little more or less; no picture with much coffee."""
     shares = [(a / 20, b / 20, (20 - a - b) / 20) for a in range(21) for b in range(21 - a) if a + b > 7]
     answered = [
@@ -579,7 +579,7 @@ def test_where_a_mixture_has_one_answer_it_is_shown_how_far_that_leads() -> None
     leads = {name: mean for name, _, mean, _ in made.rows}
     assert list(leads) == ["w", "m", "c"] and leads["m"] < 2.5 < 4.0 < leads["w"]  # type: ignore[operator]
     assert (
-        made.text[0].startswith("The answer is mug in every picture, so that shares")
+        made.text[0].startswith("The prediction is mug in every picture, so that shares")
         and "most of the mixture is m: 2." in made.text[1]
     )
     assert "The difference is shown" in made.text[1]
@@ -589,7 +589,7 @@ def test_where_a_mixture_has_one_answer_it_is_shown_how_far_that_leads() -> None
     assert "No difference is shown" in same.text[1]
     unknown = figure({"figure": "ternary", "shares": ["w", "m", "c"]}, [replace(one, margin=None) for one in answered])
     assert unknown.text[0] == (
-        "mug, 100 % of all answers, is given as often whatever most of the mixture is: no difference is shown."
+        "mug, 100 % of all predictions, is given as often whatever most of the mixture is: no difference is shown."
     )
 
 

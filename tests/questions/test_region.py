@@ -11,7 +11,7 @@ from stand_ins import Impatient, rows
 
 from advsearch.engine import acceptance
 from advsearch.questions.region import growing, region
-from advsearch.questions.region.answer import RegionConfig, RegionResult
+from advsearch.questions.region.result import RegionConfig, RegionResult
 from advsearch.runs.store import NAME as STORE
 from advsearch.runs.store import Store
 from advsearch.scene.surface import arrangement, texels

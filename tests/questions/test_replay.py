@@ -20,10 +20,10 @@ from advsearch.questions.attack.carry_out import attack_once
 from advsearch.questions.attack.parts import problem_from_config
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.replay import replay
-from advsearch.questions.replay.answer import ReplayConfig
+from advsearch.questions.replay.result import ReplayConfig
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Store
-from advsearch.runs.summary import read_answer, read_result, write_answer
+from advsearch.runs.summary import read_configuration, read_result, write_configuration
 from advsearch.scene.formation import ImageFormation
 
 EASY = "small_models:easy"
@@ -42,7 +42,7 @@ def attacked(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return run
 
 
-def test_an_answer_is_rendered_again_under_every_condition(
+def test_an_adversarial_scene_is_rendered_again_under_every_condition(
     attacked: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run = tmp_path / "run"
@@ -69,12 +69,14 @@ def test_an_answer_is_rendered_again_under_every_condition(
     assert len(seeds) == 1, "the same seeds under every condition"
     assert main(["show", str(run)]) == 0
     text = capsys.readouterr().out
-    assert text.startswith("As verified, the answer holds; changed, it holds under ") and "quality 50" in text
+    assert (
+        text.startswith("As verified, the adversarial scene holds; changed, it holds under ") and "quality 50" in text
+    )
     assert "quality 50" in (run / "report.html").read_text("utf-8")
 
 
 def test_a_replay_goes_on_where_it_was_stopped(attacked: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    config = ReplayConfig(answer=attacked, ways="jpeg", trials=6, run=str(tmp_path / "run"))
+    config = ReplayConfig(attack=attacked, ways="jpeg", trials=6, run=str(tmp_path / "run"))
     real, done = Problem.judge, 0
 
     def stopped(*given: Any) -> Any:
@@ -118,7 +120,7 @@ def test_a_shared_radiance_gives_the_same_picture(attacked: Path, tmp_path: Path
     problem, _ = problem_from_config(AttackConfig.from_yaml(attacked / "run.yaml"))
     changed = replace(problem, renderer=problem.renderer.like(transfer=curve))
     pair = [RetrialCondition(name, one, 4, name, light="own") for name, one in (("a", problem), ("b", changed))]
-    u = torch.from_numpy(read_answer(attacked))
+    u = torch.from_numpy(read_configuration(attacked))
     with RunDirectory.create(tmp_path / "run") as run:
         retrials = Retrials(pair, run, NullProgress(), trials=6, seed=0)
         first, second = (retrials._rendered(one, u, 7) for one in pair)
@@ -131,21 +133,25 @@ def test_a_model_that_cannot_be_loaded_is_refused_before_anything_is_rendered(at
     assert not (tmp_path / "never").exists()
 
 
-def test_a_run_without_an_answer_is_refused(attacked: Path, tmp_path: Path) -> None:
+def test_a_run_without_an_adversarial_scene_is_refused(attacked: Path, tmp_path: Path) -> None:
     with pytest.raises(advsearch.errors.UnknownNameError, match="unknown run"):
         advsearch.replay(tmp_path / "none")
     for name, break_it, message in (
         ("gone", lambda path: path.unlink(), "did the run end"),
-        ("short", lambda path: write_answer(path.parents[1], torch.zeros(3).numpy()), "has 3 numbers, and its scene"),
-        ("torn", lambda path: path.write_bytes(b"\x93NUMPY"), "expected the answer of a run"),
+        (
+            "short",
+            lambda path: write_configuration(path.parents[1], torch.zeros(3).numpy()),
+            "has 3 numbers, and its scene",
+        ),
+        ("torn", lambda path: path.write_bytes(b"\x93NUMPY"), "expected the adversarial configuration of a run"),
     ):
         copy = tmp_path / name
         with RunDirectory.create(copy):
             pass
-        for file in ("run.yaml", "summary.json", "artifacts/answer.npy"):
+        for file in ("run.yaml", "summary.json", "artifacts/adversarial.npy"):
             (copy / file).parent.mkdir(exist_ok=True)
             (copy / file).write_bytes((attacked / file).read_bytes())
-        break_it(copy / "artifacts" / "answer.npy")
+        break_it(copy / "artifacts" / "adversarial.npy")
         with pytest.raises((InputError, FileFormatError), match=message):
             advsearch.replay(copy, run=tmp_path / "never")
     assert not (tmp_path / "never").exists()
@@ -154,26 +160,26 @@ def test_a_run_without_an_answer_is_refused(attacked: Path, tmp_path: Path) -> N
 @pytest.mark.parametrize(
     "header", [b"{'descr': '<f4', 'fortran_order': False, 'shape': (10%b,), }", b"{'shape': '''%b"]
 )
-def test_a_hostile_header_of_an_answer_is_refused(header: bytes, tmp_path: Path) -> None:
+def test_a_hostile_header_of_a_configuration_is_refused(header: bytes, tmp_path: Path) -> None:
     text = header % (b"0" * 11) + b"\n"
-    path = write_answer(tmp_path, torch.zeros(3).numpy())
+    path = write_configuration(tmp_path, torch.zeros(3).numpy())
     path.write_bytes(b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text)
-    with pytest.raises(FileFormatError, match=r"answer\.npy: expected numbers"):
-        read_answer(tmp_path)
+    with pytest.raises(FileFormatError, match=r"adversarial\.npy: expected numbers"):
+        read_configuration(tmp_path)
 
 
 @pytest.mark.parametrize("data", [[[0.5]], [2.0], [float("nan")]], ids=["two axes", "out of range", "nan"])
-def test_an_answer_is_a_point_of_the_box(data: Any, tmp_path: Path) -> None:
-    write_answer(tmp_path, torch.tensor(data).numpy())
+def test_a_configuration_is_a_point_of_the_box(data: Any, tmp_path: Path) -> None:
+    write_configuration(tmp_path, torch.tensor(data).numpy())
     with pytest.raises(FileFormatError, match=r"expected numbers \(d,\) float32 in \[0, 1\]"):
-        read_answer(tmp_path)
-    write_answer(tmp_path, torch.tensor([0.25, 1.0]).numpy())
-    assert read_answer(tmp_path).tolist() == [0.25, 1.0]
+        read_configuration(tmp_path)
+    write_configuration(tmp_path, torch.tensor([0.25, 1.0]).numpy())
+    assert read_configuration(tmp_path).tolist() == [0.25, 1.0]
 
 
 def test_an_unknown_way_is_refused() -> None:
     with pytest.raises(InputError, match="ways: expected some of samples, resolution, depth"):
-        ReplayConfig(answer="run", ways="jpeg,fog")
+        ReplayConfig(attack="run", ways="jpeg,fog")
 
 
 @pytest.mark.parametrize(("curve", "middle"), [("srgb", 0.4613561), ("gamma", 0.4586564), ("reinhard", 0.4268)])

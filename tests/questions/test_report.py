@@ -11,12 +11,11 @@ from typing import Any
 import pytest
 import samples
 
-from advsearch.questions.explain.answer import ExplainResult
-from advsearch.questions.harden.answer import HardenResult
-from advsearch.questions.photographs.answer import PhotoAgreement
-from advsearch.questions.recipe.answer import RecipeResult
-from advsearch.questions.replay.answer import ReplayResult
-from advsearch.questions.report.answer import Evidence, evidence_page, markdown
+from advsearch.questions.explain.result import ExplainResult
+from advsearch.questions.harden.result import HardenResult
+from advsearch.questions.photographs.result import PhotoAgreement
+from advsearch.questions.recipe.result import RecipeResult
+from advsearch.questions.replay.result import ReplayResult
 from advsearch.questions.report.evidence import (
     RULES,
     claims_of,
@@ -24,6 +23,7 @@ from advsearch.questions.report.evidence import (
     photo_claims,
     warnings_over,
 )
+from advsearch.questions.report.result import Evidence, evidence_page, markdown
 from advsearch.report.shown import ENDED, NO_PROOF, NOTHING, Claim
 from advsearch.runs.results import Result
 from advsearch.runs.summary import to_json
@@ -184,7 +184,7 @@ def test_evidence_says_what_varied_how_far_and_what_judged() -> None:
     assert found.excluded[0] == "Nothing varied but what stands under What varied, and the noise of the renders."
 
 
-def test_answers_of_several_models_to_the_same_pictures_are_not_counted_together() -> None:
+def test_predictions_of_several_models_to_the_same_pictures_are_not_counted_together() -> None:
     one = {"configurations": 20, "correct": 5, "accuracy": 0.25, "interval": (0.1, 0.5), "axis": "model", "unit": ""}
     rows = [{**one, "value": name} for name in ("first", "second")]
     counts = {"configurations": 40, "correct": 10, "accuracy": 0.25}

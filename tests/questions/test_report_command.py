@@ -13,7 +13,7 @@ from samples import attack, make_run
 import advsearch
 from advsearch.cli.main import main
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.recipe.answer import RecipeConfig
+from advsearch.questions.recipe.result import RecipeConfig
 from advsearch.questions.report.evidence import QUICK
 from advsearch.runs.directory import PARTS, RunDirectory
 from advsearch.runs.images import write_png

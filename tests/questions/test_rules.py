@@ -76,7 +76,7 @@ def test_no_rule_is_told_where_there_is_none(seed: int) -> None:
     assert find_rules(*halves(planted("none", seed), seed), seed=seed).told == []
 
 
-def test_answers_that_are_all_the_same_have_no_rule() -> None:
+def test_predictions_that_are_all_the_same_have_no_rule() -> None:
     found = planted("none")
     same = found.assign(correct=True)
     assert find_rules(*halves(same, 0), seed=0).told == [] and find_importance(same) == ()

@@ -16,7 +16,8 @@ from covering import only
 from advsearch.cli.main import main
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.questions.stability import carry_out as suite
-from advsearch.questions.stability.answer import (
+from advsearch.questions.stability.carry_out import chosen
+from advsearch.questions.stability.result import (
     CASES,
     FELL_SHORT,
     OK,
@@ -28,7 +29,6 @@ from advsearch.questions.stability.answer import (
     check,
     holds,
 )
-from advsearch.questions.stability.carry_out import chosen
 from advsearch.questions.stability.stiff import condition_number, hessian
 from advsearch.runs.directory import RunDirectory, find_run
 from advsearch.runs.summary import read_result

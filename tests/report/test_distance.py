@@ -13,7 +13,7 @@ from stored_sweeps import make_sweep
 
 from advsearch.attacks.trials import clopper_pearson
 from advsearch.errors import InputError
-from advsearch.questions.sweep.answer import distance_of, distance_sentence, seen_from
+from advsearch.questions.sweep.display import distance_of, distance_sentence, seen_from
 from advsearch.questions.sweep.page import SweepSource, sweep_page_html
 from advsearch.questions.sweep.summary import AxisRow
 

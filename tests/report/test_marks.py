@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from advsearch.report.marks import SAID, SMALLEST, TINT, TRUE, marked
-from advsearch.report.wording import answer_cells, answer_text, calling, calls, margin_text, marks_text, wanted
-from advsearch.tasks import Answer, Mark
+from advsearch.report.wording import calling, calls, margin_text, marks_text, prediction_cells, prediction_text, wanted
+from advsearch.tasks import Mark, Prediction
 
 
 def where(picture: npt.NDArray[np.float32], colour: tuple[int, int, int]) -> npt.NDArray[np.bool_]:
@@ -86,19 +86,19 @@ def test_a_large_picture_keeps_its_size_and_nothing_changes_nothing() -> None:
 @pytest.mark.parametrize(
     ("task", "answer", "text"),
     [
-        ("classification", Answer("vase", 3, 0.913), "vase, 91 %"),
-        ("classification", Answer("vase", 3, 0.9999999), "vase, over 99.9 %"),
-        ("detection", Answer("cup", 46, 0.762), "cup (score 0.76)"),
-        ("detection", Answer("no cup", None, 0.124), "no cup found (best score of cup 0.12)"),
-        ("detection", Answer("cup elsewhere", None, 0.7), "cup elsewhere (score 0.70)"),
-        ("detection", Answer("out of view"), "out of view"),
-        ("segmentation", Answer("background", 0, 0.031),
+        ("classification", Prediction("vase", 3, 0.913), "vase, 91 %"),
+        ("classification", Prediction("vase", 3, 0.9999999), "vase, over 99.9 %"),
+        ("detection", Prediction("cup", 46, 0.762), "cup (score 0.76)"),
+        ("detection", Prediction("no cup", None, 0.124), "no cup found (best score of cup 0.12)"),
+        ("detection", Prediction("cup elsewhere", None, 0.7), "cup elsewhere (score 0.70)"),
+        ("detection", Prediction("out of view"), "out of view"),
+        ("segmentation", Prediction("background", 0, 0.031),
          "accuracy over the object's pixels 3.1 %, most often background"),
-        ("yaw", Answer("30 degrees"), "30 degrees"),
+        ("yaw", Prediction("30 degrees"), "30 degrees"),
     ],
 )  # fmt: skip
-def test_an_answer_in_words(task: str, answer: Answer, text: str) -> None:
-    assert answer_text(task, answer) == text
+def test_an_answer_in_words(task: str, answer: Prediction, text: str) -> None:
+    assert prediction_text(task, answer) == text
 
 
 @pytest.mark.parametrize(
@@ -110,7 +110,7 @@ def test_an_answer_in_words(task: str, answer: Answer, text: str) -> None:
         ("detection", "dog elsewhere", "sees a dog where there is none", "seeing a dog where there is none"),
         ("segmentation", "sofa", "takes this mug for a sofa", "taking it for a sofa"),
         ("segmentation", "background", "takes this mug for background", "taking it for background"),
-        ("yaw", "30 degrees", 'answers "30 degrees" for this mug', 'answering "30 degrees"'),
+        ("yaw", "30 degrees", 'predicts "30 degrees" for this mug', 'predicting "30 degrees"'),
     ],
 )
 def test_what_a_model_does_in_words(task: str, label: str, does: str, doing: str) -> None:
@@ -122,4 +122,7 @@ def test_margins_and_objectives_in_words() -> None:
     assert len({marks_text(task) for task in ("detection", "segmentation", "yaw")}) == 3
     assert wanted("vanish", "this mug") == "makes the model miss this mug"
     assert wanted("displace", "this mug") == "makes the model see this mug elsewhere"
-    assert answer_cells("detection", Answer("no cup", None, 0.124)) == ["no cup found", "best score of cup 0.12"]
+    assert prediction_cells("detection", Prediction("no cup", None, 0.124)) == [
+        "no cup found",
+        "best score of cup 0.12",
+    ]

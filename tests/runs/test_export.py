@@ -168,7 +168,7 @@ def test_no_runs_and_no_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, 
     assert main(["runs", "nowhere"]) == 2 and "nowhere: expected a folder" in capsys.readouterr().err
 
 
-def test_resume_of_a_run_that_is_done_shows_its_answer(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_resume_of_a_run_that_is_done_shows_its_result(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with RunDirectory.resume("one") as again:
         again.write_summary(attack(verified=None))
     assert main(["resume", "one", "--json"]) == 0

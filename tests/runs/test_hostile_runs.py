@@ -181,7 +181,7 @@ def test_pipes_in_a_run_do_not_block(name: str, run: Path) -> None:
 KEPT = (
     *("run.yaml", "summary.json", "results.sqlite", "results.sqlite-wal", "report.html", "columns.bin"),
     *("images", "images/clean.png", "images/rows", "images/rows/0000", "images/photos", "images/photos/3-0000.jpg"),
-    *("artifacts", "artifacts/answer.npy", "artifacts/object.glb", "aov", "aov/000001.exr", "parts", "parts/a"),
+    *("artifacts", "artifacts/adversarial.npy", "artifacts/object.glb", "aov", "aov/000001.exr", "parts", "parts/a"),
     *("parts/a/report.html", "parts/a/images/rows", ".lock"),
 )
 """Whatever is read, shown, copied or written."""

@@ -17,7 +17,7 @@ from advsearch.runs.units import NOTE, Units, units_of
 
 @pytest.mark.parametrize("frames", [0, 1, 2])
 @pytest.mark.parametrize(("models", "again"), [(1, 0), (2, 0), (2, 1)])
-def test_rows_of_a_unit_differ_in_frame_model_and_answer_alone(frames: int, models: int, again: int) -> None:
+def test_rows_of_a_unit_differ_in_frame_model_and_prediction_alone(frames: int, models: int, again: int) -> None:
     sizes, samples, scenes = (3, 2, 4), 2, 2
     whole = Units(sizes, frames, samples, models, again * scenes * 24 * samples)
     found: dict[int, set[tuple[int, ...]]] = {}

@@ -10,7 +10,7 @@ import torch
 
 from advsearch.engine.acceptance import ACCEPTED, Deviation, levels_off, view_of
 from advsearch.engine.gradients import smooth_loss
-from advsearch.questions.stability.answer import Outcome, check, holds
+from advsearch.questions.stability.result import Outcome, check, holds
 from advsearch.questions.stability.scene import (
     REFERENCE_SPP,
     ControlSettings,

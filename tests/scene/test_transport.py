@@ -17,7 +17,7 @@ from torch import Tensor
 import advsearch
 from advsearch.engine import acceptance
 from advsearch.engine import transport as searching
-from advsearch.question import Asked, answered
+from advsearch.question import Asked, carried_out
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.studies import curve
 from advsearch.questions.attack.summary import attack_of
@@ -218,7 +218,7 @@ def test_a_curve_over_epsilon_is_searched_with_one_matrix(monkeypatch: pytest.Mo
     monkeypatch.setattr(searching, "predicting", counted)
     settings: Any = {**SMALL, "baseline": False, "average": 0, "resolution": (SIZE, SIZE)}
     config = AttackConfig(object="mug", epsilon="0.002,0.004", run=str(tmp_path / "curve"), **settings)
-    found = answered(curve, Asked(config))
+    found = carried_out(curve, Asked(config))
     assert made == 1 and [one.robust for one in found.curve] == [1, 1]
     alone = advsearch.attack("mug", epsilon=0.004, run=tmp_path / "alone", **settings)
     shared = attack_of(tmp_path / "curve" / "parts" / found.parts[1])

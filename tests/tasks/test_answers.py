@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 import advsearch
 from advsearch.errors import InputError, ModelError
-from advsearch.tasks import Answer, Facts, FreeAnswer, make_task
+from advsearch.tasks import Facts, FreeAnswer, Prediction, make_task
 from advsearch.tasks.answers import Utterance, has_word
 
 VOCABULARY = ("a", "mug", "cup", "bowl", ".")
@@ -68,8 +68,8 @@ def test_the_text_alone_says_what_is_right() -> None:
         assert gradient[0, 2] < 0 < gradient[0, 1] and not gradient[1].any()
     first, second = task.judge([said("cup", logits), said(" \n", logits)], ("cup",))
     assert first.right and not first.success and second.success and not second.right
-    assert (first.answer.label, second.answer.label) == ("cup", "(nothing)")
-    assert task.answers([said("a\n\x1b[2J cup", logits)]) == [(Answer("a [2J cup"),)]
+    assert (first.prediction.label, second.prediction.label) == ("cup", "(nothing)")
+    assert task.predictions([said("a\n\x1b[2J cup", logits)]) == [(Prediction("a [2J cup"),)]
     assert task.judge([said("cup", logits * math.nan)], ("cup",))[0].not_a_number
 
 

@@ -58,7 +58,7 @@ TASK = Depth(size=0.5)
 def test_a_factor_of_the_tolerance_is_what_decides(kind: str, factor: float, right: bool, answer: str) -> None:
     """By whatever scale and shift the model speaks: what is beside the object says them."""
     (found,) = TASK.judge(said(moved(factor), kind), TRUTH)
-    assert (found.right, found.answer.label, found.success) == (right, answer, not right)
+    assert (found.right, found.prediction.label, found.success) == (right, answer, not right)
     assert found.margin == pytest.approx(abs(math.log(factor)) - math.log(1.25), abs=1e-4)
     payload: Any = found.payload
     assert payload["factor"] == pytest.approx(max(factor, 1.0 / factor), abs=1e-3)
@@ -73,9 +73,9 @@ def test_an_object_that_takes_the_depth_of_what_is_behind_is_gone() -> None:
         (found,) = gone.judge(said(inverse), TRUTH)
         payload: Any = found.payload
         assert payload["relief"] == pytest.approx(left, abs=1e-3)
-        assert found.success is (left < 0.5) and (found.answer.label == GONE) is (left < 0.5)
+        assert found.success is (left < 0.5) and (found.prediction.label == GONE) is (left < 0.5)
     (found,) = replace(TASK, seek="farther").judge(said(GROUND), TRUTH)
-    assert found.success and found.answer.label == FARTHER, "what is sought is named first"
+    assert found.success and found.prediction.label == FARTHER, "what is sought is named first"
 
 
 def test_behind_the_object_is_what_is_beside_it_in_its_row() -> None:
@@ -96,7 +96,7 @@ def test_nearer_and_farther_have_a_sign_and_a_mixture_has_neither() -> None:
         assert float(get_objective(seek, task)(said(moved(factor)), torch.zeros(1), TRUTH)) > 0.0
     columns = torch.where(torch.arange(WIDE) % 2 == 0, 2.0, 0.5)
     (found,) = TASK.judge(said(torch.where(MASK, INVERSE * columns, INVERSE)), TRUTH)
-    assert not found.right and found.answer.label == OUT_OF_SHAPE
+    assert not found.right and found.prediction.label == OUT_OF_SHAPE
     assert replace(TASK, minimise=True).judge(said(INVERSE), TRUTH)[0].success
 
 
@@ -109,14 +109,14 @@ def test_near_does_not_become_far_by_a_negative_scale() -> None:
 def test_where_nothing_is_seen_nothing_is_wrong_and_where_numbers_are_none_nothing_is_right() -> None:
     unseen = Distances(torch.zeros_like(MASK), TRUTH.z)
     (found,) = TASK.judge(said(GROUND), unseen)
-    assert (found.right, found.answer.label, found.payload) == (True, "out of view", None)
+    assert (found.right, found.prediction.label, found.payload) == (True, "out of view", None)
     for value in (math.nan, math.inf):
         broken = said(INVERSE)
         broken[0][DISPARITY][0, 0] = value
         (found,) = TASK.judge(broken, TRUTH)
         assert found.not_a_number and not found.right and not found.success
-        assert TASK.answers(broken)[0][0].label == NOT_A_NUMBER
-    assert TASK.answers(said(INVERSE, METRIC))[0][0].label == "metric depth from 0.417 to 2.5"
+        assert TASK.predictions(broken)[0][0].label == NOT_A_NUMBER
+    assert TASK.predictions(said(INVERSE, METRIC))[0][0].label == "metric depth from 0.417 to 2.5"
 
 
 def test_what_is_beside_the_object_has_to_say_the_scale() -> None:
@@ -125,13 +125,16 @@ def test_what_is_beside_the_object_has_to_say_the_scale() -> None:
     above = Distances(MASK, torch.where(MASK, 1.0, 2.0))
     for truth, count in ((alone, 0), (above, 60)):
         assert not truth.anchored
-        task = TASK.seeing(said(INVERSE), truth)
-        assert f"expected 16 pixels at distances that differ by a factor of 1.1, got {count}" in task.unsaid
-        assert not TASK.seeing(said(INVERSE, METRIC), truth).unsaid
+        task = TASK.after_calibration(said(INVERSE), truth)
+        assert f"expected 16 pixels at distances that differ by a factor of 1.1, got {count}" in task.ambiguities
+        assert not TASK.after_calibration(said(INVERSE, METRIC), truth).ambiguities
     (found,) = TASK.judge([{DISPARITY: torch.where(MASK, 3.0, 1.0)}], above)
     payload: Any = found.payload
     assert found.right and payload["fitted"] == "in the whole picture"
-    assert TASK.seeing(said(INVERSE), OPEN).unsaid == "" and TASK.seeing(said(INVERSE), None).unsaid == ""
+    assert (
+        TASK.after_calibration(said(INVERSE), OPEN).ambiguities == ""
+        and TASK.after_calibration(said(INVERSE), None).ambiguities == ""
+    )
 
 
 def test_a_model_is_read_in_every_form() -> None:
@@ -149,10 +152,13 @@ def test_a_model_is_read_in_every_form() -> None:
 def test_what_has_to_be_said_is_said() -> None:
     assert (
         "kind: expected what its numbers are, one of relative disparity, relative depth, metric depth, and"
-        in TASK.seeing([{"": INVERSE}], TRUTH).unsaid
+        in TASK.after_calibration([{"": INVERSE}], TRUTH).ambiguities
     )
-    assert "give the longest side of the real object in metres" in Depth().seeing(said(INVERSE, METRIC), TRUTH).unsaid
-    (remark,) = Depth(kind=RELATIVE).seeing([{"": INVERSE}], TRUTH).remarks
+    assert (
+        "give the longest side of the real object in metres"
+        in Depth().after_calibration(said(INVERSE, METRIC), TRUTH).ambiguities
+    )
+    (remark,) = Depth(kind=RELATIVE).after_calibration([{"": INVERSE}], TRUTH).remarks
     assert remark.startswith("The model's numbers are read as relative depth: the distance, up to a scale and a shift")
     with pytest.raises(InputError, match="label: task depth has no classes"):
         TASK.check(Facts("mug", "mug"))
@@ -243,7 +249,7 @@ def test_a_search_verifies_and_draws(asked: list[str], capsys: pytest.CaptureFix
     with Store(run / "results.sqlite", read_only=True) as store:
         payloads: list[Any] = [row.payload for row in store.rows("verification")]
     assert {one["fitted"] for one in payloads} == {"beside the object"}
-    clean, drawn = (read_png(run / "images" / f"{name}-answer.png") for name in ("clean", "adversarial"))
+    clean, drawn = (read_png(run / "images" / f"{name}-prediction.png") for name in ("clean", "adversarial"))
     assert clean.shape == (512, 3 * 512, 3), "the picture, the true disparity and the model's"
     orange = [float((one[:, :512, 0] - one[:, :512, 2]).clip(0.2).mean()) for one in (clean, drawn)]
     assert orange[0] > orange[1] + 0.02, "fewer pixels of the object are right"

@@ -14,10 +14,10 @@ from advsearch.attacks.objectives import check_objective, get_objective
 from advsearch.described import NOT_A_NUMBER
 from advsearch.errors import InputError, ModelError
 from advsearch.models import load_model
-from advsearch.tasks import Answer, Detection, Facts, Judgement, Sight
+from advsearch.tasks import Detection, Facts, Judgement, Prediction, Sight
 from advsearch.tasks.boxes import Place, corners, log_odds, overlap, share_inside, strongest
 from advsearch.tasks.detection import GOALS
-from advsearch.tasks.detector_answers import detections_in
+from advsearch.tasks.detector_outputs import detections_in
 
 NAMES = ("cup", "bowl", "dog")
 HERE, NEAR, AWAY = [0.2, 0.2, 0.6, 0.6], [0.3, 0.2, 0.7, 0.6], [0.7, 0.7, 0.9, 0.9]
@@ -143,11 +143,11 @@ FAR = [0.34, 0.2, 0.74, 0.6]
 """Overlaps `NEAR` by 0.82, and the object by 0.48: not where it is."""
 
 
-def test_a_right_box_that_suppression_drops_is_no_right_answer() -> None:
+def test_a_right_box_that_suppression_drops_is_no_right_prediction() -> None:
     """A better cup beside the object takes the right box away; that is no success either, for the box was there."""
     output = dense((NEAR, [0.7, 0.0, 0.0]), (FAR, [0.9, 0.0, 0.0]))
     found = judged(TASK, output)
-    assert not found.right and not found.success and found.answer.label == "cup elsewhere"
+    assert not found.right and not found.success and found.prediction.label == "cup elsewhere"
     assert judged(replace(TASK, suppression=1.0), output).right, "every box counts where none is suppressed"
     assert judged(TASK, sparse((NEAR, 0, 0.7), (FAR, 0, 0.9))).right, "boxes with labels have been through it"
     assert judged(TASK, dense((NEAR, [0.7, 0.0, 0.0]), (FAR, [0.0, 0.9, 0.0]))).right, "another class drops nothing"
@@ -187,23 +187,23 @@ FOUND = dense((HERE, [0.8, 0.1, 0.0]), (AWAY, [0.1, 0.2, 0.1]))
 @pytest.mark.parametrize(
     ("output", "answer", "right"),
     [
-        (FOUND, Answer("cup", 0, 0.8), True),
-        (dense((NEAR, [0.7, 0.6, 0.0])), Answer("cup", 0, 0.7), True),
-        (dense((HERE, [0.5, 0.6, 0.0])), Answer("cup", 0, 0.5), True),
-        (dense((HERE, [0.3, 0.6, 0.0])), Answer("bowl", 1, 0.6), False),
-        (dense((HERE, [0.3, 0.4, 0.0]), (AWAY, [0.7, 0.0, 0.0])), Answer("cup elsewhere", None, 0.7), False),
-        (dense((HERE, [0.3, 0.4, 0.0]), (AWAY, [0.4, 0.9, 0.0])), Answer("no cup", None, 0.3), False),
-        (sparse((HERE, 0, 0.8), (AWAY, 1, 0.9)), Answer("cup", 0, 0.8), True),
-        (sparse((HERE, 1, 0.8), (AWAY, 0, 0.4)), Answer("bowl", 1, 0.8), False),
-        (sparse(), Answer("no cup", None, 0.0), False),
+        (FOUND, Prediction("cup", 0, 0.8), True),
+        (dense((NEAR, [0.7, 0.6, 0.0])), Prediction("cup", 0, 0.7), True),
+        (dense((HERE, [0.5, 0.6, 0.0])), Prediction("cup", 0, 0.5), True),
+        (dense((HERE, [0.3, 0.6, 0.0])), Prediction("bowl", 1, 0.6), False),
+        (dense((HERE, [0.3, 0.4, 0.0]), (AWAY, [0.7, 0.0, 0.0])), Prediction("cup elsewhere", None, 0.7), False),
+        (dense((HERE, [0.3, 0.4, 0.0]), (AWAY, [0.4, 0.9, 0.0])), Prediction("no cup", None, 0.3), False),
+        (sparse((HERE, 0, 0.8), (AWAY, 1, 0.9)), Prediction("cup", 0, 0.8), True),
+        (sparse((HERE, 1, 0.8), (AWAY, 0, 0.4)), Prediction("bowl", 1, 0.8), False),
+        (sparse(), Prediction("no cup", None, 0.0), False),
     ],
 )
 def test_the_object_is_found_by_a_right_box_with_a_right_name(
-    output: list[dict[str, Tensor]], answer: Answer, right: bool
+    output: list[dict[str, Tensor]], answer: Prediction, right: bool
 ) -> None:
     found = judged(TASK, output)
-    assert (found.answer.label, found.answer.index, found.right) == (answer.label, answer.index, right)
-    assert found.answer.probability == pytest.approx(answer.probability)
+    assert (found.prediction.label, found.prediction.index, found.right) == (answer.label, answer.index, right)
+    assert found.prediction.probability == pytest.approx(answer.probability)
     assert found.success is not right
 
 
@@ -218,7 +218,7 @@ def test_the_margin_is_in_log_odds_of_the_score_that_counts() -> None:
 def test_several_names_may_be_right() -> None:
     either = Place((0, 1), TRUTH.box, TRUTH.size)
     found = judged(TASK, dense((HERE, [0.2, 0.7, 0.6])), either)
-    assert found.right and found.answer.label == "bowl" and TASK.truth_names(either) == ("cup", "bowl")
+    assert found.right and found.prediction.label == "bowl" and TASK.truth_names(either) == ("cup", "bowl")
 
 
 @pytest.mark.parametrize(
@@ -252,8 +252,8 @@ def test_an_objective_says_what_is_a_success(seek: str, output: list[dict[str, T
 def test_what_is_created_is_wrong_and_named() -> None:
     task = TASK.seeking("create")
     ghost = dense((HERE, [0.8, 0.0, 0.0]), (AWAY, [0.0, 0.0, 0.6]))
-    assert (judged(task, ghost).right, judged(task, ghost).answer.label) == (False, "dog elsewhere")
-    assert (judged(task, FOUND).right, judged(task, FOUND).answer.label) == (True, "cup")
+    assert (judged(task, ghost).right, judged(task, ghost).prediction.label) == (False, "dog elsewhere")
+    assert (judged(task, FOUND).right, judged(task, FOUND).prediction.label) == (True, "cup")
     assert judged(TASK, ghost).right, "nobody asked for what is beside the object"
 
 
@@ -279,13 +279,13 @@ def test_where_nothing_of_the_object_is_seen_nothing_is_missed() -> None:
     hidden = Place((0,), None, (20, 20))
     for seek in ("vanish", "mislabel", "displace"):
         found = judged(TASK.seeking(seek), FOUND, hidden)
-        assert found.right and not found.success and found.answer == Answer("out of view")
+        assert found.right and not found.success and found.prediction == Prediction("out of view")
     assert judged(TASK.seeking("create"), dense((HERE, [0.0, 0.7, 0.0])), hidden).success
 
 
 def test_a_score_that_is_no_number_is_neither_right_nor_a_success() -> None:
     found = judged_anyway(dense((HERE, [math.nan, 0.1, 0.1])))
-    assert not found.right and not found.success and found.answer == Answer(NOT_A_NUMBER)
+    assert not found.right and not found.success and found.prediction == Prediction(NOT_A_NUMBER)
 
 
 def judged_anyway(output: list[dict[str, Tensor]]) -> Judgement:
@@ -324,9 +324,9 @@ def test_the_payload_has_all_boxes_in_pixels_and_marks_show_those_that_count() -
     assert [one.box for one in marks] == [pytest.approx((4.0, 4.0, 12.0, 12.0))] * 2
 
 
-def test_answers_are_the_best_boxes_whatever_is_true() -> None:
-    rows = TASK.answers([*FOUND, *sparse()], 2)
-    assert [one.label for one in rows[0]] == ["cup", "bowl"] and rows[1] == (Answer("nothing"),)
+def test_predictions_are_the_best_boxes_whatever_is_true() -> None:
+    rows = TASK.predictions([*FOUND, *sparse()], 2)
+    assert [one.label for one in rows[0]] == ["cup", "bowl"] and rows[1] == (Prediction("nothing"),)
 
 
 # ---- on a model -----------------------------------------------------------------------------------------------------
@@ -370,7 +370,7 @@ class Listed(nn.Module):
 def test_a_list_of_mappings_needs_names() -> None:
     model = load_model(Listed(), input_size=8, read=Detection().reader, labels=NAMES)
     task = Detection().on(model)
-    assert task.looks and task.seen_unit == "" and "unit: pixels" in task.unsaid, "nothing shows in noise"
+    assert task.calibrates and task.seen_unit == "" and "unit: pixels" in task.ambiguities, "nothing shows in noise"
     assert len(model(torch.zeros(3, 8, 8, 3))) == 3
     with pytest.raises(InputError, match="labels: expected a file with the names of the classes of model Listed"):
         Detection().on(load_model(Listed(), input_size=8, read=Detection().reader))

@@ -16,8 +16,8 @@ from torch import nn
 
 import advsearch
 from advsearch.cli.main import main
-from advsearch.questions.photographs.answer import rendering_file
 from advsearch.questions.photographs.carry_out import Photographs
+from advsearch.questions.photographs.result import rendering_file
 from advsearch.runs.images import read_png
 from advsearch.runs.store import Store
 from advsearch.tasks import Detection
@@ -108,12 +108,12 @@ def test_a_search_predicts_verifies_and_draws(
     assert found["adversarial"]["payload"].keys() == ({"box", "found"} if detects else {"accuracy", "iou", "pixels"})
     with Store(run / "results.sqlite", read_only=True) as store:
         assert {type(row.payload) for row in store.rows("verification")} == {dict}
-    plain, drawn = (read_png(run / "images" / f"{name}.png") for name in ("adversarial", "adversarial-answer"))
+    plain, drawn = (read_png(run / "images" / f"{name}.png") for name in ("adversarial", "adversarial-prediction"))
     assert max(drawn.shape) == 512 and np.array_equal(plain, np.rint(plain * 255) / np.float32(255))
     blue = (np.abs(drawn - np.array([0, 190, 255]) / 255) < 1 / 255).all(axis=2)
     assert blue.sum() > 100, "the true box, or the outline of the mask"
     page = (run / "report.html").read_text("utf-8")
-    assert "What it answers" in page and "trial 00" in page
+    assert "What it predicts" in page and "trial 00" in page
     said = "(score" if detects else "accuracy over the object&#x27;s pixels"
     assert said in page.replace("'", "&#x27;")
     taker = Photographs()
@@ -145,14 +145,14 @@ def test_a_sweep_counts_and_keeps_the_worst(
     )  # fmt: skip
     assert {table["part"]: table["seen"] > 500 for table in swept["surface"]["tables"]} == {"cell": True, "face": True}
     assert swept["configurations"] == 4 and swept["worst"]["claimed"]["payload"] is not None
-    assert (tmp_path / "run" / "images" / "worst-answer.png").is_file()
+    assert (tmp_path / "run" / "images" / "worst-prediction.png").is_file()
     taker = Photographs()
     assert photographed(taker, tmp_path / "run", "0") == [True, True]
     assert photographed(taker, tmp_path / "run", "0", SIDE // 2) == [True, False]
 
 
 @ALSO_SLOWLY
-def test_an_answer_is_tried_on_other_models_and_under_other_conditions(
+def test_an_adversarial_scene_is_tried_on_other_models_and_under_other_conditions(
     asked: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     """Each model's, on both, of which the second is the first under another name; then the first's, replayed."""
@@ -202,7 +202,7 @@ def test_the_smallest_change(asked: list[str], capsys: pytest.CaptureFixture[str
 
 
 @ALSO_SLOWLY
-def test_an_answer_that_holds_for_many_conditions(
+def test_a_configuration_that_holds_for_many_conditions(
     asked: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     """Every condition has a true box or mask of its own."""
@@ -213,7 +213,7 @@ def test_an_answer_that_holds_for_many_conditions(
     assert found["verified"]["trials"] == 8 and found["over"] == ["camera"]
 
 
-def test_a_picture_with_the_answers_beside(
+def test_a_picture_with_the_predictions_beside(
     asked: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     flags = [*asked, "--denoise", "none", "--spp", "2", "--out", str(tmp_path / "mug.png")]
@@ -223,7 +223,7 @@ def test_a_picture_with_the_answers_beside(
     assert first["label"] == ("cup" if detects else "mug")  # most pixels are background, which is no answer
     assert first["probability"] > (0.5 if detects else 0.05)
     drawn = read_png(Path(found["answered"]))
-    assert found["answered"] == str(tmp_path / "mug-answer.png")
+    assert found["answered"] == str(tmp_path / "mug-prediction.png")
     assert (np.abs(drawn - np.array([0, 190, 255]) / 255) < 1 / 255).all(axis=2).sum() > 100, "what is true, in blue"
     assert read_png(tmp_path / "mug.png").shape[:2] == tuple(found["size"]), "the picture itself is what the model sees"
 
@@ -237,7 +237,9 @@ def test_nothing_is_drawn_where_nobody_says_what_is_right(
     assert "answered" not in found and len(said) == 1
 
 
-def test_the_first_answers_are_told_where_no_label_fits(asked: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_first_predictions_are_told_where_no_label_fits(
+    asked: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
     """A detector's own cup is no mug; a segmenter without names has no mug either."""
     detects = task_of(asked) == "detection"
     assert main(["attack", "--object", "mug", *asked[: 6 if detects else 4], *SHORT]) == 2
@@ -278,4 +280,4 @@ def test_a_box_elsewhere_is_sought_by_its_objective(
     summary = result.summary
     assert summary.ending == "found" and summary.clean.control and summary.clean.control.correct == 6
     assert summary.clean.label == "cup" and summary.verified and set(summary.verified.labels) == {said}
-    assert (tmp_path / "run" / "images" / "adversarial-answer.png").is_file()
+    assert (tmp_path / "run" / "images" / "adversarial-prediction.png").is_file()

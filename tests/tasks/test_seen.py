@@ -27,7 +27,7 @@ from advsearch.models import load_model
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results import plain
 from advsearch.runs.store import Row, Store
-from advsearch.tasks import Answer, Facts, Judgement, Sight, Task
+from advsearch.tasks import Facts, Judgement, Prediction, Sight, Task
 
 DOCS = Path(__file__).parents[2] / "docs"
 
@@ -47,8 +47,8 @@ class Edge(Task):
     def margin(self, output: Tensor, truth: float) -> Tensor:
         return (output[:, 0] - truth).abs() - self.tolerance
 
-    def answers(self, output: Tensor, count: int = 1) -> list[tuple[Answer, ...]]:
-        return [(Answer("here"),) for _ in output]
+    def predictions(self, output: Tensor, count: int = 1) -> list[tuple[Prediction, ...]]:
+        return [(Prediction("here"),) for _ in output]
 
     def payloads(self, output: Tensor) -> list[Any]:
         return [{"column": column, "boxes": [[column, 0.0, 16.0, 16.0]]} for column in output[:, 0]]
@@ -90,16 +90,18 @@ KEPT = {"boxes": [[1, 2.5, 3, 4]], "words": ["a, b", 'c"d', None], "deep": {"er"
 
 @pytest.mark.parametrize("payload", [KEPT, None, 0, [], "text", {"lost": math.nan, "tensor": torch.tensor([1.0, 2.0])}])
 def test_a_payload_comes_back_from_the_rows_of_searches_and_trials(tmp_path: Path, payload: Any) -> None:
-    judgement = Judgement(1.0, 1.0, False, Answer("here"), payload)
+    judgement = Judgement(1.0, 1.0, False, Prediction("here"), payload)
     with RunDirectory.create(tmp_path / "run") as run:
         run.record(trial_row("sweep", 0, 7, 1, judgement), Row("sweep", 1))
     with Store(tmp_path / "run" / "results.sqlite", read_only=True) as store:
         row, without = store.rows()
     assert row.payload == plain(payload) and without.payload is None
-    assert judgement_of(row) == Judgement(1.0, 1.0, False, Answer("here"), plain(payload))
+    assert judgement_of(row) == Judgement(1.0, 1.0, False, Prediction("here"), plain(payload))
     with RunDirectory.resume(tmp_path / "run") as run:
         problem: Any = None
-        (answer,) = Journal(run, Shared(problem)).answers([Query(torch.zeros(1), 0, "sweep", 0)], lambda queries: [])
+        (answer,) = Journal(run, Shared(problem)).evaluate_all(
+            [Query(torch.zeros(1), 0, "sweep", 0)], lambda queries: []
+        )
         assert answer.said == judgement_of(row), "it is read back, and nothing is asked"
 
 

@@ -14,7 +14,7 @@ from advsearch.attacks.objectives import get_objective
 from advsearch.described import NOT_A_NUMBER
 from advsearch.errors import InputError, ModelError
 from advsearch.models import ModelWarning, load_model
-from advsearch.tasks import Answer, Facts, Segmentation, Sight
+from advsearch.tasks import Facts, Prediction, Segmentation, Sight
 from advsearch.tasks.segmentation import Region
 
 NAMES = ("background", "bottle", "chair")
@@ -34,22 +34,25 @@ ALL, HALF, QUARTER = of([0, 1, 1, 0], [0, 1, 1, 0]), of([0, 1, 0, 0], [0, 2, 1, 
 @pytest.mark.parametrize(
     ("output", "accuracy", "right", "answer"),
     [
-        (ALL, 0.5, True, Answer("bottle", 1, 1.0)),
-        (HALF, 0.5, True, Answer("bottle", 1, 0.5)),
-        (HALF, 0.51, False, Answer("no bottle", None, 0.5)),
-        (QUARTER, 0.5, False, Answer("chair", 2, 0.25)),
-        (QUARTER, 0.25, True, Answer("bottle", 1, 0.25)),
-        (HALF, 1.0, False, Answer("no bottle", None, 0.5)),
-        (of([0, 0, 0, 0], [0, 0, 0, 0], sure=0.0), 1.0, True, Answer("bottle", 1, 1.0)),
+        (ALL, 0.5, True, Prediction("bottle", 1, 1.0)),
+        (HALF, 0.5, True, Prediction("bottle", 1, 0.5)),
+        (HALF, 0.51, False, Prediction("no bottle", None, 0.5)),
+        (QUARTER, 0.5, False, Prediction("chair", 2, 0.25)),
+        (QUARTER, 0.25, True, Prediction("bottle", 1, 0.25)),
+        (HALF, 1.0, False, Prediction("no bottle", None, 0.5)),
+        (of([0, 0, 0, 0], [0, 0, 0, 0], sure=0.0), 1.0, True, Prediction("bottle", 1, 1.0)),
     ],
 )
 def test_enough_of_the_objects_pixels_have_to_be_right(
-    output: Tensor, accuracy: float, right: bool, answer: Answer
+    output: Tensor, accuracy: float, right: bool, answer: Prediction
 ) -> None:
     task = replace(TASK, accuracy=accuracy)
     (found,) = task.judge(output, TRUTH)
     assert found.right is right and (found.margin <= 0.0) is right and found.success is not right
-    assert (found.answer.index, found.answer.probability) == (answer.index, answer.probability) or found.margin == 0.0
+    assert (found.prediction.index, found.prediction.probability) == (
+        answer.index,
+        answer.probability,
+    ) or found.margin == 0.0
     assert abs(found.margin) in (0.0, 2.0)
 
 
@@ -88,7 +91,7 @@ def test_a_target_has_to_get_enough_of_the_pixels() -> None:
 def test_where_nothing_of_the_object_is_seen_nothing_is_wrong() -> None:
     output = QUARTER.clone().requires_grad_()
     (found,) = TASK.judge(output, Region((1,), torch.zeros_like(MASK)))
-    assert found.right and found.answer == Answer("out of view") and found.payload is None
+    assert found.right and found.prediction == Prediction("out of view") and found.payload is None
     assert TASK.pixel_margin(output, Region((1,), torch.zeros_like(MASK))).requires_grad
 
 
@@ -106,9 +109,11 @@ def test_a_mask_follows_the_size_of_the_output() -> None:
     assert TASK.judge(ALL, Region((1,), fine))[0].right
 
 
-def test_answers_are_the_classes_of_most_pixels() -> None:
-    assert TASK.answers(ALL, 5) == [(Answer("bottle", 1, 0.5),)], "background is none"
-    assert replace(TASK, target=(0,)).answers(ALL, 5) == [(Answer("background", 0, 0.5), Answer("bottle", 1, 0.5))]
+def test_predictions_are_the_classes_of_most_pixels() -> None:
+    assert TASK.predictions(ALL, 5) == [(Prediction("bottle", 1, 0.5),)], "background is none"
+    assert replace(TASK, target=(0,)).predictions(ALL, 5) == [
+        (Prediction("background", 0, 0.5), Prediction("bottle", 1, 0.5))
+    ]
     true, said = TASK.marks(QUARTER, TRUTH)[0]
     assert true.true and true.mask is MASK and not said.true and said.mask is not None
     assert said.mask.int().tolist() == [[1, 1, 0, 1], [1, 0, 0, 1]]
@@ -150,7 +155,7 @@ def test_a_task_learns_names_from_its_model() -> None:
     assert task.truth_names(TRUTH) == ("bottle",)
     with pytest.raises(InputError, match="target: the model has no label 'table'"):
         Segmentation().on(model, target="table")
-    with pytest.raises(InputError, match=r"target: expected classes that are not right answers, got \[2\]"):
+    with pytest.raises(InputError, match=r"target: expected classes that are not right labels, got \[2\]"):
         task.check(Facts("bottle", "chair"))
     with pytest.raises(ModelError, match=r"expected logits \(N, classes, height, width\)"):
         load_model(nn.Sequential(nn.Flatten(), nn.Linear(48, 3)), input_size=4, read=Segmentation().reader)
@@ -170,11 +175,16 @@ def test_a_segmenter_of_probabilities_is_warned_about() -> None:
         load_model(nn.Sequential(network, nn.Softmax(dim=1)), input_size=8, read=TASK.reader, labels=NAMES)
 
 
-def test_pixels_that_are_not_numbers_are_no_answer() -> None:
+def test_pixels_that_are_not_numbers_are_no_output() -> None:
     broken = ALL.clone()
     broken[0, 1, 1, 1] = math.nan
     for output in (broken, torch.full_like(ALL, math.nan), torch.where(broken.isnan(), math.inf, broken)):
         (found,) = TASK.judge(output, TRUTH)
-        assert found.answer == Answer(NOT_A_NUMBER) and found.not_a_number and not found.right and not found.success
-    assert TASK.answers(torch.full_like(ALL, math.nan)) == [(Answer(NOT_A_NUMBER),)]
-    assert TASK.answers(torch.zeros_like(ALL)) == [(Answer("nothing"),)], "background everywhere"
+        assert (
+            found.prediction == Prediction(NOT_A_NUMBER)
+            and found.not_a_number
+            and not found.right
+            and not found.success
+        )
+    assert TASK.predictions(torch.full_like(ALL, math.nan)) == [(Prediction(NOT_A_NUMBER),)]
+    assert TASK.predictions(torch.zeros_like(ALL)) == [(Prediction("nothing"),)], "background everywhere"

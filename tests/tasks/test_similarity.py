@@ -149,7 +149,7 @@ def test_a_pooler_that_was_never_trained_is_left_out(tmp_path: Path) -> None:
 
 def test_what_has_no_classes_is_refused_as_a_classifier(tmp_path: Path) -> None:
     spec = published(tmp_path, "Dinov2Model")
-    with pytest.raises(ModelError, match=r"is a Dinov2Model, which answers with features .* use `task=similarity`"):
+    with pytest.raises(ModelError, match=r"is a Dinov2Model, which returns features .* use `task=similarity`"):
         advsearch.load_model(spec)
     network = transformers.Dinov2Model.from_pretrained(tmp_path)
 
@@ -179,7 +179,7 @@ def test_logits_are_the_mean_cosine_of_the_nearest_of_each_name(folder: Path, mo
     logits = task.logits(model(asked))
     torch.testing.assert_close(logits, torch.stack(expected, dim=1) / TEMPERATURE)
     assert task.labels == NAMES and logits.argmax(dim=1).tolist() == [0, 1, 2]
-    assert [first.label for first, *_ in task.answers(model(asked), 2)] == list(NAMES)
+    assert [first.label for first, *_ in task.predictions(model(asked), 2)] == list(NAMES)
 
 
 def test_a_linear_head_is_the_minimum_of_its_loss_and_the_same_each_time(folder: Path, model: Model) -> None:
@@ -219,7 +219,7 @@ def test_a_judgement_says_where_the_right_one_stands(folder: Path, model: Model)
     cosines = task.gallery.cosines(features(model, green[None]))[0]
     own = cosines[task.gallery.owners == 0].max()
     assert right.right and right.payload["rank"] == right.payload["name_rank"] == 1  # type: ignore[index, call-overload]
-    assert not wrong.right and wrong.answer.label == "green"
+    assert not wrong.right and wrong.prediction.label == "green"
     assert wrong.payload == {
         "rank": 1 + int((cosines > own).sum()),
         "references": 11,
@@ -258,15 +258,15 @@ def test_objectives_of_logits_have_a_true_gradient(
 def test_a_threshold_compares_with_the_clean_picture(model: Model) -> None:
     task = Similarity(threshold=0.8).on(model)
     clean, other = noisy(COLOURS["red"], 1), noisy(COLOURS["blue"], 1)
-    assert task.looks and task.truth(Facts("mug", own_label="mug")) == (0,)
+    assert task.calibrates and task.truth(Facts("mug", own_label="mug")) == (0,)
     with pytest.raises(InputError, match="a clean picture that it was shown first"):
         task.judge(model(clean), (0,))
-    task = task.seeing(model(clean), (0,))
-    assert not task.looks and task.seeing(model(other), (0,)) is task
+    task = task.after_calibration(model(clean), (0,))
+    assert not task.calibrates and task.after_calibration(model(other), (0,)) is task
     same, different = task.judge(model(torch.stack([clean, other])), (0,))
-    assert same.right and same.answer.label == ITSELF and same.payload == {"cosine": 1.0}
+    assert same.right and same.prediction.label == ITSELF and same.payload == {"cosine": 1.0}
     assert same.margin == pytest.approx((0.8 - 1.0) / TEMPERATURE, rel=1e-3)
-    assert not different.right and different.answer.label == ELSE
+    assert not different.right and different.prediction.label == ELSE
 
 
 def test_the_distance_is_one_minus_the_cosine_and_leads_away_from_the_start(model: Model) -> None:

@@ -23,7 +23,7 @@ from advsearch.models import load_model
 from advsearch.options import as_setting
 from advsearch.questions.attack.parts import problem_from_config
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.tasks import TASKS, Answer, Classification, Facts, Judgement, Task, make_task
+from advsearch.tasks import TASKS, Classification, Facts, Judgement, Prediction, Task, make_task
 from advsearch.tasks.base import typical
 from advsearch.tasks.together import Together
 
@@ -73,52 +73,53 @@ def test_a_task_with_a_margin_or_a_score_of_its_own_judges_by_it() -> None:
     assert [(one.score, one.margin) for one in shifted.judge(LOGITS[:2], (0,))] == [(-1.0, -2.0), (3.0, 2.0)]
 
 
-def test_an_answer_is_the_largest_logit_in_words_with_its_probability() -> None:
-    first, second, *_ = NAMED.answers(LOGITS[:1], 2)[0]
+def test_a_prediction_is_the_largest_logit_in_words_with_its_probability() -> None:
+    first, second, *_ = NAMED.predictions(LOGITS[:1], 2)[0]
     shares = LOGITS[0].softmax(dim=0).tolist()
-    assert (first, second) == (Answer("mug", 0, shares[0]), Answer("bowl", 1, shares[1]))
+    assert (first, second) == (Prediction("mug", 0, shares[0]), Prediction("bowl", 1, shares[1]))
     judged = NAMED.judge(LOGITS[:4], (0, 1))
-    assert [one.answer.label for one in judged] == ["mug", "bowl", "vase", "mug"]
+    assert [one.prediction.label for one in judged] == ["mug", "bowl", "vase", "mug"]
     assert [one.right for one in judged] == [True, True, False, True] and judged[0].payload is None
 
 
 @pytest.mark.parametrize("logits", [[math.nan, 0.0, 1.0], [math.nan] * 3, [1.0, math.inf, 0.0], [math.inf, 0.0, 0.0]])
-def test_an_answer_that_is_not_a_number_is_called_that(logits: list[float]) -> None:
+def test_an_output_that_is_not_a_number_is_called_that(logits: list[float]) -> None:
     output = torch.tensor([logits])
     for task in (NAMED, replace(NAMED, target=(2,)), replace(NAMED, minimise=True)):
         (found,) = task.judge(output, (0,))
-        assert found.answer == Answer("not a number", None, None) and found.not_a_number
+        assert found.prediction == Prediction("not a number", None, None) and found.not_a_number
         assert not found.right and not found.success and math.isnan(found.score) and math.isnan(found.margin)
-    assert NAMED.answers(output, 3) == [(Answer("not a number"),)]
+    assert NAMED.predictions(output, 3) == [(Prediction("not a number"),)]
     (found,) = NAMED.judge(torch.tensor([[1.0, 0.0, -math.inf]]), (0,))
-    assert found.right and found.answer.label == "mug", "a class that is ruled out is a number"
+    assert found.right and found.prediction.label == "mug", "a class that is ruled out is a number"
 
 
 @pytest.mark.parametrize("place", [0, 1, 2])
-def test_background_is_no_rival_of_a_class_and_no_answer(place: int) -> None:
+def test_background_is_no_rival_of_a_class_and_no_prediction(place: int) -> None:
     labels, logits = ["mug", "bowl"], [1.0, 0.5]
     labels.insert(place, "Background")
     logits.insert(place, 9.0)
     task, output = Classification(labels=tuple(labels)), torch.tensor([logits])
     right = (labels.index("mug"),)
     (found,) = task.judge(output, right)
-    assert found.right and found.margin == -0.5 and found.answer.label == "mug" and found.answer.probability < 0.7  # type: ignore[operator]
-    assert [one.label for one in task.answers(output, 5)[0]] == ["mug", "bowl"]
+    assert found.right and found.margin == -0.5 and found.prediction.label == "mug"
+    assert found.prediction.probability < 0.7  # type: ignore[operator]
+    assert [one.label for one in task.predictions(output, 5)[0]] == ["mug", "bowl"]
     for name, kind in OBJECTIVE_KINDS.items():
         if kind.plain is not None and name != "dlr":  # which needs three classes
             value = get_objective(name, task)(output, torch.zeros(1, 2, 2, 3), right)
             beside = output[:, [labels.index("mug"), labels.index("bowl")]]
             assert value.tolist() == kind.plain(beside, torch.zeros(1, 2, 2, 3), (0,)).tolist(), name
     sought = replace(task, target=(place,))
-    assert sought.judge(output, right)[0].success and sought.answers(output, 1)[0][0].label == "Background"
+    assert sought.judge(output, right)[0].success and sought.predictions(output, 1)[0][0].label == "Background"
     two = Classification(labels=("mug", "none"))
-    assert two.judge(torch.tensor([[0.0, 1.0]]), (0,))[0].answer.label == "none", "there is no other wrong answer"
+    assert two.judge(torch.tensor([[0.0, 1.0]]), (0,))[0].prediction.label == "none", "there is no other wrong answer"
     honest = Classification(labels=("mug", "none of the above", "bowl"))
     assert not honest.judge(torch.tensor([[0.0, 1.0, 0.0]]), (0,))[0].right
 
 
 def test_a_target_must_be_wrong_and_there_is_none_to_minimise() -> None:
-    with pytest.raises(InputError, match=r"target: expected classes that are not right answers, got \[1\]"):
+    with pytest.raises(InputError, match=r"target: expected classes that are not right labels, got \[1\]"):
         replace(NAMED, target=(1, 2)).truth(Facts("mug", "mug,bowl"))
     with pytest.raises(InputError, match="minimise"):
         replace(NAMED, target=(1,), minimise=True)
@@ -127,20 +128,20 @@ def test_a_target_must_be_wrong_and_there_is_none_to_minimise() -> None:
 def test_what_is_right_is_what_was_said_or_else_the_objects_own_label() -> None:
     assert NAMED.truth(Facts("thing", "bowl,vase", "mug")) == (1, 2)
     assert NAMED.truth(Facts("thing", None, "mug")) == (0,) and NAMED.truth_names((0, 2)) == ("mug", "vase")
-    with pytest.raises(InputError, match=r"^label: expected the right answers for thing, got none$"):
+    with pytest.raises(InputError, match=r"^label: expected the right labels for thing, got none$"):
         NAMED.truth(Facts("thing"))
     with pytest.raises(InputError, match=r"^label: the label of thing itself does not fit the model"):
         NAMED.truth(Facts("thing", None, "chair"))
 
 
-def test_the_typical_answer_is_the_most_frequent_one() -> None:
+def test_the_typical_prediction_is_the_most_frequent_one() -> None:
     def said(margin: float, index: int, probability: float) -> Judgement:
-        return Judgement(margin, margin, margin <= 0.0, Answer(f"class {index}", index, probability))
+        return Judgement(margin, margin, margin <= 0.0, Prediction(f"class {index}", index, probability))
 
     answer = typical((said(1.0, 7, 0.5), said(3.0, 7, 0.7), said(2.0, 3, 0.99)))
-    assert answer.answer.index == 7
-    assert (answer.margin, answer.answer.probability) == pytest.approx((2.0, 0.6))
-    assert typical((said(1.0, 9, 0.1), said(1.0, 2, 0.3))).answer.index == 2
+    assert answer.prediction.index == 7
+    assert (answer.margin, answer.prediction.probability) == pytest.approx((2.0, 0.6))
+    assert typical((said(1.0, 9, 0.1), said(1.0, 2, 0.3))).prediction.index == 2
 
 
 # ---- another task ---------------------------------------------------------------------------------------------------
@@ -160,8 +161,8 @@ class Yaw(Task):
     def margin(self, output: Tensor, truth: float) -> Tensor:
         return (output[:, 0] - truth).abs() - self.tolerance
 
-    def answers(self, output: Tensor, count: int = 1) -> list[tuple[Answer, ...]]:
-        return [(Answer(f"{value:.0f} degrees"),) for value in output[:, 0].tolist()]
+    def predictions(self, output: Tensor, count: int = 1) -> list[tuple[Prediction, ...]]:
+        return [(Prediction(f"{value:.0f} degrees"),) for value in output[:, 0].tolist()]
 
     def payloads(self, output: Tensor) -> list[Any]:
         return output[:, 0].tolist()
@@ -183,7 +184,7 @@ def test_three_methods_make_a_task() -> None:
     truth = task.truth(at({"pose.yaw": 30.0}))
     assert truth == 30.0 and task.truth_names(truth) == ("30.0",)
     near, far, lost = task.judge(output, truth)
-    assert (near.score, near.right, near.answer, near.payload) == (-8.0, True, Answer("32 degrees"), 32.0)
+    assert (near.score, near.right, near.prediction, near.payload) == (-8.0, True, Prediction("32 degrees"), 32.0)
     assert (far.score, far.success, far.right) == (15.0, True, False)
     assert not lost.success and not lost.right
     easier = task.on(load_model(Level(), input_size=8, read=task.reader), minimise=True)

@@ -45,7 +45,7 @@ def answer(capsys: pytest.CaptureFixture[str], *command: str) -> dict[str, Any]:
     return found
 
 
-def test_one_answer_against_a_detector_and_a_model_of_depth(
+def test_one_configuration_against_a_detector_and_a_model_of_depth(
     files: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     run = tmp_path / "run"
@@ -62,7 +62,7 @@ def test_one_answer_against_a_detector_and_a_model_of_depth(
     for one in payloads:
         assert {"bowl"} == {box["label"] for box in one["finder"]["found"] if box["score"] > 0.5}
         assert one["ranger"]["relief"] < 0.5
-    drawn = read_png(run / "images" / "clean-answer.png")
+    drawn = read_png(run / "images" / "clean-prediction.png")
     for colour in ((0, 190, 255), (255, 110, 0)):  # a true box, and the detector's; depth tints
         assert (abs(drawn - torch.tensor(colour).numpy() / 255) < 1 / 255).all(axis=2).sum() > 100
 
@@ -136,8 +136,8 @@ def test_each_is_judged_by_its_own_rule() -> None:
     task.check(facts)
     truth = task.truth(facts)
     output = model(torch.rand((SIDE, SIDE, 3), generator=torch.Generator().manual_seed(0)))
-    task = task.seeing(output, truth)
-    assert task.looks and not task.unsaid and len(task.remarks) == 1
+    task = task.after_calibration(output, truth)
+    assert task.calibrates and not task.ambiguities and len(task.remarks) == 1
     own = list(zip(task.tasks, output[0], truth, strict=True))
     margins = [float(one.margin(said, true)) for one, said, true in own]
     scores = [float(one.score(said, true)) for one, said, true in own]
@@ -146,7 +146,7 @@ def test_each_is_judged_by_its_own_rule() -> None:
     objective, _ = objective_for("each", task, model, None, 0)  # type: ignore[arg-type]
     values = [float(parts[0].pixel_margin(output[0][0], truth[0])), scores[1]]
     assert float(objective(output, torch.zeros(1), truth)) == pytest.approx(min(values))
-    assert judged.answer.label.count(";") == 1 and task.told(task.tasks[1], facts).label is None
+    assert judged.prediction.label.count(";") == 1 and task.told(task.tasks[1], facts).label is None
     with pytest.raises(InputError, match="model: expected 2, one for each task, got 1"):
         Together(parts=parts).on(both[0])
     with pytest.raises(InputError, match="label: task depth has no classes"):

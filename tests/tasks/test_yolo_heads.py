@@ -17,7 +17,7 @@ from advsearch.models import ModelWarning, load_model
 from advsearch.models.labels import names_in, read_labels
 from advsearch.tasks import Detection
 from advsearch.tasks.boxes import Place, left_over, strongest
-from advsearch.tasks.detector_answers import order_in
+from advsearch.tasks.detector_outputs import order_in
 
 CUP = (20.0, 40.0, 60.0, 90.0)
 PICTURE = torch.full((100, 100, 3), 0.25)
@@ -126,7 +126,7 @@ def on(network: nn.Module, labels: Any = NAMES, **options: Any) -> tuple[Detecti
     model = load_model(network, input_size=100, read=task.reader, labels=labels)
     output = model(PICTURE)
     names = tuple(labels)
-    return task.on(model).seeing(output, Place((cup(len(names)),), TRUTH.box, TRUTH.size)), output
+    return task.on(model).after_calibration(output, Place((cup(len(names)),), TRUTH.box, TRUTH.size)), output
 
 
 @pytest.mark.filterwarnings("ignore:no gradient")
@@ -139,11 +139,15 @@ def test_each_form_is_read_right(form: str, classes: int) -> None:
     truth = Place((cup(classes),), TRUTH.box, TRUTH.size)
     (found,) = task.judge(output, truth)
     score = 0.8 * (objectness or 1.0)
-    assert found.right and astuple(found.answer) == (names[cup(classes)], cup(classes), pytest.approx(score, abs=1e-4))
+    assert found.right and astuple(found.prediction) == (
+        names[cup(classes)],
+        cup(classes),
+        pytest.approx(score, abs=1e-4),
+    )
     best: Any = found.payload
     assert best["found"][0]["box"] == pytest.approx(CUP, abs=0.1)
     assert task.seen_order == order and task.seen_unit == ("fractions" if "RT-DETR" in form else "pixels")
-    assert not task.unsaid and not task.doubts
+    assert not task.ambiguities and not task.doubts
     said = " ".join(task.remarks)
     assert f"order: {order}" in said and ("masks are left out" in said) is ("masks" in form)
 
@@ -159,7 +163,7 @@ def more(columns: int, span: float = 0.9) -> Callable[[Tensor], Tensor]:
 @pytest.mark.parametrize(
     ("form", "labels", "text"),
     [
-        (more(1, span=3.0), NAMES, r"answer is \(8, 21\): it has an angle after the scores, as OBB heads have it"),
+        (more(1, span=3.0), NAMES, r"output is \(8, 21\): it has an angle after the scores, as OBB heads have it"),
         (
             lambda n: more(1)(n).abs(),
             NAMES,
@@ -206,13 +210,13 @@ def test_what_fits_twice_is_asked_for() -> None:
         on(Head(square, len(names)), names)
     task, output = on(Head(square, len(names)), names, order=V8)
     truth = Place((cup(len(names)),), TRUTH.box, TRUTH.size)
-    assert task.judge(output, truth)[0].answer.probability == pytest.approx(0.8, abs=1e-4) and not task.remarks
+    assert task.judge(output, truth)[0].prediction.probability == pytest.approx(0.8, abs=1e-4) and not task.remarks
 
 
 @pytest.mark.parametrize("order", ["boxes objectness scores", "boxes, objectness, scores, channels, first"])
 def test_an_order_says_what_a_head_is(order: str) -> None:
     task, output = on(Head(first, objectness=0.9), order=order)
-    assert astuple(task.judge(output, TRUTH)[0].answer) == ("cup", 1, pytest.approx(0.72, abs=1e-4))
+    assert astuple(task.judge(output, TRUTH)[0].prediction) == ("cup", 1, pytest.approx(0.72, abs=1e-4))
     assert not task.remarks
     with pytest.raises(InputError, match="order: expected boxes, scores and labels in their order"):
         Detection(order="boxes objectness")
@@ -265,7 +269,7 @@ def test_many_boxes_that_overlap_are_suppressed_at_once() -> None:
     task = Detection(labels=read_labels("coco"), unit="pixels", order=V8, input_size=(640, 640), confidence=0.25)
     truth = Place((41,), (35, 35, 75, 75), (640, 640))
     (found,) = task.judge(task.read(raw, 1), truth)
-    assert found.answer.label == "cup" and found.right
+    assert found.prediction.label == "cup" and found.right
 
 
 class Suppressed(nn.Module):
@@ -319,7 +323,7 @@ def test_a_search_goes_through_a_head_to_its_verified_end(tmp_path: Path) -> Non
     assert summary.clean.label == "coffee mug" and summary.verified
     assert set(summary.verified.labels) <= {"bowl", "no coffee mug"}
     assert any(f"read as a YOLO's: `task='detection={{order: {V8}}}'`" in one for one in summary.warnings)
-    assert (tmp_path / "run" / "images" / "adversarial-answer.png").is_file()
+    assert (tmp_path / "run" / "images" / "adversarial-prediction.png").is_file()
 
 
 def test_a_file_of_onnx_says_names_and_size(tmp_path: Path) -> None:
@@ -350,8 +354,10 @@ def test_a_file_of_onnx_says_names_and_size(tmp_path: Path) -> None:
         loaded = load_model(tmp_path / "head.onnx", read=Detection().reader)
     assert loaded.labels == NAMES and loaded.input_size == (100, 100)
     output = loaded(PICTURE)
-    task = Detection().on(loaded).seeing(output, TRUTH)
-    assert astuple(task.judge(output, TRUTH)[0].answer) == ("cup", 1, pytest.approx(0.8, abs=1e-3)) and not task.doubts
+    task = Detection().on(loaded).after_calibration(output, TRUTH)
+    assert (
+        astuple(task.judge(output, TRUTH)[0].prediction) == ("cup", 1, pytest.approx(0.8, abs=1e-3)) and not task.doubts
+    )
 
 
 @pytest.mark.parametrize(

@@ -34,7 +34,7 @@ from advsearch.attacks.objectives import OBJECTIVE_KINDS
 from advsearch.errors import FileFormatError
 from advsearch.questions.attack import wording
 from advsearch.report.figures import search_axes
-from advsearch.report.markup import NARROW, WIDE, Html, element, figure_of_answer, join_html, study_chart
+from advsearch.report.markup import NARROW, WIDE, Html, element, join_html, result_figure, study_chart
 from advsearch.report.shown import shown
 from advsearch.report.wording import interval_text, objective_label, percent, seconds_text
 from advsearch.runs.directory import OBJECT_FILE
@@ -130,7 +130,7 @@ def test_the_page_says_what_was_asked_beside_the_worst_case(tmp_path: Path) -> N
         "adversarial target in 20 of 20 83-100 % vase 91 %",
         "random search target in 1 of 20 0.1-25 % 40 pictures",
         "average case right in 150 of 200 68-81 % 200 configurations",
-        "Wanted the model should answer vase",
+        "Wanted the model should predict vase",
         "Over camera and environment, drawn anew for every picture",
         "Smallest 0.0123; no search found one at 0.0118",
     ):
@@ -299,7 +299,7 @@ def test_any_name_may_stand_in_a_chart(name: str) -> None:
 def test_the_worst_case_of_a_gap_does_not_hide_an_average_that_is_equal_to_it() -> None:
     average = {**AVERAGE, "accuracy": 1.0, "interval": [1.0, 1.0]}
     row = {**GAP["table"][0], "average": average, "worst": rated(0), "ending": "budget spent"}
-    figure = figure_of_answer(shown(gap(table=[row])))["png"]
+    figure = result_figure(shown(gap(table=[row])))["png"]
     pixels = np.asarray(Image.open(io.BytesIO(figure)).convert("RGB")).astype(int)
     pixels = pixels[: int(0.55 * len(pixels))]  # without the axis and the legend
     for colour in ((0x1D, 0x5F, 0xD0), (0xB3, 0x26, 0x1E)):
@@ -309,7 +309,7 @@ def test_the_worst_case_of_a_gap_does_not_hide_an_average_that_is_equal_to_it() 
 def test_every_row_of_a_gap_is_drawn_whole() -> None:
     row = {**GAP["table"][0], "worst": rated(10), "ending": "budget spent"}
     several = gap(table=[{**row, "control": name} for name in ("pose", "light", "camera")])
-    figure = figure_of_answer(shown(several))["png"]
+    figure = result_figure(shown(several))["png"]
     pixels = np.asarray(Image.open(io.BytesIO(figure)).convert("RGB")).astype(int)
     red = (pixels[..., 0] - pixels[..., 1:].max(axis=-1) > 20).any(axis=1).astype(int)
     edges = np.diff(np.concatenate([[0], red, [0]])).nonzero()[0].reshape(-1, 2)
@@ -343,8 +343,8 @@ ALL = "20 of 20 fresh renders (95 % interval 83-100 %)."
         ),
         (
             {"ending": "not verified", "verified": rated(3, 0.032, 0.379)},
-            "The search claims an answer that is not confirmed: the model is wrong about this mug in 3 of 20 fresh"
-            " renders (95 % interval 3.2-38 %).",
+            "The search claims a wrong prediction that is not confirmed: the model is wrong about this mug in 3 of 20 "
+            "fresh renders (95 % interval 3.2-38 %).",
         ),
         (
             {"ending": "already wrong", "clean": {**ATTACK["clean"], "label": "vase"}},
@@ -352,7 +352,7 @@ ALL = "20 of 20 fresh renders (95 % interval 83-100 %)."
         ),
         (
             {"ending": "interrupted", "verified": None},
-            "Interrupted after 40 steps. The answer so far is not verified: the model calls this mug a vase.",
+            "Interrupted after 40 steps. What was found so far is not verified: the model calls this mug a vase.",
         ),
         (
             {"ending": "interrupted", "verified": None, "adversarial": None, "steps": 0},
@@ -376,8 +376,8 @@ ALL = "20 of 20 fresh renders (95 % interval 83-100 %)."
         ),
         (
             {**TARGET, "ending": "not verified", "verified": rated(3, 0.032, 0.379)},
-            "The search claims an answer that is not confirmed: the model calls this mug a vase in 3 of 20 fresh"
-            " renders (95 % interval 3.2-38 %).",
+            "The search claims a wrong prediction that is not confirmed: the model calls this mug a vase in 3 of 20 "
+            "fresh renders (95 % interval 3.2-38 %).",
         ),
         (
             {**EASIER, "verified": rated(labels={"mug": 20})},

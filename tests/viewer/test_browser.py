@@ -36,18 +36,18 @@ from samples import attack as attack_with
 from stored_sweeps import described, make_sweep, serving
 
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.explain.answer import ExplainResult
-from advsearch.questions.harden.answer import HardenResult
+from advsearch.questions.explain.result import ExplainResult
+from advsearch.questions.harden.result import HardenResult
 from advsearch.questions.photographs.carry_out import Photographs
-from advsearch.questions.recipe.answer import RecipeResult
-from advsearch.questions.replay.answer import ReplayResult
-from advsearch.questions.stability.answer import StabilityResult
+from advsearch.questions.recipe.result import RecipeResult
+from advsearch.questions.replay.result import ReplayResult
+from advsearch.questions.stability.result import StabilityResult
 from advsearch.questions.sweep.page import write_bundle
-from advsearch.report.wording import answer_text, percent_number
+from advsearch.report.wording import percent_number, prediction_text
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results import Result
 from advsearch.runs.store import Row, Store, Told
-from advsearch.tasks import Answer
+from advsearch.tasks import Prediction
 from advsearch.viewer import thumbnails
 from advsearch.viewer.document import asset
 from advsearch.viewer.pages import write_page
@@ -348,16 +348,18 @@ def test_an_attack_that_goes_on_is_followed_step_by_step(browser: Browser, tmp_p
         with opened(browser, f"{server.address}runs/going/", 390) as page:
             page.wait_for_selector("#follow img")
             status = page.locator("#search .status")
-            assert status.inner_text() == "step 4, objective 4.00, answer mug"
+            assert status.inner_text() == "step 4, objective 4.00, prediction mug"
             evaluated(run, 6 - 1)
             evaluated(run, 6)
-            until(page, lambda: status.inner_text() == "step 6, objective 6.00, answer vase")
+            until(page, lambda: status.inner_text() == "step 6, objective 6.00, prediction vase")
             assert "pose.yaw\t60 degrees" in page.locator("#follow table").inner_text()
             assert "objective over 7 steps" in str(page.locator("svg.along").get_attribute("aria-label"))
             page.get_by_label("step of the search").fill("2")
             evaluated(run, 7)
             until(page, lambda: "8 of search" in page.locator("#state").inner_text())
-            assert status.inner_text() == "step 2, objective 2.00, answer mug"  # whoever looks back is not interrupted
+            assert (
+                status.inner_text() == "step 2, objective 2.00, prediction mug"
+            )  # whoever looks back is not interrupted
             page.get_by_role("button", name="Play").click()
             until(page, lambda: status.inner_text().startswith("step 4"))
             page.get_by_role("button", name="Stop").click()
@@ -380,7 +382,7 @@ def test_an_attack_is_compared_and_played(browser: Browser, attack: Path) -> Non
         step.fill("0")
         first = page.locator("#search img").get_attribute("src")
         page.get_by_role("button", name="Play").click()
-        until(page, lambda: page.locator("#search .status").inner_text() == "the answer")
+        until(page, lambda: page.locator("#search .status").inner_text() == "the adversarial scene")
         assert page.locator("#search img").get_attribute("src") != first
 
 
@@ -483,7 +485,7 @@ def test_everybody_can_use_the_pages(
     ],
     ids=lambda result: type(result).__name__,
 )  # fmt: skip
-def test_everybody_can_use_the_pages_of_answers(browser: Browser, tmp_path: Path, result: Result) -> None:
+def test_everybody_can_use_the_pages_of_results(browser: Browser, tmp_path: Path, result: Result) -> None:
     (tmp_path / "images").mkdir()
     for name in ("figure-1.png", "harden.png"):  # wider than a phone
         Image.new("RGB", (700, 40)).save(tmp_path / "images" / name)
@@ -548,7 +550,7 @@ def test_drawn_parameters_are_shown_in_the_parts_of_the_table(browser: Browser) 
         ("classification", "lamp", 0.99999),
     ):
         said = page.evaluate(f"{code} return said({task!r}, {label!r}, {share}); }})()")
-        assert said == answer_text(task, Answer(label, None, share)).replace(", ", " ").replace(" %", "\u00a0%")
+        assert said == prediction_text(task, Prediction(label, None, share)).replace(", ", " ").replace(" %", "\u00a0%")
 
 
 def test_intervals_are_those_of_clopper_and_pearson(browser: Browser, sweep: Path) -> None:

@@ -26,14 +26,14 @@ from stored_sweeps import make_sweep, serving
 from advsearch.attacks import clopper_pearson
 from advsearch.cli.main import main
 from advsearch.errors import InputError
-from advsearch.questions.photographs.answer import (
+from advsearch.questions.photographs.carry_out import Photographs, photo_agreement
+from advsearch.questions.photographs.result import (
     align_page,
     photo_file,
     rendering_file,
     rendering_names,
     sound_photo,
 )
-from advsearch.questions.photographs.carry_out import Photographs, photo_agreement
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Store
 from advsearch.viewer.clients import LARGEST_SENT, https_context, reachable

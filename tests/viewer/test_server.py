@@ -23,7 +23,7 @@ from samples import make_run, written_page
 from stored_sweeps import make_sweep, serving
 
 from advsearch.errors import InputError
-from advsearch.questions.photographs.answer import PhotoAgreement
+from advsearch.questions.photographs.result import PhotoAgreement
 from advsearch.runs.directory import RunDirectory
 from advsearch.viewer import clients
 from advsearch.viewer.document import document, has_other_scripts
@@ -328,7 +328,7 @@ def test_who_takes_no_answer_keeps_nobody_out(run: Path, monkeypatch: pytest.Mon
         ("/runs/none/", "text/plain; charset=utf-8", False),
     ],
 )
-def test_every_answer_has_a_kind_and_a_policy(run: Path, attack_run: Path, path: str, kind: str, own: bool) -> None:
+def test_every_result_has_a_kind_and_a_policy(run: Path, attack_run: Path, path: str, kind: str, own: bool) -> None:
     """A page of the server's own may ask it for more; all else has an origin of its own. Neither runs foreign code."""
     with serving(run, attack_run, photographs=NoPhotographs()) as server:
         answer, _ = ask(server, path)

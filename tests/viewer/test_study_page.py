@@ -13,8 +13,8 @@ from stored_sweeps import serving
 
 from advsearch.cli.main import main
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.recipe.answer import RecipeResult
-from advsearch.questions.stability.answer import StabilityResult
+from advsearch.questions.recipe.result import RecipeResult
+from advsearch.questions.stability.result import StabilityResult
 from advsearch.report.shown import fields_shown
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results import Result, StudyResult

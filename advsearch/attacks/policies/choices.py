@@ -72,21 +72,21 @@ class Race:
     def update(self, evaluated: Evaluated) -> Race:
         """Tell each search what came of its proposals, or of the first of them; every u and its evaluation are as its
         own domain has them."""
-        told = defaultdict[int, list[Any]](list)
+        by_runner = defaultdict[int, list[Any]](list)
         for number, (u, evaluation) in zip(self.asked, evaluated, strict=False):
-            told[number].append((u, evaluation))
+            by_runner[number].append((u, evaluation))
         runners = list(self.runners)
-        for number, own in told.items():
+        for number, own in by_runner.items():
             runner, reached = runners[number], max(evaluation.objective for _, evaluation in own)
             state = runner.policy.update(runner.state, own)
             runners[number] = replace(runner, state=state, best=max(runner.best, reached))
         spent = self.spent + sum(evaluation.cost for _, evaluation in evaluated)
         return replace(self, runners=tuple(runners), spent=spent, asked=())
 
-    def answer(self) -> Distribution | None:
+    def distribution(self) -> Distribution | None:
         """Return the leader's distribution, if it has one."""
         runner = self.runners[self.leader]
-        return runner.policy.answer(runner.state)
+        return runner.policy.distribution(runner.state)
 
     def failures(self) -> Failures | None:
         """Return the different failures of the search that has met the most; None where none looks for such."""
@@ -118,16 +118,16 @@ class Race:
         runners, field = list(self.runners), self.field
         queue = _queue(runners, field)
         each = -(-n // max(1, len(queue)))
-        given, taken = dict[int, tuple[Proposal, ...]](), Counter[int]()
+        proposals, taken = dict[int, tuple[Proposal, ...]](), Counter[int]()
         batch, asked = list[Proposal](), list[int]()
         while queue and len(batch) < n:
             _, place = queue[0]
             k = field[place]
             runner = runners[k]
-            if k not in given:
-                given[k], state = runner.policy.propose(runner.state, min(each, runner.left))
+            if k not in proposals:
+                proposals[k], state = runner.policy.propose(runner.state, min(each, runner.left))
                 runner = replace(runner, state=state)
-            if not given[k]:
+            if not proposals[k]:
                 # take out a search that has nothing more to propose; its share is for those left in the round
                 share, runners[k] = runners[k].left, replace(runners[k], left=0, over=True)
                 others = [other for other in field if not runners[other].over]
@@ -135,9 +135,9 @@ class Race:
                     runners[other] = replace(runners[other], left=runners[other].left + share // len(others))
                 queue = _queue(runners, field)
                 continue
-            if taken[k] == len(given[k]):  # what it proposes next, these evaluations say
+            if taken[k] == len(proposals[k]):  # what it proposes next, these evaluations say
                 break
-            wanted = given[k][taken[k]]
+            wanted = proposals[k][taken[k]]
             capped = replace(wanted, samples=min(runner.left, wanted.samples))
             later = self.round + 1 < self.rounds  # there will be renders to use a gradient
             batch.append(affordable(capped, runner.domain, runner.left + later))
@@ -148,7 +148,7 @@ class Race:
             if runners[k].left:
                 heappush(queue, (-runners[k].left, place))
         for k, count in taken.items():
-            if count < len(given[k]):  # it shall not count on more than was taken
+            if count < len(proposals[k]):  # it shall not count on more than was taken
                 _, state = runners[k].policy.propose(self.runners[k].state, count)
                 runners[k] = replace(runners[k], state=state)
         return tuple(batch), replace(self, runners=tuple(runners), asked=tuple(asked))
@@ -200,8 +200,8 @@ class Raced(Policy[Race]):
     def update(self, state: Race, evaluated: Evaluated) -> Race:
         return state.update(evaluated)
 
-    def answer(self, state: Race) -> Distribution | None:
-        return state.answer()
+    def distribution(self, state: Race) -> Distribution | None:
+        return state.distribution()
 
     def failures(self, state: Race) -> Failures | None:
         return state.failures()
@@ -311,8 +311,8 @@ class Choices(Policy[ChoicesState]):
     def counts(self, state: ChoicesState) -> Counts:
         return state.race.counts()
 
-    def answer(self, state: ChoicesState) -> Distribution | None:
-        inner = state.race.answer()
+    def distribution(self, state: ChoicesState) -> Distribution | None:
+        inner = state.race.distribution()
         if inner is None:
             return None
         deviation = torch.zeros_like(state.domain.start)
@@ -344,15 +344,15 @@ def _combinations(counts: list[int], begin: Tensor, most: int, generator: torch.
     random order, or so many distinct ones."""
     sizes = torch.tensor(counts)
     total = math.prod(counts)
-    own = torch.floor(begin * sizes).long().clamp(max=sizes - 1)
+    start = torch.floor(begin * sizes).long().clamp(max=sizes - 1)
     if total <= max(1024, 4 * most):
         every = torch.cartesian_prod(*(torch.arange(count) for count in counts)).reshape(total, len(counts))
         every = every[torch.randperm(total, generator=generator)]
-        picked = every[~(every == own).all(dim=1)][: most - 1]
+        picked = every[~(every == start).all(dim=1)][: most - 1]
     else:
-        seen = {tuple(own.tolist())}
+        seen = {tuple(start.tolist())}
         while len(seen) < most:
             seen.add(tuple(int(torch.randint(count, (1,), generator=generator)) for count in counts))
-        picked = torch.tensor(sorted(seen - {tuple(own.tolist())})).reshape(-1, len(counts))
+        picked = torch.tensor(sorted(seen - {tuple(start.tolist())})).reshape(-1, len(counts))
     middles = centre_of_option((picked + 0.5) / sizes, sizes)
     return torch.cat([begin[None], middles.to(begin.dtype)])

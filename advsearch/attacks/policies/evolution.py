@@ -86,7 +86,7 @@ class NES(Policy[NESState]):
     with w_k = max(0, ln(n/2 + 1) - ln(rank_k)) normalised to the sum 1, less 1/n, and rate = (3 + ln d) / (5 sqrt d).
     We depart from it in that samples come in pairs s and -s, and equal objectives share their weights.
 
-    Its answer is the distribution, beside the best configuration met: a set of configurations that are bad on average.
+    Its result is the distribution, beside the best configuration met: a set of configurations that are bad on average.
     Memory and time a render are a few vectors of the domain's size, so it takes textures too; but it needs twenty to a
     hundred renders for each number.
 
@@ -143,7 +143,7 @@ class NES(Policy[NESState]):
         mean = state.domain.project(state.mean + state.scale * state.deviation * towards)
         return replace(state, mean=mean, deviation=deviation, generation=state.generation + 1, values=())
 
-    def answer(self, state: NESState) -> Distribution:
+    def distribution(self, state: NESState) -> Distribution:
         return Distribution(state.mean, state.scale * state.deviation)
 
 
@@ -247,7 +247,7 @@ class CMAES(Policy[CMAESState]):
 
     A run whose largest deviation has fallen under a thousandth of half a range has nothing more to find. The next one
     begins at a sample of the domain with twice the population (Auger and Hansen 2005, "A restart CMA evolution strategy
-    with increasing population size"). The distribution answered is that of the run that met the largest objective.
+    with increasing population size"). The distribution returned is that of the run that met the largest objective.
 
     pycma's object changes as it goes and draws from numpy's global generator. Here it is copied before every change,
     and the generator is seeded for it and put back at once, so that states can be replayed and pickled.
@@ -297,7 +297,7 @@ class CMAES(Policy[CMAESState]):
         state = state.tell()
         return (state if float(state.deviations.max()) > NARROWEST else self._anew(state)).ask()
 
-    def answer(self, state: CMAESState) -> Distribution:
+    def distribution(self, state: CMAESState) -> Distribution:
         if state.before is not None and state.before[0] > state.best:
             return state.before[1]
         return state.distribution

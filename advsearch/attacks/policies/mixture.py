@@ -161,7 +161,7 @@ class Mixture(Policy[MixtureState]):
     maximisation to the draws that failed (as long as these are few, to those with the largest objectives), weighed by
     the even density over the mean density that they came from (the balance heuristic of Veach and Guibas 1995).
 
-    It answers with a failure for each component, and with the share of all configurations that fail: see
+    Its result is a failure for each component, and with the share of all configurations that fail: see
     `failure_share`. That share is of single renders with the search's samples. In an l2 ball the draws are projected,
     and no share is told.
 
@@ -226,8 +226,8 @@ class Mixture(Policy[MixtureState]):
             points, objectives = state.seen[failed], log[failed, 0]
             nearest = current.logs(points, state.ranges).argmax(dim=1)
             for k in sorted(set(nearest.tolist()), key=lambda k: -float(current.weights[k])):
-                own = (nearest == k).nonzero().flatten()
-                worst = int(own[objectives[own].argmax()])
+                members = (nearest == k).nonzero().flatten()
+                worst = int(members[objectives[members].argmax()])
                 u = state.configuration(points[worst])
                 listed.append(FoundFailure(u, float(objectives[worst]), state.telling(current, k)))
         elif bool(failed.any()):

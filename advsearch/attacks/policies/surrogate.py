@@ -1,6 +1,6 @@
 """A Gaussian process (Matérn-5/2, a length for each coordinate, noise) over the box blocks of a domain as one unit box.
 All is fitted by maximum likelihood over fixed grids, and every proposal is one of finitely many, so that last bits of a
-factorisation do not change an answer."""
+factorisation do not change a result."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ class Draw:
         return canonical if self.rng is None else choices[int(self.rng.integers(len(choices)))]
 
     def chance(self, probability: float, canonical: bool = False) -> bool:
-        """Return True with a probability, or the canonical answer."""
+        """Return True with a probability, or the canonical one."""
         return canonical if self.rng is None else bool(self.rng.random() < probability)
 
     def offset(self) -> npt.NDArray[np.float64]:

@@ -57,7 +57,7 @@ def source(loaded: Loaded) -> Source:
     """Return the source of a network that is finished when names are there, or a free answer is asked for. Raises
     ModelError where it has an encoder for texts of its own, or its processor can't be had."""
     if getattr(loaded.network.config, "is_encoder_decoder", False):
-        raise _another(loaded, "answers from an encoder of its own")
+        raise _another(loaded, "reads from an encoder of its own")
     try:
         processor = loaded.part("AutoProcessor")
     except ModelError as error:
@@ -275,11 +275,11 @@ class _Reader(nn.Module):
     def begin(self, image: Tensor) -> tuple[Tensor, Any]:
         """Return the logits (tokens,) float32 of what follows picture and prompt, and the keys and values so far.
         Raises ValueError where the network keeps none."""
-        answer = self.network(**self.given(image), use_cache=True)
-        past = answer.get(self.cache)
+        returned = self.network(**self.given(image), use_cache=True)
+        past = returned.get(self.cache)
         if past is None:
             raise ValueError("it keeps no keys and values of what it has read")
-        return answer.logits[0, -1].float(), past
+        return returned.logits[0, -1].float(), past
 
     def go_on(self, tokens: Tensor, past: Any) -> Tensor:
         """Return the logits (N, L, tokens) float32 of what follows each of N x L tokens; `past` is of one picture."""
@@ -371,7 +371,7 @@ def _check(loaded: Loaded, module: _Named, side: tuple[int, int]) -> None:
             whole[key] = torch.cat([value, torch.full_like(name, kind)[None]], dim=1)
     logits = loaded.network(**whole).logits
     if logits.shape[1] != whole["input_ids"].shape[1]:
-        raise _another(loaded, "answers with logits of another length than the text has")
+        raise _another(loaded, "returns logits of another length than the text has")
     likely = logits[0, -len(name) - 1 : -1].float().log_softmax(dim=-1)
     own, ours = float(likely.gather(1, name[:, None]).sum()), float(module(image[None])[0, number])
     size = max(TOLERANCE, 8.0 * torch.finfo(loaded.network.dtype).eps) * max(1.0, abs(own))

@@ -127,7 +127,7 @@ SIDES = (96, 160)
 """Sides in pixels of the square pictures that a processor is shown."""
 
 TOLERANCE = 1e-3
-"""Of the range of a processor's answers: what it may be off from an affine map."""
+"""Of the range of a processor's outputs: what it may be off from an affine map."""
 
 FILES = ("preprocessor_config.json", "processor_config.json")
 """Where a repository keeps its processor."""
@@ -159,13 +159,13 @@ def measured(processor: Any, spec: str) -> Measured:
     does.
 
     Pictures of one colour tell gain and offset of each channel, whatever is resized or cropped: with x in [0, 1],
-    ``gain x + offset = (x - mean) / std``. The size is that of a square picture's answer. A processor that does
+    ``gain x + offset = (x - mean) / std``. The size is that of a square picture's output. A processor that does
     something else to the values of pixels is returned, to be called, if a gradient goes through it. Raises ModelError:
     no gradient does, or it pads pictures or cuts them into patches.
     """
 
     def shown(colour: tuple[int, int, int], side: int = SIDES[0]) -> Array:
-        return _answer(processor, np.full((side, side, 3), colour, np.uint8), spec)
+        return _processed(processor, np.full((side, side, 3), colour, np.uint8), spec)
 
     black = shown((0, 0, 0))
     found = Measured()
@@ -187,11 +187,11 @@ def measured(processor: Any, spec: str) -> Measured:
     return Measured(mean=_triple(-offset / gain), std=_triple(1.0 / gain), channels=own[0], **found)
 
 
-def _answer(processor: Any, picture: Any, spec: str) -> Array:
-    """Return a processor's answer (3, h, w) to an 8-bit picture (H, W, 3)."""
+def _processed(processor: Any, picture: Any, spec: str) -> Array:
+    """Return a processor's output (3, h, w) for an 8-bit picture (H, W, 3)."""
     values: Array = np.asarray(processor(images=picture, return_tensors="np")["pixel_values"], np.float64)
     if values.ndim != 4 or values.shape[:2] != (1, 3):
-        raise _other(spec, processor, f"answers with an array of shape {values.shape} in place of (1, 3, H, W)")
+        raise _other(spec, processor, f"returns an array of shape {values.shape} in place of (1, 3, H, W)")
     picked: Array = values[0]
     return picked
 
@@ -199,11 +199,11 @@ def _answer(processor: Any, picture: Any, spec: str) -> Array:
 def _called(processor: Any, spec: str, found: Measured, what: str) -> Measured:
     """Return what was found, with the processor to be called on a picture of that size."""
     height, width = found.get("input_size", (SIDES[0], SIDES[0]))
-    ends = [_answer(processor, np.full((SIDES[0], SIDES[0], 3), level, np.uint8), spec) for level in (0, 255)]
+    ends = [_processed(processor, np.full((SIDES[0], SIDES[0], 3), level, np.uint8), spec) for level in (0, 255)]
     if (ends[0] == ends[1]).all(axis=0).any():
         raise _other(spec, processor, "pads a square picture, or leaves some of its pixels out")
     levels = np.random.default_rng(0).integers(0, 256, (height, width, 3), np.uint8)
-    asked = _answer(partial(processor, **_as_it_is(processor)), levels, spec)
+    asked = _processed(partial(processor, **_as_it_is(processor)), levels, spec)
     picture = (torch.from_numpy(levels).float() / 255.0).movedim(2, 0)[None].requires_grad_()
     call = partial(_process, processor)
     try:
@@ -216,12 +216,12 @@ def _called(processor: Any, spec: str, found: Measured, what: str) -> Measured:
         raise _other(spec, processor, f"{what}, and lets no gradient through ({first_line(error)}){advice}") from error
     off = np.abs(seen.detach().double().numpy() - asked).max() if seen.shape == (1, *asked.shape) else np.inf
     if not reaches or not off <= TOLERANCE * np.ptp(asked):
-        raise _other(spec, processor, f"{what}, and rounds or answers otherwise where a gradient goes through it")
+        raise _other(spec, processor, f"{what}, and rounds or does otherwise where a gradient goes through it")
     return Measured(processor=call, **found)
 
 
 def _process(processor: Any, images: Tensor) -> Tensor:
-    """Return what a processor answers to pictures (N, 3, H, W) in [0, 1]: it is shown numbers up to 255, unrounded."""
+    """Return what a processor returns for pictures (N, 3, H, W) in [0, 1]: it is shown numbers up to 255, unrounded."""
     does = partial(processor, return_tensors="pt", **_as_it_is(processor))
     return torch.cat([does(images=255.0 * one)["pixel_values"] for one in images]).to(images)
 

@@ -1,4 +1,4 @@
-"""Networks of transformers that answer with features (DINOv2, ViT, the half of CLIP that sees pictures) or by pixel.
+"""Networks of transformers that return features (DINOv2, ViT, the half of CLIP that sees pictures) or by pixel.
 
 For every pixel some say how far it is, as Depth Anything does, others masks and their classes: these, as Mask2Former,
 become segmenters by the class of each pixel.
@@ -29,13 +29,13 @@ TASK = "similarity"
 
 ENDINGS = ("Model", "ModelWithProjection")
 PARTS = ("image_embeds", "pooler_output", "last_hidden_state")
-"""What holds the features in answers of transformers, the best first."""
+"""What holds the features in outputs of transformers, the best first."""
 
 TOKENS = ("cls_token", "class_embedding", "class_token")
 """How weights of a first token are called that stands for the whole picture."""
 
 
-def answers_with_features(architecture: str, network: Any) -> bool:
+def gives_features(architecture: str, network: Any) -> bool:
     """Whether a network of transformers, or the class of one, has features of a picture and no head; its architecture
     is a name such as Dinov2Model or CLIPVisionModelWithProjection. None stands for one that transformers has not."""
     if network is None or not architecture.endswith(ENDINGS) or zero_shot.compares(network):
@@ -62,7 +62,7 @@ def no_classes(name: str, what: str) -> ModelError:
     """Return the error for a model that is asked for classes and has features only; `what` it is: "is a
     Dinov2Model"."""
     return ModelError(
-        f"model {name}: {what}, which answers with features and has no classes: use `task={TASK}`, which compares "
+        f"model {name}: {what}, which returns features and has no classes: use `task={TASK}`, which compares "
         "them with those of other pictures, or give a network with a head"
     )
 
@@ -90,17 +90,17 @@ def _finished(loaded: Loaded, plain: Callable[[Loaded], Source] | None, purpose:
     return found if found.finish is None else found.finish(purpose)
 
 
-def pooled(answer: Any, *, token: bool) -> Tensor | None:
-    """Return the features (N, D) in an answer of a network, a tensor (N, D) or what has one of `PARTS`; None where
+def pooled(returned: Any, *, token: bool) -> Tensor | None:
+    """Return the features (N, D) in an output of a network, a tensor (N, D) or what has one of `PARTS`; None where
     there are none. Maps (N, D, H, W) are averaged over their positions. Of several tokens (N, T, D), the first stands
     for the picture if `token`, otherwise their mean."""
     for part in PARTS:
-        value = answer.get(part) if isinstance(answer, Mapping) else getattr(answer, part, None)
+        value = returned.get(part) if isinstance(returned, Mapping) else getattr(returned, part, None)
         if isinstance(value, Tensor):
             if value.dim() == 3:
                 return value[:, 0] if token else value.mean(dim=1)
             return value.flatten(2).mean(dim=2) if value.dim() == 4 else value
-    return answer if isinstance(answer, Tensor) else None
+    return returned if isinstance(returned, Tensor) else None
 
 
 class _Features(nn.Module):
@@ -114,9 +114,9 @@ class _Features(nn.Module):
 
     def forward(self, images: Tensor) -> Tensor:
         asked = self.network.get_image_features if self.compares else self.network
-        answer = asked(pixel_values=images)
-        found = pooled(answer, token=self.has_token)
-        return answer if found is None else found
+        returned = asked(pixel_values=images)
+        found = pooled(returned, token=self.has_token)
+        return returned if found is None else found
 
 
 DISPARITY, METRIC = "relative disparity", "metric depth"
@@ -127,7 +127,7 @@ BY_FAMILY = {"dpt": DISPARITY, "depth_pro": DISPARITY, "zoedepth": METRIC, "glpn
 
 
 def depth_source(loaded: Loaded) -> Source:
-    """Return the source of a network that answers with how far each pixel is."""
+    """Return the source of a network that returns how far each pixel is."""
     return loaded.source(_DepthMap(loaded.network, bool(getattr(loaded.processor, "do_pad", False))))
 
 
@@ -167,12 +167,12 @@ SENTENCE = "the task is semantic"
 
 
 def is_ours(architecture: str, network: Any) -> bool:
-    """Whether an architecture answers with masks and their classes."""
+    """Whether an architecture returns masks and their classes."""
     return OURS.fullmatch(architecture) is not None
 
 
 def mask_source(loaded: Loaded, labels: tuple[str, ...] | None) -> Source:
-    """Return the source of a network that answers with masks and their classes. Warns what its scores are
+    """Return the source of a network that returns masks and their classes. Warns what its scores are
     (ModelWarning)."""
     warnings.warn(
         f"model {loaded.name} gives a pixel a score of each class, summed over its masks, which is no logit: its "
@@ -211,8 +211,8 @@ class _MaskQueries(nn.Module):
     def forward(self, images: Tensor) -> Tensor:
         size = (images.shape[2], images.shape[3])
         tokens = {} if self.told is None else {"task_inputs": self.told.expand(len(images), -1)}
-        answer = self.network(pixel_values=images, **tokens)
-        masks, classes = answer.masks_queries_logits, answer.class_queries_logits.softmax(dim=-1)[..., :-1]
+        returned = self.network(pixel_values=images, **tokens)
+        masks, classes = returned.masks_queries_logits, returned.class_queries_logits.softmax(dim=-1)[..., :-1]
         if self.family == "mask2former":
             masks = functional.interpolate(masks, size=FINE, mode="bilinear")
         elif self.family.startswith("eomt"):

@@ -126,7 +126,7 @@ def _kind(architecture: str, network: Any, spec: str) -> Family:
         f"model {spec}: is a {architecture}; expected one whose name has ForImageClassification, "
         "ForSemanticSegmentation, ForUniversalSegmentation, ForObjectDetection or ForDepthEstimation in it, one that "
         "compares pictures with texts, as CLIPModel, one that goes on in words, as LlavaForConditionalGeneration, or "
-        "one that has features, as Dinov2Model. Wrap another in an nn.Module whose answer a task can judge, your own "
+        "one that has features, as Dinov2Model. Wrap another in an nn.Module whose output a task can judge, your own "
         "too, and give that from Python"
     )
 
@@ -236,11 +236,11 @@ class _Detector(nn.Module):
         self.network, self.classes = network, len(network.config.id2label)
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
-        answer = self.network(pixel_values=images)
-        boxes = in_pixels(answer.pred_boxes, images)
-        if answer.logits.shape[-1] > self.classes:
-            return boxes, answer.logits.softmax(dim=-1)[..., :-1]
-        return boxes, answer.logits.sigmoid()
+        returned = self.network(pixel_values=images)
+        boxes = in_pixels(returned.pred_boxes, images)
+        if returned.logits.shape[-1] > self.classes:
+            return boxes, returned.logits.softmax(dim=-1)[..., :-1]
+        return boxes, returned.logits.sigmoid()
 
 
 def _with_names(make: Callable[[Any], nn.Module]) -> Callable[[Loaded], Source]:
@@ -276,7 +276,7 @@ NETWORKS = (
         "AutoModel",
         outputs.also(zero_shot.source, reads_text=True),
     ),
-    Family(outputs.answers_with_features, "", outputs.source),
+    Family(outputs.gives_features, "", outputs.source),
 )
 """Every kind that is read, the particular ones first."""
 

@@ -114,8 +114,8 @@ def _embedded(network: Any, tokenizer: Any, texts: Sequence[str]) -> Tensor:
     return functional.normalize(torch.cat(rows), dim=-1)
 
 
-def _pooled(answer: Any) -> Tensor:
-    features: Tensor = getattr(answer, "pooler_output", answer)
+def _pooled(returned: Any) -> Tensor:
+    features: Tensor = getattr(returned, "pooler_output", returned)
     return features.float()
 
 
@@ -254,9 +254,9 @@ class _Grounded(nn.Module):
         self.register_buffer("places", places)
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
-        answer = self.network(pixel_values=images, input_ids=self.text.expand(len(images), -1))
-        scores = answer.logits[..., self.places].amax(dim=-1).sigmoid()
-        return in_pixels(answer.pred_boxes, images), scores
+        returned = self.network(pixel_values=images, input_ids=self.text.expand(len(images), -1))
+        scores = returned.logits[..., self.places].amax(dim=-1).sigmoid()
+        return in_pixels(returned.pred_boxes, images), scores
 
 
 def _grounded(

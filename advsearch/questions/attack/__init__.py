@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from advsearch.question import Asked, question
-from advsearch.questions.attack.answer import claims as claims
-from advsearch.questions.attack.answer import shown as shown
+from advsearch.questions.attack.display import claims as claims
+from advsearch.questions.attack.display import shown as shown
 from advsearch.questions.attack.page import page as page
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.summary import BY_FIELD as BY_FIELD

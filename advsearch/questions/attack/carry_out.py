@@ -17,7 +17,7 @@ from advsearch.attacks.objectives import OBJECTIVE_KINDS
 from advsearch.cluster import Call
 from advsearch.config import SceneConfig
 from advsearch.controls.values import sentences
-from advsearch.engine.journal import Journal, Shared, answering, check_made_of
+from advsearch.engine.journal import Journal, Shared, check_made_of, worker_call
 from advsearch.engine.judging import Metric, check_shared, load_metrics, metrics_as_settings
 from advsearch.engine.judging import only_here as metrics_only_here
 from advsearch.engine.loading import Controls, Scene, load_scene, only_here, scene_as_settings, settings_of
@@ -96,10 +96,10 @@ def attack(
         objective: "margin", "log_odds", "cross_entropy", "dlr", "feature_distance", "score", or a function of (output,
             images (N, H, W, 3), truth, or the target where there is one) or of (output, labels) that returns (N,)
             values, which are maximised; in classification the output is logits (N, C) and the truth the index of the
-            right answer, (N,), or a tuple of several. It may ask for more by the names of further parameters: `u`,
+            right label, (N,), or a tuple of several. It may ask for more by the names of further parameters: `u`,
             `texture`, `inputs`, `configuration` (docs/own-loss.md). None takes the task's own.
         policy: a name, a mapping with a `name` and options, or an instance.
-        over: controls that vary by chance: the answer has to hold for all of their values.
+        over: controls that vary by chance: the configuration has to hold for all of their values.
         metrics: columns of the rows, by name: functions of (image (H, W, 3) sRGB in [0, 1], output of that picture,
             truth: the index of the right class) that return a number or a dict. `workers` need functions of a module.
         run: folder to keep the run in; None keeps it in memory only.
@@ -240,11 +240,11 @@ def _carry_out(job: AttackParts, progress: Progress, resumed: str | Path | None 
             functions = {f"metric {name}": one for name, one in job.metrics.items()}
             objective = {"objective": job.objective} if callable(job.objective) else {}
             check_made_of(kept, [job.loaded[0]], {**functions, **objective, "task": function_of(job.task)})
-        with executor_for(job.config, "advsearch.questions.attack.carry_out:attack_answers", progress) as executor:
+        with executor_for(job.config, "advsearch.questions.attack.carry_out:attack_worker", progress) as executor:
             journal = Journal(kept, Shared(problem, executor))
             if problem.conditions is not None and None in (job.config.steps, job.config.draws):
                 progress.message(
-                    f"One answer for many conditions: {count(problem.steps, 'step')}, each over "
+                    f"One configuration for many conditions: {count(problem.steps, 'step')}, each over "
                     f"{count(problem.draws, 'condition')}; `steps` and `draws` change that."
                 )
             findings = Attack(journal, job.config, policy, stages, clean=job.clean).carry_out()
@@ -254,10 +254,10 @@ def _carry_out(job: AttackParts, progress: Progress, resumed: str | Path | None 
         return replace(result, parts=lambda: parts)
 
 
-def attack_answers(settings: JsonObject) -> Call:
-    """Return what answers the queries of the attack that the settings describe: what a worker does."""
+def attack_worker(settings: JsonObject) -> Call:
+    """Return what evaluates the queries of the attack that the settings describe: what a worker does."""
     problem = problem_on(parts_of(AttackConfig(**settings)))
-    return answering(lambda name: problem)
+    return worker_call(lambda name: problem)
 
 
 def _policy(job: AttackParts, problem: Problem) -> Policy[Any]:

@@ -21,7 +21,7 @@ from advsearch.questions.attack import summary as results
 from advsearch.questions.attack.result import (
     AttackResult,
     KeptPicture,
-    answer_along,
+    along_drive,
     save_trial,
     trial_to_show,
     write_artifacts,
@@ -30,7 +30,7 @@ from advsearch.questions.attack.result import (
 )
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.stages import UNPRINTED
-from advsearch.questions.attack.summary import AttackSummary, PicturedAnswer
+from advsearch.questions.attack.summary import AttackSummary, PicturedPrediction
 from advsearch.report.wording import number_text
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.files import write_bytes
@@ -45,7 +45,7 @@ from advsearch.runs.results import (
     VariedValue,
     VerifiedRate,
 )
-from advsearch.runs.summary import write_answer
+from advsearch.runs.summary import write_configuration
 from advsearch.tasks import Judgement
 from advsearch.tasks.base import mean
 from advsearch.viewer.pages import write_page
@@ -82,9 +82,9 @@ def summarise(
         write_object(run, problem, u)
         for name, data in space.files(u).items():
             write_bytes(run.path / "artifacts" / name, data)
-        write_answer(run.path, u.numpy())
+        write_configuration(run.path, u.numpy())
     summary = _summary(config, objective, problem, findings, clean, adversarial)
-    drive = None if findings.interrupted else answer_along(problem, None if search is None else u, findings.spp, run)
+    drive = None if findings.interrupted else along_drive(problem, None if search is None else u, findings.spp, run)
     kept = {"run": None if run is None else str(run.path), "warnings": warnings, "drive": drive}
     shared = SharedWork.of_facts(journal.traced.facts, journal.machines.known)
     summary = summary.model_copy(
@@ -154,13 +154,13 @@ def _summary(
         image_formation=Formation.of(problem.renderer.formation),
         gradient_plan=problem.plan_summary(problem.plan),
         light_path_segments=results.PathSegments(search=problem.search_depth or depth, verification=depth),
-        clean=results.CleanAnswer(
-            **_answer(clean),
+        clean=results.CleanPrediction(
+            **_prediction(clean),
             correct=clean.judgement.right,
             moved=[MovedValue.of(value) for value in problem.space.moved],
             control=control_group(findings.clean, findings.spp) if findings.clean else None,
         ),
-        adversarial=None if search is None else results.PicturedAnswer(**_answer(adversarial)),
+        adversarial=None if search is None else results.PicturedPrediction(**_prediction(adversarial)),
         verified=_verified(findings.verification),
         tried_objective=results.TriedObjective(
             clean=_objective_over(findings.clean),
@@ -180,7 +180,7 @@ def _summary(
         printability=_printability(problem, findings) if config.printable else None,
         distribution=None
         if distribution is None
-        else results.AnswerDistribution(
+        else results.SearchDistribution(
             mean=_described(problem, distribution.mean), deviation=distribution.deviation.tolist()
         ),
         failures=described_failures(problem, findings),
@@ -216,7 +216,8 @@ def _objective_over(trials: Sequence[Judgement]) -> results.ObjectiveValues | No
 
 
 def _printability(problem: Problem, findings: Findings) -> results.Printability:
-    """The print terms, and the margin of the answer beside that of the search without them, if both were verified."""
+    """The print terms, and the margin of the adversarial scene beside that of the search without them, if both were
+    verified."""
     space, domain = problem.searched_space, problem.domain
     cost = None
 
@@ -234,16 +235,16 @@ def _printability(problem: Problem, findings: Findings) -> results.Printability:
             verified=theirs,
             terms=terms(unprinted),
         )
-    answer = None if findings.search is None else terms(findings.search)
-    return results.Printability(clean=print_terms(space, domain.start), answer=answer, cost=cost)
+    adversarial = None if findings.search is None else terms(findings.search)
+    return results.Printability(clean=print_terms(space, domain.start), answer=adversarial, cost=cost)
 
 
 def _alone(values: dict[str, T]) -> T | dict[str, T]:
     return next(iter(values.values())) if len(values) == 1 else values
 
 
-def _answer(shown: KeptPicture) -> dict[str, Any]:
-    return {**vars(shown.judgement.answer), "payload": shown.judgement.payload, "trial": shown.trial}
+def _prediction(shown: KeptPicture) -> dict[str, Any]:
+    return {**vars(shown.judgement.prediction), "payload": shown.judgement.payload, "trial": shown.trial}
 
 
 def _described(problem: Problem, u: Tensor) -> dict[str, DescribedValue]:
@@ -252,7 +253,8 @@ def _described(problem: Problem, u: Tensor) -> dict[str, DescribedValue]:
 
 
 def _found_values(problem: Problem, u: Tensor) -> dict[str, results.FoundValue]:
-    """The answer in a few values, each beside the clean scene's and, of a single number, both ends of its range."""
+    """The adversarial configuration in a few values, each beside the clean scene's and, of a single number, both ends
+    of its range."""
     start = problem.domain.start
     single = [group for group in problem.space.groups if group.size == 1 and group.begin < len(start)]
     ends = []
@@ -421,7 +423,9 @@ def _described_failure(
         holds=None if checked is None else checked.ending is Ending.FOUND,
         verified=None if checked is None else verified_rate(checked),
         picture=None if checked is None else f"images/{_picture(number)}.png",
-        pictured=None if first is None else PicturedAnswer(**vars(first.answer), payload=first.payload, trial=0),
+        pictured=None
+        if first is None
+        else PicturedPrediction(**vars(first.prediction), payload=first.payload, trial=0),
     )
 
 

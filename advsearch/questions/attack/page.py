@@ -1,4 +1,4 @@
-"""The page of an attack: what is shown of its answer, with pictures, the course of the search and how it worked.
+"""The page of an attack: what is shown of its result, with pictures, the course of the search and how it worked.
 
 Without its script it lacks the slider and the animation.
 """
@@ -16,17 +16,17 @@ import numpy as np
 from PIL import Image, ImageSequence
 
 from advsearch.questions.attack import wording
-from advsearch.questions.attack.answer import answered_text, failures_part, failures_text, range_text, shown
-from advsearch.questions.attack.summary import AttackSummary, FoundValue, PicturedAnswer
+from advsearch.questions.attack.display import failures_part, failures_text, most_predicted, range_text, shown
+from advsearch.questions.attack.summary import AttackSummary, FoundValue, PicturedPrediction
 from advsearch.report.figures import search_axes
-from advsearch.report.shown import AnswerPart, Picture
+from advsearch.report.shown import Picture, ResultPart
 from advsearch.report.wording import (
     SUCCESS_ABOVE_ZERO,
-    answer_text,
     formation_text,
     marks_text,
     number_text,
     objective_label,
+    prediction_text,
     seconds_text,
 )
 from advsearch.runs import directory, images, store
@@ -44,8 +44,12 @@ AT_THE_END = 1e-6
 """Of a range: as near as that to one of its ends a value was stopped by it."""
 
 
+MARKED, FORMERLY_MARKED = "-prediction.png", "-answer.png"
+"""How files with marks end, and how those of runs that were made before do."""
+
+
 def page(run: Path, result: Result) -> str | None:
-    """Return the page of an attack in the folder `run`; None of several, which are shown as all answers are.
+    """Return the page of an attack in the folder `run`; None of several, which are shown as all results are.
 
     Raises:
         FileFormatError: the results are damaged.
@@ -62,8 +66,8 @@ def page(run: Path, result: Result) -> str | None:
         *_failures(result),
         _rates(result, given.sections[0]),
         _curve(result, curves),
-        AnswerPart("How the search worked", rows=_named(wording.method_facts(result)), folded=True),
-        AnswerPart(wording.plan_text(result), heads=wording.PLAN_HEADS, rows=wording.plan_rows(result), folded=True),
+        ResultPart("How the search worked", rows=_named(wording.method_facts(result)), folded=True),
+        ResultPart(wording.plan_text(result), heads=wording.PLAN_HEADS, rows=wording.plan_rows(result), folded=True),
     ]
     seconds = result.seconds
     parts = ", ".join(f"{name} {seconds_text(value)}" for name, value in seconds.items() if name != "total")
@@ -89,36 +93,37 @@ def _named(facts: dict[str, str]) -> list[list[str]]:
     return [[name, text] for name, text in facts.items() if text]
 
 
-def _pictures(run: Path, summary: AttackSummary, *, animated: bool) -> Iterator[AnswerPart]:
-    """What the model sees, and what it answers; trials of the verification, the search, and frames along a drive."""
-    said = [("clean", "Clean", _answer(summary, summary.clean))]
-    said.append(("adversarial", "Adversarial", _answer(summary, summary.adversarial)))
+def _pictures(run: Path, summary: AttackSummary, *, animated: bool) -> Iterator[ResultPart]:
+    """What the model sees, and what it predicts; trials of the verification, the search, and frames along a drive."""
+    said = [("clean", "Clean", _prediction(summary, summary.clean))]
+    said.append(("adversarial", "Adversarial", _prediction(summary, summary.adversarial)))
     seen = [Picture(f"images/{file}.png", text, name) for file, name, text in said]
     gain = f"{images.DIFFERENCE_GAIN:g} times magnified, grey where nothing changed"
     seen.append(Picture("images/difference.png", gain, "Difference"))
-    yield AnswerPart("What the model sees", pictures=[seen], note=_same_conditions(summary))
-    yield AnswerPart(live="compare")
-    answered = [Picture(f"images/{file}-answer.png", text, name) for file, name, text in said]
-    if (run / answered[0].file).is_file():
+    yield ResultPart("What the model sees", pictures=[seen], note=_same_conditions(summary))
+    yield ResultPart(live="compare")
+    ends = MARKED if (run / directory.IMAGES / f"clean{MARKED}").is_file() else FORMERLY_MARKED
+    marked = [Picture(f"images/{file}{ends}", text, name) for file, name, text in said]
+    if (run / marked[0].file).is_file():
         marks = marks_text(summary.task)
-        yield AnswerPart("What it answers", pictures=[answered], layout="large", note=marks)
+        yield ResultPart("What it predicts", pictures=[marked], layout="large", note=marks)
     trials = sorted(file.name for file in (run / directory.IMAGES).glob("verification*.png"))
-    trials = ([name for name in trials if name.endswith("-answer.png")] or trials)[:MOST_TRIALS]
-    numbers = [Path(name).stem.removeprefix("verification").removesuffix("-answer").strip("-_") for name in trials]
+    trials = ([name for name in trials if name.endswith(ends)] or trials)[:MOST_TRIALS]
+    numbers = [name.removesuffix(ends).removeprefix("verification").removesuffix(".png").strip("-_") for name in trials]
     small = [Picture(f"images/{name}", f"trial {one}") for name, one in zip(trials, numbers, strict=True)]
     if small:
-        yield AnswerPart("Pictures of the verification", pictures=[small], layout="small", folded=True)
+        yield ResultPart("Pictures of the verification", pictures=[small], layout="small", folded=True)
     if animated:
-        yield AnswerPart("The search, step by step", live="search")
+        yield ResultPart("The search, step by step", live="search")
     if summary.drive is not None:
         files, frames = {"drive-clean": "Clean", "drive": "Adversarial"}, "from the first frame to the last"
         strips = [Picture(f"images/{file}.png", frames, name) for file, name in files.items()]
         note = f"The model is {wording.drive_text(summary)}."
-        yield AnswerPart("Along the drive", pictures=[strips], layout="rows", note=note)
+        yield ResultPart("Along the drive", pictures=[strips], layout="rows", note=note)
 
 
-def _answer(summary: AttackSummary, answer: PicturedAnswer | None) -> str:
-    return "no answer recorded" if answer is None else answer_text(summary.task, answer)
+def _prediction(summary: AttackSummary, prediction: PicturedPrediction | None) -> str:
+    return "no prediction recorded" if prediction is None else prediction_text(summary.task, prediction)
 
 
 def _same_conditions(summary: AttackSummary) -> str:
@@ -131,8 +136,9 @@ def _same_conditions(summary: AttackSummary) -> str:
     return f"Both of trial {trial}, with the same {where}; in other trials they, and what the model says, are others."
 
 
-def _changes(summary: AttackSummary) -> AnswerPart:
-    """The answer in a few values, each beside its range where it has one, from the clean value to the one found."""
+def _changes(summary: AttackSummary) -> ResultPart:
+    """The adversarial configuration in a few values, each beside its range where it has one, from the clean value to
+    the one found."""
     found = summary.configuration or {}
     rows = [
         [name, "" if value.clean is None else number_text(value.clean), _value_text(value), _range_text(value)]
@@ -140,7 +146,7 @@ def _changes(summary: AttackSummary) -> AnswerPart:
     ]
     heads = ("parameter", "clean", "adversarial", "in its range")
     kept = [at for at in range(len(heads)) if any(row[at] for row in rows)]
-    return AnswerPart(
+    return ResultPart(
         "What was changed" if rows else "",
         heads=[heads[at] for at in kept],
         rows=[[row[at] for at in kept] for row in rows],
@@ -176,7 +182,7 @@ def _place(changed: FoundValue) -> tuple[float, float, float] | None:
     return low, high, mark
 
 
-def _textures(run: Path) -> AnswerPart:
+def _textures(run: Path) -> ResultPart:
     """The texture of the object, and of every other mesh (`texture@NAME.png`), before and after."""
     names = sorted(file.name for file in (run / directory.ARTIFACTS).glob("texture*-original.png"))
     before = [name for name in names if re.fullmatch(r"texture(@[\w-]+)?-original\.png", name)]
@@ -186,10 +192,10 @@ def _textures(run: Path) -> AnswerPart:
         pictures.append(Picture(f"artifacts/{original}", "texture as it was", "Original"))
         pictures.append(Picture(changed, f"texture that was found; {changed}", "Adversarial"))
     title = "The textures" if len(before) > 1 else "The texture"
-    return AnswerPart(title, pictures=[pictures] if pictures else [], layout="pair")
+    return ResultPart(title, pictures=[pictures] if pictures else [], layout="pair")
 
 
-def _failures(summary: AttackSummary) -> Iterator[AnswerPart]:
+def _failures(summary: AttackSummary) -> Iterator[ResultPart]:
     known = summary.failures
     if known is None:
         return
@@ -197,7 +203,7 @@ def _failures(summary: AttackSummary) -> Iterator[AnswerPart]:
         Picture(
             failure.picture,
             range_text(failure),
-            answer_text(summary.task, failure.pictured) if failure.pictured else answered_text(failure),
+            prediction_text(summary.task, failure.pictured) if failure.pictured else most_predicted(failure),
         )
         for failure in known.listed
         if failure.picture and failure.holds
@@ -206,7 +212,7 @@ def _failures(summary: AttackSummary) -> Iterator[AnswerPart]:
     yield replace(failures_part(known), title="Different failures", text=said, pictures=[pictures] if pictures else [])
 
 
-def _rates(summary: AttackSummary, table: AnswerPart) -> AnswerPart:
+def _rates(summary: AttackSummary, table: ResultPart) -> ResultPart:
     """The table of rates, these first, for a phone cuts what is on the right, with a bar for each; empty where nothing
     was rated."""
     baseline, average = summary.baseline, summary.average
@@ -215,24 +221,24 @@ def _rates(summary: AttackSummary, table: AnswerPart) -> AnswerPart:
     bars = [None if rate is None else (*rate.interval, rate.rate) for rate in rated]
     bars += [(*average.interval, average.accuracy)] if average else []
     if not any(bars):
-        return AnswerPart()
+        return ResultPart()
     spp = f", {summary.verified.spp} samples per pixel" if summary.verified else ""
     note = f"Fresh seeds, pictures rounded to 8 bits, Clopper-Pearson intervals{spp}."
     heads, *rows = ([row[0], *row[3:], *row[1:3]] for row in (table.heads, *table.rows))
     return replace(table, title="Verified rates", heads=heads, rows=rows, bars=bars, note=note)
 
 
-def _curve(summary: AttackSummary, curves: dict[str, list[float | None]]) -> AnswerPart:
+def _curve(summary: AttackSummary, curves: dict[str, list[float | None]]) -> ResultPart:
     named = {summary.policy: curves.get("search", []), "random search": curves.get("baseline", [])}
     known = {name: values for name, values in named.items() if any(value is not None for value in values)}
     if not known:
-        return AnswerPart()
+        return ResultPart()
     above = "right" if summary.minimises else wording.success(summary)
     zero = f"above: {above}" if summary.objective in SUCCESS_ABOVE_ZERO else ""
     ends = {name: [one for one in values if one is not None] for name, values in known.items()}
     listed = "; ".join(f"{name}: from {one[0]:.3g} to {max(one):.3g}" for name, one in ends.items())
     label = objective_label(summary.objective)
-    return AnswerPart(
+    return ResultPart(
         "The search",
         [f"{label} over evaluations. {listed}"],
         draw=partial(search_axes, known, label, zero_means=zero),
@@ -242,7 +248,7 @@ def _curve(summary: AttackSummary, curves: dict[str, list[float | None]]) -> Ans
 
 
 def _animation(frames: list[str], searched: list[float | None]) -> dict[str, object]:
-    """The frames of the search with the steps they are of, where each step has one; the last is the answer."""
+    """The frames of the search with the steps they are of, where each step has one; the last is the adversarial one."""
     steps = [round(number) for number in np.linspace(0, max(len(searched) - 1, 0), len(frames) - 1)]
     objectives = [searched[step] if step < len(searched) else None for step in steps]
     return {"pictures": frames, "steps": steps, "objectives": objectives}

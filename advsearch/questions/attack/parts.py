@@ -56,7 +56,7 @@ LOADING = "loading the scene and the model"
 """What a person who waits is told first."""
 
 SEARCHED_WITH = ("the objective", "the policy", "the metric")
-"""How the parts of a run begin that say nothing of whether its answer is right."""
+"""How the parts of a run begin that say nothing of whether its result is right."""
 
 
 @dataclass
@@ -93,9 +93,9 @@ def parts_of(config: AttackConfig) -> AttackParts:
 
 
 def parts_in(run: Path) -> AttackParts:
-    """Find and load everything that the run of an attack was asked with, as its answer is judged."""
+    """Find and load everything that the run of an attack was asked with, as its result is judged."""
     if needed := [one for one in only_python_has(run) if not one.startswith(SEARCHED_WITH)]:
-        raise InputError(f"{run}: {', '.join(needed)}: only the Python session that asked has what judges its answer")
+        raise InputError(f"{run}: {', '.join(needed)}: only the Python session that asked has what judges its result")
     return parts_of(judged_alone(AttackConfig.from_yaml(run / CONFIG)))
 
 
@@ -258,8 +258,8 @@ def is_named(entry: Task | Policy[Any], make: Callable[[Any], object]) -> bool:
 
 
 def judged_alone(config: AttackConfig) -> AttackConfig:
-    """Return what an answer of a run is judged with: what counts as success needs no metric, and neither an objective
-    nor a policy that only the session had which searched with them."""
+    """Return what the adversarial scene of a run is judged with: what counts as success needs no metric, and neither an
+    objective nor a policy that only the session had which searched with them."""
     change: dict[str, object] = {"metrics": {}}
     if config.objective is not None and config.objective not in OBJECTIVE_KINDS:
         change["objective"] = None

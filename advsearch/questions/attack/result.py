@@ -1,4 +1,4 @@
-"""The answer of an attack as Python has it, and its pictures: of trials, of the object to turn, along a drive."""
+"""The result of an attack as Python has it, and its pictures: of trials, of the object to turn, along a drive."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from advsearch.engine.record import KEPT, Findings
 from advsearch.engine.rendering import Rendering, pictures_of, render
 from advsearch.errors import InputError
 from advsearch.questions.attack.parts import AttackParts
-from advsearch.questions.attack.summary import AnswerAlongDrive, AttackSummary
+from advsearch.questions.attack.summary import AlongDrive, AttackSummary
 from advsearch.registry import names_code
 from advsearch.report.figures import new_axes, search_axes
 from advsearch.report.marks import marked
-from advsearch.report.markup import answer_html, side_by_side
+from advsearch.report.markup import result_html, side_by_side
 from advsearch.report.shown import shown
 from advsearch.runs import images, store
 from advsearch.runs.directory import IMAGES, OBJECT_FILE, RunDirectory
@@ -62,7 +62,7 @@ class RenderKeywords(TypedDict, total=False):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class AttackResult:
-    """The answer of an attack.
+    """The result of an attack.
 
     Attributes:
         summary: what `summary.json` holds.
@@ -119,9 +119,9 @@ class AttackResult:
         settings: Given | None = None,
         **options: Unpack[RenderKeywords],
     ) -> Rendering:
-        """Render the answer again, and ask a model what it sees.
+        """Render the adversarial scene again, and ask a model what it sees.
 
-        What the answer does not say is as the scene comes: conditions of `over` have their start.
+        What the adversarial configuration does not say is as the scene comes: conditions of `over` have their start.
 
         Args:
             model: None for the attack's own.
@@ -133,7 +133,8 @@ class AttackResult:
 
         Raises:
             TypeError: there is no such keyword.
-            InputError: the answer sets one of `settings` itself, or has other numbers than the scene takes.
+            InputError: the adversarial configuration sets one of `settings` itself, or has other numbers than the scene
+                takes.
         """
         if self.parts is None:
             raise InputError(
@@ -150,7 +151,7 @@ class AttackResult:
         if isinstance(camera, Mapping):
             settings, camera = {**(settings or {}), **{f"camera.{name}": one for name, one in camera.items()}}, None
         if twice := sorted({*(settings or {})} & {*(self.summary.configuration or {})}):
-            raise InputError(f"settings: the answer says what {twice[0]} is; leave it out")
+            raise InputError(f"settings: the adversarial configuration says what {twice[0]} is; leave it out")
         seen = seen.with_settings(settings) if settings else seen
         seen = replace(seen, description=seen.description.seen_by(camera)) if camera else seen
         as_before = pictures_of(config)
@@ -200,7 +201,7 @@ class AttackResult:
 
     def _repr_html_(self) -> str:
         pictures = {"clean": self.clean.numpy(), "adversarial": self.adversarial.numpy()}
-        return answer_html(shown(self.summary), pictures)
+        return result_html(shown(self.summary), pictures)
 
     def _repr_png_(self) -> bytes:
         return side_by_side([self.clean.numpy(), self.adversarial.numpy()])
@@ -241,26 +242,27 @@ class KeptPicture:
 
 
 def trial_to_show(findings: Findings) -> int | None:
-    """Return the trial whose pictures are kept, of the clean scene and of the answer, which see the same conditions.
+    """Return the trial whose pictures are kept, of the clean scene and of the adversarial scene, which see the same
+    conditions.
 
-    It is the first with the most frequent answer among the successes (else among the trials that count), if there is
-    one beside which the clean scene has its own most frequent answer. None where nothing was tried.
+    It is the first with the most frequent prediction among the successes (else among the trials that count), if there
+    is one beside which the clean scene has its own most frequent prediction. None where nothing was tried.
     """
     checked = findings.verification
     clean = _labels(findings.clean if checked is None else checked.clean_trials)
     if checked is None:
         return clean.index(_usual(clean)) if clean else None
-    answers = _labels(checked.adversarial_trials)
+    labels = _labels(checked.adversarial_trials)
     usual, usual_clean = _usual(_labels(checked.successes or checked.counting)), _usual(clean)
     ranks = [
-        (answer == usual and outcome is bool(checked.successes), answer == usual, beside == usual_clean)
-        for answer, outcome, beside in zip(answers, checked.outcomes, clean, strict=False)
+        (label == usual and outcome is bool(checked.successes), label == usual, beside == usual_clean)
+        for label, outcome, beside in zip(labels, checked.outcomes, clean, strict=False)
     ]
     return checked.begin + ranks.index(max(ranks))
 
 
 def _labels(trials: Sequence[Judgement]) -> list[str]:
-    return [trial.answer.label for trial in trials]
+    return [trial.prediction.label for trial in trials]
 
 
 def _usual(labels: Sequence[str]) -> str:
@@ -294,7 +296,7 @@ def write_pictures(run: RunDirectory, problem: Problem, findings: Findings, show
 def save_trial(
     run: RunDirectory, problem: Problem, findings: Findings, trial: tuple[str, int], name: str, u: Tensor
 ) -> None:
-    """Write the picture of a trial, by kind and number, as the model saw it, and with its answer."""
+    """Write the picture of a trial, by kind and number, as the model saw it, and with its prediction."""
     seed, picture = seeds.stream(problem.seed, "verification", trial[1]), findings.pictures.get(trial)
     picture = problem.picture(u, seed, findings.spp) if picture is None else picture
     run.save_image(name, picture)
@@ -302,9 +304,9 @@ def save_trial(
 
 
 def save_marked(run: RunDirectory, name: str, picture: Tensor, marks: list[Mark]) -> None:
-    """Write ``<name>-answer.png``, the picture with marks; nothing where there are none."""
+    """Write ``<name>-prediction.png``, the picture with marks; nothing where there are none."""
     if marks:
-        run.save_image(f"{name}-answer", marked(picture.numpy(), marks))
+        run.save_image(f"{name}-prediction", marked(picture.numpy(), marks))
 
 
 def write_artifacts(run: RunDirectory, artifacts: dict[str, Tensor]) -> None:
@@ -353,9 +355,9 @@ FASTEST = 40
 Frames = list[npt.NDArray[np.float32]]
 
 
-def answer_along(problem: Problem, u: Tensor | None, spp: int, run: RunDirectory | None) -> AnswerAlongDrive | None:
-    """Look at an answer, and at the clean scene, at evenly spaced times of the path that varies by chance; None where
-    none does. What varies beside it is as the scene comes."""
+def along_drive(problem: Problem, u: Tensor | None, spp: int, run: RunDirectory | None) -> AlongDrive | None:
+    """Look at an adversarial scene, and at the clean scene, at evenly spaced times of the path that varies by chance;
+    None where none does. What varies beside it is as the scene comes."""
     along = _path_of(problem)
     if along is None:
         return None
@@ -379,9 +381,7 @@ def answer_along(problem: Problem, u: Tensor | None, spp: int, run: RunDirectory
             pictures.append(np.asarray(marked(picture.numpy(), marks), dtype=np.float32))
         if run is not None:
             write_drive(run, name, pictures, seconds)
-    return AnswerAlongDrive(
-        frames=FRAMES, seconds=seconds, clean=counts["drive-clean"], answer=counts.get("drive"), spp=spp
-    )
+    return AlongDrive(frames=FRAMES, seconds=seconds, clean=counts["drive-clean"], answer=counts.get("drive"), spp=spp)
 
 
 def _path_of(problem: Problem) -> tuple[PathControl, int] | None:

@@ -12,7 +12,7 @@ from advsearch.files import JsonObject
 from advsearch.settings import Clash, power, setting, setting_as_in, split_names
 
 TRIALS, TRIALS_OVER = 20, 200
-"""Fresh renders that check an answer, and one that holds for many conditions."""
+"""Fresh renders that check what a search found, and what holds for many conditions."""
 
 STEPS = 40
 """Of a search about one picture."""
@@ -90,12 +90,12 @@ class AttackConfig(DerivativeConfig):
     )
     model: str = setting_as_in(
         SceneConfig, "model",
-        description="the network under test; of several, separated by commas, each is attacked and its answer tried "
-        "on all",
+        description="the network under test; of several, separated by commas, each is attacked and its adversarial "
+        "scene tried on all",
     )
     ensemble: Literal["mean", "worst"] | None = setting(
         None, "model",
-        "find one answer against several models together: maximise the mean of their objectives, or the lowest one",
+        "find one scene against several models together: maximise the mean of their objectives, or the lowest one",
         otherwise="each by itself",
     )
     measure: Literal["no", "quick", "full"] = setting(
@@ -118,8 +118,8 @@ class AttackConfig(DerivativeConfig):
         otherwise="no limit", unit="seconds", gt=0.0, le=1e9,
     )
     target: str | None = setting(
-        None, "search", "the wrong answer to aim for, or several",
-        "names of classes or their numbers, separated by commas", otherwise="any wrong answer",
+        None, "search", "the wrong prediction to aim for, or several",
+        "names of classes or their numbers, separated by commas", otherwise="any wrong prediction",
     )
     minimise: bool = setting(False, "search", "make the object easier to recognise, not harder")
     smallest: bool = setting(
@@ -133,7 +133,7 @@ class AttackConfig(DerivativeConfig):
     aov: str | None = setting_as_in(
         RenderConfig, "aov",
         description="write ground truth of each pixel, names separated by commas, as layers of an EXR, for the clean "
-        "scene and the answer",
+        "scene and the adversarial one",
     )
     metrics: dict[str, str] = setting(
         dict, "run", "your own numbers for every picture, each a column of the rows; may be repeated",
@@ -146,12 +146,13 @@ class AttackConfig(DerivativeConfig):
     )
     over: ControlsByName = setting_as_in(
         SceneConfig, "controls", default=dict,
-        description="controls that are drawn at random; one answer has to hold across the draws", flag="",
+        description="controls that are drawn at random; one configuration has to hold across the draws", flag="",
         min_length=None,
     )
     path: str | None = setting(
         None, "search",
-        "the path along which camera or object travel, with --over path; pictures of the answer along it are kept",
+        "the path along which camera or object travel, with --over path; pictures of the adversarial scene along it "
+        "are kept",
         "approach, pass, orbit, a .csv file, or two of them, the camera's and the object's, as in approach+orbit",
         otherwise="approach", min_length=1,
     )
@@ -174,7 +175,7 @@ class AttackConfig(DerivativeConfig):
         otherwise="raised until more would leave the margin on its side", unit="samples", ge=1, le=65536,
     )
     trials: int | None = setting(
-        None, "verification", "fresh renders that verify the answer, and as many of the clean scene",
+        None, "verification", "fresh renders that verify the adversarial scene, and as many of the clean scene",
         f"a whole number from {FEWEST_TRIALS} to 100000 (with fewer, nothing can be called found)",
         otherwise=f"14, or 23 where one fails; with --over 30, or up to {TRIALS_OVER} where some fail; {TRIALS} with "
         "--smallest", unit="renders", ge=FEWEST_TRIALS, le=100_000,

@@ -1,5 +1,5 @@
 """The stages of an attack, one after the other: first look, search, random search beside it, verification. For the
-smallest change that flips the answer, searches and trials take turns, within ever smaller budgets."""
+smallest change that flips the prediction, searches and trials take turns, within ever smaller budgets."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from advsearch.attacks.verification import OVER_LOOKS, TRIAL_LOOKS
 from advsearch.engine import planning, surface_light
 from advsearch.engine.bank import Bank
 from advsearch.engine.gradients import inside
-from advsearch.engine.journal import PLAN, Journal, finite, other_answers, same
+from advsearch.engine.journal import PLAN, Journal, finite, other_numbers, same
 from advsearch.engine.objective import penalised
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Findings, Stages
@@ -48,7 +48,7 @@ from advsearch.tasks import Judgement
 MOST_FRAMES = 60
 
 UNPRINTED = "search without print terms"
-"""The kind of the search beside one with print terms: what these cost is told by its answer."""
+"""The kind of the search beside one with print terms: what these cost is told by its result."""
 
 
 LOOK, LOOKED_AT = "first look", ("score", "margin", "objective")
@@ -178,9 +178,9 @@ class Attack:
         )
 
         def look(query: Query) -> Evaluation:
-            answer = problem.evaluate(query)
+            evaluation = problem.evaluate(query)
             self._advance()
-            return answer
+            return evaluation
 
         spp = self._asked_spp
         findings.first_look = run_trials(partial(map, look), start, spp=spp, seed=seed, trials=FIRST_LOOK)
@@ -207,7 +207,7 @@ class Attack:
         again = self.problem.evaluate(Query(start, seed, spp=self._asked_spp))
         if same(_values(again.said), now[0]):
             values = dict(zip(LOOKED_AT, zip(before[0], now[0], strict=True), strict=True))
-            raise other_answers(self.journal.run, values)
+            raise other_numbers(self.journal.run, values)
 
     def _advance(self, steps: int = 1) -> None:
         self.stages.progress.advance(steps)
@@ -215,8 +215,8 @@ class Attack:
     # ---- verification -----------------------------------------------------------------------------------------------
 
     def verify(self) -> None:
-        """Choose the sample count, then try the clean configuration, the answer, that without print terms and the
-        baseline's with equal seeds.
+        """Choose the sample count, then try the clean configuration, the adversarial configuration, that without print
+        terms and the baseline's with equal seeds.
 
         The smallest change lies at the decision, where no sample count settles the margin: it is tried with that of the
         clean configuration, as on the way to it.
@@ -225,18 +225,18 @@ class Attack:
         answered, baseline, unprinted = findings.search, findings.baseline, findings.unprinted
         if answered is None:
             raise RuntimeError("nothing was searched, so there is nothing to verify")
-        answer = problem.domain.project(answered.best_u)
+        adversarial = problem.domain.project(answered.best_u)
         if not self.config.smallest or findings.sample_count is None:
             searched = [result for result in (answered, baseline, unprinted) if result is not None]
             pictures = sum((result.renders + result.gradients) * problem.draws for result in searched)
-            candidates = {"adversarial": answer, "clean": problem.domain.start}
+            candidates = {"adversarial": adversarial, "clean": problem.domain.start}
             self._verifier.choose_spp(candidates, searched=pictures * problem.spp)
         groups = 1 + (baseline is not None) + (unprinted is not None) + (not self._verifier.clean_tried)
-        self._verifier.begin("checking the answer with fresh renders", groups * self._verifier.count, at_most=True)
+        self._verifier.begin("checking what was found with fresh renders", groups * self._verifier.count, at_most=True)
         self._verifier.try_clean()
         findings.verification = self._verifier.verified("verification", answered)
         if findings.verification.ending is Ending.ALREADY_WRONG:
-            findings.smallest = None  # seen with other samples than before: no change at all flips the answer
+            findings.smallest = None  # seen with other samples than before: no change at all flips the prediction
         if unprinted is not None:
             findings.unprinted_verification = self._verifier.verified("unprinted verification", unprinted)
         if baseline is not None:
@@ -249,13 +249,13 @@ class Attack:
             check_failures(self._verifier, answered)
 
     def _take_the_worse(self, result: SearchResult, baseline: SearchResult) -> None:
-        """Let the random search's answer be the run's if it is found and the worse one for the model, and remember
+        """Let what the random search found be the run's if it is found and the worse one for the model, and remember
         that. It is chosen by its trials, so these are no evidence: it has to be the worse one in fresh ones, too."""
         findings = self.findings
         own, other = findings.verification, findings.baseline_verification
         if own is None or other is None or other.ending is not Ending.FOUND or _rank(other) <= _rank(own):
             return
-        title = "checking the random search's answer again"
+        title = "checking what the random search found again"
         self._verifier.begin(title, 2 * self._verifier.count, at_most=True)
         other = findings.baseline_verification = self._verifier.verified("baseline verification", baseline, again=True)
         if _rank(other) <= _rank(own):
@@ -358,17 +358,17 @@ class Attack:
             self.stages.progress.advance(record.renders - before, best=record.best, **self.journal.traced.told)
             before = record.renders
 
-        def answers(queries: Sequence[Query]) -> Iterator[Evaluation]:
+        def evaluations(queries: Sequence[Query]) -> Iterator[Evaluation]:
             if frames is not None:
                 queries = [replace(one, keep=one.phase == "search" and one.number % every == 0) for one in queries]
             passed = (lambda query: None) if self.findings.transport is None else self.findings.transport.passed
-            return self.journal.answers(queries, self._evaluated, passed)
+            return self.journal.evaluate_all(queries, self._evaluated, passed)
 
         domain = self.problem.domain if domain is None else domain
         transport = self.findings.transport
         exact, drawn = (transport.exact, transport.drawn) if transport is not None else (False, False)
         found = search(
-            answers,
+            evaluations,
             replace(domain, exact=exact, drawn=drawn and policy.uses_gradient),
             policy,
             steps=steps,
@@ -386,13 +386,15 @@ class Attack:
         return found
 
     def _evaluated(self, queries: Sequence[Query]) -> Iterator[Evaluation]:
-        """Have queries of one search answered: predicted where something predicts, and traced otherwise."""
+        """Evaluate queries of one search: predicted where something predicts, and traced otherwise."""
         transport, traced = self.findings.transport, self.journal.traced
         predicted = transport is not None and bool(queries) and queries[0].phase == "search"
-        answers = transport.answered(queries, traced) if transport is not None and predicted else traced(queries)
-        for query, answer in zip(queries, answers, strict=True):
+        evaluations = (
+            transport.evaluate_all(queries, traced) if transport is not None and predicted else traced(queries)
+        )
+        for query, evaluation in zip(queries, evaluations, strict=True):
             printed = self.config.printable and query.kind != UNPRINTED
-            yield penalised(answer, self.problem.searched_space, query.u) if printed else answer
+            yield penalised(evaluation, self.problem.searched_space, query.u) if printed else evaluation
 
     def begin(self, name: str, title: str, steps: int, shorter: str) -> None:
         renders = planned_renders(steps, close=self.config.close_looks)
@@ -423,7 +425,7 @@ def find_smallest(attack: Attack, verifier: Verifier) -> None:
         kind, seed = f"search {number}" if number else "search", seeds.stream(problem.seed, "smallest", number)
         ranked = transport is None  # what is predicted has no noise
         results.append(attack.search(kind, attack.policy, problem.steps, seed, domain=inside, ranked=ranked))
-        findings.search = findings.search or results[0]  # the answer if this is interrupted
+        findings.search = findings.search or results[0]  # what was found if this is interrupted
         verifier.begin("trying smaller changes", MOST_CHECKS * trials, at_most=True)
         return results[-1].best_u
 
@@ -450,11 +452,11 @@ def find_smallest(attack: Attack, verifier: Verifier) -> None:
         verifier.begin("checking the smallest change", most, at_most=True)
     bracket = confirmed(bracket, passes, problem.domain, times=times)
     renders, gradients = sum(one.renders for one in results), sum(one.gradients for one in results)
-    answer = results[0].best_u if bracket.u is None else bracket.u
+    adversarial = results[0].best_u if bracket.u is None else bracket.u
     ending = results[0].ending if bracket.u is None else Ending.FOUND
     findings.smallest = bracket
     winner = results[0 if bracket.u is None else bracket.found_by]
-    findings.search = replace(winner, best_u=answer, ending=ending, renders=renders, gradients=gradients)
+    findings.search = replace(winner, best_u=adversarial, ending=ending, renders=renders, gradients=gradients)
 
 
 def _values(trial: Judgement) -> list[float | None]:
@@ -462,7 +464,7 @@ def _values(trial: Judgement) -> list[float | None]:
 
 
 def _rank(verification: Verification) -> tuple[bool, float, float]:
-    """How bad an answer is for the model: found, then the rate of successes, then the mean margin."""
+    """How bad a configuration is for the model: found, then the rate of successes, then the mean margin."""
     scores = [trial.score for trial in verification.counting]
     mean = sum(scores) / len(scores)
     mean = mean if mean == mean else -math.inf
@@ -474,10 +476,11 @@ TRIED = 8
 
 
 def check_failures(verifier: Verifier, result: SearchResult) -> None:
-    """Verify the first of the different failures that a search answers with, each for itself.
+    """Verify the first of the different failures that a search found, each for itself.
 
-    Each goes through the trials of the answer, with the seeds that the control group had, up to the first that decides
-    against it: what holds is found by the rule of the answer. Over conditions that vary one answer takes hundreds of
+    Each goes through the trials of the adversarial configuration, with the seeds that the control group had, up to the
+    first that decides
+    against it: what holds is found by its rule. Over conditions that vary one of them takes hundreds of
     trials, and nothing is tried here.
     """
     problem, findings = verifier.problem, verifier.findings

@@ -24,7 +24,7 @@ from advsearch.attacks.verification import WORST_CASE
 from advsearch.cluster import Call, Work
 from advsearch.cluster.dask_pool import executor_of
 from advsearch.config import CONFIGS
-from advsearch.engine.journal import answering
+from advsearch.engine.journal import worker_call
 from advsearch.engine.judging import one_label_for_several
 from advsearch.engine.naming import check_run_settings, different, load_models, settings_alone
 from advsearch.engine.problem import Problem
@@ -54,7 +54,7 @@ from advsearch.runs.directory import CONFIG, PARTS, default_name, is_run
 from advsearch.runs.files import PART, storage_errors, write_bytes
 from advsearch.runs.listing import finished
 from advsearch.runs.results import INTERRUPTED, Result
-from advsearch.runs.summary import read_answer, read_result
+from advsearch.runs.summary import read_configuration, read_result
 from advsearch.scene.library import list_objects, load_object
 from advsearch.settings import FILES, Config
 from advsearch.tasks import make_task
@@ -319,7 +319,7 @@ def _known(row: ObjectRow, epsilon: float | None) -> bool:
     """Whether a row says anything about an epsilon: it was tried there, or had flipped before.
 
     What ended without a number says nothing, and neither does an object that its own noise makes wrong too often for
-    any answer to be verified.
+    any scene to be verified.
     """
     if row.ending in (None, "non-finite objective"):
         return False
@@ -354,9 +354,9 @@ LEAST_SPP = 64
 
 
 def matrix(asked: Asked[AttackConfig]) -> MatrixResult:
-    """Attack several models, and try every answer on each of them in pictures that are the same for all.
+    """Attack several models, and try every adversarial scene on each of them in pictures that are the same for all.
 
-    Trial k has the same seed for every answer and every model, and none that a search or its verification has used.
+    Trial k has the same seed for every scene and every model, and none that a search or its verification has used.
     Models of one input size are shown the same picture; for another size the same configuration is rendered anew. A
     success needs the model to be right on the clean scene with the same seed, as everywhere.
     """
@@ -373,25 +373,23 @@ def matrix(asked: Asked[AttackConfig]) -> MatrixResult:
             attacked.append((one.of, summary))
     models: list[MatrixModel] = []
     cells: dict[str, list[MatrixCell]] = {}
-    answers = {name: u for name, summary in attacked if (u := _answer(summary)) is not None}
-    if answers and not study.interrupted:
+    found = {name: u for name, summary in attacked if (u := _configuration(summary)) is not None}
+    if found and not study.interrupted:
         spp = config.verify_spp or max([LEAST_SPP, *(s.sample_count.spp for _, s in attacked if s.sample_count)])
         with asked.until_interrupted():
-            study.progress.stage("loading the models to try the answers on")
+            study.progress.stage("loading the models to try the scenes on")
             problems = {name: problem_from_config(_alone(config, name))[0] for name in names}
             seed, trials = seeds.stream(config.seed, "matrix"), config.trial_count
-            with executor_for(
-                config, "advsearch.questions.attack.studies:models_answering", study.progress
-            ) as executor:
+            with executor_for(config, "advsearch.questions.attack.studies:models_worker", study.progress) as executor:
                 conditions = [RetrialCondition(name, one, spp, _size(one)) for name, one in problems.items()]
                 retrials = Retrials(conditions, study.run, study.progress, trials=trials, seed=seed, executor=executor)
                 each = trials * len(names)
-                hint = f"{each} answers; `trials` or `verify_spp` shorten it"
+                hint = f"{each} predictions; `trials` or `verify_spp` shorten it"
                 study.progress.stage("trying the clean scene on every model", each, hint=hint)
                 models = [_model(condition, retrials) for condition in conditions]
-                for name, u in answers.items():
-                    study.progress.stage(f"trying the answer to {name} on every model", each, hint=hint)
-                    checked = [(condition.name, retrials.answer(name, u, condition)) for condition in conditions]
+                for name, u in found.items():
+                    study.progress.stage(f"trying the scene against {name} on every model", each, hint=hint)
+                    checked = [(condition.name, retrials.adversarial(name, u, condition)) for condition in conditions]
                     cells[name] = [
                         MatrixCell(model=model, ending=one.ending.value, verified=verified_rate(one))
                         for model, one in checked
@@ -411,22 +409,22 @@ def matrix(asked: Asked[AttackConfig]) -> MatrixResult:
     )
 
 
-def models_answering(settings: JsonObject) -> Call:
-    """Return what answers queries of the models of a configuration: what a worker does."""
+def models_worker(settings: JsonObject) -> Call:
+    """Return what evaluates queries of the models of a configuration: what a worker does."""
     config = AttackConfig(**settings)
-    return answering(cache(lambda name: problem_from_config(_alone(config, name))[0]))
+    return worker_call(cache(lambda name: problem_from_config(_alone(config, name))[0]))
 
 
 def _alone(config: AttackConfig, name: str) -> AttackConfig:
-    """What an answer is tried on one model with; nothing is searched."""
+    """What a scene is tried on one model with; nothing is searched."""
     return AttackConfig.of(config, model=name, ensemble=None)
 
 
-def _answer(summary: AttackSummary) -> Tensor | None:
-    """The configuration that an attack answers with; None where nothing was searched."""
+def _configuration(summary: AttackSummary) -> Tensor | None:
+    """The configuration that an attack found; None where nothing was searched."""
     if summary.adversarial is None or summary.run is None:
         return None
-    return torch.from_numpy(read_answer(Path(summary.run)))
+    return torch.from_numpy(read_configuration(Path(summary.run)))
 
 
 def _model(condition: RetrialCondition, retrials: Retrials) -> MatrixModel:

@@ -32,26 +32,26 @@ from advsearch.runs.summary import NAME, other_summary, read_result
 
 
 class FoundValue(DescribedValue):
-    """One value of the answer, and where it lies."""
+    """One value of the adversarial configuration, and where it lies."""
 
     clean: int | float | str | None = Field(default=None, description="the clean scene's; absent of several numbers")
     low: float | None = Field(default=None, description="the least that the control allows; absent without a range")
     high: float | None = Field(default=None, description="the most")
 
 
-class PicturedAnswer(Fields):
-    """What the model says of the picture that is kept, which is that of a trial with the usual answer."""
+class PicturedPrediction(Fields):
+    """What the model says of the picture that is kept, which is that of a trial with the usual prediction."""
 
     label: str
     index: int | None = Field(description="of the class")
-    probability: JsonFloat | None = Field(description="of this answer; of a detector the score of the box")
+    probability: JsonFloat | None = Field(description="of this prediction; of a detector the score of the box")
     payload: Payload = Field(default=None, description="what else the task keeps of it; absent without")
     trial: int | None = Field(
         default=None, description="number of the trial, the same for both pictures; absent where nothing was tried"
     )
 
 
-class CleanAnswer(CleanScene, PicturedAnswer):
+class CleanPrediction(CleanScene, PicturedPrediction):
     """What the model says of the picture of the clean scene that is kept."""
 
     correct: bool = Field(description="whether that is right")
@@ -71,16 +71,16 @@ class TriedObjective(Fields):
     """What the search maximised, over the trials of the verification, which have other seeds and 8 bits."""
 
     clean: ObjectiveValues | None = Field(description="of the clean scene; null where it was not tried")
-    answer: ObjectiveValues | None = Field(description="of the answer; null where nothing was verified")
+    answer: ObjectiveValues | None = Field(description="of the adversarial scene; null where nothing was verified")
 
 
-class AnswerAlongDrive(Fields):
-    """The clean scene and the answer at evenly spaced times of the path that varied by chance."""
+class AlongDrive(Fields):
+    """The clean scene and the adversarial one at evenly spaced times of the path that varied by chance."""
 
     frames: int
     seconds: float = Field(description="from the first frame to the last")
     clean: int = Field(description="frames of the clean scene in which the model is right")
-    answer: int | None = Field(description="likewise, with the answer; null if nothing was searched")
+    answer: int | None = Field(description="likewise, with the adversarial one; null if nothing was searched")
     spp: int = Field(description="samples a pixel")
 
 
@@ -93,7 +93,7 @@ class BaselineSearch(Fields):
 
 
 class SmallestEpsilon(Fields):
-    """The bracket of the least epsilon at which the answer flips, by control."""
+    """The bracket of the least epsilon at which the prediction flips, by control."""
 
     epsilon: dict[str, float] | None = Field(description="the least that passed its trials; null: none did")
     not_found_at: dict[str, float] | None = Field(description="the largest at which a search found none; null: none")
@@ -103,8 +103,8 @@ class SmallestEpsilon(Fields):
     checks: int
 
 
-class AnswerDistribution(Fields):
-    """The distribution that the policy answers with, where it is over few numbers."""
+class SearchDistribution(Fields):
+    """The distribution that the policy found, where it is over few numbers."""
 
     mean: dict[str, DescribedValue]
     deviation: list[float] = Field(description="in u")
@@ -119,7 +119,7 @@ class DifferentFailure(Fields):
     holds: bool | None = Field(description="whether it is verified; null if it was not tried")
     verified: VerifiedRate | None = Field(description="trials that ended as soon as that was clear; null: not tried")
     picture: str | None = Field(description="the first of these trials; null if there is none")
-    pictured: PicturedAnswer | None = Field(default=None, description="of that picture; absent if there is none")
+    pictured: PicturedPrediction | None = Field(default=None, description="of that picture; absent if there is none")
 
 
 class FailingShare(Fields):
@@ -195,18 +195,18 @@ class PrintCost(Fields):
     """
 
     steps: int = Field(description="evaluations of the search without the terms")
-    margin_with: JsonFloat = Field(description="of the run's answer, in logits")
-    margin_without: JsonFloat = Field(description="of the answer of the search without the terms, in logits")
+    margin_with: JsonFloat = Field(description="of the run's adversarial scene, in logits")
+    margin_without: JsonFloat = Field(description="of what was found by the search without the terms, in logits")
     cost: JsonFloat = Field(description="the second less the first, in logits")
-    verified: VerifiedRate = Field(description="trials of the answer of the search without the terms")
-    terms: PrintTerms = Field(description="of that answer")
+    verified: VerifiedRate = Field(description="trials of what was found by the search without the terms")
+    terms: PrintTerms = Field(description="of that scene")
 
 
 class Printability(Fields):
     """What `printable` was about, and what it cost."""
 
     clean: PrintTerms = Field(description="of the clean scene")
-    answer: PrintTerms | None = Field(description="of the answer; null if nothing was searched")
+    answer: PrintTerms | None = Field(description="of the adversarial scene; null if nothing was searched")
     cost: PrintCost | None = Field(
         default=None, description="what the terms cost in margin; null if nothing was verified, and in older runs"
     )
@@ -234,20 +234,22 @@ class AttackSummary(SceneResult):
     image_formation: Formation
     gradient_plan: PlannedGradient
     light_path_segments: PathSegments
-    clean: CleanAnswer
-    adversarial: PicturedAnswer | None = Field(description="of the search's answer; null if nothing was searched")
-    verified: VerifiedRate | None = Field(description="trials of the answer; null if nothing was verified")
+    clean: CleanPrediction
+    adversarial: PicturedPrediction | None = Field(description="of what the search found; null if nothing was searched")
+    verified: VerifiedRate | None = Field(description="trials of the adversarial scene; null if nothing was verified")
     tried_objective: TriedObjective | None = Field(default=None, description="the objective over these trials")
     baseline: BaselineSearch | None = Field(default=None, description="the random search; absent without `baseline`")
-    answer_from: str | None = Field(default=None, description="`random` where the random search's answer is the run's")
-    policy_verified: VerifiedRate | None = Field(default=None, description="of the policy's own answer then")
-    drive: AnswerAlongDrive | None = Field(
+    answer_from: str | None = Field(
+        default=None, description="`random` where the run's adversarial scene is the random search's"
+    )
+    policy_verified: VerifiedRate | None = Field(default=None, description="of what the policy itself found then")
+    drive: AlongDrive | None = Field(
         default=None, description="[along a drive](drives.md), with `over` a path; absent without"
     )
     average: AverageCase | None = Field(default=None, description="only with `average`")
     smallest: SmallestEpsilon | None = Field(default=None, description="only with `smallest`")
     printability: Printability | None = Field(default=None, description="only with `printable`")
-    distribution: AnswerDistribution | None = Field(default=None, description="of a policy that answers with one")
+    distribution: SearchDistribution | None = Field(default=None, description="of a policy that finds one")
     failures: DifferentFailures | None = Field(default=None, description="of a policy that looks for different ones")
     sample_count: VerificationSamples | None = Field(default=None, description="of the verification")
     transport: LinearTransport | None = Field(
@@ -255,7 +257,9 @@ class AttackSummary(SceneResult):
     )
     claimed: SearchClaim | None = Field(default=None, description="what the search itself believes")
     gradients: SearchGradients | None = Field(default=None, description="of the search")
-    configuration: dict[str, FoundValue] | None = Field(default=None, description="the answer in a few values")
+    configuration: dict[str, FoundValue] | None = Field(
+        default=None, description="the adversarial configuration in a few values"
+    )
     shared: SharedWork | None = Field(default=None, description="only with `workers` or `cluster`")
     renders: dict[str, int] = Field(
         description="of the search, its gradients, the baseline and the verification; `unprinted`: of the search "
@@ -272,7 +276,7 @@ class AttackSummary(SceneResult):
 
     @property
     def brief(self) -> str:
-        """The verified rate; of a run that was interrupted before, the answer so far."""
+        """The verified rate; of a run that was interrupted before, what was found so far."""
         if self.verified is None:
             return f"{self.adversarial.label}, unverified" if self.goes_on and self.adversarial else ""
         return f"{self.verified.successes}/{self.verified.trials}"
@@ -288,7 +292,9 @@ class ObjectRow(Fields):
     clean: ControlGroup | None
     ending: str | None = None
     epsilon: EpsilonBudget = Field(default=None, description="of the last attack")
-    flips_at: EpsilonBudget = Field(description="the least epsilon at which an answer was found; null: at none")
+    flips_at: EpsilonBudget = Field(
+        description="the least epsilon at which an adversarial scene was found; null: at none"
+    )
     verified: VerifiedRate | None = None
     margin: JsonFloat | None = Field(default=None, description="mean of the trials, in logits")
     run: str | None = None
@@ -332,7 +338,7 @@ class MatrixModel(Fields):
 
 
 class MatrixCell(Fields):
-    """One answer, tried on one model."""
+    """One adversarial scene, tried on one model."""
 
     model: str = Field(description="that it is tried on")
     ending: str = Field(description="`found` where it is verified on this model, as for an attack")
@@ -340,7 +346,7 @@ class MatrixCell(Fields):
 
 
 class MatrixRow(Fields):
-    """One answer, and what it does to each model."""
+    """One adversarial scene, and what it does to each model."""
 
     attacked: str = Field(description="the model that it was searched on; `all` for an ensemble")
     ending: str = Field(description="of the search and its own verification")
@@ -350,18 +356,20 @@ class MatrixRow(Fields):
 
 
 class MatrixResult(InNotebook, StudyResult):
-    """Answers that were searched on each of several models, or on all of them together, tried on each."""
+    """Adversarial scenes that were searched on each of several models, or on all of them together, tried on each."""
 
     command: ClassVar[str] = "attack"
 
     models: list[str] = Field(description="as they were asked for")
     ensemble: str | None = Field(description="how objectives were put together; null: each model by itself")
-    tested: list[MatrixModel] = Field(description="the models that answers were tried on; empty where none was")
+    tested: list[MatrixModel] = Field(
+        description="the models that adversarial scenes were tried on; empty where none was"
+    )
     table: list[MatrixRow]
 
     @property
     def brief(self) -> str:
-        """How many answers hold on models that they were not searched on."""
+        """How many adversarial scenes hold on models that they were not searched on."""
         others = [cell for row in self.table for cell in row.tested if cell.model != row.attacked]
         return f"{sum(cell.ending == 'found' for cell in others)} of {len(others)} transfer" if others else ""
 

@@ -1,4 +1,4 @@
-"""An attack in words: its verdict, what was asked and changed, and how it came to its answer."""
+"""An attack in words: its verdict, what was asked and changed, and how it came to its result."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _REASONS = {
     "stalled": "The policy had nothing more to propose.",
     "non-finite objective": "The objective was not a number several times in a row.",
 }
-"""Why a search ended without an answer, where the name of the ending doesn't say it."""
+"""Why a search ended without finding anything, where the name of the ending doesn't say it."""
 
 
 def attack_verdict(summary: AttackSummary) -> str:
@@ -48,7 +48,10 @@ def attack_verdict(summary: AttackSummary) -> str:
         return f"The model already {wrong}: nothing was changed and nothing counts as found."
     if verified is None and ending == "interrupted" and summary.adversarial:
         says = calls(summary.task, thing, summary.adversarial.label)
-        return f"Interrupted after {count(summary.steps, 'step')}. The answer so far is not verified: the model {says}."
+        return (
+            f"Interrupted after {count(summary.steps, 'step')}. What was found so far is not verified: the model "
+            f"{says}."
+        )
     if verified is None:
         return f"{ending[:1].upper()}{ending[1:]} after {count(summary.steps, 'step')}; nothing is verified."
     rate = rate_text(verified) + another_text(summary.over)
@@ -58,7 +61,7 @@ def attack_verdict(summary: AttackSummary) -> str:
     if ending == "interrupted":
         return f"Interrupted; so far {claim} in {rate}."
     if ending == "not verified":
-        return f"The search claims an answer that is not confirmed: {claim} in {rate}."
+        return f"The search claims a wrong prediction that is not confirmed: {claim} in {rate}."
     why = _REASONS.get(ending, f"The search ended: {ending}.")
     return f"No {budget_text(summary)} was found that {_wanted(summary, thing)}: {claim} in {rate}. {why}"
 
@@ -78,13 +81,13 @@ def remarks(summary: AttackSummary) -> list[str]:
     missed = control.trials - control.correct if control else 0
     if control and missed and summary.ending != "already wrong" and not summary.minimises:
         apart = " They do not count." if summary.over else ""
-        nothing = f"; in {control.not_a_number} the answer is not a number" if control.not_a_number else ""
+        nothing = f"; in {control.not_a_number} the output is not a number" if control.not_a_number else ""
         said.append(f"The clean scene itself fails {missed} of its {control.trials} trials{nothing}.{apart}")
     if summary.answer_from == "random" and own:
         said.append(
             "The random search beside it found a worse configuration than the policy did "
             f"({own.successes} of {own.trials} with a margin of {own.margin:.2f}); that of the random search is the "
-            f"answer. The margin is {margin_text(summary.task)}."
+            f"scene. The margin is {margin_text(summary.task)}."
         )
     else:
         said += _against_random(summary)
@@ -110,9 +113,9 @@ def success(summary: AttackSummary) -> str:
 
 
 def goal_text(summary: AttackSummary) -> str:
-    """Return what was asked for, where it was not just any wrong answer."""
+    """Return what was asked for, where it was not just any wrong prediction."""
     if summary.target:
-        return f"the model should answer {' or '.join(summary.target)}"
+        return f"the model should predict {' or '.join(summary.target)}"
     return "easier to recognise" if summary.minimises else ""
 
 
@@ -123,7 +126,7 @@ def objective_text(summary: AttackSummary) -> str:
         return ""
     parts = [
         f"{name} {one.mean:.3g} (from {one.low:.3g} to {one.high:.3g})"
-        for name, one in (("clean", tried.clean), ("answer", tried.answer))
+        for name, one in (("clean", tried.clean), ("adversarial", tried.answer))
         if one is not None
     ]
     return f"{summary.objective} in the trials: {', '.join(parts)}" if parts else ""
@@ -139,8 +142,8 @@ def drive_text(summary: AttackSummary) -> str:
     drive = summary.drive
     if drive is None:
         return ""
-    answer = "" if drive.answer is None else f", {drive.answer} with the answer"
-    return f"right in {drive.clean} of {drive.frames} frames of the clean scene{answer}"
+    adversarial = "" if drive.answer is None else f", {drive.answer} of the adversarial one"
+    return f"right in {drive.clean} of {drive.frames} frames of the clean scene{adversarial}"
 
 
 def smallest_text(summary: AttackSummary) -> str:
@@ -211,11 +214,11 @@ def _how_it_errs(summary: AttackSummary, verified: VerifiedRate, thing: str) -> 
     """Return "The model calls this mug a vase" where that is known of every trial, a weaker clause otherwise."""
     if summary.minimises:
         return f"The model recognises {thing}, more surely than in the clean scene,"
-    answers = verified.labels
-    if len(answers) == 1:
-        return f"The model {calls(summary.task, thing, next(iter(answers)))}"
-    if answers:
-        most = max(answers, key=lambda label: answers[label])
+    labels = verified.labels
+    if len(labels) == 1:
+        return f"The model {calls(summary.task, thing, next(iter(labels)))}"
+    if labels:
+        most = max(labels, key=lambda label: labels[label])
         what = "takes {} for one of the targets" if summary.target else "is wrong about {}"
         return f"The model {what.format(thing)}, most often {calling(summary.task, most)},"
     if summary.task != CLASSIFICATION:
@@ -231,7 +234,7 @@ def _claim(summary: AttackSummary, thing: str) -> str:
     if summary.target and summary.task == CLASSIFICATION:
         return f"the model calls {thing} {_a_target(summary)}"
     if summary.target:
-        return f"the model answers {' or '.join(summary.target)}"
+        return f"the model predicts {' or '.join(summary.target)}"
     return "it is wrong" if summary.ending in _REASONS else f"the model is wrong about {thing}"
 
 
@@ -258,7 +261,7 @@ def _against_random(summary: AttackSummary) -> list[str]:
     return []
 
 
-# ---- how it came to its answer ---------------------------------------------------------------------------------------
+# ---- how it came to its result ---------------------------------------------------------------------------------------
 
 PLAN_HEADS = ("parameter", "numbers", "derivative", "why", "step")
 

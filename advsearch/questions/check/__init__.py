@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from advsearch.question import Asked, question
-from advsearch.questions.check.answer import CheckConfig, CheckResult
-from advsearch.questions.check.answer import shown as shown
+from advsearch.questions.check.result import CheckConfig, CheckResult
+from advsearch.questions.check.result import shown as shown
 
 
 @question(

@@ -1,4 +1,4 @@
-"""Compare models, objects or answers on the same pictures, pair by pair."""
+"""Compare models, objects or adversarial scenes on the same pictures, pair by pair."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from pydantic import ValidatorFunctionWrapHandler, field_validator, model_valida
 from advsearch.config import SceneConfig
 from advsearch.errors import InputError
 from advsearch.question import Asked, question
-from advsearch.questions.compare.answer import ComparedPair, ComparedSide, CompareResult
-from advsearch.questions.compare.answer import claims as claims
-from advsearch.questions.compare.answer import shown as shown
+from advsearch.questions.compare.result import ComparedPair, ComparedSide, CompareResult
+from advsearch.questions.compare.result import claims as claims
+from advsearch.questions.compare.result import shown as shown
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.runs.directory import PARTS, find_run
 from advsearch.runs.results import INTERRUPTED
@@ -31,7 +31,7 @@ class CompareConfig(SweepConfig):
 
     command: ClassVar[str] = "compare"
     without: ClassVar[tuple[str, ...]] = (
-        *("model", "answer_of", "surface", "aov", "metrics", "log", "trials", "verify_spp", "path", "fps"),
+        *("model", "adversarial_of", "surface", "aov", "metrics", "log", "trials", "verify_spp", "path", "fps"),
     )
 
     compared: str = setting(
@@ -100,7 +100,7 @@ class CompareConfig(SweepConfig):
     expected=("WHAT", "the run of a sweep, or models and what they are shown", "", True),
 )
 def compare(asked: Asked[CompareConfig]) -> CompareResult:
-    """Compare models, objects or answers on the same pictures, pair by pair (docs/compare.md).
+    """Compare models, objects or adversarial scenes on the same pictures, pair by pair (docs/compare.md).
 
     All other arguments are the settings of `advsearch compare`. The run is kept, in `run` or under runs/. Models that
     exist in Python alone are swept first (`sweep(scene, [one, other], run=...)`), and then the run is compared.

@@ -22,7 +22,7 @@ from advsearch import seeds
 from advsearch.attacks.units import paired_by_unit
 from advsearch.errors import FileFormatError, InputError, ModelError
 from advsearch.question import Asked
-from advsearch.questions.compare.answer import ComparedPair, CountOf, PairPart, PairPicture, PairRule
+from advsearch.questions.compare.result import ComparedPair, CountOf, PairPart, PairPicture, PairRule
 from advsearch.questions.sweep.carry_out import scenes_of
 from advsearch.questions.sweep.job import Scenes
 from advsearch.questions.sweep.settings import SweepConfig
@@ -45,7 +45,7 @@ FOLLOWS = (
     *(*DRAWS, "label", "labels", "prompt", "up", "size", "unit", "batch", "keep_pictures", "trials", "verify_spp"),
     "specialise",
 )
-"""Settings that do not tell sweeps apart: of draws, along with object and model, or of no answer."""
+"""Settings that do not tell sweeps apart: of draws, along with object and model, or of no adversarial scene."""
 
 TOLERANCE = 1e-4
 """Of a value, relative to the largest in its column: values come from single precision."""
@@ -58,8 +58,9 @@ Mask = npt.NDArray[np.bool_]
 
 @dataclass(frozen=True, eq=False)
 class Side:
-    """One of the things that are compared: what tells it from the others; its sweep; object, model and answer; and its
-    rows as `runs.tables` has them, one for each picture in their order, with the `number` of the picture."""
+    """One of the things that are compared: what tells it from the others; its sweep; object, model and adversarial
+    scene; and its rows as `runs.tables` has them, one for each picture in their order, with the `number` of the
+    picture."""
 
     name: str
     folder: Path
@@ -83,8 +84,8 @@ class Side:
 def read_sides(folders: Sequence[Path]) -> list[Side]:
     """Return what the sweeps in some folders compare, each side with a name of its own.
 
-    A sweep has a side for each of its models. The sweep of an answer has these without the answer and with it; beside
-    other sweeps, only with it.
+    A sweep has a side for each of its models. The sweep of an adversarial scene has these without it and with it;
+    beside other sweeps, only with it.
 
     Raises:
         FileFormatError: a folder has another run, or a sweep that has not ended.
@@ -114,7 +115,7 @@ def _sides_of(folder: Path, *, alone: bool) -> Iterator[Side]:
     if summary.goes_on or summary.configurations != summary.planned:
         raise FileFormatError(
             f"{folder}: expected a sweep that has ended, got one with {summary.configurations} of {summary.planned} "
-            f"answers; go on with it: advsearch resume {folder}"
+            f"predictions; go on with it: advsearch resume {folder}"
         )
     config, rows = SweepConfig.from_yaml(folder / CONFIG), read_sweep(folder)
     if len(rows) != summary.planned or not rows["step"].is_unique:
@@ -125,8 +126,10 @@ def _sides_of(folder: Path, *, alone: bool) -> Iterator[Side]:
     rows = rows.sort_values("step", ignore_index=True)
     rows["correct"] = rows["correct"] == 1
     rows["number"], model_of = rows["step"] // models, rows["step"] % models
-    with_answer = rows["number"] >= summary.planned // models // 2
-    halves_of = [~with_answer, with_answer][0 if alone else 1 :] if config.answer_of else [rows["number"] >= 0]
+    with_adversarial = rows["number"] >= summary.planned // models // 2
+    halves_of = (
+        [~with_adversarial, with_adversarial][0 if alone else 1 :] if config.adversarial_of else [rows["number"] >= 0]
+    )
     for half in halves_of:
         for model, name in enumerate(config.models):
             mine = rows[half & (model_of == model)].reset_index(drop=True)
@@ -169,12 +172,12 @@ def _same(one: pd.Series, other: pd.Series) -> bool:
 
 
 def differing(sides: Sequence[Side]) -> list[str]:
-    """Return the settings in which the sweeps of some sides differ and that decide answers."""
+    """Return the settings in which the sweeps of some sides differ and that decide predictions."""
     settings = [side.config.deciding() for side in sides]
     names = {name for one in settings[1:] for name in one if one[name] != settings[0][name]}
     names |= {name for name in OF_THE_SIDE if len({side.named[name] for side in sides}) > 1}
     names |= {name for name in ("object", "model") if len({getattr(side.config, name) for side in sides}) > 1}
-    return sorted(names - {*FOLLOWS, "answer_of"})
+    return sorted(names - {*FOLLOWS, "adversarial_of"})
 
 
 def compared(first: Side, second: Side, seed: int, *, rules: bool = True) -> ComparedPair:
@@ -236,7 +239,7 @@ def _parts(column: pd.Series, edges: Sequence[float] | None) -> Iterator[tuple[A
 def _rules(table: pd.DataFrame, seed: int) -> list[PairRule] | None:
     """Where one side alone is right more often than elsewhere; None of too few pairs, or where nothing varies.
 
-    These are the rules of `explain`, whose wrong answers are the pairs that one side alone gets right.
+    These are the rules of `explain`, whose wrong predictions are the pairs that one side alone gets right.
     """
     if len(table) < FEWEST_ROWS or not table.attrs["units"]:
         return None

@@ -9,9 +9,9 @@ from typing import ClassVar
 from advsearch.config import SceneConfig
 from advsearch.errors import InputError
 from advsearch.question import Asked, question
-from advsearch.questions.explain.answer import EnvelopeRow, ExplainResult, ParameterWeight, RuleRow
-from advsearch.questions.explain.answer import claims as claims
-from advsearch.questions.explain.answer import shown as shown
+from advsearch.questions.explain.result import EnvelopeRow, ExplainResult, ParameterWeight, RuleRow
+from advsearch.questions.explain.result import claims as claims
+from advsearch.questions.explain.result import shown as shown
 from advsearch.runs.directory import PARTS, find_run
 from advsearch.runs.results import INTERRUPTED
 from advsearch.runs.summary import read_result
@@ -95,13 +95,13 @@ def explain(asked: Asked[ExplainConfig]) -> ExplainResult:
         right_of,
         rule_counts,
     )
-    from advsearch.questions.explain.renders import AskedSweep, Renders, read_answers
+    from advsearch.questions.explain.renders import AskedSweep, Renders, read_predictions
     from advsearch.rules import FEWEST_ROWS, find_rules, halves, is_independent, observed
 
     config, progress = asked.config, asked.progress
     progress.stage("reading rows")
     sweeps = [AskedSweep.of(folder) for name in split_names(config.sweeps) for folder in _sweeps_of(find_run(name))]
-    rows = read_answers(sweeps)
+    rows = read_predictions(sweeps)
     if len(rows) < FEWEST_ROWS:
         raise InputError(f"explain: expected at least {FEWEST_ROWS} rows, got {len(rows)}; sweep more configurations")
     table = observed(rows, rows.attrs["units"])
@@ -119,7 +119,7 @@ def explain(asked: Asked[ExplainConfig]) -> ExplainResult:
     clusters = renders.clusters()
     if renders.interrupted:
         asked.ending = INTERRUPTED
-    answers = right_of(table)
+    counted = right_of(table)
 
     def together(names: Iterator[str]) -> str:
         return ",".join(dict.fromkeys(one for name in names for one in split_names(name)))
@@ -132,7 +132,7 @@ def explain(asked: Asked[ExplainConfig]) -> ExplainResult:
         environment=together(one.summary.environment for one in sweeps),
         controls=sweeps[0].summary.controls,
         parameters=list(table.attrs["units"]),
-        **vars(answers),
+        **vars(counted),
         units=None if is_independent(table) else table["unit"].nunique(),
         rules=rules,
         not_told=not_told(found.next, len(table)),
@@ -145,7 +145,7 @@ def explain(asked: Asked[ExplainConfig]) -> ExplainResult:
             held=box.held,
         ),
         pairs=pairs,
-        pairs_sought=min(config.pairs, answers.total - answers.right),
+        pairs_sought=min(config.pairs, counted.total - counted.right),
         clusters=clusters,
         renders=renders.count,
         warnings=[*renders.warnings, *cautions(table, importance)],

@@ -1,13 +1,14 @@
 """What rows say beside rules: which factors decide, a box to rely on, and failures that look alike.
 
 Factors. A factor's values are cut into parts that have equally many rows (a name is a part). The share is the variance
-of the model's accuracy between the parts over the variance of the yes/no answers: the first-order Sobol index of the
-answer, by parts (given-data estimators: Plischke, Borgonovo and Smith 2013). What differs inside a part is not in it,
-so that the index without parts is at least as large. Of two factors it is that of the parts of both at once.
+of the model's accuracy between the parts over the variance of the yes/no predictions: the first-order Sobol index of
+the prediction, by parts (given-data estimators: Plischke, Borgonovo and Smith 2013). What differs inside a part is not
+in it, so that the index without parts is at least as large. Of two factors it is that of the parts of both at once.
 
-Of n answers and k parts, n times the share that is counted is Pearson's chi-squared statistic of a table of k x 2, and
-the true share is its noncentrality over n (Cohen's w squared). The interval is that of the noncentrality (Smithson
-2003, "Confidence Intervals"). Where answers are those of units (frames of drives), chance adds more to the statistic
+Of n predictions and k parts, n times the share that is counted is Pearson's chi-squared statistic of a table of k x 2,
+and the true share is its noncentrality over n (Cohen's w squared). The interval is that of the noncentrality (Smithson
+2003, "Confidence Intervals"). Where predictions are those of units (frames of drives), chance adds more to the
+statistic
 than with independent ones: it is divided by how much more, which the deviations of units say, and is one of F, as that
 is known from few units (Rao and Scott 1981, their first-order correction; Thomas and Rao 1987). `benchmarks/explain.py`
 and `benchmarks/drives.py` print in how many of repeated samples it covers the truth.
@@ -34,7 +35,7 @@ from scipy.stats import chi2, ncf, ncx2
 from scipy.stats import f as fisher
 
 from advsearch.attacks.trials import CONFIDENCE
-from advsearch.questions.explain.answer import RightOf, RuleNotTold
+from advsearch.questions.explain.result import RightOf, RuleNotTold
 from advsearch.rules import CHANCE as RULES_CHANCE
 from advsearch.rules import (
     FEWEST_ROWS,
@@ -54,15 +55,15 @@ CHANCE = 0.01
 """Probability that any pair is told to decide together where none does; each is tested at its part (Bonferroni)."""
 
 LEAST_SPREAD = 0.1
-"""What chance adds for units, at least, of what it adds to independent answers, though units deviate in nothing."""
+"""What chance adds for units, at least, of what it adds to independent predictions, though units deviate in nothing."""
 
 Places = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)
 class FactorWeight:
-    """What one factor, or two together, decide: a share of the variance of the answers, in [0, 1], without what chance
-    adds to it, with its 95 % interval, and into how many parts it was cut."""
+    """What one factor, or two together, decide: a share of the variance of the predictions, in [0, 1], without what
+    chance adds to it, with its 95 % interval, and into how many parts it was cut."""
 
     factors: tuple[str, ...]
     share: float
@@ -74,20 +75,20 @@ def find_importance(table: pd.DataFrame) -> tuple[FactorWeight, ...]:
     """Return each factor of a table (`rules`) by falling share, then the pairs that decide together more than each of
     the two by itself.
 
-    Nothing where the answers are all the same.
+    Nothing where the predictions are all the same.
     """
     if table["correct"].nunique() < 2:
         return ()
-    answers, factors = _Answers(table), list(table.attrs["units"])
-    fine, few = round(answers.count ** (1.0 / 3.0)), max(2, math.isqrt(answers.count // ROWS_IN_A_CELL))
-    alone = [answers.weight((one,), _parts(table[one], fine)) for one in factors]
+    predictions, factors = _Predictions(table), list(table.attrs["units"])
+    fine, few = round(predictions.count ** (1.0 / 3.0)), max(2, math.isqrt(predictions.count // ROWS_IN_A_CELL))
+    alone = [predictions.weight((one,), _parts(table[one], fine)) for one in factors]
     pairs, tested = [], list(combinations(factors, 2))
     coarse = {one: _parts(table[one], few) for one in factors}
     for pair in tested:
         one, other = (coarse[factor] for factor in pair)
         both = one * (int(other.max()) + 1) + other
-        if answers.chance_of_more(both, one, other) < CHANCE / len(tested):
-            pairs.append(answers.weight(pair, both))
+        if predictions.chance_of_more(both, one, other) < CHANCE / len(tested):
+            pairs.append(predictions.weight(pair, both))
     return (*sorted(alone, key=lambda one: -one.share), *sorted(pairs, key=lambda one: -one.share))
 
 
@@ -100,8 +101,8 @@ def _parts(column: pd.Series, most: int) -> Places:
     return np.asarray(np.searchsorted(ends, values, side="left"), dtype=np.int64)
 
 
-class _Answers:
-    """The answers of a table: (n,) whether they are right, and the number of the unit of each."""
+class _Predictions:
+    """The predictions of a table: (n,) whether they are right, and the number of the unit of each."""
 
     def __init__(self, table: pd.DataFrame) -> None:
         self.right: npt.NDArray[np.bool_] = table["correct"].to_numpy()
@@ -130,7 +131,7 @@ class _Answers:
         return FactorWeight(factors, max(share, 0.0), (min(low, 1.0), min(high, 1.0)), k)
 
     def by_chance(self, parts: Places) -> float:
-        """What chance adds to the statistic of some parts, from how much units deviate: k - 1 where answers are
+        """What chance adds to the statistic of some parts, from how much units deviate: k - 1 where predictions are
         independent; NaN where too few units say it."""
         seen, right = np.bincount(parts), self.right
         if self.independent:
@@ -242,7 +243,7 @@ def _peeled(conditions: RuleConditions, inside: pd.DataFrame) -> Iterator[RuleCo
                 yield tuple(box[name] for name in inside.attrs["units"] if name in box)
 
 
-# ---- rules as answers have them -----------------------------------------------------------------------------------
+# ---- rules as results have them -----------------------------------------------------------------------------------
 
 
 def right_of(rows: pd.DataFrame) -> RightOf:

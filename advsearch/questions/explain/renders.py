@@ -24,8 +24,8 @@ from advsearch.options import BY_KEY
 from advsearch.progress import Progress
 from advsearch.question import Asked
 from advsearch.questions.attack.studies import carry_out_part
-from advsearch.questions.explain.answer import FailureCluster, FailureClusters, NearestRight, RightOf
 from advsearch.questions.explain.findings import find_clusters, right_of
+from advsearch.questions.explain.result import FailureCluster, FailureClusters, NearestRight, RightOf
 from advsearch.questions.sweep.carry_out import scenes_of
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.questions.sweep.summary import SweepSummary
@@ -38,7 +38,7 @@ from advsearch.settings import split_names
 from advsearch.viewer.thumbnails import path_of
 
 ALONG = 9
-"""Values of a factor that are tried on the way to a right answer."""
+"""Values of a factor that are tried on the way to a right prediction."""
 OUTER = ("object", "environment", "model")
 
 
@@ -61,7 +61,7 @@ class AskedSweep:
         return cls(folder, SweepConfig.from_yaml(folder / CONFIG), summary)
 
 
-def read_answers(sweeps: Sequence[AskedSweep]) -> pd.DataFrame:
+def read_predictions(sweeps: Sequence[AskedSweep]) -> pd.DataFrame:
     """Return the rows of some sweeps as one frame (`runs.tables`), with the number of their `sweep`; sweeps of the same
     draws share their units, so that two models' are not told twice. Object, environment and model are called as figures
     call them, and what a sweep has no parameter for is missing."""
@@ -225,7 +225,7 @@ class Renders:
         assert isinstance(done, SweepSummary)
         self.interrupted = done.goes_on
         self.count += sum(done.renders.values())
-        return None if self.interrupted else read_answers([AskedSweep(path, own, done)])
+        return None if self.interrupted else read_predictions([AskedSweep(path, own, done)])
 
     def confirmed(self, rule: CountedRule, number: int) -> RightOf | None:
         """Render fresh configurations inside a rule, in the scene of each sweep."""
@@ -267,11 +267,11 @@ class Renders:
         return abs(float(pair.right_at) - float(pair.wrong_at)) / float(column.max() - column.min())
 
     def _nearest(self, name: str, place: int, factor: str) -> NearestRight | None:
-        """Go along one factor until the answer is right, twice with other noise; the failure fails in both."""
+        """Go along one factor until the prediction is right, twice with other noise; the failure fails in both."""
         config, row = self.sweeps[self.rows["sweep"][place]].config, values_of(self.rows, place)
         if not can_be_given(config, factor):
             return None
-        self.progress.message(f"{name}: the nearest right answer along {factor}")
+        self.progress.message(f"{name}: the nearest right prediction along {factor}")
         label = f"{name}-{factor.replace('.', '_')}"
         passes = []
         for number in range(2):

@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 from advsearch.question import Asked, question
-from advsearch.questions.harden.answer import HardenConfig, HardenResult
-from advsearch.questions.harden.answer import claims as claims
-from advsearch.questions.harden.answer import shown as shown
+from advsearch.questions.harden.result import HardenConfig, HardenResult
+from advsearch.questions.harden.result import claims as claims
+from advsearch.questions.harden.result import shown as shown
 
 
 @question(

@@ -24,9 +24,16 @@ from advsearch.models.source import split_weights
 from advsearch.progress import Progress, Watched, watcher
 from advsearch.question import Asked
 from advsearch.questions.attack.parts import LOADING, executor_for
-from advsearch.questions.harden import answer, scenes, training
-from advsearch.questions.harden.answer import HardenConfig, HardenResult, Share
+from advsearch.questions.harden import scenes, training
 from advsearch.questions.harden.lessons import FOLDER, Lesson
+from advsearch.questions.harden.result import (
+    RENDERED_SCENES,
+    HardenConfig,
+    HardenedControl,
+    HardenResult,
+    Share,
+    SplitSide,
+)
 from advsearch.questions.harden.scenes import FURTHER, HELD_OUT, ROBUST, TRAINING, VALIDATION, SceneWork, Wanted
 from advsearch.questions.harden.training import WEIGHTS, Course, Examples, MakeOptimiser
 from advsearch.rooms import made_question
@@ -127,7 +134,7 @@ class Hardening:
         self.clean: dict[str, Share] = {}
         self.stages = Stages(progress)
         self._executor: Executor = InProcess(work)
-        self.further = answer.RENDERED_SCENES if work.rendered else answer.PLAIN_SCENES
+        self.further = RENDERED_SCENES if work.rendered else PLAIN_SCENES
         searched = self.config.scenes * self.config.rounds
         held = scenes.CLEAN_SCENES * self.config.measured  # of which a part is attacked
         self.counts = {TRAINING: searched, FURTHER: self.further * searched, VALIDATION: self.rounds.judged}
@@ -173,7 +180,8 @@ class Hardening:
 
         In the training a fourth of the scenes have one texture for all views, in half of them the controls that are
         rendered vary by chance, and further scenes come on top: of what is rendered new scenes teach more than further
-        views. Of what is rendered one in so many scenes is drawn as it is, too: there the given model's answers count.
+        views. Of what is rendered one in so many scenes is drawn as it is, too: there the given model's predictions
+        count.
         """
         linear, rendered, training = self.scenes.linear, self.scenes.rendered, split == TRAINING
         wanted, draw = list[Wanted](), scenes.Drawing
@@ -235,7 +243,7 @@ class Hardening:
         for control in names:
             shares = {which: self._robust(which, [control]) for which in MEASUREMENTS}
             if None not in shares.values():
-                table.append(answer.HardenedControl.of({"control": control, **shares}))
+                table.append(HardenedControl.of({"control": control, **shares}))
         if done and self.rounds.best == 0:
             warnings = [*warnings, "No round kept the clean accuracy, so the weights are the model's own."]
         weights, taught = self.run.path / ARTIFACTS / WEIGHTS, self.scenes.splits[TRAINING]
@@ -246,7 +254,7 @@ class Hardening:
             HELD_OUT: scenes.CLEAN_VIEWS,
         }
         split = {
-            name: answer.SplitSide.of({**vars(side), "scenes": self.counts[name], "views": views[name]})
+            name: SplitSide.of({**vars(side), "scenes": self.counts[name], "views": views[name]})
             for name, side in self.scenes.splits.items()
         }
         facts, (name, _) = self._executor.facts, split_weights(config.model)

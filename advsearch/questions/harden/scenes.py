@@ -28,8 +28,8 @@ from advsearch.models.reference import trainable
 from advsearch.questions.attack.carry_out import attack_on
 from advsearch.questions.attack.parts import problem_of
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.harden.answer import ALL, HardenConfig
 from advsearch.questions.harden.lessons import Lesson, has_matrix, lessons, plain_lessons
+from advsearch.questions.harden.result import ALL, HardenConfig
 from advsearch.runs.results import INTERRUPTED
 from advsearch.scene.assets import ObjectAsset
 from advsearch.scene.formation import levels_of

@@ -23,8 +23,8 @@ from advsearch.models.augmentation import Augmentation
 from advsearch.models.reference import Trainable
 from advsearch.progress import Progress
 from advsearch.questions.harden import lessons
-from advsearch.questions.harden.answer import HardenConfig, TrainingRound
 from advsearch.questions.harden.lessons import Lesson, RenderedLesson, TextureLesson, surprise, with_worst
+from advsearch.questions.harden.result import HardenConfig, TrainingRound
 from advsearch.questions.harden.scenes import TRAINING, VALIDATION
 from advsearch.report.wording import percent
 from advsearch.runs.directory import ARTIFACTS, RunDirectory
@@ -147,7 +147,8 @@ class Gradients:
 
         Worst textures are changed as the search for them saw them: seen otherwise, they are no longer the worst. At
         times all that was rendered is mixed with each other (mixup, Zhang et al. 2018, arXiv 1710.09412), as no more
-        pictures of it will come; a texture is another one each time. The given model's answers count of scenes as they
+        pictures of it will come; a texture is another one each time. The given model's predictions count of scenes as
+        they
         are alone: where something moved, it is right without being sure.
         """
         searched, rng, mixed = with_worst(part), np.random.default_rng(seed), list[int]()

@@ -22,14 +22,14 @@ from advsearch.described import Value
 from advsearch.engine.judging import judgements
 from advsearch.engine.naming import in_turn
 from advsearch.engine.record import judged
-from advsearch.engine.verifier import kept_answer
+from advsearch.engine.verifier import kept_configuration
 from advsearch.errors import FileFormatError, InputError
 from advsearch.files import JsonObject, read_bytes
 from advsearch.models import Model
 from advsearch.questions.attack.parts import judged_alone, problem_from_config
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.photographs import answer
-from advsearch.questions.photographs.answer import LOOSE_PHOTO, PHOTO, PhotoAgreement, PhotographedRendering
+from advsearch.questions.photographs import result
+from advsearch.questions.photographs.result import LOOSE_PHOTO, PHOTO, PhotoAgreement, PhotographedRendering
 from advsearch.questions.sweep.carry_out import scenes_of
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.runs.directory import CONFIG, IMAGES, RunDirectory, find_run
@@ -112,7 +112,7 @@ def photographs_in(folder: Path, task: AnyTask) -> list[Path]:
     files = sorted(folder.iterdir()) if folder.is_dir() else []
     photographs = [file for file in files if file.suffix.lower() in SUFFIXES and file.is_file()]
     loose = [file for file in photographs if not _ALIGNED.fullmatch(file.stem)]
-    if loose and (made := make_task(task)) and (made.varies or made.looks):
+    if loose and (made := make_task(task)) and (made.varies or made.calibrates):
         raise InputError(
             f"{loose[0].name}: the task asks where the object is, and only a rendering says that; name the file "
             "rendering-NUMBER.jpg by the rendering that it was aligned with, or take it out"
@@ -155,16 +155,16 @@ class Photographs:
         models say of it is kept."""
         file, kind, sound, name = None, PHOTO if rendering else LOOSE_PHOTO, b"", ""
         if rendering is not None:
-            file = answer.rendering_file(run, rendering)
+            file = result.rendering_file(run, rendering)
             with Image.open(file, formats=("PNG", "JPEG")) as image:
-                sound = answer.sound_photo(data, image.size)  # before anything is loaded
+                sound = result.sound_photo(data, image.size)  # before anything is loaded
         with RunDirectory.resume(run) as held:
             number, rows, judges = held.store.last_step(kind) + 1, [], self._judges(run)
             for place, judge in enumerate(judges):
                 kept: JsonObject = {"source": source}
                 values: dict[str, Value] = {}
                 if file is None or rendering is None:
-                    sound = answer.sound_photo(data, judge.size[::-1])
+                    sound = result.sound_photo(data, judge.size[::-1])
                 else:
                     step = int(rendering) * len(judges) + place if rendering.isdigit() else None
                     seen = None if step is None else held.store.row("sweep", step)
@@ -177,7 +177,7 @@ class Photographs:
                 row = judged(Row(kind, number, values=values), judge.judgement(rendering, shown, sound))
                 rows.append(replace(row, payload={"photo": kept, "answer": row.payload}))
             if file is not None:
-                write_bytes(run / IMAGES / answer.FOLDER / name, sound)
+                write_bytes(run / IMAGES / result.FOLDER / name, sound)
             held.record(*rows)
 
 
@@ -218,7 +218,7 @@ def _by_sweep(config: SweepConfig) -> Sequence[_PhotoJudge]:
 
     def truth(model: int, rendering: str | None, name: str | None) -> Truth:
         task = job.tasks[model]
-        if rendering is None or not (task.varies or task.looks):
+        if rendering is None or not (task.varies or task.calibrates):
             place = next((place for place in job.places if place.object == name), job.places[0])
             return job.truth(place, model, {})
         number = int(rendering)
@@ -239,9 +239,9 @@ def _by_attack(run: Path, config: AttackConfig) -> Sequence[_PhotoJudge]:
         alone = list(zip(whole_task.models, whole_task.tasks, strict=True))
 
     def truth(task: Task, rendering: str | None, _: str | None) -> Truth:
-        """Of the clean configuration, of the answer, or of one of its trials."""
-        known = rendering in (None, "clean") or not (task.varies or task.looks)
-        u = problem.domain.start if known else kept_answer(run, problem)
+        """Of the clean configuration, of the adversarial one, or of one of its trials."""
+        known = rendering in (None, "clean") or not (task.varies or task.calibrates)
+        u = problem.domain.start if known else kept_configuration(run, problem)
         trial = (rendering or "").rpartition("verification-")[2]
         whole = problem.whole(u, seeds.stream(problem.seed, "verification", int(trial)) if trial.isdigit() else None)
         look = partial(problem.renderer.surfaces, whole)
@@ -251,10 +251,11 @@ def _by_attack(run: Path, config: AttackConfig) -> Sequence[_PhotoJudge]:
 
 
 def _rendered(judge: _PhotoJudge, rendering: str, file: Path, row: Row | None) -> tuple[bool, str]:
-    """Whether the model is right on a rendering, and its answer: a sweep's as it was stored, others' by its file."""
+    """Whether the model is right on a rendering, and its prediction: a sweep's as it was stored, others' by its
+    file."""
     if row is not None:
         return bool(row.correct), row.label or ""
     if file.suffix != ".png":
         raise InputError(f"rendering: the results have no row for {file.stem}; it belongs to another run")
     judgement = judge.judgement(rendering, None, file.read_bytes())
-    return judgement.right, judgement.answer.label
+    return judgement.right, judgement.prediction.label

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from advsearch.question import Asked, question
-from advsearch.questions.precision.answer import PrecisionConfig, PrecisionResult
-from advsearch.questions.precision.answer import shown as shown
+from advsearch.questions.precision.result import PrecisionConfig, PrecisionResult
+from advsearch.questions.precision.result import shown as shown
 
 
 @question(

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from advsearch import seeds
 from advsearch.engine.gradients import Estimate, Loss, Probe, agreement, estimated, only, probes, reference
-from advsearch.questions.precision.answer import PrecisionReference
+from advsearch.questions.precision.result import PrecisionReference
 from advsearch.questions.precision.rule import Array, Numbers, ReferenceValue, Setting, reference_of
 from advsearch.scene.gradients import BY_ADJOINT, Group, compared
 from advsearch.scene.renderer import Renderer
@@ -239,7 +239,7 @@ BY_COORDINATE = 32
 
 @dataclass(frozen=True)
 class GradientPart:
-    """Coordinates of one control whose gradient one call of an estimator answers; named with parameters where a control
+    """Coordinates of one control whose gradient one call of an estimator gives; named with parameters where a control
     has several."""
 
     name: str

@@ -21,16 +21,6 @@ from advsearch.engine.record import Results, kept_rows
 from advsearch.errors import InputError
 from advsearch.progress import NullProgress, Progress
 from advsearch.questions.attack.parts import LOADING, problem_from_config
-from advsearch.questions.precision.answer import (
-    Machine,
-    PrecisionConfig,
-    PrecisionPoint,
-    PrecisionResult,
-    Recommended,
-    Sitting,
-    cautions,
-    precision_figures,
-)
 from advsearch.questions.precision.benches import (
     OIDN,
     GradientBench,
@@ -40,13 +30,23 @@ from advsearch.questions.precision.benches import (
     gradient_parts,
     in_rounds,
 )
+from advsearch.questions.precision.result import (
+    Machine,
+    PrecisionConfig,
+    PrecisionPoint,
+    PrecisionResult,
+    Recommended,
+    Sitting,
+    cautions,
+    precision_figures,
+)
 from advsearch.questions.precision.rule import RoundUp, confirmed, fit_line, point_of, reaching, warning_of
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.files import write_bytes
 from advsearch.runs.results import Formation
 from advsearch.scene.formation import next_count
 from advsearch.settings import split_names
-from advsearch.viewer.pages import keep_answer
+from advsearch.viewer.pages import keep_result
 
 SHARES = {"image": 0.6, "gradient": 0.4}
 """Of the time, by quantity; what one doesn't use is the others'."""
@@ -121,7 +121,7 @@ def precision_from_config(
         (run.path / "images").mkdir(exist_ok=True)
         figures = precision_figures(found)
         written = [write_bytes(run.path / "images" / f"precision.{kind}", data) for kind, data in figures.items()]
-        return keep_answer(run, found.model_copy(update={"figures": [str(path) for path in written]}))
+        return keep_result(run, found.model_copy(update={"figures": [str(path) for path in written]}))
 
 
 class Measurement:

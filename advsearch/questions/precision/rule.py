@@ -14,7 +14,7 @@ import numpy.typing as npt
 from scipy.special import stdtrit
 from scipy.stats import linregress
 
-from advsearch.questions.precision.answer import WARM_UP, PrecisionPoint, PrecisionSlope, Recommended
+from advsearch.questions.precision.result import WARM_UP, PrecisionPoint, PrecisionSlope, Recommended
 
 Array = npt.NDArray[np.float64]
 Numbers = Mapping[str, float]

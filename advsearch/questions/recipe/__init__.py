@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from advsearch.question import Asked, question
-from advsearch.questions.recipe.answer import RecipeConfig, RecipeResult
-from advsearch.questions.recipe.answer import shown as shown
+from advsearch.questions.recipe.result import RecipeConfig, RecipeResult
+from advsearch.questions.recipe.result import shown as shown
 
 
 @question(

@@ -1,4 +1,4 @@
-"""`recipe`: an experiment that a YAML file describes: runs of the commands there are, and figures of their answers."""
+"""`recipe`: an experiment that a YAML file describes: runs of the commands there are, and figures of their results."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from advsearch.question import Asked
 from advsearch.questions.attack.parts import check_from_config
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.studies import carry_out_part
-from advsearch.questions.attack.summary import AnswerDistribution, AttackSummary, FoundValue, attack_of
-from advsearch.questions.photographs.answer import LOOSE_PHOTO, PHOTO
+from advsearch.questions.attack.summary import AttackSummary, FoundValue, SearchDistribution, attack_of
 from advsearch.questions.photographs.carry_out import Photographs, photographs_in
+from advsearch.questions.photographs.result import LOOSE_PHOTO, PHOTO
 from advsearch.questions.recipe import description
-from advsearch.questions.recipe.answer import RecipeConfig, RecipeFigure, RecipePart, RecipeResult
 from advsearch.questions.recipe.description import PHOTOGRAPHS, PlannedRun, Recipe, planned
 from advsearch.questions.recipe.figures import ANY, check_figures, files_of, make, read_options
 from advsearch.questions.recipe.frame import TRIAL, TRIALS, WORKERS, frame_of, read_rows
+from advsearch.questions.recipe.result import RecipeConfig, RecipeFigure, RecipePart, RecipeResult
 from advsearch.questions.sweep.carry_out import scenes_of
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.questions.sweep.summary import SweepSummary
@@ -109,8 +109,8 @@ def check_described(recipe: Recipe, config: RecipeConfig) -> None:
         kind, _ = read_options(figure, config.recipe)
         if kind == "cues" and config.task is not None and name_in(config.task) == DETECTION:
             raise InputError(
-                f"task: {config.recipe} asks whether answers are classes of the texture or of the shape, and detection "
-                "answers whether the object is found; give it a classifier"
+                f"task: {config.recipe} asks whether predictions are classes of the texture or of the shape, and "
+                "detection says whether the object is found; give it a classifier"
             )
 
 
@@ -154,7 +154,7 @@ def _photographed(recipe: Recipe, runs: Sequence[PlannedRun]) -> list[PlannedRun
 
 def _carried_out(runs: Sequence[PlannedRun], asked: Asked[RecipeConfig]) -> tuple[list[DoneRun], list[str]]:
     """Carry out the runs that are not done, until one is interrupted; return all that there are, and a sentence for
-    each that cannot be carried out after another one's answer."""
+    each that cannot be carried out after another one's result."""
     done, left_out, folder = list[DoneRun](), list[str](), asked.run.path / PARTS
     for number, run in enumerate(runs):
         config = run.config
@@ -176,12 +176,12 @@ def _carried_out(runs: Sequence[PlannedRun], asked: Asked[RecipeConfig]) -> tupl
     return done, left_out
 
 
-def around(config: SceneConfig, answer: AnswerDistribution, searched: Mapping[str, FoundValue]) -> SceneConfig:
-    """Draw evenly from the distribution that a search answers with, over the ranges that it searched: mean and
+def around(config: SceneConfig, distribution: SearchDistribution, searched: Mapping[str, FoundValue]) -> SceneConfig:
+    """Draw evenly from the distribution that a search found, over the ranges that it searched: mean and
     deviation are the same. An even distribution of deviation s is sqrt(12) s wide. The ranges end where the search's
     did; angles that go all the way round may pass that end, and take the whole turn at most."""
     controls: dict[str, dict[str, object]] = {}
-    for (name, mean), deviation in zip(answer.mean.items(), answer.deviation, strict=True):
+    for (name, mean), deviation in zip(distribution.mean.items(), distribution.deviation, strict=True):
         control, _, parameter = name.partition(".")
         declared = next(one for one in CONTROLS[control].parameters if one.name == parameter)
         ends = searched[name].low, searched[name].high, mean.value

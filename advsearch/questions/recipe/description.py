@@ -1,6 +1,6 @@
 """A recipe as its YAML file describes it, and the runs that it comes to.
 
-A part is carried out once for each object, as a run of its command; figures are made of what these answer.
+A part is carried out once for each object, as a run of its command; figures are made of their results.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from advsearch import seeds
 from advsearch.config import CONFIGS, DEFAULT_ENVIRONMENT, SceneConfig
 from advsearch.errors import FileFormatError, InputError, UnknownNameError
-from advsearch.questions.recipe.answer import RecipeConfig
+from advsearch.questions.recipe.result import RecipeConfig
 from advsearch.runs.directory import default_name
 from advsearch.settings import read_yaml, split_names
 from advsearch.settings.configuration import PLACE, SettingsError
@@ -67,7 +67,7 @@ class Changes(_Described):
 
 
 class Recipe(_Described):
-    """What a recipe's file says (docs/recipes.md): its question, what is done for an answer and whose experiment it
+    """What a recipe's file says (docs/recipes.md): its question, what is done for a result and whose experiment it
     is, settings of all parts, parts in the order in which they are carried out, figures with a `figure`, their kind,
     and options, groups of objects by name, and what is different when it should be quick."""
 
@@ -164,7 +164,7 @@ def first_of(error: ValidationError) -> str:
 
 @dataclass(frozen=True)
 class PlannedRun:
-    """One run of a recipe; `around` is the folder of the run whose answer says what is drawn, None where the settings
+    """One run of a recipe; `around` is the folder of the run whose result says what is drawn, None where the settings
     say it."""
 
     name: str

@@ -1,4 +1,4 @@
-"""The kinds of figures that a recipe may have: what each may say in the file, and what it makes of the answers."""
+"""The kinds of figures that a recipe may have: what each may say in the file, and what it makes of the rows."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from advsearch.report.figures import Figures, drawn
 
 FIGURES: Mapping[str, tuple[type[Options], Any]] = {
     "rates": (rates.RatesOptions, rates.rates),
-    "answers": (given.AnswersOptions, given.answers),
+    "answers": (given.PredictionsOptions, given.predictions),
     "cues": (given.CuesOptions, given.cues),
     "ternary": (given.TernaryOptions, given.ternary),
     "agreement": (rates.AgreementOptions, rates.agreement),
     "scaling": (Options, rates.scaling),
     "surface": (Options, rates.surface),
 }
-"""The options that each kind takes, and what makes it of the answers."""
+"""The options that each kind takes, and what makes it of the rows."""
 
 TOGETHER = ("agreement", "scaling", "surface")
 """Kinds that tell several models apart by themselves; of the others each model has one."""
 
 NAMING = ("by", "series", "texture", "shape", "shares")  # options of figures that name columns
-OUTER = ("object", "environment", frame.MODEL, frame.ANSWER, frame.PART)  # columns of every recipe
+OUTER = ("object", "environment", frame.MODEL, frame.PREDICTION, frame.PART)  # columns of every recipe
 ANY = "*"  # stands for the parameters of a control that does not say beforehand which it has
 
 
@@ -47,7 +47,7 @@ def read_options(described: Mapping[str, object], where: str) -> tuple[str, Opti
 
 def make(rows: Rows, kind: str, options: Options) -> Iterator[MadeFigure]:
     """Yield a figure; where it does not tell several models apart, one of each. An InputError where it needs what the
-    answers do not have."""
+    predictions do not have."""
     parts, made = rows[frame.PART], FIGURES[kind][1]
     shown = rows[parts.isin(options.parts) if options.parts else parts != PHOTOGRAPHS]
     together = kind in TOGETHER or frame.MODEL in vars(options).values() or frame.MODEL not in shown

@@ -1,4 +1,4 @@
-"""The answers of a recipe's runs as one frame, and what all figures make of it: counts, sentences, a picture."""
+"""The rows of a recipe's runs as one frame, and what all figures make of it: counts, sentences, a picture."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from advsearch.runs.results import Interval
 from advsearch.runs.store import NAME, Store
 from advsearch.runs.units import units_of
 
-ANSWER, GROUP, PART, TRIAL, MODEL, WORKERS = "answer", "group", "part", "trial", "model", "workers"
+PREDICTION, GROUP, PART, TRIAL, MODEL, WORKERS = "answer", "group", "part", "trial", "model", "workers"
 """Columns beside parameters: what the model said, the group that an object is in, the part of the recipe, which trial
 of an attack it is, the model, and the number of processes that shared a sweep, of sweeps that say it."""
 
@@ -42,7 +42,7 @@ Rows = Any  # pd.DataFrame, which has no types
 def read_rows(
     part: str, folder: Path, summary: AttackSummary | SweepSummary, seed: int, kinds: Sequence[str], **more: Cell
 ) -> tuple[list[dict[str, Any]], dict[str, str]]:
-    """Return the answers of some kinds that a run has stored, and the units of their parameters. Each has what it shows
+    """Return the rows of some kinds that a run has stored, and the units of their parameters. Each has what it shows
     (`object`, `environment`, `model`, and parameters), what was said of it (`answer`, `correct`, `margin`), the `time`
     when it was stored, seconds since 1970, and the `unit` of what it shares with rows that are not independent of it:
     draws of one seed are the same ones, also in another part."""
@@ -64,13 +64,18 @@ def read_rows(
                 values[TRIAL], unit = TRIALS[row.kind], f"{seed} {row.step}"
             for name in ("object", "environment", MODEL):
                 values[name] = figure_value(str(values.get(name, getattr(summary, name))))
-            said = {ANSWER: row.label or "none", "correct": bool(row.correct), "margin": row.margin, "time": row.time}
+            said = {
+                PREDICTION: row.label or "none",
+                "correct": bool(row.correct),
+                "margin": row.margin,
+                "time": row.time,
+            }
             rows.append({**values, **said, PART: part, "unit": unit, **more})
     return rows, units
 
 
 def frame_of(rows: Iterable[Mapping[str, Any]], groups: Mapping[str, Sequence[str]], **facts: Any) -> Rows:
-    """Return answers as a frame, with the groups of their objects if there are any: their names, each with those of
+    """Return rows as a frame, with the groups of their objects if there are any: their names, each with those of
     the objects in it. Its ``attrs`` are the facts."""
     frame = pd.DataFrame(rows)
     if groups:
@@ -108,8 +113,8 @@ def by(rows: Rows, name: str) -> dict[str, Rows]:
 
 
 def most_frequent(rows: Rows) -> list[tuple[str, int]]:
-    """Return the answers with how often each was given, the most frequent first."""
-    return sorted(Counter(rows[ANSWER]).items(), key=lambda item: (-item[1], item[0]))
+    """Return the predictions with how often each was given, the most frequent first."""
+    return sorted(Counter(rows[PREDICTION]).items(), key=lambda item: (-item[1], item[0]))
 
 
 class Tally:
@@ -123,7 +128,7 @@ class Tally:
 
     @classmethod
     def over(cls, name: str, rows: Rows, flags: Any = None) -> Tally:
-        """Count rows: those with right answers, or those that flags (n,) say."""
+        """Count rows: those with right predictions, or those that flags (n,) say."""
         counted = np.asarray(rows["correct"] if flags is None else flags, dtype=np.float64)
         units = pd.factorize(rows["unit"])[0]
         return cls(name, per_unit(counted, units), per_unit(np.ones(len(rows)), units))
@@ -192,7 +197,7 @@ def bare(name: str) -> str:
 
 class Options(BaseModel):
     """Options that every figure has: a title, made from the other options where it is empty, and the parts whose
-    answers it shows; all where none is named."""
+    rows it shows; all where none is named."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -201,7 +206,7 @@ class Options(BaseModel):
 
     @property
     def parts(self) -> tuple[str, ...]:
-        """The parts whose answers it is made from; none for all that were rendered."""
+        """The parts whose rows it is made from; none for all that were rendered."""
         return self.of
 
 

@@ -1,4 +1,4 @@
-"""Figures of which answers are given: the most frequent ones, whether they go by shape or texture, and where in a
+"""Figures of which predictions are made: the most frequent ones, whether they go by shape or texture, and where in a
 mixture each is given (ternary diagrams)."""
 
 from __future__ import annotations
@@ -25,24 +25,24 @@ from advsearch.report.wording import percent
 LETTERS, FEWEST_LETTERS = 85, 4  # letters that a bar of the whole width has room for, and of a name that is cut short
 
 
-class AnswersOptions(Options):
-    """Options of the most frequent answers."""
+class PredictionsOptions(Options):
+    """Options of the most frequent predictions."""
 
     by: str
     most: int = Field(default=4, ge=1, le=10)
 
 
-def answers(rows: Rows, options: AnswersOptions) -> MadeFigure:
-    """Count the most frequent answers for each value of something."""
+def predictions(rows: Rows, options: PredictionsOptions) -> MadeFigure:
+    """Count the most frequent predictions for each value of something."""
     groups: dict[str, list[tuple[Tally, int]]] = {}  # how often each was given, and how often it was a right one
     for value, some in frame.by(rows, options.by).items():
-        given = {answer: some[frame.ANSWER] == answer for answer, _ in frame.most_frequent(some)[: options.most]}
+        given = {label: some[frame.PREDICTION] == label for label, _ in frame.most_frequent(some)[: options.most]}
         groups[value] = [
-            (Tally.over(answer, some, flags), int(some["correct"][flags].sum())) for answer, flags in given.items()
+            (Tally.over(label, some, flags), int(some["correct"][flags].sum())) for label, flags in given.items()
         ]
     wrong = {value: each[0] for value, each in groups.items() if 2 * each[0][1] < each[0][0].times}
     known, thing = len(groups) - len(wrong), frame.plural(options.by)
-    text = [f"For {known} of {len(groups)} {thing} the most frequent answer is mostly a right one."]
+    text = [f"For {known} of {len(groups)} {thing} the most frequent prediction is mostly a right one."]
     text += [
         f"For {value} it is {tally.name}, {tally.told('given')} and right in {right} of these."
         for value, (tally, right) in wrong.items()
@@ -60,15 +60,18 @@ def answers(rows: Rows, options: AnswersOptions) -> MadeFigure:
             axes.barh(place, max(1.0 - left, 0.0), left=left, color=GREY, alpha=0.15, height=0.72)
         axes.set_yticks(range(len(groups)), list(groups))
         axes.invert_yaxis()
-        axes.set(xlabel="share of answers; blue: mostly right, red: mostly wrong, grey: others", xlim=(0.0, 1.0))
+        axes.set(xlabel="share of predictions; blue: mostly right, red: mostly wrong, grey: others", xlim=(0.0, 1.0))
 
     table = [[value, tally.name, *tally.cells, right] for value, given in groups.items() for tally, right in given]
-    heads, title = [options.by, "answer", "given in", *frame.COUNT, "right"], f"Most frequent answers by {options.by}"
+    heads, title = (
+        [options.by, "prediction", "given in", *frame.COUNT, "right"],
+        f"Most frequent predictions by {options.by}",
+    )
     return MadeFigure(options.title or title, text, heads, table, draw, (6.4, 1.2 + 0.3 * len(groups)))
 
 
 def fitting(name: str, share: float) -> str:
-    """Return as much of an answer's name as a bar has room for: the first of several names, or its beginning."""
+    """Return as much of a prediction's name as a bar has room for: the first of several names, or its beginning."""
     room, first = int(share * LETTERS), name.partition(",")[0]
     cut = f"{first[: room - 1].rstrip()}…" if room > FEWEST_LETTERS else ""
     return next((text for text in (name, first) if len(text) <= room), cut)
@@ -76,12 +79,12 @@ def fitting(name: str, share: float) -> str:
 
 # ---- shape and texture ----------------------------------------------------------------------------------------------
 
-SEED, RESAMPLES = 0, 2000  # of the answers that predict, and of the bootstrap
+SEED, RESAMPLES = 0, 2000  # of the pairs that predict, and of the bootstrap
 FEWEST_PAIRS = 4  # pairs of object and texture: two of each
 
 
 class CuesOptions(Options):
-    """Options of cues; for a texture, `classes` are the answers that name it."""
+    """Options of cues; for a texture, `classes` are the predictions that name it."""
 
     texture: str = "material.which"
     shape: str = "object"
@@ -89,21 +92,24 @@ class CuesOptions(Options):
 
 
 def cues(rows: Rows, options: CuesOptions) -> MadeFigure:
-    """Count how often the answer is the object and how often the texture, and which of both predicts answers better."""
+    """Count how often the prediction is the object and how often the texture, and which of both foretells predictions
+    better."""
 
-    def says(texture: str, some: Rows) -> Any:  # the whole answer, or one of the names that it consists of
+    def says(texture: str, some: Rows) -> Any:  # the whole prediction, or one of the names that it consists of
         classes = options.classes.get(texture, ())
-        return some[frame.ANSWER].map(lambda said: any(name.strip() in classes for name in [said, *said.split(",")]))
+        return some[frame.PREDICTION].map(
+            lambda said: any(name.strip() in classes for name in [said, *said.split(",")])
+        )
 
     textures = frame.by(rows, options.texture)
     shapes = {name: Tally.over(name, some) for name, some in textures.items()}
     naming = {name: says(name, some) for name, some in textures.items()}
     named = {name: Tally.over(name, some, naming[name]) for name, some in textures.items()}
-    text = [f"The answer is the object, whatever its texture: {Tally.over('', rows).told('so')}."]
+    text = [f"The prediction is the object, whatever its texture: {Tally.over('', rows).told('so')}."]
     if asked := [name for name in textures if options.classes.get(name)]:
         flags = pd.concat([naming[name] for name in asked])
         total = Tally.over("", rows.loc[flags.index], flags)
-        text.append(f"The answer names the texture ({', '.join(asked)}): {total.told('so')}.")
+        text.append(f"The prediction names the texture ({', '.join(asked)}): {total.told('so')}.")
         text += [] if total.share else ["A model that has no class for a texture cannot name it."]
     text.append(_which(predicted(rows, options)))
     text += frame.extremes(list(shapes.values()), "The hardest texture", "the easiest", "textures")
@@ -115,25 +121,25 @@ def cues(rows: Rows, options: CuesOptions) -> MadeFigure:
         axes.barh(ordered, texture, left=shape, color=RED, alpha=0.55, height=0.66, label="the texture")
         for place, name in enumerate(ordered):
             axes.plot(shapes[name].interval(), [place, place], color="#1c1d20", linewidth=1.2)
-        axes.set(xlabel="share of answers; line: 95 % interval of the object's", xlim=(0.0, 1.0))
+        axes.set(xlabel="share of predictions; line: 95 % interval of the object's", xlim=(0.0, 1.0))
         axes.grid(True, axis="x")
-        figure.legend(loc="outside lower center", ncols=2, title="the answer names")
+        figure.legend(loc="outside lower center", ncols=2, title="the prediction names")
 
     table = [[name, *shapes[name].cells, named[name].times] for name in textures]
-    heads, title = [options.texture, "the object", *frame.COUNT, "the texture"], "Answers by shape and by texture"
+    heads, title = [options.texture, "the object", *frame.COUNT, "the texture"], "Predictions by shape and by texture"
     return MadeFigure(options.title or title, text, heads, table, draw, (6.0, 1.7 + 0.27 * len(textures)))
 
 
 def predicted(rows: Rows, options: CuesOptions) -> list[tuple[int, int, int]]:
-    """Predict the answers about each object with each texture by those about it with others, and with others by it;
-    return of each pair how many answers there are, and how many of these the shape and the texture predict. Each cue
-    predicts the most frequent one of as many answers: those about the same object with other textures, and
+    """Foretell the predictions about each object with each texture by those about it with others, and with others by it;
+    return of each pair how many predictions there are, and how many of these the shape and the texture predict. Each cue
+    predicts the most frequent one of as many predictions: those about the same object with other textures, and
     about the same texture on other objects, drawn so that both are as many as the fewer are. None of the predicted
-    answers is among them, so that a model which answers by neither cue is predicted as well by both.
+    predictions is among them, so that a model which goes by neither cue is predicted as well by both.
     """
     generator, counts = random.Random(SEED), []
     groups = rows.groupby([frame.column(rows, options.shape), frame.column(rows, options.texture)], sort=False)
-    pairs = {pair: list(some[frame.ANSWER]) for pair, some in groups}
+    pairs = {pair: list(some[frame.PREDICTION]) for pair, some in groups}
     for (shape, texture), given in pairs.items():
         same_shape = [one for (s, t), more in pairs.items() if s == shape and t != texture for one in more]
         same_texture = [one for (s, t), more in pairs.items() if t == texture and s != shape for one in more]
@@ -145,12 +151,12 @@ def predicted(rows: Rows, options: CuesOptions) -> list[tuple[int, int, int]]:
 
 
 def _which(pairs: Sequence[tuple[int, int, int]]) -> str:
-    """By how much more the shape predicts than the texture, both of the same answers. Answers about one pair go
+    """By how much more the shape predicts than the texture, both of the same predictions. Predictions about one pair go
     together: the interval is a percentile bootstrap over pairs."""
     if len(pairs) < FEWEST_PAIRS:
         return (
-            "Whether the answers go more by shape or by texture is not said: that takes at least two objects and two "
-            f"textures, {FEWEST_PAIRS} pairs in all."
+            "Whether the predictions go more by shape or by texture is not said: that takes at least two objects and "
+            f"two textures, {FEWEST_PAIRS} pairs in all."
         )
 
     def ahead(some: Sequence[tuple[int, int, int]]) -> float:
@@ -163,8 +169,8 @@ def _which(pairs: Sequence[tuple[int, int, int]]) -> str:
     cue = "shape than by texture" if low > 0.0 else "texture than by shape" if high < 0.0 else ""
     verdict = f"the model goes more by {cue}" if cue else "no difference is shown"
     return (
-        f"The most frequent answer about the same object with other textures is given in {percent(shape / total)}, "
-        f"and that about the same texture on other objects, of as many answers, in {percent(texture / total)}: "
+        f"The most frequent prediction about the same object with other textures is given in {percent(shape / total)}, "
+        f"and that about the same texture on other objects, of as many predictions, in {percent(texture / total)}: "
         f"{ahead(pairs):.0f} points more by shape (95 % interval {low:.0f} to {high:.0f}, over pairs of object and "
         f"texture): {verdict}."
     )
@@ -176,14 +182,14 @@ Doubles = npt.NDArray[np.float64]
 Shares = tuple[float, float, float]
 Triangle = tuple[int, int, bool]  # how far along the first and the second share it is, and whether it points down
 MEANINGLESS = (
-    "The answer is {} in every picture, so that shares of answers tell nothing. Colours are how far the right answer "
-    "leads the best wrong one: the margin with its sign turned, in logits for a classifier."
+    "The prediction is {} in every picture, so that shares of predictions tell nothing. Colours are how far the right "
+    "prediction leads the best wrong one: the margin with its sign turned, in logits for a classifier."
 )
 
 
 class TernaryOptions(Options):
-    """Options of ternary diagrams of three shares. Of normalised ones the colours of each answer end at its own largest
-    share, and those of leads begin at the smallest; `side` is triangles along a side."""
+    """Options of ternary diagrams of three shares. Of normalised ones the colours of each prediction end at its own
+    largest share, and those of leads begin at the smallest; `side` is triangles along a side."""
 
     shares: tuple[str, str, str]
     normalised: bool = False
@@ -192,7 +198,7 @@ class TernaryOptions(Options):
 
 
 def ternary(rows: Rows, options: TernaryOptions) -> MadeFigure:
-    """Count where in a mixture each answer is given; where all are the same, how far the right one leads."""
+    """Count where in a mixture each prediction is given; where all are the same, how far the right one leads."""
     amounts = np.stack([frame.numbers(rows, name) for name in options.shares], axis=1)
     sums, names = amounts.sum(axis=1, keepdims=True), [frame.bare(name) for name in options.shares]
     mixtures = amounts / np.where(sums == 0.0, 1.0, sums)
@@ -205,33 +211,33 @@ def ternary(rows: Rows, options: TernaryOptions) -> MadeFigure:
     by_lead = len(given) == 1 and min(map(len, leads.values())) >= 2
     text, table = list[str](), list[list[frame.Cell]]()
     panels: dict[str, list[float | None]] = {}
-    for answer, times in given[: options.most]:
-        flags = (rows[frame.ANSWER] == answer).to_numpy()
+    for label, times in given[: options.most]:
+        flags = (rows[frame.PREDICTION] == label).to_numpy()
         values = lead if by_lead else flags
         known = [values[here & ~np.isnan(values)] for here in inside.values()]
-        panels[answer] = [float(some.mean()) if len(some) else None for some in known]
+        panels[label] = [float(some.mean()) if len(some) else None for some in known]
         if not by_lead:
             by_most = [Tally.over(name, rows[most == k], flags[most == k]) for k, name in enumerate(names)]
-            whose = f"{answer}, {percent(times / len(rows))} of all answers, is"
+            whose = f"{label}, {percent(times / len(rows))} of all predictions, is"
             if len({tally.share for tally in by_most if tally.total}) == 1:
                 text.append(f"{whose} given as often whatever most of the mixture is: no difference is shown.")
             else:
                 least, most_often = f"{whose} rarest where most of the mixture", "most frequent where most of it"
                 text += frame.extremes(by_most, least, most_often, "ingredients", "given")
-            table += [[answer, tally.name, *tally.cells] for tally in by_most]
-    heads = ["answer", "where most is", "given in", *frame.COUNT]
+            table += [[label, tally.name, *tally.cells] for tally in by_most]
+    heads = ["prediction", "where most is", "given in", *frame.COUNT]
     if by_lead:
         text = [MEANINGLESS.format(given[0][0]), _told_leads(leads)]
-        heads = ["where most is", "pictures", "mean lead of the right answer", "standard error"]
+        heads = ["where most is", "pictures", "mean lead of the right label", "standard error"]
         table = [[name, len(own), float(own.mean()), _error(own)] for name, own in leads.items()]
     if empty := sum(not here.any() for here in inside.values()):
         text.append(f"No picture was drawn in {empty} of {len(corners)} parts of the diagram, which are hatched.")
 
     def draw(figure: Any) -> None:
         each = figure.subplots(1, len(panels), squeeze=False)[0]
-        label = "mean lead of the right answer" if by_lead else "share of answers"
-        for axes, (answer, values) in zip(each, panels.items(), strict=True):
-            colours = _panel(axes, answer, values, list(corners.values()), names)
+        label = "mean lead of the right label" if by_lead else "share of predictions"
+        for axes, (label, values) in zip(each, panels.items(), strict=True):
+            colours = _panel(axes, label, values, list(corners.values()), names)
             known = [value for value in values if value is not None]
             low = min(known) if options.normalised and by_lead else min([*known, 0.0])
             colours.set_clim(low, max([*known, 1e-9]) if options.normalised or by_lead else 1.0)
@@ -240,7 +246,7 @@ def ternary(rows: Rows, options: TernaryOptions) -> MadeFigure:
         if not options.normalised:
             figure.colorbar(colours, ax=list(each), shrink=0.7 / len(each), location="bottom", label=label)
 
-    title = options.title or f"Answers over {', '.join(names)}"
+    title = options.title or f"Predictions over {', '.join(names)}"
     return MadeFigure(title, text, heads, table, draw, (max(2.4 * len(panels), 4.8), 3.5))
 
 
@@ -293,7 +299,7 @@ def _error(values: Doubles) -> float:
 
 
 def _panel(
-    axes: Any, answer: str, values: Sequence[float | None], corners: Sequence[Sequence[Shares]], names: Sequence[str]
+    axes: Any, label: str, values: Sequence[float | None], corners: Sequence[Sequence[Shares]], names: Sequence[str]
 ) -> Any:
     """Draw a diagram; what is coloured in it is returned."""
     from matplotlib.collections import PolyCollection  # matplotlib takes half a second
@@ -314,7 +320,7 @@ def _panel(
     for (x, y), name in zip(outer, names, strict=True):
         away, side = (-4, "top") if y < 0.1 else (4, "bottom")
         axes.annotate(name, (x, y), (0, away), textcoords="offset points", ha="center", va=side, fontsize=8)
-    axes.set_title(answer, fontsize=9, loc="center", pad=14)
+    axes.set_title(label, fontsize=9, loc="center", pad=14)
     axes.set(xlim=(-0.12, 1.12), ylim=(-0.14, 1.0), aspect="equal")
     axes.axis("off")
     return coloured

@@ -1,5 +1,5 @@
-"""Figures of how often: right or wrong answers by one or two columns, photographs that agree with renderings, pictures
-a second, and parts of a surface that go with wrong answers."""
+"""Figures of how often: right or wrong predictions by one or two columns, photographs that agree with renderings, pictures
+a second, and parts of a surface that go with wrong predictions."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from advsearch.errors import InputError
 from advsearch.questions.recipe import frame
 from advsearch.questions.recipe.description import PHOTOGRAPHS
 from advsearch.questions.recipe.frame import MadeFigure, Options, Rows, Tally
-from advsearch.questions.sweep.answer import surface_sentences
+from advsearch.questions.sweep.display import surface_sentences
 from advsearch.report.figures import BLUE, MARKS, SERIES, draw_shares
 from advsearch.report.wording import count, figure_value, percent, short_name
 from advsearch.runs.directory import IMAGES, PARTS
@@ -49,7 +49,7 @@ class RatesOptions(Options):
 
 
 def rates(rows: Rows, options: RatesOptions) -> MadeFigure:
-    """Count the answers and say what the counts show."""
+    """Count the predictions and say what the counts show."""
     verb, form, second = "wrong" if options.wrong else "right", options.form, options.series
     beside, rows = rows[rows[frame.PART] == options.beside], rows[rows[frame.PART] != options.beside]
     if rows.empty:
@@ -199,10 +199,10 @@ def agreement(rows: Rows, options: AgreementOptions) -> MadeFigure:
     """Count in how many pairs the model is right, or wrong, about a rendering and another picture of the same alike."""
     renderings = rows[rows[frame.PART] == options.of[0]].dropna(axis=1, how="all")
     if renderings.empty:
-        raise InputError(f"figures: agreement: expected answers of a part {options.of[0]!r}, got none")
+        raise InputError(f"figures: agreement: expected predictions of a part {options.of[0]!r}, got none")
     # the values that renderings have; other pictures may have more
     shared = [
-        name for name in renderings if name not in (frame.ANSWER, frame.PART, "correct", "margin", "time", "unit")
+        name for name in renderings if name not in (frame.PREDICTION, frame.PART, "correct", "margin", "time", "unit")
     ]
     text, table, series = list[str](), list[list[frame.Cell]](), list[str]()
     bars: dict[str, list[Tally]] = {thing: [] for thing in (ALL, *renderings["object"].unique())}
@@ -220,14 +220,14 @@ def agreement(rows: Rows, options: AgreementOptions) -> MadeFigure:
             some = pairs if thing == ALL else pairs[pairs["object"] == thing]
             first, second = some["correct rendered"], some["correct"]
             four = [int(((first == a) & (second == b)).sum()) for a in (True, False) for b in (True, False)]
-            same = int((some[f"{frame.ANSWER} rendered"] == some[frame.ANSWER]).sum())
+            same = int((some[f"{frame.PREDICTION} rendered"] == some[frame.PREDICTION]).sum())
             tallies.append(tally := Tally.over(thing, some, first == second))
             table.append([name, thing, *four, same, *tally.cells])
             if thing == ALL and len(some):
                 text.append(
                     f"Renderings and {name}: {tally.told('right about both or wrong about both')}. "
                     f"{_where(True, some)} {_where(False, some)} "
-                    f"The answer is the same in {same} of {len(some)} ({percent(same / len(some))})."
+                    f"The prediction is the same in {same} of {len(some)} ({percent(same / len(some))})."
                 )
         if part == PHOTOGRAPHS:
             text += ["The intervals take photographs as independent."] if len(pairs) else []
@@ -242,7 +242,7 @@ def agreement(rows: Rows, options: AgreementOptions) -> MadeFigure:
         figure.legend(loc="outside lower center", ncols=1)
 
     four_heads = ["right, right", "right, wrong", "wrong, right", "wrong, wrong"]
-    heads = ["rendering and", "object", *four_heads, "same answer", "agree", *frame.COUNT]
+    heads = ["rendering and", "object", *four_heads, "same prediction", "agree", *frame.COUNT]
     title = options.title or "Renderings and other pictures of the same"
     return MadeFigure(title, text, heads, table, draw, (6.0, 1.7 + 0.2 * len(series) + 0.34 * (len(bars) - 1)))
 
@@ -314,7 +314,7 @@ def _spread(values: Any) -> str:
 
 
 def surface(rows: Rows, options: Options) -> MadeFigure:
-    """Show which parts of each object, when seen, go with wrong answers."""
+    """Show which parts of each object, when seen, go with wrong predictions."""
     surfaces = rows.attrs["surfaces"]
     if not surfaces:
         raise InputError("figures: surface: expected a sweep with `surface: true` among its parts, got none")
@@ -331,7 +331,7 @@ def surface(rows: Rows, options: Options) -> MadeFigure:
         for found in surfaces.values()
         for part in found.tables
     ]
-    heads = ["object", "model", "parts", "seen", "compared", "with wrong answers", "with right answers"]
+    heads = ["object", "model", "parts", "seen", "compared", "with wrong predictions", "with right predictions"]
     text = [sentence for found in surfaces.values() for sentence in surface_sentences(found)]
-    title = options.title or "Which parts of the surface go with wrong answers"
+    title = options.title or "Which parts of the surface go with wrong predictions"
     return MadeFigure(title, text, heads, table, draw, (6.4, 2.65 * len(surfaces)))

@@ -8,13 +8,13 @@ from typing import Any
 
 from advsearch.question import Asked, question
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.region.answer import RegionConfig, RegionResult
-from advsearch.questions.region.answer import claims as claims
-from advsearch.questions.region.answer import shown as shown
+from advsearch.questions.region.result import RegionConfig, RegionResult
+from advsearch.questions.region.result import claims as claims
+from advsearch.questions.region.result import shown as shown
 
 
 def of_the_run(file: Path, typed: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what the run around whose answer a box grows brings: scene, model and controls."""
+    """Return what the run around whose adversarial configuration a box grows brings: scene, model and controls."""
     return RegionConfig.shared(AttackConfig.from_yaml(file))
 
 

@@ -23,13 +23,13 @@ from advsearch.question import Asked
 from advsearch.questions.attack.outcome import transport_of
 from advsearch.questions.attack.parts import LOADING, problem_from_config
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.region.answer import AxisRange, BoxSide, GrownRegion, MarginMap, RegionConfig, RegionResult
+from advsearch.questions.region.result import AxisRange, BoxSide, GrownRegion, MarginMap, RegionConfig, RegionResult
 from advsearch.questions.sweep.predicting import pays_from
 from advsearch.report.figures import MARGIN, Figures, axis_title, figure_of, heat
 from advsearch.runs.directory import CONFIG, RunDirectory, find_run
 from advsearch.runs.files import write_bytes
 from advsearch.runs.results import CleanScene, Formation, MovedValue
-from advsearch.runs.summary import read_answer
+from advsearch.runs.summary import read_configuration
 from advsearch.scene.surface import renderer as surface_renderer
 from advsearch.scene.surface.arrangement import CAMERAS, FREE
 from advsearch.seeds import stream
@@ -57,7 +57,7 @@ def region_around(asked: Asked[RegionConfig]) -> RegionResult:
     config, stages = asked.config, Stages(asked.progress)
     stages.begin("setup", LOADING)
     budget: dict[str, object] = {}
-    if config.around is not None:  # its answer has to lie within
+    if config.around is not None:  # its centre has to lie within
         theirs = AttackConfig.from_yaml(find_run(config.around) / CONFIG)
         budget = {"epsilon": theirs.epsilon, "norm": theirs.norm}
     problem, warnings = problem_from_config(AttackConfig.of(config, **budget))
@@ -159,10 +159,10 @@ def _light(verifier: Verifier, config: RegionConfig, varied: Varied, centre: Ten
 def _centre(problem: Problem, config: RegionConfig) -> Tensor:
     if config.around is None:
         return problem.domain.start.clone()
-    values = torch.from_numpy(read_answer(find_run(config.around)))
+    values = torch.from_numpy(read_configuration(find_run(config.around)))
     if values.shape != problem.domain.start.shape:
         raise InputError(
-            f"`around` {config.around}: expected a run over the same controls, whose answer has "
+            f"`around` {config.around}: expected a run over the same controls, whose configuration has "
             f"{problem.domain.dim} numbers, got one with {len(values)}; leave `controls` out so that the run's own are "
             "taken"
         )
@@ -191,15 +191,15 @@ def _varied(problem: Problem, config: RegionConfig) -> Varied:
 
 
 def _verdict(verifier: Verifier, centre: Tensor) -> bool:
-    """Whether the model is wrong at the centre; an InputError where that depends on the noise, or the answer is not a
-    number."""
+    """Whether the model is wrong at the centre; an InputError where that depends on the noise, or the prediction is not
+    a number."""
     verifier.stages.begin("verification", "looking at the centre", AT_CENTRE)
     wrong = nothing = 0
     for trial in verifier.trials("centre", dict.fromkeys(range(AT_CENTRE), centre), sought=False):
         wrong, nothing = wrong + trial.success, nothing + trial.not_a_number
     if nothing:
         raise InputError(
-            f"the model's answer is not a number in {nothing} of {AT_CENTRE} trials at the centre, so there is no "
+            f"the model's prediction is not a number in {nothing} of {AT_CENTRE} trials at the centre, so there is no "
             "verdict; choose another centre, or mend the model"
         )
     verdict = verifier.problem.rule.decided(wrong, AT_CENTRE)
@@ -276,13 +276,13 @@ def map_figure(drawn: MarginMap, box: Sequence[BoxSide]) -> Figures:
 
 
 Same = Callable[[Tensor, int], bool]
-"""(u, number) -> whether the answer at u is that of the centre; number numbers its seed."""
+"""(u, number) -> whether the prediction at u is that of the centre; number numbers its seed."""
 
 
 @dataclass(frozen=True, eq=False)
 class GrownBox:
-    """A box in the unit box in which the answer stays the same: the centre (d,) and its corners (d,), how many of the
-    final samples had the centre's answer, and pictures in all."""
+    """A box in the unit box in which the prediction stays the same: the centre (d,) and its corners (d,), how many of
+    the final samples had the centre's prediction, and pictures in all."""
 
     centre: Tensor
     low: Tensor
@@ -293,7 +293,7 @@ class GrownBox:
 
     @property
     def interval(self) -> tuple[float, float]:
-        """95 % interval of the share of the box with the centre's answer; see the module."""
+        """95 % interval of the share of the box with the centre's prediction; see the module."""
         return clopper_pearson(self.same, self.samples, 1.0 - 0.05 / ATTEMPTS)
 
     @property
@@ -318,7 +318,7 @@ def grow(
 
     Each face in turn tries to move out by a share of what is left to the bound (1/2 at first, halved at every level at
     which no face can move any more). The slab that it would win is probed at random points; if all have the centre's
-    answer, it moves. Growing ends after `MOST_PROBED` pictures for each parameter at the latest. Then the box is
+    prediction, it moves. Growing ends after `MOST_PROBED` pictures for each parameter at the latest. Then the box is
     sampled; on an exception, the face that cuts off the least of the box moves in to it and the box is sampled anew,
     with other seeds, `ATTEMPTS` times at most; the last check counts whatever it shows. `on_check` is told the
     beginning of each.
@@ -369,7 +369,7 @@ SHORTEST = 1e-3
 
 
 def _push(judge: _Judge, low: Tensor, high: Tensor, face: int, share: float) -> bool:
-    """Move one face out if the slab that it wins has the centre's answer; whether it moved."""
+    """Move one face out if the slab that it wins has the centre's prediction; whether it moved."""
     axis, up = divmod(face, 2)
     room = float(1.0 - high[axis] if up else low[axis])
     step = room if room < 4.0 * SHORTEST else share * room

@@ -1,4 +1,5 @@
-"""`replay`: the answer of a run under other conditions than it was searched and verified under, in other pictures."""
+"""`replay`: the adversarial scene of a run under other conditions than it was searched and verified under, in other
+pictures."""
 
 from __future__ import annotations
 
@@ -18,14 +19,14 @@ from advsearch.controls.sensor import SensorControl, through_sensor
 from advsearch.engine.naming import different
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import control_group, verified_rate
-from advsearch.engine.verifier import RetrialCondition, Retrials, kept_answer, unchanged
+from advsearch.engine.verifier import RetrialCondition, Retrials, kept_configuration, unchanged
 from advsearch.errors import InputError
 from advsearch.progress import Progress, Watched, watcher
-from advsearch.question import Asked, answered
+from advsearch.question import Asked, carried_out
 from advsearch.questions.attack.parts import LOADING, SEARCHED_WITH, AttackParts, parts_in, problem_of_parts
 from advsearch.questions.attack.result import AttackResult
 from advsearch.questions.attack.summary import AttackSummary, attack_of
-from advsearch.questions.replay.answer import NOT_DONE, ReplayConfig, ReplayResult, ReplayRow
+from advsearch.questions.replay.result import NOT_DONE, ReplayConfig, ReplayResult, ReplayRow
 from advsearch.runs.directory import RunDirectory, find_run, only_here
 from advsearch.runs.store import NAME, Store
 from advsearch.runs.summary import MADE_WITH, changed_file
@@ -79,7 +80,7 @@ class Way:
 
 
 def ways_of(problem: Problem, spp: int, sized: Callable[[tuple[int, int]], Problem]) -> Iterator[Way]:
-    """Yield every condition of a problem's answer but other models; the first changes nothing.
+    """Yield every condition of a problem's configuration but other models; the first changes nothing.
 
     `spp` is that of the run's verification, and `sized` makes the same problem at another (height, width) in pixels.
     """
@@ -153,46 +154,48 @@ def _sensor(values: dict[str, float]) -> Callable[[Tensor, int], Tensor]:
 
 
 @asks(ReplayConfig)
-def replay(answer: str | Path | AttackResult, *, progress: Watched = None, **settings: Any) -> ReplayResult:
-    """Render the answer of a run under other conditions, each beside the clean scene (docs/questions.md).
+def replay(attack: str | Path | AttackResult, *, progress: Watched = None, **settings: Any) -> ReplayResult:
+    """Render the adversarial scene of a run under other conditions, each beside the clean scene (docs/questions.md).
 
     Args:
-        answer: of an attack that was kept and has ended: its result, or name or folder of its run.
+        attack: one that was kept and has ended: its result, or name or folder of its run.
     """
     parts, only_now = None, list[str]()
-    if isinstance(answer, AttackResult):
-        if answer.run is None:
-            raise InputError("answer: expected an attack that was kept, got one that was not; give it a `run`")
-        only_now = [one for one in only_here(answer.run) if not one.startswith(SEARCHED_WITH)]
-        parts = None if answer.parts is None else answer.parts()
-    config = configured(ReplayConfig, answer=answer.run if isinstance(answer, AttackResult) else answer, **settings)
+    if isinstance(attack, AttackResult):
+        if attack.run is None:
+            raise InputError("attack: expected an attack that was kept, got one that was not; give it a `run`")
+        only_now = [one for one in only_here(attack.run) if not one.startswith(SEARCHED_WITH)]
+        parts = None if attack.parts is None else attack.parts()
+    config = configured(ReplayConfig, attack=attack.run if isinstance(attack, AttackResult) else attack, **settings)
     asked = Asked(config.with_only_here(only_now) if only_now else config, watcher(progress))
-    return answered(partial(rendered_again, parts=parts), asked)
+    return carried_out(partial(rendered_again, parts=parts), asked)
 
 
 def rendered_again(asked: Asked[ReplayConfig], parts: AttackParts | None = None) -> ReplayResult:
-    """Render an answer again as a configuration describes; every trial is stored at once, and a run goes on with the
-    next.
+    """Render an adversarial scene again as a configuration describes; every trial is stored at once, and a run goes on
+    with the next.
 
     `parts` is what the attack was asked with; None loads what its run names.
 
     Raises:
-        InputError: the run has no answer, or its scene is another one now.
+        InputError: the run has no adversarial configuration, or its scene is another one now.
         FileFormatError: it did not end, or is of another command.
     """
     config = asked.config
     asked.progress.stage(LOADING)
-    folder = find_run(config.answer)
+    folder = find_run(config.attack)
     summary = attack_of(folder)
     if summary.adversarial is None:
-        raise InputError(f"{folder}: ended with {summary.ending!r}, so that there is no answer to render again")
+        raise InputError(
+            f"{folder}: ended with {summary.ending!r}, so that there is no adversarial configuration to render again"
+        )
     different((OWN_MODEL, *config.models), "model")
     parts = parts or parts_in(folder)
     threads = {} if config.threads is None else {"threads": config.threads}
     again = partial(problem_of_parts, parts, **threads)
     problem, warnings = again()
     warnings += _changed(folder, parts)
-    u = kept_answer(folder, problem)
+    u = kept_configuration(folder, problem)
     own, *others = ways_of(problem, _spp(summary), lambda size: again(resolution=size)[0])
     ways = [own, *(way for way in others if way.name in config.chosen), *_models(config, again, problem, summary)]
     table = _Table(ways, u, config.trials, seeds.stream(parts.config.seed, "replay"), asked.run, asked.progress)
@@ -218,7 +221,8 @@ def rendered_again(asked: Asked[ReplayConfig], parts: AttackParts | None = None)
 
 @dataclass
 class _Table:
-    """The rows so far, by the place of their condition among all, for an answer (d,), and the pictures rendered."""
+    """The rows so far, by the place of their condition among all, for a configuration (d,), and the pictures
+    rendered."""
 
     ways: Sequence[Way]
     u: torch.Tensor
@@ -230,8 +234,8 @@ class _Table:
     renders: int = 0
 
     def fill(self, batch: Sequence[int]) -> None:
-        """Add the rows of some conditions that share their renders: the clean scene under all of them, then the answer.
-        A condition that cannot be had, or that Blender fails at, gets a row that says why."""
+        """Add the rows of some conditions that share their renders: the clean scene under all of them, then the
+        adversarial one. A condition that cannot be had, or that Blender fails at, gets a row that says why."""
         ways = {number: self.ways[number] for number in batch}
         missing = next((way.missing for way in ways.values() if way.missing), "")
         try:
@@ -254,7 +258,7 @@ class _Table:
         try:
             clean = {number: retrials.clean(condition) for number, condition in conditions.items()}
             for number, condition in conditions.items():
-                checked = retrials.answer("answer", self.u, condition)
+                checked = retrials.adversarial("answer", self.u, condition)
                 self.rows[number] = ReplayRow(
                     way=ways[number].name,
                     condition=ways[number].text,

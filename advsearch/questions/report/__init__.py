@@ -29,8 +29,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Write the files."""
     # late, so that --help answers at once
-    from advsearch.questions.report.answer import evidence_page, markdown
     from advsearch.questions.report.evidence import collected
+    from advsearch.questions.report.result import evidence_page, markdown
     from advsearch.runs.files import write_text
     from advsearch.runs.summary import to_json
 

@@ -14,8 +14,8 @@ from advsearch.errors import AdvsearchError
 from advsearch.options import FROM_RUN
 from advsearch.questions.attack import wording as attack_wording
 from advsearch.questions.attack.summary import AttackSummary
-from advsearch.questions.photographs.answer import FOLDER, PhotoAgreement
-from advsearch.questions.report.answer import Evidence, EvidenceRun
+from advsearch.questions.photographs.result import FOLDER, PhotoAgreement
+from advsearch.questions.report.result import Evidence, EvidenceRun
 from advsearch.questions.sweep.summary import SweepSummary
 from advsearch.report import wording
 from advsearch.report.shown import Claim, Extent, claim, nothing_claimed, share_text
@@ -31,8 +31,9 @@ RULES = (
     "Each claim is about the run's own model, object, environment, label and settings, and about nothing else.",
     "`found`: fresh renders confirm a configuration that a search found; how many others there are is not known.",
     "`not found`: a search of so many renders found none; another policy or more renders may find one.",
-    "`measured`: a share of what was counted; its interval has 95 % confidence (Clopper-Pearson's; where answers share "
-    "a draw, as frames of a drive do, one over draws, by bets) and holds for the distribution that was drawn from.",
+    "`measured`: a share of what was counted; its interval has 95 % confidence (Clopper-Pearson's; where predictions "
+    "share a draw, as frames of a drive do, one over draws, by bets) and holds for the distribution that was drawn "
+    "from.",
     "`nothing claimed`: the run does not carry a claim, for the reason that it gives.",
     "Renderings are not photographs: a claim is about reality only as far as photographs were compared.",
 )
@@ -217,7 +218,7 @@ def _excluded(result: Result, claims: Sequence[Claim]) -> list[str]:
             for one in result.clean.moved
         ]
     if isinstance(result, SweepSummary) and result.not_finite:
-        lines.append(f"{result.not_finite} answers were not numbers; they count as not right.")
+        lines.append(f"{result.not_finite} predictions were not numbers; they count as not right.")
     if isinstance(result, SweepSummary) and result.configurations < result.planned:
         lines.append(f"Only {result.configurations} of {result.planned} planned configurations were looked at.")
     if all(one.kind == "nothing claimed" for one in claims):

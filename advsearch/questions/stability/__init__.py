@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from advsearch.question import Asked, question
-from advsearch.questions.stability.answer import StabilityConfig, StabilityResult
-from advsearch.questions.stability.answer import shown as shown
+from advsearch.questions.stability.result import StabilityConfig, StabilityResult
+from advsearch.questions.stability.result import shown as shown
 
 
 @question(

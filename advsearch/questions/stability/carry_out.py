@@ -11,7 +11,7 @@ import advsearch.questions.stability.stiff  # noqa: F401  (both fill `CASES`)
 from advsearch.engine.record import Results, kept_rows
 from advsearch.errors import UnknownNameError
 from advsearch.progress import NullProgress, Progress
-from advsearch.questions.stability.answer import CASES, Case, CaseRow, StabilityConfig, StabilityResult
+from advsearch.questions.stability.result import CASES, Case, CaseRow, StabilityConfig, StabilityResult
 from advsearch.runs.directory import RunDirectory
 
 

@@ -16,7 +16,7 @@ from advsearch.attacks import PGD, Domain, Evaluation, Query, SearchResult, sear
 from advsearch.controls import Space, make_control, make_space
 from advsearch.engine import objective
 from advsearch.engine.gradients import Loss, derivatives, smooth_loss
-from advsearch.questions.stability.answer import Outcome, check, holds
+from advsearch.questions.stability.result import Outcome, check, holds
 from advsearch.runs.results import Measured
 from advsearch.scene import library
 from advsearch.scene.assembly import Motion
@@ -38,7 +38,7 @@ ERROR = 0.1
 DOUBT = 0.4
 """The noise of a comparison, as a share of the derivative, from which it decides nothing."""
 SHARPNESS = 20.0
-"""Logits per unit of the linear loss that the searched model answers with."""
+"""Logits per unit of the linear loss that the searched model returns."""
 SAME_PICTURE = 2e-3
 """Mean difference of two pictures that should be one: an 8-bit level is 4e-3."""
 

@@ -16,7 +16,7 @@ from advsearch.attacks import PGD, Adam, Auto, Query, search
 from advsearch.controls.occlusion import sphere
 from advsearch.engine.gradients import smooth_loss
 from advsearch.errors import InputError
-from advsearch.questions.stability.answer import Outcome, case, cases, check, holds
+from advsearch.questions.stability.result import Outcome, case, cases, check, holds
 from advsearch.questions.stability.scene import (
     ERROR,
     REFERENCE_SPP,
@@ -207,8 +207,8 @@ def texels_at_the_ends() -> Outcome:
     ).best_u
     return seen(controls, black_and_white, compare=False).also(
         check("gradient error along a direction that points inwards", error, most=ERROR),
-        check("smallest texel of the answer", float(best.min()), least=0.0),
-        check("largest texel of the answer", float(best.max()), most=1.0),
+        check("smallest texel of the adversarial configuration", float(best.min()), least=0.0),
+        check("largest texel of the adversarial configuration", float(best.max()), most=1.0),
         check("texels that the search moved", float((best != start).sum()), least=1.0),
         holds("the start has both 0 and 1", set(start.tolist()) == {0.0, 1.0}),
         relative_error=error,

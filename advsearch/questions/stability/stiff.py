@@ -16,7 +16,7 @@ from torch import Tensor
 
 from advsearch.attacks import PGD, search
 from advsearch.engine.gradients import smooth_loss
-from advsearch.questions.stability.answer import Outcome, case, cases, check, holds
+from advsearch.questions.stability.result import Outcome, case, cases, check, holds
 from advsearch.questions.stability.scene import SHARPNESS, ControlSettings, Evaluator, search_domain, seen, shown, small
 
 RATIO = 1e6

@@ -8,16 +8,16 @@ from typing import Any
 
 from advsearch.question import Asked, question
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.sweep.answer import claims as claims
-from advsearch.questions.sweep.answer import shown as shown
+from advsearch.questions.sweep.display import claims as claims
+from advsearch.questions.sweep.display import shown as shown
 from advsearch.questions.sweep.page import page as page
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.questions.sweep.summary import SweepSummary
 
 
-def of_the_answer(file: Path, typed: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what the run of an answer brings: scene and model, and what varies where nothing else does."""
-    return SweepConfig.of_answer(AttackConfig.from_yaml(file), varies="grid" in typed or "controls" in typed)
+def of_the_attack(file: Path, typed: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what the run of an attack brings: scene and model, and what varies where nothing else does."""
+    return SweepConfig.of_attack(AttackConfig.from_yaml(file), varies="grid" in typed or "controls" in typed)
 
 
 @question(
@@ -25,9 +25,9 @@ def of_the_answer(file: Path, typed: Mapping[str, Any]) -> dict[str, Any]:
     "sweep --object mug,bowl --environment studio,noon --grid camera.azimuth=0,90,180,270",
     "sweep --object mug --control pose,camera --samples 1000",
     "sweep --object mug --control pose --samples 200 --surface",
-    "sweep --answer-of mug-texture-001 --control camera,environment --samples 200",
-    about="answer_of",
-    brought=of_the_answer,
+    "sweep --adversarial-of mug-texture-001 --control camera,environment --samples 200",
+    about="adversarial_of",
+    brought=of_the_attack,
     called="advsearch.questions.sweep.carry_out:sweep",
 )
 def sweep(asked: Asked[SweepConfig]) -> SweepSummary:

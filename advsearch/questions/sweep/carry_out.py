@@ -14,7 +14,7 @@ from advsearch.api.keywords import asks
 from advsearch.cluster import Call
 from advsearch.controls import Control
 from advsearch.controls.camera import CameraControl, measured_in
-from advsearch.engine.journal import answering, check_made_of
+from advsearch.engine.journal import check_made_of, worker_call
 from advsearch.engine.judging import (
     Metric,
     check_shared,
@@ -55,7 +55,7 @@ from advsearch.questions.sweep.result import SweepResult
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.runs.directory import CONFIG, RunDirectory, begun, check_free, find_run, is_run, run_path
 from advsearch.runs.listing import finished
-from advsearch.runs.summary import read_answer
+from advsearch.runs.summary import read_configuration
 from advsearch.scene.description import ENVIRONMENT
 from advsearch.scene.surfaces import aovs_of
 from advsearch.scene.things import ALL
@@ -66,11 +66,11 @@ from advsearch.tasks.each_thing import each_thing
 OF_A_SCENE = ("object", "environment", "up", "size", "unit", "camera", "things", "set_", "exposure")
 """Settings that a scene of the caller's own has."""
 
-ANSWERING = "advsearch.questions.sweep.carry_out:sweep_answers"
+WORKER = "advsearch.questions.sweep.carry_out:sweep_worker"
 """What a worker does."""
 
 CLEAN = "clean"
-"""What the scene without the answer of a run is called beside that with it."""
+"""What the scene without the adversarial configuration of a run is called beside that with it."""
 
 AnyScene = Scene | str | Path
 
@@ -84,7 +84,7 @@ def sweep(
     task: AnyTask = "classification",
     samples: int | None = None,
     controls: Controls = (),
-    answer_of: str | Path | AttackResult | None = None,
+    adversarial_of: str | Path | AttackResult | None = None,
     metrics: Mapping[str, str | Metric] | None = None,
     run: str | Path | None = None,
     progress: Watched = None,
@@ -96,17 +96,17 @@ def sweep(
     arguments are the settings of `advsearch sweep`.
 
     Args:
-        scene: from `load_scene`, or what that takes; or several. None takes that of `answer_of`.
+        scene: from `load_scene`, or what that takes; or several. None takes that of `adversarial_of`.
         model: from `load_model`, or what that takes; or several, which are shown the same pictures. None takes that of
-            `answer_of`, and the reference model without.
+            `adversarial_of`, and the reference model without.
         task: what judges the models' outputs: a name, a mapping with a `name` and options, an instance, or a function
             (output, truth) that says how wrong it is, over 0 where it is wrong (docs/tasks.md).
         grid: parameter to its values: a list, a range, or "FIRST:LAST:COUNT".
         samples: draws of `controls` at each point of the grid; by default 1, or 100 without a grid.
         controls: what is drawn by chance, as for `attack`.
-        answer_of: an attack that was kept, or its folder, whose answer is swept beside the clean scene, under the same
-            draws; `summary.beside` compares the two. Where neither `grid` nor `controls` is given, what the attack was
-            over varies.
+        adversarial_of: an attack that was kept, or its folder, whose adversarial scene is swept beside the clean scene,
+            under the same draws; `summary.beside` compares the two. Where neither `grid` nor `controls` is given, what
+            the attack was over varies.
         metrics: columns of the rows, by name: functions of (image (H, W, 3) sRGB in [0, 1], output of that picture,
             truth: the index of the right class) that return a number or a dict. `workers` need functions of a module.
         run: folder to keep the run in; None keeps it in memory, which then grows with every configuration.
@@ -114,10 +114,10 @@ def sweep(
     options = {name: value for name, value in settings.items() if value is not None}
     if not isinstance(grid, (Mapping, type(None))):
         raise InputError(f"grid: expected a mapping from parameters to values, got {type(grid).__name__}")
-    folder, brought = _folder(answer_of), dict[str, Any]()
+    folder, brought = _folder(adversarial_of), dict[str, Any]()
     if folder is not None:
         theirs = AttackConfig.from_yaml(find_run(folder) / CONFIG)
-        brought = SweepConfig.of_answer(theirs, varies=bool(grid) or bool(controls))
+        brought = SweepConfig.of_attack(theirs, varies=bool(grid) or bool(controls))
     if scene is None and not brought:
         raise InputError("scene: expected what load_scene returns or takes, got nothing; name one")
     if scene is not None:
@@ -136,7 +136,7 @@ def sweep(
         "controls": settings_of(controls),
         "grid": dict(grid or {}),
         "samples": samples,
-        "answer_of": folder,
+        "adversarial_of": folder,
         "metrics": metrics_as_settings(metrics or {}),
     }
     loaded = tuple(
@@ -176,7 +176,7 @@ def sweep(
         job = replace(job, metrics=load_metrics(config.metrics, metrics))
         if config.run is not None:
             return _kept(config, job, progress, begun_in)
-        with executor_for(config, ANSWERING, progress) as executor:
+        with executor_for(config, WORKER, progress) as executor:
             return carry_out(job, None, progress, executor)
 
 
@@ -194,38 +194,42 @@ def sweep_from_config(
 # ---- from names to things -------------------------------------------------------------------------------------------
 
 
-def _folder(answer: str | Path | AttackResult | None) -> str | None:
-    """The run of an answer; an InputError where the attack was not kept."""
-    if isinstance(answer, AttackResult) and answer.run is None:
-        raise InputError("answer_of: expected an attack that was kept, got one that was not; give it a `run`")
-    kept = answer.run if isinstance(answer, AttackResult) else answer
+def _folder(attack: str | Path | AttackResult | None) -> str | None:
+    """The run of an attack; an InputError where the attack was not kept."""
+    if isinstance(attack, AttackResult) and attack.run is None:
+        raise InputError("adversarial_of: expected an attack that was kept, got one that was not; give it a `run`")
+    kept = attack.run if isinstance(attack, AttackResult) else attack
     return None if kept is None else str(kept)
 
 
-def _beside_answer(
+def _beside_adversarial(
     config: SweepConfig, places: Sequence[NamedScene], drawn: Sequence[Control], axes: Sequence[Axis]
 ) -> tuple[NamedScene, ...]:
-    """The places as they are, and then with the answer of the run that the configuration names.
+    """The places as they are, and then with the adversarial scene of the run that the settings name.
 
     Raises:
-        InputError: the run has no answer, or the sweep varies what that sets.
+        InputError: the run has no adversarial configuration, or the sweep varies what that sets.
         FileFormatError: it did not end, or is of another command.
     """
-    if config.answer_of is None:
+    if config.adversarial_of is None:
         return tuple(places)
-    folder = find_run(config.answer_of)
+    folder = find_run(config.adversarial_of)
     summary, theirs = attack_of(folder), AttackConfig.from_yaml(folder / CONFIG)
     if summary.adversarial is None:
-        raise InputError(f"answer_of: {folder} ended with {summary.ending!r}, so that there is no answer to sweep")
+        raise InputError(
+            f"adversarial_of: {folder} ended with {summary.ending!r}, so that there is no adversarial configuration "
+            "to sweep"
+        )
     held = given_to(theirs, theirs.controls)
     varied = {control.name for control in drawn} | {axis.instance for axis in axes}
     if twice := sorted(varied & {control.name for control in held}):
         raise InputError(
-            f"answer_of: the answer of {folder} says what {twice[0]} is already; leave it out of `grid` and `controls`"
+            f"adversarial_of: the configuration of {folder} says what {twice[0]} is already; leave it out of `grid` "
+            "and `controls`"
         )
-    u, name = torch.from_numpy(read_answer(folder)), folder.resolve().name
-    clean = [replace(place, held=held, answer=CLEAN) for place in places]
-    return (*clean, *(replace(place, u=u, answer=f"{name}'s" if name == CLEAN else name) for place in clean))
+    u, name = torch.from_numpy(read_configuration(folder)), folder.resolve().name
+    clean = [replace(place, held=held, beside_clean=CLEAN) for place in places]
+    return (*clean, *(replace(place, u=u, beside_clean=f"{name}'s" if name == CLEAN else name) for place in clean))
 
 
 def _several(given: Any) -> list[Any]:
@@ -281,7 +285,7 @@ def _job(
             "grid: expected something that varies, got nothing; add an axis such as `grid` pose.yaw=0:360:24, or "
             "`controls=pose` `samples=100`"
         )
-    places = _beside_answer(config, places, drawn, axes)
+    places = _beside_adversarial(config, places, drawn, axes)
     check_scenes(places, drawn, axes)
     sized = all(place.scene.description.object.metres is not None for place in places)
     axes = tuple(
@@ -356,12 +360,12 @@ def _stopped(config: SweepConfig) -> Path | None:
 
 def _kept(config: SweepConfig, job: Job, progress: Progress, resumed: Path | None) -> SweepResult:
     """Sweep in a run directory: a new one, or one that was begun."""
-    with RunDirectory.of(config, resumed) as run, executor_for(config, ANSWERING, progress) as executor:
+    with RunDirectory.of(config, resumed) as run, executor_for(config, WORKER, progress) as executor:
         functions = {f"metric {name}": one for name, one in job.metrics.items()}
         check_made_of(run, job.models, {**functions, "task": function_of(job.tasks[0])})
         return carry_out(job, run, progress, executor)
 
 
-def sweep_answers(settings: JsonObject) -> Call:
-    """Return what answers the queries of the sweep that the settings describe: what a worker does."""
-    return answering(Scenes(job_of(SweepConfig(**settings))).named)
+def sweep_worker(settings: JsonObject) -> Call:
+    """Return what evaluates the queries of the sweep that the settings describe: what a worker does."""
+    return worker_call(Scenes(job_of(SweepConfig(**settings))).named)

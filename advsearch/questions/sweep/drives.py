@@ -73,20 +73,20 @@ class Drives:
         self._away = away[:, order]
 
     def rates(self) -> list[DriveRates]:
-        """Return what is said of the drives of each model, without and with an answer."""
+        """Return what is said of the drives of each model, without and with an adversarial scene."""
         found, places = list[DriveRates](), self._job.places
-        for answer in dict.fromkeys(one.answer for one in places):
-            mine = [number for number, one in enumerate(places) if one.answer == answer]
+        for beside_clean in dict.fromkeys(one.beside_clean for one in places):
+            mine = [number for number, one in enumerate(places) if one.beside_clean == beside_clean]
             for model, network in enumerate(self._job.models):
                 right = self._right[mine][..., model, :].reshape(len(mine), -1, len(self.times))
                 whole = (right != UNKNOWN).all(axis=2)
                 away = np.repeat(self._away[mine][:, None], right.shape[1], axis=1)[whole]
                 if whole.any():
-                    found.append(self._rates(network.name, answer, right[whole] == 1, away))
+                    found.append(self._rates(network.name, beside_clean, right[whole] == 1, away))
         return found
 
     def _rates(
-        self, model: str, answer: str, right: npt.NDArray[np.bool_], away: npt.NDArray[np.float64]
+        self, model: str, beside_clean: str, right: npt.NDArray[np.bool_], away: npt.NDArray[np.float64]
     ) -> DriveRates:
         """What is said of drives: (n, frames) whether the model is right, and how far away it is."""
         seconds, frames = float(self.times[-1] - self.times[0]), len(self.times)
@@ -97,7 +97,7 @@ class Drives:
         ends = float(away.min()), float(away.max())
         return DriveRates(
             model=model,
-            answer=answer or None,
+            answer=beside_clean or None,
             drives=len(right),
             frames=right.shape[1],
             seconds=seconds,
@@ -122,7 +122,7 @@ class Drives:
 
 
 def picture_of(scenes: Scenes, number: int) -> npt.NDArray[np.float32]:
-    """Return the picture (h, w, 3) with a number, with the marks of the first model's answer."""
+    """Return the picture (h, w, 3) with a number, with the marks of the first model's prediction."""
     sent = scenes.job.queries(range(number, number + 1))
     view, query = scenes.named(sent[0][0]), sent[0][2]
     picture = view.pictures([query])[0]

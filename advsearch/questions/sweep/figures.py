@@ -20,35 +20,35 @@ MOST_TICKS = 16
 """Values of an axis that are written."""
 
 
-def figure_size(answer: SweepSummary) -> tuple[float, float] | None:
+def figure_size(summary: SweepSummary) -> tuple[float, float] | None:
     """Return width and height of a sweep's figure in inches; None where there is neither a map nor one axis."""
-    return _map_size(answer.cells) if answer.cells else (5.6, 3.6) if _only_axis(answer) else None
+    return _map_size(summary.cells) if summary.cells else (5.6, 3.6) if _only_axis(summary) else None
 
 
-def sweep_figure(answer: SweepSummary) -> Figures:
+def sweep_figure(summary: SweepSummary) -> Figures:
     """Draw a sweep: a map over two axes, or the accuracy over the only one; nothing where there is none.
 
     A cell shows the accuracy there; where no cell has more than one configuration, the margin.
     """
-    size = figure_size(answer)
-    return {} if size is None else figure_of(lambda axes: sweep_axes(answer, axes), size)
+    size = figure_size(summary)
+    return {} if size is None else figure_of(lambda axes: sweep_axes(summary, axes), size)
 
 
-def sweep_axes(answer: SweepSummary, axes: Any) -> None:
+def sweep_axes(summary: SweepSummary, axes: Any) -> None:
     """Draw a sweep on matplotlib axes, as `sweep_figure` does; nothing where there is neither a map nor one axis."""
-    if answer.cells:
-        _cells(axes, answer, answer.cells)
-    elif _only_axis(answer):
-        _along(axes, answer, _only_axis(answer))
+    if summary.cells:
+        _cells(axes, summary, summary.cells)
+    elif _only_axis(summary):
+        _along(axes, summary, _only_axis(summary))
 
 
-def _only_axis(answer: SweepSummary) -> Sequence[AxisRow]:
+def _only_axis(summary: SweepSummary) -> Sequence[AxisRow]:
     """The values of the only axis of a sweep; none where there are more, or too many values."""
-    rows = [row for row in answer.axes if not isinstance(row.value, (list, tuple))] or answer.axes
+    rows = [row for row in summary.axes if not isinstance(row.value, (list, tuple))] or summary.axes
     return rows if len({row.axis for row in rows}) == 1 and len(rows) <= MOST_POINTS else ()
 
 
-def _cells(axes: Any, answer: SweepSummary, cells: SweepMap) -> None:
+def _cells(axes: Any, summary: SweepSummary, cells: SweepMap) -> None:
     first, second = cells.axes
     seen, correct, margin = cells.configurations, cells.correct, cells.margin
     extent = (-0.5, len(first.values) - 0.5, -0.5, len(second.values) - 0.5)
@@ -64,10 +64,10 @@ def _cells(axes: Any, answer: SweepSummary, cells: SweepMap) -> None:
     axes.set_yticks(*_ticks(second.values))
     more = len(cells.over)
     over = f", over {more} more {'axes' if more > 1 else 'axis'}" if more else ""
-    axes.set_title(f"{_who(answer)}{over}")
+    axes.set_title(f"{_who(summary)}{over}")
 
 
-def _along(axes: Any, answer: SweepSummary, rows: Sequence[AxisRow]) -> None:
+def _along(axes: Any, summary: SweepSummary, rows: Sequence[AxisRow]) -> None:
     at, accuracy = range(len(rows)), [row.accuracy for row in rows]
     low, high = ([row.interval[end] for row in rows if row.interval] for end in (0, 1))
     axes.vlines(at, low, high, color=BLUE, alpha=0.35, linewidth=5, label="95 % interval")
@@ -75,7 +75,7 @@ def _along(axes: Any, answer: SweepSummary, rows: Sequence[AxisRow]) -> None:
     axes.set_xticks(*_ticks([row.value for row in rows]), rotation=45 if _long([r.value for r in rows]) else 0)
     axes.set(xlabel=axis_title(rows[0].axis, rows[0].unit), ylabel="accuracy", ylim=(-0.03, 1.03))
     axes.margins(x=0.08)
-    axes.set_title(_who(answer))
+    axes.set_title(_who(summary))
     axes.grid(True, axis="y")
     axes.figure.legend(loc="outside lower center", ncols=2)
 
@@ -93,8 +93,8 @@ def _written(value: Any) -> str:
     return short_name(value) if isinstance(value, str) else f"{value:.4g}"
 
 
-def _who(answer: SweepSummary) -> str:
-    return ", ".join(short_name(name) for name in (*split_names(answer.object), *split_names(answer.model)))
+def _who(summary: SweepSummary) -> str:
+    return ", ".join(short_name(name) for name in (*split_names(summary.object), *split_names(summary.model)))
 
 
 def _long(values: Sequence[Any]) -> bool:
@@ -152,7 +152,7 @@ class SurfacePanel:
         model: likewise.
         surface: where there is a surface.
         compared: where enough pictures show it, and do not.
-        difference: by how much answers are wrong more often where a cell is seen, in [-1, 1]; NaN where that is not
+        difference: by how much predictions are wrong more often where a cell is seen, in [-1, 1]; NaN where that is not
             told from chance.
         views: of the object.
     """
@@ -191,7 +191,7 @@ def surface_figure(panels: Sequence[SurfacePanel]) -> Figures:
                 row, column = divmod(number, across)
                 solid.text((column + 0.5) * width, row * height + 4, view.title, ha="center", va="top", fontsize=7)
         bar = figure.colorbar(scale, ax=axes, shrink=0.8 if len(panels) == 1 else 0.4, format=_percent)
-        bar.set_label("share of wrong answers where it is seen,\nless that where it is not")
+        bar.set_label("share of wrong predictions where it is seen,\nless that where it is not")
         marks = [
             mpl.patches.Patch(facecolor=colour, label=text)
             for colour, text in ((UNTOLD, "not told from chance"), (UNCOMPARED, "too few pictures with or without it"))

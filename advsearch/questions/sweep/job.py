@@ -46,15 +46,16 @@ SAMPLES = 100
 
 @dataclass(frozen=True)
 class NamedScene:
-    """One of the scenes. Controls that are `held` stay where `u` (d,) has them, or as the scene is without it; `answer`
-    is what the place is called beside the same one without the answer of a run, empty where there is no such."""
+    """One of the scenes. Controls that are `held` stay where `u` (d,) has them, or as the scene is without it;
+    `beside_clean` is what the place is called beside the same one without the adversarial scene of a run, empty where
+    there is no such."""
 
     object: str
     environment: str
     scene: Scene
     held: tuple[Control, ...] = ()
     u: Tensor | None = None
-    answer: str = ""
+    beside_clean: str = ""
 
     @property
     def values(self) -> dict[str, Value]:
@@ -62,7 +63,7 @@ class NamedScene:
             "object": {"value": self.object, "unit": ""},
             "environment": {"value": self.environment, "unit": ""},
         }
-        return {**named, "answer": {"value": self.answer, "unit": ""}} if self.answer else named
+        return {**named, "answer": {"value": self.beside_clean, "unit": ""}} if self.beside_clean else named
 
 
 @dataclass(frozen=True)
@@ -161,14 +162,15 @@ class Job:
         start = torch.cat([bound.start for bound in space.controls[: len(place.held)]])
         if place.u is not None and len(place.u) != len(start):
             raise InputError(
-                f"answer_of: the answer of {place.answer} has {len(place.u)} numbers, and {place.object} takes "
-                f"{len(start)}: it is another object, or it has changed since; do the run again"
+                f"adversarial_of: the adversarial configuration of {place.beside_clean} has {len(place.u)} numbers, "
+                f"and {place.object} takes {len(start)}: it is another object, or it has changed since; do the run "
+                "again"
             )
         return space.holding(start if place.u is None else place.u)
 
     def points(self, space: Space) -> Points:
-        """The configurations of a space; those with an answer have the draws of those without it."""
-        scenes = len(self.places) // 2 if self.places[0].answer else 0
+        """The configurations of a space; those with an adversarial scene have the draws of those without it."""
+        scenes = len(self.places) // 2 if self.places[0].beside_clean else 0
         domain = domain_of(space.controls)
         among, config = len(self.places), self.config
         return Points(space, domain, self.axes, self.samples, config.sampler, config.seed, scenes, among)
@@ -281,7 +283,7 @@ class SweptScene:
         rendered = sum(renderer.non_finite for renderer in self.renderers.values())
         return rendered + sum(one.not_finite for one in self.predicted.values())
 
-    def answers(self, queries: Sequence[Query], prepared: Prepared | None = None) -> list[Evaluation]:
+    def evaluate_all(self, queries: Sequence[Query], prepared: Prepared | None = None) -> list[Evaluation]:
         """Answer queries of neighbouring rows: a picture is made once for each size, and a model sees all of its own at
         once. Nothing is prepared for these."""
         begun, before, job = time.perf_counter(), self.not_finite, self.job
@@ -295,22 +297,22 @@ class SweptScene:
                 judged = problem.judge_several(shown, [query.u for query in mine], [query.values for query in mine])
                 said |= {query.number: judgement for query, judgement in zip(mine, judged, strict=True)}
         wrong = {number // models for number, judgement in said.items() if not judgement.right}
-        seconds, answers = (time.perf_counter() - begun) / len(queries), list[Evaluation]()
+        seconds, evaluations = (time.perf_counter() - begun) / len(queries), list[Evaluation]()
         for query in queries:
             number, model = divmod(query.number, models)
             picture, first = made[job.sizes[model]][number], job.first_of_size[model]
-            answer = Evaluation.of(
+            evaluation = Evaluation.of(
                 said[query.number], cost=picture.traced * first, predicted=picture.predicted, seconds=seconds
             )
             if model == 0 and query.keep and (job.config.keep_pictures == "all" or number in wrong):
-                answer = replace(answer, small=thumbnails.thumbnail(picture.picture))
+                evaluation = replace(evaluation, small=thumbnails.thumbnail(picture.picture))
             if model == 0 and job.aovs:
                 surfaces = self.renderers[job.sizes[0]].surfaces(query.u)
                 layers = {name: layer.numpy() for name, layer in surfaces.layers(job.aovs, OBJECT).items()}
-                answer = replace(answer, layers=(layers, surfaces.notes(job.aovs)))
-            answers.append(answer)
+                evaluation = replace(evaluation, layers=(layers, surfaces.notes(job.aovs)))
+            evaluations.append(evaluation)
         so_far = [one.summary() for one in self.predicted.values()]
-        return [*answers[:-1], replace(answers[-1], light=so_far, non_finite=max(0, self.not_finite - before))]
+        return [*evaluations[:-1], replace(evaluations[-1], light=so_far, non_finite=max(0, self.not_finite - before))]
 
     def _made(self, size: tuple[int, int], queries: Sequence[Query]) -> dict[int, SweptPicture]:
         """The pictures of one size, rounded to 8 bits, by their numbers."""
@@ -341,7 +343,7 @@ class Scenes:
         return self.scene
 
     def named(self, name: str) -> SweptScene:
-        """The same by its number as text: see `advsearch.engine.journal.answering`."""
+        """The same by its number as text: see `advsearch.engine.journal.worker_call`."""
         return self.open(int(name))
 
     def picture(self, number: int) -> Tensor:
@@ -360,7 +362,7 @@ def check_worst(
     verifier.choose_spp({"worst": u})
     verifier.begin("checking the worst configuration with fresh renders", config.trials)
     spp, count = verifier.findings.spp, verifier.findings.sample_count
-    tried = run_trials(verifier.answers, u, spp=spp, seed=config.seed, trials=config.trials)
+    tried = run_trials(verifier.evaluate_all, u, spp=spp, seed=config.seed, trials=config.trials)
     wrong = [trial for trial in tried if trial.success]
     rate = rate_of(Trials(len(wrong), len(tried), spp), tried, wrong)
     settled = len(verifier.ladder) == 1 or (count is not None and count.converged)

@@ -1,7 +1,7 @@
-"""The loop of a sweep: ask about every configuration, store and count what is answered, sum it up. They are numbered:
-scenes (beside an answer first all without it), then the grid with its last axis fastest, then draws, then models; a
-batch begins at a multiple of its size, so that a sweep that was stopped, or whose batches come in another order, ends
-bit for bit as any other."""
+"""The loop of a sweep: ask about every configuration, store and count what is predicted, sum it up. They are numbered:
+scenes (beside an adversarial scene first all without it), then the grid with its last axis fastest, then draws, then
+models; a batch begins at a multiple of its size, so that a sweep that was stopped, or whose batches come in another
+order, ends bit for bit as any other."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from advsearch.attacks import Evaluation, Query
 from advsearch.attacks.draws import batches
 from advsearch.attacks.units import most_shown
 from advsearch.cluster import Executor, InProcess
-from advsearch.engine.journal import Journal, Sent, Shared, answering, finite, lost, other_answers, same
+from advsearch.engine.journal import Journal, Sent, Shared, finite, lost, other_numbers, same, worker_call
 from advsearch.engine.loading import framed
 from advsearch.engine.record import LOST, Stages, judgement_of, lost_remarks
 from advsearch.interrupts import interruptible
@@ -32,7 +32,7 @@ from advsearch.questions.sweep.predicting import combined
 from advsearch.questions.sweep.result import (
     FINISHED,
     INTERRUPTED,
-    Answers,
+    Predictions,
     SweepResult,
     SweptAxis,
     counted_by_unit,
@@ -71,7 +71,7 @@ DRAWN_AT_ONCE = 4096
 
 class Sweep:
     """One sweep, from its first configuration or from where it was stopped: `run` has the rows that are there already,
-    and None keeps it in memory. Without an executor all is answered here."""
+    and None keeps it in memory. Without an executor all is done here."""
 
     def __init__(
         self, job: Job, run: RunDirectory | None, progress: Progress, executor: Executor | None = None
@@ -88,7 +88,7 @@ class Sweep:
         self.total = len(job.places) * self.per_scene * self.models
         self.samples = job.spp
         self._scenes = Scenes(job)
-        self._executor = InProcess(answering(self._scenes.named)) if executor is None else executor
+        self._executor = InProcess(worker_call(self._scenes.named)) if executor is None else executor
         self.journal = Journal(run, Shared(None, executor))
         self._rendered = self._traced = self._predicted = self._lost = 0
         self._transport: dict[tuple[str, int], list[LinearTransport | None]] = {}
@@ -98,24 +98,27 @@ class Sweep:
         self._drives: list[results.DriveRates] | None = None
 
     def carry_out(self, first: int | None = None) -> SweepResult:
-        """Do what is left, or all from the configuration with a number on, and return the answer."""
-        answers = self._counted()
+        """Do what is left, or all from the configuration with a number on, and return the result."""
+        predictions = self._counted()
         ending, worst = FINISHED, None
-        self._check_answers()
+        self._check_numbers()
         for text in self.job.warnings:
             self.stages.progress.message(text)
         try:
             with interruptible():
                 left = [range(first, self.total)] if first is not None else self._left()
                 self._scenes.open((left[0].start if left else self.total - 1) // self.models // self.per_scene)
-                hint = f"{self.total} answers, pictures of {count(self.samples, 'sample')} a pixel; `resolution`, `spp`"
+                hint = (
+                    f"{self.total} predictions, pictures of {count(self.samples, 'sample')} a pixel; `resolution`, "
+                    "`spp`"
+                )
                 hint += " or fewer points shorten it"
                 if self.run is not None and self.job.config.keep_pictures != "none":
                     hint += f"; pictures that are kept take {self._pictures_text()}"
                 self.stages.begin("sweep", "rendering and classifying", self.total, hint=hint)
                 self.stages.progress.advance(self.total - sum(map(len, left)))
-                self._go_through(left, answers)
-                worst = self._claimed(answers)
+                self._go_through(left, predictions)
+                worst = self._claimed(predictions)
                 if worst is not None:
                     worst = worst.model_copy(update=self._verified(worst))
                 if self.job.config.surface and self.run is not None:
@@ -125,17 +128,17 @@ class Sweep:
                 self._drives = self._driven()
         except KeyboardInterrupt:
             ending = INTERRUPTED
-            answers = self._counted()
-            worst = self._claimed(answers)
+            predictions = self._counted()
+            worst = self._claimed(predictions)
         self.stages.end()
-        return self._finish(answers, ending, worst)
+        return self._finish(predictions, ending, worst)
 
     # ---- the loop ---------------------------------------------------------------------------------------------------
 
     def _left(self) -> list[range]:
         return [range(self.total)] if self.run is None else list(self.run.store.missing(KIND, self.total))
 
-    def _go_through(self, left: Sequence[range], answers: Answers) -> None:
+    def _go_through(self, left: Sequence[range], predictions: Predictions) -> None:
         """Have what is left carried out, store and count it."""
         self._begun = time.monotonic()
         for done in self._executor.results(self._asked(left)):
@@ -143,8 +146,8 @@ class Sweep:
             said = [lost(one, done.lost) for one in queries] if done.lost else done.value
             self._take(queries, said, done.worker, done.machine)
             for query, one in zip(queries, said, strict=True):
-                answers.add(query.number, one.said)
-            self._tell(len(queries), answers)
+                predictions.add(query.number, one.said)
+            self._tell(len(queries), predictions)
         self.journal.rows.sort(key=lambda row: row.step)
 
     def _asked(self, left: Sequence[range]) -> Iterator[list[Sent]]:
@@ -158,21 +161,23 @@ class Sweep:
                     yield [one for one in asked if part.start <= one[2].number < part.stop]
                 first = before + self.per_scene
 
-    def _take(self, queries: Sequence[Query], answers: Sequence[Evaluation], worker: str, machine: str | None) -> None:
-        answers = [replace(one, machine=machine) for one in answers]
+    def _take(
+        self, queries: Sequence[Query], evaluations: Sequence[Evaluation], worker: str, machine: str | None
+    ) -> None:
+        evaluations = [replace(one, machine=machine) for one in evaluations]
         if self.run is not None:
-            for query, answer in zip(queries, answers, strict=True):
+            for query, evaluation in zip(queries, evaluations, strict=True):
                 number = query.number // self.models
-                if answer.small is not None:
-                    thumbnails.keep(self.run.path, number, answer.small)
-                if answer.layers is not None:
-                    write_layers(self.run.path / AOV_FOLDER / f"{number:06d}.exr", *answer.layers)
-        rows = self.journal.keep(list(zip(queries, answers, strict=True)), numbered=True)
+                if evaluation.small is not None:
+                    thumbnails.keep(self.run.path, number, evaluation.small)
+                if evaluation.layers is not None:
+                    write_layers(self.run.path / AOV_FOLDER / f"{number:06d}.exr", *evaluation.layers)
+        rows = self.journal.keep(list(zip(queries, evaluations, strict=True)), numbered=True)
         self._spend(rows)
         scene = queries[0].number // self.models // self.per_scene
         self._rendered += sum(self.job.first_of_size[query.number % self.models] for query in queries)
-        self._transport[worker, scene] = answers[-1].light or []
-        if any(one.non_finite for one in answers) and not self._not_finite:
+        self._transport[worker, scene] = evaluations[-1].light or []
+        if any(one.non_finite for one in evaluations) and not self._not_finite:
             self._not_finite = True
             if self.run is not None:
                 self.run.store.set_note(NOT_FINITE, "yes")
@@ -185,7 +190,7 @@ class Sweep:
         size = f"{megabytes / 1e3:.1f} GB" if megabytes >= 1e3 else f"{max(megabytes, 0.1):.1f} MB"
         return f"about {size}" if self.job.config.keep_pictures == "all" else f"at most about {size}"
 
-    def _check_answers(self) -> None:
+    def _check_numbers(self) -> None:
         """Look again at the first picture that is stored, where there is more to come here."""
         row = None if self.run is None else next(self.run.store.rows(KIND), None)
         if row is None or self.run is None or self._executor.facts is not None or not any(map(len, self._left())):
@@ -195,19 +200,19 @@ class Sweep:
         other = Scenes(self.job).named(sent[0][0])  # what is done here decides no row
 
         def look() -> float | None:
-            return finite(other.answers([query for _, _, query in sent])[model].said.margin)
+            return finite(other.evaluate_all([query for _, _, query in sent])[model].said.margin)
 
         now = look()
         if not same([row.margin], [now]) and same([now], [look()]):
-            raise other_answers(self.run, {"margin": (row.margin, now)})
+            raise other_numbers(self.run, {"margin": (row.margin, now)})
 
-    def _tell(self, count: int, answers: Answers) -> None:
+    def _tell(self, count: int, predictions: Predictions) -> None:
         self._untold += count
         now = time.monotonic()
         if now - self._told >= TELL_SECONDS:
             facts, told = self._executor.facts, dict[str, float | str]()
-            if seen := int(answers.seen.sum()):
-                told["accuracy"] = int(answers.right.sum()) / seen
+            if seen := int(predictions.seen.sum()):
+                told["accuracy"] = int(predictions.right.sum()) / seen
             if facts is not None:
                 told |= {**facts.told, "a second": self._rendered / max(1e-9, now - self._begun)}
             self.stages.progress.advance(self._untold, **told)
@@ -215,14 +220,14 @@ class Sweep:
 
     # ---- counting ---------------------------------------------------------------------------------------------------
 
-    def _counted(self) -> Answers:
+    def _counted(self) -> Predictions:
         """What the rows say that are stored already, read one after the other."""
-        answers = Answers(self.total)
+        predictions = Predictions(self.total)
         self._traced = self._predicted = self._lost = 0
         for row in self.rows():
-            answers.add(row.step, judgement_of(row))
+            predictions.add(row.step, judgement_of(row))
             self._spend([row])
-        return answers
+        return predictions
 
     def rows(self) -> Iterable[Row]:
         return self.journal.rows if self.run is None else self.run.store.rows(KIND)
@@ -240,8 +245,9 @@ class Sweep:
         job, (pictures, model) = self.job, np.divmod(numbers, self.models)
         scene, local = np.divmod(pictures, self.per_scene)
         axes = []
-        for what in ("object", "environment", "answer"):
-            names = [getattr(place, what) for place in job.places]
+        by = {"object": "object", "environment": "environment", "answer": "beside_clean"}
+        for what, attribute in by.items():
+            names = [getattr(place, attribute) for place in job.places]
             several = list(dict.fromkeys(names))
             axes.append(SweptAxis(what, "", several, np.array([several.index(name) for name in names])[scene]))
         axes.append(SweptAxis("model", "", [one.name for one in job.models], model))
@@ -259,9 +265,9 @@ class Sweep:
 
     # ---- the worst configuration ------------------------------------------------------------------------------------
 
-    def _claimed(self, answers: Answers) -> WorstConfiguration | None:
+    def _claimed(self, predictions: Predictions) -> WorstConfiguration | None:
         """What the sweep saw at its worst."""
-        index = answers.worst
+        index = predictions.worst
         if index is None:
             return None
         rows = self.journal.rows if self.run is None else [self.run.store.row(KIND, index)]
@@ -308,18 +314,18 @@ class Sweep:
             drives.keep_worst(self._scenes, self.run)
         return drives.rates()
 
-    # ---- the answer -------------------------------------------------------------------------------------------------
+    # ---- the result -------------------------------------------------------------------------------------------------
 
-    def _finish(self, answers: Answers, ending: str, worst: WorstConfiguration | None) -> SweepResult:
+    def _finish(self, predictions: Predictions, ending: str, worst: WorstConfiguration | None) -> SweepResult:
         job, seconds = self.job, self.stages.seconds
         view, checked = self._scenes.scene, worst.verified if worst else None
         predicting = self._transport.values() or [[one.summary() for one in (view.predicted.values() if view else ())]]
         swept = seconds.get("sweep", 0.0)
         formation = Formation.of(next(iter(view.renderers.values())).formation) if view else None
         gains = self._gains() if formation else {}
-        models, answer = [model.name for model in job.models], job.places[-1].answer
-        numbers = np.flatnonzero(answers.seen)
-        right, units, axes = answers.right[numbers], self.units.of(numbers), self._axes(numbers)
+        models, adversarial = [model.name for model in job.models], job.places[-1].beside_clean
+        numbers = np.flatnonzero(predictions.seen)
+        right, units, axes = predictions.right[numbers], self.units.of(numbers), self._axes(numbers)
         if formation is not None and len(set(gains.values())) != 1:
             formation = formation.model_copy(update={"gain": None})
         summary = results.SweepSummary(
@@ -336,11 +342,13 @@ class Sweep:
             planned=self.total,
             **vars(counted_by_unit(right, units)),
             units=len(np.unique(units)) if self.units.size > 1 and len(units) else None,
-            not_finite=answers.not_finite,
-            answers=answers.frequent,
+            not_finite=predictions.not_finite,
+            answers=predictions.frequent,
             axes=[row for axis in axes for row in axis.rows(right, units)],
-            cells=map_over(axes, right, answers.margin[numbers]),
-            beside=results.BesideAnswer(answer=answer, pairs=answers.beside(models, self.units)) if answer else None,
+            cells=map_over(axes, right, predictions.margin[numbers]),
+            beside=results.BesideClean(answer=adversarial, pairs=predictions.beside(models, self.units))
+            if adversarial
+            else None,
             worst=worst,
             grid={axis.name: len(axis.values) for axis in job.axes},
             samples=job.samples,
@@ -358,7 +366,7 @@ class Sweep:
             renders_per_second=self._rendered / swept if self._rendered and swept else None,
             seconds={**seconds, "total": self.stages.total},
             seed=job.config.seed,
-            warnings=[*job.warnings, *self._remarks(answers, checked)],
+            warnings=[*job.warnings, *self._remarks(predictions, checked)],
             command_line=job.config.command_line(),
         )
         if self.run is not None:
@@ -378,7 +386,7 @@ class Sweep:
             for place in self.job.places
         }
 
-    def _remarks(self, answers: Answers, checked: WorstVerified | None) -> list[str]:
+    def _remarks(self, predictions: Predictions, checked: WorstVerified | None) -> list[str]:
         remarks = lost_remarks(self._lost)
         remarks += self.journal.machines.remarks
         few = min((one.drives for one in self._drives or ()), default=ENOUGH_DRIVES)
@@ -387,8 +395,10 @@ class Sweep:
                 f"{count(few, 'drive')} can show little: were the model right in all their frames, the interval of "
                 f"that share would begin at {100 * most_shown(few):.0f} %."
             )
-        if answers.not_finite:
-            remarks.append(f"{answers.not_finite} answers of the model are not numbers; they count as not right.")
+        if predictions.not_finite:
+            remarks.append(
+                f"{predictions.not_finite} predictions of the model are not numbers; they count as not right."
+            )
         if self._not_finite:
             remarks.append("Some values of pictures were not finite and were set to 0.")
         if checked and not checked.converged:
@@ -400,7 +410,7 @@ class Sweep:
 
 
 def _claim_of(seen: Judgement) -> results.WorstClaim:
-    return results.WorstClaim(**vars(seen.answer), margin=seen.margin, payload=seen.payload)
+    return results.WorstClaim(**vars(seen.prediction), margin=seen.margin, payload=seen.payload)
 
 
 def carry_out(job: Job, run: RunDirectory | None, progress: Progress, executor: Executor | None = None) -> SweepResult:

@@ -17,12 +17,12 @@ from typing import TYPE_CHECKING
 
 from advsearch.errors import AdvsearchError, InputError
 from advsearch.files import JsonObject, JsonValue
-from advsearch.questions.sweep import answer as sweeps
+from advsearch.questions.sweep import display as sweeps
 from advsearch.questions.sweep.summary import SweepSummary
 from advsearch.report import wording
 from advsearch.report.markup import Html, element, join_html
 from advsearch.report.shown import shown
-from advsearch.report.wording import answer_text, beside_text, percent
+from advsearch.report.wording import beside_text, percent, prediction_text
 from advsearch.runs import directory
 from advsearch.runs.files import placed_by, write_bytes, write_text
 from advsearch.runs.summary import read_result
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 MOST_EMBEDDED = 3_000_000
-"""Bytes of pictures that a page which needs no other file takes along; the worst answers first."""
+"""Bytes of pictures that a page which needs no other file takes along; the worst predictions first."""
 
 MOST_ROWS = 200_000
 """Rows that such a page takes along; more are for `advsearch dashboard`."""
@@ -229,8 +229,8 @@ def _worst_text(summary: SweepSummary) -> str:
     if worst is None:
         return ""
     where = ", ".join(f"{name} {wording.number_text(one.value)}" for name, one in worst.values.items())
-    said = answer_text(summary.task, worst.pictured or worst.claimed)
-    told, rate = f"{where}: the model answers {said}", worst.verified
+    said = prediction_text(summary.task, worst.pictured or worst.claimed)
+    told, rate = f"{where}: the model predicts {said}", worst.verified
     if rate is None:
         return f"{told}."
     return f"{told}; {wording.tally('wrong', rate.successes, rate.trials, rate.not_a_number)} fresh renders."

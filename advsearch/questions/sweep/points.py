@@ -1,6 +1,6 @@
 """From the number of a picture to its configuration and what is stored of it: arithmetic, nothing is kept. Every
-picture has a draw of its own, so that pictures are independent; only pairs without and with an answer have the same
-ones."""
+picture has a draw of its own, so that pictures are independent; only pairs without and with an adversarial scene have
+the same ones."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Counting what a sweep finds, its summary (docs/sweeps.md, "What it says"), and its answer as Python has it; sweeps
+"""Counting what a sweep finds, its summary (docs/sweeps.md, "What it says"), and its result as Python has it; sweeps
 that another program made are read into a run here, too. Counting takes some 15 bytes a configuration."""
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from advsearch.pictures import FORMATS
 from advsearch.questions.sweep.figures import sweep_axes, sweep_figure
 from advsearch.questions.sweep.job import KIND
 from advsearch.questions.sweep.page import write_sweep_page
-from advsearch.questions.sweep.summary import AxisRow, CountedAnswers, MapAxis, PairedRates, SweepMap, SweepSummary
+from advsearch.questions.sweep.summary import AxisRow, CountedPredictions, MapAxis, PairedRates, SweepMap, SweepSummary
 from advsearch.report.figures import new_axes
-from advsearch.report.markup import answer_html
+from advsearch.report.markup import result_html
 from advsearch.report.shown import shown
 from advsearch.runs import store
 from advsearch.runs.directory import RunDirectory, default_name
@@ -41,29 +41,29 @@ FINISHED, INTERRUPTED = "finished", "interrupted"
 MOST_CELLS = 4096
 """Cells of a map; with more pairs of values there is none."""
 
-MOST_ANSWERS = 20
-"""Wrong answers that the summary lists, the most frequent first."""
+MOST_PREDICTIONS = 20
+"""Wrong predictions that the summary lists, the most frequent first."""
 
 
-def counted(right: npt.ArrayLike, of: npt.ArrayLike) -> CountedAnswers:
-    """Return count, accuracy and its 95 % interval, from right answers and answers of each unit (n,)."""
+def counted(right: npt.ArrayLike, of: npt.ArrayLike) -> CountedPredictions:
+    """Return count, accuracy and its 95 % interval, from right predictions and predictions of each unit (n,)."""
     correct, seen = int(np.sum(right)), int(np.sum(of))
     interval = share_interval(right, of) if seen else None
-    return CountedAnswers(
+    return CountedPredictions(
         configurations=seen, correct=correct, accuracy=correct / seen if seen else None, interval=interval
     )
 
 
-def counted_by_unit(right: npt.ArrayLike, units: npt.NDArray[np.int64]) -> CountedAnswers:
-    """Return that of answers (n,) that are of some units (n,)."""
+def counted_by_unit(right: npt.ArrayLike, units: npt.NDArray[np.int64]) -> CountedPredictions:
+    """Return that of predictions (n,) that are of some units (n,)."""
     right = np.asarray(right)
     return counted(per_unit(right, units), per_unit(np.ones(len(right)), units))
 
 
-def rate(correct: int, seen: int) -> CountedAnswers:
-    """Return count, accuracy and its 95 % Clopper-Pearson interval, of answers that are independent; None where nothing
-    was seen."""
-    return CountedAnswers(
+def rate(correct: int, seen: int) -> CountedPredictions:
+    """Return count, accuracy and its 95 % Clopper-Pearson interval, of predictions that are independent; None where
+    nothing was seen."""
+    return CountedPredictions(
         configurations=seen,
         correct=correct,
         accuracy=correct / seen if seen else None,
@@ -71,9 +71,9 @@ def rate(correct: int, seen: int) -> CountedAnswers:
     )
 
 
-class Answers:
-    """What is answered so far, by the number of the configuration (n,): whether there is an answer, whether it is right
-    and whether it is wrong, its margin, NaN where that is no number, and what it is."""
+class Predictions:
+    """What is predicted so far, by the number of the configuration (n,): whether there is a prediction, whether it is
+    right and whether it is wrong, its margin, NaN where that is no number, and what it is."""
 
     def __init__(self, total: int) -> None:
         self.seen: npt.NDArray[np.bool_] = np.zeros(total, dtype=bool)
@@ -84,7 +84,7 @@ class Answers:
     def add(self, number: int, said: Judgement) -> None:
         self.seen[number], self.right[number], self._wrong[number] = True, said.right, said.success
         self.margin[number] = said.margin
-        self._labels[number] = self._names.setdefault(said.answer.label, len(self._names))
+        self._labels[number] = self._names.setdefault(said.prediction.label, len(self._names))
 
     @property
     def worst(self) -> int | None:
@@ -93,19 +93,19 @@ class Answers:
 
     @property
     def not_finite(self) -> int:
-        """How many margins are no number; these answers count as not right."""
+        """How many margins are no number; these predictions count as not right."""
         return int((self.seen & np.isnan(self.margin)).sum())
 
     @property
     def frequent(self) -> dict[str, int]:
-        """How often each of the most frequent wrong answers was given, the most frequent first."""
+        """How often each of the most frequent wrong predictions was given, the most frequent first."""
         names = list(self._names)
-        answers = Counter(names[label] for label in self._labels[self._wrong])
-        return dict(sorted(answers.most_common(MOST_ANSWERS), key=lambda one: (-one[1], one[0])))
+        wrong = Counter(names[label] for label in self._labels[self._wrong])
+        return dict(sorted(wrong.most_common(MOST_PREDICTIONS), key=lambda one: (-one[1], one[0])))
 
     def beside(self, models: Sequence[str], units: Units) -> list[PairedRates]:
-        """Return both rates of each model without and with an answer, of the pairs of which both are known: the second
-        half of the configurations are the first with the answer."""
+        """Return both rates of each model without and with an adversarial scene, of the pairs of which both are known:
+        the second half of the configurations are the first with the adversarial scene."""
         halves = (2, -1, len(models))
         found = list[PairedRates]()
         seen: npt.NDArray[np.bool_] = np.logical_and(*self.seen.reshape(halves))
@@ -145,7 +145,8 @@ class SweptAxis:
     kind: Literal["outside", "grid", "drawn"] = "outside"
 
     def rows(self, right: npt.NDArray[np.bool_], units: npt.NDArray[np.int64]) -> list[AxisRow]:
-        """Return the table: right answers (n,), which are of units (n,), by value; values without any are left out."""
+        """Return the table: right predictions (n,), which are of units (n,), by value; values without any are left
+        out."""
         rows = pd.DataFrame({"right": right, "unit": units}).groupby(self.places)
         return [
             AxisRow(
@@ -184,7 +185,7 @@ def map_over(
 
 @dataclass(frozen=True, eq=False, repr=False)
 class SweepResult:
-    """The answer of a sweep.
+    """The result of a sweep.
 
     Attributes:
         summary: what `summary.json` holds.
@@ -232,7 +233,7 @@ class SweepResult:
         return f"SweepResult({self.summary.object!r}, {self.summary.model!r}, {right}, run={place!r})"
 
     def _repr_html_(self) -> str:
-        return answer_html(shown(self.summary))
+        return result_html(shown(self.summary))
 
     def _repr_png_(self) -> bytes | None:
         return sweep_figure(self.summary).get("png")
@@ -288,7 +289,7 @@ def _summary_of(rows: pd.DataFrame, run: Path, folder: Path) -> SweepSummary:
         planned=len(rows),
         **vars(rate(int(right.sum()), len(rows))),
         not_finite=0,
-        answers=dict(Counter(rows["label"][~right]).most_common(MOST_ANSWERS)),
+        answers=dict(Counter(rows["label"][~right]).most_common(MOST_PREDICTIONS)),
         axes=tables,
         cells=None,
         worst=None,

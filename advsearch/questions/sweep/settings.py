@@ -57,10 +57,12 @@ class SweepConfig(SceneConfig):
         SceneConfig, "controls", default=dict, group="sweep",
         description="controls that are drawn at random at each grid point, separated by commas", min_length=None,
     )
-    answer_of: str | None = setting(
+    formerly: ClassVar[Mapping[str, str]] = {"answer_of": "adversarial_of"}
+
+    adversarial_of: str | None = setting(
         None, "sweep",
-        "sweep the answer of this attack beside the clean scene, under the same draws; scene and model come from that "
-        "run, and so does what its --over drew if nothing else varies",
+        "sweep the adversarial scene of this attack beside the clean scene, under the same draws; scene and model "
+        "come from that run, and so does what its --over drew if nothing else varies",
         "the name or the folder of a run", metavar="RUN", otherwise="none", min_length=1,
     )
     samples: int | None = setting(
@@ -81,7 +83,8 @@ class SweepConfig(SceneConfig):
     fps: float = setting(
         2.0, "sweep", "frames of the drive that are looked at", unit="frames a second", gt=0.0, le=1000.0
     )
-    keep_pictures: Literal["all", "wrong", "none"] = setting("none", "sweep", "keep small pictures of these answers")
+    keep_pictures: Literal["all", "wrong", "none"] = setting("none", "sweep", "keep small pictures of these "
+    "predictions")
     specialise: bool = setting_as_in(
         DerivativeConfig, "specialise", group="sweep", description="predict pictures that differ in light alone",
         switched="render every picture, also those that differ in light alone",
@@ -92,7 +95,7 @@ class SweepConfig(SceneConfig):
         "configuration",
     )
     surface: bool = setting(
-        False, "sweep", "map which parts of the object's surface, when visible, go with wrong answers"
+        False, "sweep", "map which parts of the object's surface, when visible, go with wrong predictions"
     )
     spp: int | None = setting_as_in(
         SceneConfig, "spp", group="sweep", description="samples per pixel of each picture", expects="", ge=1, le=65536
@@ -122,14 +125,14 @@ class SweepConfig(SceneConfig):
         return split_names(self.lit_by)
 
     @classmethod
-    def of_answer(cls, theirs: AttackConfig, *, varies: bool) -> dict[str, Any]:
-        """Return the settings that a sweep of an attack's answer takes from the attack, where it says nothing else.
-        Unless it says itself what `varies`, that is what the attack was over."""
+    def of_attack(cls, theirs: AttackConfig, *, varies: bool) -> dict[str, Any]:
+        """Return the settings that a sweep of an attack's adversarial scene takes from the attack, where it says
+        nothing else. Unless it says itself what `varies`, that is what the attack was over."""
         apart = ("controls", "texture_resolution", "spp", "seed", "threads", "deterministic")
         kept = {name: value for name, value in cls.shared(theirs).items() if name not in apart}
         return kept if varies else {**kept, "controls": theirs.over}
 
-    @field_validator("answer_of", mode="before")
+    @field_validator("adversarial_of", mode="before")
     @classmethod
     def _run_as_text(cls, value: Any) -> Any:
         return str(value) if isinstance(value, Path) else value

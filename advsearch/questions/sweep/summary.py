@@ -26,16 +26,16 @@ AxisValue = int | float | str | tuple[float, float]
 """A number, a name, or both ends of a part of a range."""
 
 
-class CountedAnswers(Fields):
+class CountedPredictions(Fields):
     """Configurations, and in how many of them the model is right."""
 
     configurations: int = Field(description="how many were looked at")
-    correct: int = Field(description="right answers")
+    correct: int = Field(description="right predictions")
     accuracy: float | None = Field(description="their share; null where there is no configuration")
     interval: Interval | None = Field(description="of that share")
 
 
-class AxisRow(CountedAnswers):
+class AxisRow(CountedPredictions):
     """Every configuration with one value of an axis."""
 
     axis: str
@@ -72,7 +72,7 @@ class WorstClaim(Fields):
 
 
 class WorstVerified(VerifiedRate):
-    """What fresh renders of the worst configuration say; a success is a wrong answer."""
+    """What fresh renders of the worst configuration say; a success is a wrong prediction."""
 
     converged: bool = Field(description="whether the margin stood still with the samples")
     renders: int
@@ -91,15 +91,15 @@ class WorstConfiguration(Fields):
 
 
 class SurfacePart(Fields):
-    """A part of an object's surface, and the answers by whether it was seen."""
+    """A part of an object's surface, and the predictions by whether it was seen."""
 
     face: int = Field(description="number of the triangle in its middle")
     u: float = Field(description="its middle, across the map")
     v: float = Field(description="its middle, up the map, whose bottom row is 0")
     place: tuple[float, float, float] = Field(description="its middle, in the mesh's coordinates, z up")
-    seen: CountedAnswers = Field(description="pictures that see it")
-    hidden: CountedAnswers = Field(description="the other ones")
-    difference: float = Field(description="share of wrong answers where it is seen, less that where it is not")
+    seen: CountedPredictions = Field(description="pictures that see it")
+    hidden: CountedPredictions = Field(description="the other ones")
+    difference: float = Field(description="share of wrong predictions where it is seen, less that where it is not")
     interval: Interval = Field(
         description="of that difference, 95 %, for the part by itself; null where pictures share a draw, as frames of "
         "a drive do"
@@ -108,7 +108,7 @@ class SurfacePart(Fields):
 
 
 class SurfaceTable(Fields):
-    """What goes with wrong answers on the surface of one object, for one model."""
+    """What goes with wrong predictions on the surface of one object, for one model."""
 
     object: str
     model: str
@@ -116,15 +116,15 @@ class SurfaceTable(Fields):
     unwrapped: bool = Field(description="whether the map is a new one, and not that of the object's texture")
     seen: int = Field(description="how many were seen at all")
     compared: int = Field(description="how many were seen often enough, and hidden often enough")
-    worse: int = Field(description="how many of these go with wrong answers, told from chance")
-    better: int = Field(description="likewise, with right answers")
+    worse: int = Field(description="how many of these go with wrong predictions, told from chance")
+    better: int = Field(description="likewise, with right predictions")
     strongest: list[SurfacePart] = Field(
         description="those told most clearly, none close to another; `worse` ones first"
     )
 
 
 class SurfaceMap(Fields):
-    """Which parts of the surface, when seen, go with wrong answers."""
+    """Which parts of the surface, when seen, go with wrong predictions."""
 
     file: str = Field(description="the counts, in the folder")
     cells: int = Field(description="along each side of the map")
@@ -133,21 +133,21 @@ class SurfaceMap(Fields):
 
 
 class PairedRates(Fields):
-    """The same configurations without and with an answer, which one model was shown with the same noise."""
+    """The same configurations without and with an adversarial scene, which one model was shown with the same noise."""
 
     model: str
-    clean: CountedAnswers = Field(description="without the answer")
-    answer: CountedAnswers = Field(description="with it")
+    clean: CountedPredictions = Field(description="without the adversarial scene")
+    answer: CountedPredictions = Field(description="with it")
     both: int = Field(description="pairs that are right in both")
     clean_only: int = Field(description="pairs that are right without it alone")
     answer_only: int = Field(description="pairs that are right with it alone")
     neither: int = Field(description="pairs that are right in none")
-    difference: float = Field(description="accuracy with the answer less that without")
+    difference: float = Field(description="accuracy with the adversarial scene less that without")
     interval: Interval = Field(description="of that difference, 95 %, of pairs, over draws where some share one")
 
 
-class BesideAnswer(Fields):
-    """The clean scene and the answer of a run under the same draws."""
+class BesideClean(Fields):
+    """The clean scene and the adversarial one of a run under the same draws."""
 
     answer: str = Field(description="the run")
     pairs: list[PairedRates] = Field(description="for each model")
@@ -165,7 +165,7 @@ class DriveRates(Fields):
     """What a model says along whole drives; intervals are over drives, not over frames."""
 
     model: str
-    answer: str | None = Field(description="the answer of a run that is in the scene; null without")
+    answer: str | None = Field(description="the adversarial scene of a run; null without")
     drives: int = Field(description="how many there are with all their frames")
     frames: int = Field(description="of each drive")
     seconds: float = Field(description="from the first frame to the last")
@@ -179,25 +179,26 @@ class DriveRates(Fields):
     flicker: OverDrives = Field(description="changes between right and wrong a second")
 
 
-class SweepSummary(CountedAnswers, RunResult):
+class SweepSummary(CountedPredictions, RunResult):
     """How often the model is right over configurations that were not searched for."""
 
     command: ClassVar[str] = "sweep"
 
     object: str
     model: str
-    task: str = Field(description="what judges the answers")
+    task: str = Field(description="what judges the predictions")
     image_formation: Formation | None
     planned: int = Field(description="how many configurations there are")
-    not_finite: int = Field(description="answers that were not numbers; they count as not right")
-    answers: dict[str, int] = Field(description="how often each wrong answer was given, the 20 most frequent")
+    not_finite: int = Field(description="outputs that were not numbers; they count as not right")
+    answers: dict[str, int] = Field(description="how often each wrong prediction was given, the 20 most frequent")
     axes: list[AxisRow] = Field(description="a row for every value of every axis")
     cells: SweepMap | None = Field(
         description="over the first two axes with several values; null where there are fewer, or more than 4096 pairs"
     )
-    beside: BesideAnswer | None = Field(
+    beside: BesideClean | None = Field(
         default=None,
-        description="the clean scene beside [an answer](sweeps.md#an-answer-beside-the-clean-scene); absent without",
+        description="the clean scene beside [an adversarial "
+        "one](sweeps.md#an-adversarial-scene-beside-the-clean-one); absent without",
     )
     worst: WorstConfiguration | None
     drives: list[DriveRates] | None = Field(
@@ -228,7 +229,7 @@ class SweepSummary(CountedAnswers, RunResult):
     )
     surface: SurfaceMap | None = Field(
         default=None,
-        description="which parts of the [surface](sweeps.md#the-surface), when seen, go with wrong answers; absent "
+        description="which parts of the [surface](sweeps.md#the-surface), when seen, go with wrong predictions; absent "
         "unless asked",
     )
     shared: SharedWork | None = Field(
@@ -241,7 +242,7 @@ class SweepSummary(CountedAnswers, RunResult):
 
     @property
     def brief(self) -> str:
-        """How many are right; beside an answer, that without and with it."""
+        """How many are right; beside an adversarial scene, that without and with it."""
         if self.beside and self.beside.pairs:
             rates = self.beside.pairs[0]
             return f"accuracy {rates.clean.accuracy:.1%}, {rates.answer.accuracy:.1%} with {self.beside.answer}"

@@ -1,8 +1,8 @@
-"""Which parts of an object's surface, when seen, go with wrong answers (docs/sweeps.md, "The surface"): the interval of
-a difference is Newcombe's (1998, Statistics in Medicine 17, method 10) of Wilson's (1927); what is chance comes from
-sharing the wrong answers out anew, each time with the part that stands out most (Westfall and Young 1993, the
-single-step maximum) by the likelihood ratio. Where pictures share a draw (frames of a drive), draws are exchanged
-whole, and no interval is told."""
+"""Which parts of an object's surface, when seen, go with wrong predictions (docs/sweeps.md, "The surface"): the
+interval of a difference is Newcombe's (1998, Statistics in Medicine 17, method 10) of Wilson's (1927); what is chance
+comes from sharing the wrong predictions out anew, each time with the part that stands out most (Westfall and Young
+1993, the single-step maximum) by the likelihood ratio. Where pictures share a draw (frames of a drive), draws are
+exchanged whole, and no interval is told."""
 
 from __future__ import annotations
 
@@ -41,10 +41,10 @@ Counts = npt.NDArray[np.int64]
 Doubles = npt.NDArray[np.float64]
 
 SHARINGS = 199
-"""How often the wrong answers are shared out anew, so that no p-value is under 0.005."""
+"""How often the wrong predictions are shared out anew, so that no p-value is under 0.005."""
 
 LEVEL = 0.05
-"""Where no part has to do with the answers, the chance that any is told from chance."""
+"""Where no part has to do with the predictions, the chance that any is told from chance."""
 
 
 class PartCounts:
@@ -76,9 +76,9 @@ class PartCounts:
 
 @dataclass(frozen=True, eq=False)
 class Association:
-    """What n parts have to do with the answers, (n,) each, NaN where a part was not compared: the share of wrong
-    answers where it holds less that where it does not, both ends of the 95 % interval for the part by itself, and how
-    likely it is that by chance any part stands out as far."""
+    """What n parts have to do with the predictions, (n,) each, NaN where a part was not compared: the share of wrong
+    predictions where it holds less that where it does not, both ends of the 95 % interval for the part by itself, and
+    how likely it is that by chance any part stands out as far."""
 
     compared: npt.NDArray[np.bool_]
     difference: Doubles
@@ -100,7 +100,7 @@ class Association:
 
 
 def association(tally: PartCounts, some: slice, least: int) -> Association:
-    """Compare the answers where each of some parts holds with those where it does not; at least so many pictures of
+    """Compare the predictions where each of some parts holds with those where it does not; at least so many pictures of
     either kind."""
     seen, wrong, pictures, failures = tally.seen[some], tally.wrong[some], tally.pictures, tally.failures
     compared = (seen >= least) & (pictures - seen >= least)
@@ -136,13 +136,13 @@ def _newcombe(k: Counts, n: Counts, others: Counts, rest: Counts) -> tuple[Doubl
 
 
 LEAST = 5
-"""Pictures that have to see a part, and as many that do not, before its answers are compared."""
+"""Pictures that have to see a part, and as many that do not, before its predictions are compared."""
 
 RAYS = 4 * CELLS
 """Least number of rays along each side of a picture: in smaller ones, many cells would lie between two pixels."""
 
 STRONGEST = 5
-"""Parts of each kind that the summary lists: so many that go with wrong answers, and so many with right ones."""
+"""Parts of each kind that the summary lists: so many that go with wrong predictions, and so many with right ones."""
 
 APART = 0.1
 """Distance of two listed parts, in units of the object's largest extent, so that one spot is listed once."""
@@ -155,20 +155,21 @@ SIDES = ((0.0, 20.0), (90.0, 20.0), (180.0, 20.0), (270.0, 20.0), (0.0, 80.0), (
 SIDE_PIXELS = 240
 
 UNKNOWN = -1
-"""Stands for the answer to a picture of which there is no row."""
+"""Stands for the prediction of a picture of which there is no row."""
 
 AT_ONCE = 16
 """Pictures whose places are worked out at once."""
 
 
 class SurfaceCounts:
-    """How often each part of an object's surface was seen, and how often the answers of each model were wrong then."""
+    """How often each part of an object's surface was seen, and how often the predictions of each model were wrong
+    then."""
 
     def __init__(self, parts: SurfaceParts, tallies: Sequence[PartCounts]) -> None:
         self.parts, self.tallies = parts, tuple(tallies)
 
     def add(self, shown: Surfaces, wrong: Mapping[int, bool]) -> None:
-        """Count a picture, by what it shows and the models whose answers are wrong."""
+        """Count a picture, by what it shows and the models whose predictions are wrong."""
         there = shown.seen(OBJECT)
         face, uv = shown.face[there].numpy(), shown.uv[there].numpy().astype(np.float64)
         seen = np.unique(self.parts.cells(face, uv))
@@ -178,7 +179,7 @@ class SurfaceCounts:
             self.tallies[model].add(seen, failed)
 
     def compared(self, model: int) -> dict[str, Association]:
-        """Return what a model's answers have to do with each part that is seen, by the kind of part."""
+        """Return what a model's predictions have to do with each part that is seen, by the kind of part."""
         return {kind: association(self.tallies[model], some, LEAST) for kind, some in self.parts.kinds.items()}
 
     def table(self, name: str, model: str, tally: PartCounts, kind: str, found: Association) -> SurfaceTable:
@@ -196,8 +197,8 @@ class SurfaceCounts:
         )
 
     def _strongest(self, first: int, found: Association) -> list[int]:
-        """The parts that are told from chance most clearly, none close to another: those that go with wrong answers,
-        and then those that go with right ones."""
+        """The parts that are told from chance most clearly, none close to another: those that go with wrong
+        predictions, and then those that go with right ones."""
         extent = float(np.ptp(self.parts.mesh.vertices, axis=0).max())
         order = np.argsort(-found.strength, kind="stable")
         listed: list[int] = []
@@ -241,7 +242,7 @@ def map_surface(
         wrong.flat[row.step] = not judgement_of(row).right
     draws = np.asarray(opened(0).points[job.sizes[0]].units.draw(np.arange(wrong[..., 0].size)))
     counts = _empty(job, wrong, draws.reshape(wrong.shape[:2]))
-    for scene, answers in enumerate(wrong):
+    for scene, pictures in enumerate(wrong):
         view, mine = opened(scene), counts[job.places[scene].object]
         for some in batches(0, per_scene, AT_ONCE):
             for size in dict.fromkeys(job.sizes):
@@ -249,15 +250,15 @@ def map_surface(
                 picks = view.points[size].picks(some.start, len(some), scene * per_scene)
                 us, fineness = view.points[size].configurations(picks), ceil(RAYS / min(size))
                 seen = (view.renderers[size].surfaces(u, fineness) for u in us)
-                for said, shown in zip(answers[some.start : some.stop], seen, strict=True):
+                for said, shown in zip(pictures[some.start : some.stop], seen, strict=True):
                     mine.add(shown, {model: bool(said[model]) for model in asked if said[model] != UNKNOWN})
             progress.advance(len(some) * models)
     return _told(job, counts, run)
 
 
 def _empty(job: Job, wrong: npt.NDArray[np.int8], draws: Counts) -> dict[str, SurfaceCounts]:
-    """Counts of each object, by its name, that know how many answers (scenes, pictures, models) there will be, and of
-    which draw (scenes, pictures) each is."""
+    """Counts of each object, by its name, that know how many predictions (scenes, pictures, models) there will be, and
+    of which draw (scenes, pictures) each is."""
     counts, models = {}, len(job.models)
     for number, (name, asset) in enumerate(_assets(job).items()):
         parts, tallies = SurfaceParts(asset.mesh), []
@@ -265,16 +266,16 @@ def _empty(job: Job, wrong: npt.NDArray[np.int8], draws: Counts) -> dict[str, Su
         mine = wrong[here]
         for model in range(models):
             seed = seeds.stream(job.config.seed, "surface", number * models + model)
-            answers, failures = (int((mine[..., model] >= least).sum()) for least in (0, 1))
+            pictures, failures = (int((mine[..., model] >= least).sum()) for least in (0, 1))
             exchanged = exchange(mine[..., model].ravel(), draws[here].ravel(), seed)
-            tallies.append(PartCounts(parts.count, answers, failures, seed, exchanged))
+            tallies.append(PartCounts(parts.count, pictures, failures, seed, exchanged))
         counts[name] = SurfaceCounts(parts, tallies)
     return counts
 
 
 def exchange(wrong: npt.NDArray[np.int8], draws: Counts, seed: int) -> npt.NDArray[np.uint8] | None:
-    """Return the answers of whole draws dealt out to draws anew, as `PartCounts` takes them; None where each picture
-    has a draw of its own. Both (n,), answers that are not known are left out."""
+    """Return the predictions of whole draws dealt out to draws anew, as `PartCounts` takes them; None where each
+    picture has a draw of its own. Both (n,), predictions that are not known are left out."""
     known, (_, of) = wrong != UNKNOWN, np.unique(draws, return_counts=True)
     if of.max(initial=1) == 1:
         return None

@@ -11,10 +11,10 @@ from advsearch.cli.output import at_work
 from advsearch.errors import InputError
 
 if TYPE_CHECKING:
-    from advsearch.questions.test.answer import SuiteResult
+    from advsearch.questions.test.result import SuiteResult
     from advsearch.settings import Config
 
-HELP = "test claims about a model, each answered held, failed or undecided: a gate at every change"
+HELP = "test claims about a model, each found held, failed or undecided: a gate at every change"
 EXAMPLES = (
     "test suites/mug.yaml",
     "test suites/mug.yaml --model model.pt2 --junit junit.xml --sarif robustness.sarif",
@@ -25,10 +25,10 @@ EXAMPLES = (
 
 
 class _Test(QuestionCommand):
-    """The command: its exit status is the suite's answer, and machines get their files."""
+    """The command: its exit status is the suite's verdict, and machines get their files."""
 
     def carry_out(self, config: Config, *, as_json: bool, quiet: bool, resumed: Path | None = None) -> int:
-        """Try the claims, print their answers, write the files, and return the exit status."""
+        """Try the claims, print their verdicts, write the files, and return the exit status."""
         _check_files(config)
         with at_work(as_json=as_json, quiet=quiet) as progress:
             # late, so that --help answers at once
@@ -36,7 +36,7 @@ class _Test(QuestionCommand):
 
             result: Any = carry_out(config, progress=progress, resumed=resumed)
         write_files(config, result)
-        return output.finish(result, self.answer, as_json=as_json) or result.status
+        return output.finish(result, self.text, as_json=as_json) or result.status
 
 
 def _files(config: Config) -> dict[str, Path]:
@@ -53,11 +53,11 @@ def _check_files(config: Config) -> None:
 def write_files(config: Config, result: SuiteResult) -> None:
     """Write the files for machines that a configuration asks for."""
     # late, so that --help answers at once
-    from advsearch.questions.test import answer
+    from advsearch.questions.test import result as room
     from advsearch.runs.files import write_text
 
     for name, path in _files(config).items():
-        write_text(path, getattr(answer, name)(result), durable=False)
+        write_text(path, getattr(room, name)(result), durable=False)
 
 
 COMMAND = _Test("test", about="suite", place=Positional("SUITE", "a suite, a YAML file"))

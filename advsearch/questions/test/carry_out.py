@@ -17,17 +17,6 @@ from advsearch.interrupts import interruptible
 from advsearch.progress import NullProgress, Progress
 from advsearch.questions.attack.parts import check_from_config
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.test.answer import (
-    FAILED,
-    NOT_TRIED,
-    STOPPED,
-    TIME_OVER,
-    UNDECIDED,
-    ClaimAnswer,
-    SuiteResult,
-    statement,
-    verdict,
-)
 from advsearch.questions.test.changes import OTHER_SCENE
 from advsearch.questions.test.claims import Trial, check_pictures, with_scene
 from advsearch.questions.test.counterexamples import (
@@ -37,6 +26,17 @@ from advsearch.questions.test.counterexamples import (
     read_expected,
     remove,
     write_expected,
+)
+from advsearch.questions.test.result import (
+    FAILED,
+    NOT_TRIED,
+    STOPPED,
+    TIME_OVER,
+    UNDECIDED,
+    ClaimResult,
+    SuiteResult,
+    statement,
+    verdict,
 )
 from advsearch.questions.test.settings import (
     COUNTEREXAMPLES,
@@ -52,7 +52,7 @@ from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results import INTERRUPTED, OUT_OF_TIME
 from advsearch.runs.store import NAME as STORE
 from advsearch.runs.store import Store
-from advsearch.viewer.pages import keep_answer
+from advsearch.viewer.pages import keep_result
 
 NOTE = "suite"
 """Under which a run's store keeps the suite with its seed, so that it goes on as it began."""
@@ -116,11 +116,11 @@ def test_from_config(
             progress.message(remark)
         suite_run = _SuiteRun(config, described, planned, trial, read_expected(config.suite))
         ending = suite_run.carry_out()
-        if added is not None and suite_run.answers[0].answer != FAILED:
+        if added is not None and suite_run.results[0].answer != FAILED:
             remove(added)
-            raise InputError(f"add: the answer of {config.add} is not kept: {suite_run.answers[0].reason}")
+            raise InputError(f"add: the adversarial scene of {config.add} is not kept: {suite_run.results[0].reason}")
         result = suite_run.result(ending, time.perf_counter() - begun, added)
-        return keep_answer(run, result)
+        return keep_result(run, result)
 
 
 @dataclass
@@ -134,7 +134,7 @@ class _SuiteRun:
     expected: Mapping[str, str]
 
     def __post_init__(self) -> None:
-        self.answers: list[ClaimAnswer] = []
+        self.results: list[ClaimResult] = []
 
     def carry_out(self) -> str:
         """Try what is planned, and return how it ended."""
@@ -143,25 +143,25 @@ class _SuiteRun:
             with interruptible():
                 for number, one in enumerate(self.planned):
                     self._add(one, self._tried(one, results))
-                    progress = f"{one.name}: {self.answers[-1].answer}: {self.answers[-1].reason}"
+                    progress = f"{one.name}: {self.results[-1].answer}: {self.results[-1].reason}"
                     self.trial.progress.message(progress)
                     if number + 1 < len(self.planned):
                         seconds = time.perf_counter() - begun
                         self.trial.run.write_summary(self.result(INTERRUPTED, seconds, None))  # what a kill leaves
         except KeyboardInterrupt:
-            for one in self.planned[len(self.answers) :]:
+            for one in self.planned[len(self.results) :]:
                 self._add(one, self._not_tried(one, STOPPED))
             return INTERRUPTED
-        if any(one.reason == NOT_TRIED for one in self.answers):
+        if any(one.reason == NOT_TRIED for one in self.results):
             self.trial.warnings.append("A counterexample failed, so that no claim was tried; `all` goes on with them.")
-        return OUT_OF_TIME if any(TIME_OVER in one.reason for one in self.answers) else "done"
+        return OUT_OF_TIME if any(TIME_OVER in one.reason for one in self.results) else "done"
 
-    def _tried(self, one: PlannedClaim, results: Results) -> ClaimAnswer:
+    def _tried(self, one: PlannedClaim, results: Results) -> ClaimResult:
         """What a claim says; what is decided, or has used its pictures, is stored."""
         key = f"claim {one.name}"
         if (stored := results.stored(key)) is not None:
-            return ClaimAnswer.of(stored)
-        failed = [known for known in self.answers if known.kind == "counterexample" and not known.accepted]
+            return ClaimResult.of(stored)
+        failed = [known for known in self.results if known.kind == "counterexample" and not known.accepted]
         if failed and one.one is None and not self.config.all:
             return self._not_tried(one, NOT_TRIED)
         if self.trial.late():
@@ -179,27 +179,27 @@ class _SuiteRun:
             raise KeyboardInterrupt
         return found
 
-    def _not_tried(self, one: PlannedClaim, reason: str) -> ClaimAnswer:
+    def _not_tried(self, one: PlannedClaim, reason: str) -> ClaimResult:
         claim = self.suite.claims.get(one.name)
         said = "" if claim is None or one.one is not None else statement(claim, one.config)
-        return ClaimAnswer(name=one.name, kind=one.kind, statement=said, answer=UNDECIDED, reason=reason)
+        return ClaimResult(name=one.name, kind=one.kind, statement=said, answer=UNDECIDED, reason=reason)
 
-    def _add(self, one: PlannedClaim, found: ClaimAnswer) -> None:
+    def _add(self, one: PlannedClaim, found: ClaimResult) -> None:
         only = {"only": one.name, "seed": self.suite.seed, "fresh": False, "add": None, "update": False, "run": None}
         files = {"junit": None, "sarif": None, "markdown": None, "overwrite": False}
         again = self.config.model_copy(update={**only, **files}).with_only_here(self.config.only_here)
         expected = self.expected.get(one.name, "held")
-        self.answers.append(found.model_copy(update={"expected": expected, "repeat": again.command_line()}))
+        self.results.append(found.model_copy(update={"expected": expected, "repeat": again.command_line()}))
 
     def result(self, ending: str, seconds: float, added: Counterexample | None) -> SuiteResult:
         """Return what the claims so far come to."""
         configs = [one.config for one in self.planned]
         changes: list[str] = []
-        answers = self.answers
+        results = self.results
         if self.config.update and ending == "done":
-            now = {one.name: one.answer for one in answers if NOT_TRIED not in one.reason}
+            now = {one.name: one.answer for one in results if NOT_TRIED not in one.reason}
             changes = write_expected(self.config.suite, now)
-            answers = [one.model_copy(update={"expected": now.get(one.name, one.expected)}) for one in answers]
+            results = [one.model_copy(update={"expected": now.get(one.name, one.expected)}) for one in results]
         return SuiteResult(
             run=str(self.trial.run.path),
             suite=self.config.suite,
@@ -208,9 +208,9 @@ class _SuiteRun:
             model=",".join(dict.fromkeys(one.model for one in configs)),
             environment=",".join(dict.fromkeys(one.lit_by for one in configs)),
             controls=list(dict.fromkeys(name for one in configs for name in one.controls)),
-            answer=verdict(answers),
+            answer=verdict(results),
             confidence=self.suite.confidence,
-            claims=answers,
+            claims=results,
             ending=ending,
             added=None if added is None else str(added.path),
             changes=changes,
@@ -290,7 +290,7 @@ def _check_search(name: str, config: SceneConfig) -> None:
         ("model", config.is_study, "one model; make a claim of each"),
         ("smallest", config.smallest, "a budget, which the claim is about; leave it out"),
         ("minimise", config.minimise, "a search that makes the model wrong; leave it out"),
-        ("target", config.target is not None, "any wrong answer; leave it out"),
+        ("target", config.target is not None, "any wrong prediction; leave it out"),
     ):
         if wrong:
             raise InputError(f"claims.{name}.settings: {setting}: expected {why}")

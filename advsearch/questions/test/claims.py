@@ -17,7 +17,7 @@ from advsearch.attacks import Evaluation
 from advsearch.attacks.evaluation import Query
 from advsearch.attacks.trials import ConfidenceSequence, clopper_pearson, draws_needed
 from advsearch.config import SceneConfig
-from advsearch.engine.journal import Journal, Shared, answering
+from advsearch.engine.journal import Journal, Shared, worker_call
 from advsearch.engine.problem import Problem
 from advsearch.engine.verifier import ladder_of
 from advsearch.errors import InputError
@@ -27,19 +27,19 @@ from advsearch.questions.attack.parts import executor_for, parts_of, problem_of
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.studies import carry_out_part
 from advsearch.questions.attack.summary import AttackSummary
-from advsearch.questions.test.answer import (
+from advsearch.questions.test.changes import ALIKE, CHANGED, OTHER_SCENE
+from advsearch.questions.test.counterexamples import TRIALS, Counterexample, is_over, same_scene
+from advsearch.questions.test.result import (
     FAILED,
     HELD,
     TIME_OVER,
     UNDECIDED,
-    ClaimAnswer,
+    ClaimResult,
     difference_reason,
-    search_answer,
+    search_verdict,
     share_reason,
     tried_reason,
 )
-from advsearch.questions.test.changes import ALIKE, CHANGED, OTHER_SCENE
-from advsearch.questions.test.counterexamples import TRIALS, Counterexample, is_over, same_scene
 from advsearch.questions.test.settings import (
     AnyClaim,
     DrawnConfig,
@@ -84,7 +84,7 @@ class Trial:
     progress: Progress
     warnings: list[str] = field(default_factory=list)
 
-    def claim(self, asked: ClaimAnswer, claim: AnyClaim, config: SceneConfig) -> ClaimAnswer:
+    def claim(self, asked: ClaimResult, claim: AnyClaim, config: SceneConfig) -> ClaimResult:
         """Try a claim that is asked and undecided; what was asked before is read back."""
         if isinstance(claim, RightClaim):
             return self._right(asked, claim, config)
@@ -95,40 +95,40 @@ class Trial:
         assert isinstance(config, AttackConfig)
         return self._not_broken(asked, config)
 
-    def _right(self, asked: ClaimAnswer, claim: RightClaim, config: SceneConfig) -> ClaimAnswer:
+    def _right(self, asked: ClaimResult, claim: RightClaim, config: SceneConfig) -> ClaimResult:
         problem, shared = self._problem(config), self._shared(config)
         sequence, right = ConfidenceSequence(self.confidence, sides=1), 0
         wrong: list[tuple[float, Query, str]] = []
         self.progress.stage(asked.name, claim.pictures, hint="fewer pictures in the suite shorten it", at_most=True)
-        with executor_for(shared, "advsearch.questions.attack.carry_out:attack_answers", self.progress) as executor:
+        with executor_for(shared, "advsearch.questions.attack.carry_out:attack_worker", self.progress) as executor:
             journal = Journal(self.run, Shared(problem, executor))
             queries = drawn(problem, f"claim {asked.name}", claim.pictures, spp_of(config))
-            answer = UNDECIDED
-            for query, evaluation in self._answers(journal, queries):
+            verdict = UNDECIDED
+            for query, evaluation in self._evaluations(journal, queries):
                 said = evaluation.said
                 sequence.add(1.0 if said.right else 0.0)
                 right += said.right
                 if not said.right:
                     score = said.score if math.isfinite(said.score) else -math.inf
-                    wrong = sorted([*wrong, (score, query, said.answer.label)], key=lambda one: -one[0])[:1]
-                answer = decided(sequence, least_mean(claim))
-                if answer != UNDECIDED:
+                    wrong = sorted([*wrong, (score, query, said.prediction.label)], key=lambda one: -one[0])[:1]
+                verdict = decided(sequence, least_mean(claim))
+                if verdict != UNDECIDED:
                     break
         worst, picture = "", None
         if wrong:
             _, query, label = wrong[0]
             worst = f"most wrong where it says {label}: {self._described(problem, query)}"
             picture = self._picture(asked.name, problem, query)
-        reason = share_reason("right", answer, right, sequence.count, sequence.interval, worst)
-        return self._decided(asked, answer, reason, sequence, config, picture, (0.0, 1.0))
+        reason = share_reason("right", verdict, right, sequence.count, sequence.interval, worst)
+        return self._decided(asked, verdict, reason, sequence, config, picture, (0.0, 1.0))
 
-    def _no_worse(self, asked: ClaimAnswer, claim: NoWorseClaim, config: SceneConfig) -> ClaimAnswer:
+    def _no_worse(self, asked: ClaimResult, claim: NoWorseClaim, config: SceneConfig) -> ClaimResult:
         problem, other = self._problem(config), self._problem(config.model_copy(update={"model": claim.than}))
         same = other.renderer.formation == problem.renderer.formation
-        sequence, ours, theirs, answer = ConfidenceSequence(self.confidence, sides=1), 0, 0, UNDECIDED
+        sequence, ours, theirs, verdict = ConfidenceSequence(self.confidence, sides=1), 0, 0, UNDECIDED
         first = None
         shared = self._shared(config).model_copy(update={"model": f"{config.model},{claim.than}"})
-        with executor_for(shared, "advsearch.questions.test.claims:answering_of", self.progress) as executor:
+        with executor_for(shared, "advsearch.questions.test.claims:claim_worker", self.progress) as executor:
             journal = Journal(self.run, Shared(problem, executor, "0"))
             beside = Journal(self.run, Shared(other, executor, "1"))
             for query, own, its in self._pairs(asked, claim, config, journal, beside, Tensor.clone if same else None):
@@ -137,28 +137,28 @@ class Trial:
                 if first is None and its.said.right and not own.said.right:
                     first = query
                 sequence.add((own.said.right - its.said.right + 1) / 2)
-                answer = decided(sequence, least_mean(claim))
-                if answer != UNDECIDED:
+                verdict = decided(sequence, least_mean(claim))
+                if verdict != UNDECIDED:
                     break
         low, high = sequence.interval
         counts = (sequence.count, ours, theirs)
-        reason = difference_reason(answer, counts, (2 * low - 1, 2 * high - 1), claim.than)
+        reason = difference_reason(verdict, counts, (2 * low - 1, 2 * high - 1), claim.than)
         picture = None if first is None else self._picture(asked.name, problem, first)
-        return self._decided(asked, answer, reason, sequence, config, picture, (-1.0, 2.0))
+        return self._decided(asked, verdict, reason, sequence, config, picture, (-1.0, 2.0))
 
     def _changes(
-        self, asked: ClaimAnswer, claim: MustChangeClaim | MustNotChangeClaim, config: SceneConfig
-    ) -> ClaimAnswer:
+        self, asked: ClaimResult, claim: MustChangeClaim | MustNotChangeClaim, config: SceneConfig
+    ) -> ClaimResult:
         """Whether a change of the picture changes what the model says, or not."""
         problem = self._problem(config)
         other = self._problem(with_scene(config, claim)) if claim.when in OTHER_SCENE else problem
-        sequence, held, example, answer = ConfidenceSequence(self.confidence, sides=1), 0, "", UNDECIDED
+        sequence, held, example, verdict = ConfidenceSequence(self.confidence, sides=1), 0, "", UNDECIDED
         picture = None
         shared = self._shared(config)
-        with executor_for(shared, "advsearch.questions.attack.carry_out:attack_answers", self.progress) as executor:
+        with executor_for(shared, "advsearch.questions.attack.carry_out:attack_worker", self.progress) as executor:
             journal, beside = Journal(self.run, Shared(problem, executor)), Journal(self.run, Shared(other))
             for query, own, its in self._pairs(asked, claim, config, journal, beside, CHANGED.get(claim.when)):
-                before, after = own.said.answer, its.said.answer
+                before, after = own.said.prediction, its.said.prediction
                 moved = abs((before.probability or 0.0) - (after.probability or 0.0))
                 another = before.label != after.label
                 as_claimed = another or moved > ALIKE if claim.claim == "must_change" else not another
@@ -167,15 +167,15 @@ class Trial:
                     example = f"{before.label} before and {after.label} after: {self._described(problem, query)}"
                     picture = self._picture(asked.name, problem, query)
                 sequence.add(float(as_claimed))
-                answer = decided(sequence, least_mean(claim))
-                if answer != UNDECIDED:
+                verdict = decided(sequence, least_mean(claim))
+                if verdict != UNDECIDED:
                     break
-        reason = share_reason("as claimed", answer, held, sequence.count, sequence.interval, example)
-        return self._decided(asked, answer, reason, sequence, config, picture, (0.0, 1.0))
+        reason = share_reason("as claimed", verdict, held, sequence.count, sequence.interval, example)
+        return self._decided(asked, verdict, reason, sequence, config, picture, (0.0, 1.0))
 
     def _pairs(
         self,
-        asked: ClaimAnswer,
+        asked: ClaimResult,
         claim: NoWorseClaim | MustChangeClaim | MustNotChangeClaim,
         config: SceneConfig,
         journal: Journal,
@@ -190,8 +190,8 @@ class Trial:
         pictures: dict[int, Tensor | None] = {}
 
         def here(queries: Sequence[Query]) -> Iterator[Evaluation]:
-            answers = journal.traced([replace(query, keep=shown is not None) for query in queries])
-            for query, evaluation in zip(queries, answers, strict=True):
+            evaluations = journal.traced([replace(query, keep=shown is not None) for query in queries])
+            for query, evaluation in zip(queries, evaluations, strict=True):
                 pictures[query.number] = evaluation.picture
                 yield evaluation
 
@@ -207,15 +207,15 @@ class Trial:
         queries = drawn(problem, kind, claim.pictures, spp_of(config))
         while batch := list(islice(queries, self._at_once(journal))):
             pictures.clear()
-            mine = list(journal.answers(batch, here))
-            both = beside.answers([replace(query, kind=f"{kind} beside") for query in batch], there)
+            mine = list(journal.evaluate_all(batch, here))
+            both = beside.evaluate_all([replace(query, kind=f"{kind} beside") for query in batch], there)
             for query, own, its in zip(batch, mine, both, strict=True):
                 self.progress.advance(1, **journal.traced.told)
                 yield query, own, its
             if self.late():
                 return
 
-    def _not_broken(self, asked: ClaimAnswer, config: AttackConfig) -> ClaimAnswer:
+    def _not_broken(self, asked: ClaimResult, config: AttackConfig) -> ClaimResult:
         seconds = min(self.left(), config.seconds or math.inf)
         shared = {"workers": self.workers, "cluster": self.cluster}
         limited = {**shared, "seconds": seconds if math.isfinite(seconds) else None}
@@ -224,27 +224,27 @@ class Trial:
         summary = carry_out_part(path, own, self.progress)
         assert isinstance(summary, AttackSummary)
         self.warnings += summary.warnings
-        answer, reason = search_answer(summary, own.model_copy(update={"steps": own.steps or summary.steps}))
+        verdict, reason = search_verdict(summary, own.model_copy(update={"steps": own.steps or summary.steps}))
         shown = "clean" if summary.ending == "already wrong" else "adversarial"
         file = f"{PARTS}/{asked.name}/{IMAGES}/{shown}.png"
         return asked.model_copy(
             update={
-                "answer": answer,
+                "answer": verdict,
                 "reason": reason,
                 "pictures": sum(count for name, count in summary.renders.items() if name != "products"),
-                "picture": file if answer == FAILED and (self.run.path / file).is_file() else None,
+                "picture": file if verdict == FAILED and (self.run.path / file).is_file() else None,
                 "part": asked.name,
             }
         )
 
     def counterexample(
-        self, asked: ClaimAnswer, one: Counterexample, config: AttackConfig, *, added: bool = False
-    ) -> ClaimAnswer:
+        self, asked: ClaimResult, one: Counterexample, config: AttackConfig, *, added: bool = False
+    ) -> ClaimResult:
         """Try a counterexample: the model should be right on it. Trials by which it is `added` are no trials of it."""
         asked = asked.model_copy(update={"statement": f"{config.model} is right where it said {one.said}"})
         parts = parts_of(config)
         if not same_scene(one, parts.scene):
-            reason = "its scene is another one now; remove it, or add the answer of a new run"
+            reason = "its scene is another one now; remove it, or add the adversarial scene of a new run"
             return asked.model_copy(update={"reason": reason})
         problem = problem_of(config, parts.scene, parts.loaded[0], differentiated=False)
         u = problem.domain.project(one.configuration(problem.domain.start))
@@ -255,17 +255,17 @@ class Trial:
             Query(u, seeds.stream(problem.seed, kind, number), kind, number, spp=one.spp) for number in range(count)
         )
         tried = 0
-        for query, evaluation in self._answers(Journal(self.run, Shared(problem)), queries):
+        for query, evaluation in self._evaluations(Journal(self.run, Shared(problem)), queries):
             tried, right = tried + 1, right + evaluation.said.right
             if not evaluation.said.right and not label:
-                label, picture = evaluation.said.answer.label, self._picture(one.name, problem, query)
+                label, picture = evaluation.said.prediction.label, self._picture(one.name, problem, query)
             if 0 < right < tried:
                 break  # it depends on the noise, whatever comes
         interval = clopper_pearson(right, tried) if tried else None
-        answer, reason = tried_reason(right, tried - right, label, interval)
+        verdict, reason = tried_reason(right, tried - right, label, interval)
         if tried < count and not 0 < right < tried:
-            answer, reason = UNDECIDED, TIME_OVER
-        said = {"answer": answer, "reason": reason, "pictures": tried, "spp": one.spp, "picture": picture}
+            verdict, reason = UNDECIDED, TIME_OVER
+        said = {"answer": verdict, "reason": reason, "pictures": tried, "spp": one.spp, "picture": picture}
         said |= {"rate": right / tried if tried else None, "interval": interval}
         return asked.model_copy(update=said)
 
@@ -279,12 +279,12 @@ class Trial:
     def _shared(self, config: SceneConfig) -> AttackConfig:
         return AttackConfig.of(config, workers=self.workers, cluster=self.cluster)
 
-    def _answers(self, journal: Journal, queries: Iterator[Query]) -> Iterator[tuple[Query, Evaluation]]:
+    def _evaluations(self, journal: Journal, queries: Iterator[Query]) -> Iterator[tuple[Query, Evaluation]]:
         """Ask, as many at once as there are workers for, until the time is over."""
         while batch := list(islice(queries, self._at_once(journal))):
-            for query, answer in zip(batch, journal.answers(batch), strict=True):
+            for query, evaluation in zip(batch, journal.evaluate_all(batch), strict=True):
                 self.progress.advance(1, **journal.traced.told)
-                yield query, answer
+                yield query, evaluation
             if self.late():
                 return
 
@@ -305,22 +305,22 @@ class Trial:
 
     def _decided(
         self,
-        asked: ClaimAnswer,
-        answer: str,
+        asked: ClaimResult,
+        verdict: str,
         reason: str,
         sequence: ConfidenceSequence,
         config: SceneConfig,
         picture: str | None,
         scale: tuple[float, float],
-    ) -> ClaimAnswer:
+    ) -> ClaimResult:
         """What drawn pictures say; `scale` has the value of a mean of 0, and how much more that of 1 is."""
-        if answer == UNDECIDED and self.late():
+        if verdict == UNDECIDED and self.late():
             reason = f"{reason}; {TIME_OVER}"
         begin, wide = scale
         low, high = sequence.interval
         return asked.model_copy(
             update={
-                "answer": answer,
+                "answer": verdict,
                 "reason": reason,
                 "pictures": sequence.count,
                 "rate": begin + wide * sequence.mean if sequence.count else None,
@@ -331,8 +331,8 @@ class Trial:
         )
 
 
-def answering_of(settings: JsonObject) -> Callable[[Any], Any]:
-    """Return what answers the queries of a claim about two models, named by their place: what a worker does."""
+def claim_worker(settings: JsonObject) -> Callable[[Any], Any]:
+    """Return what evaluates the queries of a claim about two models, named by their place: what a worker does."""
     models = split_names(str(settings["model"]))
 
     def problem(name: str) -> Problem:
@@ -340,7 +340,7 @@ def answering_of(settings: JsonObject) -> Callable[[Any], Any]:
         parts = parts_of(config)
         return problem_of(config, parts.scene, parts.loaded[0], differentiated=False)
 
-    return answering(cache(problem))
+    return worker_call(cache(problem))
 
 
 def _judged(problem: Problem, query: Query, picture: Tensor) -> Evaluation:
@@ -372,7 +372,7 @@ def check_pictures(name: str, claim: AnyClaim, confidence: float) -> str:
     """Return what has to be said of a claim's number of pictures before any is made; nothing where it is enough.
 
     Raises:
-        InputError: no answers to so many pictures could decide it, or only one way.
+        InputError: no predictions of so many pictures could decide it, or only one way.
     """
     if not isinstance(claim, ShareClaim | NoWorseClaim):
         return ""
@@ -381,13 +381,13 @@ def check_pictures(name: str, claim: AnyClaim, confidence: float) -> str:
     if claim.pictures < needed:
         raise InputError(
             f"claims.{name}.pictures: expected at least {needed}, as fewer cannot both hold and fail this claim at a "
-            f"confidence of {number_text(confidence)} whatever the model answers, got {claim.pictures}"
+            f"confidence of {number_text(confidence)} whatever the model predicts, got {claim.pictures}"
         )
     alike = draws_needed(least, confidence=confidence, value=0.5) if isinstance(claim, NoWorseClaim) else 0
     if claim.pictures >= alike:
         return ""
     return (
-        f"{name}: two models that answer alike are shown to be so by {alike} pictures, and it takes {claim.pictures}."
+        f"{name}: two models that predict alike are shown to be so by {alike} pictures, and it takes {claim.pictures}."
     )
 
 

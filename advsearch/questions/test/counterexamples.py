@@ -1,4 +1,4 @@
-"""Answers of runs that became tests: each a small file and a picture in a folder beside the suite."""
+"""Adversarial scenes of runs that became tests: each a small file and a picture in a folder beside the suite."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from advsearch import seeds
 from advsearch.config import SceneConfig
 from advsearch.engine.loading import Scene
 from advsearch.engine.problem import Problem
-from advsearch.engine.verifier import kept_answer
+from advsearch.engine.verifier import kept_configuration
 from advsearch.errors import FileFormatError, InputError
 from advsearch.files import parse_json, read_text
 from advsearch.questions.attack.parts import parts_in, problem_of_parts
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.summary import attack_of
-from advsearch.questions.test.answer import ANSWERS, HELD
+from advsearch.questions.test.result import HELD, VERDICTS
 from advsearch.questions.test.settings import OWN, Suite
 from advsearch.runs.directory import CONFIG, IMAGES, PARTS, default_name, find_run
 from advsearch.runs.files import write_bytes, write_text
@@ -62,7 +62,7 @@ OF_SEARCH = (
     *(*OWN, "policy", "steps", "objective", "metrics", "log", "average", "baseline", "trials"),
     *("measure", "estimators", "specialise", "draws", "aov", "printable", "spp", "verify_spp"),
 )
-"""Settings of a run that say nothing of what its answer is."""
+"""Settings of a run that say nothing of what its adversarial scene is."""
 
 OF_MODEL = ("model", "labels", "prompt", "task", "label")
 """Settings that a suite says of the model under test, in place of the run's."""
@@ -133,7 +133,7 @@ class _File(BaseModel):
 
 @dataclass(frozen=True)
 class Counterexample:
-    """The answer of a run.
+    """The adversarial scene of a run.
 
     Attributes:
         path: of its file; the picture is beside it.
@@ -164,7 +164,7 @@ class Counterexample:
         if start.numel() != len(self.moved):
             raise InputError(
                 f"{self.path}: has {len(self.moved)} numbers, and its scene has {start.numel()} now; remove it, or "
-                "add the answer of a new run"
+                "add the adversarial scene of a new run"
             )
         return (start + torch.from_numpy(self.moved)).clamp(0.0, 1.0)
 
@@ -185,20 +185,20 @@ def scene_digest(scene: Scene) -> str:
 
 
 def add(suite: str, run: str) -> Counterexample:
-    """Keep the answer of a run as a counterexample of a suite.
+    """Keep the adversarial scene of a run as a counterexample of a suite.
 
     Raises:
-        InputError: the run found nothing, or its answer is no counterexample.
+        InputError: the run found nothing, or its scene is no counterexample.
     """
     path = find_run(run)
     summary, config = attack_of(path), AttackConfig.from_yaml(path / CONFIG)
     if summary.ending != "found" or summary.verified is None:
-        raise InputError(f"add: expected a run whose answer was found, got {path}, which ended with {summary.ending!r}")
+        raise InputError(f"add: expected a run that ended as 'found', got {path}, which ended with {summary.ending!r}")
     if summary.minimises:
         raise InputError(f"add: expected a run that makes the model wrong, got {path}, which makes the object easier")
     parts = parts_in(path)
     problem, _ = problem_of_parts(parts)
-    moved = (kept_answer(path, problem) - problem.domain.start).numpy()
+    moved = (kept_configuration(path, problem) - problem.domain.start).numpy()
     of = path.parents[1].name if path.parent.name == PARTS else ""
     folder, name = folder_of(suite), default_name(of or path.name, (path.name,) if of else ())
     values: dict[str, Any] = {
@@ -287,22 +287,22 @@ def read_expected(suite: str) -> dict[str, str]:
     try:
         values = parse_json(read_text(path, "what is expected of a suite", LARGEST))
     except (OSError, ValueError) as error:
-        raise FileFormatError(f"{path}: expected answers by claim, got {str(error)[:80]}; remove it") from None
+        raise FileFormatError(f"{path}: expected verdicts by claim, got {str(error)[:80]}; remove it") from None
     found = values.get("expected") if isinstance(values, dict) else None
-    if not isinstance(found, dict) or not set(map(str, found.values())) <= set(ANSWERS):
-        raise FileFormatError(f"{path}: expected answers by claim, got something else; remove it")
-    return {str(name): str(answer) for name, answer in found.items()}
+    if not isinstance(found, dict) or not set(map(str, found.values())) <= set(VERDICTS):
+        raise FileFormatError(f"{path}: expected verdicts by claim, got something else; remove it")
+    return {str(name): str(verdict) for name, verdict in found.items()}
 
 
-def write_expected(suite: str, answers: Mapping[str, str]) -> list[str]:
-    """Expect these answers from now on, and return what changes, in words."""
+def write_expected(suite: str, verdicts: Mapping[str, str]) -> list[str]:
+    """Expect these verdicts from now on, and return what changes, in words."""
     before = read_expected(suite)
-    now = {**before, **answers}
-    kept = {name: answer for name, answer in sorted(now.items()) if answer != HELD}
+    now = {**before, **verdicts}
+    kept = {name: verdict for name, verdict in sorted(now.items()) if verdict != HELD}
     folder = folder_of(suite)
     folder.mkdir(parents=True, exist_ok=True)
     write_text(folder / EXPECTED, json.dumps({"schema": 1, "expected": kept}, indent=1) + "\n")
-    changed = {name: (before.get(name, HELD), answer) for name, answer in answers.items()}
+    changed = {name: (before.get(name, HELD), verdict) for name, verdict in verdicts.items()}
     return [f"{name}: {was} -> {now}" for name, (was, now) in changed.items() if was != now]
 
 
@@ -312,5 +312,5 @@ def same_scene(one: Counterexample, scene: Scene) -> bool:
 
 
 def is_over(config: SceneConfig) -> bool:
-    """Whether an answer has to hold under many conditions."""
+    """Whether a scene has to hold under many conditions."""
     return bool(getattr(config, "over", {}))

@@ -61,7 +61,7 @@ class SuiteConfig(Config):
     add: str | None = setting(
         None,
         "test",
-        "keep the answer of this run as a counterexample beside the suite, and try it",
+        "keep the adversarial scene of this run as a counterexample beside the suite, and try it",
         "the name or the folder of a run of attack",
         otherwise="nothing is added",
         power=power.beside_suite,

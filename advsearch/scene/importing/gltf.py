@@ -61,7 +61,7 @@ def read_header(path: Path, data: bytes) -> Header:
         header = Header.model_validate(content)
     except ValidationError as error:
         raise damaged(path, *_first(error)) from None
-    found: set[str] = set()
+    extensions: set[str] = set()
     level: list[JsonValue] = [content]
     while level:
         entry = level.pop()
@@ -71,12 +71,12 @@ def read_header(path: Path, data: bytes) -> Header:
             held = {} if entry.get("extensions") is None else entry["extensions"]
             if not isinstance(held, dict) or not all(isinstance(held.get(name) or {}, dict) for name in READ):
                 raise damaged(path, "glTF whose extensions are objects", shown(json.dumps(held)))
-            found.update(held)
+            extensions.update(held)
             level.extend(value for key, value in entry.items() if key != "extras")
     for number, (node, entry) in enumerate(zip(header.nodes, content.get("nodes", ()), strict=True)):
         if node.lamp is None and (entry.get("extensions") or {}).get("KHR_lights_punctual") is not None:
             raise damaged(path, f"glTF with nodes[{number}].extensions.KHR_lights_punctual.light", "nothing")
-    header = header.model_copy(update={"extensionsUsed": sorted({*header.extensionsUsed, *found})})
+    header = header.model_copy(update={"extensionsUsed": sorted({*header.extensionsUsed, *extensions})})
     check_header(path, header)
     return header
 
@@ -338,22 +338,22 @@ class Buffers:
         """
         if index in self._put_in:
             return self._put_in[index]
-        one = self._header.accessors[index]
-        values = np.zeros((one.count, one.width), _TYPES[one.componentType])
-        if one.bufferView is not None and one.count:
-            stride = self._header.bufferViews[one.bufferView].byteStride
-            values = self._array(one.bufferView, one.byteOffset, values.shape, values.dtype, stride)
-        if one.sparse is None or not one.sparse.count:
+        accessor = self._header.accessors[index]
+        values = np.zeros((accessor.count, accessor.width), _TYPES[accessor.componentType])
+        if accessor.bufferView is not None and accessor.count:
+            stride = self._header.bufferViews[accessor.bufferView].byteStride
+            values = self._array(accessor.bufferView, accessor.byteOffset, values.shape, values.dtype, stride)
+        if accessor.sparse is None or not accessor.sparse.count:
             return values
-        places, given, count = one.sparse.indices, one.sparse.values, one.sparse.count
-        if count > one.count:
-            raise damaged(self._path, f"at most {one.count:,} sparse values", f"{count:,}")
+        places, given, count = accessor.sparse.indices, accessor.sparse.values, accessor.sparse.count
+        if count > accessor.count:
+            raise damaged(self._path, f"at most {accessor.count:,} sparse values", f"{count:,}")
         kind = np.dtype(_TYPES[places.componentType])
         rows = self._array(places.bufferView, places.byteOffset, (count, 1), kind)[:, 0]
-        if rows.max() >= one.count:
-            raise damaged(self._path, f"sparse values at places under {one.count:,}", f"{int(rows.max()):,}")
+        if rows.max() >= accessor.count:
+            raise damaged(self._path, f"sparse values at places under {accessor.count:,}", f"{int(rows.max()):,}")
         values = np.array(values)
-        values[rows] = self._array(given.bufferView, given.byteOffset, (count, one.width), values.dtype)
+        values[rows] = self._array(given.bufferView, given.byteOffset, (count, accessor.width), values.dtype)
         self._put_in[index] = values
         return values
 

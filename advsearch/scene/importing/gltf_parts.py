@@ -86,14 +86,14 @@ class GltfSurfaces:
         """
         uvs = [part.uvs for part in parts if part.uvs is not None]
         material = MaterialEntry() if number is None else self.header.materials[number]
-        given = material.surface
-        scaled = np.array([1.0] * 4 if given.baseColorFactor is None else given.baseColorFactor, np.float32).clip(0, 1)
+        entry = material.surface
+        scaled = np.array([1.0] * 4 if entry.baseColorFactor is None else entry.baseColorFactor, np.float32).clip(0, 1)
         factor, alpha = scaled[:3], material.alphaMode in CUT_OUTS
         color = linear_to_srgb(factor)
-        textured = given.baseColorTexture is not None and bool((color > 0.999).all())
+        textured = entry.baseColorTexture is not None and bool((color > 0.999).all())
         instead = "neutral grey" if textured else f"its base colour ({', '.join(f'{c:.2f}' for c in color)})"
         texture = self._picture(
-            given.baseColorTexture,
+            entry.baseColorTexture,
             "colours and alpha" if alpha else "colours",
             " names the texture {name}, which {why}; " + instead + " is used instead",
         )
@@ -104,15 +104,15 @@ class GltfSurfaces:
         if alpha:
             cutoff = None if material.alphaMode == "BLEND" else material.alphaCutoff
             kept, texture = with_opacity(kept, scaled[3:], cutoff), with_opacity(texture, scaled[3:], cutoff)
-        roughness, metallic = given.roughnessFactor, given.metallicFactor
+        roughness, metallic = entry.roughnessFactor, entry.metallicFactor
         packed = self._picture(
-            given.metallicRoughnessTexture,
+            entry.metallicRoughnessTexture,
             "numbers",
             "the texture {name} of roughness and metallic {why}; it is left out",
         )
         if packed is not None:
             self.notes.say("textures of roughness and metallic are replaced by their means")
-            _, green, blue = self._mean(packed, material, given.metallicRoughnessTexture, parts).tolist()
+            _, green, blue = self._mean(packed, material, entry.metallicRoughnessTexture, parts).tolist()
             roughness, metallic = roughness * green, metallic * blue
         normals = None
         if material.normalTexture is not None and material.reads(material.normalTexture):
@@ -162,21 +162,21 @@ class GltfSurfaces:
         uri = None if number is None else self.header.images[number].uri
         name = "(embedded)" if uri is None or uri.startswith("data:") else uri
         if number is None:
-            found: Floats | str | None = "has a picture of a kind that is not understood"
+            texels: Floats | str | None = "has a picture of a kind that is not understood"
         else:
-            found = self._pictures.decoded(self._image(number), kind, name)
-        if not isinstance(found, np.ndarray):
-            why = self._pictures.why(name, found)
+            texels = self._pictures.decoded(self._image(number), kind, name)
+        if not isinstance(texels, np.ndarray):
+            why = self._pictures.why(name, texels)
             self.notes.say(words.format(name=shown(name), why=why))
             return None
-        if self._sampler(use).magFilter != NEAREST or min(found.shape[:2]) == max(found.shape[:2]) == 1:
-            return found
+        if self._sampler(use).magFilter != NEAREST or min(texels.shape[:2]) == max(texels.shape[:2]) == 1:
+            return texels
         sharp = self._pictures.side // 2  # so many that filtering does not show
-        times = sharp // max(found.shape[:2])
+        times = sharp // max(texels.shape[:2])
         if times < 2:
             self.notes.say(BLURRED.format(most=sharp // 2))
-            return found
-        return found.repeat(times, axis=0).repeat(times, axis=1)
+            return texels
+        return texels.repeat(times, axis=0).repeat(times, axis=1)
 
     def _image(self, number: int) -> Image.Image | None:
         """Open a picture of the file; None where it cannot be had."""
@@ -360,22 +360,22 @@ def read_gltf(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
         for mesh, entry in meshes.items()
         for number, primitive in enumerate(entry.primitives)
     }
-    found = {key: piece for key, piece in pieces.items() if piece is not None and len(piece.part.faces)}
-    if not found:
+    with_faces = {key: piece for key, piece in pieces.items() if piece is not None and len(piece.part.faces)}
+    if not with_faces:
         got = "points or lines only" if pieces else "none"
         raise FileFormatError(f"{path}: expected a mesh with faces, got {got}; export triangles")
     left_out(header, notes)
-    if len(found) < len(pieces):
-        notes.say(f"{len(pieces) - len(found)} parts without faces (points, lines) are left out")
+    if len(with_faces) < len(pieces):
+        notes.say(f"{len(pieces) - len(with_faces)} parts without faces (points, lines) are left out")
     for words, keys in (
-        (SEE_THROUGH, [mesh for (mesh, _), piece in found.items() if piece.see_through]),
-        (DEFAULT, [mesh for (mesh, _), piece in found.items() if piece.material is None]),
+        (SEE_THROUGH, [mesh for (mesh, _), piece in with_faces.items() if piece.see_through]),
+        (DEFAULT, [mesh for (mesh, _), piece in with_faces.items() if piece.material is None]),
     ):
         if keys:
             notes.say(counted(len(set(keys)), words))
     surfaces = GltfSurfaces(header, buffers, references, notes)
     groups: dict[int | None, dict[tuple[int, int], ImportedPart]] = {}
-    for key, piece in found.items():
+    for key, piece in with_faces.items():
         groups.setdefault(piece.material, {})[key] = piece.part
     finished = {}
     for material, group in groups.items():
@@ -392,7 +392,7 @@ def read_gltf(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
     }
 
     def in_place(key: tuple[int, int], node: int, pose: Doubles) -> ImportedPart:
-        skin, by = header.nodes[node].skin, found[key].bound
+        skin, by = header.nodes[node].skin, with_faces[key].bound
         if skin is None or by is None:
             return placed(finished[key], pose)
         return posed(path, finished[key], by, skins[skin])

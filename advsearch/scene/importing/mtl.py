@@ -105,22 +105,22 @@ class MapUse:
 
 def parsed(text: str, file: str) -> tuple[list[MtlMaterial], list[str]]:
     """Return the materials of a material file, and the keywords of statements before the first of them."""
-    found: list[MtlMaterial] = []
+    materials: list[MtlMaterial] = []
     stray = []
     for line in _CONTINUED.sub(r"\1 ", text.replace("\r\n", "\n")).splitlines():
         key, _, rest = line.strip().replace("\t", " ").partition(" ")
         if not key or key.startswith("#"):
             continue
         if key.lower() == "newmtl":
-            found.append(MtlMaterial(" ".join(rest.split()), file))
-        elif found:
-            if found[-1].statements.get(key.lower(), rest.strip()) != rest.strip():
-                found[-1].again.append(key)
-            found[-1].statements[key.lower()] = rest.strip()
-            found[-1].spelled[key.lower()] = key
+            materials.append(MtlMaterial(" ".join(rest.split()), file))
+        elif materials:
+            if materials[-1].statements.get(key.lower(), rest.strip()) != rest.strip():
+                materials[-1].again.append(key)
+            materials[-1].statements[key.lower()] = rest.strip()
+            materials[-1].spelled[key.lower()] = key
         else:
             stray.append(key)
-    return found, stray
+    return materials, stray
 
 
 def without_comment(text: str) -> str:

@@ -159,9 +159,9 @@ class MtlReader:
         texture = self._texture(material, uses.get("map_kd"), color)
         if "map_kd" in uses and color is not None and (color > 0.999).all():
             color = None  # plain white only leaves a texture alone
-        found = self._see_through(material, uses.get("map_d"), ImportedSurface(color, texture))
-        found = replace(
-            found,
+        look = self._see_through(material, uses.get("map_d"), ImportedSurface(color, texture))
+        look = replace(
+            look,
             roughness=self._share(material, "pr", uses.get("map_pr"), name, square),
             metallic=self._share(material, "pm", uses.get("map_pm"), name, square),
             normal_map=self._bumps(material, uses),
@@ -169,9 +169,9 @@ class MtlReader:
             name=material.name,
         )
         if first is None:
-            return Painted(found)
+            return Painted(look)
         clamped = any(use.options.get("clamp", "").lower() == "on" for use in uses.values())
-        return Painted(found, first.scale, first.offset, clamped)
+        return Painted(look, first.scale, first.offset, clamped)
 
     def _list(self, material: MtlMaterial) -> None:
         """Put what is not read into the inventory; what is there by default, and changes nothing, is not in it."""
@@ -356,18 +356,18 @@ def libraries_of(rests: Sequence[str], references: References) -> list[str]:
     A line may name several, and a name may have blanks: a line that is the name of a file is that, else each name ends
     in ``.mtl``, else in a blank.
     """
-    found: list[str] = []
+    names: list[str] = []
     for rest in rests:
         plain = without_comment(rest)
         for line in (rest, plain):
             if isinstance(references.tried(line), bytes):
-                found.append(line)
+                names.append(line)
                 break
         else:
             parts = _split(plain)
             ended = all(part.strip('"').lower().endswith(".mtl") for part in parts)
-            found += parts if ended or any(isinstance(references.tried(part), bytes) for part in parts) else [plain]
-    return list(dict.fromkeys(one for one in found if one))
+            names += parts if ended or any(isinstance(references.tried(part), bytes) for part in parts) else [plain]
+    return list(dict.fromkeys(one for one in names if one))
 
 
 def _split(line: str) -> list[str]:

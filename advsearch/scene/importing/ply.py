@@ -371,7 +371,7 @@ class _Reader:
     def colors(self, at: Ints, face: Ints) -> Doubles | None:
         """Return the linear colours (T, 3, 3) of the corners of triangles, or None: those of vertices, unless these are
         all the same and those of faces are not."""
-        found = {}
+        channels = {}
         for element, index in (("vertex", at), ("face", face)):
             values = self.columns(element, COLORS)
             if values is None:
@@ -382,15 +382,15 @@ class _Reader:
             linear = srgb_to_linear(np.clip(np.nan_to_num(values / _scale(values, kind)), 0.0, 1.0).astype(np.float32))
             padded = np.concatenate([linear, srgb_to_linear(np.full((1, 3), NEUTRAL, np.float32))])  # of strips
             colors = padded[np.minimum(index, len(linear))].astype(np.float64)
-            found[element] = colors if element == "vertex" else np.repeat(colors[:, None], 3, axis=1)
-        if len(found) < 2:
-            return next(iter(found.values()), None)
-        better = "face" if np.ptp(found["vertex"]) == 0.0 else "vertex"
+            channels[element] = colors if element == "vertex" else np.repeat(colors[:, None], 3, axis=1)
+        if len(channels) < 2:
+            return next(iter(channels.values()), None)
+        better = "face" if np.ptp(channels["vertex"]) == 0.0 else "vertex"
         other = "faces" if better == "vertex" else "vertices"
         self.notes.say(
             f"colours of {other} are left out: its {'vertices' if better == 'vertex' else 'faces'} have some, too"
         )
-        return found[better]
+        return channels[better]
 
     def _alpha(self, table: Element, kind: np.dtype[np.generic]) -> None:
         for name in ALPHAS:

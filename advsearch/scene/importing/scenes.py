@@ -93,7 +93,7 @@ def import_scene(path: Path, node: str) -> ImportedScene:
     parts, notes = read_parts(path, data)
     places = dict(poses(header))
     chosen = _below(header, _named(path, header, node, {part.node for part in parts}))
-    own = [part for part in parts if part.node in chosen]
+    chosen_parts = [part for part in parts if part.node in chosen]
     others = sorted({part.node for part in parts} - chosen)
     lamps = [index for index in places if header.nodes[index].lamp is not None]
     if len(others) + len(lamps) > MOST_SURROUNDINGS:
@@ -101,7 +101,7 @@ def import_scene(path: Path, node: str) -> ImportedScene:
             f"{path}: expected at most {MOST_SURROUNDINGS} meshes and lights beside the object, got "
             f"{len(others) + len(lamps)}; join some of them in the file"
         )
-    frame, names = _frame(own), _Names()
+    frame, names = _frame(chosen_parts), _Names()
     called = _mesh_names(header, parts, names)
     surroundings: list[ScenePart] = []
     for number in others:
@@ -129,7 +129,7 @@ def import_scene(path: Path, node: str) -> ImportedScene:
         _check_camera(path, name, camera)
     notes.extend(_changed(path, header))
     return ImportedScene(
-        object_of(own, notes, path, f"{safe_name(path)}-{clean(node)}", "y"), tuple(surroundings), cameras
+        object_of(chosen_parts, notes, path, f"{safe_name(path)}-{clean(node)}", "y"), tuple(surroundings), cameras
     )
 
 

@@ -70,8 +70,8 @@ def read_obj(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
         return tables["vt"][mapped[mine]], np.linalg.norm(np.cross(b - a, c - a), axis=1)
 
     reader = MtlReader(references, notes, shown_on)
-    said = _statements(lines, notes)
-    libraries = list(dict.fromkeys(said.libraries))
+    statements = _statements(lines, notes)
+    libraries = list(dict.fromkeys(statements.libraries))
     _check_count(path, libraries, "lines that name material files (mtllib)")
     libraries = libraries_of(libraries, references)
     _check_count(path, libraries, "material files")
@@ -84,9 +84,9 @@ def read_obj(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
     if wrong:
         notes.say(f"{wrong:,} faces cross themselves, or are too much work, and may be cut up wrongly")
     position, mapped, normal = (corners[triangles, place] for place in range(3))
-    names, material = _in_effect(said.materials, rows[face])
+    names, material = _in_effect(statements.materials, rows[face])
     _check_count(path, names, "materials")
-    smoothness, smooth = _in_effect(said.smoothing, rows[face])
+    smoothness, smooth = _in_effect(statements.smoothing, rows[face])
     off = np.array([*(word in ("off", "0", "") for word in smoothness), False])[smooth]
     if ((smooth >= 0) & ~off & (normal < 0).any(axis=1)).any():
         notes.say("smoothing groups are left out: its normals are made, with creases at sharp edges")
@@ -103,7 +103,7 @@ def read_obj(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
         if painted is None:
             painted = Painted(ImportedSurface(name=without_comment(names[first[0]])))
             instead = "neutral grey" if tint is None else "the colour of its vertices"
-            _note_unknown(reader, said, names[first[0]], instead)
+            _note_unknown(reader, statements, names[first[0]], instead)
         surface, tint = _tinted(reader, painted.surface, tint)
         uvs = Looked(tables["vt"], mapped).at(chosen)
         if uvs is not None:
@@ -149,22 +149,22 @@ class _Said:
 
 def _statements(lines: Lines, notes: Notes) -> _Said:
     """Read the statements that are no numbers; what nothing becomes of is put into the inventory."""
-    said = _Said([], [], [])
+    statements = _Said([], [], [])
     for row, word, rest in lines.others():
         key, plain = word.lower(), without_comment(rest).lower()
         if key == "mtllib":
-            said.libraries.append(rest)
+            statements.libraries.append(rest)
         elif key == "usemtl":
-            said.materials.append((row, " ".join(rest.split())))
+            statements.materials.append((row, " ".join(rest.split())))
         elif key == "s":
-            said.smoothing.append((row, plain))
+            statements.smoothing.append((row, plain))
         elif key in ("p", "l"):
             notes.has("points, statement" if key == "p" else "lines, statement", key)
         elif key in FREE_FORM:
             notes.has("curves and curved surfaces, statement", key)
         elif key not in GROUPING and plain not in ("off", "0"):
             notes.has("statement", word)
-    return said
+    return statements
 
 
 def _in_effect(changes: list[tuple[int, str]], rows: Ints) -> tuple[list[str], Ints]:

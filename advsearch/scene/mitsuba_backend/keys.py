@@ -38,8 +38,8 @@ def plugin_numbers(description: SceneDescription, name: str, keys: tuple[str, ..
         UnknownNameError: the scene has no such key; the message has near ones.
         InputError: it is something else than a number or a colour.
     """
-    found, others = _all(description)
-    channels = {f"{key}.{one}": key for key in found for one in CHANNELS if len(found[key].values) > 1}
+    numbers, others = _all(description)
+    channels = {f"{key}.{one}": key for key in numbers for one in CHANNELS if len(numbers[key].values) > 1}
     keys = tuple(dict.fromkeys(channels.get(key, key) for key in keys))
     for key in keys:
         if key in others:
@@ -47,9 +47,9 @@ def plugin_numbers(description: SceneDescription, name: str, keys: tuple[str, ..
                 f"`controls` mitsuba:{key}: expected a number or a colour, and Mitsuba has {others[key]} there; other "
                 "controls may move it, such as pose and texture"
             )
-        if key not in found:
-            raise UnknownNameError("number or colour in Mitsuba", key, found)
-    return tuple(_named(found[key], name) for key in keys)
+        if key not in numbers:
+            raise UnknownNameError("number or colour in Mitsuba", key, numbers)
+    return tuple(_named(numbers[key], name) for key in keys)
 
 
 def _named(one: PluginNumber, name: str) -> PluginNumber:
@@ -62,7 +62,7 @@ def _all(description: SceneDescription) -> tuple[dict[str, PluginNumber], dict[s
     rest."""
     scene = MitsubaScene(description, SMALL)
     own = {key: name for name, (key, one) in scene.declared.items() if one.write in (number, color)}
-    found: dict[str, PluginNumber] = {}
+    numbers: dict[str, PluginNumber] = {}
     others: dict[str, str] = {}
     for key in scene.parameters.keys():
         value, flags = scene.parameters[key], scene.parameters.flags(key)
@@ -72,8 +72,8 @@ def _all(description: SceneDescription) -> tuple[dict[str, PluginNumber], dict[s
             continue
         still = flags == mi.ParamFlags.Differentiable.value
         valid = BEHIND if flags & mi.ParamFlags.NonDifferentiable.value else STILL if still else UNSURE
-        found[key] = PluginNumber(key, values, own.get(key, ""), valid, isinstance(value, float))
-    return found, others
+        numbers[key] = PluginNumber(key, values, own.get(key, ""), valid, isinstance(value, float))
+    return numbers, others
 
 
 def _values(value: Any) -> tuple[float, ...] | None:

@@ -266,8 +266,8 @@ def asked_version(library: str) -> Version:
     """Load a library in another process, which a bad one may take down, and ask for its version; () if it has none."""
     command = [sys.executable, "-c", _PROBE, os.path.abspath(library) if os.sep in library else library]
     try:
-        answer = subprocess.run(command, capture_output=True, text=True, timeout=30, check=True, cwd=OWN_FOLDER).stdout
-        return tuple(int(part) for part in answer.split())
+        printed = subprocess.run(command, capture_output=True, text=True, timeout=30, check=True, cwd=OWN_FOLDER).stdout
+        return tuple(int(part) for part in printed.split())
     except (OSError, subprocess.SubprocessError, ValueError):
         return ()
 

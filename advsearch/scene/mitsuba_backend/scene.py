@@ -219,7 +219,7 @@ class MitsubaScene:
                 self._recorded.clear()
                 self._recorded_at = now
             media = population.media() if self.volumetric else []
-            found: list[Tensor] = []
+            pictures: list[Tensor] = []
             for (what, seed), integrator in zip(seeds.items(), integrators, strict=True):
                 key = what, spp, self._depth
                 if self._freeze and key not in self._recorded:
@@ -229,8 +229,8 @@ class MitsubaScene:
                 if what == "guides":
                     image = image[..., -6:]
                     image[..., :3].clamp_(0.0, 1.0)
-                found.append(image)
-            return found
+                pictures.append(image)
+            return pictures
 
     def radiance(self, inputs: Mapping[str, Tensor], seed: int, spp: int, *, hide: bool = False) -> Tensor:
         """Render linear radiance, without what the environment shows directly if hidden; as of `pictures`."""
@@ -410,19 +410,19 @@ class MitsubaScene:
         population.changes += not self._literals.isdisjoint(wanted)
         for name, fresh in wanted.items():
             key, one = self.declared[name]
-            own = self.parameters[key]
+            current = self.parameters[key]
             if fresh is not None and one.shape is not None and fresh.numel() != math.prod(one.shape):
                 raise InputError(f"{name}: expected shape {one.shape}, got {tuple(fresh.shape)}, from what sets it")
             if name not in self._base:
-                self._base[name] = type(own)(own.torch().clone() if name in self._buffers else own)
-            given = type(own)(self._base[name]) if fresh is None else mi.TensorXf(fresh)
+                self._base[name] = type(current)(current.torch().clone() if name in self._buffers else current)
+            given = type(current)(self._base[name]) if fresh is None else mi.TensorXf(fresh)
             if fresh is not None and one.write:
                 given = one.write(given)
             if name in self._buffers:
-                place = own.torch().data_ptr()
-                dr.scatter(own, given, dr.arange(mi.UInt32, len(own)))
-                dr.eval(own)
-                population.changes += own.torch().data_ptr() != place  # Dr.Jit copies what has a second owner
+                place = current.torch().data_ptr()
+                dr.scatter(current, given, dr.arange(mi.UInt32, len(current)))
+                dr.eval(current)
+                population.changes += current.torch().data_ptr() != place  # Dr.Jit copies what has a second owner
                 self.parameters.set_dirty(key)
             else:
                 self.parameters[key] = given

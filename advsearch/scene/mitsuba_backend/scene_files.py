@@ -293,8 +293,8 @@ def _without(surface: Mapping[str, object], mesh: Mesh) -> Iterator[str]:
 def _left_out(tree: Mapping[str, object], shape: Mapping[str, object], *, hazy: bool, lit: bool) -> Iterator[str]:
     """Sentences about what is not as it is in the file; `hazy`: the camera's medium is the scene's haze, `lit`: the
     object keeps its light."""
-    for name, one in _plugins(tree):
-        kind = one["type"]
+    for name, plugin in _plugins(tree):
+        kind = plugin["type"]
         if kind in SENSORS - CAMERAS:
             yield f"the sensor {name} is left out: a {kind}"
         elif kind == "thinlens":
@@ -302,18 +302,18 @@ def _left_out(tree: Mapping[str, object], shape: Mapping[str, object], *, hazy: 
         elif kind in INTEGRATORS - {"path", "prb", "volpath", "prbvolpath", "volpathmis", "prb_projective"}:
             yield f"the integrator {name} is left out: a {kind}; light takes all paths of up to 6 segments"
         elif kind in INTEGRATORS:
-            if one.get("hide_emitters"):
+            if plugin.get("hide_emitters"):
                 yield f"hide_emitters of the integrator {name} is left out: lights are seen"
-            depth = one.get("max_depth", -1)
+            depth = plugin.get("max_depth", -1)
             if isinstance(depth, int) and 0 <= depth < 6:
                 yield f"the integrator's max_depth of {depth} is left out: light takes all paths of up to 6 segments"
         if kind in SENSORS and any(
-            isinstance(film, Mapping) and any(str(key).startswith("crop") for key in film) for film in one.values()
+            isinstance(film, Mapping) and any(str(key).startswith("crop") for key in film) for film in plugin.values()
         ):
             yield f"the crop of the film of {name} is left out: the whole picture is seen"
-        if kind in SENSORS and "medium" in one and not hazy:
+        if kind in SENSORS and "medium" in plugin and not hazy:
             yield f"the sensor {name} sees nothing of its medium up to the first surface"
-        if kind in SENSORS and any("principal_point" in key for key in one):
+        if kind in SENSORS and any("principal_point" in key for key in plugin):
             yield f"the sensor {name} looks along its middle: its principal point is left out"
     for key, inner in shape.items():
         if not isinstance(inner, Mapping) and key not in OF_A_SHAPE:
@@ -356,27 +356,27 @@ class _Frame:
 
     def moved(self, plugin: Mapping[str, object]) -> Plugin:
         """Return a plugin at the top of a scene in its place."""
-        kind, found = plugin["type"], dict(plugin)
+        kind, entries = plugin["type"], dict(plugin)
         if kind == "merge":
-            return {key: self.moved(one) if isinstance(one, Mapping) else one for key, one in found.items()}
+            return {key: self.moved(one) if isinstance(one, Mapping) else one for key, one in entries.items()}
         if kind in SHAPES - {"shapegroup", "merge"}:
-            found["to_world"] = self.matrix @ _matrix(plugin)
+            entries["to_world"] = self.matrix @ _matrix(plugin)
         elif kind in ("constant", "envmap", "sunsky", "timed_sunsky", "directional"):
             turn = np.eye(4)
             turn[:3, :3] = self.turn
-            if "direction" in found:
-                found["direction"] = (self.turn @ np.asarray(found["direction"], dtype=np.float64)).tolist()
+            if "direction" in entries:
+                entries["direction"] = (self.turn @ np.asarray(entries["direction"], dtype=np.float64)).tolist()
             elif kind != "constant":
-                found["to_world"] = turn @ _matrix(plugin)
+                entries["to_world"] = turn @ _matrix(plugin)
         elif kind in ("point", "spot", "projector"):
-            if "position" in found:
-                place = np.asarray(found["position"], dtype=np.float64)
-                found["position"] = (self.matrix[:3, :3] @ place + self.matrix[:3, 3]).tolist()
+            if "position" in entries:
+                place = np.asarray(entries["position"], dtype=np.float64)
+                entries["position"] = (self.matrix[:3, :3] @ place + self.matrix[:3, 3]).tolist()
             else:
-                found["to_world"] = self.matrix @ _matrix(plugin)
+                entries["to_world"] = self.matrix @ _matrix(plugin)
             power = "irradiance" if kind == "projector" else "intensity"
-            found[power] = _times(found.get(power, 1.0), self.size**-2, str(kind))
-        return {key: self._inside(value) if isinstance(value, Mapping) else value for key, value in found.items()}
+            entries[power] = _times(entries.get(power, 1.0), self.size**-2, str(kind))
+        return {key: self._inside(value) if isinstance(value, Mapping) else value for key, value in entries.items()}
 
     def _inside(self, plugin: Mapping[str, object]) -> Plugin:
         """Return a plugin within another: media and volumes are scaled."""

@@ -74,18 +74,18 @@ def surface_of(bsdf: Mapping[str, object]) -> ShapeSurface:
     Whatever else is looked up by texture coordinates stays in its place: where the base colour has a transform of its
     own, the others get the inverse before theirs.
     """
-    found: _Color | None = None
+    base: _Color | None = None
 
     def without(plugin: Mapping[str, object]) -> Plugin:
-        nonlocal found
+        nonlocal base
         key = COLORS.get(str(plugin["type"]))
-        color = None if key is None or found is not None else _color(plugin.get(key, GREY))
+        color = None if key is None or base is not None else _color(plugin.get(key, GREY))
         if key is not None and color is not None:
-            found, plugin = color, {**plugin, key: {"type": BASE_COLOR, **color.options}}
+            base, plugin = color, {**plugin, key: {"type": BASE_COLOR, **color.options}}
         return {name: without(value) if isinstance(value, Mapping) else value for name, value in plugin.items()}
 
     surface = without(bsdf)
-    color = found or _Color(np.full((PLAIN_SIZE, PLAIN_SIZE, 3), GREY, np.float32), {})
+    color = base or _Color(np.full((PLAIN_SIZE, PLAIN_SIZE, 3), GREY, np.float32), {})
     notes, plugins = [], list(plugins_in(surface))
     if not any(one["type"] == BASE_COLOR for one in plugins):
         kinds = sorted({str(one["type"]) for one in plugins} & {"mesh_attribute", "volume"})

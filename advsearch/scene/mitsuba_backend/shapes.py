@@ -108,18 +108,18 @@ def _loaded(shape: Mapping[str, object], name: str) -> Buffers:
             loaded = mi.load_dict(loadable({key: value for key, value in shape.items() if key in OF_A_MESH}))
     except RuntimeError as error:
         raise InputError(f"object {name}: Mitsuba refuses the shape: {error}; change it there") from error
-    found = mi.traverse(loaded)
-    vertices = np.array(found[POSITIONS], np.float64).reshape(-1, 3)
-    faces = np.array(found[FACES], np.int64).reshape(-1, 3)
+    parameters = mi.traverse(loaded)
+    vertices = np.array(parameters[POSITIONS], np.float64).reshape(-1, 3)
+    faces = np.array(parameters[FACES], np.int64).reshape(-1, 3)
     if not len(faces):
         raise InputError(f"object {name}: expected a mesh with faces, got none; export triangles")
-    normals = np.array(found[NORMALS], np.float64).reshape(-1, 3) if loaded.has_vertex_normals() else None
-    uvs = np.array(found[TEXCOORDS], np.float64).reshape(-1, 2) if loaded.has_vertex_texcoords() else None
+    normals = np.array(parameters[NORMALS], np.float64).reshape(-1, 3) if loaded.has_vertex_normals() else None
+    uvs = np.array(parameters[TEXCOORDS], np.float64).reshape(-1, 2) if loaded.has_vertex_texcoords() else None
     attributes: dict[str, Floats] = {}
-    for key in found.keys():
+    for key in parameters.keys():
         count = {"vertex": len(vertices), "face": len(faces)}.get(key.split("_")[0], 0)
         if count and key not in (POSITIONS, NORMALS, TEXCOORDS) and "." not in key:
-            attributes[str(key)] = np.array(found[key], np.float32).reshape(count, -1)
+            attributes[str(key)] = np.array(parameters[key], np.float32).reshape(count, -1)
     return vertices, faces, normals, uvs, attributes
 
 
@@ -129,20 +129,20 @@ def _unit(vectors: Doubles) -> Doubles:
 
 def _solid(kind: str, shape: Mapping[str, object], name: str) -> Buffers:
     """The same of a shape of which Mitsuba has no triangles."""
-    own = np.eye(4)
+    local = np.eye(4)
     round_ = np.linspace(0.0, 1.0, SECTIONS + 1)
     normals = None
     if kind == "sphere":
         uvs, faces = _grid(round_, round_[::2])
         down = np.pi * uvs[:, 1]
         vertices = normals = np.stack([*(np.sin(down) * _circle(uvs[:, 0])), np.cos(down)], axis=1)
-        own[:3, :3] *= _number(shape.get("radius", 1.0))
-        own[:3, 3] = np.asarray(shape.get("center", (0.0, 0.0, 0.0)), dtype=np.float64)
+        local[:3, :3] *= _number(shape.get("radius", 1.0))
+        local[:3, 3] = np.asarray(shape.get("center", (0.0, 0.0, 0.0)), dtype=np.float64)
     elif kind == "cylinder":  # open at both ends, as Mitsuba's
         uvs, faces = _grid(round_, np.array([0.0, 1.0]))
         vertices = np.stack([*_circle(uvs[:, 0]), uvs[:, 1]], axis=1)
         normals = vertices * (1.0, 1.0, 0.0)
-        own = _along(shape)
+        local = _along(shape)
     elif kind == "disk":
         uvs, faces = _grid(round_[::8], round_)
         vertices = np.stack([*(uvs[:, 0] * _circle(uvs[:, 1])), np.zeros(len(uvs))], axis=1)
@@ -151,7 +151,7 @@ def _solid(kind: str, shape: Mapping[str, object], name: str) -> Buffers:
         vertices = np.column_stack([uvs * 2.0 - 1.0, np.zeros(4)])
     normals = np.tile((0.0, 0.0, 1.0), (len(vertices), 1)) if normals is None else normals
     faces = faces[np.linalg.norm(_fronts(vertices, faces), axis=1) > 1e-9]
-    matrix = np.asarray(shape.get("to_world", np.eye(4)), dtype=np.float64) @ own
+    matrix = np.asarray(shape.get("to_world", np.eye(4)), dtype=np.float64) @ local
     if not abs(np.linalg.det(matrix[:3, :3])) > 0.0:
         raise InputError(f"object {name}: expected a {kind} of some size, got one without extent; change its numbers")
     normals = _unit(normals @ np.linalg.inv(matrix[:3, :3]))

@@ -84,7 +84,7 @@ def gather(
     steps = (np.arange(1, rays + 1)[:, None] * np.array([0.7548776662466927, 0.5698402909980532])) % 1.0
     points = mi.Point2f(mi.Float(steps[:, 0].astype(np.float32)), mi.Float(steps[:, 1].astype(np.float32)))
     shifts = np.random.default_rng(seed).random((count, 2), dtype=np.float32)
-    found = np.empty((count, rays), dtype=np.int32)
+    seen_by_rays = np.empty((count, rays), dtype=np.int32)
     for begin in range(0, count, max(1, PASS // rays)):
         some = slice(begin, min(count, begin + max(1, PASS // rays)))
         lane = dr.arange(mi.UInt32, (some.stop - begin) * rays)
@@ -109,8 +109,8 @@ def gather(
             y, x = grid_place(grid, si.p, si.uv)
             nearest = mi.Int32(grid.first + _cell(y, grid.shape[0]) * grid.shape[1] + _cell(x, grid.shape[1]))
             seen = dr.select(on, nearest, seen)
-        found[some] = seen.numpy().reshape(-1, rays)
-    return found
+        seen_by_rays[some] = seen.numpy().reshape(-1, rays)
+    return seen_by_rays
 
 
 def towards(scene: MitsubaScene, places: Floats, normals: Floats, ways: Floats) -> Floats:

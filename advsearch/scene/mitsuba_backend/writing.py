@@ -149,11 +149,11 @@ def _put(plugin: Plugin, key: list[str], values: list[float]) -> bool:
 
 def _part(part: ScenePart, left: Plugin) -> Plugin:
     """A part's dictionary; takes its inputs from what is left."""
-    given = {name.partition(".")[2]: left.pop(name) for name in sorted(left) if name.startswith(f"{part.name}.")}
+    inputs = {name.partition(".")[2]: left.pop(name) for name in sorted(left) if name.startswith(f"{part.name}.")}
     if isinstance(part, MeshPart):
-        given.pop("vertices", None), given.pop("normals", None)  # the mesh that is written has them
-        color = given.pop("base_color", None)
-        numbers = {name: float(given.pop(name)[0]) for name in MATERIAL if name in given and part.surface is None}
+        inputs.pop("vertices", None), inputs.pop("normals", None)  # the mesh that is written has them
+        color = inputs.pop("base_color", None)
+        numbers = {name: float(inputs.pop(name)[0]) for name in MATERIAL if name in inputs and part.surface is None}
         part = replace(part, material=replace(part.material, **numbers))
         if color is not None:
             part = replace(part, base_color=_display(color))
@@ -161,24 +161,24 @@ def _part(part: ScenePart, left: Plugin) -> Plugin:
         if part.surface is not None:
             base_color = part.base_color
             surface = own_surface(part.surface, lambda options: base_texture(base_color, options))
-        radiance = given.pop("radiance", None)
+        radiance = inputs.pop("radiance", None)
         if radiance is not None:
             part = replace(part, emission=radiance.reshape(-1, *radiance.shape[-2:] if radiance.ndim > 1 else (1, 3)))
         light = emitter(part)
-        found: Plugin = {"type": "ply", "bsdf": surface, **({"emitter": light} if light else {})}
+        plugin: Plugin = {"type": "ply", "bsdf": surface, **({"emitter": light} if light else {})}
     elif isinstance(part, (PointLamp, SpotLamp)):
-        found = translation(replace(part, **_triples(given))).plugins[part.name]
+        plugin = translation(replace(part, **_triples(inputs))).plugins[part.name]
     elif isinstance(part, BallLamp):
-        ball = given.pop("ball", None)
-        found = translation(replace(part, **_triples(given))).plugins[part.name]
+        ball = inputs.pop("ball", None)
+        plugin = translation(replace(part, **_triples(inputs))).plugins[part.name]
         if ball is not None:
-            found["to_world"] = mi.ScalarTransform4f(ball)
+            plugin["to_world"] = mi.ScalarTransform4f(ball)
     elif isinstance(part, PluginPart):
-        found = loadable(part.plugin)
+        plugin = loadable(part.plugin)
     else:
         raise InputError(f"out: stock Mitsuba has nothing for {part.name}; export a run without it")
-    left |= {f"{part.name}.{name}": value for name, value in given.items()}
-    return found
+    left |= {f"{part.name}.{name}": value for name, value in inputs.items()}
+    return plugin
 
 
 def _triples(given: Plugin) -> Plugin:
@@ -213,7 +213,7 @@ def write_xml(path: Path, scene: Plugin, meshes: Mapping[str, Any], note: str) -
 
     def filed(name: str, plugin: Mapping[str, Any]) -> Plugin:
         """The plugin with its pictures, and the files that it names, beside the scene."""
-        found: Plugin = {}
+        copied: Plugin = {}
         for key, entry in plugin.items():
             if isinstance(entry, mi.Bitmap):
                 key, file = "filename", beside(name, ".exr")
@@ -225,8 +225,8 @@ def write_xml(path: Path, scene: Plugin, meshes: Mapping[str, Any], note: str) -
                 file = beside(name, Path(entry).suffix)
                 shutil.copyfile(entry, file)
                 entry = file.name
-            found[key] = entry
-        return found
+            copied[key] = entry
+        return copied
 
     whole: Plugin = {"type": "scene"}
     for name, plugin in scene.items():

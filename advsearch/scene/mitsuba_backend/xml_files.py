@@ -186,20 +186,20 @@ class _Text:
 def _plugin(path: Path, state: Any, number: int, referred: set[str]) -> Plugin:
     """Return a parsed plugin with all that is in it, as `mitsuba.load_dict` takes it; ids that it names are put into
     `referred`."""
-    kinds, own = mi.Properties.Type, state.nodes[number].props
-    found: Plugin = {"type": own.plugin_name()}
+    kinds, props = mi.Properties.Type, state.nodes[number].props
+    entries: Plugin = {"type": props.plugin_name()}
     last: dict[str, int] = {}
 
     def put(wanted: str, made: object) -> None:
         """Under a name that is free: the one that is wanted, or with a number behind it."""
         name, count = wanted, last.get(wanted, 1)
-        while name in found:
+        while name in entries:
             count += 1
             name = f"{wanted}-{count}"
-        last[wanted], found[name] = count, made
+        last[wanted], entries[name] = count, made
 
-    for key in own.keys():
-        kind, value = own.type(key), own[key]
+    for key in props.keys():
+        kind, value = props.type(key), props[key]
         named = "" if key.startswith("_arg_") else key
         if kind == kinds.ResolvedReference:
             node = state.nodes[value.index()]
@@ -212,7 +212,7 @@ def _plugin(path: Path, state: Any, number: int, referred: set[str]) -> Plugin:
             put(named or "ref", {"type": "ref", "id": _plain(str(value.id()))})
         else:
             put(key, _value(f"{path}: {shown(key, quoted=False)}", kind, value))
-    return found
+    return entries
 
 
 def _value(where: str, kind: Any, value: Any) -> object:
@@ -321,18 +321,18 @@ def trusted(path: Path, scene: Mapping[str, object], notes: list[str]) -> Plugin
             )
         if not re.fullmatch(r"\w*", str(plugin.get("material", ""))):
             raise FileFormatError(f"{path}: {shown(str(plugin['material']))} is no name of a material")
-        found = {key: checked(value) if isinstance(value, Mapping) else value for key, value in plugin.items()}
-        if kind in readers and "filename" not in found:  # without one Mitsuba's bitmap ends the process
+        entries = {key: checked(value) if isinstance(value, Mapping) else value for key, value in plugin.items()}
+        if kind in readers and "filename" not in entries:  # without one Mitsuba's bitmap ends the process
             raise FileFormatError(f"{path}: expected a filename in each {kind}, got none; name the file")
-        if "filename" in found:
+        if "filename" in entries:
             if kind not in readers:
-                named = shown(str(found["filename"]))
+                named = shown(str(entries["filename"]))
                 raise FileFormatError(
                     f"{path}: {kind} names the file {named}, which only Mitsuba reads, without checks; convert it to "
                     "a .ply mesh or a picture, or give the scene as a dictionary from Python"
                 )
-            found = readers[kind](found)
-        return found
+            entries = readers[kind](entries)
+        return entries
 
     return checked(scene)
 

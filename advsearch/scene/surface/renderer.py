@@ -174,7 +174,7 @@ class SurfaceRenderer(Predictor):
         """Return the pictures (n, H, W, 3) sRGB of what cameras see; differentiable in the base colour.
 
         Args:
-            looks: see `looks`.
+            looks: see `calibrates`.
             inputs: of the scene, for each; their base colour does not count.
             color: (h, w, 3) base colour.
             wholes: (d,) configurations of the space, for what controls do to the finished picture.

@@ -157,7 +157,7 @@ def between(
     tall, wide = charts.covered.shape
     y, x = (rows + 0.5) * tall / shape[0] - 0.5, (columns + 0.5) * wide / shape[1] - 0.5
     number = np.where(charts.covered, np.cumsum(charts.covered.ravel()).reshape(charts.covered.shape) - 1, -1)
-    found, weights = [], []
+    corners, weights = [], []
     for down in range(-REACH, REACH + 1):
         for across in range(-REACH, REACH + 1):
             row, column = np.round(y).astype(int) + down, np.round(x).astype(int) + across
@@ -166,9 +166,9 @@ def between(
             far = ((row - y) ** 2 + (column - x) ** 2) / (2.0 * WIDTH**2)
             apart = ((texels.places[one] - at) ** 2).sum(axis=1) / (2.0 * (SAME * side) ** 2)
             alike = np.clip((texels.normals[one] * facing).sum(axis=1), 0.0, 1.0) ** 8
-            found.append(one)
+            corners.append(one)
             weights.append(np.where((one >= 0) & ~buried[one], np.exp(-far - apart) * alike, 0.0))
-    chosen, weight = np.stack(found, axis=1), np.stack(weights, axis=1)
+    chosen, weight = np.stack(corners, axis=1), np.stack(weights, axis=1)
     lost = weight.sum(axis=1) < 1e-6
     chosen[lost, 0] = texels.of_cell[
         np.round(y[lost]).astype(int).clip(0, tall - 1) * wide + np.round(x[lost]).astype(int).clip(0, wide - 1)

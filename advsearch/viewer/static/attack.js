@@ -27,7 +27,7 @@
     const input = make("input", { type: "range", min: 0, max: pictures.length - 1, value: at, "aria-label": "step of the search", oninput: (event) => { stop(); show(Number(event.target.value)); } });
     const button = make("button", { type: "button", onclick: () => (timer === null ? play() : stop()) }, "Play");
     function words(k) {
-      if (k === pictures.length - 1) return "the answer";
+      if (k === pictures.length - 1) return "the adversarial scene";
       const objective = objectives[k];
       return `step ${steps[k]}${objective === null || objective === undefined ? "" : `, objective ${objective.toFixed(2)}`}`;
     }

@@ -22,7 +22,7 @@
   function show(number) {
     shown = number;
     const { step, picture: data } = pictures[number], row = rows.search[step];
-    const told = `step ${step}${row && row.objective !== null ? `, objective ${row.objective.toFixed(2)}` : ""}${row && row.label ? `, answer ${row.label}` : ""}`;
+    const told = `step ${step}${row && row.objective !== null ? `, objective ${row.objective.toFixed(2)}` : ""}${row && row.label ? `, prediction ${row.label}` : ""}`;
     picture.src = data;
     picture.alt = `the search at ${told}`;
     slider.value = number;
@@ -90,7 +90,7 @@
     if (best) {
       const number = (value) => (typeof value === "number" ? Number(value.toPrecision(4)) : value);
       const lines = Object.entries(best.values).map(([name, [value, unit]]) => [name, `${[value].flat().map(number).join(", ")} ${unit === "1" ? "" : unit}`]);
-      table.replaceChildren(...[["objective", `${best.objective.toFixed(3)} at step ${best.step}`], ["answer", best.label ?? ""], ...lines]
+      table.replaceChildren(...[["objective", `${best.objective.toFixed(3)} at step ${best.step}`], ["prediction", best.label ?? ""], ...lines]
         .map(([name, text]) => make("tr", {}, make("th", { scope: "row" }, name), make("td", {}, text))));
       values.hidden = false;
     }

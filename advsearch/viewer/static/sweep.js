@@ -48,7 +48,7 @@
     return rounded === 0 ? `under ${least.toFixed(decimals)}` : rounded === 100 ? `over ${(100 - least).toFixed(decimals)}` : String(rounded);
   }
   const percent = (share, most) => (share === null ? "none" : `${percentNumber(share, most)}\u00a0%`);
-  // An answer with its number, by what judges answers: as `cells` there.
+  // A prediction with its number, by what judges it: as `cells` there.
   function said(task, label, share) {
     if (share === null) return label;
     if (task === "detection") return label.startsWith("no ") ? `${label} found (best score of ${label.slice(3)} ${share.toFixed(2)})` : `${label} (score ${share.toFixed(2)})`;
@@ -678,10 +678,10 @@
     showGallery() {
       const state = this.state, { rows, all } = this.found(state.cell, SHOWN), boxes = rows.some((k) => this.address(k) && this.marks(k).length);
       this.parts.bar.replaceChildren(
-        choice("Show", [["all", "all"], ["wrong", "wrong answers"], ["right", "right answers"]], state.show, (show) => this.change({ show })),
+        choice("Show", [["all", "all"], ["wrong", "wrong predictions"], ["right", "right predictions"]], state.show, (show) => this.change({ show })),
         choice("First", [["worst", "worst margin"], ["best", "best margin"], ["first", "as they were made"]], state.order, (order) => this.change({ order })),
         make("span", { class: "soft" }, `${rows.length} of ${all.toLocaleString("en")}${state.cell ? " in this cell" : ""}`),
-        boxes ? make("span", { class: "soft boxes" }, "Boxes: ", make("span", { class: "true" }, "where the object is"), ", ", make("span", { class: "said" }, "where the model says its answer is")) : "",
+        boxes ? make("span", { class: "soft boxes" }, "Boxes: ", make("span", { class: "true" }, "where the object is"), ", ", make("span", { class: "said" }, "where the model says it is")) : "",
         ...(state.cell ? [make("button", { type: "button", onclick: () => this.change({ cell: null }) }, "All cells")] : []),
       );
       this.parts.gallery.replaceChildren(...rows.map((k, place) => this.card(k, () => this.details(rows, place))));
@@ -692,7 +692,7 @@
       return this.table.sources[source[k]].picture(step[k]);
     }
 
-    // The boxes of a detector's answer: a class and x, y, width, height in pixels of what it saw.
+    // The boxes of a detector's prediction: a class and x, y, width, height in pixels of what it saw.
     marks(k) {
       const { boxes, source } = this.table.columns;
       if (!boxes || !this.table.sources[source[k]].size) return [];
@@ -709,16 +709,16 @@
       return make("span", { class: "picture" }, image, drawn("svg", { viewBox: `0 0 ${wide} ${high}`, "aria-hidden": "true" }, ...marks.map(({ name, ...ends }) => drawn("rect", { class: name, ...ends }))));
     }
 
-    // What was answered, with its probability or score: of an object that was missed, the best score that did not count.
-    answered(k) {
-      const { answer, probability, source } = this.table.columns, label = this.table.answers[answer[k]] || "no answer";
+    // What was predicted, with its probability or score: of an object that was missed, the best score that did not count.
+    predicted(k) {
+      const { answer, probability, source } = this.table.columns, label = this.table.answers[answer[k]] || "no prediction";
       return said(this.table.sources[source[k]].task, label, probability[k] === NO_PROBABILITY ? null : probability[k] / 10000);
     }
 
     card(k, open) {
       const { right } = this.table.columns, verdict = right[k] === UNKNOWN ? "not judged" : right[k] ? "right" : "wrong";
-      const picture = this.address(k) ? [this.picture(k, `${verdict}: ${this.answered(k)}`)] : [];
-      return make("button", { type: "button", class: `card ${verdict.replace(" ", "-")}`, onclick: open }, ...picture, make("span", {}, make("strong", {}, verdict === "wrong" ? "✗ " : verdict === "right" ? "✓ " : ""), this.answered(k)));
+      const picture = this.address(k) ? [this.picture(k, `${verdict}: ${this.predicted(k)}`)] : [];
+      return make("button", { type: "button", class: `card ${verdict.replace(" ", "-")}`, onclick: open }, ...picture, make("span", {}, make("strong", {}, verdict === "wrong" ? "✗ " : verdict === "right" ? "✓ " : ""), this.predicted(k)));
     }
 
     // The short names of a parameter's levels, which its axis has where it varies.
@@ -742,7 +742,7 @@
       });
       const show = () => {
         const k = rows[place], { right, margin, step: number, source } = this.table.columns;
-        const facts = [["run", this.table.sources[source[k]].name], ["configuration", String(number[k])], ["answer", this.answered(k)], ["verdict", ["wrong", "right", "not judged"][right[k]]], ["margin", short(Number(margin[k].toPrecision(4)))]];
+        const facts = [["run", this.table.sources[source[k]].name], ["configuration", String(number[k])], ["prediction", this.predicted(k)], ["verdict", ["wrong", "right", "not judged"][right[k]]], ["margin", short(Number(margin[k].toPrecision(4)))]];
         for (const one of this.table.parameters) facts.push([named(one.name, one.unit), one.levels ? this.named(one)[one.data[k]] : short(one.data[k]), one.levels && one.levels[one.data[k]]]);
         dialog.setAttribute("aria-label", `Configuration ${number[k]}`);
         count.textContent = `${place + 1} of ${rows.length}`;

@@ -78,7 +78,7 @@ def test_of_a_batch_that_is_cut_the_first_count(policy: str) -> None:
             first = proposals[: most - told]
             state = one.update(state, [(p.u, worth(p.u, p.gradient, p.samples, 0)) for p in first])
             told += len(first)
-        answer, failures = one.answer(state), one.failures(state)
+        answer, failures = one.distribution(state), one.failures(state)
         assert len(one.propose(state, n)[0]) <= n
         return (
             one.counts(state),

@@ -232,8 +232,8 @@ def test_a_texture_takes_a_few_vectors_of_memory_only() -> None:
         state = policy.update(state, [(proposal.u, Evaluation(float(k), None, False))])
     own = [value for value in vars(state).values() if isinstance(value, Tensor)]
     assert sum(value.numel() for value in own) <= 4 * d
-    assert policy.answer(state) is not None
-    assert Random().answer(Random().start(domain, seeded(0, 0), 1)) is None
+    assert policy.distribution(state) is not None
+    assert Random().distribution(Random().start(domain, seeded(0, 0), 1)) is None
 
 
 @pytest.mark.parametrize(

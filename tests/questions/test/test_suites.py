@@ -31,13 +31,13 @@ from advsearch.errors import AdvsearchError
 from advsearch.questions.attack.carry_out import attack_once
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.report.evidence import claims_of
-from advsearch.questions.test import answer as words
 from advsearch.questions.test import claims
-from advsearch.questions.test.answer import ClaimAnswer, SuiteResult
+from advsearch.questions.test import result as words
 from advsearch.questions.test.carry_out import test_from_config as carry_out
 from advsearch.questions.test.changes import CHANGED
 from advsearch.questions.test.counterexamples import _Block as Block
 from advsearch.questions.test.counterexamples import counterexamples, folder_of
+from advsearch.questions.test.result import ClaimResult, SuiteResult
 from advsearch.questions.test.settings import BLIND, HARMLESS, NoWorseClaim, SuiteConfig
 from advsearch.runs.store import Store
 from advsearch.runs.summary import read_result
@@ -313,7 +313,9 @@ def test_a_counterexample_is_kept_small_tried_first_and_fails_fast(attacked: Pat
     assert (skipped.get("failures"), skipped.get("errors"), skipped.get("skipped")) == ("0", "0", "2")
 
 
-def test_an_answer_that_does_not_hold_for_the_suite_s_model_is_not_kept(attacked: Path, tmp_path: Path) -> None:
+def test_an_adversarial_scene_that_does_not_hold_for_the_suite_s_model_is_not_kept(
+    attacked: Path, tmp_path: Path
+) -> None:
     suite = written(tmp_path, {"too-few": CLAIMS["too-few"]})
     advsearch.allow_code("test_suites:always")
     always = {"object": "mug", "model": "test_suites:always", **SMALL}
@@ -421,7 +423,7 @@ def test_sarif_obeys_the_standard_whatever_a_suite_is_called(tested: tuple[Suite
 # ---- for machines ---------------------------------------------------------------------------------------------------
 
 
-def test_the_command_writes_what_machines_read_and_its_status_is_the_answer(
+def test_the_command_writes_what_machines_read_and_its_status_is_the_result(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -454,7 +456,7 @@ def test_the_command_writes_what_machines_read_and_its_status_is_the_answer(
 
 def test_texts_of_others_stay_texts(tested: tuple[SuiteResult, Path]) -> None:
     result, _ = tested
-    odd = ClaimAnswer(name="odd", kind="right", statement="<b>|`\x00", answer="failed", reason="a | b\n<script>")
+    odd = ClaimResult(name="odd", kind="right", statement="<b>|`\x00", answer="failed", reason="a | b\n<script>")
     odd_result = result.model_copy(update={"claims": [odd], "title": "T\x07 & <x>"})
     root = ElementTree.fromstring(words.junit(odd_result).partition("\n")[2])
     assert root.find("testsuite") is not None and root[0].get("name") == "T? & <x>"

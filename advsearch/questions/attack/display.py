@@ -22,11 +22,11 @@ from advsearch.report.shown import (
     ENDED,
     NO_PROOF,
     WHY,
-    AnswerPart,
     Claim,
     Column,
     Extent,
-    ShownAnswer,
+    ResultPart,
+    ShownResult,
     average_claim,
     case_claim,
     claim,
@@ -36,13 +36,13 @@ from advsearch.report.shown import (
     share_text,
 )
 from advsearch.report.wording import (
-    answer_cells,
     count,
     interval_text,
     margin_text,
     no_numbers,
     number_text,
     percent,
+    prediction_cells,
     short_name,
     tally,
 )
@@ -52,7 +52,7 @@ NOT_VERIFIED = ("not verified", "")
 """Cells of what was not rendered afresh."""
 
 
-def shown(result: AttackSummary | CurveResult | MatrixResult) -> ShownAnswer:
+def shown(result: AttackSummary | CurveResult | MatrixResult) -> ShownResult:
     """Return the verdict, the rates and the cost; of a curve or a matrix, its tables and its figure."""
     if isinstance(result, CurveResult):
         return _shown_curve(result)
@@ -69,22 +69,22 @@ def claims(result: AttackSummary | CurveResult | MatrixResult) -> Iterator[Claim
 # ---- one attack -----------------------------------------------------------------------------------------------------
 
 
-def _shown_attack(summary: AttackSummary) -> ShownAnswer:
-    heads = ("", "answer", "probability", "rate", "95 % interval")
-    sections = [AnswerPart(heads=heads, rows=_rates(summary))]
+def _shown_attack(summary: AttackSummary) -> ShownResult:
+    heads = ("", "prediction", "probability", "rate", "95 % interval")
+    sections = [ResultPart(heads=heads, rows=_rates(summary))]
     if summary.failures and summary.failures.tried:
         sections.append(failures_part(summary.failures, tried=True))
     cautions = [text for text in wording.remarks(summary) if text not in summary.warnings]
-    return ShownAnswer(wording.attack_verdict(summary), sections, _facts(summary), cautions=cautions)
+    return ShownResult(wording.attack_verdict(summary), sections, _facts(summary), cautions=cautions)
 
 
 def _rates(summary: AttackSummary) -> list[list[str]]:
     clean, success, average = summary.clean, wording.success(summary), summary.average
     control = clean.control
     rated = _rate("right", control.correct, control) if control else NOT_VERIFIED
-    rows = [["clean", *answer_cells(summary.task, clean), *rated]]
+    rows = [["clean", *prediction_cells(summary.task, clean), *rated]]
     if summary.adversarial:
-        said = answer_cells(summary.task, summary.adversarial)
+        said = prediction_cells(summary.task, summary.adversarial)
         rows.append(["adversarial", *said, *_verified(success, summary.verified)])
     if summary.baseline:
         pictures = f"{summary.baseline.renders} pictures"
@@ -138,15 +138,15 @@ def failing_share_text(share: FailingShare) -> str:
     return interval if share.estimate is None else f"{interval}, {percent(share.estimate)} by the estimate"
 
 
-def failures_part(known: DifferentFailures, *, tried: bool = False) -> AnswerPart:
+def failures_part(known: DifferentFailures, *, tried: bool = False) -> ResultPart:
     """Return a table of the failures that are listed, or of those that were tried."""
     columns: Mapping[str, Column] = {
         "failures": range_text,
-        "most often answered": answered_text,
+        "most often predicted": most_predicted,
         "holds in fresh renders": _held,
         "objective": lambda failure: number_text(failure.objective),
     }
-    return AnswerPart.table((failure for failure in known.listed if not tried or failure.verified is not None), columns)
+    return ResultPart.table((failure for failure in known.listed if not tried or failure.verified is not None), columns)
 
 
 def range_text(one: DifferentFailure) -> str:
@@ -163,8 +163,8 @@ def _ends(failure: DifferentFailure, name: str) -> str:
     return f"{number_text(ends[0])} to {number_text(ends[1])}{unit}"
 
 
-def answered_text(failure: DifferentFailure) -> str:
-    """Return the most frequent wrong answer of its trials; empty where there is none."""
+def most_predicted(failure: DifferentFailure) -> str:
+    """Return the most frequent wrong prediction of its trials; empty where there is none."""
     return next(iter(failure.verified.labels), "") if failure.verified else ""
 
 
@@ -193,12 +193,12 @@ def _claims_of_attack(result: AttackSummary) -> Iterator[Claim]:
 # ---- robust accuracy against epsilon --------------------------------------------------------------------------------
 
 CURVE_NOTE = (
-    "Robust: recognised as it is, and no answer was verified within the epsilon. That is what these attacks found: a "
-    "stronger one may find more. Clopper-Pearson intervals over objects."
+    "Robust: recognised as it is, and no configuration was verified within the epsilon. That is what these attacks "
+    "found: a stronger one may find more. Clopper-Pearson intervals over objects."
 )
 
 
-def _shown_curve(result: CurveResult) -> ShownAnswer:
+def _shown_curve(result: CurveResult) -> ShownResult:
     by_epsilon: Mapping[str, Column] = {
         "epsilon": lambda point: plain_epsilon(point.epsilon) or "own",
         "robust": "{0.robust}/{0.objects}",
@@ -216,7 +216,7 @@ def _shown_curve(result: CurveResult) -> ShownAnswer:
     }
     points = _points(result)
     listed = "; ".join(f"{point.robust} of {point.objects} at {point.epsilon:g}" for point in points)
-    chart = AnswerPart(
+    chart = ResultPart(
         "Robust accuracy",
         [f"Over epsilon with 95 % intervals: {listed}."],
         draw=lambda axes: _draw_curve(result, axes),
@@ -224,12 +224,12 @@ def _shown_curve(result: CurveResult) -> ShownAnswer:
         only="page" if len(points) > 1 else "notebook",
     )
     known = [point for point in result.curve if point.accuracy is not None]
-    curve = AnswerPart.table(known, by_epsilon, title="" if len(points) > 1 else chart.title, note=CURVE_NOTE)
+    curve = ResultPart.table(known, by_epsilon, title="" if len(points) > 1 else chart.title, note=CURVE_NOTE)
     runs = [row.run for row in result.table]
-    objects = AnswerPart.table(result.table, by_object, title="The objects, at the last epsilon tried", parts=runs)
-    meaning = AnswerPart(text=[f"Margin: {margin_text(result.task)}, in the trials of the worst case."])
+    objects = ResultPart.table(result.table, by_object, title="The objects, at the last epsilon tried", parts=runs)
+    meaning = ResultPart(text=[f"Margin: {margin_text(result.task)}, in the trials of the worst case."])
     sections = [*([chart] if points else []), *([curve] if known else []), objects, meaning]
-    return ShownAnswer(_said_of_curve(result), sections, {"model": result.model, "policy": result.policy})
+    return ShownResult(_said_of_curve(result), sections, {"model": result.model, "policy": result.policy})
 
 
 def _said_of_curve(result: CurveResult) -> str:
@@ -260,20 +260,20 @@ def plain_epsilon(value: EpsilonBudget) -> str:
     return "" if value is None else number_text(value)
 
 
-def _draw_curve(answer: CurveResult, axes: Any) -> None:
-    points = _points(answer)
+def _draw_curve(result: CurveResult, axes: Any) -> None:
+    points = _points(result)
     at, accuracy = [point.epsilon for point in points], [point.accuracy for point in points]
     low, high = ([point.interval[end] for point in points] for end in (0, 1))
     axes.fill_between(at, low, high, color=BLUE, alpha=0.15, linewidth=0, label="95 % interval")
     axes.plot(at, accuracy, color=BLUE, marker="o", label="robust accuracy")
     axes.set(xlabel="epsilon", ylabel="robust accuracy", ylim=(-0.02, 1.02))
-    axes.set_title(f"{', '.join(answer.controls)}: {points[0].objects} objects, {answer.model}")
+    axes.set_title(f"{', '.join(result.controls)}: {points[0].objects} objects, {result.model}")
     axes.grid(True)
     axes.legend()
 
 
-def _points(answer: CurveResult) -> list[CurvePoint]:
-    return [point for point in answer.curve if point.epsilon is not None and point.accuracy is not None]
+def _points(result: CurveResult) -> list[CurvePoint]:
+    return [point for point in result.curve if point.epsilon is not None and point.accuracy is not None]
 
 
 def _claims_of_curve(result: CurveResult) -> Iterator[Claim]:
@@ -300,7 +300,7 @@ def _claims_of_curve(result: CurveResult) -> Iterator[Claim]:
 # ---- attacked on against tested on ----------------------------------------------------------------------------------
 
 
-def _shown_matrix(result: MatrixResult) -> ShownAnswer:
+def _shown_matrix(result: MatrixResult) -> ShownResult:
     """The matrix, with a row for the clean scene; the stronger a cell's colour, the more successes."""
     heads = ["attacked on", "ending", *(f"tested on {short_name(tried.model)}" for tried in result.tested)]
     clean = [tried.clean for tried in result.tested]
@@ -316,30 +316,30 @@ def _shown_matrix(result: MatrixResult) -> ShownAnswer:
     }
     spp = f", {result.tested[0].spp} samples per pixel" if result.tested else ""
     note = (
-        "Successes of the trials, in which the model is wrong on the answer and right on the clean scene with the same "
-        "seed, with 95 % Clopper-Pearson intervals; * where that is verified. All models are shown the scene with the "
-        f"same seeds{spp}, rounded to 8 bits. The stronger a cell's colour, the more successes."
+        "Successes of the trials, in which the model is wrong on the adversarial scene and right on the clean scene "
+        "with the same seed, with 95 % Clopper-Pearson intervals; * where that is verified. All models are shown the "
+        f"scene with the same seeds{spp}, rounded to 8 bits. The stronger a cell's colour, the more successes."
     )
     runs = [*[None] * before, *(row.run for row in result.table)]
-    table = AnswerPart("Attacked on, tested on", heads=heads, rows=rows, note=note, parts=runs, shares=shares)
+    table = ResultPart("Attacked on, tested on", heads=heads, rows=rows, note=note, parts=runs, shares=shares)
     tried = sum(bool(row.tested) for row in result.table)
     size = (2.6 + 1.3 * len(result.models), 1.8 + 0.5 * tried)
-    figure = AnswerPart(draw=lambda axes: _draw_matrix(result, axes), size=size, only="notebook")
+    figure = ResultPart(draw=lambda axes: _draw_matrix(result, axes), size=size, only="notebook")
     facts = {
         "models": ", ".join(f"{tried.model} ({' x '.join(map(str, tried.input_size))})" for tried in result.tested),
         "ensemble": result.ensemble or "",
         "policy": result.policy,
     }
-    return ShownAnswer(_said_of_matrix(result), [table, *([figure] if tried else [])], facts)
+    return ShownResult(_said_of_matrix(result), [table, *([figure] if tried else [])], facts)
 
 
 def _said_of_matrix(result: MatrixResult) -> str:
     pairs = [(row, cell) for row in result.table for cell in row.tested]
     if not pairs:
-        return "No answer was tried on any model."
+        return "No adversarial scene was tried on any model."
     if result.ensemble is not None:
         held = sum(cell.ending == "found" for _, cell in pairs)
-        return f"One answer to all models together misleads {held} of {len(pairs)}."
+        return f"One scene against all models together misleads {held} of {len(pairs)}."
     at_home = [cell for row, cell in pairs if cell.model == row.attacked]
     others = [cell for row, cell in pairs if cell.model != row.attacked]
     held, passed = (sum(cell.ending == "found" for cell in cells) for cells in (at_home, others))
@@ -356,8 +356,8 @@ def _cell(cell: MatrixCell) -> str:
     return f"{rate}, {interval_text(rated.interval)}{mark}"
 
 
-def _draw_matrix(answer: MatrixResult, axes: Any) -> None:
-    rows = [row for row in answer.table if row.tested]
+def _draw_matrix(result: MatrixResult, axes: Any) -> None:
+    rows = [row for row in result.table if row.tested]
     rates = [[cell.verified.rate for cell in row.tested] for row in rows]
     axes.imshow(rates, cmap="Reds", vmin=0.0, vmax=1.0, aspect="auto")
     for up, row in enumerate(rows):
@@ -366,11 +366,11 @@ def _draw_matrix(answer: MatrixResult, axes: Any) -> None:
             colour = "white" if rated.rate > 0.6 else "black"
             text = f"{rated.successes}/{rated.trials}"
             axes.text(across, up, text, ha="center", va="center", color=colour)
-    names = [short_name(tried.model) for tried in answer.tested]
+    names = [short_name(tried.model) for tried in result.tested]
     axes.set_xticks(range(len(names)), names, rotation=20 if max(map(len, names)) > 12 else 0)
     axes.set_yticks(range(len(rows)), [short_name(row.attacked) for row in rows])
     axes.set(xlabel="tested on", ylabel="attacked on")
-    axes.set_title(f"{', '.join(answer.objects)}, {', '.join(answer.controls)}: wrong in trials")
+    axes.set_title(f"{', '.join(result.objects)}, {', '.join(result.controls)}: wrong in trials")
 
 
 def _claims_of_matrix(result: MatrixResult) -> Iterator[Claim]:

@@ -26,19 +26,19 @@ from advsearch.questions.test.settings import (
     RightClaim,
 )
 from advsearch.report.markup import InNotebook
-from advsearch.report.shown import AnswerPart, Claim, Kind, Picture, ShownAnswer
+from advsearch.report.shown import Claim, Kind, Picture, ResultPart, ShownResult
 from advsearch.report.wording import count, interval_text, number_text, percent, seconds_text, short_name, with_article
 from advsearch.runs.results import Fields, Interval, JsonFloat, RunResult
 
 HELD, UNDECIDED, FAILED = "held", "undecided", "failed"
-ANSWERS = (HELD, UNDECIDED, FAILED)
+VERDICTS = (HELD, UNDECIDED, FAILED)
 """From the best to the worst."""
 
 STATUS = {HELD: 0, FAILED: 1, UNDECIDED: 2}
 """Exit status of the command, by what the suite says as a whole."""
 
 
-class ClaimAnswer(Fields):
+class ClaimResult(Fields):
     """One claim, or one counterexample, and what came out."""
 
     name: str = Field(description="in the suite; of a counterexample, its file's")
@@ -52,7 +52,7 @@ class ClaimAnswer(Fields):
     pictures: int = Field(0, description="that it took; absent if none")
     rate: JsonFloat | None = Field(
         None,
-        description="share of right answers, or of pictures as claimed; of two models the difference; absent of "
+        description="share of right predictions, or of pictures as claimed; of two models the difference; absent of "
         "a search",
     )
     interval: Interval | None = Field(
@@ -69,7 +69,7 @@ class ClaimAnswer(Fields):
     @property
     def accepted(self) -> bool:
         """Whether it is no worse than expected."""
-        return ANSWERS.index(self.answer) <= ANSWERS.index(self.expected)
+        return VERDICTS.index(self.answer) <= VERDICTS.index(self.expected)
 
 
 class SuiteResult(InNotebook, RunResult):
@@ -85,7 +85,7 @@ class SuiteResult(InNotebook, RunResult):
         description="`failed` if a claim is that was not expected to be, else `undecided` likewise, else `held`"
     )
     confidence: float = Field(description="of each claim that is decided by drawn pictures")
-    claims: list[ClaimAnswer]
+    claims: list[ClaimResult]
     added: str | None = Field(None, description="the file of the counterexample that was added; only with `add`")
     changes: list[str] = Field([], description="what is expected from now on; only with `update`")
     warnings: list[str] = Field(description="sentences that a reader has to know")
@@ -93,8 +93,8 @@ class SuiteResult(InNotebook, RunResult):
     @property
     def brief(self) -> str:
         """How many claims were held, failed and undecided."""
-        counts = {answer: sum(one.answer == answer for one in self.claims) for answer in (HELD, FAILED, UNDECIDED)}
-        return ", ".join(f"{count} {answer}" for answer, count in counts.items() if count)
+        counts = {verdict: sum(one.answer == verdict for one in self.claims) for verdict in (HELD, FAILED, UNDECIDED)}
+        return ", ".join(f"{count} {verdict}" for verdict, count in counts.items() if count)
 
     @property
     def status(self) -> int:
@@ -102,16 +102,16 @@ class SuiteResult(InNotebook, RunResult):
         return 0 if self.added is not None else STATUS[self.answer]
 
 
-def verdict(claims: list[ClaimAnswer]) -> str:
+def verdict(claims: list[ClaimResult]) -> str:
     """Return what a suite says as a whole: the worst of what was not expected."""
     worse = [one.answer for one in claims if not one.accepted]
-    return max(worse, key=ANSWERS.index, default=HELD)
+    return max(worse, key=VERDICTS.index, default=HELD)
 
 
 RESULT = SuiteResult
 
 
-TABLE_HEADS = ("claim", "answer", "pictures", "why")
+TABLE_HEADS = ("claim", "verdict", "pictures", "why")
 
 NOTE = (
     "Held and failed are shown at the stated confidence, by one end of an interval, each of which holds however often "
@@ -123,18 +123,18 @@ STOPPED = "it was interrupted"
 NOT_TRIED = "not tried, since a counterexample failed"
 
 
-def shown(result: SuiteResult) -> ShownAnswer:
+def shown(result: SuiteResult) -> ShownResult:
     """Return what the suite says, a table of its claims, and what repeats those that are not held."""
     runs = [one.part for one in result.claims]
-    sections = [AnswerPart("The claims", heads=TABLE_HEADS, rows=table_rows(result), note=NOTE, parts=runs)]
+    sections = [ResultPart("The claims", heads=TABLE_HEADS, rows=table_rows(result), note=NOTE, parts=runs)]
     for one in result.claims:
         if one.answer != HELD and one.reason != NOT_TRIED:
             caption = f"{one.statement}: {one.answer}. {one.reason}."
             pictures = [[Picture(one.picture, caption)]] if one.picture else []
-            sections.append(AnswerPart(one.name, rows=[["repeat", one.repeat]], pictures=pictures))
-    sections.append(AnswerPart("Expected from now on", result.changes))
+            sections.append(ResultPart(one.name, rows=[["repeat", one.repeat]], pictures=pictures))
+    sections.append(ResultPart("Expected from now on", result.changes))
     about = [Path(result.suite).name, result.object, result.model]
-    return ShownAnswer(f"{result.title}. {suite_text(result)}", sections, facts(result), about)
+    return ShownResult(f"{result.title}. {suite_text(result)}", sections, facts(result), about)
 
 
 def statement(claim: AnyClaim, config: SceneConfig) -> str:
@@ -157,15 +157,15 @@ def statement(claim: AnyClaim, config: SceneConfig) -> str:
     return f"no search finds a picture that {short_name(config.model)} gets wrong: {what}{within}"
 
 
-def share_reason(what: str, answer: str, right: int, pictures: int, interval: tuple[float, float], worst: str) -> str:
+def share_reason(what: str, verdict: str, right: int, pictures: int, interval: tuple[float, float], worst: str) -> str:
     """Return why a claim about a share is held, failed or undecided, with the interval at all times together. `what` is
     so in `right` of the pictures; `worst` says where it was not, and is empty where it always was."""
     said = f"{what} in {right} of {pictures} (interval {interval_text(interval)})" if pictures else "no picture"
-    more = f"; not decided after {count(pictures, 'picture')}" if answer == UNDECIDED else ""
+    more = f"; not decided after {count(pictures, 'picture')}" if verdict == UNDECIDED else ""
     return said + more + (f"; {worst}" if worst else "")
 
 
-def difference_reason(answer: str, counts: tuple[int, int, int], interval: tuple[float, float], than: str) -> str:
+def difference_reason(verdict: str, counts: tuple[int, int, int], interval: tuple[float, float], than: str) -> str:
     """Return why a claim about two models is held, failed or undecided. The counts are pictures; those in which only
     the model is right, and those in which only the other one is."""
     pictures, ours, theirs = counts
@@ -176,10 +176,10 @@ def difference_reason(answer: str, counts: tuple[int, int, int], interval: tuple
         f"of {count(pictures, 'picture')} it alone is right in {ours}, {short_name(than)} alone in {theirs} "
         f"(difference {100.0 * (ours - theirs) / pictures:+.1f} points, interval {ends})"
     )
-    return said + (f"; not decided after {count(pictures, 'picture')}" if answer == UNDECIDED else "")
+    return said + (f"; not decided after {count(pictures, 'picture')}" if verdict == UNDECIDED else "")
 
 
-def search_answer(summary: AttackSummary, config: AttackConfig) -> tuple[str, str]:
+def search_verdict(summary: AttackSummary, config: AttackConfig) -> tuple[str, str]:
     """Return what a search says of a claim that there is nothing to find, and why."""
     verified, clean = summary.verified, summary.clean.control
     if summary.ending == "already wrong":
@@ -195,7 +195,7 @@ def search_answer(summary: AttackSummary, config: AttackConfig) -> tuple[str, st
     if summary.goes_on:
         return UNDECIDED, STOPPED
     if verified is not None and verified.successes:
-        return UNDECIDED, f"its answer is wrong in {verified.successes} of {verified.trials} trials, by noise"
+        return UNDECIDED, f"what it found is wrong in {verified.successes} of {verified.trials} trials, by noise"
     asked = config.steps
     if config.seconds is not None and asked is not None and summary.steps < asked:
         return UNDECIDED, f"{TIME_OVER} after {summary.steps} of {asked} steps"
@@ -204,7 +204,7 @@ def search_answer(summary: AttackSummary, config: AttackConfig) -> tuple[str, st
 
 
 def tried_reason(right: int, wrong: int, label: str, interval: tuple[float, float] | None) -> tuple[str, str]:
-    """Return what trials of a counterexample say, and why; the interval is of the share of right answers."""
+    """Return what trials of a counterexample say, and why; the interval is of the share of right predictions."""
     if interval is None:
         return UNDECIDED, TIME_OVER
     if not wrong:
@@ -217,11 +217,11 @@ def tried_reason(right: int, wrong: int, label: str, interval: tuple[float, floa
 
 def table_rows(result: SuiteResult) -> list[list[str]]:
     """Return a row for each claim, under `TABLE_HEADS`."""
-    return [[one.name, answer_text(one), str(one.pictures or ""), one.reason] for one in result.claims]
+    return [[one.name, verdict_text(one), str(one.pictures or ""), one.reason] for one in result.claims]
 
 
-def answer_text(one: ClaimAnswer) -> str:
-    """Return the answer, with what was expected where that is another one."""
+def verdict_text(one: ClaimResult) -> str:
+    """Return the verdict, with what was expected where that is another one."""
     if one.expected == HELD:
         return one.answer
     return f"{one.answer} ({'as expected' if one.answer == one.expected else f'expected: {one.expected}'})"
@@ -270,7 +270,7 @@ MEANINGS = {
     "no_worse": "The model is right at most so many points less often than another one, on the same pictures.",
     "must_change": "The model says something else where there is nothing left to see.",
     "must_not_change": "The model says the same where a change means nothing.",
-    "counterexample": "The model is right on the answer of an earlier search.",
+    "counterexample": "The model is right on the adversarial scene of an earlier search.",
 }
 """What a claim of each kind says; the rules of SARIF."""
 
@@ -365,7 +365,7 @@ def markdown(result: SuiteResult) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _picture(result: SuiteResult, one: ClaimAnswer) -> str:
+def _picture(result: SuiteResult, one: ClaimResult) -> str:
     return f"{result.run}/{one.picture}" if one.picture else ""
 
 

@@ -43,7 +43,7 @@ ORDERS = ("boxes scores labels", "boxes labels scores")
 """What two numbers of a box may be."""
 
 QUERIES = ("boxes logits", "boxes logits nothing")
-"""What DETR's networks answer: logits that judge each class by itself, with a sigmoid (Zhu et al. 2021, section 4), or
+"""What DETR's networks return: logits that judge each class by itself, with a sigmoid (Zhu et al. 2021, section 4), or
 of which a softmax chooses one, the last of which stands for nothing (Carion et al. 2020, section 3.1)."""
 
 QUERY_LOGITS = ("pred_logits", "logits")
@@ -54,7 +54,7 @@ NAMES = {
     "scores": ("scores", "pred_scores", "detection_scores", "confidences", "confidence", "conf", "score"),
     "labels": ("labels", "pred_classes", "detection_classes", "classes", "class_ids", "category_ids", "cls", "label"),
 }
-"""What the parts of an answer are called, the usual name first."""
+"""What the parts of an output are called, the usual name first."""
 
 WORDS = {"boxes": ("box",), "scores": ("score", "conf", "prob", "logit"), "labels": ("label", "class", "cls", "categ")}
 """What is in a name that is none of these."""
@@ -63,7 +63,7 @@ NOTHING: Detections = {"boxes": torch.zeros(0, 4), "either": torch.zeros(0, 2)}
 
 
 def told_by_classes(order: str) -> bool:
-    """Whether an order is of answers that the number of classes explains; their boxes have a middle and sides."""
+    """Whether an order is of outputs that the number of classes explains; their boxes have a middle and sides."""
     return names_head(order) or order in QUERIES
 
 
@@ -87,34 +87,38 @@ def checked_order(text: str) -> tuple[str, ...]:
     return parts
 
 
-def detections_in(answer: Any, count: int, order: str = "") -> list[Detections]:
-    """Return what a detector answered, as `EXPECTED` says, to each of `count` pictures. The order is of parts that have
-    no names, see `checked_order`; "" for what types and shapes say. Raises ValueError: it is something else, or scores
-    are not in [0, 1]."""
+def detections_in(returned: Any, count: int, order: str = "") -> list[Detections]:
+    """Return what a detector returned, as `EXPECTED` says, for each of `count` pictures. The order is of parts that
+    have no names, see `checked_order`; "" for what types and shapes say. Raises ValueError: it is something else, or
+    scores are not in [0, 1]."""
     parts = checked_order(order) if order else ()
-    if isinstance(answer, (list, tuple)) and answer and all(isinstance(one, Tensor) and one.ndim > 3 for one in answer):
+    if (
+        isinstance(returned, (list, tuple))
+        and returned
+        and all(isinstance(one, Tensor) and one.ndim > 3 for one in returned)
+    ):
         raise ValueError("expected boxes, and not the maps of a head from which they are made: export it in .eval()")
-    if (queries := _queries(answer, " ".join(parts))) is not None:
+    if (queries := _queries(returned, " ".join(parts))) is not None:
         boxes, logits = queries
         if boxes.ndim != 3 or boxes.shape[2] != 4 or logits.ndim != 3 or boxes.shape[:2] != logits.shape[:2]:
             raise ValueError("expected boxes (N, D, 4) and logits (N, D, classes)")
         return [{"boxes": b.float(), "logits": one.float()} for b, one in zip(boxes, logits, strict=True)]
-    answer, channels = _first(answer)
+    returned, channels = _first(returned)
     beside = torch.tensor(sorted(channels), dtype=torch.long)
-    grid = isinstance(answer, Tensor) and answer.ndim == 3 and answer.shape[0] == count and answer.shape[2] != 4
-    masked = grid and answer.shape[2] - 6 in channels and bool((answer[..., 5] == answer[..., 5].round()).all())
-    if grid and (names_head(" ".join(parts)) or not (parts or masked or answer.shape[2] == 6)):
-        return [{"raw": one.float(), "beside": beside} for one in answer]
+    grid = isinstance(returned, Tensor) and returned.ndim == 3 and returned.shape[0] == count and returned.shape[2] != 4
+    masked = grid and returned.shape[2] - 6 in channels and bool((returned[..., 5] == returned[..., 5].round()).all())
+    if grid and (names_head(" ".join(parts)) or not (parts or masked or returned.shape[2] == 6)):
+        return [{"raw": one.float(), "beside": beside} for one in returned]
     if masked:  # rows of a box, a score, a class and mask coefficients
-        return [{**one, "beside": beside} for one in detections_in(answer[..., :6], count, order)]
+        return [{**one, "beside": beside} for one in detections_in(returned[..., :6], count, order)]
     if "objectness" in parts or "channels" in parts:
         raise ValueError(EXPECTED)
-    if isinstance(answer, (list, tuple)) and len(answer) == count and all(map(_is_one, answer)):
-        found = [dict(NOTHING) if one is None else _parts(one, parts) for one in answer]
-    elif isinstance(answer, Tensor) and answer.ndim == 2 and answer.shape[1] == 7:
-        found = [_parts(rows, [part for part in parts if part != "batch"]) for rows in _split(answer, count, parts)]
+    if isinstance(returned, (list, tuple)) and len(returned) == count and all(map(_is_one, returned)):
+        found = [dict(NOTHING) if one is None else _parts(one, parts) for one in returned]
+    elif isinstance(returned, Tensor) and returned.ndim == 2 and returned.shape[1] == 7:
+        found = [_parts(rows, [part for part in parts if part != "batch"]) for rows in _split(returned, count, parts)]
     else:
-        together = _parts(answer, parts)
+        together = _parts(returned, parts)
         if together["boxes"].ndim == 2 and count == 1:  # the network has dropped the batch dimension
             together = {name: part[None] for name, part in together.items()}
         if together["boxes"].ndim != 3 or any(len(part) != count for part in together.values()):
@@ -123,31 +127,31 @@ def detections_in(answer: Any, count: int, order: str = "") -> list[Detections]:
     return [_one(one) for one in found]
 
 
-def _queries(answer: Any, order: str) -> tuple[Tensor, Tensor] | None:
-    """The boxes and logits of an answer as DETR's networks give it, or that is said to be one; None of any other."""
-    if order in QUERIES and isinstance(answer, (list, tuple)):  # boxes are shares, which logits are not
-        tensors = [one for one in answer if isinstance(one, Tensor)]
+def _queries(returned: Any, order: str) -> tuple[Tensor, Tensor] | None:
+    """The boxes and logits of an output as DETR's networks give it, or that is said to be one; None of any other."""
+    if order in QUERIES and isinstance(returned, (list, tuple)):  # boxes are shares, which logits are not
+        tensors = [one for one in returned if isinstance(one, Tensor)]
         boxes = [one for one in tensors if one.shape[-1] == 4 and bool(((one >= 0.0) & (one <= 1.0)).all())][:1]
         logits = [one for one in tensors if not any(one is box for box in boxes)][:1]
         return (boxes[0], logits[0]) if boxes and logits else None
-    part = answer.get if isinstance(answer, Mapping) else partial(getattr, answer)
+    part = returned.get if isinstance(returned, Mapping) else partial(getattr, returned)
     found = [[one] if isinstance(one := part(name, None), Tensor) else [] for name in ("pred_boxes", *QUERY_LOGITS)]
     boxes, logits = found[0], [*found[1], *found[2]][:1]
     return (boxes[0], logits[0]) if boxes and logits and order in ("", *QUERIES) else None
 
 
-def _first(answer: Any) -> tuple[Any, set[int]]:
-    """The predictions of a YOLO's answer, and how many channels the maps (N, K, h, w) have that came with them.
+def _first(returned: Any) -> tuple[Any, set[int]]:
+    """The predictions of a YOLO's output, and how many channels the maps (N, K, h, w) have that came with them.
 
     In training form they are the first of a tuple, feature maps and prototypes of masks stand beside them, in lists and
-    mappings too. Any other answer is returned as it is.
+    mappings too. Any other output is returned as it is.
     """
-    if not isinstance(answer, (list, tuple)) or not answer or not isinstance(answer[0], Tensor):
-        return answer, set()
-    first, others = answer[0], answer[1:]
+    if not isinstance(returned, (list, tuple)) or not returned or not isinstance(returned[0], Tensor):
+        return returned, set()
+    first, others = returned[0], returned[1:]
     beside = any(isinstance(one, Tensor) and one.ndim < 4 for one in others)
     if first.ndim != 3 or first.shape[2] == 4 or beside:
-        return answer, set()
+        return returned, set()
     channels = set[int]()
 
     def keep(one: Tensor) -> Tensor:
@@ -159,7 +163,7 @@ def _first(answer: Any) -> tuple[Any, set[int]]:
 
 
 def _is_one(part: Any) -> bool:
-    """Whether a part of an answer is that to one picture, and not boxes or scores of all; None where nothing is."""
+    """Whether a part of an output is that for one picture, and not boxes or scores of all; None where nothing is."""
     if isinstance(part, Tensor):
         return part.ndim == 2 and part.shape[1] == 6
     return part is None or isinstance(part, (Mapping, list, tuple)) or _named(part) is not None
@@ -184,23 +188,23 @@ def _columns(order: Sequence[str]) -> dict[str, slice]:
     return found
 
 
-def _parts(answer: Any, order: Sequence[str]) -> dict[str, Tensor]:
-    """Return the parts of an answer by name: boxes, and scores, with labels or without, or `either`."""
-    if isinstance(answer, Tensor):
-        if answer.ndim not in (2, 3) or answer.shape[-1] != 6:
+def _parts(returned: Any, order: Sequence[str]) -> dict[str, Tensor]:
+    """Return the parts of an output by name: boxes, and scores, with labels or without, or `either`."""
+    if isinstance(returned, Tensor):
+        if returned.ndim not in (2, 3) or returned.shape[-1] != 6:
             raise ValueError(EXPECTED)
         if order:
-            columns = {part: answer[..., where] for part, where in _columns(order).items()}
+            columns = {part: returned[..., where] for part, where in _columns(order).items()}
             return {name: part if name == "boxes" else part[..., 0] for name, part in columns.items()}
-        return {"boxes": answer[..., :4], "either": answer[..., 4:]}
-    named = _named(answer)
+        return {"boxes": returned[..., :4], "either": returned[..., 4:]}
+    named = _named(returned)
     if named is not None and "boxes" in named and "scores" in named:
         return named
-    listed = answer.values() if isinstance(answer, Mapping) else answer
+    listed = returned.values() if isinstance(returned, Mapping) else returned
     if not isinstance(listed, Iterable):
         raise ValueError(EXPECTED)
     tensors = list(listed)
-    if isinstance(answer, Mapping):
+    if isinstance(returned, Mapping):
         tensors = [one for one in tensors if isinstance(one, Tensor)]
     if not all(isinstance(one, Tensor) for one in tensors):
         raise ValueError(EXPECTED)
@@ -211,13 +215,13 @@ def _parts(answer: Any, order: Sequence[str]) -> dict[str, Tensor]:
     return _by_shape(tensors)
 
 
-def _named(answer: Any) -> dict[str, Tensor] | None:
+def _named(returned: Any) -> dict[str, Tensor] | None:
     """The parts of a mapping or an object by their names; None of what is neither."""
-    if isinstance(answer, Mapping):
-        given = {str(name): part for name, part in answer.items() if isinstance(part, Tensor)}
-    elif any(hasattr(answer, name) for name in NAMES["boxes"]):
+    if isinstance(returned, Mapping):
+        given = {str(name): part for name, part in returned.items() if isinstance(part, Tensor)}
+    elif any(hasattr(returned, name) for name in NAMES["boxes"]):
         known = [name for names in NAMES.values() for name in names]
-        given = {name: getattr(answer, name) for name in known if isinstance(getattr(answer, name, None), Tensor)}
+        given = {name: getattr(returned, name) for name in known if isinstance(getattr(returned, name, None), Tensor)}
     else:
         return None
     found, left = dict[str, Tensor](), dict(given)
@@ -358,7 +362,7 @@ def order_in(found: Sequence[Detections], classes: int | None = None, head: str 
     Args:
         found: of any pictures.
         classes: that there are; None where nobody says.
-        head: of `boxes.HEADS`, what is said of answers in one tensor, or of `QUERIES`; "" for nothing.
+        head: of `boxes.HEADS`, what is said of outputs in one tensor, or of `QUERIES`; "" for nothing.
 
     Raises:
         ValueError: no number can be a score, or none a class; or a grid of boxes has none or several of its orders; or

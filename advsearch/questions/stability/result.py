@@ -15,7 +15,7 @@ from pydantic import Field
 from advsearch.config import SceneConfig, TimedConfig
 from advsearch.errors import AdvsearchError
 from advsearch.report.markup import InNotebook
-from advsearch.report.shown import AnswerPart, Column, ShownAnswer
+from advsearch.report.shown import Column, ResultPart, ShownResult
 from advsearch.runs.results import Fields, JsonFloat, Result, having
 from advsearch.settings import Clash, Config, each_once, setting, setting_as_in, split_names, texts
 
@@ -129,7 +129,7 @@ COLUMNS: Mapping[str, Column] = {
 }
 
 
-def shown(result: StabilityResult) -> ShownAnswer:
+def shown(result: StabilityResult) -> ShownResult:
     """Return the cases, what was measured, what decides where a case fell short, and what was not run."""
     short = [row for row in result.rows if row.status != OK]
     numbers = [
@@ -138,14 +138,14 @@ def shown(result: StabilityResult) -> ShownAnswer:
         for name, value in row.measured.items()
         if name.startswith("condition number")
     ]
-    return ShownAnswer(
+    return ShownResult(
         f"{len(result.rows) - len(short)} of {len(result.rows)} cases hold, in "
         f"{math.fsum(row.seconds for row in result.rows):.0f} seconds.",
         [
-            AnswerPart.table(result.rows, COLUMNS, title="Cases"),
-            AnswerPart("Condition numbers", rows=numbers),
-            AnswerPart("Short", [f"{row.case} fell short: {row.decides}; expected: {row.holds}" for row in short]),
-            AnswerPart("Not run", [", ".join(result.not_run)]),
+            ResultPart.table(result.rows, COLUMNS, title="Cases"),
+            ResultPart("Condition numbers", rows=numbers),
+            ResultPart("Short", [f"{row.case} fell short: {row.decides}; expected: {row.holds}" for row in short]),
+            ResultPart("Not run", [", ".join(result.not_run)]),
         ],
     )
 

@@ -10,7 +10,7 @@ from pydantic import Field
 from advsearch.config import DerivativeConfig, SceneConfig
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.report.markup import InNotebook
-from advsearch.report.shown import AnswerPart, Claim, Column, Extent, ShownAnswer, claim, share_text
+from advsearch.report.shown import Claim, Column, Extent, ResultPart, ShownResult, claim, share_text
 from advsearch.report.wording import percent
 from advsearch.runs.results import (
     CleanScene,
@@ -38,7 +38,7 @@ class RegionConfig(SceneConfig):
     around: str | None = setting(
         None,
         "region",
-        "a run whose answer is the centre; it brings scene, model and controls with it",
+        "a run whose adversarial configuration is the centre; it brings scene, model and controls with it",
         "the name or the folder of a run",
         otherwise="the scene as it is",
     )
@@ -129,10 +129,10 @@ class RegionResult(InNotebook, GrownRegion, SceneResult):
         return f"{self.verdict} in {self.same} of {self.samples} samples of the box" if self.samples else ""
 
 
-def shown(result: RegionResult) -> ShownAnswer:
+def shown(result: RegionResult) -> ShownResult:
     """Return the box and what is known of it."""
     if result.box is None or result.interval is None:
-        return ShownAnswer("Stopped before the box was known.")
+        return ShownResult("Stopped before the box was known.")
     box: Mapping[str, Column] = {
         "parameter": "{0.name}",
         "from": "{0.low:.4g}",
@@ -140,10 +140,10 @@ def shown(result: RegionResult) -> ShownAnswer:
         "centre": "{0.centre:.4g}",
         "unit": "{0.unit}",
     }
-    return ShownAnswer(
+    return ShownResult(
         f"The model is {result.verdict} in {result.same} of {result.samples} fresh samples of this box: with 95 % "
         f"confidence in at least {percent(result.interval[0])} of it.",
-        [AnswerPart.table(result.box, box, title="The box")],
+        [ResultPart.table(result.box, box, title="The box")],
         {"share of the space": percent(result.volume), "samples a pixel": str(result.spp or "")},
     )
 

@@ -10,7 +10,7 @@ from pydantic import Field, field_validator
 
 from advsearch.config import DerivativeConfig, SceneConfig
 from advsearch.report.figures import BLUE, GREY, RED, Figures, drawn
-from advsearch.report.shown import AnswerPart, Column, ShownAnswer
+from advsearch.report.shown import Column, ResultPart, ShownResult
 from advsearch.runs.results import Fields, Formation, Interval, JsonFloat, Measured, RunResult
 from advsearch.settings import Clash, check_once, setting, setting_as_in, split_names
 
@@ -193,7 +193,7 @@ FAMILIES = {"none": " without denoiser", "oidn": " with denoiser"}
 READING = (
     "Each row is a setting: its error beside a reference of far more samples, with the 95 % interval of that "
     "error, and the processor time, in seconds, that one picture or gradient takes. A margin is how far the wrong "
-    "answer leads the right one, in logits; a cosine of 1 means that a gradient points the right way."
+    "prediction leads the right one, in logits; a cosine of 1 means that a gradient points the right way."
 )
 
 
@@ -222,20 +222,20 @@ REFERENCES: Mapping[str, Column] = {
 }
 
 
-def shown(result: PrecisionResult) -> ShownAnswer:
+def shown(result: PrecisionResult) -> ShownResult:
     """Return what was measured, what follows from it, and what was not measured."""
     machine = result.machine
     threads = " and ".join(f"{count} of {name}" for name, count in machine.threads.items())
     stopped = "It was stopped: only a part was measured. " if result.goes_on else ""
-    return ShownAnswer(
+    return ShownResult(
         stopped + headline(result),
         [
-            AnswerPart("Recommended", [sentence(found, result.goal) for found in result.recommendations]),
-            AnswerPart(text=[READING], only="text"),
+            ResultPart("Recommended", [sentence(found, result.goal) for found in result.recommendations]),
+            ResultPart(text=[READING], only="text"),
             *(_errors(quantity, result.points) for quantity in ("picture", "margin", "gradient")),
-            AnswerPart.table(result.slopes, SLOPES, title="Slopes: logarithm of the error against that of samples"),
-            AnswerPart.table(result.references, REFERENCES, title="References, with their own errors", note=READING),
-            AnswerPart("Not measured, the time was up", result.left_out),
+            ResultPart.table(result.slopes, SLOPES, title="Slopes: logarithm of the error against that of samples"),
+            ResultPart.table(result.references, REFERENCES, title="References, with their own errors", note=READING),
+            ResultPart("Not measured, the time was up", result.left_out),
         ],
         {
             "model": result.model,
@@ -247,7 +247,7 @@ def shown(result: PrecisionResult) -> ShownAnswer:
 
 
 def headline(result: PrecisionResult) -> str:
-    """Return the answer in one line: what an error takes, of the first quantity that reaches it."""
+    """Return the result in one line: what an error takes, of the first quantity that reaches it."""
     found = next((one for one in result.recommendations if one.estimator), None)
     if found is None:
         return "Nothing that was measured is known to reach the error: give it more `seconds` or a larger `error`."
@@ -285,7 +285,7 @@ def cautions(points: Sequence[PrecisionPoint]) -> list[str]:
     return warnings
 
 
-def _errors(quantity: str, points: Sequence[PrecisionPoint]) -> AnswerPart:
+def _errors(quantity: str, points: Sequence[PrecisionPoint]) -> ResultPart:
     """A row for each setting of a quantity."""
     rows = [point for point in points if point.quantity == quantity]
     columns: dict[str, Column] = {"control": "{0.control}"} if quantity == "gradient" else {}
@@ -298,7 +298,7 @@ def _errors(quantity: str, points: Sequence[PrecisionPoint]) -> AnswerPart:
     if quantity == "gradient":
         columns["cosine"] = lambda point: f"{math.nan if point.cosine is None else point.cosine:.3f}"
     columns["seconds"] = "{0.seconds:.3g}"
-    return AnswerPart.table(rows, {**columns, "repeats": "{0.repeats}"}, title=quantity.capitalize())
+    return ResultPart.table(rows, {**columns, "repeats": "{0.repeats}"}, title=quantity.capitalize())
 
 
 def _between(interval: Interval | None) -> str:

@@ -15,9 +15,9 @@ from torch import Tensor, nn
 from advsearch.described import NOT_A_NUMBER
 from advsearch.errors import InputError
 from advsearch.models import load_model
-from advsearch.tasks import Answer, Detection
+from advsearch.tasks import Detection, Prediction
 from advsearch.tasks.boxes import Detections, Place
-from advsearch.tasks.detector_answers import detections_in, settled
+from advsearch.tasks.detector_outputs import detections_in, settled
 
 CUP, BOWL = [20.0, 40.0, 60.0, 90.0], [65.0, 10.0, 90.0, 35.0]
 NAMES = ("cup", "bowl")
@@ -53,7 +53,7 @@ def on(network: nn.Module, **options: Any) -> tuple[Detection, list[Detections]]
     task = Detection(**options)
     model = load_model(network, input_size=100, read=task.reader, labels=NAMES)
     output = model(PICTURE)
-    return task.on(model).seeing(output, TRUTH), output
+    return task.on(model).after_calibration(output, TRUTH), output
 
 
 def rows(boxes: Tensor, scores: Tensor, classes: Tensor, order: str = "bsc") -> Tensor:
@@ -101,17 +101,17 @@ def test_scores_and_classes_are_told_apart_and_rows_that_fill_up_are_nothing(for
 
     task, output = on(Shaped(made, fill))
     (found,) = task.judge(output, TRUTH)
-    assert found.right and astuple(found.answer) == ("cup", 0, pytest.approx(0.8))
-    assert task.seen_unit == "pixels" and not task.unsaid and not task.doubts
-    assert [one.label for one in task.answers(output, 5)[0]] == ["cup", "bowl"]
+    assert found.right and astuple(found.prediction) == ("cup", 0, pytest.approx(0.8))
+    assert task.seen_unit == "pixels" and not task.ambiguities and not task.doubts
+    assert [one.label for one in task.predictions(output, 5)[0]] == ["cup", "bowl"]
     nothing = task.judge(load_model(Shaped(made, fill), input_size=100, read=task.reader)(PICTURE * 2.0), TRUTH)
-    assert nothing[0].answer == Answer("no cup", None, 0.0), "rows that fill up are no answer of NaN"
+    assert nothing[0].prediction == Prediction("no cup", None, 0.0), "rows that fill up are no answer of NaN"
 
 
 @pytest.mark.parametrize("form", ["boxes scores classes", "boxes classes scores", "rows", "rows, class first"])
 def test_one_class_is_all_zeros_and_still_no_score(form: str) -> None:
     task, output = on(Shaped(FORMS[form], classes=(0, 0)))
-    assert astuple(task.judge(output, TRUTH)[0].answer) == ("cup", 0, pytest.approx(0.8))
+    assert astuple(task.judge(output, TRUTH)[0].prediction) == ("cup", 0, pytest.approx(0.8))
     (said,) = task.remarks
     assert f"read as `task='detection={{order: {task.seen_order}}}'`" in said
 
@@ -123,7 +123,7 @@ def test_what_the_numbers_leave_open_is_asked_for() -> None:
     ):
         on(network)
     task, output = on(network, order="boxes scores labels")
-    assert [(one.label, one.probability) for one in task.answers(output, 2)[0]] == [("cup", 1.0), ("bowl", 1.0)]
+    assert [(one.label, one.probability) for one in task.predictions(output, 2)[0]] == [("cup", 1.0), ("bowl", 1.0)]
     task, output = on(Shaped(rows, classes=(0, 1), scores=(1.0, 1.0)))
     assert task.seen_order == "boxes scores labels", "what suppression leaves comes by falling scores"
 
@@ -132,7 +132,7 @@ def test_a_silent_model_leaves_all_open() -> None:
     def silent(form: str, **options: Any) -> str:
         task = Detection(**options)
         model = load_model(Shaped(FORMS[form]), input_size=100, read=task.reader, labels=NAMES)
-        return task.on(model).seeing(model(PICTURE * 2.0), TRUTH).unsaid
+        return task.on(model).after_calibration(model(PICTURE * 2.0), TRUTH).ambiguities
 
     assert "say `task='detection={order: boxes scores labels}'` or `task='detection={order: boxes labels" in silent(
         "rows"
@@ -204,13 +204,13 @@ def test_the_unit_is_read_from_boxes_that_count_and_an_odd_form_is_named(
 def test_boxes_that_are_said_in_a_wrong_unit_are_smaller_than_a_pixel() -> None:
     task, output = on(Shaped(lambda b, s, c: (b / 100.0, s, c.long())), unit="pixels")
     assert "unit: fractions" in task.doubts
-    unknown = task.seeing(output, None)
+    unknown = task.after_calibration(output, None)
     assert "are smaller than a pixel; `task='detection={unit: fractions}'` would mend that" in unknown.doubts
 
 
 def test_what_is_said_in_full_is_not_looked_at() -> None:
     said = on(Shaped(FORMS["whole classes"]), boxes="xyxy", unit="pixels")[0]
-    assert not said.looks and on(Shaped(FORMS["whole classes"]), unit="pixels")[0].looks
+    assert not said.calibrates and on(Shaped(FORMS["whole classes"]), unit="pixels")[0].calibrates
 
 
 # ---- no answers -----------------------------------------------------------------------------------------------------
@@ -222,7 +222,7 @@ def dense(*scores: list[float]) -> list[Detections]:
 
 @pytest.mark.parametrize("name", ["background", "__background__", "No Object", "N/A", "none", "no-object", "???"])
 @pytest.mark.parametrize("place", [0, 1, 2])
-def test_background_is_no_answer_wherever_it_stands(name: str, place: int) -> None:
+def test_background_is_no_prediction_wherever_it_stands(name: str, place: int) -> None:
     labels, scores = ["cup", "bowl"], [0.1, 0.2]
     labels.insert(place, name)
     scores.insert(place, 0.9)
@@ -232,9 +232,9 @@ def test_background_is_no_answer_wherever_it_stands(name: str, place: int) -> No
     named = [{"boxes": box, "labels": torch.tensor([place]), "scores": torch.tensor([0.9])}]
     for output in (dense(scores), named):
         (found,) = task.judge(output, truth)
-        assert not found.success and found.answer.label == "no cup"
+        assert not found.success and found.prediction.label == "no cup"
         assert isinstance(found.payload, dict) and f'"{name}"' not in json.dumps(found.payload["found"])
-        assert all(one.label != name for one in task.answers(output, 5)[0])
+        assert all(one.label != name for one in task.predictions(output, 5)[0])
         hidden = Place(truth.labels, None, (100, 100))
         assert not task.seeking("create").judge(output, hidden)[0].success
     honest = Detection(labels=("cup", "none of the above"), unit="fractions", seek="mislabel")
@@ -257,6 +257,6 @@ def test_what_is_not_a_number_is_called_that_and_what_fills_up_is_left_out(one: 
     task = Detection(labels=NAMES, unit="fractions")
     output = task.read([{name: torch.tensor(part) for name, part in one.items()}], 1)
     (found,) = task.judge(output, TRUTH)
-    assert found.answer.label == label and found.right is (label == "cup") and not found.success
+    assert found.prediction.label == label and found.right is (label == "cup") and not found.success
     assert found.not_a_number is (label == NOT_A_NUMBER) is math.isnan(found.margin)
-    assert task.answers(output)[0][0].label == label
+    assert task.predictions(output)[0][0].label == label

@@ -12,7 +12,7 @@ from pydantic import Field, JsonValue, field_validator
 from advsearch.config import SceneConfig, read_joined
 from advsearch.files import MESHES, either
 from advsearch.report.markup import InNotebook
-from advsearch.report.shown import AnswerPart, ShownAnswer
+from advsearch.report.shown import ResultPart, ShownResult
 from advsearch.report.wording import count, percent, short_name
 from advsearch.runs.results import Fields, RunResult
 from advsearch.settings import Clash, Config, setting, setting_as_in, split_names
@@ -67,7 +67,7 @@ class RecipeConfig(Config):
     )
     label: dict[str, str] = setting(
         dict, "model",
-        "the right answers, separated by commas, for all objects or one (OBJECT=LABELS); may be repeated",
+        "the right labels, separated by commas, for all objects or one (OBJECT=LABELS); may be repeated",
         'names of classes, such as "coffee mug,cup" or mug="coffee mug,cup"',
         form="choices", metavar="LABELS", otherwise="each object's own",
     )
@@ -111,7 +111,7 @@ class RecipeConfig(Config):
         return (Path(self.recipe).stem, *(Path(name).stem for name in split_names(self.object or "")[:1]))
 
     def label_of(self, name: str) -> str | None:
-        """Return what was said to be the right answer for an object; None for its own."""
+        """Return what was said to be the right label for an object; None for its own."""
         return self.label.get(name) or self.label.get(Path(name).stem) or self.label.get(ALL_OBJECTS)
 
 
@@ -146,7 +146,7 @@ class RecipeResult(InNotebook, RunResult):
 
     recipe: str = Field(description="its name, or its file")
     title: str = Field(description="what it asks")
-    about: str = Field(description="what is done for an answer, and whose experiment it is")
+    about: str = Field(description="what is done for a result, and whose experiment it is")
     quick: bool = Field(description="whether it was few small pictures")
     objects: list[str]
     model: str
@@ -159,23 +159,23 @@ class RecipeResult(InNotebook, RunResult):
         return f"{len(self.figures)} figures"
 
 
-def shown(result: RecipeResult) -> ShownAnswer:
+def shown(result: RecipeResult) -> ShownResult:
     """Return each figure with what it says and its numbers, and the runs that it took."""
-    sections = [AnswerPart(text=[result.about], only="page")]
+    sections = [ResultPart(text=[result.about], only="page")]
     for number, (made, texts) in enumerate(zip(result.figures, told_once(result.figures), strict=True), start=1):
         rows = [list(map(_cell, made.columns, row)) for row in made.rows]
-        sections.append(AnswerPart(made.title, texts, figure=f"images/figure-{number}.png"))
-        sections.append(AnswerPart("The numbers", heads=made.columns, rows=rows, folded=True, only="page"))
+        sections.append(ResultPart(made.title, texts, figure=f"images/figure-{number}.png"))
+        sections.append(ResultPart("The numbers", heads=made.columns, rows=rows, folded=True, only="page"))
     rows = [[run.name, run.command, run.ending, str(run.renders)] for run in result.parts]
     heads, names = ("run in parts/", "command", "ending", "renders"), [run.name for run in result.parts]
     title = count(len(result.parts), "run")
-    sections.append(AnswerPart(title, heads=heads, rows=rows, parts=names, folded=True, only="page"))
+    sections.append(ResultPart(title, heads=heads, rows=rows, parts=names, folded=True, only="page"))
     of_what = result.objects, result.environment.split(","), result.model.split(",")
     objects, environments, models = (", ".join(map(short_name, listed)) for listed in of_what)
     facts = {"objects": objects, "environments": environments, "models": models, "runs": str(len(result.parts))}
     facts |= {"renders": str(sum(run.renders for run in result.parts))}
     quick = ["Made with few and small pictures, to see what comes out; no result."] if result.quick else []
-    return ShownAnswer(result.title, sections, facts, [PurePath(result.recipe).stem, models, objects], quick)
+    return ShownResult(result.title, sections, facts, [PurePath(result.recipe).stem, models, objects], quick)
 
 
 def _cell(column: str, value: Cell) -> str:

@@ -8,23 +8,25 @@ from typing import ClassVar
 import numpy as np
 from pydantic import Field
 
-from advsearch.questions.sweep.summary import AxisValue, CountedAnswers
+from advsearch.questions.sweep.summary import AxisValue, CountedPredictions
 from advsearch.report import wording
 from advsearch.report.markup import InNotebook
-from advsearch.report.shown import AnswerPart, Claim, Column, Extent, Picture, ShownAnswer
+from advsearch.report.shown import Claim, Column, Extent, Picture, ResultPart, ShownResult
 from advsearch.report.wording import conditions_text, percent, share_of_text
 from advsearch.runs.results import ConditionRow, Fields, Interval, JsonFloat, RunResult
 
 
-class ComparedSide(CountedAnswers):
+class ComparedSide(CountedPredictions):
     """One of the things that are compared, and how often the model is right with it."""
 
     name: str = Field(description="what tells it from the others")
     run: str = Field(description="folder of the sweep that has its rows")
     object: str
     model: str
-    answer: str = Field(default="", description="the run whose answer was swept; absent without")
-    seconds: JsonFloat = Field(description="of a picture and its answers, shared evenly among the models that saw it")
+    answer: str = Field(default="", description="the run whose adversarial scene was swept; absent without")
+    seconds: JsonFloat = Field(
+        description="of a picture and its predictions, shared evenly among the models that saw it"
+    )
 
 
 class CountOf(Fields):
@@ -52,7 +54,7 @@ class PairCounts(Fields):
 
     @property
     def right(self) -> tuple[int, int]:
-        """Right answers of the first, and of the second."""
+        """Right predictions of the first, and of the second."""
         return self.both + self.first_only, self.both + self.second_only
 
 
@@ -108,7 +110,7 @@ class CompareResult(InNotebook, RunResult):
 
     object: str
     model: str
-    task: str = Field(description="what judges the answers")
+    task: str = Field(description="what judges the predictions")
     differ: list[str] = Field(description="the settings in which the sweeps differ")
     sides: list[ComparedSide] = Field(description="in the order in which they were named; empty if interrupted before")
     pairs: list[ComparedPair] = Field(description="the first side with each of the others")
@@ -140,7 +142,7 @@ MOST_TABLES, MOST_PICTURES = 4, 3
 """Parameters, and pictures of what one side alone gets right, that a terminal shows; the page has all."""
 
 
-def shown(result: CompareResult) -> ShownAnswer:
+def shown(result: CompareResult) -> ShownResult:
     """Return each side's accuracy, the pairs, where one is worse, and pictures that one alone gets right."""
 
     def cost(one: ComparedSide) -> str:
@@ -153,14 +155,14 @@ def shown(result: CompareResult) -> ShownAnswer:
         "right in": "{0.correct} of {0.configurations}",
         "accuracy": lambda one: percent(one.accuracy),
         "95 % interval": lambda one: wording.interval_text(one.interval),
-        "time an answer": cost,
+        "time a prediction": cost,
     }
-    sections = [AnswerPart.table(result.sides, columns, title="How often each is right")]
+    sections = [ResultPart.table(result.sides, columns, title="How often each is right")]
     for pair in result.pairs:
         sections += _of_pair(pair, several=len(result.pairs) > 1)
     said = headline(result.pairs[0]) if result.pairs else "Interrupted before anything was compared."
     sweeps = ", ".join(dict.fromkeys(one.run for one in result.sides))
-    return ShownAnswer(said, sections, {"sweeps": sweeps, "they differ in": ", ".join(result.differ)})
+    return ShownResult(said, sections, {"sweeps": sweeps, "they differ in": ", ".join(result.differ)})
 
 
 def headline(pair: ComparedPair) -> str:
@@ -191,7 +193,7 @@ def alone_text(pair: ComparedPair) -> str:
     )
 
 
-def _of_pair(pair: ComparedPair, *, several: bool) -> Iterator[AnswerPart]:
+def _of_pair(pair: ComparedPair, *, several: bool) -> Iterator[ResultPart]:
     """Two sides: the pairs in a table of two by two, where one is worse, the values of parameters, and pictures."""
     said = [headline(pair), alone_text(pair)] if several else [alone_text(pair)]
     heads = ["", f"{pair.second} right", f"{pair.second} wrong"]
@@ -200,8 +202,8 @@ def _of_pair(pair: ComparedPair, *, several: bool) -> Iterator[AnswerPart]:
         [f"{pair.first} wrong", str(pair.second_only), str(pair.neither)],
     ]
     note = NOTE if pair.units is None else NOTE_OF_UNITS
-    yield AnswerPart(f"{pair.first} and {pair.second}, pair by pair", said, heads, rows, note)
-    yield AnswerPart("Where one is worse", [*_rules_texts(pair)])
+    yield ResultPart(f"{pair.first} and {pair.second}, pair by pair", said, heads, rows, note)
+    yield ResultPart("Where one is worse", [*_rules_texts(pair)])
     tables: dict[str, list[PairPart]] = {}
     for part in pair.parts:
         unit = f", {part.unit}" if part.unit not in ("", "1", "name") else ""
@@ -217,10 +219,10 @@ def _of_pair(pair: ComparedPair, *, several: bool) -> Iterator[AnswerPart]:
             difference = f"{100.0 * one.difference:+.0f} ({points_text(one.interval)})"
             alone = [str(one.first_only), str(one.second_only)]
             rows.append([wording.value_text(one.value), str(one.pairs), *shares, difference, *alone])
-        yield AnswerPart(name, heads=heads, rows=rows, only="" if name in told else "page")
+        yield ResultPart(name, heads=heads, rows=rows, only="" if name in told else "page")
     if len(told) < len(tables):
         more = f"The difference varies most over these; the page has all {len(tables)} parameters."
-        yield AnswerPart(text=[more], only="text")
+        yield ResultPart(text=[more], only="text")
     for name in (pair.first, pair.second):
         yield from _alone(name, pair)
 
@@ -241,7 +243,7 @@ def _rules_texts(pair: ComparedPair) -> Iterator[str]:
             yield f"{where} {conditions_text(rule.conditions)}, in {inside} pairs; {rest} in {outside}."
 
 
-def _alone(name: str, pair: ComparedPair) -> Iterator[AnswerPart]:
+def _alone(name: str, pair: ComparedPair) -> Iterator[ResultPart]:
     """What one side alone gets right: a picture of each pair where both were shown the same, or else the two beside
     each other."""
     title, lines, missing, groups = f"Only {name} gets right:", list[list[str]](), list[str](), list[list[Picture]]()
@@ -261,8 +263,8 @@ def _alone(name: str, pair: ComparedPair) -> Iterator[AnswerPart]:
             missing.append(lines[-1][0])
     if all(len(group) == 1 for group in groups):
         groups = [[picture for group in groups for picture in group]] if groups else []
-    yield AnswerPart(title, rows=lines[:MOST_PICTURES], only="text")
-    yield AnswerPart(title, missing, pictures=groups, only="page")
+    yield ResultPart(title, rows=lines[:MOST_PICTURES], only="text")
+    yield ResultPart(title, missing, pictures=groups, only="page")
 
 
 def claims(result: CompareResult) -> Iterator[Claim]:

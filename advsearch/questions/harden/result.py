@@ -11,7 +11,7 @@ from advsearch.questions.attack.settings import STEPS, AttackConfig
 from advsearch.report import wording
 from advsearch.report.figures import BLUE, RED, draw_shares
 from advsearch.report.markup import InNotebook
-from advsearch.report.shown import NO_PROOF, AnswerPart, Claim, Extent, ShownAnswer, claim, share_text
+from advsearch.report.shown import NO_PROOF, Claim, Extent, ResultPart, ShownResult, claim, share_text
 from advsearch.report.wording import percent
 from advsearch.runs.results import Fields, Interval, RunResult, SharedWork
 from advsearch.settings import setting, setting_as_in
@@ -106,7 +106,7 @@ class HardenConfig(AttackConfig):
 
 
 class Share(Fields):
-    """A share of right answers."""
+    """A share of right predictions."""
 
     accuracy: float = Field(description="`right` of `count`")
     interval: Interval
@@ -142,7 +142,7 @@ class TrainingRound(Fields):
     part: float = Field(description="of the way from the weights that were given to the trained ones, in 0 to 1")
     clean: float = Field(description="share of plain pictures that are right")
     robust: float = Field(description="share of the worst pictures, searched for against these weights")
-    kept: bool = Field(description="whether its weights are the answer")
+    kept: bool = Field(description="whether its weights are the result")
 
 
 class SplitSide(Fields):
@@ -161,10 +161,10 @@ class HardenResult(InNotebook, RunResult):
 
     objects: list[str]
     model: str
-    task: str = Field(description="what judges the answers")
+    task: str = Field(description="what judges the predictions")
     before: Share | None = Field(
-        description="held-out scenes that are right and in which no search over any control has found a wrong answer; "
-        "null if it was interrupted, as are the others"
+        description="held-out scenes that are right and in which no search over any control has found a wrong "
+        "prediction; null if it was interrupted, as are the others"
     )
     after: Share | None = Field(description="the same, of the hardened model, searched again")
     clean_before: Share | None = Field(description="plain renders of held-out scenes that are right")
@@ -202,7 +202,7 @@ ROUNDS = ("round", "views trained on", "part of the way", "plain pictures right"
 SPLIT = ("side", "objects", "environments", "scenes", "views")
 
 
-def shown(result: HardenResult) -> ShownAnswer:
+def shown(result: HardenResult) -> ShownResult:
     """Return how robust the model was and is, what it was trained on, and what never was."""
     shares = shares_of(result)
 
@@ -247,11 +247,11 @@ def shown(result: HardenResult) -> ShownAnswer:
         )
     chart: dict[str, Any] = {"draw": draw, "size": (6.4, 1.4 + 0.45 * len(shares))} if shares else {}
     sections = [
-        AnswerPart("Before and after", heads=HEADS, rows=measured, note=ROBUST, height=110 + 44 * len(shares), **chart),
-        AnswerPart("The training", heads=ROUNDS, rows=rounds, note=TRAINED, only="page"),
-        AnswerPart("What it was trained and measured on", heads=SPLIT, rows=split, only="page"),
+        ResultPart("Before and after", heads=HEADS, rows=measured, note=ROBUST, height=110 + 44 * len(shares), **chart),
+        ResultPart("The training", heads=ROUNDS, rows=rounds, note=TRAINED, only="page"),
+        ResultPart("What it was trained and measured on", heads=SPLIT, rows=split, only="page"),
     ]
-    return ShownAnswer(said, sections, facts, about=[",".join(result.objects), ", ".join(result.controls)])
+    return ShownResult(said, sections, facts, about=[",".join(result.objects), ", ".join(result.controls)])
 
 
 def shares_of(result: HardenResult) -> dict[str, tuple[Share | None, Share | None]]:

@@ -9,7 +9,7 @@ from pydantic import Field
 
 from advsearch.config import DerivativeConfig, SceneConfig, TimedConfig
 from advsearch.report.markup import InNotebook
-from advsearch.report.shown import AnswerPart, Column, ShownAnswer
+from advsearch.report.shown import Column, ResultPart, ShownResult
 from advsearch.runs.results import (
     OUT_OF_TIME,
     Fields,
@@ -177,7 +177,7 @@ LOSSES = {
 }
 
 
-def shown(result: CheckResult) -> ShownAnswer:
+def shown(result: CheckResult) -> ShownResult:
     """Return what fell short, the plan of a search, what it leaves out, and a table for each loss."""
     rows, left, plan, sentences = result.rows, result.planned - result.measured, result.plan, []
     if left:
@@ -190,20 +190,20 @@ def shown(result: CheckResult) -> ShownAnswer:
     groups = plan.groups if plan else []
     whole = [row for row in rows if row.quantity == "gradient"]
     facts = {} if plan is None else {"renders a gradient": str(plan.renders_per_gradient), "samples": str(plan.spp)}
-    return ShownAnswer(
+    return ShownResult(
         " ".join(sentences),
         [
-            AnswerPart(text=[READING] if rows else []),
+            ResultPart(text=[READING] if rows else []),
             *(
-                AnswerPart.table(
+                ResultPart.table(
                     [row for row in rows if row.loss == name and row.quantity == "derivative"], SINGLE, title=title
                 )
                 for name, title in LOSSES.items()
             ),
-            AnswerPart.table(whole, WHOLE, title="The model's loss, cosine with the converged gradient"),
-            AnswerPart.table(groups, GROUPS, title="How a search gets its derivatives", text=_reasons(groups)),
-            AnswerPart("Left out", _left_out(result)),
-            AnswerPart.table(result.gains, GAINS, title="What that saves"),
+            ResultPart.table(whole, WHOLE, title="The model's loss, cosine with the converged gradient"),
+            ResultPart.table(groups, GROUPS, title="How a search gets its derivatives", text=_reasons(groups)),
+            ResultPart("Left out", _left_out(result)),
+            ResultPart.table(result.gains, GAINS, title="What that saves"),
         ],
         facts,
     )

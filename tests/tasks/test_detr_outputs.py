@@ -15,7 +15,7 @@ from advsearch.errors import InputError, ModelError
 from advsearch.models.labels import read_labels
 from advsearch.tasks import Detection
 from advsearch.tasks.boxes import Place
-from advsearch.tasks.detector_answers import QUERIES
+from advsearch.tasks.detector_outputs import QUERIES
 
 NAMES = ("bowl", "coffee mug", "dog")
 ALONE, CHOSEN = QUERIES
@@ -61,23 +61,23 @@ FORMS: dict[str, Callable[[Tensor, Tensor], Any]] = {
 def test_names_say_how_logits_are_read(form: str, nothing: bool) -> None:
     model = load_model(Bright(FORMS[form], nothing), input_size=32, task="detection", labels=NAMES)
     picture = torch.full((32, 32, 3), 0.6)
-    task = Detection().on(model).seeing(model(picture), TRUTH)
+    task = Detection().on(model).after_calibration(model(picture), TRUTH)
     (found,) = task.judge(model(picture), TRUTH)
     logits = torch.tensor([-2.8, 2.8, -6.0] + [-6.0] * nothing)
     score = float(logits.softmax(dim=0)[1] if nothing else logits[1].sigmoid())
-    assert found.right and found.answer.label == "coffee mug"
-    assert found.answer.probability == pytest.approx(score)
+    assert found.right and found.prediction.label == "coffee mug"
+    assert found.prediction.probability == pytest.approx(score)
     order = CHOSEN if nothing else ALONE
-    assert task.remarks == (f"The detector's answer is read as a DETR's: `task='detection={{order: {order}}}'`.",)
-    assert not task.unsaid and [one.label for one in task.answers(model(picture), 1)[0]] == ["coffee mug"]
+    assert task.remarks == (f"The detector's output is read as a DETR's: `task='detection={{order: {order}}}'`.",)
+    assert not task.ambiguities and [one.label for one in task.predictions(model(picture), 1)[0]] == ["coffee mug"]
 
 
 def test_the_name_of_nothing_may_be_among_the_names() -> None:
     model = load_model(Bright(of_its_authors), input_size=32, task="detection", labels=[*NAMES, "no object"])
     task = Detection().on(model)
     dark = model(torch.full((32, 32, 3), 0.3))
-    assert task.seen_order == CHOSEN and [one.label for one in task.answers(dark, 5)[0]][:1] == ["bowl"]
-    assert "no object" not in [one.label for one in task.answers(dark, 5)[0]]
+    assert task.seen_order == CHOSEN and [one.label for one in task.predictions(dark, 5)[0]][:1] == ["bowl"]
+    assert "no object" not in [one.label for one in task.predictions(dark, 5)[0]]
 
 
 def test_a_tuple_is_read_as_is_said() -> None:

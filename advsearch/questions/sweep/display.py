@@ -17,7 +17,7 @@ from advsearch.errors import InputError
 from advsearch.questions.sweep.figures import figure_size, sweep_axes
 from advsearch.questions.sweep.summary import (
     AxisRow,
-    CountedAnswers,
+    CountedPredictions,
     DriveRates,
     OverDrives,
     PairedRates,
@@ -29,8 +29,8 @@ from advsearch.questions.sweep.summary import (
 )
 from advsearch.report import wording
 from advsearch.report.figures import BLUE, GREY
-from advsearch.report.shown import AnswerPart, Claim, Column, Extent, ShownAnswer, claim, extent_of, share_text
-from advsearch.report.wording import answer_text, beside_text, count, margin_text, percent, short_name
+from advsearch.report.shown import Claim, Column, Extent, ResultPart, ShownResult, claim, extent_of, share_text
+from advsearch.report.wording import beside_text, count, margin_text, percent, prediction_text, short_name
 from advsearch.runs.results import INTERRUPTED
 from advsearch.settings import split_names
 
@@ -64,41 +64,41 @@ SURFACE_COLUMNS: dict[str, Column] = {
 }
 
 
-def shown(summary: SweepSummary) -> ShownAnswer:
+def shown(summary: SweepSummary) -> ShownResult:
     """Return accuracy in total and by axis, the worst configuration and the cost."""
     far = distance_of(summary)
-    sections = [*_beside(summary), AnswerPart(text=[distance_sentence(far)]) if far else AnswerPart()]
-    sections += [AnswerPart(drive_title(one), heads=DRIVE_HEADS, rows=drive_rows(one)) for one in summary.drives or ()]
+    sections = [*_beside(summary), ResultPart(text=[distance_sentence(far)]) if far else ResultPart()]
+    sections += [ResultPart(drive_title(one), heads=DRIVE_HEADS, rows=drive_rows(one)) for one in summary.drives or ()]
     sections += _tables(summary)
     if summary.surface is not None:
         said = "\n".join(surface_sentences(summary.surface))
-        sections.append(AnswerPart("What is seen of the surface when the model is wrong:", [said]))
+        sections.append(ResultPart("What is seen of the surface when the model is wrong:", [said]))
     size = figure_size(summary)
     if size is not None:
-        sections.append(AnswerPart(draw=lambda axes: sweep_axes(summary, axes), size=size, only="notebook"))
+        sections.append(ResultPart(draw=lambda axes: sweep_axes(summary, axes), size=size, only="notebook"))
     sections += (replace(part, only="page") for part in _page_parts(summary))
-    return ShownAnswer(_verdict(summary), sections, _facts(summary))
+    return ShownResult(_verdict(summary), sections, _facts(summary))
 
 
-def _page_parts(summary: SweepSummary) -> Iterator[AnswerPart]:
+def _page_parts(summary: SweepSummary) -> Iterator[ResultPart]:
     """What a page shows beside its explorer: from how far away, whole drives, the surface, and each axis in numbers."""
     if far := distance_of(summary):
         said = distance_sentence(far)
-        yield AnswerPart("How far away it is seen", [said], draw=partial(distance_axes, far), note=said)
+        yield ResultPart("How far away it is seen", [said], draw=partial(distance_axes, far), note=said)
     for number, one in enumerate(summary.drives or ()):
         title, figure = ("Whole drives", "images/drive.png") if number == 0 else ("", "")
-        yield AnswerPart(title, [drive_title(one)], heads=DRIVE_HEADS, rows=drive_rows(one), figure=figure)
+        yield ResultPart(title, [drive_title(one)], heads=DRIVE_HEADS, rows=drive_rows(one), figure=figure)
     if summary.surface is not None:
         text = [" ".join(surface_sentences(summary.surface))]
-        yield AnswerPart("The surface that was seen", text, figure="images/surface.png")
+        yield ResultPart("The surface that was seen", text, figure="images/surface.png")
         for table in (one for one in summary.surface.tables if one.strongest):
             who = f"{wording.short_name(table.object)}, {wording.short_name(table.model)}"
             title = f"{who}: the {table.part}s that are told most clearly"
-            yield AnswerPart.table(table.strongest, SURFACE_COLUMNS, title=title, folded=True)
+            yield ResultPart.table(table.strongest, SURFACE_COLUMNS, title=title, folded=True)
     for name in dict.fromkeys(row.axis for row in summary.axes):
         rows = [row for row in summary.axes if row.axis == name]
         if len(rows) <= MOST_LISTED:
-            yield AnswerPart.table(rows, AXIS_COLUMNS, title=f"Accuracy by {name}", folded=True)
+            yield ResultPart.table(rows, AXIS_COLUMNS, title=f"Accuracy by {name}", folded=True)
 
 
 def _verdict(summary: SweepSummary) -> str:
@@ -113,13 +113,13 @@ def _verdict(summary: SweepSummary) -> str:
     return f"The model is right in {correct} of {wording.count(seen, 'configuration')} ({rate})."
 
 
-def _beside(summary: SweepSummary) -> list[AnswerPart]:
+def _beside(summary: SweepSummary) -> list[ResultPart]:
     if summary.beside is None or summary.ending == INTERRUPTED:
         return []
-    return [AnswerPart(rows=_rates(pair, summary.beside.answer)) for pair in summary.beside.pairs]
+    return [ResultPart(rows=_rates(pair, summary.beside.answer)) for pair in summary.beside.pairs]
 
 
-def _rates(pair: PairedRates, answer: str) -> list[list[str]]:
+def _rates(pair: PairedRates, run: str) -> list[list[str]]:
     return [
         [
             name,
@@ -127,20 +127,20 @@ def _rates(pair: PairedRates, answer: str) -> list[list[str]]:
             percent(one.accuracy),
             wording.interval_text(one.interval),
         ]
-        for name, one in (("clean", pair.clean), (answer, pair.answer))
+        for name, one in (("clean", pair.clean), (run, pair.answer))
     ]
 
 
-def _tables(summary: SweepSummary) -> list[AnswerPart]:
+def _tables(summary: SweepSummary) -> list[ResultPart]:
     by_axis: dict[str, list[AxisRow]] = {}
     for row in (one for one in summary.axes if one.axis != "answer"):
         by_axis.setdefault(row.axis, []).append(row)
-    both = f"Of the clean scene and the answer together: {READING[0].lower()}{READING[1:]}"
-    reading = AnswerPart(text=[both if summary.beside else READING])
+    both = f"Of the clean scene and the adversarial one together: {READING[0].lower()}{READING[1:]}"
+    reading = ResultPart(text=[both if summary.beside else READING])
     return [reading, *(_table(name, rows) for name, rows in by_axis.items())] if by_axis else []
 
 
-def _table(name: str, rows: Sequence[AxisRow]) -> AnswerPart:
+def _table(name: str, rows: Sequence[AxisRow]) -> ResultPart:
     listed, title = list(rows), name + (f", {rows[0].unit}" if rows[0].unit not in ("", "name", "1") else "")
     if len(rows) > MOST_ROWS:
         worst = sorted(range(len(rows)), key=lambda number: rows[number].accuracy or 0.0)[: MOST_ROWS // 2]
@@ -156,7 +156,7 @@ def _table(name: str, rows: Sequence[AxisRow]) -> AnswerPart:
         ]
         for row in listed
     ]
-    return AnswerPart(title, rows=lines)
+    return ResultPart(title, rows=lines)
 
 
 def _facts(summary: SweepSummary) -> dict[str, str]:
@@ -180,13 +180,13 @@ def _configuration(worst: WorstConfiguration) -> str:
 
 def _said(worst: WorstConfiguration, task: str) -> str:
     claim, checked = worst.claimed, worst.verified
-    text = f"answer {answer_text(task, claim)}"
+    text = f"prediction {prediction_text(task, claim)}"
     rate = f"wrong in {wording.rate_text(checked)}" if checked else "not verified"
     return f"{text}; margin ({margin_text(task)}) {claim.margin:.3g}; {rate}"
 
 
 def claims(result: SweepSummary) -> Iterator[Claim]:
-    """Yield the share of right answers, and how often the worst of the configurations is wrong."""
+    """Yield the share of right predictions, and how often the worst of the configurations is wrong."""
     if result.accuracy is None or result.interval is None or result.ending != "finished":
         return
     extent = Extent(
@@ -216,7 +216,7 @@ def claims(result: SweepSummary) -> Iterator[Claim]:
     if len(split_names(result.model)) < 2 or not models:
         how += _in_each(result)
         yield claim("measured", f"The model is right in {share_text(extent)} {how}.{note}", extent)
-    for row in models:  # they are shown the same pictures, so that answers of several are not independent
+    for row in models:  # they are shown the same pictures, so that predictions of several are not independent
         own = Extent(what=extent.what, count=row.correct, total=row.configurations, interval=row.interval or (0.0, 1.0))
         yield claim(
             "measured", f"The model {row.value} is right in {share_text(own)} {how}{_in_each(result)}.{note}", own
@@ -284,7 +284,8 @@ def _sentence(table: SurfaceTable, least: int) -> str:
     if not table.worse + table.better:
         return f"{who}: none of {cells} that were compared is told from chance."
     said = (
-        f"{who}: of {cells} that were compared, {table.worse} go with wrong answers and {table.better} with right ones."
+        f"{who}: of {cells} that were compared, {table.worse} go with wrong predictions and {table.better} with "
+        "right ones."
     )
     if not table.strongest:
         return said
@@ -293,8 +294,8 @@ def _sentence(table: SurfaceTable, least: int) -> str:
     return f"{said} {where}: wrong in {wrong_text(first.seen)} that see it, {wrong_text(first.hidden)} that do not."
 
 
-def wrong_text(counted: CountedAnswers) -> str:
-    """Return ``35 of 40``: wrong answers among all."""
+def wrong_text(counted: CountedPredictions) -> str:
+    """Return ``35 of 40``: wrong predictions among all."""
     return f"{counted.configurations - counted.correct} of {counted.configurations}"
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path, PurePath
 from typing import ClassVar
 
@@ -12,7 +12,7 @@ from advsearch.config import SceneConfig
 from advsearch.questions.attack.settings import FEWEST_TRIALS
 from advsearch.report import wording
 from advsearch.report.markup import InNotebook
-from advsearch.report.shown import AnswerPart, Claim, ShownAnswer, case_claim
+from advsearch.report.shown import Claim, ResultPart, ShownResult, case_claim
 from advsearch.runs.results import ControlGroup, Fields, SceneResult, VerifiedRate
 from advsearch.settings import Clash, Config, each_once, setting, setting_as_in, split_names, texts
 
@@ -24,13 +24,16 @@ REPLAY_TRIALS = 10
 
 
 class ReplayConfig(Config):
-    """Everything that decides what `replay` does: which run's answer is rendered again, and under what conditions."""
+    """Everything that decides what `replay` does: which run's adversarial scene is rendered again, and under what
+    conditions."""
 
     command: ClassVar[str] = "replay"
     clashes: ClassVar[tuple[Clash, ...]] = tuple(one for one in SceneConfig.clashes if one.setting == "overwrite")
 
-    answer: str = setting(
-        ..., "replay", "the run whose answer is rendered again", "the name or the folder of a run of attack"
+    formerly: ClassVar[Mapping[str, str]] = {"answer": "attack"}
+
+    attack: str = setting(
+        ..., "replay", "the run whose adversarial scene is rendered again", "the name or the folder of a run of attack"
     )
     ways: str | None = setting(
         None, "replay", "what is changed, separated by commas", f"some of {', '.join(WAYS)}", otherwise="all"
@@ -38,7 +41,7 @@ class ReplayConfig(Config):
     model: str | None = setting(
         None,
         "replay",
-        "other models that the answer is tried on, separated by commas",
+        "other models that the scene is tried on, separated by commas",
         "models as `attack` takes them",
         otherwise="none",
     )
@@ -49,7 +52,7 @@ class ReplayConfig(Config):
     run: str | None = setting_as_in(SceneConfig, "run", otherwise="runs/RUN-replay-NNN")
     overwrite: bool = setting_as_in(SceneConfig, "overwrite")
 
-    _named = texts("answer", "run", several=["ways", "model"])
+    _named = texts("attack", "run", several=["ways", "model"])
     _different = each_once("ways")
 
     @field_validator("ways")
@@ -72,7 +75,7 @@ class ReplayConfig(Config):
     @property
     def title(self) -> tuple[str, ...]:
         """The run, and what is asked of it."""
-        return Path(self.answer).name, self.command
+        return Path(self.attack).name, self.command
 
 
 NOT_DONE = "not done"
@@ -80,24 +83,28 @@ NOT_DONE = "not done"
 
 
 class ReplayRow(Fields):
-    """One condition, and what is left of the answer under it."""
+    """One condition, and what is left of the adversarial scene under it."""
 
     way: str = Field(description="what is changed; `as verified` where nothing is")
     condition: str = Field(description="to what")
-    ending: str = Field(description="`found` where the answer holds under it, as for an attack; or `not done`")
+    ending: str = Field(
+        description="`found` where the adversarial scene holds under it, as for an attack; or `not done`"
+    )
     clean: ControlGroup | None = Field(
         None, description="trials of the clean scene under it, and in how many it is right; absent if not done"
     )
-    verified: VerifiedRate | None = Field(None, description="trials of the answer, beside these; absent if not done")
+    verified: VerifiedRate | None = Field(
+        None, description="trials of the adversarial scene, beside these; absent if not done"
+    )
     reason: str = Field("", description="why it was not done, and what to do; absent if it was")
 
 
 class ReplayResult(InNotebook, SceneResult):
-    """The answer of a run under other conditions than it was searched and verified under."""
+    """The adversarial scene of a run under other conditions than it was searched and verified under."""
 
     command: ClassVar[str] = "replay"
 
-    answer: str = Field(description="the run whose answer it is")
+    answer: str = Field(description="the run whose adversarial scene it is")
     answered: str = Field(description="how that run ended")
     table: list[ReplayRow]
     renders: int = Field(description="pictures that were rendered in this sitting")
@@ -110,10 +117,10 @@ class ReplayResult(InNotebook, SceneResult):
         return f"holds under {sum(row.ending == 'found' for row in done)} of {len(done)}"
 
 
-HEADS = ("changed", "to", "clean right", "95 % interval", "success", "95 % interval", "answer")
+HEADS = ("changed", "to", "clean right", "95 % interval", "success", "95 % interval", "verdict")
 
 
-def shown(result: ReplayResult) -> ShownAnswer:
+def shown(result: ReplayResult) -> ShownResult:
     """Return the table of conditions."""
     note = (
         "Trials with fresh seeds, the same under every condition, rounded to 8 bits, with 95 % Clopper-Pearson "
@@ -121,15 +128,15 @@ def shown(result: ReplayResult) -> ShownAnswer:
         "same condition."
     )
     rows = [[row.way, "" if row.way == row.condition else row.condition, *_rates(row)] for row in result.table]
-    table = AnswerPart("Under other conditions", heads=HEADS, rows=rows, note=note)
-    about = [f"answer of {PurePath(result.answer).name} ({result.answered})", result.object, ", ".join(result.controls)]
-    return ShownAnswer(replay_text(result), [table], {"answer": result.answer, "model": result.model}, about)
+    table = ResultPart("Under other conditions", heads=HEADS, rows=rows, note=note)
+    about = [f"{PurePath(result.answer).name} ({result.answered})", result.object, ", ".join(result.controls)]
+    return ShownResult(replay_text(result), [table], {"attack": result.answer, "model": result.model}, about)
 
 
 def claims(result: ReplayResult) -> Iterator[Claim]:
-    """Yield under which conditions the answer holds."""
+    """Yield under which conditions the adversarial scene holds."""
     for row in result.table:
-        name = f"the answer of {PurePath(result.answer).name}, {row.way}"
+        name = f"the adversarial scene of {PurePath(result.answer).name}, {row.way}"
         name += "" if row.way == row.condition else f": {row.condition}"
         yield case_claim(name, row.ending, row.verified, None)
 
@@ -142,10 +149,12 @@ def replay_text(result: ReplayResult) -> str:
     own = "holds" if result.table[0].ending == "found" else "does not hold"
     held = [row for row in changed if row.ending == "found"]
     worthless = [row for row in changed if row.ending == "already wrong"]
-    text = f"As verified, the answer {own}; changed, it holds under {len(held)} of {len(changed)} conditions."
+    text = (
+        f"As verified, the adversarial scene {own}; changed, it holds under {len(held)} of {len(changed)} conditions."
+    )
     if worthless:
         names = ", ".join(f"{row.way}: {row.condition}" for row in worthless)
-        text += f" The clean scene itself fails under {names}, where an answer says nothing."
+        text += f" The clean scene itself fails under {names}, where it says nothing."
     return text
 
 

@@ -43,13 +43,13 @@ class PhotographedRendering(Fields):
 
     rendering: str = Field(description="its name: the number of a sweep's picture, or adversarial, clean, ...")
     model: str
-    label: str = Field(description="what the model answers to the rendering")
+    label: str = Field(description="what the model predicts of the rendering")
     rendering_right: bool = Field(description="whether that is right")
     photos: int
     photos_right: int = Field(description="photographs in which the model is right")
     agreeing: int = Field(description="photographs that are right where the rendering is, or wrong where it is")
     interval: Interval = Field(description="95 % Clopper-Pearson interval of the share that agrees")
-    labels: list[str] = Field(description="what the model answers to each photograph, in their order")
+    labels: list[str] = Field(description="what the model predicts of each photograph, in their order")
     files: list[str] = Field(description="their files in images/photos/, likewise")
 
 
@@ -164,7 +164,7 @@ def align_page(run: str, renderings: Sequence[str], table: PhotoAgreement, key: 
 
 
 def table_html(table: PhotoAgreement) -> Html:
-    """Return the counts of right and wrong answers in rendering and photograph, in all and by rendering."""
+    """Return the counts of right and wrong predictions in rendering and photograph, in all and by rendering."""
     if not table.photos or table.interval is None:
         return element("p", "No photographs yet.", class_="soft")
     counts = [
@@ -238,7 +238,7 @@ def _there(taker: Any) -> Any:
 
 
 def _found(find: Callable[[Path, str], Path], run: Path, name: str) -> Path:
-    """The file that `find` returns; what it says of one that is not there becomes the answer."""
+    """The file that `find` returns; what it says of one that is not there is what is sent."""
     try:
         return find(run, name)
     except InputError as error:

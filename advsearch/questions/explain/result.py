@@ -9,12 +9,12 @@ from pydantic import Field
 
 from advsearch.report import wording
 from advsearch.report.shown import (
-    AnswerPart,
     Claim,
     Column,
     Extent,
     Picture,
-    ShownAnswer,
+    ResultPart,
+    ShownResult,
     claim,
     nothing_claimed,
     share_text,
@@ -26,7 +26,7 @@ from advsearch.runs.results import ConditionRow, Fields, Interval, JsonFloat, Ru
 class RightOf(Fields):
     """In how many of some configurations the model is right."""
 
-    right: int = Field(description="right answers")
+    right: int = Field(description="right predictions")
     total: int = Field(alias="of", description="how many")
     interval: Interval = Field(description="of the share, 95 %")
 
@@ -49,16 +49,16 @@ class RuleNotTold(RightOf):
 
     conditions: list[ConditionRow] = Field(description="all of which hold")
     elsewhere: RightOf = Field(description="rows under no rule so far")
-    chance: float = Field(description="how likely so few right answers are by chance")
+    chance: float = Field(description="how likely so few right predictions are by chance")
     asked: float = Field(description="how unlikely they would have to be")
     rows: int | None = Field(description="of so many rows, with these shares, it would be told; null where of none")
 
 
 class ParameterWeight(Fields):
-    """What one parameter, or two together, decide of the answer."""
+    """What one parameter, or two together, decide of the prediction."""
 
     parameters: list[str]
-    share: JsonFloat = Field(description="of the variance of the answers, by which of its parts a value lies in")
+    share: JsonFloat = Field(description="of the variance of the predictions, by which of its parts a value lies in")
     interval: Interval = Field(description="of the share, 95 %")
     parts: int = Field(default=0, description="into how many its values were cut, of two all pairs of parts")
 
@@ -119,7 +119,7 @@ class ExplainResult(RunResult, RightOf):
     parameters: list[str] = Field(description="what varies in all of the rows")
     rules: list[RuleRow]
     not_told: RuleNotTold | None = Field(default=None, description="the next rule, which is not told; absent without")
-    importance: list[ParameterWeight] = Field(description="empty where all answers are the same")
+    importance: list[ParameterWeight] = Field(description="empty where all predictions are the same")
     envelope: EnvelopeRow | None = Field(description="null where no box promises it")
     pairs: list[NearestRight]
     pairs_sought: int = Field(
@@ -140,18 +140,18 @@ CHOSEN = (
     "Chance alone would tell any rule in one of a hundred cases at most."
 )
 DECIDES = (
-    "The share of the variance of the answers, right or wrong, that is between parts of a parameter's values with "
+    "The share of the variance of the predictions, right or wrong, that is between parts of a parameter's values with "
     "equally many rows: its first-order Sobol index, by parts. Two parameters stand together where they decide "
     "more than each by itself. What differs inside a part is not counted."
 )
 MOST_WEIGHTS = 12
 """Rows of it that are shown."""
-MOST_ANSWERS = 3
-"""Answers of a cluster that are named."""
+MOST_PREDICTIONS = 3
+"""Predictions of a cluster that are named."""
 
 
-def shown(result: ExplainResult) -> ShownAnswer:
-    """Return the rules, what decides, the envelope, and failures beside the nearest right answers."""
+def shown(result: ExplainResult) -> ShownResult:
+    """Return the rules, what decides, the envelope, and failures beside the nearest right predictions."""
     said = f"{wording.count(len(result.rules), 'rule')} under which the model is wrong more often than elsewhere."
     if not result.rules:
         said = (
@@ -166,19 +166,19 @@ def shown(result: ExplainResult) -> ShownAnswer:
         "by parts": lambda one: str(one.parts or ""),
     }
     sections = [
-        AnswerPart("Rules", [*rules, not_told_text(result)], note=CHOSEN if rules else ""),
-        AnswerPart.table(result.importance[:MOST_WEIGHTS], weights, title="What decides", note=DECIDES),
-        AnswerPart("Where it can be relied on", [envelope_text(result)]),
+        ResultPart("Rules", [*rules, not_told_text(result)], note=CHOSEN if rules else ""),
+        ResultPart.table(result.importance[:MOST_WEIGHTS], weights, title="What decides", note=DECIDES),
+        ResultPart("Where it can be relied on", [envelope_text(result)]),
     ]
     if result.pairs_sought:
-        sections.append(AnswerPart("One thing changed", [pairs_text(result)]))
+        sections.append(ResultPart("One thing changed", [pairs_text(result)]))
     for pair in result.pairs:
         unit = f" {pair.unit}" if pair.unit not in ("", "1") else ""
         wrong, right = (one if isinstance(one, str) else f"{one:.4g}" for one in (pair.wrong_at, pair.right_at))
         text = f"{pair.parameter} {wrong}{unit}: {pair.answered}; at {right}{unit}: {pair.answered_there}."
         captions = f"wrong: {pair.answered}", f"right: {pair.answered_there}"
         pictures = [Picture(file, one) for file, one in zip(pair.pictures, captions, strict=False)]
-        sections.append(AnswerPart(text=[text], pictures=[pictures]))
+        sections.append(ResultPart(text=[text], pictures=[pictures]))
     if result.clusters:
         sections.append(_kinds(result.clusters))
     draws = f", of {result.units:,} independent draws" if result.units else ""
@@ -187,7 +187,7 @@ def shown(result: ExplainResult) -> ShownAnswer:
         "sweeps": ", ".join(result.sweeps),
         "parameters": ", ".join(result.parameters),
     }
-    return ShownAnswer(said, sections, facts, about=[result.object, result.model])
+    return ShownResult(said, sections, facts, about=[result.object, result.model])
 
 
 def rule_text(number: int, rule: RuleRow) -> str:
@@ -235,7 +235,7 @@ def pairs_text(result: ExplainResult) -> str:
     )
 
 
-def _kinds(found: FailureClusters) -> AnswerPart:
+def _kinds(found: FailureClusters) -> ResultPart:
     """How many kinds of failures there are, with the most typical of each and what the model calls them."""
     again = f"the {found.failures} failures that were rendered again"
     text = f"One kind: {again} are alike by {found.features}."
@@ -245,9 +245,9 @@ def _kinds(found: FailureClusters) -> AnswerPart:
         text = f"{kinds} (silhouette {found.silhouette:.2f}{shading})."
     pictures = []
     for one in found.listed:
-        answers = ", ".join(f"{name} {number}" for name, number in [*one.answers.items()][:MOST_ANSWERS])
-        pictures.append(Picture(one.picture, f"{one.failures}: {answers}"))
-    return AnswerPart("Kinds of failures", [text], pictures=[pictures])
+        labels = ", ".join(f"{name} {number}" for name, number in [*one.answers.items()][:MOST_PREDICTIONS])
+        pictures.append(Picture(one.picture, f"{one.failures}: {labels}"))
+    return ResultPart("Kinds of failures", [text], pictures=[pictures])
 
 
 def claims(result: ExplainResult) -> Iterator[Claim]:
