@@ -27,6 +27,7 @@ from advsearch.questions.attack.parts import LOADING, executor_for
 from advsearch.questions.harden import scenes, training
 from advsearch.questions.harden.lessons import FOLDER, Lesson
 from advsearch.questions.harden.result import (
+    PLAIN_SCENES,
     RENDERED_SCENES,
     HardenConfig,
     HardenedControl,

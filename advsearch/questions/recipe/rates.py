@@ -1,5 +1,5 @@
-"""Figures of how often: right or wrong predictions by one or two columns, photographs that agree with renderings, pictures
-a second, and parts of a surface that go with wrong predictions."""
+"""Figures of how often: right or wrong predictions by one or two columns, photographs that agree with renderings,
+pictures a second, and parts of a surface that go with wrong predictions."""
 
 from __future__ import annotations
 
