@@ -132,7 +132,7 @@ def cues(rows: Rows, options: CuesOptions) -> MadeFigure:
 
 def predicted(rows: Rows, options: CuesOptions) -> list[tuple[int, int, int]]:
     """Foretell the predictions about each object with each texture by those about it with others, and with others by
-    it; return of each pair how many predictions there are, and how many of these the shape and the texture predict. Each
+    it; return of each pair how many predictions there are, and how many of them the shape and the texture foretell. A
     cue predicts the most frequent one of as many predictions: those about the same object with other textures, and
     about the same texture on other objects, drawn so that both are as many as the fewer are. None of the predicted
     predictions is among them, so that a model which goes by neither cue is predicted as well by both.
