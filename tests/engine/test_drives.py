@@ -238,9 +238,7 @@ def test_the_longest_run() -> None:
 def test_no_frames_no_drives_and_settings_that_need_a_path() -> None:
     assert advsearch.sweep("mug", grid={"pose.yaw": [0, 90]}, **SMALL).summary.drives is None
     assert advsearch.sweep("mug", grid={"path.time": [3]}, **SMALL).summary.drives is None
-    with pytest.raises(
-        InputError, match="path: texture does not travel; add `over=path` beside it, or `controls=path`"
-    ):
+    with pytest.raises(InputError, match="path: the control texture does not move on a path; add `over=path`, or use"):
         advsearch.attack("mug", controls="texture", path="orbit")
 
 
