@@ -72,6 +72,11 @@ def read_joined(value: Any, setting: str, otherwise: str) -> Any:
     return read_named({**{k: v for k, v in options.items() if v}, "name": JOINED.join(names)}, setting, otherwise)
 
 
+def has_address(model: str) -> bool:
+    """Whether a model's name is an address, or names one among several."""
+    return any(re.match("https?:", name, re.IGNORECASE) for name in split_names(model))
+
+
 def name_in(named: str | Mapping[str, object]) -> str:
     """Return the name in what `read_named` returns."""
     return named if isinstance(named, str) else str(named["name"])
@@ -109,6 +114,7 @@ class SceneConfig(Config):
     A file is looked for relative to the current directory. None means "choose for me", and the description says how.
     """
 
+    free: ClassVar[tuple[str, ...]] = (*Config.free, "ask")
     several: ClassVar[tuple[str, ...]] = ()
     """Which of object, environment and model may be several, separated by commas."""
     # fmt: off
@@ -175,8 +181,8 @@ class SceneConfig(Config):
 
     model: str = setting(
         "reference", "model", "the network under test",
-        "reference, a .pt2, TorchScript or .onnx file, torchvision:NAME, timm:NAME, hf:REPOSITORY, or "
-        "package.module:callable",
+        "reference, a .pt2, TorchScript or .onnx file, torchvision:NAME, timm:NAME, hf:REPOSITORY, an address such as "
+        "http://localhost:8000, or package.module:callable",
     )
     labels: str | None = setting(
         None, "model", "names of the model's classes",
@@ -190,6 +196,12 @@ class SceneConfig(Config):
         "each label; for a model such as LLaVA the question",
         "a text, for CLIP with {} where the name goes, or several with | between them",
         otherwise="a photo of a {}, or What is this?", metavar="TEXT",
+    )
+    ask: dict[str, float] = setting(
+        dict, "model",
+        "a limit for a model behind an address, such as calls=500: calls (2000), tokens and money of a run, seconds of "
+        "an answer (120), and the prices per_call, per_million_in and per_million_out; may be repeated",
+        "LIMIT=NUMBER", metavar="LIMIT=NUMBER", form="assignments",
     )
     task: str | dict[str, JsonValue] = setting(
         "classification", "model",

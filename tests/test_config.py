@@ -50,11 +50,12 @@ WRONG: dict[str, tuple[Any, str]] = {
     "resolution": ("4x4", "expected SIDE or HEIGHTxWIDTH, each from 8 to 4096, got 4x4"),
     "model": (
         "a\0b",
-        "expected reference, a .pt2, TorchScript or .onnx file, torchvision:NAME, timm:NAME, hf:REPOSITORY, "
-        "or package.module:callable",
+        "expected reference, a .pt2, TorchScript or .onnx file, torchvision:NAME, timm:NAME, hf:REPOSITORY, an address "
+        "such as http://localhost:8000, or package.module:callable",
     ),
     "labels": (["tench, Tinca tinca", "goldfish"], "expected a JSON or text file, imagenet, "),
     "prompt": ("a photo of a {} | ", "expected a text, for CLIP with {} where the name goes, or several with |"),
+    "ask": ({"calls": "many"}, "expected LIMIT=NUMBER, got calls=many"),
     "task": ("  ", "expected the name of a task, or NAME={OPTION: VALUE}, got '  '"),
     "label": ("  ", "expected names of classes or their numbers, such as \"coffee mug,cup\" or #504, got '  '"),
     "controls": (
@@ -105,7 +106,8 @@ GIVEN: dict[str, Any] = {
     "things": "car@1,2", "judge": "car",
     "set": {"camera.azimuth": 130.0, "camera.target": (0.0, 0.5, 1.0), "material": "felt"},
     "exposure": -1.5, "resolution": (96, 128), "model": "net.pt2,other.pt2", "ensemble": "mean",
-    "labels": "labels.json", "prompt": "a photo of a {}", "task": "detection", "label": "coffee mug,cup",
+    "labels": "labels.json", "prompt": "a photo of a {}", "ask": {"calls": 5.0}, "task": "detection",
+    "label": "coffee mug,cup",
     "controls": {"texture": {}, "pose": {"yaw": [0, 90]}}, "epsilon": {"texture": 0.03, "pose": 2.0},
     "seconds": 20.0, "target": "bowl", "minimise": False, "smallest": False, "over": {"camera": {}}, "draws": 2,
     "path": "orbit",
