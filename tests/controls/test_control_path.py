@@ -29,8 +29,10 @@ def scene() -> SceneDescription:
     return describe("mug", size=1.0, given={"camera.roll": 20.0, "camera.azimuth": 70.0})
 
 
-def bound(scene: SceneDescription, **given: Any) -> Control:
-    return make_space([PathControl(**given)], scene).controls[0]
+def bound(scene: SceneDescription, **given: Any) -> PathControl:
+    (control,) = make_space([PathControl(**given)], scene).controls
+    assert isinstance(control, PathControl)
+    return control
 
 
 def distance(control: Control, share: float) -> float:
@@ -237,7 +239,8 @@ def test_as_many_times_at_once_are_those_one_by_one(scene: SceneDescription, tmp
         start = control._start(time)
 
         def both(at: Tensor, control: PathControl = control, start: Any = start) -> Tensor:
-            place, target = control._camera(start, at, control._object(start, at)[0])
+            (ways,) = control._paths
+            place, target = control._camera(ways, start, at, control._object(ways, start, at)[0])
             return (target - place).expand(*at.shape, 3)
 
         torch.testing.assert_close(both(time), torch.stack([both(one) for one in time]))
@@ -355,3 +358,33 @@ def test_what_does_not_go_together_is_refused(scene: SceneDescription, tmp_path:
             PathControl(path=path)
     with pytest.raises(InputError, match=r"approach\+orbit says what .* leave moves out"):
         PathControl(path="approach+orbit", moves="object")
+
+
+def test_of_several_paths_each_configuration_has_one_as_it_is_alone(scene: SceneDescription, tmp_path: Path) -> None:
+    (tmp_path / "way.csv").write_text(WAY)
+    names = ["approach", "orbit+pass", str(tmp_path / "way.csv")]
+    several = bound(scene, path=",".join(names))
+    assert [slot.parameter.name for slot in several.slots] == ["time", "way"] and several.start.shape == (2,)
+    assert several.describe(several.start)["path.way"] == {"value": "approach", "unit": "name"}
+    for number, name in enumerate(names):
+        alone = bound(scene, path=name, **({} if number == 2 else {"seconds": 4.0}))
+        u = torch.tensor([0.3, (number + 0.5) / 3])
+        poses, own = several.inputs(u), alone.inputs(u[:1])
+        assert several.describe(u)["path.way"]["value"] == name
+        assert set(poses) == {"camera.to_world", "object.to_world"}  # one set, so that no draw is a surprise
+        for one, pose in own.items():
+            torch.testing.assert_close(poses[one], pose)
+    assert bound(scene, path=["approach", "orbit"]).settings() == {"path": ["approach", "orbit"]}
+
+
+@pytest.mark.parametrize("path", ["approach,approach", "approach,", "approach,nowhere", ",".join(["a.csv"] * 70)])
+def test_several_paths_are_different_ones_that_there_are(path: str) -> None:
+    with pytest.raises((InputError, FileFormatError), match=r"path: expected|expected a table"):
+        PathControl(path=path)
+
+
+def test_a_file_that_is_shorter_than_others_is_told(scene: SceneDescription, tmp_path: Path) -> None:
+    (tmp_path / "way.csv").write_text(WAY)
+    (tmp_path / "longer.csv").write_text(WAY + "9, 1, 2, 1\n")
+    there = PathControl(path=f"{tmp_path / 'way.csv'},{tmp_path / 'longer.csv'}").prepare(scene)
+    assert any("takes 4 s of 6" in one for one in there.remarks)
