@@ -3,7 +3,7 @@
 python docs/make_world_sheet.py [--size 300] [--spp 64] [--texture shirt.png] [--folder FOLDER]
 
 All pictures of the avenue have an absolute exposure. The shirt is searched by a short attack, unless `--texture` names
-one that an attack has found. `--folder` keeps each picture by itself.
+one that an attack has found. `--folder` keeps each picture by itself as well.
 """
 
 from __future__ import annotations
@@ -125,7 +125,7 @@ def searched_shirt() -> Any:
     """Return the person's texture after a short search for a shirt that is taken for a book."""
     found = advsearch.attack(
         "person", "reference", environment="street", controls={"texture:shirt": {"epsilon": 0.7}}, target="book",
-        label="mug", resolution=128, steps=30, trials=10, measure="no", baseline=False,
+        label="mug", resolution=96, spp=8, steps=20, trials=10, measure="no", baseline=False,
     )  # fmt: skip
     return found.artifacts["texture"]
 
@@ -147,8 +147,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--size", type=int, default=300, help="side of one picture, pixels (default 300)")
     parser.add_argument("--spp", type=int, default=64, help="samples per pixel (default 64)")
     parser.add_argument("--texture", type=Path, help="of the person; by default a shirt is searched")
-    parser.add_argument("--folder", type=Path, help="each picture goes there by its name, and no sheet is written")
-    parser.add_argument("--only", default="", help="pictures whose names contain this")
+    parser.add_argument("--folder", type=Path, help="each picture goes there too, by its name")
+    parser.add_argument("--only", default="", help="pictures whose names contain this, and no sheet")
     args = parser.parse_args(argv)
     with tempfile.TemporaryDirectory() as folder:
         own = Path(folder) / "van.obj"
@@ -166,7 +166,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             if args.folder is not None:
                 args.folder.mkdir(parents=True, exist_ok=True)
                 pictures[-1].save(args.folder / f"{one.name}.png")
-    if args.folder is None:
+    if not args.only:
         sheet = Image.new("RGB", (COLUMNS * args.size, -(-len(pictures) // COLUMNS) * args.size))
         for number, picture in enumerate(pictures):
             sheet.paste(picture, (number % COLUMNS * args.size, number // COLUMNS * args.size))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.description import SceneDescription, describe
 from advsearch.scene.grounds import LUMINANCE
 from advsearch.scene.headlamps import CUT_OFF, EGO, GLASS, REAR, candela
+from advsearch.scene.library import load_object
 from advsearch.scene.mitsuba_backend.parts import translation
 from advsearch.scene.mitsuba_backend.variant import mitsuba
 from advsearch.scene.mitsuba_backend.writing import write_scene
@@ -273,7 +275,7 @@ def test_what_cannot_shine_is_refused(words: dict[str, Any], error: type[InputEr
 
 def test_an_object_without_metres_has_no_lamps() -> None:
     with pytest.raises(InputError, match="so many metres apart"):
-        describe("mug", "avenue-night", given={"camera.lamps": "low"})
+        describe(replace(load_object("mug"), metres=None), "avenue-night", given={"camera.lamps": "low"})
 
 
 def test_an_exported_scene_has_the_same_lamps(tmp_path: Path) -> None:
