@@ -29,6 +29,7 @@ from advsearch.engine.problem import Prepared, Problem
 from advsearch.engine.record import LOST, judged, judgement_of, trial_row
 from advsearch.errors import ClusterError, InputError
 from advsearch.models import Model
+from advsearch.models.address import Asked
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row, Told
 from advsearch.scene.formation import levels_of
@@ -131,9 +132,13 @@ NEAR, LEAST = 1e-3, 1e-4
 def check_made_of(
     run: RunDirectory, models: Sequence[Model], functions: Mapping[str, Callable[..., Any] | None] | None = None
 ) -> None:
-    """Note what networks and functions are, or refuse to go on with others than a run began with."""
+    """Note what networks and functions are, or refuse to go on with others than a run began with. A model behind an
+    address keeps its answers in the run."""
     several = [one.module.models if isinstance(one.module, Ensemble) else (one,) for one in models]
     networks = [one for some in several for one in some]
+    for one in networks:
+        if isinstance(one.module, Asked):
+            one.module.keep_in(run.store)
     now: dict[str, Any] = {f"model {one.name}": {"weights": weights_digest(one)} for one in networks}
     now |= {name: _function(one) for name, one in (functions or {}).items() if one is not None}
     before = run.store.noted(MADE_OF)

@@ -79,8 +79,8 @@ def load_models(models: Sequence[Any], task: Task, config: SceneConfig) -> tuple
 def _load(model: Any, task: Task, config: SceneConfig, *, alone: bool) -> Model:
     """Load a model; of several tasks, those that take no label or have names of their own are given none."""
     if not alone and (task.names_from or not task.labelled):
-        return load_model(model, task=task)
-    return load_model(model, labels=config.labels, prompt=config.prompt, task=task)
+        return load_model(model, task=task, ask=config.ask)
+    return load_model(model, labels=config.labels, prompt=config.prompt, task=task, ask=config.ask)
 
 
 AnyModel = Model | nn.Module | str | Path

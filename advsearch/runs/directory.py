@@ -288,7 +288,7 @@ class RunDirectory:
                 self.close()
             return
         kept = not self._began or any((self.path / name).exists() for name in (summary.NAME, PARTS))
-        if not kept and self.store.count() == 0:
+        if not kept and self.store.count() == 0 and not self.store.has_answers:
             self.discard()
         else:
             self.close()

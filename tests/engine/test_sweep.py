@@ -419,7 +419,7 @@ def test_a_label_for_several_objects_says_whose_own_it_is_not(
 
 
 def test_what_a_row_says_of_an_occluder_is_true_of_its_own_camera() -> None:
-    grid = {"camera.distance": [2, 4], "occlusion.coverage": [0.3]}
+    grid = {"camera.sizes": [2, 4], "occlusion.coverage": [0.3]}
     found = advsearch.sweep("mug", model(), grid, trials=0, resolution=SIZE)
     near, far = (float(row.values["occlusion.true_distance"]["value"]) for row in found.rows())
     assert near == pytest.approx(1.0, abs=0.1) and far == pytest.approx(2.0, abs=0.1)
