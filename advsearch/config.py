@@ -16,7 +16,7 @@ from typing import Any, ClassVar, Literal
 from pydantic import JsonValue, field_validator, model_validator
 
 from advsearch import rooms
-from advsearch.errors import InputError
+from advsearch.errors import FileFormatError, InputError
 from advsearch.files import MESHES, either
 from advsearch.options import JOINED, by_key, things_as_text
 from advsearch.settings import (
@@ -94,6 +94,11 @@ TEXTS = (*SEVERAL, "task", "up", "camera", "run", "objective")
 ControlsByName = dict[str, dict[str, object]]
 """Controls as they are asked for: their names, each with its settings."""
 
+LARGE = ("car", "person", "stop-sign")
+"""The bundled objects around which lengths were in metres in files of schema 1."""
+LENGTHS = frozenset({"camera.distance", "camera.height", "camera.focus", "ground.height", "ground.radius", "path"})
+"""What is in metres, and was in object sizes around all others."""
+
 SEARCH_SPP = {"oidn": 8, "none": 16}
 """Samples a pixel of a search that asks for none. `benchmarks/formation.py` shows the noise that is left at each."""
 
@@ -137,7 +142,8 @@ class SceneConfig(Config):
     )
     size: float | None = setting(
         None, "scene", "how large the object is: its longest side; distances are then in metres",
-        "a number of metres from 1e-4 to 1e4", otherwise="as its file says: glTF is in metres", ge=1e-4, le=1e4,
+        "a number of metres from 1e-4 to 1e4", otherwise="as bundled, or as its file says: glTF is in metres", ge=1e-4,
+        le=1e4,
     )
     unit: Literal["mm", "cm", "m", "in"] | None = setting(
         None, "scene", "unit of the coordinates of the object's file, which says how large it is",
@@ -259,6 +265,19 @@ class SceneConfig(Config):
         if self.size is not None and len(self.objects) > 1:
             raise InputError("size: it is the size of one object, and there are several; leave it out, or give `unit`")
         return self
+
+    def check_older(self, path: str | Path) -> None:
+        given = {**self.controls, **getattr(self, "over", {})}
+        named = {*self.set_, *getattr(self, "grid", {})}
+        named |= {f"{one.get('kind', name)}.{parameter}" for name, one in given.items() for parameter in one}
+        if ".csv" in str((given, getattr(self, "path", None))):
+            named.add("path")
+        small = [name for name in self.objects if name not in LARGE and not re.search(r"[./\\#]", name)]
+        if self.size is None and small and (lengths := sorted(named & LENGTHS)):
+            raise FileFormatError(
+                f"{path}: its {lengths[0]} is in sizes of the {small[0]}, which has a size in metres now; write it in "
+                "metres (or as camera.sizes) and `schema: 2`, or keep the numbers with size=1"
+            )
 
     @property
     def title(self) -> tuple[str, ...]:

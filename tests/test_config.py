@@ -7,6 +7,7 @@ import math
 import shlex
 import subprocess
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -403,7 +404,31 @@ def test_yaml_round_trip_of_everything(tmp_path: Path) -> None:
     path = tmp_path / "run.yaml"
     path.write_text(config.to_yaml())
     assert AttackConfig.from_yaml(path, {one.name: one.value for one in config.powers}) == config
-    assert read_yaml(path)["schema"] == 1 and read_yaml(path)["command"] == "attack"
+    assert read_yaml(path)["schema"] == 2 and read_yaml(path)["command"] == "attack"
+
+
+@pytest.mark.parametrize(
+    ("text", "refused"),
+    [
+        ("schema: 1\nobject: mug\nset: {camera.distance: 2}\n", "camera.distance is in sizes of the mug"),
+        ("schema: 1\nobject: mug\ncontrols: {far: {kind: camera, distance: [2, 4]}}\n", "camera.distance is in sizes"),
+        ("schema: 1\nobject: mug\ncontrols: {path: {path: way.csv}}\n", "path is in sizes of the mug"),
+        ("schema: 1\nobject: mug\nsize: 1\nset: {camera.distance: 2}\n", ""),
+        ("schema: 1\nobject: mug\ncontrols: {camera: {azimuth: [0, 90]}}\n", ""),
+        ("schema: 1\nobject: car\nset: {camera.distance: 20}\n", ""),
+        ("schema: 1\nobject: a/mug.obj\nset: {camera.distance: 2}\n", ""),
+        ("schema: 2\nobject: mug\nset: {camera.distance: 0.3}\n", ""),
+        ("object: mug\nset: {camera.distance: 0.3}\n", ""),
+    ],
+)
+def test_lengths_of_an_older_file_are_refused_where_they_meant_something_else(
+    tmp_path: Path, text: str, refused: str
+) -> None:
+    file = tmp_path / "run.yaml"
+    file.write_text(text)
+    with pytest.raises(FileFormatError, match=f"{refused}.*size=1") if refused else nullcontext():
+        AttackConfig.from_yaml(file)
+    assert AttackConfig.from_yaml(file, {"size": 1.0}).size == 1.0
 
 
 def test_the_command_line_says_the_same() -> None:
@@ -438,7 +463,7 @@ def test_any_values_go_round(
         ("- a\n", r"study\.yaml: expected settings and values such as 'object: mug', got list"),
         ("1: 2\n", r"study\.yaml: expected settings and values such as 'object: mug', got dict"),
         ("a: [1,\n", r"study\.yaml: expected YAML, got .*line 2"),
-        ("schema: 7\nobject: mug\n", r"study\.yaml: expected schema 1, got 7; it is of another advsearch"),
+        ("schema: 7\nobject: mug\n", r"study\.yaml: expected schema 2, got 7; it is of another advsearch"),
         (
             "object: mug\nepsilon: yes\n",
             r"study\.yaml: epsilon: expected a number greater than 0 and at most 1e\+06, got True",

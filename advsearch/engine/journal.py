@@ -153,7 +153,8 @@ def check_made_of(
             same_python = key != "code" or noted.get("python") == facts.get("python")
             if same_python and None not in (noted.get(key), facts.get(key)) and noted[key] != facts[key]:
                 raise InputError(
-                    f"{run.path}: cannot go on: {name} {what} now; take the one that it began with, or {run.again}"
+                    f"{run.path}: cannot resume: {name} {what} than at the start; use the one that it began with, "
+                    f"or {run.again}"
                 )
 
 
@@ -337,7 +338,7 @@ class Journal:
         if beside.u != digest(query.u) or row.seed != query.seed:
             path, again = ("", "") if self.run is None else (self.run.path, self.run.again)
             raise InputError(
-                f"{path}: cannot go on: evaluation {query.number} of the {query.kind} is another one now than it was, "
+                f"{path}: cannot resume: evaluation {query.number} of the {query.kind} is not the one that was stored, "
                 f"so advsearch, its packages or the number of threads have changed since; {again}"
             )
         if beside.non_finite:
@@ -452,8 +453,8 @@ def other_numbers(run: RunDirectory | None, values: Mapping[str, tuple[float | N
     )
     path, again = ("", "") if run is None else (run.path, run.again)
     return InputError(
-        f"{path}: cannot go on: the same picture of the clean scene has other values now ({told}), so model, "
-        f"objective or scene are not those that it began with; take these again, or {again}"
+        f"{path}: cannot resume: the same picture of the clean scene has other values now ({told}), so the model, "
+        f"the objective or the scene has changed; use those that the run began with, or {again}"
     )
 
 
