@@ -151,7 +151,7 @@ def check_names(config: Config) -> None:
         assert config.recipe in ("list", "mine.yaml") or planned(read_recipe(config.recipe), config)
         return
     assert isinstance(config, SceneConfig)
-    check_run_settings(config)
+    check_run_settings(config.model_copy(update={"path": None}) if config.command == "sweep" else config)
     given_to(config, config.controls)
     resolve(config.set_)
     lights = config.environments if isinstance(config, SweepConfig) else (config.lit_by,)
