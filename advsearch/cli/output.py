@@ -248,11 +248,11 @@ def shown_text(result: Result) -> str:
     )
 
 
-def aligned(rows: Sequence[Sequence[str]], indent: str = "  ", gap: str = "   ") -> str:
+def aligned(rows: Sequence[Sequence[str]]) -> str:
     """Return lines with the cells of `rows` in aligned columns."""
     wide = [max(len(row[i]) for row in rows if i < len(row)) for i in range(max(map(len, rows), default=0))]
     return "\n".join(
-        (indent + gap.join(cell.ljust(width) for cell, width in zip(row, wide, strict=False))).rstrip() for row in rows
+        ("  " + "   ".join(cell.ljust(width) for cell, width in zip(row, wide, strict=False))).rstrip() for row in rows
     )
 
 
