@@ -33,6 +33,8 @@ from advsearch.settings import Config, Setting, all_finite, parse_assignment, re
 WRONG: dict[str, tuple[Any, str]] = {
     "object": ("", "expected the name of an object or a .obj, .ply, .stl, .gltf, .glb or .blend file, got ''"),
     "path": ("", "expected approach, pass, orbit, a .csv file, or two of them, the camera's and the object's, as in"),
+    "shutter": (0.0, "expected a number greater than 0 and at most 60, got 0.0"),
+    "rolling": (-1.0, "expected a number greater than 0 and at most 60, got -1.0"),
     "environment": ([], "expected the name of an environment, a .hdr or .exr file, or none, got "),
     "up": ("x", "expected y or z, got x"),
     "size": (0, "expected a number of metres from 1e-4 to 1e4, got 0"),
@@ -108,6 +110,8 @@ GIVEN: dict[str, Any] = {
     "controls": {"texture": {}, "pose": {"yaw": [0, 90]}}, "epsilon": {"texture": 0.03, "pose": 2.0},
     "seconds": 20.0, "target": "bowl", "minimise": False, "smallest": False, "over": {"camera": {}}, "draws": 2,
     "path": "orbit",
+    "shutter": 0.02,
+    "rolling": 0.03,
     "average": 50, "printable": True, "aov": "mask,uv", "metrics": {"feature": "own.metrics:seen"}, "log": "wandb",
     "norm": "l2", "texture_resolution": 64,
     "estimator": {"pose": "differences", "*": "adjoint"}, "measure": "no",
