@@ -38,6 +38,7 @@ from advsearch.scene.description import (
 )
 from advsearch.scene.formation import EVERYTHING, SAMPLER, ImageFormation
 from advsearch.scene.grounds import on_its_ground
+from advsearch.scene.headlamps import with_lamps
 from advsearch.scene.importing.pictures import read_picture
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.moments import A_PIXEL, FEWEST, MOST, Moment, moments_of
@@ -114,7 +115,7 @@ class Scene:
         if environment is not None:
             check_one_environment(own.parts, f"`environment={name}`")
         lit = replace(own, environment=environment, environment_spec=name, given=given)
-        return Scene(on_its_ground(lit), self.only_here)
+        return Scene(with_lamps(on_its_ground(lit)), self.only_here)
 
     def __repr__(self) -> str:
         described = self.description
@@ -146,7 +147,8 @@ class Scene:
         values = {**own.values, **{name: resolved[name] for name in given}}
         if "camera.elevation" in given:
             values["camera.height"] = None
-        return Scene(on_its_ground(replace(own, values=values, given=own.given | set(given))), self.only_here)
+        changed = on_its_ground(replace(own, values=values, given=own.given | set(given)))
+        return Scene(with_lamps(changed), self.only_here)
 
 
 @helped
@@ -175,7 +177,7 @@ def load_scene(
         size: of the object, its longest side in metres, 1e-4 to 1e4. Distances of the camera, paths of files and the
             height of a photograph are in metres where the size of the object is known, and in object sizes elsewhere.
         unit: of the coordinates of the object's file, "mm", "cm", "m" or "in", which gives it its size; by default
-            glTF is in metres, and of other files it is not known.
+            bundled objects and glTF have one, and of other files it is not known.
         settings: parameters to fix, e.g. ``{"camera.azimuth": 130.0}``. The size of a picture belongs to none of them
             but to what makes it: `resolution` of `attack`, `sweep`, `render` and `Scene.renderer`.
         camera: a camera file (docs/cameras.md), "fisheye" or "equirectangular", whose lens the camera around the object

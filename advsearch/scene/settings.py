@@ -23,7 +23,7 @@ class Parameter:
     Attributes:
         name: short name; `control.name` addresses it everywhere.
         shape: of its value; () for a number, None in a place that depends on the scene or a choice.
-        unit: "degrees", "object sizes", "sRGB", "stops", "name", ..., or "1".
+        unit: "degrees", "metres", "object sizes", "sRGB", "stops", "name", ..., or "1".
         low: smallest allowed value (0 for a choice among names).
         high: largest allowed value (number of names - 1 for a choice among names).
         default: the value that leaves the scene as it is, in words if it depends on the scene.
@@ -136,21 +136,21 @@ CAMERA = (
     ),
     _camera(
         "distance",
-        "object sizes",
+        "metres",
         1e-4,
         1e5,
         "fits the object",
-        "Distance to the object's middle; in metres where the object's size is known.",
+        "Distance to the object's middle; in object sizes where its size in metres is not known.",
         (0.8, 1.5),
         log=True,
     ),
     _camera(
         "height",
-        "object sizes",
+        "metres",
         -1e4,
         1e5,
         "as the elevation says",
-        "Height of the lens above the ground, in place of `elevation`; in metres where the object's size is known.",
+        "Height of the lens above the ground, in place of `elevation`; in object sizes as `distance`.",
     ),
     _camera("fov", "degrees", 1.0, 170.0, 35.0, "Field of view along the larger side of the picture."),
     Parameter(
@@ -167,6 +167,15 @@ EV = Parameter(
     "Absolute exposure in place of the metered one, in the avenue: 14 is for sun, 5 for lit streets.",
     estimators=(),
 )
+LAMPS = ("off", "low", "high")
+"""What the lamps of a car may be: with either beam its tail lamps shine too."""
+
+
+def _lamps(whose: str) -> Parameter:
+    text = f"Headlamps of {whose}, with its tail lamps: the low beam, or the high beam; in the avenue."
+    return Parameter("lamps", (), "name", 0.0, len(LAMPS) - 1.0, LAMPS[0], text, options=LAMPS, estimators=())
+
+
 ENVIRONMENT = (
     Parameter(
         "rotation",
@@ -209,20 +218,20 @@ GROUND = (
     Parameter(
         "height",
         (),
-        "object sizes",
+        "metres",
         1e-3,
         1000.0,
-        f"{PHOTOGRAPHED_FROM:g}, or 1.6 m",
-        "Height above the floor from which the photograph was taken; in metres where the object's size is known.",
+        f"1.6, or {PHOTOGRAPHED_FROM:g} object sizes",
+        "Height above the floor from which the photograph was taken; in object sizes as `camera.distance`.",
     ),
     Parameter(
         "radius",
         (),
-        "object sizes",
+        "metres",
         1e-3,
         1e5,
         "5 heights",
-        "How far from the photograph's camera its floor is empty; in metres where the object's size is known.",
+        "How far from the photograph's camera its floor is empty; in object sizes as `camera.distance`.",
     ),
 )
 MATERIAL = (
@@ -231,7 +240,10 @@ MATERIAL = (
     _surface("specular", "Strength of the reflection off what is not metal.", (0.0, 1.0)),
     _surface("clearcoat", "Strength of a clear coat on top.", (0.0, 1.0)),
 )
-FAMILIES = {"camera": (*CAMERA, EV), "pose": POSE, "environment": ENVIRONMENT, "ground": GROUND, "material": MATERIAL}
+FAMILIES = {
+    "camera": (*CAMERA, EV, _lamps("the car that the camera is in")), "pose": POSE, "environment": ENVIRONMENT,
+    "ground": GROUND, "material": MATERIAL, "object": (_lamps("the object, a car"),),
+}  # fmt: skip
 
 SETTINGS: Mapping[str, Parameter] = {
     f"{family}.{one.name}": one for family, parameters in FAMILIES.items() for one in parameters

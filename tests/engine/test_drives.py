@@ -88,7 +88,7 @@ def test_rates_of_one_drive_are_those_worked_out_by_hand(
 ) -> None:
     """Five frames in four seconds, from five distances away to one, with the camera as high as the object."""
     monkeypatch.setattr(swept_scene, "make_renderer", Timed)
-    (said,), _ = clocked(frames, **DRIVE, set={"camera.elevation": 0.0, "camera.distance": 1.0})
+    (said,), _ = clocked(frames, **DRIVE, size=1.0, set={"camera.elevation": 0.0, "camera.distance": 1.0})
     assert (said.drives, said.frames, said.seconds, said.never_seen) == (1, 5, 4.0, int(first is None))
     assert (said.right.mean, said.longest_gap.mean, said.flicker.mean) == pytest.approx((right, gap, flicker))
     assert said.right.interval is None and said.right.worst == said.right.mean
@@ -99,9 +99,9 @@ def test_rates_of_one_drive_are_those_worked_out_by_hand(
 def test_frames_of_a_drive_of_both_have_their_distances_and_workers_have_the_same(
     tmp_path: Path, workers: bool
 ) -> None:
-    """Level, from 2 sizes away: the camera comes from 4 times as far, the object from as far behind its place."""
+    """Level, from 2 metres away: the camera comes from 4 times as far, the object from as far behind its place."""
     config = SweepConfig(
-        object="mug", controls={"path": {"seconds": 4.0, "reach": 4.0}}, path="approach+approach", fps=1.0,
+        object="mug", size=1.0, controls={"path": {"seconds": 4.0, "reach": 4.0}}, path="approach+approach", fps=1.0,
         set_={"camera.elevation": 0.0, "camera.distance": 2.0}, resolution=16, spp=1, trials=0, batch=2,
     )  # fmt: skip
     job = job_of(config)
@@ -238,9 +238,7 @@ def test_the_longest_run() -> None:
 def test_no_frames_no_drives_and_settings_that_need_a_path() -> None:
     assert advsearch.sweep("mug", grid={"pose.yaw": [0, 90]}, **SMALL).summary.drives is None
     assert advsearch.sweep("mug", grid={"path.time": [3]}, **SMALL).summary.drives is None
-    with pytest.raises(
-        InputError, match="path: texture does not travel; add `over=path` beside it, or `controls=path`"
-    ):
+    with pytest.raises(InputError, match="path: the control texture does not move on a path; add `over=path`, or use"):
         advsearch.attack("mug", controls="texture", path="orbit")
 
 

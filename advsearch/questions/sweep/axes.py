@@ -63,12 +63,12 @@ def read_axes(grid: Mapping[str, object], controls: Sequence[Control]) -> tuple[
     for name, given in grid.items():
         axis = _read_axis(name, given, instances)
         if axis.name in found:
-            raise InputError(f"`grid` {name}: {axis.name} is an axis already; leave one of the two out")
+            raise InputError(f"`grid` {name}: {axis.name} is given twice; leave one of the two out")
         drawn = instances.get(axis.instance)
         if isinstance(drawn, NumberControl) and axis.parameter.name in drawn.specs:
             raise InputError(
-                f"`grid` {name}: `controls` {axis.instance} says what {axis.parameter.name} is already; leave it "
-                "out of one of the two"
+                f"`grid` {name}: `controls` {axis.instance} sets {axis.parameter.name} too; leave it out of one "
+                "of the two"
             )
         found[axis.name] = axis
     return tuple(found.values())
