@@ -38,6 +38,7 @@ class HardenConfig(AttackConfig):
     several: ClassVar[tuple[str, ...]] = ("object", "environment")
     without: ClassVar[tuple[str, ...]] = (
         "smallest", "ensemble", "printable", "aov", "metrics", "log", "target", "minimise", "over", "draws", "path",
+        "shutter", "rolling",
         "average", "baseline", "seconds", "camera", "up", "size", "unit", "label", "task", "measure", "estimators",
         "things", "judge",
     )
