@@ -216,6 +216,7 @@ def seen_by_rays(parts: dict[str, npt.NDArray[np.float64]], size: tuple[int, int
     return names
 
 
+BESIDE = "car@-1.5,3.5,heading=170,name=oncoming; person@3,-1.2"
 CAMERAS = [[14.0, -4.0, 2.5], [9.0, -1.0, 2.0], [7.0, 2.5, 1.5]]
 """Where a camera is at each second, metres from the middle of the car that it looks at: right of it, then before it."""
 
@@ -228,8 +229,8 @@ def driven(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     (folder / "way.csv").write_text("\n".join(["time,x,y,z", *rows]))
     advsearch.sweep(
         "car", "small_models:finds_cars", task={"name": "detection", "unit": "fractions"}, label="car", spp=1,
-        environment="street", things="car@-1.5,3.5,heading=170,name=oncoming; person@3,-1.2", path=str(folder / "way.csv"),
-        fps=1, resolution=(90, 120), denoise="none", trials=0, run=folder / "run", keep_pictures="none",
+        environment="street", things=BESIDE, path=str(folder / "way.csv"), fps=1,
+        resolution=(90, 120), denoise="none", trials=0, run=folder / "run", keep_pictures="none",
     )  # fmt: skip
     exported(folder / "run", folder / "out", "--all", code="small_models:finds_cars")
     return folder / "run", folder / "out"
@@ -237,9 +238,7 @@ def driven(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 
 def test_a_drive_has_every_thing_where_rays_meet_it(driven: tuple[Path, Path]) -> None:
     written = json.loads((driven[1] / "annotations.json").read_text())
-    scene = advsearch.load_scene(
-        "car", "street", things="car@-1.5,3.5,heading=170,name=oncoming; person@3,-1.2"
-    ).description
+    scene = advsearch.load_scene("car", "street", things=BESIDE).description
     triangles = {
         name: (part.mesh.vertices @ part.to_world[:3, :3].T + part.to_world[:3, 3])[part.mesh.faces]
         for name, part in scene.meshes.items()
