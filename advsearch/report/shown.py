@@ -125,7 +125,7 @@ def remarks_of(result: Result, given: ShownResult) -> list[str]:
     """Return what has to be known beside a result."""
     ending = getattr(result, "ending", "")
     unsaid = ending == INTERRUPTED and "nterrupted" not in given.said
-    stopped = ["Interrupted before its end."] if unsaid else []
+    stopped = ["Not finished: these are the results so far."] if unsaid else []
     stopped += ["It is running: this is what has come out so far."] if ending == RUNNING else []
     return [*stopped, *given.cautions, *getattr(result, "warnings", ())]
 

@@ -57,12 +57,12 @@ def claims_of(result: Result) -> list[Claim]:
     """Return what a run stands for; one that stands for nothing says so in a claim of that kind."""
     if result.goes_on:
         told = f"; so far: {result.brief}" if result.brief else ""
-        state = "is running" if getattr(result, "ending", "") == RUNNING else "was stopped before its end"
+        state = "is running" if getattr(result, "ending", "") == RUNNING else "is not finished"
         return [nothing_claimed(f"the run {state}{told}")]
     room = rooms.room(result.command)
     if room and room.claims:
         return list(room.claims(result)) or [nothing_claimed("nothing in this run came to its end")]
-    return [nothing_claimed(f"the command {result.command} measures something else than how often a model is right")]
+    return [nothing_claimed(f"the command {result.command} does not measure how often a model is right")]
 
 
 def photo_claims(photos: PhotoAgreement) -> list[Claim]:
@@ -328,7 +328,7 @@ def _run(folder: Path, criterion: float | None, exposure: Exposure) -> EvidenceR
             run=name,
             command=str(settings.get("command") or "unknown"),
             ending="none yet",
-            claims=[nothing_claimed("the run has no result; it is at work, or was stopped before its end")],
+            claims=[nothing_claimed("the run has no result yet: it is still working, or was stopped")],
             about={key: text for key, text in facts.items() if text},
             searched=[],
             measured={},
