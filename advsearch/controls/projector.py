@@ -10,10 +10,12 @@ light is a darker projector in an equally bright picture, as a camera that meter
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -34,6 +36,9 @@ from advsearch.scene.geometry import camera_axes, camera_to_world, middle
 from advsearch.scene.importing.pictures import read_picture
 from advsearch.scene.parts import ProjectorPart
 from advsearch.scene.settings import LIT, moving
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 BESIDE = 15.0
 """Degrees around the object between the camera and a projector that nobody has placed."""
@@ -188,6 +193,21 @@ class ProjectorControl(NumberControl):
         vertices = self.scene.base_vertices - middle(self.scene)
         reach = float(np.linalg.norm(vertices, axis=1).max()) * max(1.0, aspect) * self.scene.metres
         return min(math.degrees(2.0 * math.atan(reach / far)), 150.0)
+
+    @property
+    def ambient(self) -> float | None:
+        """Lux beside it; None where that is searched."""
+        slot = next(one for one in self.slots if one.parameter.name == "ambient")
+        return float(slot.spec.value) if isinstance(slot.spec, Fixed) else None
+
+    def in_light(self, times: float) -> Self:
+        """Return the bound control in so many times the ambient light."""
+        if self.ambient is None:
+            return self
+        there = copy.copy(self)
+        there.specs = {**self.specs, "ambient": Fixed(times * self.ambient)}
+        there.fit()
+        return there
 
     # ---- at a configuration ------------------------------------------------------------------------------------------
 
