@@ -50,6 +50,7 @@ GREY = 0.5
 class ProjectorControl(NumberControl):
     """A picture thrown onto the object: texels are searched unless a picture is given, numbers where they get a range."""
 
+    part: ProjectorPart
     kind = "projector"
     summary = "A picture that a projector throws onto the object."
     parameters = (
@@ -136,7 +137,7 @@ class ProjectorControl(NumberControl):
         return replace(parameter, unit="metres") if metres else parameter
 
     def size(self, parameter: Parameter) -> int:
-        return 3 * math.prod(self._part.sides) if parameter.shape else 1
+        return 3 * math.prod(self.part.sides) if parameter.shape else 1
 
     def default(self, parameter: Parameter) -> Number:
         if parameter.name == "pattern":
@@ -167,7 +168,7 @@ class ProjectorControl(NumberControl):
 
     def fit(self) -> None:
         parts = [one for one in self.scene.parts if isinstance(one, ProjectorPart) and one.name == self.name]
-        (self._part,) = parts
+        (self.part,) = parts
         self._picture = self._read()
         super().fit()
 
@@ -213,7 +214,7 @@ class ProjectorControl(NumberControl):
 
     def values(self, u: Tensor) -> dict[str, Tensor]:
         values, picture = super().values(u), self._picture
-        pattern = values["pattern"].reshape(*self._part.sides, 3) if picture is None else picture.to(u.device)
+        pattern = values["pattern"].reshape(*self.part.sides, 3) if picture is None else picture.to(u.device)
         rounded = pattern + (to_8_bit(pattern.detach()) - pattern.detach())  # a projector gets 8 bits
         return values | {"pattern": rounded}
 
@@ -231,7 +232,7 @@ class ProjectorControl(NumberControl):
 
     def _lux(self, values: Values) -> Tensor:
         """Illuminance () of a white picture where it meets the object's middle head-on."""
-        return values["lumens"] / (self._part.area * values["distance"].detach() ** 2)
+        return values["lumens"] / (self.part.area * values["distance"].detach() ** 2)
 
     def _beside(self, values: Values) -> Tensor:
         return self._lux(values) / values["ambient"]

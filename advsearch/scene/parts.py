@@ -198,9 +198,14 @@ class ProjectorPart(ScenePart):
     sides: tuple[int, int] = (2, 2)
 
     @property
+    def aspect(self) -> float:
+        """Width over height."""
+        return self.sides[1] / self.sides[0]
+
+    @property
     def area(self) -> float:
         """What it covers of a screen at distance 1."""
-        return 4.0 * math.tan(math.radians(self.fov) / 2.0) ** 2 * self.sides[0] / self.sides[1]
+        return 4.0 * math.tan(math.radians(self.fov) / 2.0) ** 2 / self.aspect
 
 
 @dataclass(frozen=True, eq=False)

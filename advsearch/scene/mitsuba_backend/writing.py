@@ -32,6 +32,7 @@ from advsearch.scene.parts import (
     PluginNumbers,
     PluginPart,
     PointLamp,
+    ProjectorPart,
     ScenePart,
     SpotLamp,
 )
@@ -173,6 +174,10 @@ def _part(part: ScenePart, left: Plugin) -> Plugin:
         plugin = translation(replace(part, **_triples(inputs))).plugins[part.name]
         if ball is not None:
             plugin["to_world"] = mi.ScalarTransform4f(ball)
+    elif isinstance(part, ProjectorPart):
+        plugin = translation(part).plugins[part.name]
+        plugin["to_world"] = mi.ScalarTransform4f(inputs.pop("pose"))
+        plugin["irradiance"] |= {"bitmap": mi.Bitmap(inputs.pop("pattern"))}
     elif isinstance(part, PluginPart):
         plugin = loadable(part.plugin)
     else:
