@@ -48,7 +48,7 @@ GREY = 0.5
 
 
 class ProjectorControl(NumberControl):
-    """A picture thrown onto the object: texels are searched unless a picture is given, numbers where they get a range."""
+    """A picture thrown onto the object: its texels are searched, and numbers where they get a range."""
 
     part: ProjectorPart
     kind = "projector"
@@ -113,7 +113,9 @@ class ProjectorControl(NumberControl):
         self._given["picture"] = self.chosen["picture"] = str(picture)
         beside = [one for one in ("pattern", "epsilon", "norm", "resolution", "aspect") if one in self._given]
         if beside:
-            raise InputError(f"{self.name}.{beside[0]}: expected none beside {self.name}.picture; leave one of them out")
+            raise InputError(
+                f"{self.name}.{beside[0]}: expected none beside {self.name}.picture; leave one of them out"
+            )
 
     # ---- in a scene -------------------------------------------------------------------------------------------------
 

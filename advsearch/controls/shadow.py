@@ -136,8 +136,10 @@ class ShadowControl(NumberControl):
         if far <= size:
             return True
         model, fov = self.scene.camera_model, so_far.get("camera.fov")
-        widest = 2.0 * math.atan(math.hypot(*model.tangents)) if model is not None else math.radians(
-            self.scene.number("camera.fov") if fov is None else float(fov.detach())
+        widest = (
+            2.0 * math.atan(math.hypot(*model.tangents))
+            if model is not None
+            else math.radians(self.scene.number("camera.fov") if fov is None else float(fov.detach()))
         )
         larger = math.tan(min(widest, 3.0) / 2.0)
         corner = math.atan(larger * math.hypot(1.0, min(self.scene.aspect, 1.0 / self.scene.aspect)))

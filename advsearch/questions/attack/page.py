@@ -16,7 +16,14 @@ import numpy as np
 from PIL import Image, ImageSequence
 
 from advsearch.questions.attack import wording
-from advsearch.questions.attack.display import ambient_part, failures_part, failures_text, most_predicted, range_text, shown
+from advsearch.questions.attack.display import (
+    ambient_part,
+    failures_part,
+    failures_text,
+    most_predicted,
+    range_text,
+    shown,
+)
 from advsearch.questions.attack.summary import AttackSummary, FoundValue, PicturedPrediction
 from advsearch.report.figures import search_axes
 from advsearch.report.shown import Picture, ResultPart

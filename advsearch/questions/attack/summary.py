@@ -264,7 +264,8 @@ class AttackSummary(SceneResult):
         default=None, description="[along a drive](drives.md), with `over` a path; absent without"
     )
     ambient: AmbientLight | None = Field(
-        default=None, description="with [a projector](light.md) that is found: how much other light it bears"
+        default=None,
+        description="with [a projector](controls/projector.md) that is found: how much other light it bears",
     )
     average: AverageCase | None = Field(default=None, description="only with `average`")
     smallest: SmallestEpsilon | None = Field(default=None, description="only with `smallest`")

@@ -374,9 +374,18 @@ class MitsubaScene:
             noise.set_samples_per_wavefront(spp)
             noise.seed(dr.opaque(mi.UInt32, seed), self.resolution[0] * self.resolution[1] * spp)
             part = name.partition(".")[0]
-            projector = next((one for one in self._scene.emitters() if one.id() == part and name.endswith(PATTERN)), None)
+            projector = next(
+                (one for one in self._scene.emitters() if one.id() == part and name.endswith(PATTERN)), None
+            )
             found = collect(
-                self._scene, self.parameters, key, noise, self.resolution, depth=self._depth, spp=spp, projector=projector
+                self._scene,
+                self.parameters,
+                key,
+                noise,
+                self.resolution,
+                depth=self._depth,
+                spp=spp,
+                projector=projector,
             )
             if projector is not None:  # its picture ends at the border, where lookups of a matrix go on
                 half = 0.5 / torch.tensor(self.parameters[key].shape[1::-1])

@@ -142,7 +142,9 @@ def collect(
         L = bounce.bsdf_value_em * bounce.em_weight + bounce.bsdf_weight * incoming
     vertices.reverse()
     if projector is not None:
-        vertices = [(uv, bounce.throughput * light, bounce.sharp) for bounce, (uv, light) in zip(bounces, lit, strict=True)]
+        vertices = [
+            (uv, bounce.throughput * light, bounce.sharp) for bounce, (uv, light) in zip(bounces, lit, strict=True)
+        ]
     L = dr.select(dr.isfinite(L), L, 0.0)
 
     every = dr.full(mi.Bool, True, height * width * spp)
