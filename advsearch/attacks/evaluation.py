@@ -16,6 +16,7 @@ from torch import Tensor
 from advsearch.attacks.domain import Distribution, Domain
 from advsearch.copies import hand_copies
 from advsearch.described import Value
+from advsearch.errors import InputError
 from advsearch.seeds import stream
 from advsearch.tasks import Judgement
 
@@ -227,6 +228,8 @@ class Policy(ABC, Generic[State]):
 
     def __init_subclass__(cls, **more: Any) -> None:
         super().__init_subclass__(**more)
+        if "answer" in vars(cls):
+            raise InputError(f"policy {cls.__name__}: `answer` is called `distribution` now; rename it")
         hand_copies(cls, start=slice(1), update=slice(1, None))
 
     @property

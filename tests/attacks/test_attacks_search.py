@@ -661,3 +661,8 @@ def test_a_clear_decision_takes_no_look_more_and_a_close_one_is_settled() -> Non
     assert right[20] > right[0] + 3 and right[20] >= 45
     found = search(noisy(3), DOMAIN, script, steps=2, seed=0, close=20)
     assert found.renders <= planned_renders(2, close=20) and len({r.seed for r in found.ranking}) >= 2
+
+
+def test_the_former_name_of_a_policys_distribution_is_refused() -> None:
+    with pytest.raises(InputError, match="policy Mine: `answer` is called `distribution` now"):
+        type("Mine", (Policy,), {"answer": lambda self, state: None})

@@ -26,7 +26,6 @@ from advsearch.questions.attack.parts import executor_for, problem_of
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.harden import carry_out as hardening
 from advsearch.questions.harden import harden as asked
-from advsearch.questions.harden import result as harden_answer
 from advsearch.questions.harden import scenes as harden_scenes
 from advsearch.questions.harden.lessons import Lesson, RenderedLesson, TextureLesson
 from advsearch.questions.harden.result import QUICK, HardenConfig
@@ -54,8 +53,8 @@ def attacks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[tuple[str, 
 
     monkeypatch.setattr(harden_scenes, "attacked", attacked)
     monkeypatch.setattr(harden_scenes, "CLEAN_SCENES", 1)
-    monkeypatch.setattr(harden_answer, "PLAIN_SCENES", 1)
-    monkeypatch.setattr(harden_answer, "RENDERED_SCENES", 2)
+    monkeypatch.setattr(hardening, "PLAIN_SCENES", 1)
+    monkeypatch.setattr(hardening, "RENDERED_SCENES", 2)
     return done
 
 
