@@ -3,6 +3,7 @@
     python benchmarks/light.py gradients [--size 64]
     python benchmarks/light.py step [--object mug] [--environment studio] [--model reference] [--label mug]
     python benchmarks/light.py sign --model ssd.pt2 --labels ssd.labels.json [--lumens 3000] [--steps 60]
+    python benchmarks/light.py shadow --object bowl --environment sky --steps 150
 
 - `gradients`: derivatives by the adjoint along smooth patterns beside central differences with other seeds and four
   times the samples: the cosine of both, and the ratio of their lengths.
@@ -10,6 +11,7 @@
   same attack by both, in seconds, with the verified margin.
 - `sign`: a detector that no longer finds a stop sign at dusk under a projector 5 m away: verified, random beside it,
   and in which ambient light it ends. The model is not part of this repository.
+- `shadow`: an object under a clear sky, or in an environment, that a model gets wrong in a shadow; random beside it.
 """
 
 from __future__ import annotations
@@ -18,8 +20,10 @@ import argparse
 import time
 from typing import Any
 
+import numpy as np
 import torch
 import torch.nn.functional as F
+from PIL import Image
 from torch import Tensor
 
 from advsearch import threads
@@ -30,12 +34,16 @@ import transport  # noqa: E402
 
 import advsearch  # noqa: E402
 from advsearch.controls import make_control  # noqa: E402
+from advsearch.questions.attack.result import AttackResult  # noqa: E402
+from advsearch.runs.images import to_8bit  # noqa: E402
 from advsearch.scene.renderer import Renderer  # noqa: E402
 
 SCENES = (("mug", "studio"), ("bowl", "kitchen"), ("bottle", "noon"), ("stop-sign", "avenue-dusk"), ("car", "street"))
 SIDE = 64
 """Texels along the pattern."""
 DIRECTIONS, SEEDS, SPP = 8, 4, 64
+CARD = {"size": [0, 1], "distance": 1, "x": [-0.6, 0.6], "y": [-0.6, 0.6], "turn": [0, 360], "radii": [0.1, 1]}
+SKY = {"elevation": 30, "azimuth": 20, "turbidity": 2}
 SIGN = {"camera.azimuth": 10.0, "camera.height": 1.4, "camera.distance": 5.0, "camera.fov": 25.0}
 GREY: dict[str, Any] = {"start": "grey", "lumens": 100}
 
@@ -43,7 +51,7 @@ GREY: dict[str, Any] = {"start": "grey", "lumens": 100}
 def main() -> None:
     """Print what was asked for."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("part", choices=("gradients", "step", "sign"))
+    parser.add_argument("part", choices=("gradients", "step", "sign", "shadow"))
     parser.add_argument("--object", default="mug")
     parser.add_argument("--environment", default="studio")
     parser.add_argument("--model", default="reference")
@@ -53,6 +61,7 @@ def main() -> None:
     parser.add_argument("--lumens", type=float, default=3000.0)
     parser.add_argument("--steps", type=int, default=60)
     parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--picture", help="file for the pictures of the sign, side by side")
     args = parser.parse_args()
     if args.part == "gradients":
         for object, environment in SCENES:
@@ -61,8 +70,10 @@ def main() -> None:
             print(f"{object:10s} {environment:12s} cosine {cosine:.4f}, length {ratio:.3f}", flush=True)
     elif args.part == "step":
         step(args)
-    else:
+    elif args.part == "sign":
         sign(args)
+    else:
+        shadow(args)
 
 
 def smooth(seed: int) -> Tensor:
@@ -127,10 +138,38 @@ def sign(args: argparse.Namespace) -> None:
     )
     summary = result.summary
     print(f"{args.lumens:g} lumens: {summary.ending}, {summary.brief}; random search {summary.baseline}")
+    if args.picture:
+        strip(result).save(args.picture, optimize=True)
     if summary.ambient is not None:
         for point in summary.ambient.points:
             print(f"  {point.lux:8.3g} lux: {point.verified.successes} of {point.verified.trials}")
         print(f"  up to {summary.ambient.holds_to:.3g} lux, not at {summary.ambient.ends_at} lux")
+
+
+def shadow(args: argparse.Namespace) -> None:
+    """Print what a model sees of an object in a shadow."""
+    sky = args.environment == "sky"
+    low = {"environment.rotation": -30.0} if args.environment == "low-sun" else {}
+    result = advsearch.attack(
+        advsearch.load_scene(args.object, None if sky else args.environment, settings=low),
+        advsearch.load_model(args.model, labels=args.labels),
+        controls={"shadow": CARD, **({"sky": SKY} if sky else {})},
+        label=args.label.split(",") if args.model != "reference" else None,
+        resolution=96 if args.model == "reference" else None,
+        steps=args.steps,
+    )
+    summary = result.summary
+    labels = None if summary.verified is None else summary.verified.labels
+    print(f"{args.object}, {args.environment}: {summary.ending}, {summary.brief} {labels}; random {summary.baseline}")
+
+
+def strip(result: AttackResult) -> Image.Image:
+    """Return the clean scene, the adversarial one and the pattern side by side."""
+    side = len(result.clean)
+    gap = np.full((side, 6, 3), 255, np.uint8)
+    pattern = Image.fromarray(to_8bit(result.artifacts["projector"])).resize((side, side), Image.Resampling.NEAREST)
+    parts = [to_8bit(result.clean), gap, to_8bit(result.adversarial), gap, np.asarray(pattern)]
+    return Image.fromarray(np.concatenate(parts, axis=1)).quantize(96)  # noise makes a large file otherwise
 
 
 if __name__ == "__main__":
