@@ -16,7 +16,7 @@ from typing import Any, ClassVar, Literal
 from pydantic import JsonValue, field_validator, model_validator
 
 from advsearch import rooms
-from advsearch.errors import InputError
+from advsearch.errors import FileFormatError, InputError
 from advsearch.files import MESHES, either
 from advsearch.options import JOINED, by_key, things_as_text
 from advsearch.settings import (
@@ -72,6 +72,11 @@ def read_joined(value: Any, setting: str, otherwise: str) -> Any:
     return read_named({**{k: v for k, v in options.items() if v}, "name": JOINED.join(names)}, setting, otherwise)
 
 
+def has_address(model: str) -> bool:
+    """Whether a model's name is an address, or names one among several."""
+    return any(re.match("https?:", name, re.IGNORECASE) for name in split_names(model))
+
+
 def name_in(named: str | Mapping[str, object]) -> str:
     """Return the name in what `read_named` returns."""
     return named if isinstance(named, str) else str(named["name"])
@@ -89,6 +94,11 @@ TEXTS = (*SEVERAL, "task", "up", "camera", "run", "objective")
 ControlsByName = dict[str, dict[str, object]]
 """Controls as they are asked for: their names, each with its settings."""
 
+LARGE = ("car", "person", "stop-sign")
+"""The bundled objects around which lengths were in metres in files of schema 1."""
+LENGTHS = frozenset({"camera.distance", "camera.height", "camera.focus", "ground.height", "ground.radius", "path"})
+"""What is in metres, and was in object sizes around all others."""
+
 SEARCH_SPP = {"oidn": 8, "none": 16}
 """Samples a pixel of a search that asks for none. `benchmarks/formation.py` shows the noise that is left at each."""
 
@@ -104,6 +114,7 @@ class SceneConfig(Config):
     A file is looked for relative to the current directory. None means "choose for me", and the description says how.
     """
 
+    free: ClassVar[tuple[str, ...]] = (*Config.free, "ask")
     several: ClassVar[tuple[str, ...]] = ()
     """Which of object, environment and model may be several, separated by commas."""
     # fmt: off
@@ -131,7 +142,8 @@ class SceneConfig(Config):
     )
     size: float | None = setting(
         None, "scene", "how large the object is: its longest side; distances are then in metres",
-        "a number of metres from 1e-4 to 1e4", otherwise="as its file says: glTF is in metres", ge=1e-4, le=1e4,
+        "a number of metres from 1e-4 to 1e4", otherwise="as bundled, or as its file says: glTF is in metres", ge=1e-4,
+        le=1e4,
     )
     unit: Literal["mm", "cm", "m", "in"] | None = setting(
         None, "scene", "unit of the coordinates of the object's file, which says how large it is",
@@ -169,8 +181,8 @@ class SceneConfig(Config):
 
     model: str = setting(
         "reference", "model", "the network under test",
-        "reference, a .pt2, TorchScript or .onnx file, torchvision:NAME, timm:NAME, hf:REPOSITORY, or "
-        "package.module:callable",
+        "reference, a .pt2, TorchScript or .onnx file, torchvision:NAME, timm:NAME, hf:REPOSITORY, an address such as "
+        "http://localhost:8000, or package.module:callable",
     )
     labels: str | None = setting(
         None, "model", "names of the model's classes",
@@ -184,6 +196,12 @@ class SceneConfig(Config):
         "each label; for a model such as LLaVA the question",
         "a text, for CLIP with {} where the name goes, or several with | between them",
         otherwise="a photo of a {}, or What is this?", metavar="TEXT",
+    )
+    ask: dict[str, float] = setting(
+        dict, "model",
+        "a limit for a model behind an address, such as calls=500: calls (2000), tokens and money of a run, seconds of "
+        "an answer (120), and the prices per_call, per_million_in and per_million_out; may be repeated",
+        "LIMIT=NUMBER", metavar="LIMIT=NUMBER", form="assignments",
     )
     task: str | dict[str, JsonValue] = setting(
         "classification", "model",
@@ -247,6 +265,19 @@ class SceneConfig(Config):
         if self.size is not None and len(self.objects) > 1:
             raise InputError("size: it is the size of one object, and there are several; leave it out, or give `unit`")
         return self
+
+    def check_older(self, path: str | Path) -> None:
+        given = {**self.controls, **getattr(self, "over", {})}
+        named = {*self.set_, *getattr(self, "grid", {})}
+        named |= {f"{one.get('kind', name)}.{parameter}" for name, one in given.items() for parameter in one}
+        if ".csv" in str((given, getattr(self, "path", None))):
+            named.add("path")
+        small = [name for name in self.objects if name not in LARGE and not re.search(r"[./\\#]", name)]
+        if self.size is None and small and (lengths := sorted(named & LENGTHS)):
+            raise FileFormatError(
+                f"{path}: its {lengths[0]} is in sizes of the {small[0]}, which has a size in metres now; write it in "
+                "metres (or as camera.sizes) and `schema: 2`, or keep the numbers with size=1"
+            )
 
     @property
     def title(self) -> tuple[str, ...]:

@@ -71,6 +71,13 @@ def opened(path: Path, limit: int) -> Iterator[Image.Image]:
         raise FileFormatError(f"{path}: expected a picture file such as PNG, got {reason}; check the path") from error
 
 
+def png_of(levels: npt.NDArray[np.uint8]) -> bytes:
+    """Return a PNG file of levels (H, W, 3)."""
+    file = io.BytesIO()
+    Image.fromarray(levels).save(file, "PNG")
+    return file.getvalue()
+
+
 def upright(path: Path, side: int) -> npt.NDArray[np.float32]:
     """Read a picture as a viewer shows it.
 

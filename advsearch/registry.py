@@ -112,7 +112,7 @@ _ALLOWED: set[str] = set()
 """The Python code, and the models of libraries, that whoever uses this process has named. Of the process, so that it
 holds in every thread; empty at first, so that what only a file names is refused, whoever reads that file."""
 
-_CODE = re.compile(r"[^\W\d][\w.]*:[^\W\d][\w.]*|(?:hf|timm|torchvision):\S+")
+_CODE = re.compile(r"[^\W\d][\w.]*:[^\W\d][\w.]*|(?:hf|timm|torchvision|https?):\S+")
 
 
 def allow_code(*names: str) -> None:
@@ -120,7 +120,8 @@ def allow_code(*names: str) -> None:
 
     Args:
         names: "package.module:attribute", each as it stands in the file, without weights behind an @; or a model of a
-            library, "hf:OWNER/NAME", whose weights may then be fetched.
+            library, "hf:OWNER/NAME", whose weights may then be fetched; or a model's address, "https://...", to which
+            pictures may then be sent.
 
     Raises:
         InputError: a name is none of this form.

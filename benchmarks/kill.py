@@ -24,7 +24,7 @@ from advsearch.runs.store import NAME, Row, Store
 TEXTURE = ["--control", "texture", "--steps", "60", "--trials", "30", "--verify-spp", "32", "--deterministic"]
 POSE = ["--control", "pose", "--policy", "nes", "--steps", "120", "--average", "60", "--trials", "30", "--spp", "2"]
 VERDICT = ["--control", "texture", "--steps", "20", "--epsilon", "0.02", "--deterministic"]
-VIEWS = [f"--grid=camera.{values}" for values in ("azimuth=0:360:40", "elevation=5:60:10", "distance=2:5:5")]
+VIEWS = [f"--grid=camera.{values}" for values in ("azimuth=0:360:40", "elevation=5:60:10", "sizes=2:5:5")]
 DRIVE = ["sweep", "--path", "approach+orbit", "--fps", "4", "--grid", "environment.rotation=0,120,240"]
 DRIVE += ["--trials", "0", "--control", "sensor={shot: [0, 0.1]}", "--samples", "3", "--threads", "1"]
 OVER = ["attack", *TEXTURE, "--over", "path", "--path", "approach"]

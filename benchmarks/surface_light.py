@@ -160,7 +160,7 @@ def swept(scene: str, rows: int, label: str | None) -> None:
     grid = {
         "camera.azimuth": f"0:360:{max(2, rows // 50)}",
         "camera.elevation": "5:60:10",
-        "camera.distance": "2:5:5",
+        "camera.sizes": "2:5:5",
     }
     config = SweepConfig(object=thing, environment=environment or "studio", label=label, grid=grid, trials=0)
     sweeps = [config, *(config.model_copy(update={"specialise": False, "seed": seed}) for seed in (0, 1))]

@@ -37,9 +37,8 @@ def object_files(family: ObjectFamily) -> dict[str, bytes]:
         if asset.mesh.rig is None
         else "scenes/person.py, of MakeHuman's data (CC0 1.0)",
         "triangles": len(asset.mesh.faces),
+        "metres": asset.metres,
     }
-    if asset.metres is not None:
-        facts["metres"] = asset.metres
     if asset.finishes:
         facts["finishes"] = {name: asdict(one) for name, one in asset.finishes.items()}
         facts["faces"] = _runs(asset.mesh)

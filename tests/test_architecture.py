@@ -192,8 +192,8 @@ def test_rooms_import_only_what_they_may() -> None:
     assert sorted(broken_rules()) == []
 
 
-LIGHT = {"settings", "summary", "answer", "wording", "figures", "page"}
-"""What a room has for those who only read or show an answer."""
+LIGHT = {"settings", "summary", "result", "wording", "figures", "page"}
+"""What a room has for those who only read or show a result."""
 
 BASES = ("attack", "sweep")
 """The questions that others stand on, each on those before it."""
@@ -239,7 +239,7 @@ def test_a_result_is_read_and_shown_without_what_renders() -> None:
     broken = [
         f"{path.relative_to(ROOT)} imports {name}"
         for question, module, path, names in questions()
-        if module in LIGHT
+        if module in LIGHT and (question not in BASES or module != "result")  # theirs are what Python gets
         for name in names
         if name.startswith(heavy) or name.endswith(".carry_out")
     ]

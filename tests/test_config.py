@@ -7,6 +7,7 @@ import math
 import shlex
 import subprocess
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -49,11 +50,12 @@ WRONG: dict[str, tuple[Any, str]] = {
     "resolution": ("4x4", "expected SIDE or HEIGHTxWIDTH, each from 8 to 4096, got 4x4"),
     "model": (
         "a\0b",
-        "expected reference, a .pt2, TorchScript or .onnx file, torchvision:NAME, timm:NAME, hf:REPOSITORY, "
-        "or package.module:callable",
+        "expected reference, a .pt2, TorchScript or .onnx file, torchvision:NAME, timm:NAME, hf:REPOSITORY, an address "
+        "such as http://localhost:8000, or package.module:callable",
     ),
     "labels": (["tench, Tinca tinca", "goldfish"], "expected a JSON or text file, imagenet, "),
     "prompt": ("a photo of a {} | ", "expected a text, for CLIP with {} where the name goes, or several with |"),
+    "ask": ({"calls": "many"}, "expected LIMIT=NUMBER, got calls=many"),
     "task": ("  ", "expected the name of a task, or NAME={OPTION: VALUE}, got '  '"),
     "label": ("  ", "expected names of classes or their numbers, such as \"coffee mug,cup\" or #504, got '  '"),
     "controls": (
@@ -104,7 +106,8 @@ GIVEN: dict[str, Any] = {
     "things": "car@1,2", "judge": "car",
     "set": {"camera.azimuth": 130.0, "camera.target": (0.0, 0.5, 1.0), "material": "felt"},
     "exposure": -1.5, "resolution": (96, 128), "model": "net.pt2,other.pt2", "ensemble": "mean",
-    "labels": "labels.json", "prompt": "a photo of a {}", "task": "detection", "label": "coffee mug,cup",
+    "labels": "labels.json", "prompt": "a photo of a {}", "ask": {"calls": 5.0}, "task": "detection",
+    "label": "coffee mug,cup",
     "controls": {"texture": {}, "pose": {"yaw": [0, 90]}}, "epsilon": {"texture": 0.03, "pose": 2.0},
     "seconds": 20.0, "target": "bowl", "minimise": False, "smallest": False, "over": {"camera": {}}, "draws": 2,
     "path": "orbit",
@@ -394,7 +397,31 @@ def test_yaml_round_trip_of_everything(tmp_path: Path) -> None:
     path = tmp_path / "run.yaml"
     path.write_text(config.to_yaml())
     assert AttackConfig.from_yaml(path, {one.name: one.value for one in config.powers}) == config
-    assert read_yaml(path)["schema"] == 1 and read_yaml(path)["command"] == "attack"
+    assert read_yaml(path)["schema"] == 2 and read_yaml(path)["command"] == "attack"
+
+
+@pytest.mark.parametrize(
+    ("text", "refused"),
+    [
+        ("schema: 1\nobject: mug\nset: {camera.distance: 2}\n", "camera.distance is in sizes of the mug"),
+        ("schema: 1\nobject: mug\ncontrols: {far: {kind: camera, distance: [2, 4]}}\n", "camera.distance is in sizes"),
+        ("schema: 1\nobject: mug\ncontrols: {path: {path: way.csv}}\n", "path is in sizes of the mug"),
+        ("schema: 1\nobject: mug\nsize: 1\nset: {camera.distance: 2}\n", ""),
+        ("schema: 1\nobject: mug\ncontrols: {camera: {azimuth: [0, 90]}}\n", ""),
+        ("schema: 1\nobject: car\nset: {camera.distance: 20}\n", ""),
+        ("schema: 1\nobject: a/mug.obj\nset: {camera.distance: 2}\n", ""),
+        ("schema: 2\nobject: mug\nset: {camera.distance: 0.3}\n", ""),
+        ("object: mug\nset: {camera.distance: 0.3}\n", ""),
+    ],
+)
+def test_lengths_of_an_older_file_are_refused_where_they_meant_something_else(
+    tmp_path: Path, text: str, refused: str
+) -> None:
+    file = tmp_path / "run.yaml"
+    file.write_text(text)
+    with pytest.raises(FileFormatError, match=f"{refused}.*size=1") if refused else nullcontext():
+        AttackConfig.from_yaml(file)
+    assert AttackConfig.from_yaml(file, {"size": 1.0}).size == 1.0
 
 
 def test_the_command_line_says_the_same() -> None:
@@ -429,7 +456,7 @@ def test_any_values_go_round(
         ("- a\n", r"study\.yaml: expected settings and values such as 'object: mug', got list"),
         ("1: 2\n", r"study\.yaml: expected settings and values such as 'object: mug', got dict"),
         ("a: [1,\n", r"study\.yaml: expected YAML, got .*line 2"),
-        ("schema: 7\nobject: mug\n", r"study\.yaml: expected schema 1, got 7; it is of another advsearch"),
+        ("schema: 7\nobject: mug\n", r"study\.yaml: expected schema 2, got 7; it is of another advsearch"),
         (
             "object: mug\nepsilon: yes\n",
             r"study\.yaml: epsilon: expected a number greater than 0 and at most 1e\+06, got True",

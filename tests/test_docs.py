@@ -10,10 +10,12 @@ import shlex
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from xml.etree import ElementTree
 
 import check_docs
+import numpy as np
 import pytest
 import reference_calibration as calibration
 import torch
@@ -33,6 +35,7 @@ from advsearch.cli.export import WRITERS
 from advsearch.cli.flags import config_from
 from advsearch.cli.main import _parse
 from advsearch.config import CONFIGS, RenderConfig, SceneConfig
+from advsearch.engine.acceptance import compared, view_of
 from advsearch.engine.loading import as_controls
 from advsearch.engine.naming import check_run_settings, given_to
 from advsearch.files import MESHES
@@ -50,6 +53,8 @@ from advsearch.questions.sweep.axes import read_axes
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.questions.test.settings import SuiteConfig, read_suite
 from advsearch.runs import export
+from advsearch.runs.directory import RunDirectory
+from advsearch.runs.store import Row
 from advsearch.scene import environments, library
 from advsearch.scene.importing.scenes import MITSUBA_FILE, split_node
 from advsearch.scene.settings import resolve
@@ -146,7 +151,7 @@ def check_names(config: Config) -> None:
         assert config.recipe in ("list", "mine.yaml") or planned(read_recipe(config.recipe), config)
         return
     assert isinstance(config, SceneConfig)
-    check_run_settings(config)
+    check_run_settings(config.model_copy(update={"path": None}) if config.command == "sweep" else config)
     given_to(config, config.controls)
     resolve(config.set_)
     lights = config.environments if isinstance(config, SweepConfig) else (config.lit_by,)
@@ -287,6 +292,44 @@ def test_the_page_about_losses_of_ones_own_runs(monkeypatch: pytest.MonkeyPatch)
         endings += [names["result"].summary.ending] if "result" in names else []
     assert len(endings) == 7 and not {"already wrong"} & {*endings}
     assert names["wrong"] and float(names["u"].grad.abs().max()) > 0.0 and float(names["derivative"].abs().max()) > 0.0
+
+
+def code_with(page: str, word: str) -> dict[str, Any]:
+    """Run the only Python block of a page that has a word, and return its names."""
+    (block,) = [one for one in blocks(DOCS / page, "python") if word in one]
+    names: dict[str, Any] = {"__name__": "of_the_page"}
+    exec(compile(block, page, "exec"), names)
+    return names
+
+
+@pytest.mark.docs
+def test_the_question_that_renders_of_the_design_asks_a_problem() -> None:
+    config = AttackConfig(object="mug", controls="pose", resolution=32, denoise="none")
+    assert code_with("design.md", "problem_from_config")["right"](SimpleNamespace(config=config)) in (True, False)
+
+
+@pytest.mark.docs
+def test_the_predictor_of_the_page_is_as_good_as_a_render() -> None:
+    renderer = advsearch.load_scene("mug").renderer({"environment": {"exposure": [-2, 0]}}, resolution=32)
+    predictor = code_with("development.md", "Predictor")["Dimmed"](renderer, renderer.start, seed=1)
+    u = torch.tensor([0.2], requires_grad=True)
+    picture = predictor(u)
+    picture.mean().backward()
+    assert u.grad is not None and float(u.grad) > 0.0
+    still = u.detach()
+    deviation = compared(lambda view: view_of(renderer, picture.detach(), still, view, 16, lambda *_: 0.0))
+    assert deviation.good, deviation.reason
+
+
+@pytest.mark.docs
+def test_the_export_of_the_page_writes_a_file(tmp_path: Path) -> None:
+    with RunDirectory.create(str(tmp_path / "run")) as run:
+        run.write_config(AttackConfig(object="mug", controls="pose"))
+        run.record(Row("search", 0, score=0.5), Row("search", 1, score=0.25))
+    write = code_with("development.md", "Writer(")["_npz"]
+    told, text = write(SimpleNamespace(run=str(run.path), kind=None), tmp_path / "scores.npz")
+    assert told == {"rows": 2} and text.startswith("2 scores")
+    assert np.load(tmp_path / "scores.npz")["scores"].tolist() == [0.5, 0.25]
 
 
 # ---- the scripts ----------------------------------------------------------------------------------------------------

@@ -36,7 +36,7 @@ CLOSE = 0.01
 """Mean difference of two pictures with the same noise up to which they show the same: a value that a row names is
 rounded, so that single light paths may go another way."""
 
-GRID = {"camera.distance": [1.6, 2.6]}
+GRID = {"camera.sizes": [1.6, 2.6]}
 """What varies beside a pair, unless it is the camera."""
 
 FORMS: dict[str, dict[str, Any]] = {
@@ -212,7 +212,7 @@ def test_a_row_of_an_attack_is_true_of_its_own_picture(pair: tuple[str, ...]) ->
 
 def test_an_occluder_is_described_under_the_conditions_of_its_own_draw() -> None:
     config = AttackConfig(
-        object="mug", controls={"occlusion": {"coverage": [0.2, 0.4]}}, over={"camera": {"distance": [1, 5]}},
+        object="mug", controls={"occlusion": {"coverage": [0.2, 0.4]}}, over={"camera": {"sizes": [1, 5]}},
         resolution=SIZE, measure="no",
     )  # fmt: skip
     problem, _ = problem_from_config(config)
@@ -220,7 +220,7 @@ def test_an_occluder_is_described_under_the_conditions_of_its_own_draw() -> None
     seen = set()
     for seed in (3, 4):
         said = {**problem.describe(u, seed), **problem.conditions_of(u, seed)}
-        camera = make_control("camera", {"distance": said["camera.distance"]["value"]})
+        camera = make_control("camera", {"sizes": said["camera.sizes"]["value"]})
         alone = describe("mug")
         occlusion = make_control("occlusion", {"coverage": [0.2, 0.4]})
         space = make_space([occlusion, camera], alone)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import inspect
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, TypedDict
@@ -111,6 +111,7 @@ class ModelKeywords(TypedDict, total=False):
     channels: str | None
     max_batch: int | None
     read: Read | None
+    ask: Mapping[str, float] | None
 
 
 def load_model(

@@ -139,7 +139,7 @@ def _check_rivals(members_: Tensor, setting: str) -> None:
     if classes - size < 2:
         raise InputError(
             f"`objective` dlr: expected at least 2 classes beside the {size} of `{setting}`, got {classes - size}; "
-            "without their scale, two logits say no more than which is larger: use `objective=margin`"
+            "its ratio needs a third logit: use `objective=margin`"
         )
 
 

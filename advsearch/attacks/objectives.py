@@ -60,7 +60,7 @@ class Objective(Protocol):
 
 def nothing_more(name: str) -> Any:
     """Refuse what is asked for where there is no configuration."""
-    raise InputError(f"objective: asks for `{name}`, and there is no configuration here; pass `more`, which gives it")
+    raise InputError(f"objective: asks for `{name}`, and no configuration was given; pass `more`, which gives it")
 
 
 @dataclass(frozen=True)
@@ -436,8 +436,8 @@ def check_objective(
     if not kind.fits(task):
         fitting = [name for name, one in OBJECTIVE_KINDS.items() if one.fits(task)]
         raise InputError(
-            f"objective: expected one of task {task} ({', '.join(fitting)}), got {kind.name}, which takes outputs of "
-            f"{kind.task}"
+            f"objective: expected an objective of task {task} ({', '.join(fitting)}), got {kind.name}, which takes "
+            f"outputs of {kind.task}"
         )
     if kind.needs_features and (targeted or minimise):
         setting, reason = "minimise", "it is least at the start already"

@@ -178,7 +178,7 @@ def _export(args: argparse.Namespace) -> int:
     endings = {one.ending or format: format for format, one in WRITERS.items()}
     format = args.format or endings.get(by_name, by_name)
     if format == "fiftyone":
-        raise InputError("--format: fiftyone is gone, as FiftyOne reads COCO; say --format coco")
+        raise InputError("--format: fiftyone was removed, since FiftyOne reads COCO; use --format coco")
     if args.format and format not in (*WRITERS, *FORMATS):
         raise UnknownNameError("format", format, (*WRITERS, *FORMATS))
     of = {"all": ("coco", "yolo"), **dict.fromkeys(("size", "sheets", "paper", "icc"), ("print",))}
@@ -190,7 +190,7 @@ def _export(args: argparse.Namespace) -> int:
     if out is None:
         raise InputError(f"--out: {format} writes {WRITERS[format].writes}; give its name")
     if args.kind is not None and format != "3db":
-        raise InputError("--kind: belongs to tables of rows; leave it out")
+        raise InputError("--kind: is only for tables of rows; leave it out")
     told, text = WRITERS[format].write(args, out)
     if args.json:
         output.print_json({"schema": 1, "command": "export", "format": format, **told, "out": str(out)})

@@ -91,7 +91,7 @@ def _resume(args: argparse.Namespace) -> int:
         return show_run(str(path), args.json)
     if only := only_here(path):
         raise InputError(
-            f"{path}: cannot go on from here: {', '.join(only)} existed only in the Python session that asked; call "
+            f"{path}: cannot resume from here: {', '.join(only)} existed only in the Python session of the run; call "
             "the same function with the same arguments again, an attack with `resume=True`"
         )
     return run_file(command, path / CONFIG, changes, args, resumed=path)

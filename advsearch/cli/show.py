@@ -48,7 +48,7 @@ def _show_arguments(parser: argparse.ArgumentParser) -> None:
 def _show(args: argparse.Namespace) -> int:
     """Print the result of a run, a control's parameters, or the options of a policy or a task."""
     if args.picture and (args.json or len(args.what) > 1):
-        raise InputError("--picture: draws a run's pictures beside its result in words; leave out the rest")
+        raise InputError("--picture: draws the pictures of one run, after its text; give one run, and leave --json out")
     match args.what:
         case ["control", name]:
             return _show_control(name, args.json)
@@ -68,7 +68,7 @@ def _show(args: argparse.Namespace) -> int:
                 return show_run(name, args.json, picture=args.picture)
             except UnknownNameError as error:
                 raise InputError(
-                    f"{error} Of anything else say what it is, as in: advsearch show control pose"
+                    f"{error} For anything but a run, put its kind before the name, as in: advsearch show control pose"
                 ) from None
     kinds = "control NAME, policy NAME, task NAME, recipe NAME"
     raise InputError(f"expected the name of a run, or one of {kinds}, got {' '.join(args.what)!r}")
@@ -133,7 +133,7 @@ def _show_unfinished(run: Listed, as_json: bool) -> int:
     elif run.state == "stopped":
         lines += [
             "",
-            "It was stopped before its settings were written, so there is nothing to go on with; start again.",
+            "It was stopped before its settings were written, so it can't be resumed; start again.",
         ]
     print("\n".join(lines))
     return 0

@@ -33,8 +33,10 @@ SENSOR_WIDTH = 36.0
 """Width in millimetres of the full-frame sensor that a focal length refers to."""
 
 
-def _lens(name: str, low: float, high: float, default: float | str, text: str, log: bool = False) -> Parameter:
-    return Parameter(name, (), "object sizes", low, high, default, text, log=log, estimators=ORBIT)
+def _lens(
+    name: str, unit: str, low: float, high: float, default: float | str, text: str, log: bool = False
+) -> Parameter:
+    return Parameter(name, (), unit, low, high, default, text, log=log, estimators=ORBIT)
 
 
 def _coefficient(name: str) -> Parameter:
@@ -50,10 +52,11 @@ class CameraControl(NumberControl):
     parameters = (
         *CAMERA[:-1],
         moving(ORBIT, "focal_length", "mm", 1.5, 2100.0, "as fov", "The same for a sensor 36 mm wide.", log=True),
+        moving(ORBIT, "sizes", "object sizes", 1e-4, 1e5, "as distance", "The same as `distance`.", log=True),
         moving(ORBIT, "shift_x", "picture widths", -2.0, 2.0, 0.0, "Shift of the picture to the right."),
         moving(ORBIT, "shift_y", "picture heights", -2.0, 2.0, 0.0, "Shift of the picture downwards."),
-        _lens("aperture", 0.0, 10.0, 0.0, "Radius of the lens; 0 is a pinhole."),
-        _lens("focus", 1e-4, 1e5, "the object's middle", "Distance in focus.", log=True),
+        _lens("aperture", "object sizes", 0.0, 10.0, 0.0, "Radius of the lens; 0 is a pinhole."),
+        _lens("focus", "metres", 1e-4, 1e5, "the object's middle", "Distance in focus.", log=True),
         *map(_coefficient, COEFFICIENTS),
         CAMERA[-1],
     )
@@ -68,6 +71,8 @@ class CameraControl(NumberControl):
             raise InputError(f"`controls` {self.name}: fov and focal_length say the same thing; leave one of them out")
         if "elevation" in self.specs and "height" in self.specs:
             raise InputError(f"`controls` {self.name}: elevation and height say the same thing; leave one of them out")
+        if "distance" in self.specs and "sizes" in self.specs:
+            raise InputError(f"`controls` {self.name}: distance and sizes say the same thing; leave one of them out")
         wanted = "aperture" in self.specs or "focus" in self.specs
         if wanted and ("shift_x" in self.specs or "shift_y" in self.specs):
             raise InputError(
@@ -105,6 +110,8 @@ class CameraControl(NumberControl):
             return model.values[parameter.name]
         if parameter.name == "distance" or parameter.name == "focus":
             return fitted_distance(self._described()) * self.scene.metres
+        if parameter.name == "sizes":
+            return fitted_distance(self._described())
         if parameter.name == "height":
             return float(camera_to_world(self._described())[2, 3]) * self.scene.metres
         if parameter.name == "focal_length":
@@ -112,7 +119,9 @@ class CameraControl(NumberControl):
         return super().default(parameter)
 
     def setting(self, parameter: Parameter) -> str:
-        return "camera.fov" if parameter.name == "focal_length" else super().setting(parameter)
+        return {"focal_length": "camera.fov", "sizes": "camera.distance"}.get(
+            parameter.name, super().setting(parameter)
+        )
 
     def search_range(self, parameter: Parameter) -> tuple[float, float] | None:
         preset = PRESETS.get(self.scene.preset)
@@ -132,7 +141,9 @@ class CameraControl(NumberControl):
         scene, fov = self.scene, values["fov"]
         if "focal_length" in self.specs:
             fov = _fov_of(values["focal_length"])
-        if "distance" in self.specs or not self.asked or scene.values.get("camera.distance") is not None:
+        if "sizes" in self.specs:
+            distance = values["sizes"]
+        elif "distance" in self.specs or not self.asked or scene.values.get("camera.distance") is not None:
             distance = values["distance"] / scene.metres
         else:
             distance = framing_distance(scene, fov, scene.aspect).float()
@@ -196,9 +207,7 @@ class CameraControl(NumberControl):
 
 def measured_in(parameter: Parameter, metres: bool) -> Parameter:
     """Return a parameter of the camera as it is around an object that has a size in metres, or has none."""
-    return (
-        replace(parameter, unit="metres") if metres and parameter.name in ("distance", "height", "focus") else parameter
-    )
+    return replace(parameter, unit="object sizes") if parameter.unit == "metres" and not metres else parameter
 
 
 def fitted_distance(scene: SceneDescription) -> float:

@@ -1,5 +1,6 @@
 """The `path` control: the camera, the object or both travel, and `time` says where along the way they are.
 
+Of several paths (`approach,orbit,own.csv`) one is drawn with each configuration: `way` is its name.
 A frame of a drive is one time. So `--over path` finds one configuration for a whole drive, and a grid over `path.time`
 has its frames in order. Where the scene as it is described is a frame, that is the clean one: the end of `approach`,
 the middle of `pass`, the beginning of `orbit`.
@@ -9,7 +10,7 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -21,6 +22,7 @@ from torch import Tensor
 
 from advsearch.controls.base import Choice, Parameter, Value
 from advsearch.controls.numbers import NumberControl, Values
+from advsearch.controls.values import Number, OneOf, Spec
 from advsearch.errors import FileFormatError, InputError
 from advsearch.files import read_text
 from advsearch.scene.assets import Doubles
@@ -33,6 +35,9 @@ PATHS = (APPROACH, PASS, TURN)
 CAMERA, THING = MOVERS = "camera", "object"
 BOTH = "+"
 """Between the camera's path and the object's."""
+SEVERAL, WAY = ",", "way"
+"""Between paths of which one is drawn, and the parameter that says which."""
+MOST_PATHS = 64
 CLEAN_AT = {APPROACH: 1.0, PASS: 0.5, TURN: 0.0}
 """Share of the time at which the scene is as it is described."""
 
@@ -91,6 +96,9 @@ class Start(NamedTuple):
 Way = str | Waypoints
 """One of `PATHS`, or that of a file."""
 
+Ways = Mapping[str, Way]
+"""What the camera, the object or both do, by `MOVERS`."""
+
 
 class PathControl(NumberControl):
     """The camera, the object or both travel along a path."""
@@ -105,7 +113,8 @@ class PathControl(NumberControl):
             "path",
             APPROACH,
             "approach (straight up to where it stands), pass (straight past it), orbit (once around), or a .csv file "
-            "with columns time, x, y, z. Two of them with a + between: the camera's and the object's.",
+            "with columns time, x, y, z. Two of them with a + between: the camera's and the object's. Several with "
+            "commas between: each configuration has one of them, `way`.",
             "path",
         ),
         Choice("moves", CAMERA, "What travels along a single path: camera or object.", options=MOVERS),
@@ -118,26 +127,52 @@ class PathControl(NumberControl):
         ),
     )
 
+    @classmethod
+    def declared(cls, settings: Iterable[str]) -> tuple[Parameter, ...]:
+        """The time, and of several paths which it is."""
+        names = _names(settings.get("path", APPROACH)) if isinstance(settings, Mapping) else ()
+        if len(names) < 2:
+            return cls.parameters
+        which = Parameter(
+            WAY, (), "name", 0.0, float(len(names) - 1), names[0], "Which of the paths.", options=names, estimators=()
+        )
+        return *cls.parameters, which
+
     def check_choices(self) -> None:
-        asked = str(self.chosen["path"])
-        names = two if len(two := asked.split(BOTH)) == 2 and all(map(_is_path, two)) else [asked]
+        names = _names(self.chosen["path"])
+        if len(set(names)) < len(names) or len(names) > MOST_PATHS:
+            raise InputError(f"{self.name}.path: expected at most {MOST_PATHS} different paths, got {', '.join(names)}")
+        self._paths: tuple[Ways, ...] = tuple(map(self._read, names))
+        self._movers = {mover for ways in self._paths for mover in ways}
+        every = [way for ways in self._paths for way in ways.values()]
+        self._files = [way for way in every if isinstance(way, Waypoints)]
+        if "moves" in self._given and not any(len(one.split(BOTH)) == 1 for one in names):
+            raise InputError(f"{self.name}: {names[0]} says what the camera does and what the object; leave moves out")
+        for setting, said in (("seconds", bool(self._files)), ("reach", len(self._files) == len(every))):
+            if said and setting in self._given:
+                asked = self.chosen["path"]
+                raise InputError(f"{self.name}: {setting}: the file in {asked} says that itself; leave it out")
+        if self._files:
+            self.chosen["seconds"] = max(float(one.times[-1]) for one in self._files)
+
+    def _read(self, name: str) -> Ways:
+        """What a path makes of camera and object."""
+        names = two if len(two := name.split(BOTH)) == 2 and all(map(_is_path, two)) else [name]
         alone = len(names) == 1
-        if alone and not _is_path(asked):
+        if alone and not _is_path(name):
             raise InputError(
                 f"{self.name}.path: expected {', '.join(PATHS)}, a .csv file, or two of them as in "
-                f"{APPROACH}{BOTH}{TURN}, the camera's and the object's, got {asked!r}"
+                f"{APPROACH}{BOTH}{TURN}, the camera's and the object's, got {name!r}"
             )
-        if not alone and "moves" in self._given:
-            raise InputError(f"{self.name}: {asked} says what the camera does and what the object; leave moves out")
-        self._ways: dict[str, Way] = {}
-        for mover, name in zip([str(self.chosen["moves"])] if alone else MOVERS, names, strict=True):
-            self._ways |= {mover: name} if name in PATHS else read_waypoints(Path(name), mover, alone=alone)
-        files = [way for way in self._ways.values() if isinstance(way, Waypoints)]
-        for setting, said in (("seconds", bool(files)), ("reach", len(files) == len(self._ways))):
-            if said and setting in self._given:
-                raise InputError(f"{self.name}: {setting}: the file in {asked} says that itself; leave it out")
-        if files:
-            self.chosen["seconds"] = max(float(one.times[-1]) for one in files)
+        ways: dict[str, Way] = {}
+        for mover, one in zip([str(self.chosen["moves"])] if alone else MOVERS, names, strict=True):
+            ways |= {mover: one} if one in PATHS else read_waypoints(Path(one), mover, alone=alone)
+        return ways
+
+    def spec(self, parameter: Parameter, value: Number) -> Spec:
+        if parameter.name == WAY and WAY not in self.specs:  # whatever else is asked for
+            return OneOf(parameter.options)
+        return super().spec(parameter, value)
 
     @property
     def seconds(self) -> float:
@@ -145,26 +180,34 @@ class PathControl(NumberControl):
         return float(self.chosen["seconds"])
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
-        if CAMERA in self._ways and scene.camera != ORBIT_CAMERA:
+        if CAMERA in self._movers and scene.camera != ORBIT_CAMERA:
             raise InputError(
                 f"`controls` {self.name}: moves the camera, and the scene is seen by its camera {scene.camera!r}; give "
                 f"moves=object, or have it seen by {ORBIT_CAMERA!r}"
             )
-        if CAMERA in self._ways:
-            self.within(scene)._check_looks()
-        wide = [note for way in self._ways.values() if isinstance(way, Waypoints) for note in way.notes]
+        there = self.within(scene)
+        for name, ways in zip(_names(self.chosen["path"]), self._paths, strict=True):
+            if CAMERA in ways:
+                there._check_looks(name, ways)
+        wide = [note for way in self._files for note in way.notes]
+        shortest = min((float(one.times[-1]) for one in self._files), default=self.seconds)
+        if len(self._paths) > 1 and shortest < self.seconds:
+            wide.append(
+                f"path: the shortest of the files takes {shortest:g} s of {self.seconds:g}; who has arrived waits, and "
+                "these frames count"
+            )
         return replace(scene, remarks=tuple(dict.fromkeys((*scene.remarks, *wide)))) if wide else scene
 
-    def _check_looks(self) -> None:
+    def _check_looks(self, name: str, ways: Ways) -> None:
         """Refuse a path on which the camera is at what it looks at, at a waypoint or between two.
 
         Raises:
             InputError: it is, somewhere.
         """
-        files = [way.times for way in self._ways.values() if isinstance(way, Waypoints)]
+        files = [way.times for way in ways.values() if isinstance(way, Waypoints)]
         time = torch.cat([torch.linspace(0.0, self.seconds, LOOKS), *files]).unique()
         begin = self._start(time)
-        place, target = self._camera(begin, time, self._object(begin, time)[0])
+        place, target = self._camera(ways, begin, time, self._object(ways, begin, time)[0])
         gap = (target - place).expand(len(time), 3).double()
         step = gap[1:] - gap[:-1]
         share = (-(gap[:-1] * step).sum(dim=1) / step.square().sum(dim=1).clamp_min(1e-300)).clamp(0.0, 1.0)
@@ -173,13 +216,15 @@ class PathControl(NumberControl):
             at = int(away.argmin())
             when = float(torch.lerp(time[at], time[at + 1], share[at].float()))
             raise InputError(
-                f"`controls` {self.name}: {self.chosen['path']}: {when:.4g} s after its start the camera is where it "
+                f"`controls` {self.name}: {name}: {when:.4g} s after its start the camera is where it "
                 "looks, so that it has no direction; lead it past that place, or say what it looks at (look_x, look_y, "
                 "look_z)"
             )
 
     def default(self, parameter: Parameter) -> float | str:
-        first, *last = self._ways.values()
+        if parameter.name == WAY:
+            return parameter.options[0]
+        first, *last = self._paths[0].values()
         way = last[0] if last and first == TURN else first  # who goes around is back at the end
         return CLEAN_AT.get(way, 0.0) * self.seconds if isinstance(way, str) else 0.0
 
@@ -187,25 +232,28 @@ class PathControl(NumberControl):
         return 0.0, self.seconds
 
     def estimators(self, parameter: Parameter) -> tuple[str, ...]:
-        return ORBIT if CAMERA in self._ways else GEOMETRIC
+        return ORBIT if CAMERA in self._movers else GEOMETRIC
 
     def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        time, start = values["time"], self._start(values["time"])
-        shift, heading = self._object(start, time)
+        time, start, ways = values["time"], self._start(values["time"]), self._ways(values)
+        shift, heading = self._object(ways, start, time)
         inputs = {}
-        if CAMERA in self._ways:
-            place, target = self._camera(start, time, shift)
+        if CAMERA in self._movers:
+            place, target = self._camera(ways, start, time, shift)
             inputs["camera.to_world"] = looking(place, target, self.scene.number("camera.roll"))
-        if THING in self._ways:
+        if THING in self._movers:
             inputs["object.to_world"] = turned(start, shift, heading)
         return inputs
 
     def measured(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Value]:
-        time, start = values["time"], self._start(values["time"])
-        shift, _ = self._object(start, time)
-        away = self._camera(start, time, shift)[0] - start.middle - shift
+        time, start, ways = values["time"], self._start(values["time"]), self._ways(values)
+        shift, _ = self._object(ways, start, time)
+        away = self._camera(ways, start, time, shift)[0] - start.middle - shift
         unit = "object sizes" if self.scene.object.metres is None else "metres"
         return {"distance": {"value": float(away.norm()) * self.scene.metres, "unit": unit}}
+
+    def _ways(self, values: Values) -> Ways:
+        return self._paths[int(values[WAY])] if WAY in values else self._paths[0]
 
     def _start(self, time: Tensor) -> Start:
         """How the scene stands, on the device of a time."""
@@ -214,9 +262,9 @@ class PathControl(NumberControl):
     def _share(self, time: Tensor) -> Tensor:
         return (time / self.seconds).clamp(0.0, 1.0)
 
-    def _camera(self, begin: Start, time: Tensor, shift: Tensor) -> tuple[Tensor, Tensor]:
+    def _camera(self, ways: Ways, begin: Start, time: Tensor, shift: Tensor) -> tuple[Tensor, Tensor]:
         """Where the camera is, and what it looks at: an object that is shifted, unless a file says something else."""
-        pose, center, way = begin.camera, begin.middle, self._ways.get(CAMERA)
+        pose, center, way = begin.camera, begin.middle, ways.get(CAMERA)
         start = pose[:3, 3]
         if way is None:
             return start, center
@@ -237,9 +285,9 @@ class PathControl(NumberControl):
         turned = torch.stack([cos * x - sin * y, sin * x + cos * y, z.expand(angle.shape)], dim=-1)
         return center + turned, center + shift
 
-    def _object(self, begin: Start, time: Tensor) -> tuple[Tensor, Tensor]:
+    def _object(self, ways: Ways, begin: Start, time: Tensor) -> tuple[Tensor, Tensor]:
         """How far the object is shifted, and how many degrees it is turned by."""
-        own, way = begin.camera, self._ways.get(THING)
+        own, way = begin.camera, ways.get(THING)
         still = own.new_zeros(())
         if way is None:
             return own.new_zeros(3), still
@@ -299,6 +347,11 @@ def the_shorter_way(degrees: Doubles) -> tuple[Doubles, str | None]:
     first, last = (f"{one:g}" for one in degrees[places[0] : places[0] + 2])
     note = f"it turns the shorter way from {first} to {last} degrees; for the longer one, add a waypoint between them"
     return np.asarray(np.unwrap(degrees, period=360.0)), note
+
+
+def _names(path: object) -> tuple[str, ...]:
+    """The paths in a list, or in a text with commas between them."""
+    return tuple(str(one).strip() for one in (path if isinstance(path, list | tuple) else str(path).split(SEVERAL)))
 
 
 def _is_path(name: str) -> bool:

@@ -29,6 +29,7 @@ from advsearch.engine.problem import Prepared, Problem
 from advsearch.engine.record import LOST, judged, judgement_of, trial_row
 from advsearch.errors import ClusterError, InputError
 from advsearch.models import Model
+from advsearch.models.address import Asked
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row, Told
 from advsearch.scene.formation import levels_of
@@ -131,9 +132,13 @@ NEAR, LEAST = 1e-3, 1e-4
 def check_made_of(
     run: RunDirectory, models: Sequence[Model], functions: Mapping[str, Callable[..., Any] | None] | None = None
 ) -> None:
-    """Note what networks and functions are, or refuse to go on with others than a run began with."""
+    """Note what networks and functions are, or refuse to go on with others than a run began with. A model behind an
+    address keeps its answers in the run."""
     several = [one.module.models if isinstance(one.module, Ensemble) else (one,) for one in models]
     networks = [one for some in several for one in some]
+    for one in networks:
+        if isinstance(one.module, Asked):
+            one.module.keep_in(run.store)
     now: dict[str, Any] = {f"model {one.name}": {"weights": weights_digest(one)} for one in networks}
     now |= {name: _function(one) for name, one in (functions or {}).items() if one is not None}
     before = run.store.noted(MADE_OF)
@@ -148,7 +153,8 @@ def check_made_of(
             same_python = key != "code" or noted.get("python") == facts.get("python")
             if same_python and None not in (noted.get(key), facts.get(key)) and noted[key] != facts[key]:
                 raise InputError(
-                    f"{run.path}: cannot go on: {name} {what} now; take the one that it began with, or {run.again}"
+                    f"{run.path}: cannot resume: {name} {what} than at the start; use the one that it began with, "
+                    f"or {run.again}"
                 )
 
 
@@ -332,7 +338,7 @@ class Journal:
         if beside.u != digest(query.u) or row.seed != query.seed:
             path, again = ("", "") if self.run is None else (self.run.path, self.run.again)
             raise InputError(
-                f"{path}: cannot go on: evaluation {query.number} of the {query.kind} is another one now than it was, "
+                f"{path}: cannot resume: evaluation {query.number} of the {query.kind} is not the one that was stored, "
                 f"so advsearch, its packages or the number of threads have changed since; {again}"
             )
         if beside.non_finite:
@@ -447,8 +453,8 @@ def other_numbers(run: RunDirectory | None, values: Mapping[str, tuple[float | N
     )
     path, again = ("", "") if run is None else (run.path, run.again)
     return InputError(
-        f"{path}: cannot go on: the same picture of the clean scene has other values now ({told}), so model, "
-        f"objective or scene are not those that it began with; take these again, or {again}"
+        f"{path}: cannot resume: the same picture of the clean scene has other values now ({told}), so the model, "
+        f"the objective or the scene has changed; use those that the run began with, or {again}"
     )
 
 

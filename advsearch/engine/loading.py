@@ -172,7 +172,7 @@ def load_scene(
         size: of the object, its longest side in metres, 1e-4 to 1e4. Distances of the camera, paths of files and the
             height of a photograph are in metres where the size of the object is known, and in object sizes elsewhere.
         unit: of the coordinates of the object's file, "mm", "cm", "m" or "in", which gives it its size; by default
-            glTF is in metres, and of other files it is not known.
+            bundled objects and glTF have one, and of other files it is not known.
         settings: parameters to fix, e.g. ``{"camera.azimuth": 130.0}``. The size of a picture belongs to none of them
             but to what makes it: `resolution` of `attack`, `sweep`, `render` and `Scene.renderer`.
         camera: a camera file (docs/cameras.md), "fisheye" or "equirectangular", whose lens the camera around the object

@@ -79,8 +79,8 @@ def load_models(models: Sequence[Any], task: Task, config: SceneConfig) -> tuple
 def _load(model: Any, task: Task, config: SceneConfig, *, alone: bool) -> Model:
     """Load a model; of several tasks, those that take no label or have names of their own are given none."""
     if not alone and (task.names_from or not task.labelled):
-        return load_model(model, task=task)
-    return load_model(model, labels=config.labels, prompt=config.prompt, task=task)
+        return load_model(model, task=task, ask=config.ask)
+    return load_model(model, labels=config.labels, prompt=config.prompt, task=task, ask=config.ask)
 
 
 AnyModel = Model | nn.Module | str | Path
@@ -121,7 +121,7 @@ def check_not_of_scene(settings: Mapping[str, object]) -> None:
     """Refuse settings of a scene that is loaded already."""
     clash = [name for name in OF_SCENE if settings.get(name) is not None]
     if clash:
-        raise InputError(f"{', '.join(clash)}: belongs to the scene, which is given already; give it to load_scene")
+        raise InputError(f"{', '.join(clash)}: belongs to the scene, and a loaded scene was given; use load_scene")
 
 
 def check_not_spread(settings: Mapping[str, object]) -> None:
@@ -129,8 +129,8 @@ def check_not_spread(settings: Mapping[str, object]) -> None:
     for name in ("workers", "cluster"):
         if settings.get(name) is not None:
             raise InputError(
-                f"{name}: expected names of objects, models, controls and an objective beside it, which other "
-                "processes can load, got some that are loaded; give their names or files"
+                f"{name}: other processes load objects, models, controls and the objective by name, and some were "
+                "given as loaded objects; give their names or files"
             )
 
 
@@ -147,7 +147,7 @@ def given_to(config: SceneConfig, controls: Controls) -> tuple[Control, ...]:
         for choice in _counting(type(one), one.settings()) if one is not None else ():
             if getattr(config, choice.run_setting, None) is not None:
                 raise InputError(
-                    f"{choice.run_setting}: control {one.name} is an instance already; give it its own, as in "
+                    f"{choice.run_setting}: control {one.name} was given as an instance; set it there, as in "
                     f"{type(one).__name__}({choice.name}=...)"
                 )
     return as_controls(
@@ -237,8 +237,8 @@ def _not_taken(setting: str, name: str, kind: str) -> InputError:
             f"`controls` '{name}={{PARAMETER: [LOW, HIGH]}}'{instead}"
         )
     if setting == "path":
-        return InputError(f"path: {name} does not travel; add `over=path` beside it, or `controls=path`")
-    return InputError(f"{setting}: {name} has none, and no other control is there that has one; leave it out")
+        return InputError(f"path: the control {name} does not move on a path; add `over=path`, or use `controls=path`")
+    return InputError(f"{setting}: the control {name} does not take it, nor does another one here; leave it out")
 
 
 _TURN = threading.RLock()

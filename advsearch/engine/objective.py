@@ -95,7 +95,8 @@ class ConfigurationInputs:
             got = ", ".join(printed or (control.name for control in self._searched.controls)) or "nothing"
             instead = "ask for `textures`, which has them by name" if printed else "add `texture` or `patch`"
             raise InputError(
-                f"objective: it asks for `texture`, the colours of one control that are searched, got {got}; {instead}"
+                f"objective: it asks for `texture`, so it needs one control whose colours are searched, got "
+                f"{got}; {instead}"
             )
         (colors,) = printed.values()
         return colors.expand(len(self._wholes), *colors.shape)

@@ -129,7 +129,7 @@ class Rendering:
         """
         (surfaces, *others) = [view.surfaces for view in self.views]
         if surfaces is None or others:
-            raise InputError("aov: expected one view, rendered with `aov`; leave `around` out")
+            raise InputError("aov: ground truth is written for a single view, rendered with `aov`; leave `around` out")
         with placed_by("out"):
             return write_layers(Path(path).with_suffix(".aov.exr"), surfaces.layers(aovs, OBJECT), surfaces.notes(aovs))
 
@@ -318,7 +318,9 @@ def check_judged(description: SceneDescription, judge: str) -> None:
     if judge not in (OBJECT, ALL, *description.things):
         raise UnknownNameError("thing to judge:", judge, (OBJECT, ALL, *description.things), "It stands in `judge`.")
     if judge == ALL and not description.things:
-        raise InputError("judge: all, and nothing stands beside the object; add `things`, or leave it out")
+        raise InputError(
+            "judge: expected things beside the object for 'all', got none; add `things`, or leave `judge` out"
+        )
 
 
 def facts_about(
@@ -420,7 +422,8 @@ def _turned(description: SceneDescription, around: int | None) -> Iterator[Scene
         return
     if description.camera != ORBIT_CAMERA:
         raise InputError(
-            f"around: goes around the object, and `camera` {description.camera} stands still; leave one out"
+            f"around: turns the camera that circles the object, and `camera` {description.camera} is fixed; leave one "
+            "of the two out"
         )
     first = description.number("camera.azimuth")
     for number in range(around):

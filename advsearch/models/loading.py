@@ -14,7 +14,7 @@ from typing import Any
 from torch import Tensor, nn
 
 from advsearch.errors import InputError, UnknownNameError, resembling
-from advsearch.models import files, reference
+from advsearch.models import address, files, reference
 from advsearch.models.guards import called_under, plainly, turned_by_code
 from advsearch.models.labels import fitting_labels, labels_origin, names_in, read_labels, read_prompts
 from advsearch.models.model import PRESETS, Model, Preprocessing, Read, Triple
@@ -28,7 +28,13 @@ DEFAULT_INPUT_SIZE = (224, 224)
 
 SOURCES: Registry[Callable[[str], Source | Model]] = Registry(
     "advsearch.models",
-    {"torchvision": named.load_torchvision, "timm": named.load_timm, "hf": transformers.load},
+    {
+        "torchvision": named.load_torchvision,
+        "timm": named.load_timm,
+        "hf": transformers.load,
+        "http": address.load,
+        "https": address.load,
+    },
     "a function from the whole text, such as 'zoo:resnet18', to a Source or a Model",
     lambda name, entry: callable(entry),
 )
@@ -36,7 +42,7 @@ SOURCES: Registry[Callable[[str], Source | Model]] = Registry(
 
 FORMS = (
     "A model is 'reference', a file (.pt2, TorchScript or .onnx), 'torchvision:NAME', 'timm:NAME', 'hf:REPOSITORY', "
-    "'package.module:callable', or in Python an nn.Module"
+    "an address (https://...), 'package.module:callable', or in Python an nn.Module"
 )
 
 
@@ -56,6 +62,7 @@ def load_model(
     max_batch: int | None = None,
     task: Any = None,
     read: Read | None = None,
+    ask: Mapping[str, float] | None = None,
 ) -> Model:
     """Load a model, look at its outputs once, and return it as a function from images to logits.
 
@@ -64,7 +71,8 @@ def load_model(
     Args:
         spec: ``"reference"`` (the bundled classifier), with ``"@weights.safetensors"`` if wanted; a path to a
             `torch.export` archive (.pt2) or to TorchScript; ``"package.module:callable"``, which returns an `nn.Module`
-            or a `Model`, with ``"@weights.safetensors"`` if wanted; ``"torchvision:NAME@weights.safetensors"``; an
+            or a `Model`, with ``"@weights.safetensors"`` if wanted; ``"torchvision:NAME@weights.safetensors"``; the
+            address of a model that only answers, ``"http://..."`` or ``"https://..."`` (docs/addresses.md); an
             `nn.Module` (copied, its weights shared, unless they were made in `torch.inference_mode`); a `Model`.
         labels: the label names in index order, or a label file (see `read_labels`). Default "class 0", "class 1", ...
             A network that compares pictures with texts has no classes but these.
@@ -82,6 +90,8 @@ def load_model(
             ...) or a list of N things.
         task: what the model is to do, as in `attack`: its name ("detection"), a mapping with its name and options, or
             the task itself. It says how outputs are read. Default: classification, unless there is `read`.
+        ask: of a model behind an address: the most `calls` (2000), `tokens` and `money`; prices `per_call`,
+            `per_million_in` and `per_million_out`; `seconds` that an answer may take (120).
 
     Raises:
         UnknownNameError: `spec` is a name that means nothing; near matches are given.
@@ -112,8 +122,9 @@ def load_model(
     if prompts is not None and not (isinstance(found, Source) and found.reads_text):
         raise InputError(f"prompt: model {found.name} has classes of its own and reads no text; leave `prompt` out")
     if isinstance(found, Source) and found.finish is not None:
-        purpose = Purpose(task.name if task else "classification", names, prompts, getattr(task, "tokens", 16))
-        found = found.finish(purpose)
+        wanted = task.name if task else "classification"
+        lengths = getattr(task, "tokens", 16), getattr(task, "times", 1)
+        found = found.finish(Purpose(wanted, names, prompts, *lengths, ask or {}))
     if isinstance(found, Source) and isinstance(found.module, nn.Module):
         called_under(found.module, switches)
     if isinstance(found, Model):
@@ -182,7 +193,8 @@ def _find(spec: object) -> Source | Model:
         return load_callable(text, SOURCES)
     if Path(text).suffix.lower() in files.SUFFIXES or "/" in text or os.sep in text or os.path.exists(text):
         return files.load_file(Path(text))
-    known = ["reference", *(f"{source}:{'REPOSITORY' if source == 'hf' else 'NAME'}" for source in SOURCES)]
+    forms = {"hf": "hf:REPOSITORY", "http": "http://ADDRESS", "https": "https://ADDRESS"}
+    known = ["reference", *(forms.get(source, f"{source}:NAME") for source in SOURCES)]
     raise UnknownNameError("model", text, known, f"{_by_library(text)}{FORMS}")
 
 

@@ -71,6 +71,7 @@ class Preprocessing:
         layout: ``"NCHW"`` or ``"NHWC"``.
         channels: ``"RGB"`` or ``"BGR"``.
         processor: from pictures (N, 3, H, W) in [0, 1], RGB, to what the network takes, of the same shape.
+        resizes: whether there is the first step; a model that takes any size is given pictures as they are rendered.
     """
 
     input_size: tuple[int, int]
@@ -80,11 +81,12 @@ class Preprocessing:
     layout: str = "NCHW"
     channels: str = "RGB"
     processor: Callable[[Tensor], Tensor] | None = None
+    resizes: bool = True
 
     def __call__(self, images: Tensor) -> Tensor:
         """Preprocess images (N, H, W, 3), display-referred sRGB in [0, 1], any floating dtype; differentiable."""
         x = images.permute(0, 3, 1, 2)
-        if (x.shape[2], x.shape[3]) != self.input_size:
+        if self.resizes and (x.shape[2], x.shape[3]) != self.input_size:
             x = F.interpolate(x, size=self.input_size, mode="bilinear", align_corners=False, antialias=True)
         if self.processor:
             x = self.processor(x.clone())  # which may write into it

@@ -12,8 +12,8 @@ import os
 import pickle
 import traceback
 import warnings
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
@@ -38,12 +38,15 @@ if TYPE_CHECKING:
 @dataclass(frozen=True)
 class Purpose:
     """What a network is to be asked: the task's name, what its user gave as names of classes and as texts (None if they
-    did not), and the most tokens of a free answer."""
+    did not), the most tokens of a free answer, and how often each picture is asked for one. `ask` has limits for a
+    model behind an address (`advsearch.models.address.LIMITS`)."""
 
     task: str = "classification"
     names: tuple[str, ...] | None = None
     prompts: tuple[str, ...] | None = None
     tokens: int = 16
+    times: int = 1
+    ask: Mapping[str, float] = field(default_factory=dict)
 
     def check(self, model: str, what: str, *tasks: str) -> None:
         """Raise a ModelError where a network cannot do the task: `what` it does, such as "compares a picture with
@@ -76,7 +79,8 @@ class Source:
         batch_limits: (fewest, most) images at once.
         dtype: floating type of the input.
         device: where its weights are.
-        finish: of a network that is built for what it is asked: makes its source. None where the network is ready.
+        finish: of a network that is built for what it is asked: makes its source, or the model. None where the network
+            is ready.
         reads_text: whether it is given texts beside the picture.
     """
 
@@ -92,7 +96,7 @@ class Source:
     batch_limits: tuple[int, int] = (1, 64)
     dtype: torch.dtype = torch.float32
     device: torch.device = CPU
-    finish: Callable[[Purpose], Source] | None = None
+    finish: Callable[[Purpose], Source | Model] | None = None
     reads_text: bool = False
 
 

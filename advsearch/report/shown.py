@@ -124,7 +124,7 @@ def shown(result: Result) -> ShownResult:
 def remarks_of(result: Result, given: ShownResult) -> list[str]:
     """Return what has to be known beside a result."""
     unsaid = getattr(result, "ending", "") == INTERRUPTED and "nterrupted" not in given.said
-    stopped = ["Interrupted before its end."] if unsaid else []
+    stopped = ["Not finished: these are the results so far."] if unsaid else []
     return [*stopped, *given.cautions, *getattr(result, "warnings", ())]
 
 

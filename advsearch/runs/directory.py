@@ -185,7 +185,7 @@ class RunDirectory:
         ]
         if changed:
             raise InputError(
-                f"{self.path}: cannot go on: {', '.join(changed)} now; set it back to what the run began with, or "
+                f"{self.path}: cannot resume: {', '.join(changed)} now; set it back to what the run began with, or "
                 f"{self.again}"
             )
 
@@ -221,7 +221,7 @@ class RunDirectory:
         now = summary.made_with(config.plain())
         if changed := summary.changed_file([one for one in before if isinstance(one, dict)], config.plain()):
             raise InputError(
-                f"{self.path}: cannot go on: {changed} is another file now than it was; put that back, or {self.again}"
+                f"{self.path}: cannot resume: {changed} has changed since the run began; restore it, or {self.again}"
             )
         if now not in before:
             self.store.set_note(summary.MADE_WITH, json.dumps([*before, now]))
@@ -288,7 +288,7 @@ class RunDirectory:
                 self.close()
             return
         kept = not self._began or any((self.path / name).exists() for name in (summary.NAME, PARTS))
-        if not kept and self.store.count() == 0:
+        if not kept and self.store.count() == 0 and not self.store.has_answers:
             self.discard()
         else:
             self.close()

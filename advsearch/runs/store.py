@@ -242,6 +242,11 @@ class Store:
         except ValueError as error:
             raise FileFormatError(f"{self.path}: expected JSON in the note {key!r}, got {error}; {DAMAGED}") from None
 
+    @property
+    def has_answers(self) -> bool:
+        """Whether a model behind an address has answered, which took time and money."""
+        return any(self._select("key FROM meta WHERE key LIKE ? LIMIT 1", "answer %"))
+
     def set_note(self, key: str, value: str) -> None:
         """Keep a text under `key`, in place of what was there."""
         check_there(self.path)

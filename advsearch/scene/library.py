@@ -121,7 +121,7 @@ def load_object(name: str) -> ObjectAsset:
             source=BUNDLED_OBJECT,
             surface=finished(mesh, finishes, material) if finishes else None,
             finishes=finishes,
-            metres=facts.get("metres"),
+            metres=facts["metres"],
         )
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise FileFormatError(f"bundled object {name!r} cannot be read ({error}); reinstall advsearch") from error

@@ -157,7 +157,7 @@ class BallLamp(ScenePart):
 
     Attributes:
         name: of the lamp.
-        dark: its radiance is 0 whatever happens.
+        dark: its radiance stays 0.
         place: base value of the ball's middle, object sizes.
         radius: base value, object sizes.
         radiance: base value, linear, for each colour channel.

@@ -23,7 +23,7 @@ class Parameter:
     Attributes:
         name: short name; `control.name` addresses it everywhere.
         shape: of its value; () for a number, None in a place that depends on the scene or a choice.
-        unit: "degrees", "object sizes", "sRGB", "stops", "name", ..., or "1".
+        unit: "degrees", "metres", "object sizes", "sRGB", "stops", "name", ..., or "1".
         low: smallest allowed value (0 for a choice among names).
         high: largest allowed value (number of names - 1 for a choice among names).
         default: the value that leaves the scene as it is, in words if it depends on the scene.
@@ -136,21 +136,21 @@ CAMERA = (
     ),
     _camera(
         "distance",
-        "object sizes",
+        "metres",
         1e-4,
         1e5,
         "fits the object",
-        "Distance to the object's middle; in metres where the object's size is known.",
+        "Distance to the object's middle; in object sizes where its size in metres is not known.",
         (0.8, 1.5),
         log=True,
     ),
     _camera(
         "height",
-        "object sizes",
+        "metres",
         -1e4,
         1e5,
         "as the elevation says",
-        "Height of the lens above the ground, in place of `elevation`; in metres where the object's size is known.",
+        "Height of the lens above the ground, in place of `elevation`; in object sizes as `distance`.",
     ),
     _camera("fov", "degrees", 1.0, 170.0, 35.0, "Field of view along the larger side of the picture."),
     Parameter(
@@ -209,20 +209,20 @@ GROUND = (
     Parameter(
         "height",
         (),
-        "object sizes",
+        "metres",
         1e-3,
         1000.0,
-        f"{PHOTOGRAPHED_FROM:g}, or 1.6 m",
-        "Height above the floor from which the photograph was taken; in metres where the object's size is known.",
+        f"1.6, or {PHOTOGRAPHED_FROM:g} object sizes",
+        "Height above the floor from which the photograph was taken; in object sizes as `camera.distance`.",
     ),
     Parameter(
         "radius",
         (),
-        "object sizes",
+        "metres",
         1e-3,
         1e5,
         "5 heights",
-        "How far from the photograph's camera its floor is empty; in metres where the object's size is known.",
+        "How far from the photograph's camera its floor is empty; in object sizes as `camera.distance`.",
     ),
 )
 MATERIAL = (

@@ -14,8 +14,6 @@ from advsearch.scene.assets import ObjectAsset
 
 UNITS = {"mm": 0.001, "cm": 0.01, "m": 1.0, "in": 0.0254}
 """Metres of the units that a mesh may be in."""
-IN_METRES = ("camera.distance", "camera.height", "camera.focus", "ground.height", "ground.radius")
-"""What is in metres, and in object sizes where the object's size is not known; paths of files are so too."""
 TRIPOD = 1.6
 """Metres above the floor from which photographed environments are taken, where nobody says it."""
 SMALLEST, LARGEST = 1e-4, 1e4

@@ -307,7 +307,8 @@ class Config(BaseModel):
             FileFormatError: the file is missing, empty or not such a mapping.
             InputError: as for the class; the message names the file.
         """
-        data = {name: value for name, value in written.read_yaml(path).items() if name not in ("schema", "command")}
+        data = {name: value for name, value in written.read_yaml(path).items() if name != "command"}
+        schema = data.pop("schema", written.SCHEMA)
         for name, value in (overrides or {}).items():
             written.put(data, name, value)
         try:
@@ -317,7 +318,12 @@ class Config(BaseModel):
         except SettingsError as error:
             raise SettingsError(error.problems, path) from None
         made._left_out = tuple(left)
+        if schema == written.OLDEST:
+            made.check_older(path)
         return made
+
+    def check_older(self, path: str | Path) -> None:
+        """Refuse, by a FileFormatError, what a file of an older schema meant otherwise."""
 
     @property
     def powers(self) -> tuple[LeftOut, ...]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, TypedDict
@@ -12,9 +13,10 @@ from torch import Tensor
 from torch.nn import functional
 
 from advsearch.errors import InputError
+from advsearch.files import JsonValue
 from advsearch.models import Model
 from advsearch.options import FROM_RUN
-from advsearch.tasks.base import Facts, Prediction, Task
+from advsearch.tasks.base import Facts, Prediction, Said, Task
 
 Words = tuple[str, ...]
 
@@ -23,6 +25,12 @@ SILENCE = "(nothing)"
 
 MOST = 256
 """Most tokens of an answer."""
+
+
+class Texts(TypedDict):
+    """What a model that only answers says of one picture: the text of each time that it was asked."""
+
+    texts: list[str]
 
 
 class Utterance(TypedDict):
@@ -42,22 +50,28 @@ class FreeAnswer(Task):
     sigmoid of the lead that tokens which begin such a word have over all others, at the step where it is greatest: the
     margin is log(1 - p) of a right answer and -log(p) of a wrong one.
 
+    Of a model that gives no logits (`Texts`) the margin is 1 - 2 s, where s is the share of right answers among those
+    of one picture: it is right where at least half of them are.
+
     Args:
         tokens: the most that an answer has.
+        times: how often each picture is asked, for a model behind an address, whose answers may differ.
 
     Raises:
-        InputError: less than one, or more than `MOST`.
+        InputError: `tokens` or `times` is less than one, or more than `MOST`.
     """
 
     name = "answer"
     varies = True
 
     tokens: int = 16
+    times: int = 1
     target: Words | None = field(default=None, metadata=FROM_RUN)
 
     def __post_init__(self) -> None:
-        if not 1 <= self.tokens <= MOST:
-            raise InputError(f"task answer: tokens: expected a whole number from 1 to {MOST}, got {self.tokens!r}")
+        for name in ("tokens", "times"):
+            if not (isinstance(value := getattr(self, name), int) and 1 <= value <= MOST):
+                raise InputError(f"task answer: {name}: expected a whole number from 1 to {MOST}, got {value!r}")
 
     def on(self, model: Model, *, target: str | None = None, minimise: bool = False) -> FreeAnswer:
         """See `Task.on`: the target is a word, or several with commas between them, of which the answer has one."""
@@ -67,10 +81,10 @@ class FreeAnswer(Task):
             raise InputError("minimise: makes the right answer easier to give; leave `target` out")
         return replace(self, target=None if target is None else _words("target", target), minimise=minimise)
 
-    def read(self, returned: Any, count: int) -> list[Utterance]:
+    def read(self, returned: Any, count: int) -> list[Utterance | Texts]:
         keys = Utterance.__required_keys__
         if isinstance(returned, (list, tuple)) and all(
-            isinstance(one, Mapping) and keys <= one.keys() for one in returned
+            isinstance(one, Mapping) and (keys <= one.keys() or "texts" in one) for one in returned
         ):
             return list(returned)
         raise ValueError("expected a mapping with text, logits and begins for each picture, as answers in words have")
@@ -95,13 +109,32 @@ class FreeAnswer(Task):
     def truth_names(self, truth: Words) -> Words:
         return truth
 
-    def margin(self, output: Sequence[Utterance], truth: Words) -> Tensor:
+    def margin(self, output: Sequence[Utterance | Texts], truth: Words) -> Tensor:
         return torch.stack([_margin(one, truth) for one in output])
 
-    def predictions(self, output: Sequence[Utterance], count: int = 1) -> list[tuple[Prediction, ...]]:
-        """Return the text of each picture, in one line without signs that steer a terminal."""
-        shown = ("".join(sign if sign.isprintable() else " " for sign in one["text"]) for one in output)
-        return [(Prediction(" ".join(text.split()) or SILENCE),) for text in shown]
+    def predictions(self, output: Sequence[Utterance | Texts], count: int = 1) -> list[tuple[Prediction, ...]]:
+        """Return the text of each picture, the most frequent first, in one line without signs that steer a terminal."""
+        each = (Counter(_texts(one)).most_common(count) for one in output)
+        return [tuple(_said(text) for text, _ in texts) for texts in each]
+
+    def said(self, output: Sequence[Utterance | Texts], truth: Words, margins: Sequence[float]) -> list[Said]:
+        """See `Task.said`: of several texts the most frequent among those that decide, and all of them beside it."""
+        found = list[Said]()
+        for one, margin in zip(output, margins, strict=True):
+            texts = _texts(one)
+            deciding = [text for text in texts if has_word(text, truth) == (margin <= 0.0)] or texts
+            kept: JsonValue = {"texts": [*texts]} if len(texts) > 1 else None
+            found.append((_said(Counter(deciding).most_common(1)[0][0]), kept))
+        return found
+
+
+def _texts(one: Utterance | Texts) -> list[str]:
+    return one["texts"] if "texts" in one else [one["text"]]  # type: ignore[typeddict-item]
+
+
+def _said(text: str) -> Prediction:
+    shown = "".join(sign if sign.isprintable() else " " for sign in text)
+    return Prediction(" ".join(shown.split()) or SILENCE)
 
 
 def _words(setting: str, text: str) -> Words:
@@ -117,7 +150,9 @@ def has_word(text: str, words: Words) -> bool:
     return any(re.search(rf"(?<!\w){re.escape(word)}(?!\w)", text) for word in words)
 
 
-def _margin(one: Utterance, words: Words) -> Tensor:
+def _margin(one: Utterance | Texts, words: Words) -> Tensor:
+    if "texts" in one:
+        return 1.0 - 2.0 * torch.tensor([float(has_word(text, words)) for text in _texts(one)]).mean()
     logits, begin = one["logits"], sorted({number for word in words for number in one["begins"](word)})
     if not begin:
         raise InputError(f"label: the model has no token that begins one of {', '.join(words)}; name others")

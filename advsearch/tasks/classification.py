@@ -55,7 +55,7 @@ class ClassTask(Task):
         if self.reads_logits != (model.read is None):
             other = f'it was loaded for its logits; load it with task="{self.name}"'
             if self.reads_logits:
-                other = "expected logits, and it was loaded for another task; give that `task` here too"
+                other = "it was loaded for another task than classification; give the same `task` here"
             raise InputError(f"model {model.name}: {other}")
         labels, named = (model.labels, model.named) if self.reads_logits else self._names(model)
         try:

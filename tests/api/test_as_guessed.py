@@ -239,7 +239,7 @@ def test_metrics_are_columns_of_a_sweep_and_of_one_that_goes_on(
         with suppress(KeyboardInterrupt):
             advsearch.sweep(scene, model, metrics={"both": both}, run=run, progress=progress, **asked)
         if isinstance(progress, Stops):
-            with pytest.raises(InputError, match="cannot go on: metric both is another function now"):
+            with pytest.raises(InputError, match="cannot resume: metric both is another function than"):
                 advsearch.sweep(scene, model, metrics={"both": _other()}, run=run, **asked)
     again = advsearch.load_run(run)
     assert isinstance(again, SweepResult)
@@ -403,9 +403,9 @@ def test_a_loaded_scene_is_asked_about_as_it_is(model: advsearch.Model, tmp_path
     part = advsearch.load_run(tmp_path / "gap" / "parts" / gap.parts[0])
     assert isinstance(part, AttackResult) and part.summary.command_line == gap.command_line
     assert "pose.yaw: 77.0" in (tmp_path / "gap" / "run.yaml").read_text("utf-8")
-    with pytest.raises(InputError, match="environment: belongs to the scene, which is given already"):
+    with pytest.raises(InputError, match="environment: belongs to the scene, and a loaded scene was given"):
         advsearch.region(turned, model, environment="noon")
-    with pytest.raises(InputError, match="workers: expected names of objects, models"):
+    with pytest.raises(InputError, match="workers: other processes load objects, models"):
         advsearch.gap(turned, model, workers=2)
 
 

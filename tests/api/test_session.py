@@ -266,7 +266,7 @@ def test_what_an_attack_takes_beside_its_settings_is_read_as_they_are(asked: Cal
 
 def test_what_belongs_to_a_loaded_scene_is_not_given_beside_it(scene: advsearch.Scene) -> None:
     for function in (advsearch.attack, advsearch.sweep):
-        with pytest.raises(InputError, match="environment: belongs to the scene, which is given already"):
+        with pytest.raises(InputError, match="environment: belongs to the scene, and a loaded scene was given"):
             function(scene, environment="loft")
 
 
@@ -316,11 +316,11 @@ def test_instances_and_names_go_together_in_every_question(
     with pytest.raises(ZeroDivisionError):
         advsearch.check("mug", controls=mixed, run=tmp_path / "check", **small)
     assert [bound.name for bound in seen[0].space.controls] == ["faded", "pose"]
-    with pytest.raises(InputError, match="workers: expected names of objects, models, controls"):
+    with pytest.raises(InputError, match="workers: other processes load objects, models, controls"):
         advsearch.gap("mug", controls=mixed, workers=2)
-    with pytest.raises(InputError, match="workers: expected names of objects, models, controls"):
+    with pytest.raises(InputError, match="workers: other processes load objects, models, controls"):
         advsearch.attack("mug", controls=mixed, workers=2)
-    with pytest.raises(InputError, match="epsilon: control texture is an instance already"):
+    with pytest.raises(InputError, match="epsilon: control texture was given as an instance"):
         advsearch.gap("mug", controls=[TextureControl(), PoseControl()], epsilon=0.1, run=tmp_path / "not")
     with pytest.raises(InputError, match="unknown control 'faded'"):
         advsearch.gap("mug", controls="faded", run=tmp_path / "not")
@@ -369,10 +369,10 @@ def test_a_run_goes_on_with_the_objective_and_the_weights_that_it_began_with(
     patch.undo()
     again: dict[str, Any] = {**SMALL, "run": run, "resume": True}
     with pytest.raises(
-        InputError, match=r"cannot go on: .*(objective is another function now|objective was .* and is)"
+        InputError, match=r"cannot resume: .*(objective is another function than|objective was .* and is)"
     ):
         advsearch.attack(scene, model, objective=own(-1.0), **again)
-    with pytest.raises(InputError, match="model bright has other weights now; take the one that"):
+    with pytest.raises(InputError, match="model bright has other weights than at the start; use the one that"):
         advsearch.attack(scene, victim(level + 0.05), objective=own(1.0), **again)
     with pytest.raises(InputError, match=r"the same picture of the clean scene has other values now \(score was"):
         brighter = advsearch.load_scene("mug", settings={"camera.exposure": 0.5})
@@ -414,7 +414,7 @@ def test_a_sweep_goes_on_with_the_weights_that_it_began_with(scene: advsearch.Sc
         with suppress(KeyboardInterrupt):
             advsearch.sweep(scene, model, grid, run=tmp_path / "run", progress=ends, **asked)
         if isinstance(ends, Stops):
-            with pytest.raises(InputError, match="cannot go on: model bright has other weights now"):
+            with pytest.raises(InputError, match="cannot resume: model bright has other weights than"):
                 advsearch.sweep(scene, victim(0.6), grid, run=tmp_path / "run", **asked)
             with pytest.MonkeyPatch.context() as patch:  # of a network that shows none
                 patch.setattr(Bright, "state_dict", lambda self: {})
@@ -439,7 +439,7 @@ def test_what_exists_only_here_is_no_command(
     assert "# But it can't be: the objective <lambda>" in (run / "run.yaml").read_text("utf-8")
     (run / "summary.json").unlink()
     assert main(["resume", str(run)]) == 2
-    assert "the objective <lambda> existed only in the Python session that asked" in capsys.readouterr().err
+    assert "the objective <lambda> existed only in the Python session of the run" in capsys.readouterr().err
     run.joinpath("summary.json").write_text(json.dumps(result.summary.to_dict()), "utf-8")
     replayed = advsearch.replay(run, ways="curve", trials=6, run=tmp_path / "again", threads=1)
     assert {row.ending for row in replayed.table} <= {"found", "budget spent", "not verified", "already wrong"}

@@ -516,7 +516,7 @@ def test_a_function_asks_for_more_by_name() -> None:
     assert one_number(LOGITS, IMAGES, (0,), more).tolist() == [11.0, 22.0], "one picture at a time"
     old = get_objective(lambda outputs, inputs, targets: inputs.sum(dim=(1, 2, 3)) + outputs[:, 0])
     assert old(LOGITS, IMAGES, (0,)).tolist() == [3.0, 0.0], "its pictures may be called so"
-    with pytest.raises(InputError, match="asks for `u`, and there is no configuration here"):
+    with pytest.raises(InputError, match="asks for `u`, and no configuration was given"):
         get_objective(asks)(LOGITS, IMAGES, (0,))
 
 

@@ -481,7 +481,8 @@ def test_an_interrupted_study_says_how_to_go_on(
     api(lambda config, progress, resumed: answer)
     assert main([command, "--object", "mug,bowl"]) == 130
     assert capsys.readouterr().out.endswith(
-        f"\n\nNote: Interrupted before its end.\n\nGo on with: advsearch resume {Path(answer.run).name}\n"
+        f"\n\nNote: Not finished: these are the results so far.\n\n"
+        f"Go on with: advsearch resume {Path(answer.run).name}\n"
     )
 
 

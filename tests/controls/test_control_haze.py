@@ -118,7 +118,7 @@ def test_camera_and_object_are_inside() -> None:
     (part,) = HazeControl().prepare(plain()).parts
     assert isinstance(part, HazePart)
     assert part.radius >= max(LEAST_RADIUS, 1.4 * float(np.linalg.norm(camera_to_world(plain())[:3, 3])))
-    (far,) = HazeControl().prepare(describe("mug", given={"camera.distance": 20.0})).parts
+    (far,) = HazeControl().prepare(describe("mug", size=1.0, given={"camera.distance": 20.0})).parts
     assert isinstance(far, HazePart) and far.radius > 28.0
 
 

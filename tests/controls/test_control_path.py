@@ -26,11 +26,13 @@ WAY = "time, x, y, z\n3, 2, 0, 1\n4, 2, 2, 1\n7, -2, 2, 1\n"
 
 @pytest.fixture(scope="module")
 def scene() -> SceneDescription:
-    return describe("mug", given={"camera.roll": 20.0, "camera.azimuth": 70.0})
+    return describe("mug", size=1.0, given={"camera.roll": 20.0, "camera.azimuth": 70.0})
 
 
-def bound(scene: SceneDescription, **given: Any) -> Control:
-    return make_space([PathControl(**given)], scene).controls[0]
+def bound(scene: SceneDescription, **given: Any) -> PathControl:
+    (control,) = make_space([PathControl(**given)], scene).controls
+    assert isinstance(control, PathControl)
+    return control
 
 
 def distance(control: Control, share: float) -> float:
@@ -58,7 +60,7 @@ def test_a_frame_of_each_path_is_the_scene_as_it_is_and_others_are_not(
 
 @pytest.mark.parametrize("moves", ["camera", "object"])
 def test_distances_are_those_of_the_geometry(moves: str) -> None:
-    scene = describe("mug", given={"camera.elevation": 0.0, "camera.distance": 2.0})
+    scene = describe("mug", size=1.0, given={"camera.elevation": 0.0, "camera.distance": 2.0})
     away = distance(bound(scene, path="orbit", moves=moves), 0.7)
     assert away == pytest.approx(2.0, abs=1e-4)
     near = [distance(bound(scene, path="approach", reach=5.0, moves=moves), share) for share in (0.0, 0.25, 1.0)]
@@ -137,7 +139,7 @@ def test_the_box_of_each_frame_is_where_both_have_moved_to(tmp_path: Path) -> No
 @pytest.mark.parametrize("path", PATHS)
 def test_moving_the_camera_or_the_object_is_the_same_drive(path: str) -> None:
     """Up to the sense of the turn: what the camera sees of the object's middle is as far away."""
-    scene = describe("mug", given={"camera.elevation": 30.0})
+    scene = describe("mug", size=1.0, given={"camera.elevation": 30.0})
     camera, thing = (bound(scene, path=path, moves=moves) for moves in ("camera", "object"))
     for share in (0.0, 0.4, 0.8):
         assert distance(camera, share) == pytest.approx(distance(thing, share), rel=1e-4)
@@ -187,7 +189,7 @@ def test_a_file_says_where_the_camera_looks_and_how_the_object_is_turned(
 def test_a_camera_over_the_object_has_a_pose(tmp_path: Path) -> None:
     file = tmp_path / "over.csv"
     file.write_text("time,x,y,z\n0,0,0,3\n1,0,0,2\n")
-    assert bool(torch.isfinite(placed(bound(describe("mug"), path=str(file)), 0.5)).all())
+    assert bool(torch.isfinite(placed(bound(describe("mug", size=1.0), path=str(file)), 0.5)).all())
 
 
 @pytest.mark.parametrize(
@@ -217,10 +219,10 @@ def test_a_path_through_what_the_camera_looks_at_is_refused(
 
 
 def test_a_path_through_what_it_looks_at_is_refused_where_no_file_is(tmp_path: Path) -> None:
-    level = describe("mug", given={"camera.elevation": 0.0})
+    level = describe("mug", size=1.0, given={"camera.elevation": 0.0})
     file = tmp_path / "car.csv"
     file.write_text("time,x,y,z\n0,-9,0,0\n1,9,0,0\n")  # past the middle; the camera is at +x, and looks at the object
-    east = describe("mug", given={"camera.elevation": 0.0, "camera.azimuth": 0.0})
+    east = describe("mug", size=1.0, given={"camera.elevation": 0.0, "camera.azimuth": 0.0})
     with pytest.raises(InputError, match="the camera is where it looks"):
         bound(east, path=f"approach+{file}")
     for path in (*PATHS, "approach+orbit", "pass+pass"):
@@ -237,7 +239,8 @@ def test_as_many_times_at_once_are_those_one_by_one(scene: SceneDescription, tmp
         start = control._start(time)
 
         def both(at: Tensor, control: PathControl = control, start: Any = start) -> Tensor:
-            place, target = control._camera(start, at, control._object(start, at)[0])
+            (ways,) = control._paths
+            place, target = control._camera(ways, start, at, control._object(ways, start, at)[0])
             return (target - place).expand(*at.shape, 3)
 
         torch.testing.assert_close(both(time), torch.stack([both(one) for one in time]))
@@ -355,3 +358,33 @@ def test_what_does_not_go_together_is_refused(scene: SceneDescription, tmp_path:
             PathControl(path=path)
     with pytest.raises(InputError, match=r"approach\+orbit says what .* leave moves out"):
         PathControl(path="approach+orbit", moves="object")
+
+
+def test_of_several_paths_each_configuration_has_one_as_it_is_alone(scene: SceneDescription, tmp_path: Path) -> None:
+    (tmp_path / "way.csv").write_text(WAY)
+    names = ["approach", "orbit+pass", str(tmp_path / "way.csv")]
+    several = bound(scene, path=",".join(names))
+    assert [slot.parameter.name for slot in several.slots] == ["time", "way"] and several.start.shape == (2,)
+    assert several.describe(several.start)["path.way"] == {"value": "approach", "unit": "name"}
+    for number, name in enumerate(names):
+        alone = bound(scene, path=name, **({} if number == 2 else {"seconds": 4.0}))
+        u = torch.tensor([0.3, (number + 0.5) / 3])
+        poses, own = several.inputs(u), alone.inputs(u[:1])
+        assert several.describe(u)["path.way"]["value"] == name
+        assert set(poses) == {"camera.to_world", "object.to_world"}  # one set, so that no draw is a surprise
+        for one, pose in own.items():
+            torch.testing.assert_close(poses[one], pose)
+    assert bound(scene, path=["approach", "orbit"]).settings() == {"path": ["approach", "orbit"]}
+
+
+@pytest.mark.parametrize("path", ["approach,approach", "approach,", "approach,nowhere", ",".join(["a.csv"] * 70)])
+def test_several_paths_are_different_ones_that_there_are(path: str) -> None:
+    with pytest.raises((InputError, FileFormatError), match=r"path: expected|expected a table"):
+        PathControl(path=path)
+
+
+def test_a_file_that_is_shorter_than_others_is_told(scene: SceneDescription, tmp_path: Path) -> None:
+    (tmp_path / "way.csv").write_text(WAY)
+    (tmp_path / "longer.csv").write_text(WAY + "9, 1, 2, 1\n")
+    there = PathControl(path=f"{tmp_path / 'way.csv'},{tmp_path / 'longer.csv'}").prepare(scene)
+    assert any("takes 4 s of 6" in one for one in there.remarks)

@@ -88,7 +88,7 @@ def test_rates_of_one_drive_are_those_worked_out_by_hand(
 ) -> None:
     """Five frames in four seconds, from five distances away to one, with the camera as high as the object."""
     monkeypatch.setattr(swept_scene, "make_renderer", Timed)
-    (said,), _ = clocked(frames, **DRIVE, set={"camera.elevation": 0.0, "camera.distance": 1.0})
+    (said,), _ = clocked(frames, **DRIVE, size=1.0, set={"camera.elevation": 0.0, "camera.distance": 1.0})
     assert (said.drives, said.frames, said.seconds, said.never_seen) == (1, 5, 4.0, int(first is None))
     assert (said.right.mean, said.longest_gap.mean, said.flicker.mean) == pytest.approx((right, gap, flicker))
     assert said.right.interval is None and said.right.worst == said.right.mean
@@ -99,9 +99,9 @@ def test_rates_of_one_drive_are_those_worked_out_by_hand(
 def test_frames_of_a_drive_of_both_have_their_distances_and_workers_have_the_same(
     tmp_path: Path, workers: bool
 ) -> None:
-    """Level, from 2 sizes away: the camera comes from 4 times as far, the object from as far behind its place."""
+    """Level, from 2 metres away: the camera comes from 4 times as far, the object from as far behind its place."""
     config = SweepConfig(
-        object="mug", controls={"path": {"seconds": 4.0, "reach": 4.0}}, path="approach+approach", fps=1.0,
+        object="mug", size=1.0, controls={"path": {"seconds": 4.0, "reach": 4.0}}, path="approach+approach", fps=1.0,
         set_={"camera.elevation": 0.0, "camera.distance": 2.0}, resolution=16, spp=1, trials=0, batch=2,
     )  # fmt: skip
     job = job_of(config)
@@ -238,9 +238,7 @@ def test_the_longest_run() -> None:
 def test_no_frames_no_drives_and_settings_that_need_a_path() -> None:
     assert advsearch.sweep("mug", grid={"pose.yaw": [0, 90]}, **SMALL).summary.drives is None
     assert advsearch.sweep("mug", grid={"path.time": [3]}, **SMALL).summary.drives is None
-    with pytest.raises(
-        InputError, match="path: texture does not travel; add `over=path` beside it, or `controls=path`"
-    ):
+    with pytest.raises(InputError, match="path: the control texture does not move on a path; add `over=path`, or use"):
         advsearch.attack("mug", controls="texture", path="orbit")
 
 
@@ -285,3 +283,36 @@ class Dark(nn.Module):
     def forward(self, images: Tensor) -> Tensor:
         score = 3.0 * (2.0 - images.mean(dim=(1, 2, 3)))
         return torch.stack([score, -score], dim=1)
+
+
+class Along(FakeRenderer):
+    """A picture whose grey level is the frame, five more on `orbit`."""
+
+    def __call__(self, u: Tensor, seed: int, spp: int) -> Tensor:
+        values = self.space.describe(u)
+        further = 5 if values["path.way"]["value"] == "orbit" else 0
+        return torch.full((*self.size, 3), (round(float(str(values["path.time"]["value"]))) + further) / 25.5)
+
+
+def test_drives_on_several_paths_have_numbers_of_their_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Right in two of five frames of `approach` and in all of `orbit`, whose distance is always one."""
+    monkeypatch.setattr(swept_scene, "make_renderer", Along)
+    given = {**DRIVE, "path": "approach,orbit", "set": {"camera.elevation": 0.0, "camera.distance": 1.0}}
+    (said,), result = clocked("00110" + "11111", **given, run=tmp_path / "run")
+    approach, orbit = said.each
+    assert (said.drives, approach.path, orbit.path) == (2, "approach", "orbit")
+    assert (approach.right, approach.first_seen, approach.longest_gap, approach.flicker) == pytest.approx(
+        (0.4, 3.0, 2.0, 0.5)
+    )
+    assert (orbit.right, orbit.first_seen, orbit.longest_gap, orbit.flicker) == pytest.approx((1.0, 1.0, 0.0, 0.0))
+    assert said.right.mean == pytest.approx(0.7) and said.right.worst == pytest.approx(0.4)
+    assert "path.way" in (text := text_of(result.summary)) and "2 of 5" in text
+
+
+def test_drawn_paths_are_the_same_with_the_same_seed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(swept_scene, "make_renderer", Along)
+    given = {**DRIVE, "path": "approach,orbit", "samples": 12, "sampler": "random"}
+    first, again, other = (
+        [drive.path for drive in clocked("0" * 10, **given, seed=seed)[0][0].each] for seed in (1, 1, 2)
+    )
+    assert len(first) == 12 and set(first) == {"approach", "orbit"} and first == again != other

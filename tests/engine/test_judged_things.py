@@ -60,7 +60,7 @@ def test_rows_have_the_truth_of_each_thing_and_tasks_judge_what_is_asked(judge: 
 def test_names_of_what_is_judged_are_checked_before_anything_is_rendered() -> None:
     for judge, error, said in (
         ("stop-sine", UnknownNameError, "Did you mean 'stop-sign'"),
-        ("all", InputError, "nothing stands beside the object"),
+        ("all", InputError, "expected things beside the object for 'all'"),
     ):
         asked = {**ASKED, "things": None} if judge == "all" else ASKED
         with pytest.raises(error, match=said):

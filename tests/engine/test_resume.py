@@ -148,7 +148,9 @@ def test_another_configuration_than_was_stored_is_refused(tmp_path: Path) -> Non
         (again,) = Journal(run, Shared(problem)).evaluate_all([query])
         assert again.objective == found.objective
         for other in (replace(query, u=torch.full((6,), 0.4)), replace(query, seed=2)):
-            with pytest.raises(InputError, match="cannot go on: evaluation 0 of the search is another one now"):
+            with pytest.raises(
+                InputError, match="cannot resume: evaluation 0 of the search is not the one that was stored"
+            ):
                 list(Journal(run, Shared(problem)).evaluate_all([other]))
 
 
@@ -167,7 +169,7 @@ def test_a_run_goes_on_with_the_settings_that_it_began_with(tmp_path: Path, name
         run.record(Row(kind="search", step=0))
     recipe = tmp_path / "run" / "run.yaml"
     edited = AttackConfig.from_yaml(recipe, {name: CHANGES[name]})
-    with pytest.raises(InputError, match=rf"cannot go on: {name} was .* and is .* now; set it back to what"):
+    with pytest.raises(InputError, match=rf"cannot resume: {name} was .* and is .* now; set it back to what"):
         RunDirectory.resume(tmp_path / "run", edited)
     with RunDirectory.resume(tmp_path / "run", AttackConfig.from_yaml(recipe)):  # and nothing is locked any more
         pass

@@ -138,9 +138,9 @@ def _seen(config: AttackConfig, seen: list[Any]) -> None:
         (
             "pose,lens",
             {"norm": "l2"},
-            "--norm: pose has none, and no other control is there that has one; leave it out",
+            "--norm: the control pose does not take it, nor does another one here; leave it out",
         ),
-        ("patch", {"texture_resolution": 8}, "--texture-resolution: patch has none"),
+        ("patch", {"texture_resolution": 8}, "--texture-resolution: the control patch does not take it"),
         ("texture,pose", {"epsilon": "pose=1"}, "--epsilon pose: the control has ranges and no epsilon"),
         (
             "environment",
@@ -158,7 +158,11 @@ def _seen(config: AttackConfig, seen: list[Any]) -> None:
             "'patch={PARAMETER: [LOW, HIGH]}', or search pixels with it",
         ),
         ({"patch": {"pixels": 0.5, "size": [0.1, 0.3]}}, {"epsilon": 0.1}, "--epsilon patch: the control has ranges"),
-        ({"patch": {"picture": "a.png", "size": [0.1, 0.3]}}, {"norm": "l2"}, "--norm: patch has none"),
+        (
+            {"patch": {"picture": "a.png", "size": [0.1, 0.3]}},
+            {"norm": "l2"},
+            "--norm: the control patch does not take it",
+        ),
         (
             {"texture": {}, "sign": {"kind": "patch", "pixels": 0, "size": [0.1, 0.3]}},
             {"epsilon": "sign=0.1"},
@@ -229,7 +233,7 @@ def test_an_epsilon_for_a_control_that_is_not_there_is_refused() -> None:
 @pytest.mark.parametrize("setting", sorted(ALL))
 def test_an_instance_says_its_own(setting: str) -> None:
     config = AttackConfig(object="mug", **{setting: ALL[setting]})
-    with pytest.raises(InputError, match=rf"{setting}: control texture is an instance already; give it its own"):
+    with pytest.raises(InputError, match=rf"{setting}: control texture was given as an instance; set it there"):
         given_to(config, [PoseControl(), TextureControl()])
     assert given_to(config, [PoseControl()])[0].name == "pose"
 

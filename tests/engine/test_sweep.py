@@ -313,9 +313,9 @@ def test_a_wrong_name_of_an_axis_says_what_to_do(name: str, error: type[InputErr
 
 def test_a_parameter_cannot_be_asked_for_twice() -> None:
     drawn = (make_control("pose", {"yaw": [0, 90]}),)
-    with pytest.raises(InputError, match=r"`grid` pose.yaw: `controls` pose says what yaw is already; leave it out"):
+    with pytest.raises(InputError, match=r"`grid` pose.yaw: `controls` pose sets yaw too; leave it out of one"):
         read_axes({"pose.yaw": [0, 1, 2]}, drawn)
-    with pytest.raises(InputError, match=r"`grid` light.power:key: key.power is an axis already"):
+    with pytest.raises(InputError, match=r"`grid` light.power:key: key.power is given twice"):
         read_axes({"light:key.power": [1, 2], "light.power:key": [3, 4]}, ())
     assert [axis.name for axis in read_axes({"pose.pitch": [0, 1]}, drawn)] == ["pose.pitch"]
 
@@ -419,7 +419,7 @@ def test_a_label_for_several_objects_says_whose_own_it_is_not(
 
 
 def test_what_a_row_says_of_an_occluder_is_true_of_its_own_camera() -> None:
-    grid = {"camera.distance": [2, 4], "occlusion.coverage": [0.3]}
+    grid = {"camera.sizes": [2, 4], "occlusion.coverage": [0.3]}
     found = advsearch.sweep("mug", model(), grid, trials=0, resolution=SIZE)
     near, far = (float(row.values["occlusion.true_distance"]["value"]) for row in found.rows())
     assert near == pytest.approx(1.0, abs=0.1) and far == pytest.approx(2.0, abs=0.1)
@@ -1087,7 +1087,7 @@ def test_what_is_rendered_with_an_adversarial_scene_is_the_adversarial_scene_rea
     [
         (
             {"grid": {"pose.yaw": [0, 90]}},
-            "adversarial_of: the configuration of .*turned says what pose is already; leave it out",
+            "adversarial_of: the adversarial configuration of .*turned sets pose, so it can't vary; leave it out",
         ),
         ({"grid": {"camera.azimuth": [0]}, "adversarial_of": "nowhere"}, "unknown run 'nowhere'"),
     ],

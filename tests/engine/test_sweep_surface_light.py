@@ -30,7 +30,7 @@ from advsearch.scene.surface import arrangement, texels
 from advsearch.scene.surface.renderer import SurfaceRenderer
 
 SMALL: dict[str, Any] = {"resolution": 24, "trials": 0, "batch": 4}
-GRID: dict[str, Any] = {"pose.yaw": [0, 90], "camera.azimuth": "0:360:4", "camera.distance": [2, 3]}
+GRID: dict[str, Any] = {"pose.yaw": [0, 90], "camera.azimuth": "0:360:4", "camera.sizes": [2, 3]}
 KITCHEN_TOO: dict[str, Any] = {"environment.which": ["studio", "kitchen"], "camera.azimuth": "0:360:4"}
 
 
@@ -119,7 +119,7 @@ def test_a_sweep_that_was_stopped_and_goes_on_by_workers_has_the_same_rows(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """Each of them finds the same light."""
-    grid = {"camera.azimuth": "0:360:4", "camera.distance": [2, 3, 4]}
+    grid = {"camera.azimuth": "0:360:4", "camera.sizes": [2, 3, 4]}
     whole, answers = swept(grid=grid, run=tmp_path / "whole").summary, SweptScene.evaluate_all
     looked = iter(range(3))
 

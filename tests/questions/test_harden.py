@@ -77,7 +77,7 @@ def test_a_run_trains_measures_and_goes_on(
     both = [("ball", 40), ("book", 40), ("ball", 120)]  # what was found is not sought any harder
     assert attacks == both
     monkeypatch.setattr(Course, "round", taught)
-    with pytest.raises(InputError, match="cannot go on: it began without `beside`, which only Python gives"):
+    with pytest.raises(InputError, match="cannot resume: it began without `beside`, which only Python gives"):
         advsearch.harden(SMALL["model"], beside=[], resume=True, **given)
     result = advsearch.harden(SMALL["model"], resume=True, **given)
     assert attacks[3:] == both

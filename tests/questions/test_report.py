@@ -97,7 +97,7 @@ def test_what_was_stopped_claims_nothing_whatever_it_has_counted(ending: str) ->
     ]  # fmt: skip
     for result in stopped:
         (claim,) = claims_of(result)
-        assert nothing(claim) and "stopped" in claim.statement
+        assert nothing(claim) and "not finished" in claim.statement
 
 
 def test_a_sweep_says_how_its_configurations_were_chosen() -> None:

@@ -104,7 +104,10 @@ def test_what_is_wrong_is_told(run: Path, capsys: pytest.CaptureFixture[str]) ->
     for words, message in (
         (["export", "two"], "unknown run 'two'"),
         (["export", "one", "--format", "xls"], "unknown format 'xls'. Known: 3db, coco, csv, gltf, json, mitsuba, "),
-        (["export", "one", "--format", "fiftyone", "--out", "x"], "fiftyone is gone, as FiftyOne reads COCO; say "),
+        (
+            ["export", "one", "--format", "fiftyone", "--out", "x"],
+            "fiftyone was removed, since FiftyOne reads COCO; use ",
+        ),
         (["export", "one", "--all"], "--all: belongs to --format coco and yolo"),
         (["export", "one", "--kind", "serch"], "unknown kind of rows 'serch'. Did you mean 'search'?"),
         (["export", "one", "--json", "--format", "csv"], "--json: prints JSON, but --format asks for csv"),

@@ -411,7 +411,7 @@ def test_a_run_does_not_go_on_with_another_file(home: Path, setting: str, value:
     for wanted in ("one", "another", "one"):
         Path(file).write_text(wanted)
         if wanted == "another":
-            with pytest.raises(InputError, match=f"cannot go on: {Path(file).parts[0]} is another file now"):
+            with pytest.raises(InputError, match=f"cannot resume: {Path(file).parts[0]} has changed since"):
                 RunDirectory.resume("first", config)
         else:
             (RunDirectory.resume("first", config) if Path("runs").is_dir() else RunDirectory.create_for(config)).close()

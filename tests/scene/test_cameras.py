@@ -339,7 +339,8 @@ def test_truth_is_that_of_the_distorted_picture(camera: str, tmp_path: Path) -> 
     """The mask and the box that a detector is judged by are where the object's paint shows, and no pinhole's."""
     path = tmp_path / "camera.yaml"
     path.write_text(ros("plumb_bob", [-0.6, 0.0, 0.0, 0.0], [500.0, 0.0, 760.0, 0.0, 280.0, 300.0, 0.0, 0.0, 1.0]))
-    scene = advsearch.load_scene("mug", camera=str(path) if camera == BARREL else camera, settings=BOXED[camera])
+    seen_by = str(path) if camera == BARREL else camera
+    scene = advsearch.load_scene("mug", camera=seen_by, size=1.0, settings=BOXED[camera])
     one = scene.renderer({"texture": {"resolution": 2, "epsilon": 1.0}}, resolution=48, denoise="none")
     with torch.no_grad():
         white, black = (one.radiance(torch.full_like(one.start, value), 1, 32) for value in (1.0, 0.0))

@@ -20,7 +20,7 @@ SIDE = 64
 
 
 def renderer(controls: Any, fov: float, side: int, camera: str | None = None) -> Renderer:
-    scene = advsearch.load_scene("mug", settings={"camera.distance": 2.2, "camera.fov": fov})
+    scene = advsearch.load_scene("mug", size=1.0, settings={"camera.distance": 2.2, "camera.fov": fov})
     return scene.renderer(controls, resolution=side, denoise="none")
 
 

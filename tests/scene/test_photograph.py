@@ -64,7 +64,7 @@ def test_a_floor_as_bright_as_the_light_is_white() -> None:
 @pytest.mark.parametrize("rotation", [0.0, 70.0])
 def test_from_where_it_was_taken_the_floor_is_the_photograph(rotation: float) -> None:
     given = {**AWAY, "environment.rotation": rotation}
-    scene = describe("ball", room(), given={**given, "ground.height": 2.0})
+    scene = describe("ball", room(), size=1.0, given={**given, "ground.height": 2.0})
     with_floor, without = scene, replace(scene, values={**scene.values, "ground.size": 0.0})
     assert scene.photograph is not None and without.photograph is None
     camera = {"camera.to_world": from_the_tripod(2.0)}
@@ -75,7 +75,7 @@ def test_from_where_it_was_taken_the_floor_is_the_photograph(rotation: float) ->
 
 
 def test_the_object_keeps_light_from_the_floor() -> None:
-    scene = describe("ball", room(), given={"camera.elevation": 60.0, "camera.distance": 4.0})
+    scene = describe("ball", room(), size=1.0, given={"camera.elevation": 60.0, "camera.distance": 4.0})
     away = replace(scene, values={**scene.values, **AWAY})
     mitsuba = MitsubaScene(scene, (SIZE, SIZE))
     seen = mitsuba.surfaces({}).seen("object")

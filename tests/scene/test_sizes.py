@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
+from advsearch.controls.camera import CameraControl
 from advsearch.controls.path import PathControl
 from advsearch.engine.loading import load_scene, scene_as_settings
 from advsearch.errors import InputError
@@ -19,6 +21,7 @@ from advsearch.scene.glb import glb, posed
 from advsearch.scene.importing.objects import import_object
 from advsearch.scene.importing.scenes import import_scene
 from advsearch.scene.places.road import ROAD
+from advsearch.scene.sizes import on_roads
 
 
 def box(folder: Path, name: str, longest: float) -> Path:
@@ -75,7 +78,7 @@ def test_what_is_said_of_a_size_wins_over_what_a_file_says(tmp_path: Path) -> No
     assert describe(path, unit="cm").metres == pytest.approx(0.049, rel=1e-5)
     assert describe(path, size=4.1).metres == 4.1
     assert describe("mug", size=0.1).metres == 0.1
-    assert describe("mug").object.metres is None
+    assert describe("mug").metres == pytest.approx(0.11, abs=0.001)
 
 
 @pytest.mark.parametrize(
@@ -154,7 +157,36 @@ def test_the_floor_of_a_photograph_is_seen_from_a_tripod(tmp_path: Path) -> None
         assert describe(path, given=given, up="z", **said).capture_height == pytest.approx(height)  # type: ignore[arg-type]
 
 
-def test_bundled_objects_are_as_large_as_they_were() -> None:
-    assert {name: library.load_object(name).metres is not None for name in ("mug", "chair", "car", "stop-sign")} == {
-        "mug": False, "chair": False, "car": True, "stop-sign": True
-    }  # fmt: skip
+SIZES = {
+    "ball": 0.22, "banana": 0.175, "book": 0.275, "bottle": 0.30, "bowl": 0.16, "car": 4.3, "chair": 0.92,
+    "dumbbell": 0.23, "frying-pan": 0.40, "hammer": 0.26, "lamp": 0.48, "mug": 0.11, "person": 1.74, "stop-sign": 1.16,
+    "teapot": 0.24, "vase": 0.24, "wine-glass": 0.19,
+}  # fmt: skip
+"""Metres of the longest side of each bundled object."""
+
+
+def test_bundled_objects_have_their_true_size() -> None:
+    assert {name: library.load_object(name).metres for name in library.list_objects()} == pytest.approx(SIZES, abs=6e-3)
+    assert not any(describe(name).notes for name in SIZES)
+
+
+@pytest.mark.parametrize("name", sorted(SIZES))
+def test_a_size_in_metres_changes_no_picture(name: str) -> None:
+    """Neither where the camera stands by itself nor where it is searched; and a distance in sizes is that in metres."""
+    sized = describe(name)
+    bare = replace(sized, object=replace(sized.object, metres=None))
+    assert np.array_equal(camera_to_world(sized), camera_to_world(bare))
+    around: dict[str, Any] = {"azimuth": [0, 90], "elevation": [5, 60]}
+    far = {**around, "distance": [1.5, 6.0]}
+    pairs: list[tuple[dict[str, Any], dict[str, Any]]] = [
+        ({**around, "distance": [1.5 * sized.metres, 6.0 * sized.metres]}, far),
+        ({**around, "sizes": [1.5, 6]}, far),
+    ]
+    if not on_roads(sized.object):  # these are looked at from some height in metres
+        pairs.append(({}, {}))
+    for asked, same in pairs:
+        controls = CameraControl(**asked).bind(sized), CameraControl(**same).bind(bare)
+        for share in (0.0, 0.3, 1.0):
+            u = torch.full_like(controls[0].start, share)
+            poses = [one.inputs(u)["camera.to_world"].numpy() for one in controls]
+            np.testing.assert_allclose(poses[0], poses[1], rtol=0, atol=3e-6)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from advsearch.cli.main import main
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.options import things_as_text
 from advsearch.scene import library
+from advsearch.scene.description import describe
 from advsearch.scene.geometry import standing
 from advsearch.scene.outlines import seen_things
 from advsearch.scene.surface.renderer import why_not
@@ -54,7 +56,6 @@ def test_every_thing_has_a_name_of_its_own() -> None:
         ("car@1,2,size=0", InputError, "size: expected a number from 0.0001"),
         ("car@1,2; chair@3,3,name=car", InputError, "another thing of the scene is called car"),
         ("caar@1,2", UnknownNameError, "Did you mean 'car'"),
-        ("mug@4,2", InputError, r"the size of mug in metres is not known; say it: mug@4,2,size=METRES"),
         (";".join(["car@1,2"] * 65), InputError, "expected at most 64, got 65"),
     ],
 )  # fmt: skip
@@ -63,9 +64,13 @@ def test_what_cannot_be_is_refused(text: str, error: type[InputError], said: str
         advsearch.load_scene("car", things=text)
 
 
-def test_an_object_without_metres_has_nothing_beside_it() -> None:
+def test_an_object_without_metres_has_nothing_beside_it_and_stands_beside_none(tmp_path: Path) -> None:
+    loose = replace(library.load_object("mug"), metres=None)
     with pytest.raises(InputError, match="whose size in metres is not known"):
-        advsearch.load_scene("mug", things="car@1,2")
+        describe(loose, things="car@1,2")
+    (tmp_path / "thing.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\n")
+    with pytest.raises(InputError, match=r"the size of .*thing.obj in metres is not known; say it: .*@4,2,size=METRES"):
+        describe("car", things=f"{tmp_path}/thing.obj@4,2")
     with pytest.raises(InputError, match="expected an object, x and y"):
         advsearch.load_scene("car", things=[{"object": "car", "x": 1}])
 

@@ -12,7 +12,7 @@ from advsearch.controls import make_control, make_space
 from advsearch.engine.loading import Scene, framed, load_scene
 from advsearch.scene.assets import EnvironmentAsset
 from advsearch.scene.description import SceneDescription, describe
-from advsearch.scene.library import load_environment
+from advsearch.scene.library import load_environment, load_object
 from advsearch.scene.places.road import EDGES, EYE, LENGTH
 from advsearch.scene.validity import Surroundings, View, past, surroundings_of, valid, view_of
 
@@ -106,7 +106,8 @@ def test_along_a_street_it_fits_as_far_as_its_road() -> None:
 def photographed(height: float | None = None, radius: float | None = None, **said: float) -> SceneDescription:
     given = {"ground.height": height, "ground.radius": radius}
     lit = EnvironmentAsset("hall", np.ones((8, 16, 3), np.float32), photographed=True)
-    return describe("mug", lit, given={name: one for name, one in given.items() if one is not None}, **said)  # type: ignore[arg-type]
+    loose = replace(load_object("mug"), metres=None)
+    return describe(loose, lit, given={name: one for name, one in given.items() if one is not None}, **said)  # type: ignore[arg-type]
 
 
 def test_a_photograph_fits_by_its_height_and_its_empty_floor() -> None:

@@ -403,7 +403,7 @@ def test_options_are_checked(options: dict[str, Any], text: str) -> None:
 def test_objectives_of_detection_are_for_detection() -> None:
     check_objective("vanish", "detection")
     with pytest.raises(
-        InputError, match="expected one of task detection \\(score, vanish, mislabel, displace, create\\)"
+        InputError, match="expected an objective of task detection \\(score, vanish, mislabel, displace, create\\)"
     ):
         check_objective("margin", "detection")
     with pytest.raises(InputError, match="takes outputs of detection"):

@@ -334,7 +334,7 @@ def test_an_attack_is_verified(
         assert main(["resume", str(run)]) == 2
     finally:
         (rendered / "refs" / "bowl" / "more.png").unlink()
-    assert "cannot go on: refs is another file now than it was" in capsys.readouterr().err
+    assert "cannot resume: refs has changed since the run began" in capsys.readouterr().err
     monkeypatch.chdir(tmp_path)
     assert typed(capsys, "resume", str(run))["verified"] == found["verified"]
 
@@ -413,7 +413,7 @@ def test_options_that_make_no_sense_are_refused(model: Model) -> None:
             refused()
     with pytest.raises(InputError, match="it was loaded for its logits"):
         bar.on(replace(model, read=None))
-    with pytest.raises(InputError, match=r"expected one of task similarity .*distance.*got vanish"):
+    with pytest.raises(InputError, match=r"expected an objective of task similarity .*distance.*got vanish"):
         check_objective("vanish", "similarity")
     with pytest.raises(InputError, match="got distance, which takes outputs of similarity"):
         check_objective("distance", "classification")

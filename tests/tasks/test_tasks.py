@@ -212,7 +212,7 @@ def test_its_score_is_what_is_maximised_where_nothing_else_is_said() -> None:
 
 def test_an_objective_of_another_task_is_refused() -> None:
     with pytest.raises(
-        InputError, match=r"expected one of task yaw \(score\), got margin, which takes outputs of class"
+        InputError, match=r"expected an objective of task yaw \(score\), got margin, which takes outputs of class"
     ):
         check_objective("margin", "yaw")
     assert {kind.task for kind in OBJECTIVE_KINDS.values()} == {*TASKS, Together.name, None} - {"answer"}
@@ -256,7 +256,9 @@ def test_python_takes_a_task_with_options_of_its_own(tolerance: float, right: in
     )  # fmt: skip
     assert found.summary.ending == ("budget spent" if right else "already wrong")
     assert (found.summary.task, found.summary.objective) == ("yaw", "score")
-    with pytest.raises(InputError, match="model Level: expected logits, and it was loaded for another task; give that"):
+    with pytest.raises(
+        InputError, match="model Level: it was loaded for another task than classification; give the same"
+    ):
         advsearch.attack("mug", network, **fast)
 
 

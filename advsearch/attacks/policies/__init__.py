@@ -9,7 +9,7 @@ from pkgutil import iter_modules
 from typing import Any
 
 from advsearch.attacks.evaluation import Evaluated, Policy, Proposal, draw_seed, seeded
-from advsearch.attacks.policies.auto import Auto, Portfolio, Restarts
+from advsearch.attacks.policies.auto import Auto, Portfolio, Restarts, WithoutAscent
 from advsearch.attacks.policies.choices import Choices
 from advsearch.attacks.policies.evolution import CMAES, NES
 from advsearch.attacks.policies.pgd import PGD, Adam
@@ -81,5 +81,5 @@ def _nested(spec: Spec, where: str) -> Policy[Any]:
 
 __all__ = [
     "CMAES", "NES", "PGD", "POLICIES", "Adam", "Auto", "Choices", "Evaluated", "Grid", "Policy", "Portfolio",
-    "Proposal", "Random", "Restarts", "Sobol", "Spec", "draw_seed", "make_policy", "seeded",
+    "Proposal", "Random", "Restarts", "Sobol", "Spec", "WithoutAscent", "draw_seed", "make_policy", "seeded",
 ]  # fmt: skip

@@ -57,6 +57,10 @@ NEAR, FAR, CENTRES = 256, 128, 4
 """Candidates near the best points, candidates anywhere, and the number of best points."""
 
 
+NEVER = 1 << 30
+"""Renders of a gradient that no search can pay."""
+
+
 @dataclass(frozen=True)
 class Plan:
     """What the renders are for: the screen; the ascent, which asks for `gradient`, begins after `until`, or never at
@@ -231,6 +235,19 @@ class Auto(Policy[AutoState]):
         moved = state.box.moves(x[None], seeded(state.seed, state.plan.steps + ascent.count))[0]
         u = state.domain.project(state.box.put(proposal.u, moved))
         return replace(proposal, u=u, gradient=gradient), replace(state, trial=Tried(x, state.last))
+
+
+@dataclass(frozen=True)
+class WithoutAscent(Auto):
+    """Screen and surrogate of `Auto` alone, over box coordinates, for a model that has no gradient."""
+
+    uses_gradient: ClassVar[bool] = False
+
+    def start(self, domain: Domain, generator: torch.Generator, steps: int) -> AutoState:
+        return super().start(replace(domain, gradient_cost=NEVER), generator, steps)
+
+    def takes_differences(self, domain: Domain, steps: int) -> bool:
+        return False
 
 
 @dataclass(frozen=True)

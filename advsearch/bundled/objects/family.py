@@ -52,13 +52,13 @@ class ObjectFamily:
     Attributes:
         name: the class, usable on the command line.
         make: builds an instance from a `Draw`.
-        metres: of what has its real size, the unit in which it is made; None leaves its size open.
+        metres: of the unit in which it is made.
         texels: along each side of its texture.
     """
 
     name: str
     make: Callable[[Draw], Instance]
-    metres: float | None = None
+    metres: float
     texels: int = SIZE
 
     @property
@@ -89,7 +89,7 @@ class ObjectFamily:
             source=BUNDLED_OBJECT,
             surface=finished(mesh, instance.finishes, instance.material) if instance.finishes else None,
             finishes=instance.finishes,
-            metres=None if self.metres is None else round(float(extent) * self.metres, 4),
+            metres=round(float(extent) * self.metres, 4),
         )
 
 

@@ -272,5 +272,5 @@ def _lamp(draw: Draw) -> Instance:
     return Instance(patches, paints, finish(draw, 0.4, 0.3), {"lining": 0.6})
 
 
-CHAIR = ObjectFamily("chair", _chair)
-LAMP = ObjectFamily("lamp", _lamp)
+CHAIR = ObjectFamily("chair", _chair, metres=0.01)
+LAMP = ObjectFamily("lamp", _lamp, metres=0.01)

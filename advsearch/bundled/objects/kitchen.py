@@ -260,5 +260,5 @@ def _enamel(color: Array, height: float, offset: Array) -> Paint:
     return over(paint, between(height - 0.1, 2 * height, soft=0.15), solid(hexed("2b2c2e")))
 
 
-TEAPOT = ObjectFamily("teapot", _teapot)
-FRYING_PAN = ObjectFamily("frying-pan", _frying_pan)
+TEAPOT = ObjectFamily("teapot", _teapot, metres=0.01)
+FRYING_PAN = ObjectFamily("frying-pan", _frying_pan, metres=0.01)

@@ -308,6 +308,6 @@ def _front(draw: Draw, base: Paint, gold: Array, title: str, width: float, heigh
     return paint
 
 
-BALL = ObjectFamily("ball", _ball)
-BANANA = ObjectFamily("banana", _banana)
-BOOK = ObjectFamily("book", _book)
+BALL = ObjectFamily("ball", _ball, metres=0.01)
+BANANA = ObjectFamily("banana", _banana, metres=0.01)
+BOOK = ObjectFamily("book", _book, metres=0.01)

@@ -230,5 +230,5 @@ def _disc_mark(base: Paint, color: Array, beyond: float, inner: float, outer: fl
     )
 
 
-HAMMER = ObjectFamily("hammer", _hammer)
-DUMBBELL = ObjectFamily("dumbbell", _dumbbell)
+HAMMER = ObjectFamily("hammer", _hammer, metres=0.01)
+DUMBBELL = ObjectFamily("dumbbell", _dumbbell, metres=0.01)

@@ -416,8 +416,8 @@ def _wine_glass(draw: Draw) -> Instance:
     )
 
 
-MUG = ObjectFamily("mug", _mug)
-BOWL = ObjectFamily("bowl", _bowl)
-BOTTLE = ObjectFamily("bottle", _bottle)
-VASE = ObjectFamily("vase", _vase)
-WINE_GLASS = ObjectFamily("wine-glass", _wine_glass)
+MUG = ObjectFamily("mug", _mug, metres=0.01)
+BOWL = ObjectFamily("bowl", _bowl, metres=0.01)
+BOTTLE = ObjectFamily("bottle", _bottle, metres=0.01)
+VASE = ObjectFamily("vase", _vase, metres=0.01)
+WINE_GLASS = ObjectFamily("wine-glass", _wine_glass, metres=0.01)

@@ -14,6 +14,7 @@ from advsearch import losses
 from advsearch.api.keywords import asks
 from advsearch.attacks import Policy, make_policy
 from advsearch.attacks.objectives import OBJECTIVE_KINDS
+from advsearch.attacks.policies import WithoutAscent
 from advsearch.cluster import Call
 from advsearch.config import SceneConfig
 from advsearch.controls.values import sentences
@@ -37,6 +38,7 @@ from advsearch.engine.transport import CleanMatrix
 from advsearch.errors import InputError
 from advsearch.files import JsonObject
 from advsearch.models import Model
+from advsearch.models.address import Asked
 from advsearch.options import as_setting, told
 from advsearch.progress import NullProgress, Progress, Watched, watcher
 from advsearch.questions.attack.outcome import summarise
@@ -248,6 +250,8 @@ def _carry_out(job: AttackParts, progress: Progress, resumed: str | Path | None 
                     f"{count(problem.draws, 'condition')}; `steps` and `draws` change that."
                 )
             findings = Attack(journal, job.config, policy, stages, clean=job.clean).carry_out()
+        if isinstance(problem.model.module, Asked):
+            warnings.append(problem.model.module.line.sentence)
         named = job.objective if isinstance(job.objective, str) else job.config.objective
         result = summarise(job.config, named, findings, journal, stages, warnings)
         parts = replace(job, clean=CleanMatrix())  # without the matrix of light transport, which may be large
@@ -261,9 +265,20 @@ def attack_worker(settings: JsonObject) -> Call:
 
 
 def _policy(job: AttackParts, problem: Problem) -> Policy[Any]:
-    """The policy. Where a model lets no gradient through, `auto` climbs by differences of whole pictures."""
+    """The policy. Where a model lets no gradient through, `auto` climbs by differences of whole pictures. A model
+    behind an address has none, so that `auto` climbs nowhere else, and others that climb are refused."""
     balls = all(block.norm != "box" for block in problem.domain.blocks)
     name = job.policy if isinstance(job.policy, str) else job.policy.name
+    if isinstance(problem.model.module, Asked):
+        if name == "auto":
+            boxes = all(block.norm == "box" for block in problem.domain.blocks)
+            return with_derivatives(WithoutAscent() if boxes else make_policy("nes"), job.config)
+        policy = make_policy(job.policy, **job.config.policy_options) if isinstance(job.policy, str) else job.policy
+        if policy.uses_gradient:
+            raise InputError(
+                f"policy: {name} follows the model's gradient, and {problem.model.name}, behind an address, has none; "
+                "use auto, cmaes, nes, random, sobol or grid"
+            )
     if name == "auto" and balls and not problem.model.differentiable:
         return make_policy("nes")
     if not isinstance(job.policy, str):

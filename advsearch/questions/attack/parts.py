@@ -20,7 +20,7 @@ from advsearch.attacks.objectives import OBJECTIVE_KINDS, asked_by, check_object
 from advsearch.attacks.policies import POLICIES
 from advsearch.cluster import Executor, Work
 from advsearch.cluster.dask_pool import executor_of
-from advsearch.config import SceneConfig, one_only
+from advsearch.config import SceneConfig, has_address, one_only
 from advsearch.controls import make_space
 from advsearch.controls.base import Control
 from advsearch.controls.values import by_distribution, sentences
@@ -273,6 +273,11 @@ def executor_for(config: SceneConfig, function: str, progress: Progress) -> Abst
     settings = config.to_repeat().model_copy(update={"workers": None, "cluster": None}).plain()
     work = Work(function, settings, FILES, config.used_threads or 1)
     workers, cluster = (getattr(config, name, None) for name in ("workers", "cluster"))
+    if (workers or cluster) and has_address(config.model):
+        raise InputError(
+            f"{'workers' if workers else 'cluster'}: a model behind an address is asked by one process, which counts "
+            "its calls; leave it out"
+        )
     return executor_of(work, workers=workers, cluster=cluster, tell=progress.message)
 
 

@@ -17,7 +17,8 @@ from torch import Tensor
 
 from advsearch import seeds
 from advsearch.attacks import Ending, SearchResult
-from advsearch.controls.path import PathControl
+from advsearch.controls.path import WAY, PathControl
+from advsearch.controls.values import OneOf
 from advsearch.engine.loading import Scene, load_scene
 from advsearch.engine.naming import AnyModel, in_turn
 from advsearch.engine.objective import task_for
@@ -356,15 +357,22 @@ Frames = list[npt.NDArray[np.float32]]
 
 
 def along_drive(problem: Problem, u: Tensor | None, spp: int, run: RunDirectory | None) -> AlongDrive | None:
-    """Look at an adversarial scene, and at the clean scene, at evenly spaced times of the path that varies by chance;
+    """Look at an adversarial scene, and at the clean scene, at evenly spaced times of each path that varies by chance;
     None where none does. What varies beside it is as the scene comes."""
     along = _path_of(problem)
     if along is None:
         return None
     path, place = along
     start = problem.whole(problem.domain.start)
-    times = start.repeat(FRAMES, 1)
-    times[:, place] = torch.linspace(0.0, 1.0, FRAMES)
+    drawn = next(
+        (one.spec.values for one in path.slots if one.parameter.name == WAY and isinstance(one.spec, OneOf)), ()
+    )
+    ways = list(dict.fromkeys(drawn))
+    each = start.repeat(max(1, len(ways)), FRAMES, 1)
+    each[..., place] = torch.linspace(0.0, 1.0, FRAMES)
+    for number, way in enumerate(ways):
+        each[number, :, place + 1] = (drawn.index(way) + 0.5) / len(drawn)
+    times = each.flatten(0, 1)
     first, last = (problem.space.describe(times[end], [path])[f"{path.name}.time"]["value"] for end in (0, -1))
     seconds = float(str(last)) - float(str(first))
     counts: dict[str, int] = {}
@@ -380,16 +388,28 @@ def along_drive(problem: Problem, u: Tensor | None, spp: int, run: RunDirectory 
             counts[name] += right
             pictures.append(np.asarray(marked(picture.numpy(), marks), dtype=np.float32))
         if run is not None:
-            write_drive(run, name, pictures, seconds)
-    return AlongDrive(frames=FRAMES, seconds=seconds, clean=counts["drive-clean"], answer=counts.get("drive"), spp=spp)
+            write_drive(run, name, pictures, seconds * max(1, len(ways)))
+    return AlongDrive(
+        frames=len(times),
+        seconds=seconds,
+        paths=[str(one) for one in ways],
+        clean=counts["drive-clean"],
+        answer=counts.get("drive"),
+        spp=spp,
+    )
 
 
 def _path_of(problem: Problem) -> tuple[PathControl, int] | None:
-    """The path among what varies by chance, and the coordinate of the whole space that is its time."""
+    """The path among what varies by chance, and the coordinate of the whole space that is its time; where one of
+    several paths is drawn, which one is the next coordinate."""
     begin = 0
     for number, bound in enumerate(problem.space.controls):
         chance = problem.searched is not None and number >= problem.searched
-        if chance and isinstance(bound, PathControl) and bound.groups:
+        if (
+            chance
+            and isinstance(bound, PathControl)
+            and any(one.parameter.name == "time" and one.width for one in bound.slots)
+        ):
             return bound, begin
         begin += len(bound.start)
     return None

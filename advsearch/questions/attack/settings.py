@@ -153,7 +153,8 @@ class AttackConfig(DerivativeConfig):
         None, "search",
         "the path along which camera or object travel, with --over path; pictures of the adversarial scene along it "
         "are kept",
-        "approach, pass, orbit, a .csv file, or two of them, the camera's and the object's, as in approach+orbit",
+        "approach, pass, orbit, a .csv file, or two of them, the camera's and the object's, as in approach+orbit; of "
+        "several with commas between them, one is drawn each time",
         otherwise="approach", min_length=1,
     )
     draws: int | None = setting(

@@ -79,6 +79,7 @@ class AlongDrive(Fields):
 
     frames: int
     seconds: float = Field(description="from the first frame to the last")
+    paths: list[str] = Field(default=[], description="the paths, where one of several was drawn; the frames are theirs")
     clean: int = Field(description="frames of the clean scene in which the model is right")
     answer: int | None = Field(description="likewise, with the adversarial one; null if nothing was searched")
     spp: int = Field(description="samples a pixel")

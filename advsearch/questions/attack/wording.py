@@ -54,7 +54,7 @@ def attack_verdict(summary: AttackSummary) -> str:
         )
     if verified is None:
         return f"{ending[:1].upper()}{ending[1:]} after {count(summary.steps, 'step')}; nothing is verified."
-    rate = rate_text(verified) + another_text(summary.over)
+    rate = rate_text(verified) + another_text(summary.over, several_paths(summary))
     claim = _claim(summary, thing)
     if ending == "found":
         return f"{_how_it_errs(summary, verified, thing)} in {rate}."
@@ -66,11 +66,18 @@ def attack_verdict(summary: AttackSummary) -> str:
     return f"No {budget_text(summary)} was found that {_wanted(summary, thing)}: {claim} in {rate}. {why}"
 
 
-def another_text(over: Sequence[str]) -> str:
-    """Return what is another one in each trial: ``, each with another camera``; of a path it is the moment."""
+def several_paths(summary: AttackSummary) -> bool:
+    """Whether each trial draws one of several paths."""
+    return summary.drive is not None and len(summary.drive.paths) > 1
+
+
+def another_text(over: Sequence[str], paths: bool = False) -> str:
+    """Return what is another one in each trial: ``, each with another camera``; of a path it is the moment, and where
+    there are several `paths`, which one it is."""
     others = [name for name in over if name != PATH]
     said = [f"with another {' and '.join(others)}"] if others else []
-    said += ["at another moment of the path"] if PATH in over else []
+    if PATH in over:
+        said.append("on one of several paths, at another moment" if paths else "at another moment of the path")
     return f", each {' and '.join(said)}" if said else ""
 
 
@@ -143,7 +150,8 @@ def drive_text(summary: AttackSummary) -> str:
     if drive is None:
         return ""
     adversarial = "" if drive.answer is None else f", {drive.answer} of the adversarial one"
-    return f"right in {drive.clean} of {drive.frames} frames of the clean scene{adversarial}"
+    along = f", {len(drive.paths)} paths" if len(drive.paths) > 1 else ""
+    return f"right in {drive.clean} of {drive.frames} frames of the clean scene{adversarial}{along}"
 
 
 def smallest_text(summary: AttackSummary) -> str:

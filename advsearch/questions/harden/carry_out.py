@@ -119,8 +119,8 @@ def _same_means(run: RunDirectory, given: dict[str, bool]) -> None:
     for name, was in before.items():
         if was != given[name]:
             raise InputError(
-                f"{run.path}: cannot go on: it began {'with' if was else 'without'} `{name}`, which only Python gives; "
-                "go on with advsearch.harden(..., run=..., resume=True) and the same arguments"
+                f"{run.path}: cannot resume: it began {'with' if was else 'without'} `{name}`, which only Python "
+                "gives; resume it with advsearch.harden(..., run=..., resume=True) and the same arguments"
             )
 
 

@@ -45,11 +45,11 @@ def claims_of(result: Result) -> list[Claim]:
     """Return what a run stands for; one that stands for nothing says so in a claim of that kind."""
     if result.goes_on:
         told = f"; so far: {result.brief}" if result.brief else ""
-        return [nothing_claimed(f"the run was stopped before its end{told}")]
+        return [nothing_claimed(f"the run is not finished{told}")]
     room = rooms.room(result.command)
     if room and room.claims:
         return list(room.claims(result)) or [nothing_claimed("nothing in this run came to its end")]
-    return [nothing_claimed(f"the command {result.command} measures something else than how often a model is right")]
+    return [nothing_claimed(f"the command {result.command} does not measure how often a model is right")]
 
 
 def photo_claims(photos: PhotoAgreement) -> list[Claim]:
@@ -278,7 +278,7 @@ def _run(folder: Path) -> EvidenceRun:
             run=name,
             command=str(settings.get("command") or "unknown"),
             ending="none yet",
-            claims=[nothing_claimed("the run has no result; it is at work, or was stopped before its end")],
+            claims=[nothing_claimed("the run has no result yet: it is still working, or was stopped")],
             about={key: text for key, text in facts.items() if text},
             searched=[],
             measured={},

@@ -63,12 +63,12 @@ def read_axes(grid: Mapping[str, object], controls: Sequence[Control]) -> tuple[
     for name, given in grid.items():
         axis = _read_axis(name, given, instances)
         if axis.name in found:
-            raise InputError(f"`grid` {name}: {axis.name} is an axis already; leave one of the two out")
+            raise InputError(f"`grid` {name}: {axis.name} is given twice; leave one of the two out")
         drawn = instances.get(axis.instance)
         if isinstance(drawn, NumberControl) and axis.parameter.name in drawn.specs:
             raise InputError(
-                f"`grid` {name}: `controls` {axis.instance} says what {axis.parameter.name} is already; leave it "
-                "out of one of the two"
+                f"`grid` {name}: `controls` {axis.instance} sets {axis.parameter.name} too; leave it out of one "
+                "of the two"
             )
         found[axis.name] = axis
     return tuple(found.values())
@@ -87,7 +87,8 @@ def _read_axis(name: str, given: Any, instances: Mapping[str, Control]) -> Axis:
         raise UnknownNameError("control", kind, {*CONTROLS, *instances}, hint)
     if kind == BY_KEY:
         return _axis_by_key(control, name, given)
-    known = [one.name for one in control.parameters]
+    own = instances[instance].own if instance in instances else control.parameters
+    known = [one.name for one in own]
     if not parameter_name:
         raise InputError(
             f"`grid` {name}: expected CONTROL.PARAMETER, got no parameter; choose one of {', '.join(known)}"
@@ -95,7 +96,9 @@ def _read_axis(name: str, given: Any, instances: Mapping[str, Control]) -> Axis:
     check_instance(f"`grid` {name}", late or early, colon or early_colon)
     if parameter_name not in known:
         raise UnknownNameError(f"parameter of control {control.kind}", parameter_name, known, f"In `grid` {name}.")
-    parameter = control.declared({parameter_name: given})[known.index(parameter_name)]
+    parameter = (own if len(own) > len(control.parameters) else control.declared({parameter_name: given}))[
+        known.index(parameter_name)
+    ]
     pictures = any(len(one.shape) > 1 for one in control.parameters)
     if pictures or not issubclass(control, NumberControl) or parameter.shape != ():
         raise InputError(

@@ -224,8 +224,8 @@ def _beside_adversarial(
     varied = {control.name for control in drawn} | {axis.instance for axis in axes}
     if twice := sorted(varied & {control.name for control in held}):
         raise InputError(
-            f"adversarial_of: the configuration of {folder} says what {twice[0]} is already; leave it out of `grid` "
-            "and `controls`"
+            f"adversarial_of: the adversarial configuration of {folder} sets {twice[0]}, so it can't vary; leave it "
+            "out of `grid` and `controls`"
         )
     u, name = torch.from_numpy(read_configuration(folder)), folder.resolve().name
     clean = [replace(place, held=held, beside_clean=CLEAN) for place in places]

@@ -207,10 +207,10 @@ def claims(result: SweepSummary) -> Iterator[Claim]:
         how = "points of the grid" if not result.drives else f"{thing}, whose ways and moments are given"
         note = " Nothing is said of what lies between or beside these points; the interval takes them as a sample."
     elif result.drives:  # the frames are the grid, and what a drive has besides is drawn
-        how = f"{thing}; what else differs between drives is drawn by the sampler {result.sampler}"
+        how = f"{thing}; what else differs between drives is drawn at random ({result.sampler})"
         note = " The interval is over drives, as if these were independent." * (result.sampler != "random")
     elif result.sampler != "random" or result.grid:
-        how = f"configurations drawn by the sampler {result.sampler}" + (" at each point of a grid" * bool(result.grid))
+        how = f"configurations drawn at random ({result.sampler})" + (" at each point of a grid" * bool(result.grid))
         note = " The interval is that of independent draws, which these are not."
     models = [row for row in result.axes if row.axis == "model"]
     if len(split_names(result.model)) < 2 or not models:

@@ -11,18 +11,20 @@ import numpy.typing as npt
 
 from advsearch.attacks.units import mean_interval
 from advsearch.controls import Control
-from advsearch.controls.path import PathControl
+from advsearch.controls.path import WAY, PathControl
 from advsearch.engine.naming import given_to
 from advsearch.questions.attack.result import evenly, write_drive
 from advsearch.questions.sweep.axes import Axis
 from advsearch.questions.sweep.job import Job, Scenes
 from advsearch.questions.sweep.settings import SweepConfig
-from advsearch.questions.sweep.summary import DriveRates, OverDrives
+from advsearch.questions.sweep.summary import DriveRates, OneDrive, OverDrives
 from advsearch.report.marks import marked
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row
 
 ANIMATED = 60
+MOST_LISTED = 1000
+"""Drives of a model whose own numbers are kept."""
 
 UNKNOWN = -1
 
@@ -38,7 +40,12 @@ def with_frames(config: SweepConfig, drawn: tuple[Control, ...]) -> tuple[tuple[
         drawn, travelling = (*drawn, added), added
     name, seconds = f"{travelling.name}.time", travelling.seconds
     frames = f"0:{seconds:g}:{max(2, round(seconds * config.fps) + 1)}"
-    return drawn, config.grid if name in config.grid else {**config.grid, name: frames}
+    grid = config.grid if name in config.grid else {**config.grid, name: frames}
+    which = f"{travelling.name}.{WAY}"
+    ways = next((one.options for one in travelling.own if one.name == WAY), ())
+    if ways and config.samples is None and which not in grid and WAY not in travelling.specs:
+        grid = {which: list(ways), **grid}  # nothing is drawn: each of them is looked at
+    return drawn, grid
 
 
 def time_axis(axes: Sequence[Axis]) -> int | None:
@@ -56,21 +63,23 @@ class Drives:
         sizes = [len(one.values) for one in job.axes]
         shape = (len(job.places), *sizes, job.samples, len(job.models))
         right: Flags = np.full(shape, UNKNOWN, np.int8)
-        away = np.full((len(job.places), sizes[place]), np.nan)
-        before = int(np.prod(sizes[place + 1 :], dtype=np.int64)) * job.samples * len(job.models)
+        away = np.full(shape[:-1], np.nan)
+        self._ways: dict[int, str] = {}
+        which = f"{axis.instance}.{WAY}"
         name, self._unit = f"{axis.instance}.distance", "object sizes"
         for row in rows:
             right.flat[row.step] = bool(row.correct)
             if name in row.values:
                 distance = row.values[name]
-                scene = row.step // len(job.models) // job.per_scene
-                away[scene, row.step // before % sizes[place]] = float(str(distance["value"]))
+                away.flat[row.step // len(job.models)] = float(str(distance["value"]))
                 self._unit = distance["unit"]
+            if which in row.values:
+                self._ways[row.step] = str(row.values[which]["value"])
         order = np.argsort([float(value) for value in axis.values])
         self.times = np.array([float(value) for value in axis.values])[order]
         self._numbers = np.moveaxis(np.arange(right.size).reshape(shape), place + 1, -1)[..., order]
         self._right = np.moveaxis(right, place + 1, -1)[..., order]
-        self._away = away[:, order]
+        self._away = np.moveaxis(away, place + 1, -1)[..., order]
 
     def rates(self) -> list[DriveRates]:
         """Return what is said of the drives of each model, without and with an adversarial scene."""
@@ -80,19 +89,26 @@ class Drives:
             for model, network in enumerate(self._job.models):
                 right = self._right[mine][..., model, :].reshape(len(mine), -1, len(self.times))
                 whole = (right != UNKNOWN).all(axis=2)
-                away = np.repeat(self._away[mine][:, None], right.shape[1], axis=1)[whole]
+                away = self._away[mine].reshape(right.shape)[whole]
                 if whole.any():
-                    found.append(self._rates(network.name, beside_clean, right[whole] == 1, away))
+                    begins = self._numbers[mine][..., model, :].reshape(right.shape)[whole][:, 0]
+                    found.append(self._rates(network.name, beside_clean, right[whole] == 1, away, begins))
         return found
 
     def _rates(
-        self, model: str, beside_clean: str, right: npt.NDArray[np.bool_], away: npt.NDArray[np.float64]
+        self,
+        model: str,
+        beside_clean: str,
+        right: npt.NDArray[np.bool_],
+        away: npt.NDArray[np.float64],
+        begins: npt.NDArray[np.int64],
     ) -> DriveRates:
-        """What is said of drives: (n, frames) whether the model is right, and how far away it is."""
+        """What is said of drives: (n, frames) whether the model is right, and how far away it is; (n,) first rows."""
         seconds, frames = float(self.times[-1] - self.times[0]), len(self.times)
         step = seconds / (frames - 1)
-        seen = right.any(axis=1)
-        first = away[np.arange(len(right)), right.argmax(axis=1)][seen]
+        seen: npt.NDArray[np.bool_] = np.asarray(right.any(axis=1))
+        at_first = away[np.arange(len(right)), right.argmax(axis=1)]
+        first, gaps = at_first[seen], np.array([longest(~one) for one in right]) * step
         changes = (right[:, 1:] != right[:, :-1]).sum(axis=1) / seconds
         ends = float(away.min()), float(away.max())
         return DriveRates(
@@ -102,11 +118,22 @@ class Drives:
             frames=right.shape[1],
             seconds=seconds,
             right=over_drives(right.mean(axis=1), worst=min),
-            longest_gap=over_drives(np.array([longest(~one) for one in right]) * step, max, (0.0, frames * step)),
+            longest_gap=over_drives(gaps, max, (0.0, frames * step)),
             first_seen=over_drives(first, min, ends) if len(first) and np.isfinite(ends).all() else None,
             unit=self._unit,
             never_seen=int((~seen).sum()),
             flicker=over_drives(changes, max, (0.0, (frames - 1) / seconds)),
+            each=[
+                OneDrive(
+                    row=int(begins[k]),
+                    path=self._ways.get(int(begins[k])),
+                    right=float(right[k].mean()),
+                    first_seen=float(at_first[k]) if seen[k] and np.isfinite(at_first[k]) else None,
+                    longest_gap=float(gaps[k]),
+                    flicker=float(changes[k]),
+                )
+                for k in range(min(len(right), MOST_LISTED))
+            ],
         )
 
     def keep_worst(self, scenes: Scenes, run: RunDirectory) -> None:

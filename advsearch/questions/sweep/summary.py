@@ -161,6 +161,17 @@ class OverDrives(Fields):
     worst: float = Field(description="of the worst drive")
 
 
+class OneDrive(Fields):
+    """What a model says along one drive."""
+
+    row: int = Field(description="number of its first frame among the rows")
+    path: str | None = Field(description="its path; null where all drives have the same")
+    right: float = Field(description="share of frames in which the model is right")
+    first_seen: float | None = Field(description="distance at the first of these; null without one")
+    longest_gap: float = Field(description="seconds of the longest run of frames in which it is not")
+    flicker: float = Field(description="changes between right and wrong a second")
+
+
 class DriveRates(Fields):
     """What a model says along whole drives; intervals are over drives, not over frames."""
 
@@ -177,6 +188,7 @@ class DriveRates(Fields):
     unit: str = Field(default="object sizes", description="of that distance")
     never_seen: int = Field(description="drives without a frame in which it is right")
     flicker: OverDrives = Field(description="changes between right and wrong a second")
+    each: list[OneDrive] = Field(default=[], description="the numbers of each drive, the first 1,000")
 
 
 class SweepSummary(CountedPredictions, RunResult):

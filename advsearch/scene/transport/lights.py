@@ -39,7 +39,7 @@ TINY = 1e-30
 FEW = 4
 """Every so many rows and columns of a map are looked at first."""
 BETWEEN = (0.02, 0.29, 0.61, 0.97)
-"""Places in the range of a continuous parameter at which is looked what it changes."""
+"""Places in the range of a continuous parameter at which its effect on the inputs is looked up."""
 
 Inputs = Mapping[str, Tensor]
 

@@ -1,0 +1,448 @@
+"""Models that only answer: ``http://...`` and ``https://...``, each asked with a picture over the network.
+
+One that speaks the plain protocol is sent ``{"image": PNG in base64, "prompt": text}`` and says
+``{"scores": {name: share}}`` or ``{"text": words}``. One whose path ends in ``/chat/completions`` is asked as OpenAI's
+chat is. What is sent beside that is a key from the environment, to this address alone: redirects are not followed, and
+no message, row or file has the key.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import http.client
+import ipaddress
+import json
+import os
+import re
+import ssl
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from email.message import Message
+from functools import partial
+from typing import Any, Protocol, TypeAlias
+from urllib.parse import SplitResult, parse_qsl, urlsplit, urlunsplit
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from advsearch.errors import InputError, ModelError, UnknownNameError
+from advsearch.files import parse_json, scaled
+from advsearch.interrupts import INTERRUPTS
+from advsearch.models.model import Model, Preprocessing
+from advsearch.models.source import Purpose, Source
+from advsearch.models.zoo.language import QUESTION, SIDE
+from advsearch.pictures import png_of
+from advsearch.registry import may_fetch
+
+KEY = "ADVSEARCH_MODEL_KEY"
+"""The environment variable with the key that is sent as ``Authorization: Bearer``."""
+
+CHAT = "/chat/completions"
+"""How the path of an address ends that is asked as OpenAI's chat is."""
+
+LIMITS: dict[str, float] = {
+    "calls": 2000, "tokens": float("inf"), "money": float("inf"),
+    "per_call": 0.0, "per_million_in": 0.0, "per_million_out": 0.0, "seconds": 120.0,
+}  # fmt: skip
+"""What `ask` may say, with its defaults: the most calls, tokens and money of a run; the price of a call and of a
+million tokens in and out, in the unit of `money`; how long an answer may take."""
+
+TRIES, FIRST_WAIT, LONGEST_WAIT = 5, 1.0, 60.0
+"""How often a picture is sent to a server that is busy or fails, and the seconds between: twice as long each time."""
+
+BUSY = (408, 409, 425, 429, 500, 502, 503, 504, 529)
+"""Statuses of a server that may answer later."""
+
+LARGEST = 1 << 20
+"""Most bytes of an answer."""
+
+LONGEST = 1000
+"""Most characters that are kept of an answer in words."""
+
+LEAST = 1e-6
+"""The share that a name has which an answer leaves out, or gives less: its logarithm is the logit."""
+
+REFUSED = "(refused)"
+"""What stands for the words of a model that declines to answer."""
+
+
+Levels: TypeAlias = npt.NDArray[np.uint8]
+"""A picture (H, W, 3) as a file has it."""
+
+
+class Store(Protocol):
+    """What a run keeps notes in."""
+
+    def noted(self, key: str) -> Any:
+        """Return a JSON value, or None."""
+
+    def set_note(self, key: str, value: str) -> None:
+        """Keep JSON text under a key."""
+
+
+def load(spec: str) -> Source:
+    """Return the source of a model behind an address, which is finished by what it is asked for; nobody is asked yet.
+
+    Raises:
+        InputError: only a file names it, it is no address that may be kept, or the key would go over it unencrypted.
+    """
+    address = checked(spec)
+    if not may_fetch(spec):
+        raise InputError(
+            f"a file names the model {spec}, to which pictures would be sent, and the key in {KEY}; if you trust it, "
+            f"allow it yourself: in Python with advsearch.allow_code({spec!r}), or with `code={spec}`"
+        )
+    finish = partial(_finished, spec, address)
+    return Source(_never, address.fragment or address.netloc, finish=finish, reads_text=True)
+
+
+def _never(pictures: Tensor) -> Any:
+    raise RuntimeError("a model behind an address is asked for something")
+
+
+def checked(spec: str) -> SplitResult:
+    """Return the parts of an address. Raises InputError: it has no host, or something that is no secret's place."""
+    try:
+        address = urlsplit(spec)
+        host, _ = address.hostname, address.port
+    except ValueError as error:
+        raise InputError(f"model {spec!r}: expected an address, http://HOST:PORT/PATH ({error})") from None
+    if not host or not spec.isascii() or not spec.isprintable() or " " in spec:
+        raise InputError(f"model {spec!r}: expected an address, http://HOST:PORT/PATH")
+    secret = [name for name, _ in parse_qsl(address.query) if re.search("key|token|secret|passw|sig|auth", name, re.I)]
+    if "@" in address.netloc or secret:
+        where = f"`{secret[0]}` in the address" if secret else "the user and password in the address"
+        raise InputError(f"model: {where} would be stored with the run; put the key into {KEY} and leave it out there")
+    if _key() and address.scheme == "http" and not is_local(host):
+        raise InputError(f"model {spec}: the key in {KEY} would go there unencrypted; use https, or unset {KEY}")
+    return address
+
+
+def is_local(host: str) -> bool:
+    """Whether a host is this machine."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def _key() -> str:
+    key = os.environ.get(KEY, "").strip()
+    if not (key.isascii() and key.isprintable()):  # http.client would show it in its error
+        raise InputError(f"{KEY}: expected a key of printable ASCII characters, got others")
+    return key
+
+
+def limits_of(ask: Mapping[str, float]) -> dict[str, float]:
+    """Return every limit, as asked or by default. Raises InputError where a name is unknown, or a number below 0."""
+    for name, value in ask.items():
+        if name not in LIMITS:
+            raise UnknownNameError("name in `ask`", name, LIMITS)
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not value >= 0:
+            raise InputError(f"`ask` {name}: expected a number of at least 0, got {value!r}")
+    limits = {**LIMITS, **ask}
+    priced = any(limits[name] for name in ("per_call", "per_million_in", "per_million_out"))
+    if "money" in ask and not priced:
+        raise InputError(
+            "`ask` money: expected a price beside it; give `ask` per_call, or per_million_in and per_million_out"
+        )
+    return limits
+
+
+def _finished(spec: str, address: SplitResult, purpose: Purpose) -> Model:
+    chat, name = address.path.endswith(CHAT), address.fragment or address.netloc
+    purpose.check(name, "is behind an address", "classification", "answer")
+    free = purpose.task == "answer"
+    if free and purpose.names is not None:
+        raise InputError("labels: task answer has no classes; leave them out, and say the right words with `label`")
+    if chat and not free:
+        raise InputError(f"task: a chat such as {name} answers in words; use `task=answer`, and say the right `label`")
+    if chat and not address.fragment:
+        raise InputError(f"model {spec}: expected the name of the chat's model behind a #: {spec}#NAME")
+    if len(purpose.prompts or ()) > 1:
+        raise InputError(f"prompt: expected one question for model {name}, got {len(purpose.prompts or ())}")
+    question = (purpose.prompts or (QUESTION,))[0] if free or purpose.prompts else ""
+    line = Line(urlunsplit(address._replace(fragment="")), name, limits_of(purpose.ask), spec)
+    asked = Asked(line, address.fragment if chat else "", question, purpose.tokens, purpose.times if free else 1)
+    names = purpose.names
+    if not free:
+        asked.names = names or tuple(asked.scores(np.full((SIDE, SIDE, 3), 128, np.uint8)))
+        if len(asked.names) < 2:
+            raise ModelError(f"model {name}: expected scores of two names at least, got {len(asked.names)}")
+    return Model(
+        module=asked,
+        name=name,
+        labels=asked.names,
+        preprocessing=Preprocessing((SIDE, SIDE), resizes=False),
+        batch_limits=(1, 8),
+        differentiable=False,
+    )
+
+
+@dataclass
+class Spent:
+    """What a run has spent on a model: calls, and tokens in and out."""
+
+    calls: int = 0
+    tokens_in: int = 0
+    tokens_out: int = 0
+
+
+@dataclass
+class Line:
+    """Sends requests to one address, within the limits of a run; `spent` counts those of its earlier lives too."""
+
+    url: str
+    name: str
+    limits: Mapping[str, float]
+    spec: str
+    spent: Spent = field(default_factory=Spent)
+    store: Store | None = None
+
+    def keep_in(self, store: Store) -> None:
+        """Keep what is spent in a run from here on, and go on counting where the run stopped."""
+        before = Spent(**(store.noted(self._note) or {}))
+        now = self.spent
+        self.spent = Spent(*(getattr(before, part) + getattr(now, part) for part in vars(now)))
+        self.store = store
+
+    @property
+    def _note(self) -> str:
+        return f"asked {self.spec}"
+
+    @property
+    def money(self) -> float:
+        """What has been spent, in the unit of the prices."""
+        limits, spent = self.limits, self.spent
+        by_token = limits["per_million_in"] * spent.tokens_in + limits["per_million_out"] * spent.tokens_out
+        return limits["per_call"] * spent.calls + by_token / 1e6
+
+    @property
+    def sentence(self) -> str:
+        """What a run has spent, for its reader."""
+        tokens = self.spent.tokens_in + self.spent.tokens_out
+        more = [f"{tokens:,} tokens"] * bool(tokens) + [f"{self.money:.4g} of money"] * bool(self.money)
+        return f"The model {self.name} was asked {self.spent.calls:,} times{''.join(f', {one}' for one in more)}."
+
+    def _check_limits(self) -> None:
+        spent = {"calls": self.spent.calls, "tokens": self.spent.tokens_in + self.spent.tokens_out, "money": self.money}
+        for name, number in spent.items():
+            limit = self.limits[name]
+            if number >= limit:
+                raise ModelError(
+                    f"model {self.name}: {number:,.10g} {name} are spent, and `ask` allows {limit:,.10g}; `advsearch "
+                    f"resume RUN ask.{name}={2 * limit or 1:.10g}` goes on with more, and asks nothing twice"
+                )
+
+    def send(self, body: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the JSON object that the server answers, asked again where it is busy. Raises ModelError: limits are
+        reached, nobody answers, or something else comes."""
+        wait = FIRST_WAIT
+        for tries_left in reversed(range(TRIES)):
+            INTERRUPTS.look()
+            self._check_limits()
+            self.spent.calls += 1
+            if self.store is not None:
+                self.store.set_note(self._note, json.dumps(vars(self.spent)))
+            try:
+                return self._sent(json.dumps(body).encode())
+            except urllib.error.HTTPError as error:
+                with error:
+                    why = self._why(error)
+                later = error.code in BUSY
+                asked_to = error.headers.get("Retry-After", "")
+                if asked_to.isdigit():
+                    wait = max(wait, float(asked_to))
+            except (OSError, http.client.HTTPException) as error:  # URLError is an OSError
+                reason = getattr(error, "reason", error)
+                why = self._clean(f"{type(reason).__name__}: {reason}" if str(reason) else type(reason).__name__)
+                nobody_yet = self.spent.calls == 1 and isinstance(reason, ConnectionRefusedError)
+                later = not nobody_yet and not isinstance(reason, (ssl.SSLCertVerificationError, ValueError))
+            if not later or not tries_left:
+                raise ModelError(f"model {self.name}: {why} ({self.url})")
+            time.sleep(min(wait, LONGEST_WAIT))
+            wait *= 2
+        raise AssertionError
+
+    def _sent(self, body: bytes) -> dict[str, Any]:
+        key = _key()
+        headers = {"Content-Type": "application/json", "User-Agent": "advsearch"}
+        request = urllib.request.Request(self.url, body, headers)
+        if key:
+            request.add_unredirected_header("Authorization", f"Bearer {key}")
+        handlers: list[Any] = [_NoRedirect]
+        if is_local(request.host.rpartition(":")[0].strip("[]") or request.host):
+            handlers.append(urllib.request.ProxyHandler({}))
+        end, parts, size = time.monotonic() + self.limits["seconds"], list[bytes](), 0
+        with urllib.request.build_opener(*handlers).open(request, timeout=self.limits["seconds"]) as response:
+            while part := response.read1(1 << 16):
+                parts.append(part)
+                size += len(part)
+                if size > scaled(LARGEST):
+                    raise self._wrong(f"an answer of at most {scaled(LARGEST):,} bytes", "a longer one")
+                if time.monotonic() > end:
+                    raise TimeoutError(f"no answer within {self.limits['seconds']:g} seconds")
+        text = b"".join(parts)
+        try:
+            answer = parse_json(text.decode(), finite=True)
+        except ValueError as error:  # UnicodeDecodeError is one
+            raise self._wrong("JSON", f"{self._clean(text[:60].decode(errors='replace'))!r} ({error})") from None
+        if not isinstance(answer, dict):
+            raise self._wrong("a JSON object", type(answer).__name__)
+        return answer
+
+    def _why(self, error: urllib.error.HTTPError) -> str:
+        if 300 <= error.code < 400:
+            there = self._clean(error.headers.get("Location", "elsewhere"))
+            return f"sends on to {there}, and pictures and keys are not sent there; give that address if you trust it"
+        if error.code in (401, 403):
+            told = "is not accepted" if _key() else "is missing"
+            return f"status {error.code}: the key in {KEY} {told}"
+        try:
+            said = self._clean(error.read(2000).decode(errors="replace"))
+        except (OSError, http.client.HTTPException):
+            said = ""
+        return f"status {error.code} {self._clean(str(error.reason))}: {said[:300]}"
+
+    def _clean(self, text: str) -> str:
+        """What a server says, in one line and without the key, which it may send back."""
+        text = text.replace(_key(), "(key)") if _key() else text
+        return " ".join("".join(sign if sign.isprintable() else " " for sign in text).split())
+
+    def _wrong(self, expected: str, got: str) -> ModelError:
+        return ModelError(f"model {self.name}: expected {expected}, got {got} ({self.url})")
+
+    def count_tokens(self, answer: Mapping[str, Any]) -> None:
+        """Count the tokens that an answer says it took. Raises ModelError where a limit needs them and it says none."""
+        used = answer.get("usage")
+        used = used if isinstance(used, Mapping) else {}
+        numbers = [used.get(name) for name in ("prompt_tokens", "completion_tokens")]
+        told = [one for one in numbers if isinstance(one, int) and not isinstance(one, bool) and one >= 0]
+        by_token = self.limits["per_million_in"] or self.limits["per_million_out"]
+        if len(told) < 2 and (self.limits["tokens"] < LIMITS["tokens"] or by_token):
+            raise self._wrong("`usage` with prompt_tokens and completion_tokens, as `ask` counts tokens", "none")
+        if len(told) == 2:
+            self.spent.tokens_in += told[0]
+            self.spent.tokens_out += told[1]
+            if self.store is not None:
+                self.store.set_note(self._note, json.dumps(vars(self.spent)))
+
+
+class _NoRedirect(urllib.request.HTTPRedirectHandler):
+    """Follows no redirect: what is sent has a key in it."""
+
+    def redirect_request(
+        self, req: urllib.request.Request, fp: Any, code: int, msg: str, headers: Message, newurl: str
+    ) -> None:
+        return None
+
+
+class Asked:
+    """Answers pictures (N, 3, H, W) in [0, 1], rounded to 8 bits: logits (N, names), or without names what is said of
+    each picture (`advsearch.tasks.answers.Texts`). The same picture is not sent twice in a run, also if it goes on.
+
+    Args:
+        line: what sends.
+        chat: the name of a chat's model; empty for the plain protocol.
+        question: what is asked of the picture; may be empty.
+        tokens: the most of an answer in words.
+        times: how often each picture is asked.
+    """
+
+    def __init__(self, line: Line, chat: str, question: str, tokens: int, times: int) -> None:
+        self.line, self.chat, self.question, self.tokens, self.times = line, chat, question, tokens, times
+        self.names: tuple[str, ...] = ()
+        self._known: dict[str, dict[str, Any]] = {}
+
+    def keep_in(self, store: Store) -> None:
+        """Keep answers in a run from here on; those that it has are not asked for again."""
+        self.line.keep_in(store)
+
+    def __call__(self, pictures: Tensor) -> Any:
+        levels = (pictures.clamp(0.0, 1.0).nan_to_num() * 255.0).round().to(torch.uint8).permute(0, 2, 3, 1)
+        images = list(levels.cpu().contiguous().numpy())
+        if not self.names:
+            return [{"texts": [self.text(image, time) for time in range(self.times)]} for image in images]
+        rows = [self.scores(image) for image in images]
+        return torch.tensor([[max(row.get(name, 0.0), LEAST) for name in self.names] for row in rows]).log()
+
+    def text(self, image: Levels, time: int) -> str:
+        """Return what is said of a picture, the likeliest name where there are scores."""
+        answer = self._answer(image, time)
+        if "scores" in answer:
+            return str(max(answer["scores"], key=answer["scores"].__getitem__))
+        return str(answer["text"])
+
+    def scores(self, image: Levels) -> dict[str, float]:
+        """Return the share of each name that an answer has, in its order."""
+        answer = self._answer(image, 0)
+        if "scores" not in answer:
+            raise ModelError(
+                f"model {self.line.name}: answers in words ({answer['text'][:60]!r}), which are no scores; use "
+                "`task=answer`, and say the right `label`"
+            )
+        scores: dict[str, float] = answer["scores"]
+        if self.names and (other := scores.keys() - set(self.names)):
+            raise ModelError(f"model {self.line.name}: says {min(other)!r}, which is none of the `labels`")
+        return scores
+
+    def _answer(self, image: Levels, time: int) -> dict[str, Any]:
+        """An answer to a picture: one that the run has, or a new one. Trials differ in their noise, and so in their
+        pictures."""
+        body = self._body(image)
+        digest = hashlib.blake2b(json.dumps([body, time, self.line.spec]).encode(), digest_size=16).hexdigest()
+        key, store = f"answer {digest}", self.line.store
+        known = self._known.get(key) if store is None else store.noted(key)
+        if isinstance(known, dict):
+            return known
+        sent = self.line.send(body)
+        self.line.count_tokens(sent)
+        answer = self._read_chat(sent) if self.chat else self._read(sent)
+        if store is None:
+            self._known[key] = answer
+        else:
+            store.set_note(key, json.dumps(answer))
+        return answer
+
+    def _body(self, image: Levels) -> dict[str, Any]:
+        picture = base64.b64encode(png_of(image)).decode()
+        if not self.chat:
+            return {"image": picture, **({"prompt": self.question} if self.question else {})}
+        content = [
+            {"type": "text", "text": self.question},
+            {"type": "image_url", "image_url": {"url": f"data:image/png;base64,{picture}"}},
+        ]
+        return {"model": self.chat, "messages": [{"role": "user", "content": content}], "max_tokens": self.tokens}
+
+    def _read(self, answer: Mapping[str, Any]) -> dict[str, Any]:
+        scores, text = answer.get("scores"), answer.get("text")
+        if isinstance(scores, dict) and scores:
+            bad = [one for one in scores.values() if isinstance(one, bool) or not isinstance(one, (int, float))]
+            if bad or not all(0.0 <= one <= 1.0 for one in scores.values()):
+                raise self.line._wrong("scores from 0 to 1", f"{bad or [min(scores.values()), max(scores.values())]}")
+            return {"scores": scores}
+        if isinstance(text, str):
+            return {"text": text[:LONGEST]}
+        keys = self.line._clean(", ".join(map(str, answer)) or "nothing")[:100]
+        raise self.line._wrong('{"scores": {NAME: SHARE}} or {"text": WORDS}', keys)
+
+    def _read_chat(self, answer: Mapping[str, Any]) -> dict[str, Any]:
+        try:
+            message = answer["choices"][0]["message"]
+            content, refusal = message.get("content"), message.get("refusal")
+        except (KeyError, IndexError, TypeError, AttributeError):
+            keys = self.line._clean(", ".join(map(str, answer)) or "nothing")[:100]
+            raise self.line._wrong("choices with a message, as a chat answers", keys) from None
+        if isinstance(content, list):
+            content = " ".join(str(one.get("text", "")) for one in content if isinstance(one, dict))
+        if not content and (refusal or answer["choices"][0].get("finish_reason") == "content_filter"):
+            return {"text": REFUSED}
+        if not isinstance(content, str):
+            raise self.line._wrong("an answer in words", type(content).__name__)
+        return {"text": content[:LONGEST]}
