@@ -221,8 +221,8 @@ class ProjectorControl(NumberControl):
         return values | {"pattern": rounded}
 
     def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        place = [float(values[name].detach()) for name in ("azimuth", "elevation")]
-        left, up, outwards = torch.from_numpy(camera_axes(*place, 0.0)).to(values["pattern"])
+        azimuth, elevation = (float(values[name].detach()) for name in ("azimuth", "elevation"))
+        left, up, outwards = torch.from_numpy(camera_axes(azimuth, elevation, 0.0)).to(values["pattern"])
         pose = torch.eye(4).to(left)
         pose[:3, 0], pose[:3, 1], pose[:3, 2] = left, up, -outwards
         far = values["distance"].detach() / self.scene.metres
