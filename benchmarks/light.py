@@ -45,7 +45,7 @@ DIRECTIONS, SEEDS, SPP = 8, 4, 64
 CARD = {"size": [0, 1], "distance": 1, "x": [-0.6, 0.6], "y": [-0.6, 0.6], "turn": [0, 360], "radii": [0.1, 1]}
 SKY = {"elevation": 30, "azimuth": 20, "turbidity": 2}
 SIGN = {"camera.azimuth": 10.0, "camera.height": 1.4, "camera.distance": 5.0, "camera.fov": 25.0}
-GREY: dict[str, Any] = {"start": "grey", "lumens": 100}
+GREY: dict[str, Any] = {"start": "grey"}
 
 
 def main() -> None:
@@ -117,7 +117,7 @@ def step(args: argparse.Namespace) -> None:
     for title, specialise in (("by the matrix", True), ("rendered", False)):
         begun = time.perf_counter()
         result = advsearch.attack(
-            scene, model, controls={"projector": {"lumens": 100, "epsilon": 0.2}}, steps=args.steps, label=args.label,
+            scene, model, controls={"projector": {"epsilon": 0.3}}, steps=args.steps, label=args.label,
             specialise=specialise, measure="no", baseline=False,
         )  # fmt: skip
         searched = result.summary.seconds["search"] + result.summary.seconds.get("transport", 0.0)

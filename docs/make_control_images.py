@@ -69,7 +69,7 @@ CONTROLS: Mapping[str, Mapping[str, Any]] = {
         "mitsuba:ground.bsdf.brdf_0.reflectance.value": [0.01, 0.6],
         "mitsuba:environment.scale": [0.3, 2.0],
     },
-    "projector": {"projector": {"resolution": 16, "lumens": 300}},
+    "projector": {"projector": {"resolution": 16, "lumens": 4}},
     "shadow": {"shadow": {"size": [0.3, 0.6], "distance": 1.0}},
     "sensor": {
         "sensor": {"shot": [0.0, 0.15], "mosaic": [0, 1], "red": [-1, 1], "blue": [-1, 1], "compression": [0, 95]}

@@ -46,7 +46,7 @@ FORMS: dict[str, dict[str, Any]] = {
     "texture": {"resolution": 4, "epsilon": 0.4},
     "material": {"which": ["wood", "steel"], "red": [0.3, 1.0]},
     "light": {"power": [2, 8], "x": [-2, 2], "red": [0.5, 1.0]},
-    "projector": {"resolution": 4, "lumens": [100, 3000], "elevation": [10, 60]},
+    "projector": {"resolution": 4, "lumens": [1, 40], "elevation": [10, 60]},
     "shadow": {"size": [0.1, 0.8], "x": [-0.5, 0.5]},
     "environment": {"which": ["own", "noon", "kitchen"], "rotation": [0, 300], "exposure": [-1, 1]},
     "sky": {"azimuth": [0, 300], "elevation": [10, 80]},

@@ -44,6 +44,8 @@ BESIDE = 15.0
 """Degrees around the object between the camera and a projector that nobody has placed."""
 AMBIENT = 100.0
 """Lux of a place whose brightness has no unit: a lit hall, a street at late dusk."""
+LUMENS, TIMES = 3000.0, 20.0
+"""Of a projector that nobody has described: it is dimmed to so many times the light of the place."""
 GREY = 0.5
 
 
@@ -71,7 +73,8 @@ class ProjectorControl(NumberControl):
             "Distance to the object's middle; in metres where the object's size is known.", log=True,
         ),
         Parameter(
-            "lumens", (), "lumens", 0.0, 1e6, 3000.0, "Light of a white picture.", estimators=LIT,
+            "lumens", (), "lumens", 0.0, 1e6, f"{LUMENS:g}, or what is {TIMES:g} times as bright as the place",
+            "Light of a white picture.", estimators=LIT,
         ),
         Parameter(
             "ambient", (), "lux", 1e-3, 2e5, f"the place's, or {AMBIENT:g}",
@@ -148,6 +151,11 @@ class ProjectorControl(NumberControl):
             place = self.scene.environment
             unit = None if place is None else place.candelas
             return AMBIENT if unit is None else min(max(unit * ambient_irradiance(self.scene), 1e-3), 2e5)
+        if parameter.name == "lumens":
+            place, distance = (next(one for one in self.own if one.name == name) for name in ("ambient", "distance"))
+            spec = self.specs.get("distance")
+            far = float(spec.value) if isinstance(spec, Fixed) else float(self.default(distance))
+            return min(LUMENS, TIMES * float(self.default(place)) * self.part.area * far**2)
         away = camera_to_world(self.scene)[:3, 3] - middle(self.scene)
         far = float(np.linalg.norm(away))
         if parameter.name == "azimuth":

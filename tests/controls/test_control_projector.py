@@ -54,12 +54,12 @@ def smooth(renderer: Renderer, seed: int) -> Tensor:
 def test_white_puts_its_lumens_over_its_area_on_what_faces_it() -> None:
     """White ground below a projector in the dark: radiance = E(ambient) / pi x lux / ambient lux."""
     scene = describe("mug", DARK, given={"pose.x": 50.0, "ground.red": 1.0, "ground.green": 1.0, "ground.blue": 1.0})
-    control = ProjectorControl(elevation=89, distance=3, fov=20, lumens=500, ambient=50, resolution=4)
+    control = ProjectorControl(elevation=89, distance=3 * scene.metres, fov=20, lumens=5, ambient=50, resolution=4)
     prepared = control.prepare(scene)
     bound = control.bind(prepared)
     white = torch.ones_like(bound.start)
     seen = MitsubaScene(prepared, (SIDE, SIDE)).radiance(bound.inputs(white), 0, 64)
-    lux = 500.0 / (2.0 * 3.0 * math.tan(math.radians(10.0))) ** 2
+    lux = 5.0 / (2.0 * 3.0 * scene.metres * math.tan(math.radians(10.0))) ** 2
     described = bound.describe(white)
     assert described["projector.white"]["value"] == pytest.approx(lux)
     assert described["projector.beside_ambient"]["value"] == pytest.approx(lux / 50.0)
@@ -94,7 +94,7 @@ def test_the_picture_without_light_is_that_without_a_projector_and_all_others_ar
 
 
 def test_the_adjoint_is_the_difference() -> None:
-    renderer = renderer_of(lumens=100)
+    renderer = renderer_of()
     scene, generator = renderer.scene, torch.Generator().manual_seed(2)
     inputs = renderer.scene.assembly(renderer.space.inputs(0.5 + 0.0 * renderer.start))
     change = torch.rand(inputs["projector.pattern"].shape, generator=generator)
@@ -108,7 +108,7 @@ def test_the_adjoint_is_the_difference() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(("object", "environment"), SCENES, ids=lambda one: one)
 def test_derivatives_along_smooth_patterns_are_those_of_differences(object: str, environment: str) -> None:
-    renderer = renderer_of(object, environment, lumens=100, start="grey")
+    renderer = renderer_of(object, environment, start="grey")
     scene, u = renderer.scene, renderer.start
     weight = torch.randn(SIDE, SIDE, 3, generator=torch.Generator().manual_seed(4))
     weight = nn.functional.avg_pool2d(weight.permute(2, 0, 1)[None], 5, 1, 2)[0].permute(1, 2, 0)
@@ -131,7 +131,7 @@ def test_derivatives_along_smooth_patterns_are_those_of_differences(object: str,
 
 @pytest.mark.parametrize("object", ["mug", "stop-sign"])
 def test_the_matrix_predicts_what_is_traced(object: str) -> None:
-    renderer = renderer_of(object, "studio", side=24, lumens=300)
+    renderer = renderer_of(object, "studio", side=24)
     assert why_not(renderer) is None
     linear = predicting(renderer, renderer.start, seed=1)
     assert isinstance(linear, LinearRenderer) and linear.entries > 100
@@ -146,7 +146,7 @@ def test_the_matrix_predicts_what_is_traced(object: str) -> None:
 def test_beside_moving_lamps_and_textures_its_light_counts_once() -> None:
     scene = advsearch.load_scene("mug")
     controls = [
-        make_control("projector", {"resolution": 8, "lumens": 300}),
+        make_control("projector", {"resolution": 8}),
         make_control("light", {"power": [0, 8]}),
         make_control("texture", {"resolution": 8}),
     ]
@@ -166,8 +166,9 @@ def test_the_stored_png_throws_the_same_picture_and_texels_have_eight_bits(tmp_p
     pattern = renderer.space.artifacts(u)["projector"]
     file = write_png(tmp_path / "pattern.png", pattern)
     assert torch.equal(torch.from_numpy(read_png(file)), pattern)
+    lumens = next(one for one in renderer.space.controls[0].slots if one.parameter.name == "lumens").default
     again = advsearch.load_scene("mug").renderer(
-        [make_control("projector", {"picture": str(file), "lumens": [0, 3000]})], resolution=SIDE
+        [make_control("projector", {"picture": str(file), "lumens": [0, lumens]})], resolution=SIDE
     )
     assert torch.equal(renderer(u, seed=5, spp=8), again(torch.ones(1), seed=5, spp=8))
 
@@ -244,7 +245,7 @@ def glare() -> advsearch.Model:
 
 def test_the_result_says_in_which_ambient_light_it_ends(glare: advsearch.Model, tmp_path: Path) -> None:
     result = advsearch.attack(
-        "mug", glare, controls={"projector": {"resolution": 4, "lumens": 1000}}, resolution=16, steps=16, trials=6,
+        "mug", glare, controls={"projector": {"resolution": 4}}, resolution=16, steps=16, trials=6,
         verify_spp=16, baseline=False, measure="no", run=tmp_path / "run",
     )  # fmt: skip
     light = result.summary.ambient
@@ -261,12 +262,12 @@ def test_the_result_says_in_which_ambient_light_it_ends(glare: advsearch.Model, 
 
 
 def test_the_export_has_the_picture_marks_and_what_to_set(tmp_path: Path) -> None:
-    settings = {"resolution": 4, "lumens": 1000}
+    settings = {"resolution": 4, "lumens": 10}
     config = AttackConfig(object="mug", controls={"projector": settings}, resolution=16)
     u = np.linspace(0.0, 1.0, 4 * 4 * 3)
     run = make_attacked(tmp_path / "run", config, u)
     notes = write_projection(run, tmp_path / "out")
-    assert "1000 lumens" in notes[0]
+    assert "10 lumens" in notes[0]
     texels = torch.from_numpy(read_png(tmp_path / "out" / "texels.png"))
     assert torch.equal(texels, renderer_of(**settings).space.artifacts(torch.from_numpy(u).float())["projector"])
     marks, seen = (read_png(tmp_path / "out" / name) for name in ("marks.png", "seen.png"))
@@ -280,7 +281,7 @@ def test_the_export_has_the_picture_marks_and_what_to_set(tmp_path: Path) -> Non
 
 def test_one_picture_holds_over_cameras(glare: advsearch.Model) -> None:
     result = advsearch.attack(
-        "mug", glare, controls={"projector": {"resolution": 4, "lumens": 3000}},
+        "mug", glare, controls={"projector": {"resolution": 4}},
         over={"camera": {"azimuth": [30, 50]}}, resolution=16, steps=16, draws=2, trials=30, verify_spp=4,
         baseline=False, measure="no",
     )  # fmt: skip
