@@ -162,7 +162,7 @@ def assert_true_of_fixed_values(
         kind, parameter, *number = name.split(".")
         if not number and parameter in {one.name for one in CONTROLS[kind].parameters}:
             named.setdefault(kind, {})[parameter] = value["value"]
-        elif kind == "patch" or (number and parameter in {one.name for one in CONTROLS[kind].parameters}):
+        elif kind in ("patch", "projector") or (number and parameter in {one.name for one in CONTROLS[kind].parameters}):
             return  # one number of many cannot be fixed alone, and neither can the picture of a patch
     description = framed(scene.description, SIZE)
     space = compose([make_control(kind, given) for kind, given in named.items()], description)

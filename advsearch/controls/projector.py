@@ -152,10 +152,10 @@ class ProjectorControl(NumberControl):
             unit = None if place is None else place.candelas
             return AMBIENT if unit is None else min(max(unit * ambient_irradiance(self.scene), 1e-3), 2e5)
         if parameter.name == "lumens":
-            place, distance = (next(one for one in self.own if one.name == name) for name in ("ambient", "distance"))
+            ambient, distance = (next(one for one in self.own if one.name == name) for name in ("ambient", "distance"))
             spec = self.specs.get("distance")
-            far = float(spec.value) if isinstance(spec, Fixed) else float(self.default(distance))
-            return min(LUMENS, TIMES * float(self.default(place)) * self.part.area * far**2)
+            at = float(spec.value) if isinstance(spec, Fixed) else float(self.default(distance))
+            return min(LUMENS, TIMES * float(self.default(ambient)) * self.part.area * at**2)
         away = camera_to_world(self.scene)[:3, 3] - middle(self.scene)
         far = float(np.linalg.norm(away))
         if parameter.name == "azimuth":
