@@ -69,6 +69,8 @@ EXCLUSIVE |= {frozenset(("contents", "body"))}
 ALL = [(one,) for one in FORMS] + [
     pair for pair in itertools.combinations(FORMS, 2) if frozenset(pair) not in EXCLUSIVE
 ]
+PICTURES = ("patch", "projector")
+"""Controls with a picture, of which a row has no values."""
 QUICK = ["camera-occlusion", "pose-contents", "material-patch"]
 """Pairs in which one control goes by what the other does, or both meet in one input; the others take minutes."""
 
@@ -162,8 +164,8 @@ def assert_true_of_fixed_values(
         kind, parameter, *number = name.split(".")
         if not number and parameter in {one.name for one in CONTROLS[kind].parameters}:
             named.setdefault(kind, {})[parameter] = value["value"]
-        elif kind in ("patch", "projector") or (number and parameter in {one.name for one in CONTROLS[kind].parameters}):
-            return  # one number of many cannot be fixed alone, and neither can the picture of a patch
+        elif kind in PICTURES or (number and parameter in {one.name for one in CONTROLS[kind].parameters}):
+            return  # one number of many cannot be fixed alone, and neither can a picture
     description = framed(scene.description, SIZE)
     space = compose([make_control(kind, given) for kind, given in named.items()], description)
     renderer = make_renderer(description, space, SIZE, "none", 3)
