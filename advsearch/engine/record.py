@@ -49,6 +49,7 @@ class Findings:
         beaten: verification of what the policy found, where the random search's turned out worse for the model and is
             the run's adversarial scene instead.
         failures: verification of the first of the different failures that the policy found.
+        ambient: verification of the same picture of a projector in other ambient light, by lux.
         average: trials of configurations drawn from the whole space.
         pictures: of the first trials, (H, W, 3) with 8-bit values in [0, 1], by kind and number; of a run that goes on
             only those that it made itself.
@@ -71,6 +72,7 @@ class Findings:
     unprinted_verification: Verification | None = None
     beaten: Verification | None = None
     failures: tuple[Verification, ...] = ()
+    ambient: dict[float, Verification] = field(default_factory=dict)
     average: tuple[Judgement, ...] = ()
     smallest: Bracket | None = None
     pictures: dict[tuple[str, int], Tensor] = field(default_factory=dict)
