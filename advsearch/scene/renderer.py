@@ -240,7 +240,9 @@ class Renderer:
         u, _ = self._given(u, 1)
         with torch.no_grad():
             inputs = self.scene.assembly(self.space.inputs(u))
-        return self.scene.surfaces({name: inputs[name] for name in inputs if name not in ON_PICTURE}, fineness)
+        seen = self.scene.surfaces({name: inputs[name] for name in inputs if name not in ON_PICTURE}, fineness)
+        metres = self.scene.made[0].metres
+        return replace(seen, depth=seen.depth * metres, z_depth=seen.z_depth * metres)
 
     def gradient(
         self, loss: Callable[[Tensor], Tensor], u: Tensor, seed: int, spp: int, *, free: bool = False
