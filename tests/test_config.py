@@ -21,6 +21,7 @@ from advsearch.cli import flags
 from advsearch.cli.main import main
 from advsearch.config import CONFIGS, RenderConfig, SceneConfig
 from advsearch.errors import FileFormatError, InputError, UnknownNameError
+from advsearch.files import MESHES, either
 from advsearch.questions.attack.settings import TRIALS, TRIALS_OVER, AttackConfig
 from advsearch.questions.check.result import CheckConfig
 from advsearch.questions.gap import GapConfig
@@ -32,7 +33,10 @@ from advsearch.questions.test.settings import SuiteConfig
 from advsearch.settings import Config, Setting, all_finite, parse_assignment, read_yaml, settings
 
 WRONG: dict[str, tuple[Any, str]] = {
-    "object": ("", "expected the name of an object or a .obj, .ply, .stl, .gltf, .glb or .blend file, got ''"),
+    "object": (
+        "",
+        f"expected the name of an object or a {either(MESHES)} file, got ''",
+    ),
     "path": ("", "expected approach, pass, orbit, a .csv file, or two of them, the camera's and the object's, as in"),
     "environment": ([], "expected the name of an environment, a .hdr or .exr file, or none, got "),
     "up": ("x", "expected y or z, got x"),
@@ -192,7 +196,7 @@ def test_all_problems_are_told_at_once() -> None:
     with pytest.raises(InputError) as error:
         AttackConfig.model_validate({"epsilon": -1, "steps": 0})
     assert flags.with_flags(str(error.value)) == (
-        "--object: expected the name of an object or a .obj, .ply, .stl, .gltf, .glb or .blend file, got nothing; "
+        f"--object: expected the name of an object or a {either(MESHES)} file, got nothing; "
         "--epsilon: expected a number greater than 0 and at most 1e+06, got -1; "
         "--steps: expected a whole number from 1 to 1000000, got 0"
     )
@@ -327,7 +331,10 @@ def test_no_value_of_any_setting_ends_in_a_traceback(config: type[Config]) -> No
         ("--estimator adjoint --estimator differences", "--estimator: * is given twice; leave one of them out"),
         ("--policy 'pgd={momentum: .nan}'", "--policy: expected the name of a policy, or NAME={OPTION: VALUE}, got {"),
         ("--over 'camera={azimuth: [0, .inf]}'", "--over: expected names of controls, or NAME={PARAMETER: VALUE or "),
-        ("--object ,", "--object: expected the name of an object or a .obj, .ply, .stl, .gltf, .glb or .blend file"),
+        (
+            "--object ,",
+            f"--object: expected the name of an object or a {either(MESHES)} file",
+        ),
     ],
 )
 def test_slips_on_the_command_line_are_refused_in_one_sentence(line: str, message: str) -> None:

@@ -36,6 +36,7 @@ from advsearch.scene.description import (
 )
 from advsearch.scene.formation import EVERYTHING, SAMPLER, ImageFormation
 from advsearch.scene.grounds import on_its_ground
+from advsearch.scene.headlamps import with_lamps
 from advsearch.scene.importing.pictures import read_picture
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.renderer import Renderer
@@ -111,7 +112,7 @@ class Scene:
         if environment is not None:
             check_one_environment(own.parts, f"`environment={name}`")
         lit = replace(own, environment=environment, environment_spec=name, given=given)
-        return Scene(on_its_ground(lit), self.only_here)
+        return Scene(with_lamps(on_its_ground(lit)), self.only_here)
 
     def __repr__(self) -> str:
         described = self.description
@@ -143,7 +144,8 @@ class Scene:
         values = {**own.values, **{name: resolved[name] for name in given}}
         if "camera.elevation" in given:
             values["camera.height"] = None
-        return Scene(on_its_ground(replace(own, values=values, given=own.given | set(given))), self.only_here)
+        changed = on_its_ground(replace(own, values=values, given=own.given | set(given)))
+        return Scene(with_lamps(changed), self.only_here)
 
 
 @helped

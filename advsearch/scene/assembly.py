@@ -20,8 +20,9 @@ from torch import Tensor
 
 from advsearch.scene.assets import Mesh
 from advsearch.scene.description import SceneDescription
-from advsearch.scene.geometry import camera_to_world
+from advsearch.scene.geometry import camera_to_world, driving, seated
 from advsearch.scene.gradients import DEFAULT_PIXELS, DEFAULT_STEP, STEP_RANGE, Group
+from advsearch.scene.parts import CAMERA, BeamLamp, LampGlass
 
 ON_PICTURE = frozenset({"backdrop.color", "camera.exposure"})
 """Inputs that Mitsuba never sees: the renderer applies them to radiance."""
@@ -106,11 +107,14 @@ class Assembly:
 
     def __init__(self, description: SceneDescription) -> None:
         self.meshes = {name: MovingMesh(part.mesh, part.to_world) for name, part in description.meshes.items()}
+        self._carried = [one for one in description.parts if isinstance(one, (BeamLamp, LampGlass))]
         self._photograph = description.photograph
 
     def __call__(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return the inputs with poses, displacements and maps worked out; differentiable torch operations."""
         parameters = dict(inputs)
+        for one in self._carried:
+            parameters |= _with_carrier(one, inputs)
         for name, mesh in self.meshes.items():
             to_world, offsets = parameters.pop(f"{name}.to_world", None), parameters.pop(f"{name}.offsets", None)
             if to_world is not None or offsets is not None:
@@ -124,6 +128,21 @@ class Assembly:
                 parameters["ground.reflectance"] = self._photograph.reflectance(data)
             parameters["environment.padded"] = torch.cat([data[:, -1:], data, data[:, :1]], dim=1)
         return parameters
+
+
+def _with_carrier(part: BeamLamp | LampGlass, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The inputs of what a mesh or the camera carries, where that is moved or deformed."""
+    pose, offsets = (inputs.get(f"{part.carrier}.{one}") for one in ("to_world", "offsets"))
+    found: dict[str, Tensor] = {}
+    if isinstance(part, LampGlass):
+        if offsets is not None:
+            found[f"{part.name}.offsets"] = offsets[torch.from_numpy(part.follows).to(offsets.device)]
+        if pose is not None:
+            found[f"{part.name}.to_world"] = pose
+    elif pose is not None:
+        seat = torch.from_numpy(part.seat).to(pose)
+        found[f"{part.name}.to_world"] = seated(driving(pose) if part.carrier == CAMERA else pose, seat)
+    return found
 
 
 Value = Callable[[Tensor], Tensor]

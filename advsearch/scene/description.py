@@ -13,6 +13,7 @@ from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -25,11 +26,23 @@ from advsearch.scene.camera_files import read_camera
 from advsearch.scene.camera_model import CameraModel, bundled
 from advsearch.scene.camera_presets import ON_TABLES, PRESETS, TABLE, TABLE_SIDE
 from advsearch.scene.exposure import metered_gain
-from advsearch.scene.geometry import framing_distance, moved_part, object_to_world
+from advsearch.scene.geometry import camera_to_world, driving, framing_distance, moved_part, object_to_world, seated
 from advsearch.scene.grounds import Photograph, on_its_ground, paved, photograph_of
+from advsearch.scene.headlamps import with_lamps
 from advsearch.scene.importing.objects import import_object
 from advsearch.scene.importing.scenes import MITSUBA_FILE, ImportedScene, import_scene, split_node
-from advsearch.scene.parts import Lamp, MeshPart, PlacedCamera, PluginPart, ScenePart, mesh_part, plugins_in
+from advsearch.scene.parts import (
+    CAMERA,
+    BeamLamp,
+    Lamp,
+    LampGlass,
+    MeshPart,
+    PlacedCamera,
+    PluginPart,
+    ScenePart,
+    mesh_part,
+    plugins_in,
+)
 from advsearch.scene.settings import ORBIT_CAMERA
 from advsearch.scene.sizes import TRIPOD, doubts, on_roads, sized
 from advsearch.scene.things import ThingPart, with_things
@@ -182,7 +195,11 @@ class SceneDescription:
     def meshes(self) -> Mapping[str, MeshPart]:
         """Every mesh by name, as the settings have it; the one under test is `OBJECT`."""
         under_test = mesh_part(OBJECT, self.object, object_to_world(self), self.material)
-        return {OBJECT: under_test, **{name: moved_part(one, self.values) for name, one in self.around.items()}}
+        found = {OBJECT: under_test, **{name: moved_part(one, self.values) for name, one in self.around.items()}}
+        for name, one in found.items():
+            if isinstance(one, LampGlass):
+                found[name] = replace(one, to_world=found[one.carrier].to_world)
+        return found
 
     @cached_property
     def around(self) -> Mapping[str, MeshPart]:
@@ -218,7 +235,17 @@ class SceneDescription:
     @property
     def lamps(self) -> Mapping[str, Lamp]:
         """Every light beside the environment, by name."""
-        return {one.name: one for one in self.parts if isinstance(one, Lamp)}
+        return {one.name: self.placed(one) for one in self.parts if isinstance(one, Lamp)}
+
+    def placed(self, part: ScenePart) -> Any:
+        """Return one of the parts as the settings and the camera have it."""
+        if isinstance(part, BeamLamp):
+            if part.carrier == CAMERA:
+                carrier = driving(torch.from_numpy(camera_to_world(self)))
+            else:
+                carrier = torch.from_numpy(self.meshes[part.carrier].to_world)
+            return replace(part, to_world=seated(carrier, torch.from_numpy(part.seat)).numpy())
+        return self.meshes.get(part.name, part)
 
     @property
     def lit(self) -> bool:
@@ -415,7 +442,7 @@ def describe(
         camera=next(iter(around.cameras), ORBIT_CAMERA) if mitsuba and not orbits else ORBIT_CAMERA,
         metered=not mitsuba,
     )
-    described = with_things(on_its_ground(described), things, lambda spec: _object(spec, None))
+    described = with_lamps(with_things(on_its_ground(described), things, lambda spec: _object(spec, None)))
     check_meshes(described, values)
     idle = [name for name in given or {} if name.startswith("material.")]
     if described.object.surface is not None and idle:

@@ -216,6 +216,22 @@ def camera_to_world(description: SceneDescription, aspect: float | None = None) 
     return matrix
 
 
+def seated(carrier: Tensor, seat: Tensor) -> Tensor:
+    """Return the rigid pose (4, 4) of what sits at `seat` (4, 4) on what has the pose `carrier` (4, 4), which may be
+    scaled; differentiable."""
+    scale = torch.linalg.det(carrier[:3, :3]).abs() ** (1.0 / 3.0)
+    return affine(carrier[:3, :3] / scale @ seat[:3, :3], carrier[:3, :3] @ seat[:3, 3] + carrier[:3, 3])
+
+
+def driving(camera: Tensor) -> Tensor:
+    """Return the pose (4, 4) of a car that a camera with the pose (4, 4) looks ahead from: level, with its +x ahead,
+    on the ground below the camera; differentiable."""
+    ahead = camera[:2, 2] / camera[:2, 2].norm().clamp_min(1e-6)
+    none, along = torch.zeros_like(ahead[0]), torch.ones_like(ahead[0])
+    axes = torch.stack([ahead[0], -ahead[1], none, ahead[1], ahead[0], none, none, none, along]).reshape(3, 3)
+    return affine(axes, torch.cat([camera[:2, 3], none[None]]))
+
+
 @lru_cache(maxsize=4)
 def real_harmonics(height: int, width: int) -> Tensor:
     """Return the nine real spherical harmonics of degrees 0 to 2 over a map of equal angles: (height, width, 9).

@@ -7,14 +7,11 @@ and KHR_materials_clearcoat): a specular of 0.5 reflects 4 % at normal incidence
 from __future__ import annotations
 
 import io
-import json
-import struct
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from PIL import Image
 from torch import Tensor
@@ -22,12 +19,9 @@ from torch import Tensor
 from advsearch.scene.assembly import MovingMesh
 from advsearch.scene.assets import Doubles, Floats, Shape
 from advsearch.scene.color import linear_to_srgb
+from advsearch.scene.glb_buffer import GlbBuffer
 from advsearch.scene.parts import MeshPart
 
-FLOAT, WHOLE, SHORT = 5126, 5125, 5123
-"""Types of numbers in glTF: float32, uint32 and uint16."""
-CORNERS, INDICES = 34962, 34963
-"""What a part of the buffer is for."""
 COAT_ROUGHNESS = 0.316
 """Of Mitsuba's clearcoat, whose alpha is 0.1: the square root of it."""
 PLAIN = 0.5
@@ -69,7 +63,7 @@ def _rows(flat: Tensor) -> Floats:
 
 def glb(meshes: Sequence[Shape]) -> bytes:
     """Return a binary glTF file of some meshes."""
-    made = _Buffer()
+    made = GlbBuffer()
     return made.file(_described(made, meshes, _png))
 
 
@@ -82,7 +76,7 @@ def web_glb(adversarial: Sequence[Shape], clean: Sequence[Shape], camera: Double
         camera: (4, 4) pose of the camera that sees that; it looks along its own +z.
         note: what a reader has to know, in `asset.extras`.
     """
-    made, count = _Buffer(), len(adversarial)
+    made, count = GlbBuffer(), len(adversarial)
     header = _described(made, [*adversarial, *clean], _jpeg)
     ours = camera[:3].T.astype(np.float32)  # rows: its axes, then its place
     columns = np.eye(4)
@@ -98,7 +92,7 @@ def web_glb(adversarial: Sequence[Shape], clean: Sequence[Shape], camera: Double
     return made.file(header)
 
 
-def _described(made: _Buffer, meshes: Sequence[Shape], picture: Callable[[Floats], bytes]) -> dict[str, Any]:
+def _described(made: GlbBuffer, meshes: Sequence[Shape], picture: Callable[[Floats], bytes]) -> dict[str, Any]:
     """Return the header of a file with some meshes in one scene, and put their bytes into the buffer."""
     header: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": "advsearch"},
@@ -146,50 +140,6 @@ def _texture(header: dict[str, Any], view: int, picture: bytes) -> int:
     header["images"].append({"mimeType": kind, "bufferView": view})
     header["textures"].append({"source": len(header["textures"]), "sampler": 0})
     return len(header["textures"]) - 1
-
-
-class _Buffer:
-    """The bytes of a file and where in them what is; bytes that are there already are not added again."""
-
-    def __init__(self) -> None:
-        self.data = bytearray()
-        self._known: dict[tuple[bytes, int | None], int] = {}
-        self.views: list[dict[str, int]] = []
-        self.accessors: list[dict[str, Any]] = []
-
-    def view(self, data: bytes, target: int | None = None) -> int:
-        """Append some bytes, whole words, and return the number of the view."""
-        if (data, target) in self._known:
-            return self._known[data, target]
-        self._known[data, target] = len(self.views)
-        view = {"buffer": 0, "byteOffset": len(self.data), "byteLength": len(data)}
-        self.views.append(view if target is None else {**view, "target": target})
-        self.data += data + bytes(-len(data) % 4)
-        return len(self.views) - 1
-
-    def accessor(self, values: npt.NDArray[Any], kind: str, *, bounds: bool = False) -> int:
-        """Append an array and return the number of its accessor."""
-        kinds = {np.dtype(np.uint32): WHOLE, np.dtype(np.uint16): SHORT}
-        number = kinds.get(values.dtype, FLOAT)
-        entry: dict[str, Any] = {
-            "bufferView": self.view(np.ascontiguousarray(values).tobytes(), CORNERS if number == FLOAT else INDICES),
-            "componentType": number,
-            "count": len(values),
-            "type": kind,
-        }
-        if bounds:
-            entry |= {"min": values.min(axis=0).tolist(), "max": values.max(axis=0).tolist()}
-        self.accessors.append(entry)
-        return len(self.accessors) - 1
-
-    def file(self, header: dict[str, Any]) -> bytes:
-        """Return the whole file with a header that says all but what is in the buffer."""
-        header |= {"accessors": self.accessors, "bufferViews": self.views, "buffers": [{"byteLength": len(self.data)}]}
-        text = json.dumps(header).encode()
-        text += b" " * (-len(text) % 4)
-        rest = bytes(self.data)
-        head = struct.pack("<4sIIII", b"glTF", 2, 28 + len(text) + len(rest), len(text), 0x4E4F534A)
-        return head + text + struct.pack("<II", len(rest), 0x004E4942) + rest
 
 
 def _material(one: Shape, texture: int) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from advsearch.scene.assets import Doubles, Material, Shape
+from advsearch.scene.assets import Doubles, Floats, Ints, Material, Shape
 
 Triple = tuple[float, float, float]
 BASE_COLOR = "base color"
@@ -58,6 +58,21 @@ class MeshPart(Shape, ScenePart):
 
     to_world: Doubles = field(default_factory=lambda: np.eye(4))
     laid: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class LampGlass(MeshPart):
+    """The glass of a car's lamps, which shines; it stands in the car's own coordinates, and belongs to it.
+
+    Attributes:
+        carrier: the mesh of the car.
+        follows: (V,) the car's vertices that its vertices go with.
+        lies_on: (F,) the car's faces that its faces lie on.
+    """
+
+    carrier: str = ""
+    follows: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
+    lies_on: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
 
 
 def mesh_part(name: str, shape: Shape, to_world: Doubles, material: Material) -> MeshPart:
@@ -174,7 +189,47 @@ class BallLamp(ScenePart):
         return PointLamp(self.name, position=self.place, intensity=intensity).lighting(place)  # type: ignore[arg-type]
 
 
-Lamp = PointLamp | SpotLamp | BallLamp
+CAMERA = "camera"
+"""What carries the lamps of the car that the camera is in."""
+
+
+@dataclass(frozen=True, eq=False)
+class BeamLamp(ScenePart):
+    """A point on a mesh, or before the camera, that shines by a table, such as a headlamp; the camera does not see it.
+
+    Takes `NAME.to_world` (4, 4), its pose; its brightness stays.
+
+    Attributes:
+        name: of the lamp.
+        carrier: the mesh that carries it, or `CAMERA`.
+        seat: (4, 4) its pose in what carries it (`geometry.seated`): it shines along its +z and has +y up.
+        table: (h, w) intensities on a plane before it, row 0 on top, as far as tangents of 1 to either side.
+        tint: radiant intensity for each colour channel where the table has 1.
+        weight: how often its light is sampled, where that of the environment has 1.
+        to_world: (4, 4) its base pose in the scene, once what carries it stands there.
+    """
+
+    carrier: str
+    seat: Doubles
+    table: Floats
+    tint: Triple
+    weight: float = 1.0
+    to_world: Doubles = field(default_factory=lambda: np.eye(4))
+    dark: ClassVar[bool] = False
+
+    def lighting(self, place: Doubles) -> tuple[Doubles, Doubles]:
+        """As of a point, by the table."""
+        way = self.to_world[:3, 3] - place
+        aside, up, ahead = -way @ self.to_world[:3, :3]
+        height, width = self.table.shape
+        column = math.floor((aside / max(ahead, 1e-9) + 1.0) / 2.0 * width)
+        row = math.floor((1.0 - up / max(ahead, 1e-9) * width / height) / 2.0 * height)
+        if ahead <= 0.0 or not (0 <= column < width and 0 <= row < height):
+            return way, np.zeros(3)
+        return way, self.table[row, column] * np.array(self.tint) / max(float(way @ way), 1e-12)
+
+
+Lamp = PointLamp | SpotLamp | BallLamp | BeamLamp
 
 
 @dataclass(frozen=True, eq=False)

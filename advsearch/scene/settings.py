@@ -167,6 +167,15 @@ EV = Parameter(
     "Absolute exposure in place of the metered one, in the avenue: 14 is for sun, 5 for lit streets.",
     estimators=(),
 )
+LAMPS = ("off", "low", "high")
+"""What the lamps of a car may be: with either beam its tail lamps shine too."""
+
+
+def _lamps(whose: str) -> Parameter:
+    text = f"Headlamps of {whose}, with its tail lamps: the low beam, or the high beam; in the avenue."
+    return Parameter("lamps", (), "name", 0.0, len(LAMPS) - 1.0, LAMPS[0], text, options=LAMPS, estimators=())
+
+
 ENVIRONMENT = (
     Parameter(
         "rotation",
@@ -231,7 +240,10 @@ MATERIAL = (
     _surface("specular", "Strength of the reflection off what is not metal.", (0.0, 1.0)),
     _surface("clearcoat", "Strength of a clear coat on top.", (0.0, 1.0)),
 )
-FAMILIES = {"camera": (*CAMERA, EV), "pose": POSE, "environment": ENVIRONMENT, "ground": GROUND, "material": MATERIAL}
+FAMILIES = {
+    "camera": (*CAMERA, EV, _lamps("the car that the camera is in")), "pose": POSE, "environment": ENVIRONMENT,
+    "ground": GROUND, "material": MATERIAL, "object": (_lamps("the object, a car"),),
+}  # fmt: skip
 
 SETTINGS: Mapping[str, Parameter] = {
     f"{family}.{one.name}": one for family, parameters in FAMILIES.items() for one in parameters

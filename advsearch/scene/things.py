@@ -24,6 +24,7 @@ from advsearch.scene.geometry import middle, rotation, standing
 from advsearch.scene.importing.files import safe_name
 from advsearch.scene.parts import MeshPart, mesh_part
 from advsearch.scene.places.road import ROAD
+from advsearch.scene.settings import LAMPS
 from advsearch.scene.sizes import LARGEST, SMALLEST, doubts, sized
 
 if TYPE_CHECKING:
@@ -33,7 +34,7 @@ FARTHEST = 1000.0
 """How far from the object a thing may stand, metres."""
 MOST = 64
 """Things beside an object."""
-OPTIONS = ("heading", "size", "name", "label")
+OPTIONS = ("heading", "size", "name", "label", "lamps")
 ALL = "all"
 """What stands for the object and every thing beside it."""
 TAKEN = ("object", "environment", "ground", "camera", ROAD, ALL)
@@ -51,6 +52,7 @@ class AskedThing:
         size: its longest side in metres; None for its own.
         name: what it is called in the scene.
         label: what a model should call it; None for what the object of that name is called.
+        lamps: one of `settings.LAMPS`, of a car.
     """
 
     what: str
@@ -60,6 +62,7 @@ class AskedThing:
     size: float | None = None
     name: str = ""
     label: str | None = None
+    lamps: str = LAMPS[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,9 +71,11 @@ class ThingPart(MeshPart):
 
     Attributes:
         metres: its longest side.
+        lamps: which it has on.
     """
 
     metres: float = 1.0
+    lamps: str = LAMPS[0]
 
 
 def asked_things(text: str | None) -> tuple[AskedThing, ...]:
@@ -104,11 +109,14 @@ def _asked(part: str) -> AskedThing:
     for name in options:
         if name not in OPTIONS:
             raise UnknownNameError(f"option of things {part!r}:", name, OPTIONS)
+    lamps = options.get("lamps", LAMPS[0])
+    if lamps not in LAMPS:
+        raise UnknownNameError(f"lamps of things {part!r}:", lamps, LAMPS)
     x, y = (_number(part, name, one, -FARTHEST, FARTHEST) for name, one in zip("xy", words, strict=False))
     heading = _number(part, "heading", options["heading"], -3600.0, 3600.0) if "heading" in options else 0.0
     size = _number(part, "size", options["size"], SMALLEST, LARGEST) if "size" in options else None
     name = safe_name(Path(options.get("name") or what.strip().partition("#")[0]))
-    return AskedThing(what.strip(), x, y, heading, size, name, options.get("label"))
+    return AskedThing(what.strip(), x, y, heading, size, name, options.get("label"), lamps)
 
 
 def _number(part: str, name: str, text: str, low: float, high: float) -> float:
@@ -152,7 +160,9 @@ def with_things(scene: SceneDescription, text: str | None, load: Callable[[str],
         if one.name in {part.name for part in scene.parts}:
             raise InputError(f"things: something of the scene is called {one.name} already; add name=NAME to it")
         part = mesh_part(one.name, asset, _pose(scene, asset, one, asset.metres), asset.material)
-        parts.append(ThingPart(**{**vars(part), "label": one.label or asset.label}, metres=asset.metres))
+        parts.append(
+            ThingPart(**{**vars(part), "label": one.label or asset.label}, metres=asset.metres, lamps=one.lamps)
+        )
         remarks += [*asset.notes, *doubts(asset, asked=one.size is not None, laid=True)]
     scene = replace(scene, parts=(*scene.parts, *parts), things_spec=text or "")
     return replace(scene, remarks=(*scene.remarks, *remarks, *_meeting(scene)))
@@ -174,16 +184,22 @@ def ground_height(scene: SceneDescription, place: Doubles) -> float:
     """Return how high the ground lies at a place (2,), object sizes: that of the road, with its pavements, or 0."""
     heights = [0.0]
     for part in (one for name, one in scene.around.items() if name == ROAD):
-        a, b, c = np.moveaxis(standing(part)[part.mesh.faces.astype(np.int64)], 1, 0)
-        sides = [
-            (end[:, 0] - begin[:, 0]) * (place[1] - begin[:, 1]) - (end[:, 1] - begin[:, 1]) * (place[0] - begin[:, 0])
-            for begin, end in ((b, c), (c, a), (a, b))
-        ]
-        whole = sides[0] + sides[1] + sides[2]
-        shares = np.stack(sides) / np.where(np.abs(whole) > 1e-12, whole, np.nan)
-        under = (shares >= 0.0).all(axis=0)
-        heights += (shares * [a[:, 2], b[:, 2], c[:, 2]]).sum(axis=0)[under].tolist()
+        heights += heights_over(standing(part)[part.mesh.faces.astype(np.int64)], place)
     return max(heights)
+
+
+def heights_over(corners: Doubles, place: Doubles) -> list[float]:
+    """Return how high the triangles (F, 3 corners, 3) lie that are above or below a place (2,)."""
+    a, b, c = np.moveaxis(corners, 1, 0)
+    sides = [
+        (end[:, 0] - begin[:, 0]) * (place[1] - begin[:, 1]) - (end[:, 1] - begin[:, 1]) * (place[0] - begin[:, 0])
+        for begin, end in ((b, c), (c, a), (a, b))
+    ]
+    whole = sides[0] + sides[1] + sides[2]
+    shares = np.stack(sides) / np.where(np.abs(whole) > 1e-12, whole, np.nan)
+    under = (shares >= 0.0).all(axis=0)
+    heights: list[float] = (shares * [a[:, 2], b[:, 2], c[:, 2]]).sum(axis=0)[under].tolist()
+    return heights
 
 
 def _meeting(scene: SceneDescription) -> list[str]:

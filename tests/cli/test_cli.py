@@ -155,7 +155,7 @@ def test_no_command_prints_help_and_version_is_told(capsys: pytest.CaptureFixtur
         (["region", "--workers", "2"], "advsearch region has no --workers, a flag of advsearch attack, sweep"),
         (["attack", "mug"], "expected flags, got 'mug'; see advsearch attack --help"),
         (["attack", "--steps"], "argument --steps: expected one argument; see advsearch attack --help"),
-        (["attack"], "--object: expected the name of an object or a .obj, .ply, .stl, .gltf, .glb or .blend file, got"),
+        (["attack"], "--object: expected the name of an object or a .obj, .ply, .stl, "),
         (["attack", "--object", "mug", "--epsilon", "nan"], "--epsilon: expected a number greater than 0 and at"),
         (["attack", "--object", "mug", "--epsilon", "-0.1"], "--epsilon: expected a number greater than 0 and at"),
         (["attack", "--object", "mug", "--control", ","], "--control: expected names of controls, or NAME="),

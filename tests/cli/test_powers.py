@@ -77,8 +77,8 @@ def test_every_setting_that_reaches_beyond_the_run_says_so() -> None:
         for one in settings(CONFIGS[command]):
             text = f"{one.name} {one.description} {one.expects}"
             suspicious = ("folder that", "write ", "writes", "address", "replace ", "processes", "tracker", "keep the")
-            inside = ("aov", "suite", "attack", "keep_pictures", "compared", "sweeps", "ask")
-            inside += ("model", "models")  # what only a file names is asked nothing (test_addresses.py)
+            inside = {"aov", "suite", "attack", "keep_pictures", "compared", "sweeps", "ask"}
+            inside |= {"model", "models"}  # what only a file names is asked nothing (test_addresses.py)
             if any(word in text for word in suspicious) and one.name not in inside:
                 assert one.power is not power.none, f"{command}: {text}"
 

@@ -23,8 +23,6 @@ ENDINGS += [".step", ".stp", ".iges", ".igs", ".brep", ".ifc", ".b3dm", ".bin"]
     ("ending", "what", "do"),
     [
         (".splat", "Gaussian splats", "fuse_post.ply"),
-        (".usd", "a USD scene", "bpy.ops.wm.usd_import"),
-        (".usdz", "a USD scene", "bpy.ops.export_scene.gltf"),
         (".fbx", "an FBX model", "bpy.ops.import_scene.fbx"),
         (".DAE", "a COLLADA model", "assimp export 'my thing.DAE' 'my thing.obj'"),
         (".3mf", "a 3MF model", "assimp export"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -175,9 +176,9 @@ def test_a_size_in_metres_changes_no_picture(name: str) -> None:
     sized = describe(name)
     bare = replace(sized, object=replace(sized.object, metres=None))
     assert np.array_equal(camera_to_world(sized), camera_to_world(bare))
-    around = {"azimuth": [0, 90], "elevation": [5, 60]}
+    around: dict[str, Any] = {"azimuth": [0, 90], "elevation": [5, 60]}
     far = {**around, "distance": [1.5, 6.0]}
-    pairs = [
+    pairs: list[tuple[dict[str, Any], dict[str, Any]]] = [
         ({**around, "distance": [1.5 * sized.metres, 6.0 * sized.metres]}, far),
         ({**around, "sizes": [1.5, 6]}, far),
     ]
@@ -188,4 +189,4 @@ def test_a_size_in_metres_changes_no_picture(name: str) -> None:
         for share in (0.0, 0.3, 1.0):
             u = torch.full_like(controls[0].start, share)
             poses = [one.inputs(u)["camera.to_world"].numpy() for one in controls]
-            np.testing.assert_allclose(*poses, rtol=0, atol=3e-6)
+            np.testing.assert_allclose(poses[0], poses[1], rtol=0, atol=3e-6)

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from advsearch.errors import InputError, ModelError
-from advsearch.models.model import SMALLEST_PROBABILITY, ModelWarning
+from advsearch.models.model import SMALLEST_PROBABILITY, Model, ModelWarning
 from advsearch.models.source import Purpose, Source
 from advsearch.models.zoo import zero_shot
 from advsearch.models.zoo.library import Loaded, Measured
@@ -67,7 +67,7 @@ def no_classes(name: str, what: str) -> ModelError:
     )
 
 
-def _finished(loaded: Loaded, plain: Callable[[Loaded], Source] | None, purpose: Purpose) -> Source:
+def _finished(loaded: Loaded, plain: Callable[[Loaded], Source] | None, purpose: Purpose) -> Source | Model:
     if purpose.task == TASK:
         if purpose.prompts is not None:
             raise InputError(f"prompt: task {TASK} compares pictures and reads no text; leave `prompt` out")

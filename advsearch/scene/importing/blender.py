@@ -18,6 +18,7 @@ from pathlib import Path
 from advsearch import files
 from advsearch.errors import FileFormatError
 from advsearch.scene.importing.files import LARGEST_FILE, damaged, looks_like, read_bytes, shown
+from advsearch.scene.importing.usd import USD, converted
 
 BLEND = ".blend"
 PROGRAM = "ADVSEARCH_BLENDER"
@@ -48,12 +49,14 @@ bpy.ops.export_scene.gltf(
 
 
 def read_mesh_bytes(path: Path, what: str, suffixes: tuple[str, ...]) -> bytes:
-    """Return the content of a mesh or scene file, of a Blender file as binary glTF; see `read_bytes`.
+    """Return the content of a mesh or scene file, of a Blender or OpenUSD file as binary glTF; see `read_bytes`.
 
     Raises:
         FileFormatError: as for `read_bytes`; there is no Blender, it can't read the file, or it takes too long.
     """
     data = read_bytes(path, what, suffixes)
+    if path.suffix.lower() in USD:
+        return converted(path, data)
     if path.suffix.lower() != BLEND:
         return data
     if not data.startswith(BEGINNINGS):

@@ -35,6 +35,7 @@ def _extension(*path: str, default: Any = None) -> Any:
 class Asset(_Entry):
     version: str
     generator: JsonValue = ""
+    extras: JsonValue = None
 
 
 class Buffer(_Entry):

@@ -12,6 +12,7 @@ from pydantic import BaseModel
 from advsearch.scene.importing.files import Notes, shown
 from advsearch.scene.importing.gltf import READ
 from advsearch.scene.importing.gltf_entries import CUT_OUTS, Header
+from advsearch.scene.importing.usd import GENERATOR
 
 _OPAQUE = " lets light pass through surfaces with {name}; here they are opaque"
 
@@ -33,6 +34,10 @@ FAR = 1000.0
 
 def left_out(header: Header, notes: Notes) -> None:
     """Say what the file has that is not carried over, whether one node or all of it is the object."""
+    if header.asset.generator == GENERATOR and isinstance(header.asset.extras, dict):
+        told = header.asset.extras.get("left_out")
+        for what in told if isinstance(told, list) else ():
+            notes.say(" " + shown(str(what), quoted=False))
     used = {*header.extensionsUsed, *header.extensionsRequired}
     for name in sorted(used & set(EXTENSIONS) | used - set(READ)):
         notes.say(EXTENSIONS.get(name, UNKNOWN).format(name=shown(name, quoted=False)))

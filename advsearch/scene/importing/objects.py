@@ -33,6 +33,7 @@ from advsearch.scene.importing.gltf_parts import read_gltf
 from advsearch.scene.importing.parts import NEUTRAL, ImportedPart, ImportedSurface, visible
 from advsearch.scene.importing.ply import read_ply
 from advsearch.scene.importing.texture import by_material, textured
+from advsearch.scene.importing.usd import USD
 from advsearch.scene.importing.wavefront import read_obj
 from advsearch.scene.sizes import LARGEST, SMALLEST
 
@@ -117,7 +118,7 @@ def _colors(head: bytes, attributes: Attributes, notes: Notes) -> Doubles | None
     return np.asarray(srgb_to_linear(found), dtype=np.float64)
 
 
-GLTF = (".glb", ".gltf", ".blend")
+GLTF = (".glb", ".gltf", ".blend", *USD)
 """Endings of glTF files, which have conventions of their own: y up, linear colours; and of what is read as glTF."""
 
 Reader = Callable[[Path, bytes, Notes], list[ImportedPart]]

@@ -8,7 +8,6 @@ from pathlib import Path
 
 BLENDER_READS = {
     "an FBX model": ("bpy.ops.import_scene.fbx", (".fbx",)),
-    "a USD scene": ("bpy.ops.wm.usd_import", (".usd", ".usda", ".usdc", ".usdz")),
     "an Alembic scene": ("bpy.ops.wm.alembic_import", (".abc",)),
 }
 ASSIMP_READS = {

@@ -26,6 +26,7 @@ from advsearch.scene.importing.gltf_entries import CameraEntry, Header, LightEnt
 from advsearch.scene.importing.gltf_parts import poses
 from advsearch.scene.importing.objects import GLTF, object_of, read_parts
 from advsearch.scene.importing.parts import ImportedPart, visible
+from advsearch.scene.importing.usd import GENERATOR
 from advsearch.scene.parts import PlacedCamera, PointLamp, ScenePart, SpotLamp, mesh_part
 
 UPRIGHT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
@@ -311,6 +312,8 @@ def _unit_of_light(header: Header, both: bool) -> tuple[float, str | None]:
     Alone, lamps are in watts, as exporters have them. Beside surfaces that emit light, of which one nit is one unit,
     what a candela is decides how bright they are to each other.
     """
+    if header.asset.generator == GENERATOR:
+        return 1.0, None  # a light of USD emits radiance as its surfaces do
     if not both:
         return LUMENS, None
     if "blender" in str(header.asset.generator).lower():

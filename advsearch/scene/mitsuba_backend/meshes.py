@@ -47,7 +47,7 @@ def principled(part: MeshPart, extra: Plugin | None = None) -> Plugin:
     material = part.material
     surface: Plugin = {
         "type": "principled",
-        "base_color": _texture(srgb_to_linear(part.base_color)),
+        "base_color": texture(srgb_to_linear(part.base_color)),
         "roughness": material.roughness,
         "metallic": rendered("metallic", material.metallic),
         "specular": rendered("specular", material.specular),
@@ -57,9 +57,9 @@ def principled(part: MeshPart, extra: Plugin | None = None) -> Plugin:
         surface["clearcoat"] = rendered("clearcoat", material.clearcoat)
     found: Plugin = {"type": "twosided", "bsdf": surface}
     if part.normal_map is not None:
-        found = {"type": "normalmap", "normalmap": _texture(part.normal_map), "bsdf": found}
+        found = {"type": "normalmap", "normalmap": texture(part.normal_map), "bsdf": found}
     if part.opacity is not None:
-        found = {"type": "mask", "opacity": _texture(part.opacity[:, :, None]), "bsdf": found}
+        found = {"type": "mask", "opacity": texture(part.opacity[:, :, None]), "bsdf": found}
     return found
 
 
@@ -74,7 +74,7 @@ def emitter(part: MeshPart) -> Plugin | None:
     if part.emission is None:
         return None
     if textured_emission(part):
-        return {"type": "area", "radiance": _texture(part.emission)}
+        return {"type": "area", "radiance": texture(part.emission)}
     return {"type": "area", "radiance": {"type": "rgb", "value": part.emission[0, 0].tolist()}}
 
 
@@ -100,10 +100,11 @@ def textured_emission(part: MeshPart) -> bool:
 
 def matt(reflectance: Floats) -> Plugin:
     """A two-sided diffuse BSDF with a bilinear texture (h, w, 3) of linear reflectance, row 0 at v = 1."""
-    return {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": _texture(reflectance)}}
+    return {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": texture(reflectance)}}
 
 
-def _texture(linear: Floats) -> Plugin:
+def texture(linear: Floats) -> Plugin:
+    """A bilinear texture (h, w, channels) of linear values, row 0 at v = 1."""
     bitmap = mi.Bitmap(np.ascontiguousarray(linear, dtype=np.float32))
     return {"type": "bitmap", "bitmap": bitmap, "raw": True, "filter_type": "bilinear"}
 
@@ -129,7 +130,7 @@ def own_surface(surface: Mapping[str, object], fill: Callable[[Mapping[str, obje
 def base_texture(base_color: Floats, options: Mapping[str, object]) -> Plugin:
     """A base colour (h, w, 3), display-referred, as a texture of linear reflectance that is looked up as `options`
     say."""
-    return {**_texture(srgb_to_linear(base_color)), **loadable(options)}
+    return {**texture(srgb_to_linear(base_color)), **loadable(options)}
 
 
 def repeating(uv: Tensor, options: Mapping[str, object], size: tuple[int, int]) -> Tensor:

@@ -32,11 +32,13 @@ from advsearch.scene.mitsuba_backend.meshes import (
     mitsuba_mesh,
     own_surface,
     principled,
+    texture,
     textured_emission,
 )
 from advsearch.scene.mitsuba_backend.variant import Plugin, dr, fewer_warnings, mi, population
 from advsearch.scene.parts import (
     BallLamp,
+    BeamLamp,
     HazePart,
     Lamp,
     MeshPart,
@@ -274,6 +276,26 @@ def _ball(part: BallLamp) -> Translation:
         SceneInput(f"{name}.radiance", f"{name}.emitter.radiance.value", color, interior=True, shape=(3,)),
     )
     return Translation({name: ball}, inputs)
+
+
+@translation.register
+def _beam(part: BeamLamp) -> Translation:
+    """Mitsuba's projector puts pi times its texture on a plane before it, where an intensity I puts I cos^3."""
+    height, width = part.table.shape
+    aside, up = np.linspace(-1.0, 1.0, 2 * width + 1)[1::2], np.linspace(-1.0, 1.0, 2 * height + 1)[1::2]
+    cosine = (1.0 + aside[None] ** 2 + (up[:, None] * height / width) ** 2) ** -0.5
+    picture = (part.table * cosine**3 / np.pi)[..., None] * np.array(part.tint)
+    lamp = {
+        "type": "projector",
+        "to_world": mi.ScalarTransform4f(part.to_world),
+        "fov": 90.0,
+        "fov_axis": "x",
+        "irradiance": {**texture(picture), "wrap_mode": "clamp"},
+        "sampling_weight": part.weight,
+    }
+    return Translation(
+        {part.name: lamp}, (SceneInput(f"{part.name}.to_world", f"{part.name}.to_world", transform, shape=(4, 4)),)
+    )
 
 
 @translation.register

@@ -40,7 +40,7 @@ from advsearch.scene.mitsuba_backend.parts import (
 from advsearch.scene.mitsuba_backend.transport import Paths, collect, first_hits
 from advsearch.scene.mitsuba_backend.variant import Plugin, dr, media_in, mi, one_at_a_time, population, recorded
 from advsearch.scene.parts import BASE_COLOR as BASE_COLOR_PLACE
-from advsearch.scene.parts import plugins_in
+from advsearch.scene.parts import LampGlass, plugins_in
 from advsearch.scene.surfaces import Surfaces
 
 MAX_DEPTH = 6
@@ -124,7 +124,7 @@ class MitsubaScene:
                 translated = [
                     mesh_translation(description.meshes[OBJECT], None if "lobes" in leave_out else IDLE_LOBES)
                 ]
-                translated += [translation(description.meshes.get(part.name, part)) for part in description.parts]
+                translated += [translation(description.placed(part)) for part in description.parts]
                 for one in translated:
                     plugins |= one.plugins
                     self._path |= one.integrator
@@ -258,7 +258,13 @@ class MitsubaScene:
         with one_at_a_time:
             self._set(inputs)
             height, width = self.resolution
-            return first_hits(self._scene, self._sensor, (height * fineness, width * fineness))
+            found = first_hits(self._scene, self._sensor, (height * fineness, width * fineness))
+            for one in self.made[0].parts:
+                if isinstance(one, LampGlass):  # it belongs to what carries it
+                    there, mesh = found.seen(one.name), found.names.index(one.carrier) + 1
+                    found.face[there] = torch.from_numpy(one.lies_on)[found.face[there]]
+                    found.id[there] = mesh
+            return found
 
     def adjoint(
         self,

@@ -27,6 +27,7 @@ from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.mitsuba_backend.variant import VARIANT, Plugin, mi
 from advsearch.scene.parts import (
     BallLamp,
+    BeamLamp,
     HazePart,
     MeshPart,
     PluginNumbers,
@@ -107,7 +108,7 @@ def described(base: Plugin, description: SceneDescription, inputs: Mapping[str, 
         if isinstance(part, HazePart):
             _put_haze(scene, part, left)
         elif not isinstance(part, PluginNumbers):
-            scene[part.name] = _part(description.meshes.get(part.name, part), left)
+            scene[part.name] = _part(description.placed(part), left)
     for part in description.parts:
         if isinstance(part, PluginNumbers):
             for one in part.numbers:
@@ -173,6 +174,9 @@ def _part(part: ScenePart, left: Plugin) -> Plugin:
         plugin = translation(replace(part, **_triples(inputs))).plugins[part.name]
         if ball is not None:
             plugin["to_world"] = mi.ScalarTransform4f(ball)
+    elif isinstance(part, BeamLamp):
+        pose = inputs.pop("to_world", part.to_world)
+        plugin = translation(replace(part, to_world=pose)).plugins[part.name]
     elif isinstance(part, PluginPart):
         plugin = loadable(part.plugin)
     else:

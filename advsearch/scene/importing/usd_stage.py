@@ -1,0 +1,696 @@
+"""OpenUSD stages as binary glTF, by `usd-core` in a process of its own (`usd.converted`), which this module is run in.
+
+Layers are looked at before anything is composed of them: all that they name has to be a layer in the folder of the
+first one or below. What glTF as we read it has no place for is named in `asset.extras` of the file.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import os
+import re
+import sys
+import zipfile
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from PIL import Image
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade, UsdSkel, Vt
+
+from advsearch import files
+from advsearch.errors import FileFormatError
+from advsearch.pictures import FORMATS, check_decodable
+from advsearch.scene.glb_buffer import GlbBuffer
+from advsearch.scene.importing.files import LARGEST_FACES, LARGEST_FILE
+from advsearch.scene.importing.gltf import DEEPEST_TREE, LARGEST_TREE
+from advsearch.scene.importing.polygons import triangulated
+from advsearch.scene.importing.usd import GENERATOR, LAYERS, PACKAGE
+
+FIRST = Usd.TimeCode.EarliestTime()
+MOST_LAYERS = 1000
+MOST_ENTRIES = 10_000
+PURPOSES = ("default", "render")
+WRAPS = {"repeat": 10497, "mirror": 33648, "clamp": 33071, "black": 33071, "useMetadata": 10497}
+COAT = ("clearcoat", "displacement", "occlusion", "specularColor")
+"""Inputs of a preview surface that our surfaces have nothing for."""
+
+Array = npt.NDArray[Any]
+
+
+def main(source: str, target: str, folder: str) -> None:
+    """Write a file as binary glTF, and print the files that it was read from; a package is unpacked into a folder
+    first. Raises FileFormatError, which tells the file by its name."""
+    file = Path(source)
+    if file.suffix.lower() == PACKAGE:
+        file = unpacked(file, Path(folder))
+    layers = checked_layers(file)
+    stage = Usd.Stage.Open(str(file))
+    made = Conversion(stage, file.parent.resolve(), Path(source).name)
+    made.read = layers
+    Path(target).write_bytes(made.glb())
+    print(json.dumps(made.read if file == Path(source) else []))
+
+
+# ---- what a file may name -------------------------------------------------------------------------------------------
+
+
+def unpacked(package: Path, folder: Path) -> Path:
+    """Unpack a .usdz file, and return its first layer."""
+    try:
+        with zipfile.ZipFile(package) as archive:
+            entries = archive.infolist()
+            size = sum(one.file_size for one in entries)
+            if len(entries) > files.scaled(MOST_ENTRIES) or size > files.scaled(LARGEST_FILE):
+                most = f"at most {files.scaled(MOST_ENTRIES):,} files of {files.scaled(LARGEST_FILE):,} bytes in all"
+                raise files.too_large(package.name, most, f"{len(entries):,} of {size:,}")
+            for entry in entries:
+                place = PurePosixPath(entry.filename)
+                odd = place.is_absolute() or ".." in place.parts or "\\" in entry.filename or ":" in entry.filename
+                if odd or entry.compress_type != zipfile.ZIP_STORED or entry.flag_bits & 1:
+                    raise FileFormatError(
+                        f"{package.name}: expected files that lie in it as they are, got {entry.filename[:80]!r}, "
+                        "which is packed or lies elsewhere; make it again with usdzip"
+                    )
+                if not entry.is_dir():
+                    goal = folder / place
+                    goal.parent.mkdir(parents=True, exist_ok=True)
+                    goal.write_bytes(archive.read(entry))
+    except (zipfile.BadZipFile, OSError, EOFError, ValueError, NotImplementedError) as error:
+        raise FileFormatError(f"{package.name}: expected a .usdz archive, got one that is damaged ({error})") from None
+    first = next((entry.filename for entry in entries if not entry.is_dir()), "")
+    if Path(first).suffix.lower() not in LAYERS:
+        raise FileFormatError(f"{package.name}: expected a USD layer first in it, got {first[:80]!r}")
+    return folder / first
+
+
+def checked_layers(file: Path) -> list[str]:
+    """Return the files of all layers that a file is made of, itself first; refuse what it names elsewhere."""
+    folder, waiting, known, size = file.parent.resolve(), [file.resolve()], dict[Path, None](), 0
+    while waiting:
+        path = waiting.pop()
+        if path in known:
+            continue
+        known[path] = None
+        size += path.stat().st_size
+        if len(known) > files.scaled(MOST_LAYERS) or size > files.scaled(LARGEST_FILE):
+            raise files.too_large(file.name, f"at most {files.scaled(MOST_LAYERS):,} layers", "more, or larger ones")
+        try:
+            layer = Sdf.Layer.FindOrOpen(str(path))
+        except Exception as error:  # Tf.ErrorException, of which there are many kinds
+            raise FileFormatError(f"{path.name}: expected a USD layer, got {_short(error)}") from None
+        if layer is None:
+            raise FileFormatError(f"{path.name}: expected a USD layer, got none that can be read")
+        for name in layer.GetCompositionAssetDependencies():
+            if name:
+                waiting.append(_inside(folder, path, name, file.name))
+        layer.Traverse(Sdf.Path.absoluteRootPath, lambda at, layer=layer: _check_spec(layer, at, file.name))
+    return [str(path) for path in known]
+
+
+def _inside(folder: Path, layer: Path, name: str, source: str) -> Path:
+    plain = not any(sign in name for sign in "`[]:\0") and Path(name).suffix.lower() in LAYERS
+    path = Path(os.path.realpath(layer.parent / name)) if plain else folder
+    if not plain or not path.is_relative_to(folder):
+        raise FileFormatError(
+            f"{source}: names the layer {name[:100]!r}, which is no USD file in its folder and is not read; put it "
+            "there, or make one file of all with usdcat"
+        )
+    if not path.is_file():
+        raise FileFormatError(f"{source}: needs {name[:100]!r}, which is missing; put that file beside it")
+    return path
+
+
+def _check_spec(layer: Any, at: Any, source: str) -> None:
+    spec = layer.GetObjectAtPath(at) if at.IsPrimPath() else None
+    if spec is not None and "clips" in spec.ListInfoKeys():
+        raise FileFormatError(f"{source}: has value clips ({at}), which are not read; make one file of all with usdcat")
+
+
+def _short(error: Exception) -> str:
+    """What a library says, without where in its code it says so."""
+    said = re.findall(r":(\d+:\d+: .+)", str(error)) or re.findall(r" : '(.+)", str(error))
+    lines = said or [line.strip() for line in str(error).splitlines() if len(line.strip()) > 3]
+    return (lines[-1] if lines else type(error).__name__)[:200]
+
+
+# ---- the stage ------------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Conversion:
+    """Makes glTF of a stage, whose files lie in a folder; `source` is what messages call it."""
+
+    stage: Any
+    folder: Path
+    source: str
+    read: list[str] = field(default_factory=list)
+    left: Counter[str] = field(default_factory=Counter)
+    buffer: GlbBuffer = field(default_factory=GlbBuffer)
+    triangles: int = 0
+
+    def __post_init__(self) -> None:
+        self.header: dict[str, Any] = {name: [] for name in ("nodes", "meshes", "materials", "textures", "images")}
+        self.header |= {"samplers": [], "cameras": [], "asset": {"version": "2.0", "generator": GENERATOR}}
+        self.lights: list[dict[str, Any]] = []
+        self._materials: dict[str, tuple[int, str]] = {}
+        self._images: dict[str, int | None] = {}
+        self._skins, self.transforms = UsdSkel.Cache(), dict[int | None, Array]()
+        for prim in self._prims():
+            if prim.IsA(UsdSkel.Root):
+                self._skins.Populate(UsdSkel.Root(prim), Usd.TraverseInstanceProxies())
+
+    def _prims(self) -> Iterator[Any]:
+        for number, prim in enumerate(Usd.PrimRange(self.stage.GetPseudoRoot(), Usd.TraverseInstanceProxies())):
+            if number > files.scaled(LARGEST_TREE):
+                raise files.too_large(self.source, f"USD of at most {files.scaled(LARGEST_TREE):,} prims", "more")
+            if prim.GetPath().pathElementCount > files.scaled(DEEPEST_TREE):
+                raise files.too_large(self.source, f"prims of at most {files.scaled(DEEPEST_TREE)} levels", "more")
+            yield prim
+
+    def glb(self) -> bytes:
+        """Return the file."""
+        unit = UsdGeom.GetStageMetersPerUnit(self.stage)
+        if not 0.0 < unit < math.inf:
+            raise FileFormatError(f"{self.source}: expected metersPerUnit greater than 0, got {unit}")
+        if not UsdGeom.StageHasAuthoredMetersPerUnit(self.stage):
+            self._leave("does not say its unit, which USD takes for centimetres")
+        if self.stage.HasAuthoredTimeCodeRange():
+            self._leave("is animated; what is there first is read")
+        self.unit = unit
+        upright = np.eye(4) if UsdGeom.GetStageUpAxis(self.stage) == "Y" else _TO_Y_UP
+        matrix = upright @ np.diag([unit, unit, unit, 1.0])
+        nodes, header = self.header["nodes"], self.header
+        nodes.append({"name": "stage", "matrix": matrix.T.ravel().tolist(), "children": []})
+        names = Counter(prim.GetName() for prim in self._prims())
+        places: dict[Any, int] = {}
+        for prim in self._prims():
+            self._name_unread(prim)
+            if not prim.IsA(UsdGeom.Imageable) or prim.IsA(UsdGeom.Subset):
+                continue
+            name = prim.GetName() if names[prim.GetName()] == 1 else str(prim.GetPath()).lstrip("/")
+            node: dict[str, Any] = {"name": name, "children": []}
+            parent = 0
+            moves = UsdGeom.Xformable(prim)
+            if moves:
+                local = np.array(moves.GetLocalTransformation(FIRST))  # rows, as glTF's columns
+                if not np.isfinite(local).all():
+                    raise FileFormatError(f"{self.source}: expected finite transforms, got others at {prim.GetPath()}")
+                node["matrix"] = local.ravel().tolist()
+            if not (moves and moves.GetResetXformStack()):
+                parent = next((places[at] for at in prim.GetPath().GetAncestorsRange() if at in places), 0)
+            self._fill(prim, node)
+            if "moved" in node:
+                node["matrix"], parent = node.pop("moved"), 0
+            places[prim.GetPath()] = len(nodes)
+            nodes[parent]["children"].append(len(nodes))
+            nodes.append(node)
+        for node in nodes:
+            if not node["children"]:
+                del node["children"]
+        header["scenes"], header["scene"] = [{"nodes": [0]}], 0
+        if self.lights:
+            header["extensions"] = {"KHR_lights_punctual": {"lights": self.lights}}
+        notes = [one if count == 1 else f"{one} ({count:,} times)" for one, count in self.left.items()]
+        header["asset"]["extras"] = {"left_out": notes[:100]}
+        return self.buffer.file({key: value for key, value in header.items() if value or key == "asset"})
+
+    def _leave(self, what: str) -> None:
+        self.left[what] += 1
+
+    def _name_unread(self, prim: Any) -> None:
+        """Say what of a prim, or of its kind, is not carried over."""
+        kind = prim.GetTypeName()
+        gprim = prim.IsA(UsdGeom.Gprim) and not prim.IsA(UsdGeom.Mesh)
+        if gprim or kind == "PointInstancer":
+            self._leave(f"has a {kind}, which is no mesh: left out; make meshes of it where the file is from")
+        if prim.HasAPI(UsdSkel.BindingAPI) and UsdSkel.BindingAPI(prim).GetBlendShapesAttr().HasAuthoredValue():
+            self._leave("has a mesh with blend shapes, which are left out")
+        if kind == "SkelAnimation":
+            self._leave("has an animation of a skeleton, which is shown at rest")
+
+    def _fill(self, prim: Any, node: dict[str, Any]) -> None:
+        """Give a node what its prim shows, if it is seen."""
+        imageable = UsdGeom.Imageable(prim)
+        shows = prim.IsA(UsdGeom.Mesh) or prim.IsA(UsdGeom.Camera) or prim.HasAPI(UsdLux.LightAPI)
+        if not shows:
+            return
+        if imageable.ComputeVisibility(FIRST) == UsdGeom.Tokens.invisible:
+            self._leave("has something invisible, which is left out")
+        elif imageable.ComputePurpose() not in PURPOSES:
+            self._leave(f"has something for the purpose {imageable.ComputePurpose()!r}, which is left out")
+        elif prim.IsA(UsdGeom.Mesh):
+            self._mesh(prim, node)
+        elif prim.IsA(UsdGeom.Camera):
+            self._camera(UsdGeom.Camera(prim), node)
+        else:
+            self._light(prim, node)
+
+    # ---- cameras and lights ------------------------------------------------------------------------------------------
+
+    def _camera(self, camera: Any, node: dict[str, Any]) -> None:
+        wide, high = (one.Get(FIRST) for one in (camera.GetHorizontalApertureAttr(), camera.GetVerticalApertureAttr()))
+        focal = camera.GetFocalLengthAttr().Get(FIRST)
+        offsets = camera.GetHorizontalApertureOffsetAttr().Get(FIRST), camera.GetVerticalApertureOffsetAttr().Get(FIRST)
+        entry: dict[str, Any] = {"name": node["name"], "type": "orthographic"}
+        if camera.GetProjectionAttr().Get(FIRST) == UsdGeom.Tokens.perspective and min(wide, high, focal) > 0.0:
+            if any(offsets):
+                self._leave("has a camera whose aperture is shifted; the shift is left out")
+            view = {"yfov": 2.0 * math.atan(high / (2.0 * focal)), "aspectRatio": wide / high, "znear": 0.01}
+            entry |= {"type": "perspective", "perspective": view}
+        node["camera"] = len(self.header["cameras"])
+        self.header["cameras"].append(entry)
+
+    def _light(self, prim: Any, node: dict[str, Any]) -> None:
+        """A sphere as a point, a spot where it is shaped, and a distant light; radiant power as UsdLux defines it."""
+        light, kind = UsdLux.LightAPI(prim), prim.GetTypeName()
+        power = light.GetIntensityAttr().Get(FIRST) * 2.0 ** light.GetExposureAttr().Get(FIRST)
+        normalised = light.GetNormalizeAttr().Get(FIRST)
+        color = np.array(light.GetColorAttr().Get(FIRST), np.float64)
+        if light.GetEnableColorTemperatureAttr().Get(FIRST):
+            color *= np.array(UsdLux.BlackbodyTemperatureAsRgb(light.GetColorTemperatureAttr().Get(FIRST)))
+        if kind == "DistantLight":
+            half = math.radians(UsdLux.DistantLight(prim).GetAngleAttr().Get(FIRST)) / 2.0
+            entry: dict[str, Any] = {"type": "directional"}
+            power *= 1.0 if normalised or half <= 0.0 else math.pi * math.sin(half) ** 2
+        elif kind == "SphereLight":
+            sphere, shaping = UsdLux.SphereLight(prim), UsdLux.ShapingAPI(prim)
+            radius = sphere.GetRadiusAttr().Get(FIRST)
+            # radiance times the disk that is seen; normalised, what is emitted is divided by the area of the sphere
+            power *= 0.25 if normalised else math.pi * radius**2
+            power *= self.unit**2
+            entry = {"type": "point"}
+            cone = shaping.GetShapingConeAngleAttr().Get(FIRST) if prim.HasAPI(UsdLux.ShapingAPI) else 90.0
+            if cone is not None and cone < 90.0:
+                soft = shaping.GetShapingConeSoftnessAttr().Get(FIRST) or 0.0
+                outer = math.radians(max(cone, 0.1))
+                entry |= {
+                    "type": "spot",
+                    "spot": {"outerConeAngle": outer, "innerConeAngle": outer * (1.0 - min(soft, 1.0))},
+                }
+            self._leave("has a SphereLight, which shines from its middle here")
+        else:
+            self._leave(f"has a {kind}, which is left out; `environment` and `controls=light` light a scene")
+            return
+        if not (math.isfinite(power) and power >= 0.0 and np.isfinite(color).all() and (color >= 0.0).all()):
+            raise FileFormatError(f"{self.source}: expected the light {node['name']} to have a power of at least 0")
+        node["extensions"] = {"KHR_lights_punctual": {"light": len(self.lights)}}
+        self.lights.append({**entry, "name": node["name"], "color": color.tolist(), "intensity": power})
+
+    # ---- meshes ------------------------------------------------------------------------------------------------------
+
+    def _mesh(self, prim: Any, node: dict[str, Any]) -> None:
+        mesh, path = UsdGeom.Mesh(prim), str(prim.GetPath())
+        points = _array(mesh.GetPointsAttr().Get(FIRST), np.float64, 3)
+        counts = _array(mesh.GetFaceVertexCountsAttr().Get(FIRST), np.int64)
+        corners = _array(mesh.GetFaceVertexIndicesAttr().Get(FIRST), np.int64)
+        if not len(points) or not len(counts):
+            return
+        if (counts < 0).any() or counts.sum() != len(corners) or corners.min() < 0 or corners.max() >= len(points):
+            raise FileFormatError(f"{self.source}: expected faces of the points of {path}, got others; export it again")
+        moved, points = self._at_rest(prim, points)
+        if moved is not None:
+            node["moved"] = moved.ravel().tolist()
+        scheme = mesh.GetSubdivisionSchemeAttr().Get(FIRST)
+        normals, per_normal = self._normals(mesh, len(points), len(counts), len(corners))
+        if scheme != UsdGeom.Tokens.none:
+            self._leave("has a mesh that is to be subdivided, which is shown as it is, and smooth")
+            normals = None
+        self.triangles += int(np.maximum(counts - 2, 0).sum())
+        if self.triangles > files.scaled(LARGEST_FACES):
+            raise files.too_large(self.source, f"a mesh of at most {files.scaled(LARGEST_FACES):,} triangles", "more")
+        picked, face, _ = triangulated(points[corners], counts)
+        holes = _array(mesh.GetHoleIndicesAttr().Get(FIRST), np.int64)
+        keep = ~np.isin(face, holes)
+        picked, face = picked[keep], face[keep]
+        if mesh.GetOrientationAttr().Get(FIRST) == UsdGeom.Tokens.leftHanded:
+            picked = picked[:, ::-1]
+        if scheme != UsdGeom.Tokens.none:
+            normals, per_normal = _smooth(points, corners[picked]), "vertex"
+        primitives = []
+        for material, uv_name, faces in self._groups(prim, mesh, len(counts)):
+            triangles = picked[np.isin(face, faces)] if faces is not None else picked
+            owners = face[np.isin(face, faces)] if faces is not None else face
+            if not len(triangles):
+                continue
+            uvs, per_uv = self._uvs(prim, uv_name, material)
+            colors, per_color = self._colors(prim, material)
+            at = triangles.reshape(-1)
+            by = {"vertex": corners[at], "varying": corners[at], "faceVarying": at, "uniform": owners.repeat(3)}
+            index = [corners[at]]
+            for values, per in ((normals, per_normal), (uvs, per_uv), (colors, per_color)):
+                rows = by.get(per, np.zeros(len(at), np.int64))
+                if values is not None and rows.max() >= len(values):
+                    raise FileFormatError(f"{self.source}: expected as many values as corners on {path}, got fewer")
+                index.append(rows if values is not None else np.zeros(len(at), np.int64))
+            rows, inverse = np.unique(np.stack(index, axis=1), axis=0, return_inverse=True)
+            attributes = {"POSITION": self.buffer.accessor(points[rows[:, 0]].astype(np.float32), "VEC3", bounds=True)}
+            for name, values, column in (("NORMAL", normals, 1), ("TEXCOORD_0", uvs, 2), ("COLOR_0", colors, 3)):
+                if values is not None:
+                    kind = "VEC2" if name == "TEXCOORD_0" else "VEC3"
+                    attributes[name] = self.buffer.accessor(values[rows[:, column]].astype(np.float32), kind)
+            entry = {"attributes": attributes, "mode": 4}
+            entry["indices"] = self.buffer.accessor(inverse.reshape(-1).astype(np.uint32), "SCALAR")
+            primitives.append(entry if material is None else {**entry, "material": material})
+        if primitives:
+            node["mesh"] = len(self.header["meshes"])
+            self.header["meshes"].append({"name": node["name"], "primitives": primitives})
+
+    def _normals(self, mesh: Any, points: int, faces: int, corners: int) -> tuple[Array | None, str]:
+        given = UsdGeom.PrimvarsAPI(mesh).GetPrimvar("normals")
+        if given and given.HasValue():
+            return _array(given.ComputeFlattened(FIRST), np.float64, 3), str(given.GetInterpolation())
+        values = _array(mesh.GetNormalsAttr().Get(FIRST), np.float64, 3)
+        return (values, str(mesh.GetNormalsInterpolation())) if len(values) else (None, "vertex")
+
+    def _uvs(self, prim: Any, name: str, material: int | None) -> tuple[Array | None, str]:
+        """Texture coordinates as glTF has them, v down, with the transform that the material asks for."""
+        given = UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance(name)
+        if not given or not given.HasValue():
+            return None, "vertex"
+        values = _array(given.ComputeFlattened(FIRST), np.float64, 2)
+        turned = self.transforms.get(material, np.eye(3)) if material is not None else np.eye(3)
+        values = values @ turned[:2, :2].T + turned[:2, 2]
+        return np.stack([values[:, 0], 1.0 - values[:, 1]], axis=1), str(given.GetInterpolation())
+
+    def _colors(self, prim: Any, material: int | None) -> tuple[Array | None, str]:
+        """Colours of vertices, where there is no material."""
+        given = UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance("displayColor")
+        if material is not None or not given or not given.HasValue():
+            return None, "vertex"
+        return _array(given.ComputeFlattened(FIRST), np.float64, 3), str(given.GetInterpolation())
+
+    def _groups(self, prim: Any, mesh: Any, faces: int) -> Iterator[tuple[int | None, str, Array | None]]:
+        """Yield the materials of a mesh: number, name of the texture coordinates, and faces (None for all)."""
+        subsets = UsdShade.MaterialBindingAPI(prim).GetMaterialBindSubsets()
+        rest = np.ones(faces, bool)
+        for subset in subsets:
+            some = _array(subset.GetIndicesAttr().Get(FIRST), np.int64)
+            some = some[(some >= 0) & (some < faces)]
+            some = some[rest[some]]
+            rest[some] = False
+            yield *self._material(subset.GetPrim()), some
+        if rest.any():
+            yield *self._material(prim), np.flatnonzero(rest) if subsets else None
+
+    def _at_rest(self, prim: Any, points: Array) -> tuple[Array | None, Array]:
+        """Points of a mesh whose skeleton is at rest, and where they lie (4, 4), rows; (None, points) without one."""
+        skin = self._skins.GetSkinningQuery(prim)
+        if not skin or not skin.HasJointInfluences():
+            return None, points
+        bound = UsdSkel.BindingAPI(prim).GetInheritedSkeleton()
+        query = self._skins.GetSkelQuery(bound) if bound else None
+        if not query:
+            return None, points
+        rest, binding = query.ComputeJointSkelTransforms(FIRST, atRest=True), query.GetJointWorldBindTransforms()
+        if not rest or len(rest) != len(binding):
+            return None, points
+        moves = [bind.GetInverse() * place for bind, place in zip(binding, rest, strict=True)]
+        mapper = skin.GetJointMapper()
+        if mapper and not mapper.IsNull() and not mapper.IsIdentity():
+            moves = mapper.RemapTransforms(type(rest)(moves))
+        given = Vt.Vec3fArray([Gf.Vec3f(*map(float, one)) for one in points])
+        if not skin.ComputeSkinnedPoints(Vt.Matrix4dArray(list(moves)), given, FIRST):
+            return None, points
+        place = UsdGeom.Xformable(bound.GetPrim()).ComputeLocalToWorldTransform(FIRST)
+        return np.array(place), _array(given, np.float64, 3)
+
+    # ---- materials ---------------------------------------------------------------------------------------------------
+
+    def _material(self, prim: Any) -> tuple[int | None, str]:
+        """The number of what a prim is made of, and the name of its texture coordinates; (None, "st") of none."""
+        bound, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial(UsdShade.Tokens.preview)
+        if not bound:
+            bound, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
+        if not bound:
+            return None, "st"
+        path = str(bound.GetPath())
+        if path not in self._materials:
+            self._materials[path] = self._made(bound, str(bound.GetPrim().GetName()))
+        return self._materials[path]
+
+    def _made(self, bound: Any, name: str) -> tuple[int, str]:
+        number, shader = len(self.header["materials"]), bound.ComputeSurfaceSource()[0]
+        entry: dict[str, Any] = {"name": name, "doubleSided": True}
+        self.header["materials"].append(entry)
+        if not shader or shader.GetIdAttr().Get() != "UsdPreviewSurface":
+            self._leave("has a material that is no UsdPreviewSurface, which is grey here")
+            entry["pbrMetallicRoughness"] = {"baseColorFactor": [0.2140, 0.2140, 0.2140, 1.0], "metallicFactor": 0.0}
+            entry["pbrMetallicRoughness"]["roughnessFactor"] = 0.5
+            return number, "st"
+        inputs = Inputs(self, shader, number)
+        self._ask(inputs, entry)
+        for one in COAT:
+            if inputs.differs(one):
+                self._leave(f"has materials with {one}, which is left out")
+        if inputs.number("useSpecularWorkflow", 0.0):
+            self._leave("has materials with a specular workflow, of which the diffuse colour is read")
+        if abs(inputs.number("ior", 1.5) - 1.5) > 1e-3:
+            self._leave("has materials with an ior other than 1.5, which is left out")
+        return number, inputs.uv_name
+
+    def _ask(self, inputs: Inputs, entry: dict[str, Any]) -> None:
+        surface = entry["pbrMetallicRoughness"] = {}
+        color, base = inputs.color("diffuseColor", (0.18, 0.18, 0.18)), inputs.texture("diffuseColor", "rgb")
+        opacity, cutoff = inputs.number("opacity", 1.0), inputs.number("opacityThreshold", 0.0)
+        cut = inputs.texture("opacity", "a")
+        if base is not None:
+            surface["baseColorTexture"] = {"index": base}
+        if cut is not None and cut == base:
+            opacity = 1.0
+        elif cut is not None:
+            self._leave("has an opacity of another picture than the colour's, which is left out")
+            opacity = 1.0
+        elif inputs.connected("opacity"):
+            opacity = 1.0
+        surface["baseColorFactor"] = [*color, opacity]
+        if opacity < 1.0 or (cut is not None and cut == base):
+            entry |= {"alphaMode": "MASK", "alphaCutoff": cutoff} if cutoff > 0.0 else {"alphaMode": "BLEND"}
+        surface["metallicFactor"], surface["roughnessFactor"] = 1.0, 1.0
+        packed = self._packed(inputs)
+        if packed is None:
+            surface["metallicFactor"] = inputs.number("metallic", 0.0)
+            surface["roughnessFactor"] = inputs.number("roughness", 0.5)
+        else:
+            surface["metallicRoughnessTexture"] = {"index": packed}
+        normals = inputs.texture("normal", "rgb")
+        if normals is not None:
+            entry["normalTexture"] = {"index": normals}
+        glow, glowing = inputs.color("emissiveColor", (0.0, 0.0, 0.0)), inputs.texture("emissiveColor", "rgb")
+        if glowing is not None:
+            entry["emissiveTexture"] = {"index": glowing}
+        most = max(*glow, 1e-12)
+        if max(glow) > 0.0:
+            entry["emissiveFactor"] = [one / max(most, 1.0) for one in glow]
+            if most > 1.0:
+                entry["extensions"] = {"KHR_materials_emissive_strength": {"emissiveStrength": most}}
+
+    def _packed(self, inputs: Inputs) -> int | None:
+        """One picture of roughness (green) and metallic (blue), of the pictures of each; None where there is none."""
+        planes = [inputs.plane(name) for name in ("roughness", "metallic")]
+        if planes == [None, None]:
+            return None
+        sizes = [one.size for one in planes if one is not None]
+        values = (inputs.number("roughness", 0.5), inputs.number("metallic", 0.0))
+        made = [
+            Image.new("L", sizes[0], round(255 * min(max(value, 0.0), 1.0))) if one is None else one.resize(sizes[0])
+            for one, value in zip(planes, values, strict=True)
+        ]
+        file = io.BytesIO()
+        Image.merge("RGB", [Image.new("L", sizes[0], 255), *made]).save(file, "PNG")
+        return self.add_texture(file.getvalue(), {"wrapS": 10497, "wrapT": 10497})
+
+    def image(self, asset: Any, name: str) -> bytes | None:
+        """The bytes of a picture in the folder; None, and a note, of one that is not there."""
+        given = str(asset.path)
+        resolved = os.path.realpath(str(asset.resolvedPath) or str(self.folder / given))
+        inside = Path(resolved).is_relative_to(self.folder)
+        if not inside or not os.path.isfile(resolved):
+            why = "is missing" if inside else "is outside its folder and is not read"
+            self._leave(f"the texture {given[:100]!r} of {name} {why}")
+            return None
+        self.read.append(resolved)
+        return files.read_bytes(Path(resolved), "a picture", LARGEST_FILE)
+
+    def add_texture(self, data: bytes, sampler: Mapping[str, int]) -> int:
+        """Put a picture into the file, and return the number of its texture."""
+        kind = "image/png" if data.startswith(b"\x89PNG") else "image/jpeg"
+        image = {"mimeType": kind, "bufferView": self.buffer.view(data)}
+        if image not in self.header["images"]:
+            self.header["images"].append(image)
+        if sampler not in self.header["samplers"]:
+            self.header["samplers"].append(dict(sampler))
+        entry = {"source": self.header["images"].index(image), "sampler": self.header["samplers"].index(sampler)}
+        if entry not in self.header["textures"]:
+            self.header["textures"].append(entry)
+        found: int = self.header["textures"].index(entry)
+        return found
+
+
+@dataclass
+class Inputs:
+    """The inputs of a preview surface: numbers, and the pictures that they are connected to."""
+
+    conversion: Conversion
+    shader: Any
+    material: int
+    uv_name: str = "st"
+
+    def _source(self, name: str) -> tuple[Any, str] | None:
+        given = self.shader.GetInput(name)
+        if not given:
+            return None
+        for attribute in UsdShade.Utils.GetValueProducingAttributes(given):
+            prim = UsdShade.Shader(attribute.GetPrim())
+            if prim and UsdShade.Utils.GetType(attribute.GetName()) == UsdShade.AttributeType.Output:
+                return prim, UsdShade.Utils.GetBaseNameAndType(attribute.GetName())[0]
+        return None
+
+    def connected(self, name: str) -> bool:
+        """Whether an input has something in place of its own value."""
+        return self._source(name) is not None
+
+    def _value(self, name: str) -> Any:
+        given = self.shader.GetInput(name)
+        attributes = UsdShade.Utils.GetValueProducingAttributes(given) if given else []
+        return attributes[0].Get(FIRST) if attributes and not self.connected(name) else None
+
+    def differs(self, name: str) -> bool:
+        """Whether an input that is not read does something."""
+        value = self._value(name)
+        zero = {"occlusion": 1.0, "specularColor": None}.get(name, 0.0)
+        workflow = name != "specularColor" or bool(self.number("useSpecularWorkflow", 0.0))
+        return workflow and (self.connected(name) or (value is not None and value != zero))
+
+    def number(self, name: str, otherwise: float) -> float:
+        """A number; that of the format where the surface says none."""
+        value = self._value(name)
+        number = otherwise if value is None else float(value)
+        return number if math.isfinite(number) else otherwise
+
+    def color(self, name: str, otherwise: tuple[float, float, float]) -> tuple[float, ...]:
+        """A linear colour: of a picture, what it is multiplied by."""
+        source = self._source(name)
+        if source is not None:
+            scale = source[0].GetInput("scale")
+            value = None if not scale else scale.Get(FIRST)
+            return (1.0, 1.0, 1.0) if value is None else tuple(float(one) for one in value[:3])
+        value = self._value(name)
+        return otherwise if value is None else tuple(float(one) for one in value)
+
+    def _picture(self, name: str) -> tuple[bytes, Any, str] | None:
+        source = self._source(name)
+        if source is None:
+            return None
+        texture, output = source
+        if texture.GetIdAttr().Get() != "UsdUVTexture":
+            self.conversion._leave(f"has a {name} of {texture.GetIdAttr().Get()}, which is left out")
+            return None
+        asset = UsdShade.Utils.GetValueProducingAttributes(texture.GetInput("file"))
+        path = asset[0].Get(FIRST) if asset else None
+        if path is None:
+            return None
+        if "<UDIM>" in str(path.path):
+            self.conversion._leave("has UDIM textures, which are left out; make .obj or one texture of them")
+            return None
+        data = self.conversion.image(path, self.shader.GetPrim().GetParent().GetName())
+        return None if data is None else (data, texture, output)
+
+    def texture(self, name: str, output: str) -> int | None:
+        """The number of the texture that an input shows; None where there is none, or it cannot be read."""
+        found = self._picture(name)
+        if found is None:
+            return None
+        data, texture, shown = found
+        if shown != output:
+            self.conversion._leave(f"has a {name} of the output {shown!r} of a picture, which is left out")
+            return None
+        return self.conversion.add_texture(data, self._sampler(texture, name))
+
+    def plane(self, name: str) -> Image.Image | None:
+        """The picture of 8 bits of an input that is one number."""
+        found = self._picture(name)
+        if found is None:
+            return None
+        data, texture, output = found
+        self._sampler(texture, name)
+        try:
+            with Image.open(io.BytesIO(data), formats=FORMATS) as image:
+                check_decodable(image, name)
+                planes: tuple[Image.Image, ...] = image.convert("RGBA").split()
+        except (OSError, ValueError, SyntaxError) as error:
+            self.conversion._leave(f"has a picture of {name} that cannot be read ({_short(error)})")
+            return None
+        return planes["rgba".index(output)] if output in tuple("rgba") else planes[0]
+
+    def _sampler(self, texture: Any, name: str) -> dict[str, int]:
+        """How a picture goes on; its texture coordinates become those of the material."""
+        wraps = []
+        for axis in ("wrapS", "wrapT"):
+            given = texture.GetInput(axis)
+            word = str(given.Get(FIRST)) if given and given.Get(FIRST) is not None else "useMetadata"
+            if word == "black":
+                self.conversion._leave("has a texture that is black beyond its edges, which goes on as at them here")
+            wraps.append(WRAPS.get(word, 10497))
+        turned, reader = np.eye(3), self._st(texture)
+        if reader is not None and reader.GetIdAttr().Get() == "UsdTransform2d":
+            turned, reader = _transform2d(reader), self._st(reader, "in")
+        if reader is not None and reader.GetInput("varname"):
+            found = UsdShade.Utils.GetValueProducingAttributes(reader.GetInput("varname"))
+            self.uv_name = str(found[0].Get(FIRST) or "st") if found else "st"
+        known = self.conversion.transforms.setdefault(self.material, turned)
+        if not np.array_equal(known, turned):
+            self.conversion._leave(
+                f"has a {name} with another UsdTransform2d than the first texture's, which is left out"
+            )
+        return {"wrapS": wraps[0], "wrapT": wraps[1]}
+
+    def _st(self, shader: Any, name: str = "st") -> Any:
+        given = shader.GetInput(name)
+        found = UsdShade.Utils.GetValueProducingAttributes(given) if given else []
+        return UsdShade.Shader(found[0].GetPrim()) if found and found[0].GetPrim() != shader.GetPrim() else None
+
+
+_TO_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1.0, 0], [0, -1.0, 0, 0], [0, 0, 0, 1.0]])
+
+
+def _transform2d(shader: Any) -> Array:
+    """The matrix (3, 3) of a UsdTransform2d: scaled, turned counter-clockwise in degrees, moved."""
+    given = {name: shader.GetInput(name) for name in ("scale", "rotation", "translation")}
+    values = {name: one.Get(FIRST) if one else None for name, one in given.items()}
+    angle = math.radians(values["rotation"] or 0.0)
+    scale, shift = values["scale"] or (1.0, 1.0), values["translation"] or (0.0, 0.0)
+    turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+    made = np.eye(3)
+    made[:2, :2], made[:2, 2] = turn @ np.diag(scale), shift
+    return made
+
+
+def _array(values: Any, kind: Any, width: int = 0) -> Array:
+    if values is None:
+        return np.zeros((0, width) if width else 0, kind)
+    made = np.asarray(values, dtype=kind)
+    return made.reshape(-1, width) if width else made
+
+
+def _smooth(points: Array, faces: Array) -> Array:
+    """Normals (P, 3) of points: the mean of those of their triangles (T, 3), by area."""
+    across = np.cross(points[faces[:, 1]] - points[faces[:, 0]], points[faces[:, 2]] - points[faces[:, 0]])
+    normals = np.zeros_like(points)
+    for corner in range(3):
+        np.add.at(normals, faces[:, corner], across)
+    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+    return np.where(lengths > 0.0, normals / np.maximum(lengths, 1e-30), [0.0, 0.0, 1.0])
+
+
+if __name__ == "__main__":
+    try:
+        main(*sys.argv[1:])
+    except FileFormatError as error:
+        sys.exit(f"refused: {error}")

@@ -1,0 +1,179 @@
+"""Renders `docs/images/world.webp`: cars near and far in four kinds of light, an own car, others beside it, a person.
+
+python docs/make_world_sheet.py [--size 300] [--spp 64] [--texture shirt.png] [--folder FOLDER]
+
+All pictures of the avenue have an absolute exposure. The shirt is searched by a short attack, unless `--texture` names
+one that an attack has found. `--folder` keeps each picture by itself as well.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from PIL import Image
+
+import advsearch
+from advsearch.scene.formation import to_8_bit
+
+SHEET = Path(__file__).resolve().parent / "images" / "world.webp"
+COLUMNS = 4
+LIGHTS: dict[str, tuple[str, dict[str, Any]]] = {
+    "day": ("avenue", {"camera.ev": 14.0}),
+    "wet": ("avenue-wet", {"camera.ev": 11.5}),
+    "dusk": ("avenue-dusk", {"camera.ev": 4.5}),
+    "night": ("avenue-night", {"camera.ev": 3.0, "object.lamps": "low", "camera.lamps": "low"}),
+}
+"""Environment and settings."""
+POSES: dict[str, dict[str, float]] = {
+    "stands": {},
+    "walks": {"stride": 1.0, "walk": 40.0},
+    "waves": {"left_shoulder_out": 130.0, "left_elbow": 40.0, "right_shoulder": 20.0, "right_elbow": 60.0},
+}
+
+
+class Asked(NamedTuple):
+    """A picture by its name: the scene, and the controls that are fixed."""
+
+    name: str
+    scene: dict[str, Any]
+    controls: dict[str, dict[str, float]]
+
+
+def asked(own_car: Path, shirt: Any) -> Iterator[Asked]:
+    """Yield the pictures of the sheet, row by row."""
+    for light, (environment, given) in LIGHTS.items():
+        for metres in (10.0, 30.0, 60.0, 100.0):
+            behind = {"camera.distance": metres, "camera.fov": 60.0, **given}
+            scene = {"object": "car", "environment": environment, "settings": behind, "camera": "dashcam"}
+            yield Asked(f"{light}-{metres:.0f}", scene, {})
+    for light, turn in (("day", 32.0), ("night", 28.0)):
+        environment, given = LIGHTS[light]
+        view = {"camera.distance": 9.0, "camera.azimuth": turn, "camera.elevation": 9.0, **given, "camera.lamps": "off"}
+        yield Asked(f"own-{light}", {"object": own_car, "size": 5.1, "environment": environment, "settings": view}, {})
+    for light, lamps in (("day", "off"), ("night", "low")):
+        environment, given = LIGHTS[light]
+        view = {
+            "camera.distance": 17.0,
+            "camera.azimuth": 14.0,
+            "camera.elevation": 6.0,
+            **given,
+            "camera.lamps": "off",
+        }
+        things = f"car@9,3.5,heading=180,lamps={lamps}; person@4,-2.8,heading=-20"
+        yield Asked(
+            f"two-{light}", {"object": "car", "environment": environment, "settings": view, "things": things}, {}
+        )
+    wet = {**LIGHTS["night"][1], "ground.kind": "wet-avenue", "camera.distance": 15.0, "camera.azimuth": 14.0}
+    wet |= {"camera.elevation": 7.0, "camera.lamps": "off"}
+    yield Asked(
+        "wet-night",
+        {"object": "car", "environment": "avenue-night", "settings": wet, "things": "car@9,3.5,heading=180,lamps=high"},
+        {},
+    )
+    for name, pose in POSES.items():
+        view = {"camera.distance": 3.4, "camera.azimuth": 20.0, "camera.elevation": 6.0, "camera.ev": 14.0}
+        scene = {"object": "person", "environment": "avenue", "settings": view, "texture": shirt}
+        yield Asked(f"person-{name}", scene, {"body": pose or {"stride": 0.0}})
+
+
+def write_van(path: Path) -> None:
+    """Write a delivery van as OBJ, in centimetres, with a material for each of paint, glass and tyres."""
+    side = [(-255, 28), (-255, 205), (60, 212), (120, 195), (196, 112), (246, 92), (255, 62), (255, 28)]
+    vertices: list[tuple[float, float, float]] = []
+    faces: list[str] = []
+
+    def polygon(material: str, corners: Sequence[tuple[float, float, float]]) -> None:
+        first = len(vertices) + 1
+        vertices.extend(corners)
+        faces.extend([f"usemtl {material}", "f " + " ".join(str(first + n) for n in range(len(corners)))])
+
+    for y, turned in ((95.0, side[::-1]), (-95.0, side)):
+        polygon("paint", [(x, y, z) for x, z in turned])
+    for (x0, z0), (x1, z1) in zip(side, [*side[1:], side[0]], strict=True):
+        polygon("paint", [(x0, -95, z0), (x0, 95, z0), (x1, 95, z1), (x1, -95, z1)])
+    polygon("glass", [(128.6, -82, 188.6), (128.6, 82, 188.6), (191.6, 82, 119.8), (191.6, -82, 119.8)])
+    polygon("glass", [(-256, 70, 130), (-256, 70, 185), (-256, -70, 185), (-256, -70, 130)])
+    for y in (96.0, -96.0):
+        window = [(30.0, y, 125.0), (30.0, y, 185.0), (112.0, y, 185.0), (168.0, y, 125.0)]
+        polygon("glass", window if y > 0.0 else window[::-1])
+        for x in (160.0, -150.0):
+            ring = [
+                (x + 33.0 * np.cos(a), y * 1.01, 33.0 + 33.0 * np.sin(a)) for a in np.linspace(0, 2 * np.pi, 25)[1:]
+            ]
+            polygon("tyre", ring[::-1] if y > 0.0 else ring)
+            inner = [(cx, y * 0.75, cz) for cx, _, cz in ring]
+            for n in range(len(ring)):
+                tread = [ring[n - 1], ring[n], inner[n], inner[n - 1]]
+                polygon("tyre", tread if y > 0.0 else tread[::-1])
+    colors = {"paint": "0.86 0.72 0.2", "glass": "0.04 0.05 0.06", "tyre": "0.03 0.03 0.03"}
+    rough = {"paint": 0.35, "glass": 0.05, "tyre": 0.9}
+    path.with_suffix(".mtl").write_text(
+        "".join(f"newmtl {n}\nKd {c}\nPr {rough[n]}\nPm 0\n" for n, c in colors.items())
+    )
+    lines = [f"mtllib {path.with_suffix('.mtl').name}", *(f"v {x:g} {y:g} {z:g}" for x, y, z in vertices), *faces]
+    path.write_text("\n".join(lines) + "\n")
+
+
+def searched_shirt() -> Any:
+    """Return the person's texture after a short search for a shirt that is taken for a book."""
+    found = advsearch.attack(
+        "person", "reference", environment="street", controls={"texture:shirt": {"epsilon": 0.7}}, target="book",
+        label="mug", resolution=96, spp=8, steps=20, trials=10, measure="no", baseline=False,
+    )  # fmt: skip
+    return found.artifacts["texture"]
+
+
+def rendered(one: Asked, size: int, spp: int) -> Image.Image:
+    """Render a picture."""
+    scene = dict(one.scene)
+    loaded = advsearch.load_scene(scene.pop("object"), scene.pop("environment"), **scene)
+    still = {"camera": {"roll": [-1.0, 1.0]}}  # a space needs something that varies; its start is the scene as it is
+    render = loaded.renderer({**still, **one.controls}, resolution=size)
+    with torch.no_grad():
+        levels = to_8_bit(render(render.start, 0, spp)) * 255.0
+    return Image.fromarray(levels.round().byte().numpy())
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Render and write; returns the exit status."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--size", type=int, default=300, help="side of one picture, pixels (default 300)")
+    parser.add_argument("--spp", type=int, default=64, help="samples per pixel (default 64)")
+    parser.add_argument("--texture", type=Path, help="of the person; by default a shirt is searched")
+    parser.add_argument("--folder", type=Path, help="each picture goes there too, by its name")
+    parser.add_argument("--only", default="", help="pictures whose names contain this, and no sheet")
+    args = parser.parse_args(argv)
+    with tempfile.TemporaryDirectory() as folder:
+        own = Path(folder) / "van.obj"
+        write_van(own)
+        wanted = [one for one in asked(own, args.texture) if args.only in one.name]
+        if args.texture is None and any("texture" in one.scene for one in wanted):
+            shirt = searched_shirt()
+            wanted = [
+                one._replace(scene={**one.scene, "texture": shirt}) if "texture" in one.scene else one for one in wanted
+            ]
+        pictures = []
+        for one in wanted:
+            pictures.append(rendered(one, args.size, args.spp))
+            print(one.name, file=sys.stderr, flush=True)
+            if args.folder is not None:
+                args.folder.mkdir(parents=True, exist_ok=True)
+                pictures[-1].save(args.folder / f"{one.name}.png")
+    if not args.only:
+        sheet = Image.new("RGB", (COLUMNS * args.size, -(-len(pictures) // COLUMNS) * args.size))
+        for number, picture in enumerate(pictures):
+            sheet.paste(picture, (number % COLUMNS * args.size, number // COLUMNS * args.size))
+        sheet.save(SHEET, quality=84, method=6)
+        print(f"written: {SHEET.name}, {SHEET.stat().st_size // 1024} KiB", file=sys.stderr)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
