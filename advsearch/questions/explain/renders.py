@@ -395,7 +395,10 @@ class Renders:
 
 def beyond(rules: Sequence[RuleConditions], rows: pd.DataFrame) -> Mask:
     """Return which rows (n,) no rule covers."""
-    return ~np.any([np.zeros(len(rows), np.bool_), *(covered(one, rows) for one in rules)], axis=0)
+    left = np.ones(len(rows), np.bool_)
+    for one in rules:
+        left &= ~covered(one, rows)
+    return left
 
 
 def typical_failures(table: pd.DataFrame, rules: Sequence[CountedRule], most: int) -> list[tuple[int, RuleConditions]]:
