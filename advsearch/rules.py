@@ -14,7 +14,8 @@ import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from itertools import product
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -46,6 +47,11 @@ MOST_NEEDED = 1_000_000
 """Rows up to which it is said how many a rule would take."""
 LEAST_GAP = 0.1
 """By how much more often the model is wrong under a rule than elsewhere, at least."""
+AROUND = 270.0
+"""Degrees that the values of an angle span, at least, where it goes all the way round: a grid of four values does."""
+ARCS = ((360.0, 180.0), (180.0, 0.0), (180.0, 90.0))
+"""Of an angle that goes all the way round, trees see it once more by turn and zero, degrees: an arc through 0 is one
+interval there, and so is what lies end-on, at 0 and at 180."""
 
 
 # ---- tables ---------------------------------------------------------------------------------------------------------
@@ -91,13 +97,17 @@ def halves(table: pd.DataFrame, seed: int) -> tuple[pd.DataFrame, pd.DataFrame]:
 
 @dataclass(frozen=True)
 class RuleCondition:
-    """A part of the values of one factor: over `low` and at most `high`, or some of its names."""
+    """A part of the values of one factor: over `low` and at most `high`, or some of its names.
+
+    With a `turn`, 360 or 180 degrees, values repeat after it, and where `low` is over `high` the part goes through 0.
+    """
 
     factor: str
     unit: str = ""
     low: float = -np.inf
     high: float = np.inf
     options: frozenset[str] | None = None
+    turn: float = 0.0
 
     def holds(self, table: pd.DataFrame) -> Mask:
         """Return in which rows (n,) it does."""
@@ -105,7 +115,19 @@ class RuleCondition:
         if self.options is not None:
             return np.asarray(column.isin(self.options))
         values = column.to_numpy()
+        if self.turn:
+            values = values % self.turn
+            if self.low > self.high:
+                return np.asarray((values > self.low) | (values <= self.high))
         return np.asarray((values > self.low) & (values <= self.high))
+
+    @property
+    def arcs(self) -> tuple[tuple[float, float], ...]:
+        """Where it holds of an angle, from and to in degrees, each once in a turn of 360; none without a `turn`."""
+        if not self.turn:
+            return ()
+        width = (self.high - self.low) % self.turn
+        return tuple((self.low + at, self.low + at + width) for at in np.arange(0.0, 360.0, self.turn).tolist())
 
     @property
     def row(self) -> ConditionRow:
@@ -113,12 +135,15 @@ class RuleCondition:
         unit = f" {self.unit}" if self.unit not in ("", "1") else ""
         names, over, at_most = sorted(self.options or ()), f"over {self.low:g}", f"at most {self.high:g}"
         bounds = [text for text, end in ((over, self.low), (at_most, self.high)) if np.isfinite(end)]
+        if self.turn:
+            bounds = [" or ".join(f"from {low % 360:g} to {high % 360:g}" for low, high in self.arcs)]
         return ConditionRow(
             parameter=self.factor,
             unit=self.unit,
             over=self.low if np.isfinite(self.low) else None,
             at_most=self.high if np.isfinite(self.high) else None,
             options=names,
+            turn=self.turn or None,
             text=f"{self.factor} {' or '.join(names) if names else ' and '.join(bounds) + unit}",
         )
 
@@ -240,12 +265,32 @@ def _moved(condition: RuleCondition, table: pd.DataFrame) -> Iterator[RuleCondit
     """The condition with its bounds elsewhere: nodes of trees lie where the nodes above them left them."""
     if condition.options is not None:
         return
-    quantiles = np.quantile(table[condition.factor].to_numpy(), np.linspace(0.0, 1.0, BOUNDS + 1)[1:-1])
+    values = table[condition.factor].to_numpy()
+    quantiles = np.quantile(values % condition.turn if condition.turn else values, np.linspace(0, 1, BOUNDS + 1)[1:-1])
     for at in dict.fromkeys(float(f"{one:.3g}") for one in quantiles):
-        if condition.low > -np.inf and at < condition.high:
+        if at in (condition.low, condition.high):
+            continue
+        if condition.low > -np.inf and (condition.turn or at < condition.high):
             yield replace(condition, low=at)
-        if condition.high < np.inf and at > condition.low:
+        if condition.high < np.inf and (condition.turn or at > condition.low):
             yield replace(condition, high=at)
+
+
+class Split(NamedTuple):
+    """What a column of the trees' data is of: all values of a factor; the name that it is 1 of; or, of an angle that
+    goes round, where its zero is."""
+
+    whole: RuleCondition
+    name: str | None = None
+    zero: float = 0.0
+
+    def told(self, condition: RuleCondition) -> RuleCondition:
+        """A condition on the column as one on the factor."""
+        turn = self.whole.turn
+        if not turn:
+            return condition
+        low, high = max(condition.low, 0.0) + self.zero, min(condition.high, turn) + self.zero
+        return replace(condition, low=low % turn, high=high % turn or turn)
 
 
 def _candidates(table: pd.DataFrame, least: int, seed: int) -> Iterator[RuleConditions]:
@@ -253,46 +298,59 @@ def _candidates(table: pd.DataFrame, least: int, seed: int) -> Iterator[RuleCond
     one_tree = import_library("sklearn.tree").DecisionTreeClassifier
     forest = import_library("sklearn.ensemble").RandomForestClassifier
     columns: list[npt.NDArray[np.float64]] = []
-    splits: list[tuple[RuleCondition, str | None]] = []  # of each column: everything, and the name that it is 1 of
+    splits: list[Split] = []
     for factor, unit in table.attrs["units"].items():
         column, whole = table[factor], RuleCondition(factor, unit)
         if column.dtype != "category":
-            columns.append(column.to_numpy())
-            splits.append((whole, None))
+            columns.append(values := column.to_numpy())
+            splits.append(Split(whole))
+            if unit == "degrees" and np.ptp(values) >= AROUND:
+                columns += [(values - zero) % turn for turn, zero in ARCS]
+                splits += [Split(replace(whole, turn=turn), zero=zero) for turn, zero in ARCS]
             continue
         names = column.cat.categories.tolist()
         columns += [(column == name).to_numpy(np.float64) for name in names]
-        splits += [(replace(whole, options=frozenset(names)), name) for name in names]
+        splits += [Split(replace(whole, options=frozenset(names)), name) for name in names]
     data, right = np.stack(columns, axis=1), table["correct"].to_numpy()
     shape = {"max_depth": DEPTH, "min_samples_leaf": least}
     alone = one_tree(**shape, random_state=seed % 2**32)
     several = forest(TREES, **shape, max_features=0.6, random_state=seed % 2**32)
+    trees = [(one.tree_, splits) for one in (alone.fit(data, right), *several.fit(data, right).estimators_)]
+    for place, split in enumerate(splits):
+        if split.whole.turn:  # by itself too: in a tree of all columns other splits of the same angle come first
+            trees.append((one_tree(**shape).fit(data[:, [place]], right).tree_, [split]))
     seen: set[RuleConditions] = {()}
-    for fitted in (alone.fit(data, right), *several.fit(data, right).estimators_):
-        for node in _nodes(fitted.tree_, splits):
-            conditions = tuple(node[factor] for factor in table.attrs["units"] if factor in node)
-            if conditions not in seen:
-                seen.add(conditions)
-                yield conditions
+    for tree, own in trees:
+        for node in _nodes(tree, own):
+            factors: dict[str, list[RuleCondition]] = {name: [] for name in table.attrs["units"]}
+            for split, condition in node.items():
+                factors[condition.factor].append(split.told(condition))
+            # of several parts of one angle, each in turn: their bounds are moved later
+            for conditions in product(*filter(None, factors.values())):
+                if conditions not in seen:
+                    seen.add(conditions)
+                    yield conditions
 
 
-def _nodes(tree: Any, splits: list[tuple[RuleCondition, str | None]]) -> Iterator[dict[str, RuleCondition]]:
-    """What holds at each node of a tree, by factor."""
-    open_nodes: list[tuple[int, dict[str, RuleCondition]]] = [(0, {})]
+def _nodes(tree: Any, splits: list[Split]) -> Iterator[dict[Split, RuleCondition]]:
+    """What holds at each node of a tree, by what its columns are of."""
+    open_nodes: list[tuple[int, dict[Split, RuleCondition]]] = [(0, {})]
     while open_nodes:
         node, conditions = open_nodes.pop()
         yield conditions
         left, right = int(tree.children_left[node]), int(tree.children_right[node])
         if left == right:
             continue
-        whole, name = splits[tree.feature[node]]
-        before = conditions.get(whole.factor, whole)
-        if name is None or before.options is None:
+        split = splits[tree.feature[node]]
+        key = split._replace(name=None)
+        before = conditions.get(key, split.whole)
+        if split.name is None or before.options is None:
             at = float(f"{tree.threshold[node]:.3g}")  # as it is told
             below, above = replace(before, high=min(before.high, at)), replace(before, low=max(before.low, at))
         else:
-            below, above = (replace(before, options=one) for one in (before.options - {name}, before.options & {name}))
-        open_nodes += [(left, {**conditions, whole.factor: below}), (right, {**conditions, whole.factor: above})]
+            names = before.options
+            below, above = (replace(before, options=one) for one in (names - {split.name}, names & {split.name}))
+        open_nodes += [(left, {**conditions, key: below}), (right, {**conditions, key: above})]
 
 
 def import_library(name: str) -> Any:

@@ -37,7 +37,7 @@ def own_models() -> None:
     but what it names."""
     from advsearch.registry import allow_code
 
-    allow_code(*(f"small_models:{name}" for name in ("easy", "hard", "strange", "Colours")))
+    allow_code(*(f"small_models:{name}" for name in ("easy", "hard", "near", "strange", "Colours")))
 
 
 @pytest.fixture(scope="session")

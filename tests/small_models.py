@@ -94,6 +94,19 @@ def hard() -> Model:
     return advsearch.load_model(Blue(0.07, True), labels=["dog", "vase", "mug"], input_size=24, name="hard")
 
 
+class Near(nn.Module):
+    """Sees the mug's blue band while it is near, and turned to the camera a little farther."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        seen = 2000.0 * ((x[:, 2] - x[:, 0]).clamp_min(0.0).mean(dim=(1, 2)) - 0.004)
+        return torch.stack([seen, -seen], dim=1)
+
+
+def near() -> Model:
+    """A classifier that is wrong from afar."""
+    return advsearch.load_model(Near(), labels=["mug", "vase"], input_size=16, name="near")
+
+
 class Same(nn.Module):
     """Says the same to every picture."""
 

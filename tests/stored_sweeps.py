@@ -94,10 +94,11 @@ def serving(
         thread.join()
 
 
-def seen(values: Mapping[str, Any], right: Any, units: Any = None) -> pd.DataFrame:
-    """Rows that have some numbers and names as a table for rules, each a unit unless said otherwise."""
+def seen(values: Mapping[str, Any], right: Any, units: Any = None, of: Mapping[str, str] | None = None) -> pd.DataFrame:
+    """Rows that have some numbers and names as a table for rules, each a unit unless said otherwise; `of` has what the
+    numbers are in, such as degrees."""
     columns = {name: pd.Series(one) for name, one in values.items()}
     columns = {name: one if one.dtype.kind == "f" else one.astype("category") for name, one in columns.items()}
     rows = pd.DataFrame({**columns, "correct": right, "unit": np.arange(len(right)) if units is None else units})
-    rows.attrs["units"] = dict.fromkeys(values, "")
+    rows.attrs["units"] = {**dict.fromkeys(values, ""), **(of or {})}
     return observed(rows, values)

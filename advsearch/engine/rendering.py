@@ -357,7 +357,7 @@ def facts_about(
     looked = None if look is None else cache(look)
 
     def of(mesh: str, label: str | None) -> Facts:
-        sight = None if looked is None else lambda: sight_of(looked(), mesh)
+        sight = None if looked is None else lambda: sight_of(looked(), mesh, description.object.metres)
         if mesh == OBJECT:
             return Facts(name, label, description.object.label, numbers, sight)
         return Facts(mesh, label, things[mesh].label, numbers, sight)
@@ -368,9 +368,10 @@ def facts_about(
     return replace(each[OBJECT], each=each)
 
 
-def sight_of(surfaces: Surfaces, mesh: str = OBJECT) -> Sight:
-    """Return what a task judges by, of what the camera sees: of the object, or of another mesh."""
-    return Sight(surfaces.seen(mesh), surfaces.depth, surfaces.z_depth)
+def sight_of(surfaces: Surfaces, mesh: str = OBJECT, metres: float | None = None) -> Sight:
+    """Return what a task judges by, of what the camera sees: of the object, or of another mesh; `metres` are those of
+    the object, where they are known."""
+    return Sight(surfaces.seen(mesh), surfaces.depth, surfaces.z_depth, metres)
 
 
 def things_seen(renderer: Renderer, u: Tensor) -> JsonObject | None:
@@ -390,7 +391,7 @@ def things_seen(renderer: Renderer, u: Tensor) -> JsonObject | None:
             "pixels": 0 if one is None else int(one.mask.sum()),
             "share": 0.0 if one is None else None if one.share is None else round(one.share, 4),
             "truncated": None if one is None else one.truncated,
-            "distance": None if one is None else round(one.distance * description.metres, 3),
+            "distance": None if one is None else round(one.distance, 3),
         }
     return shown
 

@@ -219,6 +219,11 @@ class ConditionRow(Fields):
     over: float | None = Field(description="values are larger; null without that bound, and for names")
     at_most: float | None = Field(description="values are no larger; null without that bound, and for names")
     options: list[str] = Field(description="the names it is about; empty for numbers")
+    turn: float | None = Field(
+        default=None,
+        description="degrees after which values count as the same, 180 or 360; `over` may then be over `at_most`: the "
+        "part goes through 0. Null for other parts",
+    )
     text: str
 
 

@@ -36,7 +36,8 @@ class SeenThing:
         mask: (H, W) bool, the pixels that it is first seen in.
         share: of its outline that these are, in (0, 1]; None where the outline is not known.
         truncated: whether the outline goes on beyond the picture; None where it is not known.
-        distance: of the nearest point that is seen from the camera, along the ray, object sizes.
+        distance: of the nearest point that is seen from the camera, along the ray; in metres, or in object sizes where
+            the object's size is not known.
     """
 
     name: str

@@ -258,7 +258,9 @@ class Renderer:
         with torch.no_grad():
             rig = self.scene.made[0].rig
             inputs = self._seen(rig[camera] if rig else None, self.scene.assembly(self.space.inputs(u)))
-        return self.scene.surfaces(_traced(inputs), fineness)
+        seen = self.scene.surfaces(_traced(inputs), fineness)
+        metres = self.scene.made[0].metres
+        return replace(seen, depth=seen.depth * metres, z_depth=seen.z_depth * metres)
 
     def gradient(
         self, loss: Callable[[Tensor], Tensor], u: Tensor, seed: int, spp: int, *, free: bool = False

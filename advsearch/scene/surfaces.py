@@ -11,7 +11,8 @@ from advsearch.errors import UnknownNameError
 
 AOVS: Mapping[str, str] = {
     "mask": "1 where the object is seen first, else 0",
-    "depth": "distance from the camera along the ray, object sizes; infinite where there is nothing",
+    "depth": "distance from the camera along the ray, metres (object sizes where the object's size is not known); "
+    "infinite where there is nothing",
     "normal": "unit shading normal, world space (z up); 0 where there is nothing",
     "uv": "texture coordinates, v = 0 at the bottom row of the texture; 0 where there is nothing",
     "id": "number of the mesh; 0 where there is nothing",
@@ -42,7 +43,8 @@ class Surfaces:
     Attributes:
         names: of the shapes.
         id: (H, W) int64: 1 for the first of the names and so on, 0 where there is nothing.
-        depth: (H, W) distance from the camera, object sizes; infinite where there is nothing.
+        depth: (H, W) distance from the camera, infinite where there is nothing: metres, as renderers say it; object
+            sizes where the object's size is not known, and as Mitsuba's scenes say it.
         z_depth: (H, W) the part of it that lies along the camera's axis.
         normal: (H, W, 3) unit shading normal in world space.
         uv: (H, W, 2) texture coordinates; v = 0 is the bottom row.

@@ -127,11 +127,13 @@ class Sight:
         mask: (H, W) bool, where it is the object.
         depth: (H, W) float, how far it is, see `Facts.depth`.
         z_depth: (H, W) float, see `Facts.z_depth`.
+        metres: of the object's longest side; None where they are not known, and distances are in object sizes.
     """
 
     mask: Tensor
     depth: Tensor
     z_depth: Tensor
+    metres: float | None = None
 
 
 @dataclass(frozen=True)
@@ -181,9 +183,10 @@ class Facts:
 
     @property
     def depth(self) -> Tensor:
-        """How far what is seen in each pixel is from the camera, along the ray, in object sizes, (H, W) float32.
+        """How far what is seen in each pixel is from the camera, along the ray, (H, W) float32.
 
-        Infinite where there is nothing but the environment. Asked for and unaffected as the mask is.
+        In metres; in object sizes where the size of the object is not known. Infinite where there is nothing but the
+        environment. Asked for and unaffected as the mask is.
 
         Raises:
             InputError: as for `sight`.

@@ -65,11 +65,12 @@ Map = Mapping[str, Tensor]
 
 @dataclass(frozen=True, eq=False)
 class Distances:
-    """What is true of a picture: in which pixels the object is seen, (H, W) bool, and the z-depth of everything in
-    object sizes, (H, W); infinite where there is nothing."""
+    """What is true of a picture: in which pixels the object is seen, (H, W) bool, and the z-depth of everything,
+    (H, W), infinite where there is nothing: in metres, or in object sizes where the object's `metres` are not known."""
 
     mask: Tensor
     z: Tensor
+    metres: float | None = None
 
     @property
     def seen(self) -> bool:
@@ -119,7 +120,8 @@ class Depth(Task):
     Args:
         tolerance: 0.25 for a factor of 1.25, the first threshold of Eigen et al. 2014 (arXiv 1406.2283).
         kind: of the model's numbers, one of `KINDS`; "" for what the network says.
-        size: of the real object, its longest side in metres, for a model that predicts metres.
+        size: of the real object, its longest side in metres, for a model that predicts metres; the scene's own
+            without it.
         seek: what an attack is after, one of `GOALS`; "" for any wrong distance.
         seen_kind: what the network says; "" where it has not yet.
         missing: what its user has to say before predictions can be judged; empty where nothing is missing.
@@ -203,10 +205,10 @@ class Depth(Task):
                 f"kind: expected what its numbers are, one of {', '.join(KINDS)}, and its network does not say it; "
                 f"give `task='depth={{kind: {DISPARITY}}}'`, say"
             )
-        if kind == METRIC and not self.size:
+        if kind == METRIC and not self.size and (truth is None or truth.metres is None):
             return (
-                "size: it predicts metres, and scenes are in object sizes; give the longest side of the real object "
-                "in metres, `task='depth={size: 0.1}'`, say"
+                "size: it predicts metres, and how large the object is is not known; give its longest side in metres, "
+                "such as `size=0.1`"
             )
         if kind != METRIC and truth is not None and truth.seen and not truth.anchored:
             return (
@@ -226,7 +228,7 @@ class Depth(Task):
             return ()
         text = f"The model's numbers are read as {self.seen_kind}: {KINDS[self.seen_kind]}"
         if self.seen_kind == METRIC:
-            return (f"{text}, of an object of {self.size:g} m.",)
+            return (f"{text}, of an object of {self.size:g} m." if self.size else f"{text}.",)
         return (f"{text}, which are found by least squares on what is seen beside the object.",)
 
     def check(self, facts: Facts) -> None:
@@ -249,7 +251,7 @@ class Depth(Task):
                 "task depth: a model's depth is the distance along the camera's axis, and this lens sees things more "
                 f"than {math.degrees(math.acos(ASIDE)):.0f} degrees from its axis; take a lens that sees less"
             )
-        return Distances(facts.mask, facts.z_depth)
+        return Distances(facts.mask, facts.z_depth, facts.sight.metres)
 
     def truth_names(self, truth: Distances) -> tuple[str, ...]:
         return (AS_FAR,)
@@ -299,7 +301,7 @@ class Depth(Task):
         return (-logarithms if inverse else logarithms) + whole
 
     def _judged(self, one: Map, truth: Distances) -> tuple[Tensor, bool]:
-        """What the model says of every pixel, (H, W) z-depth in object sizes, or its inverse; and whether that is it.
+        """What the model says of every pixel, (H, W) z-depth as the truth has it, or its inverse; and which of the two.
 
         A map is brought to the size of the picture as transformers does it in `post_process_depth_estimation`.
         """
@@ -310,7 +312,7 @@ class Depth(Task):
             values = F.interpolate(values[None, None], size=size, mode="bicubic", align_corners=False)[0, 0]
         z, at = truth.z.to(values.device), truth.fitted.to(values.device)
         if kind == METRIC:
-            return values / self.size, False
+            return values * ((truth.metres or 1.0) / self.size if self.size else 1.0), False
         return (_fitted(values, z.reciprocal(), at), True) if kind == DISPARITY else (_fitted(values, z, at), False)
 
     def _relief(self, factors: Tensor, truth: Distances) -> Tensor:
@@ -370,7 +372,8 @@ class Depth(Task):
         found = []
         for one in output:
             marks = [Mark("disparity", True, mask=truth.mask, map=truth.z.reciprocal())]
-            if truth.seen and not self._missing(self.kind or next(iter(one)), None):
+            kind = self.kind or next(iter(one))
+            if truth.seen and not self._missing(kind, truth if kind == METRIC else None):
                 right = torch.zeros_like(truth.mask)
                 right[truth.mask] = (self._factors(one, truth).detach().abs() <= self._bar).to(right.device)
                 judged, inverse = self._judged(one, truth)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import imageio.v3 as iio
@@ -17,11 +18,12 @@ from stored_sweeps import described, make_sweep, seen
 import advsearch
 from advsearch.cli.main import main
 from advsearch.errors import FileFormatError, InputError
+from advsearch.progress import NullProgress
 from advsearch.questions.explain import renders as explaining
 from advsearch.questions.explain.renders import along, can_be_given, sweep_inside
 from advsearch.questions.explain.result import ExplainResult, pairs_text
 from advsearch.questions.sweep.settings import SweepConfig
-from advsearch.rules import CountedRule, RuleCondition, covered
+from advsearch.rules import CountedRule, RuleCondition, covered, observed
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import NAME, Row, Store
 from advsearch.runs.summary import read_result
@@ -114,6 +116,60 @@ def test_a_rule_is_confirmed_by_what_is_rendered_inside_it(
     low, high = np.asarray(asked[0].controls["camera"]["elevation"], dtype=float)
     assert 57.0 < low < 63.0 and 84.0 < high <= 85.0 and asked[0].controls["light"] == {}
     assert asked[0].samples == 10 and asked[0].seed != 0 and asked[0].trials == 0
+
+
+def test_a_rule_about_the_distance_is_confirmed_by_fresh_pictures(tmp_path: Path) -> None:
+    """As docs/explain.md has it: the distance on a grid, the direction drawn beside it, by the same control."""
+    advsearch.sweep(
+        "mug", "small_models:near", {"camera.distance": [0.2, 0.3, 0.4, 0.6, 0.9, 1.4]},
+        controls={"camera": {"azimuth": [0, 360]}}, samples=24, sampler="random", trials=0, resolution=16, spp=1,
+        denoise="none", run=tmp_path / "swept",
+    )  # fmt: skip
+    result = advsearch.explain(tmp_path / "swept", confirm=20, pairs=0, clusters=0, run=tmp_path / "run")
+    rule = result.rules[0]
+    (far,) = (one for one in rule.conditions if one.parameter == "camera.distance")
+    assert far.unit == "metres" and far.over is not None and 0.3 < far.over < 0.9 and far.at_most is None
+    assert rule.confirmed is not None and rule.confirmed.held and rule.confirmed.total >= 20
+    assert result.renders >= rule.confirmed.total and not result.warnings
+    text = (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
+    assert "Fresh renders inside it" in text and "; confirmed." in text
+
+
+def test_fresh_pictures_vary_as_the_sweep_did_and_count_beyond_the_rules_before(
+    swept: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    table = seen({"camera.elevation": [5.0, 85.0], "camera.azimuth": [10.0, 350.0]}, np.array([True, False]))
+    config = SweepConfig(object="mug", controls={"camera": {}}, samples=2)
+    high = (RuleCondition("camera.elevation", low=60.0),)
+    made = sweep_inside(config, table, high, 20, 7)
+    assert made.controls == {"camera": {"elevation": [60.0, 85.0], "azimuth": [10.0, 350.0]}}
+    end_on = RuleCondition("camera.azimuth", "degrees", 160.0, 20.0, turn=180.0)
+    drawn = [sweep_inside(config, table, (end_on,), 20, 7, arc).controls["camera"]["azimuth"] for arc in (0, 1)]
+    assert drawn == [[160.0, 200.0], [340.0, 380.0]]
+    hue = SweepConfig(object="mug", controls={"background": {"hue": [0, 360]}}, samples=2)
+    around = RuleCondition("background.hue", "degrees", 340.0, 20.0, turn=360.0)
+    colours = seen({"background.hue": [0.0, 359.0]}, np.array([True, False]))
+    assert sweep_inside(hue, colours, (around,), 20, 7).controls == hue.controls, "a hue ends at 360"
+
+    def rendered(self: Any, name: str, config: SweepConfig) -> pd.DataFrame:
+        elevation = np.linspace(20.0, 80.0, 40)
+        return pd.DataFrame({"camera.elevation": elevation, "correct": elevation <= 70, "unit": np.arange(40)})
+
+    monkeypatch.setattr(explaining.Renders, "_rendered", rendered)
+    rows = explaining.read_predictions([explaining.AskedSweep.of(swept)])
+    whole = observed(rows, rows.attrs["units"])
+    below, above = whole["camera.elevation"] <= 50, whole["camera.elevation"] > 70
+    rules = [
+        CountedRule((RuleCondition("camera.elevation", low=70.0),), whole[above], whole[~above]),
+        CountedRule((RuleCondition("camera.elevation", low=50.0),), whole[~below & ~above], whole[below]),
+    ]
+    asked = SimpleNamespace(
+        config=SimpleNamespace(confirm=20, seed=0), progress=NullProgress(), run=SimpleNamespace(path=tmp_path)
+    )
+    renders = explaining.Renders(asked, [explaining.AskedSweep.of(swept)], rows, whole)
+    first, second = (renders.confirmed(rules, number) for number in range(2))
+    assert first is not None and (first.right, first.total, first.held) == (0, 7, True)
+    assert second is not None and (second.right, second.total, second.held) == (13, 13, False), "not those of the first"
 
 
 def test_the_nearest_right_prediction_differs_in_one_value(

@@ -82,6 +82,46 @@ def test_predictions_that_are_all_the_same_have_no_rule() -> None:
     assert find_rules(*halves(same, 0), seed=0).told == [] and find_importance(same) == ()
 
 
+def around(law: str, seed: int, rows: int = 2000) -> pd.DataFrame:
+    """Rows of a model that is wrong in some directions, some of them from afar."""
+    generator = np.random.default_rng(seed)
+    azimuth, distance = generator.uniform((0.0, 5.0), (360.0, 60.0), (rows, 2)).T
+    aside = np.abs((azimuth + 90.0) % 180.0 - 90.0)
+    wrong = {
+        "in front": (azimuth > 335.0) | (azimuth < 25.0),
+        "end-on": aside < 20.0,
+        "end-on and far": (aside < 30.0) & (distance > 30.0),
+        "none": np.zeros(rows, dtype=bool),
+    }[law]
+    values = {"camera.azimuth": azimuth, "camera.distance": distance}
+    return seen(values, ~(wrong ^ (generator.random(rows) < NOISE)), of={"camera.azimuth": "degrees"})
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_an_angle_that_goes_round_has_rules_through_0_and_of_both_ends(seed: int) -> None:
+    front, end_on, far = (
+        find_rules(*halves(around(law, seed), seed), seed=seed).told[0].conditions
+        for law in ("in front", "end-on", "end-on and far")
+    )
+    assert (front[0].turn, front[0].low, front[0].high) == (360.0, pytest.approx(335, abs=8), pytest.approx(25, abs=8))
+    assert (end_on[0].turn, end_on[0].low) == (180.0, pytest.approx(160, abs=8))
+    assert end_on[0].high == pytest.approx(20, abs=8) and len(front) == len(end_on) == 1
+    assert [one.factor for one in far] == ["camera.azimuth", "camera.distance"] and far[0].turn == 180.0
+    assert far[1].low == pytest.approx(30, abs=6)
+    assert find_rules(*halves(around("none", seed), seed), seed=seed).told == []
+
+
+def test_where_an_arc_holds() -> None:
+    end_on = RuleCondition("yaw", "degrees", 160.0, 20.0, turn=180.0)
+    angles = [0.0, 20.0, 21.0, 90.0, 160.0, 161.0, 180.0, 341.0, 359.0, -10.0, 370.0, 539.0]
+    table = seen({"yaw": angles}, np.ones(len(angles), dtype=bool))
+    assert end_on.holds(table).tolist() == [True, True, False, False, False, True, True, True, True, True, True, True]
+    assert end_on.arcs == ((160.0, 200.0), (340.0, 380.0))
+    front = RuleCondition("yaw", "degrees", 350.0, 10.0, turn=360.0)
+    assert [a for a, holds in zip(angles, front.holds(table), strict=True) if holds] == [0.0, 359.0, 370.0]
+    assert front.arcs == ((350.0, 370.0),) and front.row.turn == 360.0
+
+
 def test_few_rows_tell_a_clear_rule_and_say_how_many_a_faint_one_takes() -> None:
     """Right in 28 % end-on and in 71 % from the side, as a detector of cars is."""
 
@@ -231,6 +271,11 @@ def test_halves_are_of_whole_units_and_share_none() -> None:
         (RuleCondition("power", "1", high=0.5), "power at most 0.5"),
         (RuleCondition("yaw", "degrees", 10.0, 20.0), "yaw over 10 and at most 20 degrees"),
         (RuleCondition("colour", options=frozenset({"red", "blue"})), "colour blue or red"),
+        (RuleCondition("yaw", "degrees", 350.0, 10.0, turn=360.0), "yaw from 350 to 10 degrees"),
+        (
+            RuleCondition("yaw", "degrees", 160.0, 20.0, turn=180.0),
+            "yaw from 160 to 200 or from 340 to 20 degrees",
+        ),
     ],
 )
 def test_conditions_in_words(condition: RuleCondition, text: str) -> None:

@@ -46,7 +46,7 @@ def test_layers_are_read_back_with_what_they_mean(tmp_path: Path) -> None:
     assert found["mask.Y"].tolist() == [[1.0, 0.0]] and found["depth.Z"].tolist() == [[1.5, np.inf]]
     assert found["uv.V"].tolist() == [[0.75, 0.0]] and found["normal.Z"][0, 0] == np.float32(0.8)
     assert found["id.Y"].dtype == np.uint32 and found["id.Y"].tolist() == [[2, 0]]
-    assert header["depth"].startswith("distance from the camera along the ray, object sizes")
+    assert header["depth"].startswith("distance from the camera along the ray, metres")
     assert header["id"].endswith("1 is ground, 2 is object")
 
 

@@ -155,9 +155,20 @@ def test_what_has_to_be_said_is_said() -> None:
         in TASK.after_calibration([{"": INVERSE}], TRUTH).ambiguities
     )
     assert (
-        "give the longest side of the real object in metres"
+        "how large the object is is not known; give its longest side in metres"
         in Depth().after_calibration(said(INVERSE, METRIC), TRUTH).ambiguities
     )
+    sized = Distances(TRUTH.mask, TRUTH.z, metres=2.0)
+    plain = Depth().after_calibration(said(INVERSE, METRIC), sized)
+    assert not plain.ambiguities and plain.remarks == (
+        "The model's numbers are read as metric depth: the distance in metres.",
+    )
+    (half,) = said(INVERSE, METRIC, size=0.5)
+    assert float(plain.margin([half], sized)) > 0.0 > float(TASK.margin([half], TRUTH)), (
+        "of metres, and of half a metre"
+    )
+    assert float(plain.margin(said(INVERSE, METRIC, size=1.0), sized)) < 0.0
+    assert float(Depth(size=1.0).margin([half], sized)) < 0.0, "half as far as in a scene of two metres"
     (remark,) = Depth(kind=RELATIVE).after_calibration([{"": INVERSE}], TRUTH).remarks
     assert remark.startswith("The model's numbers are read as relative depth: the distance, up to a scale and a shift")
     with pytest.raises(InputError, match="label: task depth has no classes"):

@@ -114,7 +114,9 @@ def explain(asked: Asked[ExplainConfig]) -> ExplainResult:
     importance = find_importance(table)
     box = find_envelope(choosing, counting, config.accuracy)
     renders = Renders(asked, sweeps, rows, table)
-    rules = [RuleRow(**rule_counts(one), confirmed=renders.confirmed(one, n)) for n, one in enumerate(found.told)]
+    rules = [
+        RuleRow(**rule_counts(one), confirmed=renders.confirmed(found.told, n)) for n, one in enumerate(found.told)
+    ]
     pairs = list(renders.pairs(found.told))
     clusters = renders.clusters()
     if renders.interrupted:

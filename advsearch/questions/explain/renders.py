@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from advsearch import seeds
-from advsearch.controls import CONTROLS
+from advsearch.controls import CONTROLS, Parameter
 from advsearch.errors import FileFormatError, InputError, ModelError
 from advsearch.interrupts import interruptible
 from advsearch.models.features import Features, features_of
@@ -25,7 +25,7 @@ from advsearch.progress import Progress
 from advsearch.question import Asked
 from advsearch.questions.attack.studies import carry_out_part
 from advsearch.questions.explain.findings import find_clusters, right_of
-from advsearch.questions.explain.result import FailureCluster, FailureClusters, NearestRight, RightOf
+from advsearch.questions.explain.result import Confirmation, FailureCluster, FailureClusters, NearestRight
 from advsearch.questions.sweep.carry_out import scenes_of
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.questions.sweep.summary import SweepSummary
@@ -39,6 +39,9 @@ from advsearch.viewer.thumbnails import path_of
 
 ALONG = 9
 """Values of a factor that are tried on the way to a right prediction."""
+SIDES, LEAST_LEFT = 2, 0.2
+"""Arcs of a circle that a condition has, at most. Share of a rule that no rule before it covers, from which on more is
+rendered so that enough of it is left."""
 OUTER = ("object", "environment", "model")
 
 
@@ -100,12 +103,13 @@ def values_of(rows: pd.DataFrame, place: int) -> dict[str, float | str]:
 
 
 def sweep_inside(
-    config: SweepConfig, table: pd.DataFrame, conditions: RuleConditions, samples: int, seed: int
+    config: SweepConfig, table: pd.DataFrame, conditions: RuleConditions, samples: int, seed: int, arc: int = 0
 ) -> SweepConfig:
     """Return a sweep like another, of about so many configurations, most of which lie under the conditions.
 
     Ranges of what is drawn are cut to the conditions, as far as the rows went; axes of a grid to the values that the
-    rows have there; names to those that are left. What cannot be cut has to be left out by whoever counts.
+    rows have there; names to those that are left. Of an angle that may lie on either side it is the side with the
+    number `arc`. What cannot be cut has to be left out by whoever counts.
     """
     inside = table[covered(conditions, table)]
     left = {name: sorted(inside[name].unique().tolist()) for name in table.attrs["units"]}
@@ -128,13 +132,43 @@ def sweep_inside(
     controls = {name: dict(given) for name, given in config.controls.items()}
     for one in conditions:
         name, _, parameter = one.factor.partition(".")
-        is_frame = bool(config.path) and one.factor == f"{name}.time"
-        if parameter and name in controls and one.options is None and one.factor not in grid and not is_frame:
-            if can_be_given(config, one.factor):
-                low, high = float(table[one.factor].min()), float(table[one.factor].max())
-                controls[name][parameter] = [max(one.low, low), min(one.high, high)]
+        if one.options is None and is_drawn(config, one.factor):
+            low, high = float(table[one.factor].min()), float(table[one.factor].max())
+            low, high = one.arcs[arc % len(one.arcs)] if one.turn else (max(one.low, low), min(one.high, high))
+            if high <= _declared(config, name)[parameter].high:
+                controls[name] = {**_ranges(config, name, table), **controls[name], parameter: [low, high]}
     draws = math.ceil(samples / points) if controls else None
     return _quiet(config, grid=grid, controls=controls, samples=draws, seed=seed, **outer)
+
+
+def is_drawn(config: SweepConfig, factor: str) -> bool:
+    """Whether a sweep draws a parameter by chance, from a range that it can be given."""
+    name, dot, parameter = factor.partition(".")
+    is_frame = bool(config.path) and parameter == "time"
+    return bool(dot) and not is_frame and factor not in config.grid and parameter in _declared(config, name)
+
+
+def _declared(config: SweepConfig, name: str) -> dict[str, Parameter]:
+    """The parameters of a control that is drawn, by name."""
+    given = config.controls.get(name)
+    kind = None if given is None else CONTROLS.get(str(given.get("kind", name.partition(":")[0])))
+    return {} if kind is None or kind.kind == BY_KEY else {one.name: one for one in kind.declared(given or {})}
+
+
+def _ranges(config: SweepConfig, name: str, table: pd.DataFrame) -> dict[str, Any]:
+    """What a control was given. Where it was given no range, what its rows have: with a range for one parameter, the
+    others would stay where they are."""
+    given, declared = dict(config.controls[name]), _declared(config, name)
+    if not declared.keys() & given.keys():
+        for parameter, one in declared.items():
+            column = table.get(f"{name}.{parameter}")
+            if column is not None and is_drawn(config, f"{name}.{parameter}"):
+                given[parameter] = (
+                    {"choices": column.cat.categories.tolist()}
+                    if one.options
+                    else [*map(float, (column.min(), column.max()))]
+                )
+    return given
 
 
 def along(
@@ -227,22 +261,33 @@ class Renders:
         self.count += sum(done.renders.values())
         return None if self.interrupted else read_predictions([AskedSweep(path, own, done)])
 
-    def confirmed(self, rule: CountedRule, number: int) -> RightOf | None:
-        """Render fresh configurations inside a rule, in the scene of each sweep."""
+    def confirmed(self, rules: Sequence[CountedRule], number: int) -> Confirmation | None:
+        """Render fresh configurations inside a rule and outside those before it, in the scene of each sweep. They
+        confirm it where they alone, beside the rows elsewhere, tell it."""
         if not self.config.confirm:
             return None
+        rule, before = rules[number], [one.conditions for one in rules[:number]]
+        under = self.table[covered(rule.conditions, self.table)]
+        left = float(beyond(before, under).mean())
         fresh = []
         for place, one in enumerate(self.sweeps):
-            seed = seeds.stream(self.config.seed, "confirm", number * len(self.sweeps) + place)
-            samples = -(-self.config.confirm // len(self.sweeps))
-            self.progress.message(f"rule {number + 1}: rendering about {samples} configurations inside it")
-            own = sweep_inside(one.config, self.table, rule.conditions, samples, seed)
-            rows = self._rendered(f"rule-{number + 1}-{place}", own)
-            if rows is not None:
-                inside = rows[covered(rule.conditions, rows)]
-                fresh.append(inside.assign(unit=inside["unit"] * len(self.sweeps) + place))
+            sides = max((len(c.arcs) for c in rule.conditions if is_drawn(one.config, c.factor)), default=1) or 1
+            samples = math.ceil(self.config.confirm / len(self.sweeps) / sides / max(left, LEAST_LEFT))
+            for side in range(sides):
+                part = (number * len(self.sweeps) + place) * SIDES + side
+                seed = seeds.stream(self.config.seed, "confirm", part)
+                self.progress.message(f"rule {number + 1}: rendering about {samples} configurations inside it")
+                own = sweep_inside(one.config, self.table, rule.conditions, samples, seed, side)
+                rows = self._rendered(f"rule-{number + 1}-{place}" + (f"-{side}" if side else ""), own)
+                if rows is not None:
+                    inside = rows[covered(rule.conditions, rows) & beyond(before, rows)]
+                    fresh.append(inside.assign(unit=inside["unit"].astype(str) + f" of {part}"))
         kept = pd.concat(fresh) if fresh else self.rows[:0]
-        return None if kept.empty else right_of(kept)
+        if kept.empty:
+            return None
+        elsewhere = rule.elsewhere.assign(unit=rule.elsewhere["unit"].astype(str))
+        again = CountedRule(rule.conditions, kept, elsewhere)
+        return Confirmation(**vars(right_of(kept)), held=again.holds)
 
     def pairs(self, rules: Sequence[CountedRule]) -> Iterator[NearestRight]:
         """The nearest right configurations to typical failures, along the parameters of their rule or else the others.
@@ -346,6 +391,14 @@ class Renders:
             apart=found.apart,
             listed=listed,
         )
+
+
+def beyond(rules: Sequence[RuleConditions], rows: pd.DataFrame) -> Mask:
+    """Return which rows (n,) no rule covers."""
+    left = np.ones(len(rows), np.bool_)
+    for one in rules:
+        left &= ~covered(one, rows)
+    return left
 
 
 def typical_failures(table: pd.DataFrame, rules: Sequence[CountedRule], most: int) -> list[tuple[int, RuleConditions]]:

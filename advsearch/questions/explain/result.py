@@ -36,12 +36,23 @@ class RightOf(Fields):
         return share_of_text(self.right, self.total, self.interval)
 
 
+class Confirmation(RightOf):
+    """Fresh renders inside a rule that no rule before it covers."""
+
+    held: bool = Field(
+        default=False, description="whether they confirm it: they alone, beside the rows elsewhere, tell the rule"
+    )
+
+
 class RuleRow(RightOf):
     """A rule under which the model is wrong more often than elsewhere, counted on rows that did not choose it."""
 
     conditions: list[ConditionRow] = Field(description="all of which hold")
     elsewhere: RightOf = Field(description="rows under no rule so far")
-    confirmed: RightOf | None = Field(description="fresh renders drawn inside the rule; null where none were asked for")
+    confirmed: Confirmation | None = Field(
+        description="fresh renders drawn inside the rule, and `held`, whether they tell it again; null where none were "
+        "asked for"
+    )
 
 
 class RuleNotTold(RightOf):
@@ -194,7 +205,10 @@ def rule_text(number: int, rule: RuleRow) -> str:
     """Return the rule with a number, from 1, as a sentence."""
     rest = "elsewhere" if number == 1 else "in what no rule before covers"
     text = f"{conditions_text(rule.conditions)}: right in {rule.text}; {rest} {rule.elsewhere.text}."
-    return f"{text} Fresh renders inside it: right in {rule.confirmed.text}." if rule.confirmed else text
+    if rule.confirmed is None:
+        return text
+    verdict = "confirmed" if rule.confirmed.held else "not confirmed"
+    return f"{text} Fresh renders inside it: right in {rule.confirmed.text}; {verdict}."
 
 
 def not_told_text(result: ExplainResult) -> str:
