@@ -49,6 +49,7 @@ class Tiny(nn.Module):
         layers += [nn.Conv2d(widths[-1], 64, 3, padding=1), nn.GroupNorm(4, 64), nn.SiLU()]
         layers += [nn.Conv2d(64, 64, 3, padding=2, dilation=2), nn.GroupNorm(4, 64), nn.SiLU()]
         self.features, self.head = nn.Sequential(*layers), nn.Conv2d(64, len(LABELS) + 4, 1)
+        assert self.head.bias is not None
         nn.init.constant_(self.head.bias[: len(LABELS)], -3.0)
 
     def forward(self, x: Tensor, targets: Sequence[Mapping[str, Tensor]] | None = None) -> Any:
@@ -89,7 +90,8 @@ def trained(folder: Path, scenes: int, views: int, epochs: int) -> str:
         controls={"texture": {}}, resolution=SIDE, measured=1, threads=1,
     )  # fmt: skip
     model = advsearch.load_model(Tiny(), task=make_task(TASK), labels=LABELS, input_size=SIDE, name="tiny")
-    work, pictures = SceneWork(config, model, splits_of(config, model)), []
+    work = SceneWork(config, model, splits_of(config, model))
+    pictures: list[Any] = []
     for number in range(scenes):
         problem, seed = work.problem(work.splits[TRAINING], number, ("texture",))
         pictures += examples(problem, seed, range(views))

@@ -98,7 +98,7 @@ def compared(renderer: Renderer) -> tuple[float, float]:
         ours.append((gradient * change).sum())
         ends = [{**inputs, name: pattern + sign * change} for sign in (-0.5, 0.5)]
         low, high = (
-            sum((scene.radiance(one, 100 + seed, 4 * SPP) * weight).sum() for seed in range(SEEDS)) / SEEDS
+            torch.stack([(scene.radiance(one, 100 + seed, 4 * SPP) * weight).sum() for seed in range(SEEDS)]).mean()
             for one in ends
         )
         theirs.append(high - low)

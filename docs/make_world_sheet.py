@@ -132,6 +132,7 @@ def searched_shirt(steps: int = 20) -> Any:
     for step in range(steps):
         at = u.clone().requires_grad_()
         model(render(at, step, 8)).reshape(-1).log_softmax(0)[book].neg().backward()
+        assert at.grad is not None
         u = (u - 0.08 * at.grad.sign()).clamp(0.0, 1.0)
     with torch.no_grad():
         return linear_to_srgb(render.space.inputs(u)["object.base_color"]).clamp(0.0, 1.0)

@@ -181,7 +181,7 @@ def finish(result: Result, text: Callable[[Any], str], *, as_json: bool) -> int:
 
 def go_on_text(result: Result) -> str:
     """Return how to go on with a run that was stopped; nothing of one that was not, or that is kept nowhere."""
-    run = getattr(result, "run", None)
+    run: Any = getattr(result, "run", None)
     stopped = run and result.goes_on and getattr(result, "ending", None) != "running"
     return f"\n\nGo on with: {go_on_command(run)}" if stopped else ""
 

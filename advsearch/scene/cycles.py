@@ -193,6 +193,7 @@ class Cycles:
                 ball = values.get(f"{lamp.name}.ball", torch.from_numpy(ball)).double().numpy()
                 color = values.get(f"{lamp.name}.radiance", torch.tensor(lamp.radiance))
             else:
+                assert isinstance(lamp, PointLamp)  # others are refused before
                 place[:3, 3] = values.get(f"{lamp.name}.position", torch.tensor(lamp.position)).numpy()
                 color = values.get(f"{lamp.name}.intensity", torch.tensor(lamp.intensity))
             if bool((color > 0.0).any()):

@@ -15,7 +15,8 @@ from advsearch.attacks.policies import POLICIES
 from advsearch.cli.main import main
 from advsearch.controls import OWN
 from advsearch.models.labels import SETS
-from advsearch.runs.directory import CONFIG, HEADER
+from advsearch.runs.directory import CONFIG
+from advsearch.settings import HEADER
 from advsearch.tasks import TASKS
 
 WRONG = """

@@ -17,6 +17,7 @@ import advsearch
 from advsearch.api.projection import write_projection
 from advsearch.controls import make_control
 from advsearch.controls.projector import AMBIENT, ProjectorControl, ambient_irradiance
+from advsearch.controls.space import Space
 from advsearch.errors import InputError
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.runs.images import read_png, write_png
@@ -38,6 +39,11 @@ SCENES = [("mug", "studio"), ("bowl", "kitchen"), ("bottle", "noon"), ("stop-sig
 def renderer_of(object: str = "mug", environment: str = "studio", side: int = SIDE, **settings: Any) -> Renderer:
     scene = advsearch.load_scene(object, environment=environment)
     return scene.renderer([make_control("projector", {"resolution": 16, **settings})], resolution=side)
+
+
+def space_of(renderer: Renderer) -> Space:
+    assert isinstance(renderer.space, Space)
+    return renderer.space
 
 
 def raw(renderer: Renderer, u: Tensor, spp: int) -> Tensor:
@@ -74,7 +80,9 @@ def test_white_puts_its_lumens_over_its_area_on_what_faces_it() -> None:
 
 
 def test_lux_are_those_of_the_place_where_it_has_a_unit() -> None:
-    lit = {name: renderer_of(object, name).space for object, name in (("stop-sign", "avenue-dusk"), ("mug", "studio"))}
+    lit = {
+        name: space_of(renderer_of(object, name)) for object, name in (("stop-sign", "avenue-dusk"), ("mug", "studio"))
+    }
     dusk, studio = (space.controls[0] for space in lit.values())
     assert isinstance(dusk, ProjectorControl) and isinstance(studio, ProjectorControl)
     assert dusk.ambient is not None and 5.0 < dusk.ambient < 50.0  # civil dusk
@@ -163,10 +171,10 @@ def test_beside_moving_lamps_and_textures_its_light_counts_once() -> None:
 def test_the_stored_png_throws_the_same_picture_and_texels_have_eight_bits(tmp_path: Path) -> None:
     renderer = renderer_of()
     u = torch.rand(len(renderer.start), generator=torch.Generator().manual_seed(3))
-    pattern = renderer.space.artifacts(u)["projector"]
+    pattern = space_of(renderer).artifacts(u)["projector"]
     file = write_png(tmp_path / "pattern.png", pattern)
     assert torch.equal(torch.from_numpy(read_png(file)), pattern)
-    lumens = next(one for one in renderer.space.controls[0].slots if one.parameter.name == "lumens").default
+    lumens = next(one for one in space_of(renderer).controls[0].slots if one.parameter.name == "lumens").default
     again = advsearch.load_scene("mug").renderer(
         [make_control("projector", {"picture": str(file), "lumens": [0, lumens]})], resolution=SIDE
     )
@@ -262,14 +270,14 @@ def test_the_result_says_in_which_ambient_light_it_ends(glare: advsearch.Model, 
 
 
 def test_the_export_has_the_picture_marks_and_what_to_set(tmp_path: Path) -> None:
-    settings = {"resolution": 4, "lumens": 10}
+    settings: dict[str, Any] = {"resolution": 4, "lumens": 10}
     config = AttackConfig(object="mug", controls={"projector": settings}, resolution=16)
     u = np.linspace(0.0, 1.0, 4 * 4 * 3)
     run = make_attacked(tmp_path / "run", config, u)
     notes = write_projection(run, tmp_path / "out")
     assert "10 lumens" in notes[0]
     texels = torch.from_numpy(read_png(tmp_path / "out" / "texels.png"))
-    assert torch.equal(texels, renderer_of(**settings).space.artifacts(torch.from_numpy(u).float())["projector"])
+    assert torch.equal(texels, space_of(renderer_of(**settings)).artifacts(torch.from_numpy(u).float())["projector"])
     marks, seen = (read_png(tmp_path / "out" / name) for name in ("marks.png", "seen.png"))
     assert marks.max() == 1.0 and marks.mean() < 0.1 and seen.shape == (16, 16, 3)
     assert {one.name for one in (tmp_path / "out").iterdir()} == {

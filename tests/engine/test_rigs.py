@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -40,7 +40,7 @@ class EachBlue(nn.Module):
 
     def forward(self, pictures: Tensor) -> Tensor:
         assert pictures.ndim == 4
-        return Blue()(pictures[:, None])
+        return cast(Tensor, Blue()(pictures[:, None]))
 
 
 def rig(folder: Path, text: str) -> str:
@@ -120,7 +120,8 @@ def test_an_attack_on_a_network_that_takes_all_pictures_is_found_and_verified(tm
     assert found.summary.ending == "found", found.summary
     assert tuple(found.adversarial.shape) == (24, 24 * cameras, 3)
     kept = found.summary.adversarial
-    assert kept is not None and len(kept.payload["pictures"]) == cameras
+    assert kept is not None and isinstance(kept.payload, dict)
+    assert len(cast("list[object]", kept.payload["pictures"])) == cameras
 
 
 def test_a_sweep_judges_each_picture_and_the_rig_by_its_rule(tmp_path: Path) -> None:

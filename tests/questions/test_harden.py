@@ -30,7 +30,7 @@ from advsearch.questions.harden import scenes as harden_scenes
 from advsearch.questions.harden.lessons import Lesson, RenderedLesson, TextureLesson
 from advsearch.questions.harden.result import QUICK, HardenConfig
 from advsearch.questions.harden.scenes import FURTHER, TRAINING, VALIDATION, Drawing, SceneWork
-from advsearch.questions.harden.training import ROUNDS, Course, Score
+from advsearch.questions.harden.training import ROUNDS, Course, Score, TrainingRounds
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.summary import read_result
 
@@ -205,6 +205,7 @@ def test_a_round_ends_with_the_part_of_the_way_that_is_best(
     monkeypatch.setattr("advsearch.questions.harden.training.score", judged)
     with RunDirectory.create_for(config) as run:
         work = work_of(config, run, Course(student, load(), config))
+        assert isinstance(work.rounds, TrainingRounds)
         work.rounds.keep(0, [], Score(1.0, 0.5), 0, 0.0)
         for loss, expected, looked_at in ((0.05, 0.4, 6), (0.2, 1.0, 2), (0.001, 0.25, 6)):
             judged_at.clear()

@@ -10,7 +10,7 @@ BLENDER_READS = {
     "an FBX model": ("bpy.ops.import_scene.fbx", (".fbx",)),
     "an Alembic scene": ("bpy.ops.wm.alembic_import", (".abc",)),
 }
-ASSIMP_READS = {
+ASSIMP_READS: dict[str, tuple[str, ...]] = {
     "a COLLADA model": (".dae", ".zae"),
     "a 3MF model": (".3mf",),
     "a 3D Studio model": (".3ds",),
