@@ -19,7 +19,7 @@ RUN pip install --no-cache-dir ${TORCH_INDEX:+--extra-index-url "$TORCH_INDEX"} 
     && advsearch doctor
 
 RUN useradd --create-home --uid 1000 advsearch
-USER advsearch
+USER 1000
 WORKDIR /home/advsearch
 ENTRYPOINT ["advsearch"]
 CMD ["--help"]

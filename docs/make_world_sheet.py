@@ -20,6 +20,7 @@ import torch
 from PIL import Image
 
 import advsearch
+from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.formation import to_8_bit
 
 SHEET = Path(__file__).resolve().parent / "images" / "world.webp"
@@ -121,13 +122,19 @@ def write_van(path: Path) -> None:
     path.write_text("\n".join(lines) + "\n")
 
 
-def searched_shirt() -> Any:
-    """Return the person's texture after a short search for a shirt that is taken for a book."""
-    found = advsearch.attack(
-        "person", "reference", environment="street", controls={"texture:shirt": {"epsilon": 0.7}}, target="book",
-        label="mug", resolution=96, spp=8, steps=20, trials=10, measure="no", baseline=False,
-    )  # fmt: skip
-    return found.artifacts["texture"]
+def searched_shirt(steps: int = 20) -> Any:
+    """Return the person's texture, sRGB, after a short search for a shirt that the reference model takes for a book."""
+    model = advsearch.load_model("reference")
+    book = model.labels.index("book")
+    scene = advsearch.load_scene("person", "street", settings={"camera.azimuth": 20.0, "camera.elevation": 6.0})
+    render = scene.renderer({"texture:shirt": {"epsilon": 0.6, "resolution": 32}}, resolution=96)
+    u = render.start.clone()
+    for step in range(steps):
+        at = u.clone().requires_grad_()
+        model(render(at, step, 8)).reshape(-1).log_softmax(0)[book].neg().backward()
+        u = (u - 0.08 * at.grad.sign()).clamp(0.0, 1.0)
+    with torch.no_grad():
+        return linear_to_srgb(render.space.inputs(u)["object.base_color"]).clamp(0.0, 1.0)
 
 
 def rendered(one: Asked, size: int, spp: int) -> Image.Image:
@@ -154,13 +161,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         own = Path(folder) / "van.obj"
         write_van(own)
         wanted = [one for one in asked(own, args.texture) if args.only in one.name]
-        if args.texture is None and any("texture" in one.scene for one in wanted):
-            shirt = searched_shirt()
-            wanted = [
-                one._replace(scene={**one.scene, "texture": shirt}) if "texture" in one.scene else one for one in wanted
-            ]
-        pictures = []
+        pictures, shirt = [], args.texture
         for one in wanted:
+            if "texture" in one.scene:
+                shirt = searched_shirt() if shirt is None else shirt
+                one = one._replace(scene={**one.scene, "texture": shirt})
             pictures.append(rendered(one, args.size, args.spp))
             print(one.name, file=sys.stderr, flush=True)
             if args.folder is not None:

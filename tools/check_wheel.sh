@@ -18,6 +18,7 @@ ls -l "$work"/*.whl
 cd "$work"
 "$work/venv/bin/advsearch" --help >/dev/null
 "$work/venv/bin/advsearch" doctor
+"$work/venv/bin/advsearch" attack --object mug --control light --steps 2 --trials 6 --resolution 32 --quiet
 "$work/venv/bin/python" - <<'PYTHON'
 import importlib.util
 import pathlib

@@ -82,8 +82,8 @@ FAULTS = (
     Fault(
         "mitsuba_backend: an sRGB colour is taken for a linear one",
         "advsearch/scene/mitsuba_backend/meshes.py",
-        '"base_color": _texture(srgb_to_linear(part.base_color)),',
-        '"base_color": _texture(part.base_color),',
+        '"base_color": texture(srgb_to_linear(part.base_color)),',
+        '"base_color": texture(part.base_color),',
         ("tests/scene/test_renderer.py", "tests/scene/test_exposure.py"),
     ),
     Fault(

@@ -92,15 +92,13 @@ class Findings:
 
 
 class Stages:
-    """Tells a watcher which stage runs, and keeps the seconds of each by name. The first began at `started`, by
-    `time.perf_counter`."""
+    """Tells a watcher which stage runs, and keeps the seconds of each by name."""
 
-    def __init__(self, progress: Progress, started: float | None = None) -> None:
+    def __init__(self, progress: Progress) -> None:
         self.progress = progress
-        self.started = time.perf_counter() if started is None else started
         self.seconds: dict[str, float] = {}
         self._name = ""
-        self._begun = self.started
+        self._started = self._begun = time.perf_counter()
 
     def begin(self, name: str, title: str, total: int | None = None, *, hint: str = "", at_most: bool = False) -> None:
         """End the stage before and begin another; a `name` that comes twice adds up. The rest: `Progress.stage`."""
@@ -115,7 +113,7 @@ class Stages:
 
     @property
     def total(self) -> float:
-        return time.perf_counter() - self.started
+        return time.perf_counter() - self._started
 
 
 LOST = "(no answer)"
@@ -244,16 +242,12 @@ class Results:
         """Return the JSON value that is stored under a key, or what `measure` returns in time, and store it."""
         stored = self.stored(key)
         if stored is None:
-            self.check_time()
+            if self.made and time.monotonic() >= self._end:
+                raise OutOfTime
             self.made += 1
             stored = json.loads(json.dumps(measure()))
             self.put(key, stored)
         return stored
-
-    def check_time(self) -> None:
-        """Raise `OutOfTime` where there is no time for another measurement."""
-        if self.made and time.monotonic() >= self._end:
-            raise OutOfTime
 
     def value(self, key: str, kind: type[Measured], measure: Callable[[], Measured]) -> Measured:
         """Return what `measure` returns, or what is stored of this kind (a dataclass, or a list of some); as `get`."""

@@ -69,13 +69,12 @@ def load_model(
     Options left at None take what the model says of itself, else the defaults named here.
 
     Args:
-        spec: ``"reference"`` (the bundled classifier), with ``"@weights.safetensors"`` if wanted; a path to a
-            `torch.export` archive (.pt2) or to TorchScript; ``"package.module:callable"``, which returns an `nn.Module`
-            or a `Model`, with ``"@weights.safetensors"`` if wanted; ``"torchvision:NAME@weights.safetensors"``; the
-            address of a model that only answers, ``"http://..."`` or ``"https://..."`` (docs/addresses.md); an
-            `nn.Module` (copied, its weights shared, unless they were made in `torch.inference_mode`); a `Model`.
-        labels: the label names in index order, or a label file (see `read_labels`). Default "class 0", "class 1", ...
-            A network that compares pictures with texts has no classes but these.
+        spec: ``"reference"`` (the bundled classifier); a path to a `torch.export` archive (.pt2) or to TorchScript;
+            ``"package.module:callable"``, which returns an `nn.Module` or a `Model`; ``"torchvision:NAME"`` and the
+            like, all with ``"@weights.safetensors"`` if wanted; an address, ``"https://..."`` (docs/addresses.md); an
+            `nn.Module` (copied, its weights shared, unless made in `torch.inference_mode`); a `Model`.
+        labels: the names in index order, or a label file (see `read_labels`), which a network that compares pictures
+            with texts needs. Default "class 0", "class 1", ...
         prompt: of such a network: the text that each name is put into, with ``{}`` in its place; several (a list, or
             with | between them) are averaged. Default `advsearch.models.labels.PROMPT`.
         name: what to call it in messages and results.
@@ -88,10 +87,8 @@ def load_model(
         max_batch: the most images at once; default 64, or what the program allows.
         read: what finds the output in what the network returns for so many images, where it is not logits: a tensor (N,
             ...) or a list of N things.
-        task: what the model is to do, as in `attack`: its name ("detection"), a mapping with its name and options, or
-            the task itself. It says how outputs are read. Default: classification, unless there is `read`.
-        ask: of a model behind an address: the most `calls` (2000), `tokens` and `money`; prices `per_call`,
-            `per_million_in` and `per_million_out`; `seconds` that an answer may take (120).
+        task: as in `attack`. It says how outputs are read. Default: classification, unless there is `read`.
+        ask: ceilings and prices of a model behind an address (docs/addresses.md).
 
     Raises:
         UnknownNameError: `spec` is a name that means nothing; near matches are given.

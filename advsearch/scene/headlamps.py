@@ -142,10 +142,10 @@ def _lamps_of(scene: SceneDescription, carrier: str, kind: str, unit: float, wei
             low, high = vertices[there].min(axis=0), vertices[there].max(axis=0)
             places.append(np.array([high[0] + 5.0 * OUT * step, *(low + high)[1:] / 2.0]))
     red, green, blue = map(float, WHITE / (unit * scene.metres**2))
-    for side, place in zip(("left", "right"), places, strict=True):
+    for name, place in zip(("left", "right"), places, strict=True):
         seat = np.eye(4)
         seat[:3] = np.stack([(0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (1.0, 0.0, 0.0), place], axis=1)
-        yield BeamLamp(f"{carrier}-{side}-beam", carrier, seat, table(kind), (red, green, blue), weight)
+        yield BeamLamp(f"{carrier}-{name}-beam", carrier, seat, table(kind), (red, green, blue), weight)
 
 
 def _glass(part: MeshPart, where: str, ahead: float, step: float, power: Doubles) -> LampGlass:
@@ -194,7 +194,7 @@ def _disks(mesh: Mesh, where: str, ahead: float, step: float) -> tuple[Doubles, 
     (height, share), wide = HEIGHTS[where], high[1] - low[1]
     turn = ahead * np.linspace(0.0, 2.0 * np.pi, SPOKES, endpoint=False)
     rim = min(RADIUS * step, 0.1 * wide) * np.stack([0.0 * turn, np.cos(turn), np.sin(turn)], axis=1)
-    vertices, faces = [], []
+    vertices, faces = list[Doubles](), list[Ints]()
     for side in (1.0, -1.0):
         middle = np.array([0.0, (low[1] + high[1]) / 2.0 + side * ASIDE * wide, low[2]])
         middle[2] += min(height * step, share * (high[2] - low[2]))

@@ -140,7 +140,8 @@ def test_the_adversarial_object_is_read_back(run: Path, tmp_path: Path, capsys: 
     world, own = inputs["object.vertices"].numpy(), description.meshes["object"]
 
     read = trimesh.load(out, process=False, force="mesh")
-    np.testing.assert_array_equal(read.vertices[:, [0, 2, 1]] * (1, -1, 1), world)
+    metres = world * description.object.metres  # glTF is in metres
+    np.testing.assert_allclose(read.vertices[:, [0, 2, 1]] * (1, -1, 1), metres, rtol=1e-6, atol=1e-9)
     np.testing.assert_array_equal(read.faces, own.mesh.faces)
     np.testing.assert_allclose(read.visual.uv, own.mesh.uvs, atol=1e-6)
     np.testing.assert_array_equal(np.array(read.visual.material.baseColorTexture)[..., :3], texture)

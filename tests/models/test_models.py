@@ -711,7 +711,7 @@ def test_safetensors_alone_are_not_a_model(tmp_path: Path) -> None:
 def test_unknown_names() -> None:
     with pytest.raises(UnknownNameError, match=r"unknown model 'referense'. Did you mean 'reference'"):
         load_model("referense")
-    known = "Known: hf:REPOSITORY, reference, timm:NAME, torchvision:NAME"
+    known = "Known: hf:REPOSITORY, http://ADDRESS, https://ADDRESS, reference, timm:NAME, torchvision:NAME"
     with pytest.raises(UnknownNameError, match=rf"{known}.* library: 'torchvision:resnet50' or 'timm:resnet50'. A mod"):
         load_model("resnet50")
     with pytest.raises(InputError, match=r"write 'nets:build', without the '.py'"):

@@ -123,8 +123,8 @@ def test_the_ground_ahead_has_the_lux_of_both_headlamps() -> None:
         renderer = rendered(one, 96)
         found.append(renderer.radiance(renderer.start, 3, 64).numpy() @ np.array(LUMINANCE))
     seen, described = renderer.surfaces(renderer.start), lit.description
-    camera = described.lamps["camera-left-beam"].to_world
-    place = 0.5 * (camera + described.lamps["camera-right-beam"].to_world)[:3, 3] * described.metres
+    camera, right = (lamp.to_world for lamp in beams(described))
+    place = 0.5 * (camera + right)[:3, 3] * described.metres
     assert place[2] == pytest.approx(EGO[2]) and camera[:3, 2] == pytest.approx([1.0, 0.0, 0.0], abs=1e-6)
     eye = place - [EGO[0], 0.0, EGO[2] - 1.3]
     # from depth to places: the picture's rows are at known angles below the camera's axis, its middle column ahead
@@ -220,14 +220,8 @@ def test_lamps_go_with_what_carries_them(control: str) -> None:
 
 @pytest.mark.slow
 def test_a_texture_in_a_beam_has_the_gradient_of_differences() -> None:
-    given = {
-        "camera.distance": 9.0,
-        "camera.height": 1.3,
-        "camera.azimuth": 180.0,
-        "camera.lamps": "low",
-        "camera.ev": 6.0,
-    }
-    renderer = scene(**{**given, **LOW}).renderer({"texture": {"resolution": 4}}, resolution=16, denoise="none")
+    given = {**FRONT, **LOW, "camera.azimuth": 180.0, "camera.lamps": "low", "camera.ev": 6.0}
+    renderer = scene(**given).renderer({"texture": {"resolution": 4}}, resolution=16, denoise="none")
     at = 0.1 + 0.8 * renderer.start
     _, slope = renderer.gradient(torch.mean, at, 0, 1024)
     step = torch.full_like(at, 0.05)
