@@ -104,6 +104,11 @@ def hardened(
     config = asked.config
     asked.progress.stage(LOADING)
     check_run_settings(config)
+    finds = config.task_name == "detection"
+    if not finds and (config.task_name != "classification" or config.data or loss):
+        raise InputError("task: harden trains for classification and detection; `data` and `loss` are of detection")
+    if finds:
+        check_detector(config, beside)
     try:
         (loaded, *_), warnings = load_models([model or config.model], make_task(config.task), config)
     except ModelError as error:
@@ -111,11 +116,6 @@ def hardened(
             raise
         said = str(error).partition(": use `task=")[0]
         raise ModelError(f"{said}; harden trains classifiers and, with `task=detection`, detectors") from error
-    finds = config.task_name == "detection"
-    if not finds and (config.task_name != "classification" or config.data or loss):
-        raise InputError("task: harden trains for classification and detection; `data` and `loss` are of detection")
-    if finds:
-        check_detector(config, beside)
     work = SceneWork(config, loaded, scenes.splits_of(config, loaded))
     course: Course | DetectorRounds
     if finds:

@@ -228,7 +228,10 @@ def claims(result: SweepSummary) -> Iterator[Claim]:
     if far := distance_of(result):
         yield claim("measured", distance_sentence(far), None)
     for drive in result.drives or ():
-        told = [f"{name}: {mean} (95 % interval {ends}), {least}" for name, mean, ends, least in drive_rows(drive)]
+        told = [
+            f"{name}: {mean}{'' if ends == '-' else f' (95 % interval {ends})'}, {least}"
+            for name, mean, ends, least in drive_rows(drive)
+        ]
         heads = "mean, with its interval over drives, then the worst drive"
         yield claim("measured", f"{drive_title(drive)} ({heads}): {'; '.join(told)}.", None)
     worst = result.worst.verified if result.worst else None
