@@ -174,7 +174,9 @@ def test_the_stored_png_throws_the_same_picture_and_texels_have_eight_bits(tmp_p
     pattern = space_of(renderer).artifacts(u)["projector"]
     file = write_png(tmp_path / "pattern.png", pattern)
     assert torch.equal(torch.from_numpy(read_png(file)), pattern)
-    lumens = next(one for one in space_of(renderer).controls[0].slots if one.parameter.name == "lumens").default
+    (thrown,) = space_of(renderer).controls
+    assert isinstance(thrown, ProjectorControl)
+    lumens = next(one for one in thrown.slots if one.parameter.name == "lumens").default
     again = advsearch.load_scene("mug").renderer(
         [make_control("projector", {"picture": str(file), "lumens": [0, lumens]})], resolution=SIDE
     )

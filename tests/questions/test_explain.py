@@ -163,7 +163,7 @@ def test_fresh_pictures_vary_as_the_sweep_did_and_count_beyond_the_rules_before(
         CountedRule((RuleCondition("camera.elevation", low=70.0),), whole[above], whole[~above]),
         CountedRule((RuleCondition("camera.elevation", low=50.0),), whole[~below & ~above], whole[below]),
     ]
-    asked = SimpleNamespace(
+    asked: Any = SimpleNamespace(
         config=SimpleNamespace(confirm=20, seed=0), progress=NullProgress(), run=SimpleNamespace(path=tmp_path)
     )
     renders = explaining.Renders(asked, [explaining.AskedSweep.of(swept)], rows, whole)

@@ -103,9 +103,9 @@ def test_an_angle_that_goes_round_has_rules_through_0_and_of_both_ends(seed: int
         find_rules(*halves(around(law, seed), seed), seed=seed).told[0].conditions
         for law in ("in front", "end-on", "end-on and far")
     )
-    assert (front[0].turn, front[0].low, front[0].high) == (360.0, pytest.approx(335, abs=8), pytest.approx(25, abs=8))
-    assert (end_on[0].turn, end_on[0].low) == (180.0, pytest.approx(160, abs=8))
-    assert end_on[0].high == pytest.approx(20, abs=8) and len(front) == len(end_on) == 1
+    for (found, *_), expected in ((front, (360, 335, 25)), (end_on, (180, 160, 20))):
+        assert [found.turn, found.low, found.high] == pytest.approx(expected, abs=8)
+    assert len(front) == len(end_on) == 1
     assert [one.factor for one in far] == ["camera.azimuth", "camera.distance"] and far[0].turn == 180.0
     assert far[1].low == pytest.approx(30, abs=6)
     assert find_rules(*halves(around("none", seed), seed), seed=seed).told == []

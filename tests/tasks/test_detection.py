@@ -350,7 +350,7 @@ def test_a_task_learns_names_size_and_unit_from_its_model() -> None:
     assert task.judge(output, at)[0].right, "2 to 6 of 16 are 4 to 12 of 32"
     unnamed = Detection(unit="fractions").on(load_model(Pixels(), input_size=(8, 16), read=Detection().reader))
     assert unnamed.labels == ("class 0", "class 1", "class 2") and unnamed.unit == "fractions"
-    facts = Facts("mug", "#2", look=lambda: Sight(torch.ones(4, 4).bool(), *2 * [torch.ones(4, 4)]))
+    facts = Facts("mug", "#2", look=lambda: Sight(torch.ones(4, 4).bool(), torch.ones(4, 4), torch.ones(4, 4)))
     assert unnamed.truth(facts) == Place((2,), (0, 0, 4, 4), (4, 4))
     assert Detection().on(load_model(replace(model, labels=()), labels=NAMES)).labels == NAMES, "named afterwards"
     with pytest.raises(InputError, match="labels: 2 labels, but model Pixels has 3 classes"):

@@ -62,7 +62,8 @@ class Middle(nn.Module):
 
 
 def seen(rows: list[list[int]]) -> Facts:
-    return Facts("mug", look=lambda: Sight(torch.tensor(rows).bool(), *2 * [torch.tensor(rows).float()]))
+    there = torch.tensor(rows)
+    return Facts("mug", look=lambda: Sight(there.bool(), there.float(), there.float()))
 
 
 def test_a_box_holds_what_is_seen() -> None:

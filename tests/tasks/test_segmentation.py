@@ -149,7 +149,7 @@ def test_a_task_learns_names_from_its_model() -> None:
     model = load_model(Mapped(), input_size=4, read=Segmentation().reader, labels=NAMES)
     task = Segmentation().on(model, target="chair")
     assert (task.labels, task.target) == (NAMES, (2,)) and model.differentiable
-    facts = Facts("bottle", None, "bottle", look=lambda: Sight(MASK, *2 * [torch.ones(MASK.shape)]))
+    facts = Facts("bottle", None, "bottle", look=lambda: Sight(MASK, torch.ones(MASK.shape), torch.ones(MASK.shape)))
     truth = task.truth(facts)
     assert truth.labels == TRUTH.labels and torch.equal(truth.mask, TRUTH.mask)
     assert task.truth_names(TRUTH) == ("bottle",)

@@ -10,7 +10,7 @@ BLENDER_READS = {
     "an FBX model": ("bpy.ops.import_scene.fbx", (".fbx",)),
     "an Alembic scene": ("bpy.ops.wm.alembic_import", (".abc",)),
 }
-ASSIMP_READS: dict[str, tuple[str, ...]] = {
+ASSIMP_READS = {
     "a COLLADA model": (".dae", ".zae"),
     "a 3MF model": (".3mf",),
     "a 3D Studio model": (".3ds",),
@@ -66,8 +66,8 @@ def advice(path: Path) -> str | None:
             steps = f"bpy.ops.wm.read_factory_settings(use_empty=True); {operator}(filepath={json.dumps(name)})"
             script = f"import bpy; {steps}; bpy.ops.export_scene.gltf(filepath={json.dumps(f'{path.stem}.glb')})"
             return f"{what}: make glTF of it, with Blender: blender -b --python-expr {shlex.quote(script)}"
-    for what, endings in ASSIMP_READS.items():
-        if ending in endings:
+    for what, suffixes in ASSIMP_READS.items():
+        if ending in suffixes:
             names = " ".join(map(shlex.quote, (name, f"{path.stem}.obj")))
             return f"{what}: make an .obj of it, with assimp (Open Asset Import Library): assimp export {names}"
     if ending in (".step", ".stp", ".iges", ".igs", ".brep"):
