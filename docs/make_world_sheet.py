@@ -3,7 +3,7 @@
 python docs/make_world_sheet.py [--size 300] [--spp 64] [--texture shirt.png] [--folder FOLDER]
 
 All pictures of the avenue have an absolute exposure. The shirt is searched by a short attack, unless `--texture` names
-one that an attack has found. `--folder` keeps each picture by itself as well.
+one that an attack has found. `--folder` keeps each picture by itself, and takes those that are there.
 """
 
 from __future__ import annotations
@@ -57,7 +57,11 @@ def asked(own_car: Path, shirt: Any) -> Iterator[Asked]:
     for light, turn in (("day", 32.0), ("night", 28.0)):
         environment, given = LIGHTS[light]
         view = {"camera.distance": 9.0, "camera.azimuth": turn, "camera.elevation": 9.0, **given, "camera.lamps": "off"}
-        yield Asked(f"own-{light}", {"object": own_car, "size": 5.1, "environment": environment, "settings": view}, {})
+        yield Asked(
+            f"own-{light}",
+            {"object": own_car, "up": "z", "size": 5.1, "environment": environment, "settings": view},
+            {},
+        )
     for light, lamps in (("day", "off"), ("night", "low")):
         environment, given = LIGHTS[light]
         view = {
@@ -67,7 +71,7 @@ def asked(own_car: Path, shirt: Any) -> Iterator[Asked]:
             **given,
             "camera.lamps": "off",
         }
-        things = f"car@9,3.5,heading=180,lamps={lamps}; person@4,-2.8,heading=-20"
+        things = f"car@-8,3.5,heading=180,lamps={lamps}; person@3,-2.8,heading=-20"
         yield Asked(
             f"two-{light}", {"object": "car", "environment": environment, "settings": view, "things": things}, {}
         )
@@ -75,7 +79,7 @@ def asked(own_car: Path, shirt: Any) -> Iterator[Asked]:
     wet |= {"camera.elevation": 7.0, "camera.lamps": "off"}
     yield Asked(
         "wet-night",
-        {"object": "car", "environment": "avenue-night", "settings": wet, "things": "car@9,3.5,heading=180,lamps=high"},
+        {"object": "car", "environment": "avenue-night", "settings": wet, "things": "car@-8,3.5,heading=180,lamps=low"},
         {},
     )
     for name, pose in POSES.items():
@@ -155,7 +159,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--size", type=int, default=300, help="side of one picture, pixels (default 300)")
     parser.add_argument("--spp", type=int, default=64, help="samples per pixel (default 64)")
     parser.add_argument("--texture", type=Path, help="of the person; by default a shirt is searched")
-    parser.add_argument("--folder", type=Path, help="each picture goes there too, by its name")
+    parser.add_argument("--folder", type=Path, help="pictures go there by their names; those that are there are taken")
     parser.add_argument("--only", default="", help="pictures whose names contain this, and no sheet")
     args = parser.parse_args(argv)
     with tempfile.TemporaryDirectory() as folder:
@@ -164,14 +168,18 @@ def main(argv: Sequence[str] | None = None) -> int:
         wanted = [one for one in asked(own, args.texture) if args.only in one.name]
         pictures, shirt = [], args.texture
         for one in wanted:
+            kept = None if args.folder is None else args.folder / f"{one.name}.png"
+            if kept is not None and kept.is_file():
+                pictures.append(Image.open(kept).resize((args.size, args.size)))
+                continue
             if "texture" in one.scene:
                 shirt = searched_shirt() if shirt is None else shirt
                 one = one._replace(scene={**one.scene, "texture": shirt})
             pictures.append(rendered(one, args.size, args.spp))
             print(one.name, file=sys.stderr, flush=True)
-            if args.folder is not None:
-                args.folder.mkdir(parents=True, exist_ok=True)
-                pictures[-1].save(args.folder / f"{one.name}.png")
+            if kept is not None:
+                kept.parent.mkdir(parents=True, exist_ok=True)
+                pictures[-1].save(kept)
     if not args.only:
         sheet = Image.new("RGB", (COLUMNS * args.size, -(-len(pictures) // COLUMNS) * args.size))
         for number, picture in enumerate(pictures):
