@@ -6,6 +6,7 @@ from advsearch.api.render import load_model as load_model
 from advsearch.api.render import load_run as load_run
 from advsearch.attacks.evaluation import Policy as Policy
 from advsearch.controls.base import Control as Control
+from advsearch.engine.gradients import Loss
 from advsearch.engine.judging import Metric
 from advsearch.engine.loading import Controls
 from advsearch.engine.loading import Scene as Scene
@@ -98,6 +99,8 @@ def attack(
     aov: str | Path | None = ...,
     log: Literal['mlflow', 'tensorboard', 'wandb'] | None = ...,
     path: str | Path | None = ...,
+    shutter: float | None = ...,
+    rolling: float | None = ...,
     draws: int | None = ...,
     average: int = ...,
     baseline: bool = ...,
@@ -245,6 +248,8 @@ def gap(
     minimise: bool = ...,
     over: Controls = ...,
     path: str | Path | None = ...,
+    shutter: float | None = ...,
+    rolling: float | None = ...,
     draws: int | None = ...,
     average: int = ...,
     baseline: bool = ...,
@@ -259,6 +264,7 @@ def harden(
     *,
     optimiser: MakeOptimiser | None = ...,
     beside: Examples | None = ...,
+    loss: Loss | None = ...,
     resume: bool = ...,
     progress: Watched = ...,
     object: Path | Names = ...,
@@ -269,6 +275,7 @@ def harden(
     labels: Path | Names | None = ...,
     prompt: Path | Names | None = ...,
     ask: Mapping[str, Any] = ...,
+    task: str | Path | Mapping[str, Any] = ...,
     controls: Controls = ...,
     texture_resolution: int | None = ...,
     spp: Union[int, Literal['auto'], None] = ...,
@@ -291,6 +298,7 @@ def harden(
     cluster: str | Path | None = ...,
     held_out: Path | Names | None = ...,
     held_out_environment: Path | Names | None = ...,
+    data: str | Path | None = ...,
     layers: Literal['all', 'last'] = ...,
     rounds: int = ...,
     scenes: int = ...,
@@ -465,6 +473,8 @@ def sweep(
     sampler: Literal['sobol', 'random'] = ...,
     batch: int = ...,
     path: str | Path | None = ...,
+    shutter: float | None = ...,
+    rolling: float | None = ...,
     fps: float = ...,
     keep_pictures: Literal['all', 'wrong', 'none'] = ...,
     specialise: bool = ...,

@@ -52,6 +52,7 @@ PAIRS = (
     ("bowl", "kitchen", "material"),
     ("bottle", "noon", "environment"),
     ("mug", "studio", "light"),
+    ("mug", "studio", "projector"),
     ("bowl", "noon", "camera"),
     ("bottle", "kitchen", "pose"),
 )

@@ -46,6 +46,7 @@ SCENES: Mapping[str, tuple[str, str | None, dict[str, float]]] = {
     "sky": ("bowl", None, {}),
     "background": ("wine-glass", "studio", {}),
     "camera": ("teapot", "day-room", {}),
+    "shadow": ("mug", "low-sun", {"environment.rotation": -30.0}),
     "path": ("teapot", "day-room", {}),
     "occlusion": ("teapot", "kitchen", {}),
     "body": ("person", "street", {"camera.elevation": 6.0, "camera.azimuth": 30.0}),
@@ -68,6 +69,8 @@ CONTROLS: Mapping[str, Mapping[str, Any]] = {
         "mitsuba:ground.bsdf.brdf_0.reflectance.value": [0.01, 0.6],
         "mitsuba:environment.scale": [0.3, 2.0],
     },
+    "projector": {"projector": {"resolution": 16, "lumens": 4}},
+    "shadow": {"shadow": {"size": [0.3, 0.6], "distance": 1.0}},
     "sensor": {
         "sensor": {"shot": [0.0, 0.15], "mosaic": [0, 1], "red": [-1, 1], "blue": [-1, 1], "compression": [0, 95]}
     },

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -55,6 +56,7 @@ class StandInProblem:
     on_evaluation: Callable[[], None] = lambda: None
     domain: Domain = field(default_factory=lambda: Domain(torch.full((6,), 0.5), (Block(4, "linf", 0.2), Block(2))))
     conditions: None = None
+    searched_space: Any = field(default_factory=lambda: SimpleNamespace(controls=()))
     rule: Rule = WORST_CASE
     spp: int = 4
     search_depth: int | None = None

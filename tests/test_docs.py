@@ -57,6 +57,7 @@ from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row
 from advsearch.scene import environments, library
 from advsearch.scene.importing.scenes import MITSUBA_FILE, split_node
+from advsearch.scene.rig import read_rig
 from advsearch.scene.settings import resolve
 from advsearch.settings import Config, parse_assignment, read_yaml
 from advsearch.tasks import make_task
@@ -151,7 +152,9 @@ def check_names(config: Config) -> None:
         assert config.recipe in ("list", "mine.yaml") or planned(read_recipe(config.recipe), config)
         return
     assert isinstance(config, SceneConfig)
-    check_run_settings(config.model_copy(update={"path": None}) if config.command == "sweep" else config)
+    check_run_settings(
+        config.model_copy(update=dict.fromkeys(("path", "shutter", "rolling"))) if config.command == "sweep" else config
+    )
     given_to(config, config.controls)
     resolve(config.set_)
     lights = config.environments if isinstance(config, SweepConfig) else (config.lit_by,)
@@ -237,6 +240,9 @@ def test_every_yaml_example_is_a_configuration(page: Path, tmp_path: Path) -> No
             suite = read_suite(path)
             for name in suite.claims:
                 check_names(AttackConfig.of(suite.config_of(name)))
+            continue
+        if "cameras" in read_yaml(path):
+            assert len(read_rig(str(path))) > 1
             continue
         if "parts" in read_yaml(path):
             read_recipe(str(path))

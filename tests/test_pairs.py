@@ -46,6 +46,8 @@ FORMS: dict[str, dict[str, Any]] = {
     "texture": {"resolution": 4, "epsilon": 0.4},
     "material": {"which": ["wood", "steel"], "red": [0.3, 1.0]},
     "light": {"power": [2, 8], "x": [-2, 2], "red": [0.5, 1.0]},
+    "projector": {"resolution": 4, "lumens": [1, 40], "elevation": [10, 60]},
+    "shadow": {"size": [0.1, 0.8], "x": [-0.5, 0.5]},
     "environment": {"which": ["own", "noon", "kitchen"], "rotation": [0, 300], "exposure": [-1, 1]},
     "sky": {"azimuth": [0, 300], "elevation": [10, 80]},
     "geometry": {"modes": 4, "epsilon": 0.1},
@@ -67,6 +69,8 @@ EXCLUSIVE |= {frozenset(("contents", "body"))}
 ALL = [(one,) for one in FORMS] + [
     pair for pair in itertools.combinations(FORMS, 2) if frozenset(pair) not in EXCLUSIVE
 ]
+PICTURES = ("patch", "projector")
+"""Controls with a picture, of which a row has no values."""
 QUICK = ["camera-occlusion", "pose-contents", "material-patch"]
 """Pairs in which one control goes by what the other does, or both meet in one input; the others take minutes."""
 
@@ -160,8 +164,8 @@ def assert_true_of_fixed_values(
         kind, parameter, *number = name.split(".")
         if not number and parameter in {one.name for one in CONTROLS[kind].parameters}:
             named.setdefault(kind, {})[parameter] = value["value"]
-        elif kind == "patch" or (number and parameter in {one.name for one in CONTROLS[kind].parameters}):
-            return  # one number of many cannot be fixed alone, and neither can the picture of a patch
+        elif kind in PICTURES or (number and parameter in {one.name for one in CONTROLS[kind].parameters}):
+            return  # one number of many cannot be fixed alone, and neither can a picture
     description = framed(scene.description, SIZE)
     space = compose([make_control(kind, given) for kind, given in named.items()], description)
     renderer = make_renderer(description, space, SIZE, "none", 3)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from advsearch import rooms
 from advsearch import threads as threads  # before torch: it sets how OpenMP waits
+from advsearch.api.names import check_names
 from advsearch.runs.directory import begun
 from advsearch.runs.results import Result
 
@@ -34,6 +35,7 @@ def carry_out(config: Config, *, progress: Progress | None = None, resumed: Path
     Raises:
         InputError: anything that whoever asked can put right; nothing is written then.
     """
+    check_names(config)
     keeps_run = resumed is None and getattr(config, "out", None) is None
     with begun(config) if keeps_run else nullcontext(resumed) as folder:  # before what is heavy is imported
         room = rooms.room(config.command)

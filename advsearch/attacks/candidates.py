@@ -315,14 +315,14 @@ def smallest(search: Search, passes: Passes, domain: Domain, likely: Likely | No
     return state
 
 
-def confirmed(bracket: Bracket, passes: Passes, domain: Domain, *, times: int = 2, attempts: int = ATTEMPTS) -> Bracket:
+def confirmed(bracket: Bracket, passes: Passes, domain: Domain, *, times: int = 2) -> Bracket:
     """Return the bracket with its upper end moved out until the configuration there passes so many times in a row: what
     lies exactly on the edge passes its trials by chance. So it is tried again with new seeds; where it fails, the
-    change grows by a fortieth, in so many `attempts`, the last of which is returned untried."""
+    change grows by a fortieth, in `ATTEMPTS`, the last of which is returned untried."""
     if bracket.u is None:
         return bracket
     edge, reached, at = bracket.u, bracket.high, 1.0
-    for _ in range(attempts):
+    for _ in range(ATTEMPTS):
         if all(passes(bracket.u, bracket.checks + again) for again in range(times)):
             return replace(bracket, checks=bracket.checks + times, confirmed=True)
         at *= math.sqrt(RATIO)

@@ -236,9 +236,7 @@ MarginsOf = Callable[[int, Sequence[int]], Sequence[float]]
 """(spp, seeds) -> margins in logits, one of each render."""
 
 
-def margins_of(
-    evaluate: Evaluate, kind: str, u: Tensor, *, sought: bool = True, keep: int = 0, drawn: bool = False
-) -> MarginsOf:
+def margins_of(evaluate: Evaluate, kind: str, u: Tensor, *, keep: int = 0, drawn: bool = False) -> MarginsOf:
     """Return the margins of one configuration under the conditions that the scene comes with, or under those `drawn` by
     the seeds; the rows of all sample counts are numbered together, and the first `keep` pictures of each are wanted."""
     made = Counter[int]()
@@ -247,10 +245,7 @@ def margins_of(
         numbers = range(made[spp], made[spp] + len(seeds))
         asked = enumerate(zip(seeds, numbers, strict=True), made.total())
         made[spp] += len(seeds)
-        queries = [
-            Query(u, seed, kind, row, spp=spp, drawn=drawn, sought=sought, keep=number < keep)
-            for row, (seed, number) in asked
-        ]
+        queries = [Query(u, seed, kind, row, spp=spp, drawn=drawn, keep=number < keep) for row, (seed, number) in asked]
         return [evaluation.said.score for evaluation in evaluate(queries)]
 
     return margins

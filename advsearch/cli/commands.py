@@ -211,7 +211,7 @@ for _name in set(made_questions()).difference(*GROUPS.values()):
 COMMANDS = {name: place for group in GROUPS.values() for name, place in group.items() if place or name in rooms()}
 
 
-def found(name: str) -> Any:
+def command_named(name: str) -> Any:
     """Return what adds the arguments of a command and runs it: its `QuestionCommand` or `Command`, or a module."""
     if COMMANDS[name]:
         place, _, attribute = COMMANDS[name].partition(" ")[0].partition(":")
@@ -233,6 +233,6 @@ def help_of(name: str) -> str:
 
 def texts_of(name: str) -> tuple[str, tuple[str, ...]]:
     """Return what the help of a command says after what it does, and its examples."""
-    module = found(name) if COMMANDS[name] or made_question(name) else importlib.import_module(f"{ROOM}{name}")
+    module = command_named(name) if COMMANDS[name] or made_question(name) else importlib.import_module(f"{ROOM}{name}")
     more = getattr(module, "more", getattr(module, "MORE", ""))
     return more, getattr(module, "examples", getattr(module, "EXAMPLES", ()))

@@ -60,18 +60,9 @@ class Component:
 
 def _doctor(args: argparse.Namespace) -> int:
     print("advsearch: trying every part, a first render among them; that takes some seconds", file=sys.stderr)
-    return told(as_json=args.json)
-
-
-def told(as_json: bool = False) -> int:
-    """Check every part and print the list: a table for a person, one JSON value with `as_json`.
-
-    Returns:
-        0 when everything that is necessary works, 3 otherwise.
-    """
     parts = diagnose()
     good = all(part.status in (OK, WARNING) for part in parts)
-    if as_json:
+    if args.json:
         outcome = {"schema": 1, "command": "doctor", "ok": good, "parts": [asdict(part) for part in parts]}
         print(json.dumps(outcome, indent=2))
     else:

@@ -71,6 +71,14 @@ def _mitsuba(args: argparse.Namespace, out: Path) -> Written:
     return {"notes": notes}, " ".join([f"The scene is in {out}.", *notes])
 
 
+def _projector(args: argparse.Namespace, out: Path) -> Written:
+    with at_work(as_json=True, quiet=False):
+        from advsearch.api.projection import write_projection  # takes seconds
+
+        notes = write_projection(args.run, out)
+    return {"notes": notes}, "\n".join([f"What to project is in {out}. Set:", *notes])
+
+
 USUAL_SIZE = 100.0
 """Longest side of a printed object whose size is not known, in millimetres."""
 
@@ -124,6 +132,10 @@ WRITERS = {
     "print": Writer(
         "A patch or texture as sheets to print.", "a PDF file",
         "export mug-patch-001 --format print --size 95 --out sheets.pdf", _print, "pdf",
+    ),
+    "projector": Writer(
+        "A projector's picture, and marks to line it up.", "a new folder",
+        "export mug-projector-001 --format projector --out folder", _projector,
     ),
     "3db": Writer(
         "A sweep as a folder for 3DB's dashboard.", "a folder", "export mug-sweep-001 --format 3db --out folder",

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from typing import Any, NoReturn, cast
 
 from advsearch import __version__
-from advsearch.cli.commands import COMMANDS, GROUPS, found, help_of, texts_of
+from advsearch.cli.commands import COMMANDS, GROUPS, command_named, help_of, texts_of
 from advsearch.cli.output import BAD_INPUT, INTERRUPTED, OK, end_output, open_descriptors, screens, shortened
 from advsearch.errors import AdvsearchError, InputError, UnknownNameError
 from advsearch.interrupts import INTERRUPTS, end_at_the_second, unless_interrupted
@@ -49,13 +49,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     return status
 
 
-def _interruptible(given: list[str]) -> int:
+def _interruptible(words: list[str]) -> int:
     """As `_status`, with Ctrl-C for as long as there is something to interrupt, and never a traceback of it."""
     sys.unraisablehook = unless_interrupted
     try:
         signal.signal(signal.SIGINT, INTERRUPTS)
         end_at_the_second()
-        status = _status(given)
+        status = _status(words)
         INTERRUPTS.ended = True
         return status
     except KeyboardInterrupt:  # while `_status` told of another
@@ -63,10 +63,10 @@ def _interruptible(given: list[str]) -> int:
         return INTERRUPTED
 
 
-def _status(given: list[str]) -> int:
+def _status(words: list[str]) -> int:
     """Run one command, print what went wrong, and return the exit status."""
     try:
-        status = _run_and_tell(given)
+        status = _run_and_tell(words)
         if status != INTERRUPTED and INTERRUPTS.count:  # whatever has swallowed one: it was asked to stop
             raise KeyboardInterrupt
         return status
@@ -78,17 +78,17 @@ def _status(given: list[str]) -> int:
         return INTERRUPTED
 
 
-def _run_and_tell(given: list[str]) -> int:
+def _run_and_tell(words: list[str]) -> int:
     """Run one command and return the exit status; what the input is to blame for is printed."""
     try:
-        status = _run(given)
+        status = _run(words)
         sys.stdout.flush()
         return status
     except AdvsearchError as error:
         from advsearch.cli.flags import with_flags  # late, so that --help answers at once
 
         asks_for_flag = isinstance(error, UnknownNameError) or "`code=" in str(error)  # no file may name its own code
-        in_a_file = given[0] in ("run", "resume") and not asks_for_flag
+        in_a_file = words[0] in ("run", "resume") and not asks_for_flag
         text = str(error) if in_a_file else with_flags(str(error))
         print(f"advsearch: error: {shortened(text)}", file=sys.stderr)
         return BAD_INPUT
@@ -96,25 +96,25 @@ def _run_and_tell(given: list[str]) -> int:
         return OK
 
 
-def _run(given: list[str]) -> int:
-    command = given[0] if given and not given[0].startswith("-") else None
+def _run(words: list[str]) -> int:
+    command = words[0] if words and not words[0].startswith("-") else None
     if command == "plan":
         raise InputError("`plan` is a part of `check` now: use advsearch check --loss model, with the same flags")
     if command is not None and command not in COMMANDS:
         raise UnknownNameError("command", command, COMMANDS, "See advsearch --help.")
     try:
-        args = _parse(given, command)
+        args = _parse(words, command)
     except SystemExit as stop:  # --help and --version have printed their text
         return int(stop.code or 0)
     allow_code(*getattr(args, "code", ()))
-    return int(found(args.command).run(args))
+    return int(command_named(args.command).run(args))
 
 
-def _parse(given: list[str], command: str | None) -> argparse.Namespace:
+def _parse(words: list[str], command: str | None) -> argparse.Namespace:
     parser, subparsers = without_commands()
     for name in COMMANDS:
         add_command(subparsers, name, whole=name == command)
-    args, unknown = parser.parse_known_args(given)
+    args, unknown = parser.parse_known_args(words)
     if unknown:
         raise _unknown_argument(unknown[0], subparsers.choices[args.command] if args.command else parser)
     if args.command is None:
@@ -163,7 +163,7 @@ def add_command(
     """Return the new parser of a command; if not `whole` it has no arguments, and serves the list of commands."""
     if not whole:
         return cast(argparse.ArgumentParser, subparsers.add_parser(name))
-    command, text = found(name), help_of(name)
+    command, text = command_named(name), help_of(name)
     more, lines = texts_of(name)
     parser: argparse.ArgumentParser = subparsers.add_parser(
         name,

@@ -182,7 +182,8 @@ def finish(result: Result, text: Callable[[Any], str], *, as_json: bool) -> int:
 def go_on_text(result: Result) -> str:
     """Return how to go on with a run that was stopped; nothing of one that was not, or that is kept nowhere."""
     run = getattr(result, "run", None)
-    return f"\n\nGo on with: {go_on_command(run)}" if run and result.goes_on else ""
+    stopped = run and result.goes_on and getattr(result, "ending", None) != "running"
+    return f"\n\nGo on with: {go_on_command(run)}" if stopped else ""
 
 
 def go_on_command(run: str | Path) -> str:
@@ -248,11 +249,11 @@ def shown_text(result: Result) -> str:
     )
 
 
-def aligned(rows: Sequence[Sequence[str]], indent: str = "  ", gap: str = "   ") -> str:
+def aligned(rows: Sequence[Sequence[str]]) -> str:
     """Return lines with the cells of `rows` in aligned columns."""
     wide = [max(len(row[i]) for row in rows if i < len(row)) for i in range(max(map(len, rows), default=0))]
     return "\n".join(
-        (indent + gap.join(cell.ljust(width) for cell, width in zip(row, wide, strict=False))).rstrip() for row in rows
+        ("  " + "   ".join(cell.ljust(width) for cell, width in zip(row, wide, strict=False))).rstrip() for row in rows
     )
 
 

@@ -63,7 +63,7 @@ def run_file(
             raise InputError(f"{file}: {one.name}: {one.does}, which a file can't ask for; type {one.ask}")
         if not args.quiet:
             print(f"advsearch: {one.name} is left out: it {one.does}; type {one.ask}", file=sys.stderr)
-    return int(commands.found(command).carry_out(config, as_json=args.json, quiet=args.quiet, resumed=resumed))
+    return int(commands.command_named(command).carry_out(config, as_json=args.json, quiet=args.quiet, resumed=resumed))
 
 
 RUN = Command(_run_arguments, _run)

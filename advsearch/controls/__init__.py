@@ -21,8 +21,20 @@ from advsearch.registry import Registry
 from advsearch.scene.description import ENVIRONMENT, OBJECT, SceneDescription
 
 ORDER = (
-    *("pose", "camera", "path", "texture", "material", "light", "environment", "sky", "geometry", "body", "patch"),
-    *("occlusion", "contents", "background", "haze", "lens", "sensor", "corruption", "mitsuba"),
+    *(
+        "pose",
+        "camera",
+        "path",
+        "texture",
+        "material",
+        "light",
+        "projector",
+        "shadow",
+        "environment",
+        "sky",
+        "geometry",
+    ),
+    *("body", "patch", "occlusion", "contents", "background", "haze", "lens", "sensor", "corruption", "mitsuba"),
 )
 """In which lists have controls; one that is not named comes last."""
 SHARED = ("base", "ranges", "numbers", "space", "values", "corruption_filters", "material_patterns")

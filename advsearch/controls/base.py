@@ -257,6 +257,13 @@ class Control(ABC):
             InputError: a setting of the control is impossible in this scene.
         """
 
+    exposure: tuple[float, float] = (0.0, 0.0)
+    """Seconds that the shutter is open, and that the rows of a picture are read in; see `advsearch.scene.moments`."""
+
+    def later(self, seconds: float) -> Control:
+        """Return the bound control as it is so many seconds later, where it knows a time; else itself."""
+        return self
+
     @property
     def budget(self) -> Budget:
         """The budget of the whole slice: that of its largest group."""

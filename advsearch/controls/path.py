@@ -8,6 +8,7 @@ the middle of `pass`, the beginning of `orbit`.
 
 from __future__ import annotations
 
+import copy
 import csv
 import math
 from collections.abc import Iterable, Mapping
@@ -125,6 +126,8 @@ class PathControl(NumberControl):
             "How far it goes, in distances of the scene's own camera: where approach begins, half of what pass takes.",
             most=1000.0,
         ),
+        Choice("shutter", None, "Seconds that each row is exposed: motion blur.", "shutter", most=60.0),
+        Choice("rolling", None, "Seconds in which the rows are read, one after the other.", "rolling", most=60.0),
     )
 
     @classmethod
@@ -173,6 +176,18 @@ class PathControl(NumberControl):
         if parameter.name == WAY and WAY not in self.specs:  # whatever else is asked for
             return OneOf(parameter.options)
         return super().spec(parameter, value)
+
+    _later = 0.0
+
+    @property
+    def exposure(self) -> tuple[float, float]:  # type: ignore[override]
+        """Seconds that the shutter is open, and that rows are read in."""
+        return float(self.chosen["shutter"] or 0.0), float(self.chosen["rolling"] or 0.0)
+
+    def later(self, seconds: float) -> PathControl:
+        then = copy.copy(self)
+        then._later = self._later + seconds
+        return then
 
     @property
     def seconds(self) -> float:
@@ -235,7 +250,8 @@ class PathControl(NumberControl):
         return ORBIT if CAMERA in self._movers else GEOMETRIC
 
     def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        time, start, ways = values["time"], self._start(values["time"]), self._ways(values)
+        time, ways = values["time"] + self._later, self._ways(values)
+        start = self._start(time)
         shift, heading = self._object(ways, start, time)
         inputs = {}
         if CAMERA in self._movers:

@@ -153,6 +153,15 @@ class Space:
         each = ((control.name, control.numbers(part)) for control, part in self.slices(u))
         return {f"{name}.{one}": value for name, numbers in each for one, value in numbers.items()}
 
+    @property
+    def exposure(self) -> tuple[float, float]:
+        """Seconds that the shutter is open, and that rows are read in."""
+        return max((one.exposure for one in self.controls), default=(0.0, 0.0))
+
+    def later(self, seconds: float) -> Space:
+        """Return the space so many seconds later, where a control knows a time."""
+        return replace(self, controls=tuple(one.later(seconds) for one in self.controls))
+
     def holding(self, u: Tensor) -> Space:
         """Return the space whose first controls stay where a configuration of them has them, so that the others vary.
 
@@ -228,6 +237,7 @@ class _Held(Control):
     def __init__(self, control: Control, at: Tensor) -> None:
         self._control, self._at = control, at
         self.name, self.moved, self.on_top = control.name, control.moved, control.on_top
+        self.exposure = control.exposure
         self.fit()
 
     def fit(self) -> None:
@@ -239,6 +249,9 @@ class _Held(Control):
 
     def inputs(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Tensor]:
         return self._control.inputs(self._at, so_far)
+
+    def later(self, seconds: float) -> Control:
+        return _Held(self._control.later(seconds), self._at)
 
     def picture(self, u: Tensor, image: Tensor) -> Tensor:
         return self._control.picture(self._at, image)

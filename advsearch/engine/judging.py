@@ -7,7 +7,7 @@ import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from importlib import import_module
 from types import MappingProxyType
 from typing import Any
@@ -311,6 +311,9 @@ class KnownTruths:
             return {name: (listed or {}).get(name, value) for name, value in self.space.describe(whole).items()}
 
         facts = self.facts(values, lambda: self.renderer.surfaces(whole))
+        if rig := () if self.space.scene is None else self.space.scene.rig:
+            looks = [partial(self.renderer.surfaces, whole, camera=number) for number in range(len(rig))]
+            facts = replace(facts, views=tuple(self.facts(values, look) for look in looks))
         truth = self.task.truth(facts)
         if not listed and len(rest) <= MOST_NUMBERS and "numbers" not in vars(facts):
             _keep(self._kept, key, truth)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence, ValuesView
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -12,6 +13,7 @@ from typing import Any, final
 
 import numpy as np
 import numpy.typing as npt
+import torch
 from torch import Tensor
 
 from advsearch.calls import helped
@@ -22,7 +24,7 @@ from advsearch.models.guards import plainly
 from advsearch.options import things_as_text, told
 from advsearch.registry import names_code
 from advsearch.scene import settings
-from advsearch.scene.assembly import Motion
+from advsearch.scene.assembly import Assembly, Motion
 from advsearch.scene.assets import EnvironmentAsset, Floats, ObjectAsset
 from advsearch.scene.camera_model import bundled
 from advsearch.scene.description import (
@@ -39,6 +41,7 @@ from advsearch.scene.grounds import on_its_ground
 from advsearch.scene.headlamps import with_lamps
 from advsearch.scene.importing.pictures import read_picture
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
+from advsearch.scene.moments import A_PIXEL, FEWEST, MOST, Moment, moments_of
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.settings import ORBIT_CAMERA, Given
 from advsearch.settings import as_python
@@ -244,6 +247,8 @@ def scene_as_settings(scene: Scene) -> dict[str, Any]:
 
 def named_camera(description: SceneDescription) -> str | None:
     """Return the camera in use, as `load_scene` takes it; None for the pinhole around the object."""
+    if description.rig:
+        return description.rig_spec
     if description.preset:
         return description.preset
     if description.camera_model is not None and description.camera_model.name:
@@ -293,8 +298,31 @@ def make_renderer(
         gain=description.gain,
     )
     scene = MitsubaScene(description, size, filter=formation.filter, leave_out=leave_out, sampler=sampler)
-    motion = Motion(description, size, scene.assembly) if differentiated else None
-    return Renderer(scene, space, formation, seed, motion=motion, estimators=estimators)
+    exposed = any(space.exposure)
+    motion = Motion(description, size, scene.assembly) if differentiated or exposed else None
+    moments = exposed_in(space, motion, scene.assembly, size[0]) if exposed and motion is not None else ()
+    measured = motion if differentiated else None
+    return Renderer(scene, space, formation, seed, motion=measured, estimators=estimators, moments=moments)
+
+
+LOOKS = 64
+"""Configurations in which it is measured how far points move in the picture while it is taken."""
+
+
+def exposed_in(space: Space, motion: Motion, assembly: Assembly, height: int) -> tuple[Moment, ...]:
+    """Return the moments of an exposure, so many that no point goes far in the picture between two of them."""
+    shutter, rolling = space.exposure
+    moving = replace(space, controls=tuple(one for one in space.controls if any(one.exposure)))
+    ends = [moving.later(side * (shutter + rolling) / 2.0) for side in (-1.0, 1.0)]
+    draws = torch.rand(LOOKS, len(moving.start), generator=torch.Generator().manual_seed(0))
+    travelled = 0.0
+    for u in draws:
+        (before, seen), (after, still) = (motion.pixels(assembly(end.inputs(u))) for end in ends)
+        moved = (after - before)[seen & still].norm(dim=1)
+        travelled = max(travelled, float(moved.max()) if len(moved) else 0.0)
+    count = min(max(FEWEST, math.ceil(A_PIXEL * travelled)), MOST)
+    offsets, rows, samples = moments_of(shutter, rolling, height, count)
+    return tuple(Moment(space.later(float(at)), own, samples) for at, own in zip(offsets, rows, strict=True))
 
 
 def settings_of(controls: Controls) -> dict[str, dict[str, object]]:

@@ -6,6 +6,7 @@ import threading
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +21,11 @@ from advsearch.errors import InputError, UnknownNameError
 from advsearch.models import Model, ModelWarning, load_model
 from advsearch.models.guards import plainly
 from advsearch.models.loading import named_code
+from advsearch.scene.rig import read_rig
 from advsearch.scene.settings import Given
 from advsearch.settings import split_names
 from advsearch.tasks import Task
+from advsearch.tasks.rig import Rig
 from advsearch.tasks.together import Together, together
 
 
@@ -73,11 +76,19 @@ def load_models(models: Sequence[Any], task: Task, config: SceneConfig) -> tuple
     for one in caught:
         if not issubclass(one.category, ModelWarning):
             warnings.warn_explicit(one.message, one.category, one.filename, one.lineno)
+    if rig := () if config.camera is None else read_rig(config.camera):
+        if not isinstance(task, Rig):
+            raise InputError(
+                f"camera: {config.camera} has {len(rig)} cameras, and task {task.name} is of one picture; say what is "
+                f"made of several, as in `task='rig={{task: {task.name}, rule: any}}'`"
+            )
+        loaded = tuple(replace(one, cameras=len(rig)) for one in loaded)
     return (together(loaded, config.resolution),) if isinstance(task, Together) else loaded, sentences
 
 
 def _load(model: Any, task: Task, config: SceneConfig, *, alone: bool) -> Model:
     """Load a model; of several tasks, those that take no label or have names of their own are given none."""
+    task = task.part if isinstance(task, Rig) else task
     if not alone and (task.names_from or not task.labelled):
         return load_model(model, task=task, ask=config.ask)
     return load_model(model, labels=config.labels, prompt=config.prompt, task=task, ask=config.ask)
@@ -134,7 +145,7 @@ def check_not_spread(settings: Mapping[str, object]) -> None:
             )
 
 
-RUN_SETTINGS = ("epsilon", "norm", "texture_resolution", "path")
+RUN_SETTINGS = ("epsilon", "norm", "texture_resolution", "path", "shutter", "rolling")
 """What a configuration says for all of its controls; each control declares what it takes of it (`Choice.run_setting`).
 A configuration without such a setting counts as one that does not say it."""
 
@@ -236,8 +247,10 @@ def _not_taken(setting: str, name: str, kind: str) -> InputError:
             f"`epsilon` {name}: the control has ranges and no epsilon; give its ranges, as in "
             f"`controls` '{name}={{PARAMETER: [LOW, HIGH]}}'{instead}"
         )
-    if setting == "path":
-        return InputError(f"path: the control {name} does not move on a path; add `over=path`, or use `controls=path`")
+    if setting in ("path", "shutter", "rolling"):
+        return InputError(
+            f"{setting}: the control {name} does not move on a path; add `over=path`, or use `controls=path`"
+        )
     return InputError(f"{setting}: the control {name} does not take it, nor does another one here; leave it out")
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 import itertools
 import math
 import statistics
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -146,14 +146,12 @@ def _scores(
     return scores
 
 
-def cosine_samples(
-    plan: GradientPlan, *, counts: Sequence[int] = COUNTS, controls: Collection[str] | None = None
-) -> int:
+def cosine_samples(plan: GradientPlan, *, counts: Sequence[int] = COUNTS) -> int:
     """Return the samples a pixel that the gradients of `cosines` take in all, at most."""
     each = REPEATS * sum(counts) + WITNESSES * (1 + AGAIN) * CONVERGED
     by_control: dict[str, set[str]] = {}
     for group in plan.groups:
-        if group.estimator != "none" and (controls is None or group.control in controls):
+        if group.estimator != "none":
             by_control.setdefault(group.control, set()).add(group.estimator)
     return each * sum(len(FACTORS) if used & BY_DIFFERENCES else 1 for used in by_control.values())
 
@@ -165,20 +163,19 @@ def cosines(
     *,
     seed: int,
     counts: Sequence[int] = COUNTS,
-    controls: Collection[str] | None = None,
     tick: Callable[[int], None] = lambda samples: None,
     keep: Keep = measured_now,
 ) -> Iterator[Measured]:
     """Measure, control by control, the cosine of working gradients with the converged one at the same step.
 
-    Sample counts are tried in their order until one reaches the goal at a step; then the next step follows. With
-    `controls` only these are measured. `tick` is called after each gradient with the samples a pixel that it took;
-    `cosine_samples` bounds their sum. `keep` is asked for each gradient, by a name.
+    Sample counts are tried in their order until one reaches the goal at a step; then the next step follows. `tick` is
+    called after each gradient with the samples a pixel that it took; `cosine_samples` bounds their sum. `keep` is asked
+    for each gradient, by a name.
     """
     base, taken = renderer.plan, partial(gradients, renderer, loss, u, seed=seed, keep=keep)
     for control in dict.fromkeys(group.control for group in base.groups):
         names = {one.name for one in base.groups if one.control == control and one.estimator != "none"}
-        if not names or (controls is not None and control not in controls):
+        if not names:
             continue
         by_steps = any(one.estimator in BY_DIFFERENCES for one in base.groups if one.control == control)
         reached = False

@@ -49,6 +49,7 @@ class Findings:
         beaten: verification of what the policy found, where the random search's turned out worse for the model and is
             the run's adversarial scene instead.
         failures: verification of the first of the different failures that the policy found.
+        ambient: verification of the same picture of a projector in other ambient light, by lux.
         average: trials of configurations drawn from the whole space.
         pictures: of the first trials, (H, W, 3) with 8-bit values in [0, 1], by kind and number; of a run that goes on
             only those that it made itself.
@@ -71,6 +72,7 @@ class Findings:
     unprinted_verification: Verification | None = None
     beaten: Verification | None = None
     failures: tuple[Verification, ...] = ()
+    ambient: dict[float, Verification] = field(default_factory=dict)
     average: tuple[Judgement, ...] = ()
     smallest: Bracket | None = None
     pictures: dict[tuple[str, int], Tensor] = field(default_factory=dict)
@@ -90,15 +92,13 @@ class Findings:
 
 
 class Stages:
-    """Tells a watcher which stage runs, and keeps the seconds of each by name. The first began at `started`, by
-    `time.perf_counter`."""
+    """Tells a watcher which stage runs, and keeps the seconds of each by name."""
 
-    def __init__(self, progress: Progress, started: float | None = None) -> None:
+    def __init__(self, progress: Progress) -> None:
         self.progress = progress
-        self.started = time.perf_counter() if started is None else started
         self.seconds: dict[str, float] = {}
         self._name = ""
-        self._begun = self.started
+        self._started = self._begun = time.perf_counter()
 
     def begin(self, name: str, title: str, total: int | None = None, *, hint: str = "", at_most: bool = False) -> None:
         """End the stage before and begin another; a `name` that comes twice adds up. The rest: `Progress.stage`."""
@@ -113,7 +113,7 @@ class Stages:
 
     @property
     def total(self) -> float:
-        return time.perf_counter() - self.started
+        return time.perf_counter() - self._started
 
 
 LOST = "(no answer)"
@@ -242,16 +242,12 @@ class Results:
         """Return the JSON value that is stored under a key, or what `measure` returns in time, and store it."""
         stored = self.stored(key)
         if stored is None:
-            self.check_time()
+            if self.made and time.monotonic() >= self._end:
+                raise OutOfTime
             self.made += 1
             stored = json.loads(json.dumps(measure()))
             self.put(key, stored)
         return stored
-
-    def check_time(self) -> None:
-        """Raise `OutOfTime` where there is no time for another measurement."""
-        if self.made and time.monotonic() >= self._end:
-            raise OutOfTime
 
     def value(self, key: str, kind: type[Measured], measure: Callable[[], Measured]) -> Measured:
         """Return what `measure` returns, or what is stored of this kind (a dataclass, or a list of some); as `get`."""

@@ -37,6 +37,7 @@ from advsearch.scene.things import ALL
 from advsearch.settings import as_python
 from advsearch.tasks import AnyTask, Facts, Mark, Prediction, Sight, make_task
 from advsearch.tasks.each_thing import each_thing
+from advsearch.tasks.rig import Rig
 
 MOST_PREDICTIONS = 5
 """Predictions of the model that are kept of a picture."""
@@ -254,7 +255,8 @@ def render(
     scene = scene if isinstance(scene, Scene) else load_scene(scene)
     scene = scene if texture is None else scene.with_texture(texture)
     made = make_task(task)
-    model = load_model(model, task=made)
+    model = load_model(model, task=made.part if isinstance(made, Rig) else made)
+    model = replace(model, cameras=max(1, len(scene.description.rig)))
     check_judged(scene.description, judge)
     asked = made.on(model) if judge != ALL else each_thing(made.on(model))
     instances = as_controls(controls)
@@ -278,10 +280,10 @@ def render(
             picture = to_8_bit(space.picture(u, formation.display(radiance)))
             output, truth = model(picture), None
             if asked.varies:
-                facts = facts_about(
-                    description, description.object_name, label, partial(space.describe, u),
-                    partial(renderer.surfaces, u), judge,
-                )  # fmt: skip
+                told = partial(facts_about, description, description.object_name, label, partial(space.describe, u))
+                looks = [partial(renderer.surfaces, u, camera=number) for number in range(len(description.rig))]
+                facts = told(partial(renderer.surfaces, u), judge)
+                facts = replace(facts, views=tuple(told(look, judge) for look in looks))
                 try:
                     truth = asked.truth(facts)
                 except InputError as error:

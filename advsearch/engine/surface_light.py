@@ -45,6 +45,8 @@ def reason_against(problem: Problem, steps: int, policy: Policy[Any], specialise
     """Why light on surfaces does not predict a search, in words; None if it may: how far it is off is measured then."""
     if not specialise:
         return "nothing is left out"
+    if problem.renderer.composed:
+        return problem.renderer.composed
     names = [one.name for one in problem.space.controls]
     if not surface_renderer.varied(problem.renderer, names) & CAMERAS:
         return NO_CAMERA

@@ -49,6 +49,8 @@ def reason_against(problem: Problem, steps: int, specialise: bool) -> str | None
     """Why a search renders instead of predicting by matrices, in words; None if it predicts."""
     if not specialise:
         return "nothing is left out"
+    if problem.renderer.composed:
+        return problem.renderer.composed
     if steps < WORTH:
         return f"a matrix pays from {WORTH} evaluations on"
     by_chance = problem.space.controls[problem.searched :] if problem.conditions is not None else ()

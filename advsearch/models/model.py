@@ -125,6 +125,8 @@ class Model:
         read: from what the network returns for so many images, to its output: a tensor (N, ...), or a list with one
             thing for each; None for logits.
         asked: what `load_model` was given, where that says all of it; None for what exists in this session only.
+        cameras: how many pictures are side by side in each image, which the network is shown one by one; the output is
+            then a list with a tuple of theirs for each image.
     """
 
     module: Callable[[Tensor], Any] = field(repr=False)
@@ -140,6 +142,7 @@ class Model:
     device: torch.device = CPU
     read: Read | None = field(default=None, repr=False)
     asked: str | None = field(default=None, repr=False)
+    cameras: int = 1
 
     def __repr__(self) -> str:
         height, width = self.input_size
@@ -171,12 +174,19 @@ class Model:
             InputError: not an image, or values that are clearly not in [0, 1].
             ModelError: the network's output is not (N, classes), or `read` finds no output in it.
         """
-        images = checked_images(images)
+        images, most = checked_images(images), self.batch_limits[1]
+        if self.cameras > 1:
+            images = images.unflatten(2, (self.cameras, -1)).movedim(2, 1).flatten(0, 1)
+            most = max(most - most % self.cameras, min(most, self.cameras))
         parts = [
             each_tensor(self.ask(self.prepared(part))[: len(part)], lambda one: _kept(one, images.device))
-            for part in images.split(self.batch_limits[1])
+            for part in images.split(most)
         ]
-        return parts[0] if len(parts) == 1 else joined(parts)
+        found = parts[0] if len(parts) == 1 else joined(parts)
+        if self.cameras == 1:
+            return found
+        each = [found[number : number + 1] for number in range(len(found))]
+        return [tuple(each[begin : begin + self.cameras]) for begin in range(0, len(each), self.cameras)]
 
     def label_set(self, text: str | int | Sequence[str | int]) -> LabelSet:
         """Return the classes that `text` names, e.g. ``"coffee mug,cup"`` or ``"#504"``; see `find_label_set`."""

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from advsearch import files
 from advsearch.errors import ModelError
+from advsearch.models.all_at_once import AllAtOnce
 from advsearch.models.guards import TookTooLong, within
 from advsearch.models.labels import fitting_labels
 from advsearch.models.model import Detaching, Model, ModelWarning, each_tensor, logits_of, read_by
@@ -260,6 +261,8 @@ def _same(model: Model, a: Tensor, b: Tensor) -> bool:
 def _batch_limits(model: Model, pair: Tensor, rows: Tensor | None) -> tuple[int, int]:
     """Return the batch limits, lowered to one image at a time if the network does not take two."""
     low, high = model.batch_limits
+    if isinstance(model.module, AllAtOnce):  # which takes the pictures of a rig together
+        return model.module.cameras, high - high % model.module.cameras
     if high < 2:
         return low, high
     try:

@@ -219,7 +219,7 @@ def trainable(model: Model, layers: str = "all") -> Trainable:
     """
     if model.probabilities or model.read is not None:
         raise ModelError(f"model {model.name}: only a classifier that returns logits can be hardened")
-    net = _copied(model)
+    net = copied_network(model)
     net.eval().requires_grad_(True)
     if layers == "last":
         owners = [one for one in net.modules() if next(one.parameters(recurse=False), None) is not None]
@@ -231,7 +231,9 @@ def trainable(model: Model, layers: str = "all") -> Trainable:
     return made
 
 
-def _copied(model: Model) -> nn.Module:
+def copied_network(model: Model) -> nn.Module:
+    """Return a copy of the network of a model, to train further; a ModelError where there is none, as of an exported
+    program."""
     name, weights = split_weights(model.name)
     if name == "reference":  # its model has lost its normalisation
         return network(weights=weights)[0]

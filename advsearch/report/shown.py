@@ -23,7 +23,7 @@ from pydantic import Field
 from advsearch import rooms
 from advsearch.report import wording
 from advsearch.report.wording import percent
-from advsearch.runs.results import INTERRUPTED, AverageCase, Fields, Formation, Interval, Result, VerifiedRate
+from advsearch.runs.results import INTERRUPTED, RUNNING, AverageCase, Fields, Formation, Interval, Result, VerifiedRate
 
 LONG = 24
 """Rows of a table of fields above which it is folded."""
@@ -123,8 +123,10 @@ def shown(result: Result) -> ShownResult:
 
 def remarks_of(result: Result, given: ShownResult) -> list[str]:
     """Return what has to be known beside a result."""
-    unsaid = getattr(result, "ending", "") == INTERRUPTED and "nterrupted" not in given.said
+    ending = getattr(result, "ending", "")
+    unsaid = ending == INTERRUPTED and "nterrupted" not in given.said
     stopped = ["Not finished: these are the results so far."] if unsaid else []
+    stopped += ["It is running: this is what has come out so far."] if ending == RUNNING else []
     return [*stopped, *given.cautions, *getattr(result, "warnings", ())]
 
 

@@ -89,17 +89,16 @@ def _csv(records: Iterable[JsonObject], names: list[str], stream: IO[bytes]) -> 
     text = io.TextIOWrapper(stream, encoding="utf-8", newline="", write_through=True)
     writer = csv.DictWriter(text, names, restval="", lineterminator="\n")
     writer.writeheader()
-    writer.writerows({name: _cell(value) for name, value in _flat(one).items()} for one in records)
+    writer.writerows(
+        {name: int(value) if isinstance(value, bool) else value for name, value in _flat(one).items()}
+        for one in records
+    )
     text.detach()
 
 
 def _flat(record: JsonObject) -> JsonObject:
     payload = record[PAYLOAD]
     return record if payload is None else {**record, PAYLOAD: json.dumps(payload, allow_nan=False, ensure_ascii=False)}
-
-
-def _cell(value: JsonValue) -> JsonValue:
-    return "" if value is None else int(value) if isinstance(value, bool) else value
 
 
 def _json(records: Iterable[JsonObject], names: list[str], stream: IO[bytes]) -> None:

@@ -65,15 +65,11 @@ def listed_run(path: Path, *, counts: bool = True) -> Listed:
     """Return the run in a folder; what cannot be read is shown as far as it can, and `fault` says why. To count rows
     takes a second for a million. A run is read again where its files have changed, or a process works on it."""
     running = files.is_held(path)
-    key, state = (os.path.abspath(path), counts), (str(path), running, *map(_state, _read_of(path)))
+    read = [path / name for name in (CONFIG, summary.NAME, store.NAME, f"{store.NAME}-wal")]
+    key, state = (os.path.abspath(path), counts), (str(path), running, *map(_state, read))
     if key not in _LISTED or _LISTED[key][0] != state or (running and counts):
         _LISTED[key] = state, _listed(path, counts=counts, running=running)
     return _LISTED[key][1]
-
-
-def _read_of(path: Path) -> Iterator[Path]:
-    """What a line of the list depends on."""
-    return (path / name for name in (CONFIG, summary.NAME, store.NAME, f"{store.NAME}-wal"))
 
 
 def _state(path: Path) -> object:

@@ -26,6 +26,8 @@ SCHEMA = 1
 
 INTERRUPTED, OUT_OF_TIME = "interrupted", "out of time"
 """Endings of a run that can go on."""
+RUNNING = "running"
+"""How a result stands that is read while a process works on its run; none is kept so."""
 
 END = ("warnings", "seconds", "seed", "command_line")
 """Fields that are written last, in this order."""
@@ -104,8 +106,8 @@ class Result(Fields):
 
     @property
     def goes_on(self) -> bool:
-        """Whether it was stopped before its end, so that a run can be resumed."""
-        return getattr(self, "ending", None) in (INTERRUPTED, OUT_OF_TIME)
+        """Whether it has not come to its end: it is running, or was stopped and can be resumed."""
+        return getattr(self, "ending", None) in (INTERRUPTED, OUT_OF_TIME, RUNNING)
 
     @property
     def brief(self) -> str:

@@ -22,8 +22,8 @@ from pydantic import ValidationError
 
 from advsearch.errors import FileFormatError
 from advsearch.files import opened_for, parse_json, read_bytes, read_text, split_paths
-from advsearch.runs.files import write_bytes, write_text
-from advsearch.runs.results import Result, kind_of
+from advsearch.runs.files import is_held, write_bytes, write_text
+from advsearch.runs.results import RUNNING, Result, kind_of
 from advsearch.settings.configuration import FILES
 
 NAME = "summary.json"
@@ -42,8 +42,8 @@ def write_summary(folder: Path, result: Result) -> Path:
 
 
 def read_result(folder: Path) -> Result:
-    """Return the result of the run in `folder`; a FileFormatError says if there is none, or not what this version
-    writes."""
+    """Return the result of the run in `folder`, `RUNNING` if a process works on it and has not come to its end; a
+    FileFormatError says if there is none, or not what this version writes."""
     path = folder / NAME
     try:
         values = parse_json(read_text(path, "the summary of a run", LARGEST), finite=True)
@@ -57,7 +57,8 @@ def read_result(folder: Path) -> Result:
     if kind is None:
         raise other_summary(path, f"one of the command {str(values.get('command'))[:40]!r}")
     try:
-        return kind.of(values)
+        result = kind.of(values)
+        return result.model_copy(update={"ending": RUNNING}) if result.goes_on and is_held(folder) else result
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
         what = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"[:120]
@@ -148,7 +149,29 @@ def made_with(settings: Mapping[str, object]) -> dict[str, str]:
     for name in PACKAGES:
         with suppress(metadata.PackageNotFoundError):
             facts[name] = metadata.version(name)
-    return {**facts, **file_digests(settings)}
+    return {**facts, **bundled_digests(settings), **file_digests(settings)}
+
+
+BUNDLED = {"objects": "object", "environments": "environment"}
+"""Folders of `advsearch.bundled`, and what stands in them."""
+
+
+def bundled_digests(settings: Mapping[str, object]) -> dict[str, str]:
+    """Return the SHA-256 of what is bundled and settings name: objects, environments and the reference model."""
+    package, found = Path(__file__).parent.parent, dict[str, str]()
+    said = " ".join(str(settings.get(name) or "") for name in ("object", "environment", "things", "held_out", "grid"))
+    words = {*re.findall(r"[a-z][a-z0-9-]*", said), "" if settings.get("environment") else "studio"}
+    for folder, kind in BUNDLED.items():
+        for word in sorted(words - {""}):
+            place = package / "bundled" / "data" / folder
+            files = sorted((place / word).glob("*")) or sorted(place.glob(f"{word}.*"))
+            if files:
+                parts = "".join(f"{one.name} {_digest(one)}\n" for one in files if one.is_file())
+                found[f"bundled {kind} {word}"] = hashlib.sha256(parts.encode()).hexdigest()
+    weights = package / "models" / "data" / "reference.safetensors"
+    if re.search(r"(^|,)reference(,|$)", str(settings.get("model") or "reference")) and weights.is_file():
+        found["bundled model reference"] = _digest(weights)
+    return found
 
 
 def changed_file(before: Sequence[Mapping[str, object]], settings: Mapping[str, object]) -> str | None:

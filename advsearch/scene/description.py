@@ -43,6 +43,7 @@ from advsearch.scene.parts import (
     mesh_part,
     plugins_in,
 )
+from advsearch.scene.rig import Mount, read_rig
 from advsearch.scene.settings import ORBIT_CAMERA
 from advsearch.scene.sizes import TRIPOD, doubts, on_roads, sized
 from advsearch.scene.things import ThingPart, with_things
@@ -83,6 +84,8 @@ class SceneDescription:
         camera: name of the one in use; `ORBIT_CAMERA` for that of the settings.
         preset: name of the mounted camera that it is (`advsearch.scene.camera_presets`); "" for none.
         camera_model: intrinsics and distortion of the camera around the object; None for a pinhole.
+        rig: the cameras that take pictures at the same time, the first of them this one; empty where it is alone.
+        rig_spec: how they were asked for.
         metered: exposure is metered; otherwise a radiance of 1 is the white of the picture, as Mitsuba shows it.
         remarks: what a user should know of further files that controls have read, and of things in each other.
         things_spec: how the things beside the object were asked for.
@@ -105,6 +108,8 @@ class SceneDescription:
     camera: str = ORBIT_CAMERA
     preset: str = ""
     camera_model: CameraModel | None = None
+    rig: tuple[Mount, ...] = ()
+    rig_spec: str = ""
     metered: bool = True
     remarks: tuple[str, ...] = ()
     things_spec: str = ""
@@ -180,6 +185,19 @@ class SceneDescription:
         return seen.with_values(camera__distance=max(preset.distance, fitted))
 
     def _with_model(self, name: str) -> SceneDescription:
+        if is_path(name) and (rig := read_rig(name)):
+            first = rig[0]
+            if first.model is not None:
+                first.model.check_given(self.given)
+            values = {} if first.fov is None else {"camera.fov": first.fov}
+            return replace(
+                self,
+                camera=ORBIT_CAMERA,
+                camera_model=first.model,
+                rig=rig,
+                rig_spec=name,
+                values={**self.values, **values},
+            )
         if is_path(name):
             with reading(name.partition("#")[0]):
                 model = read_camera(name)

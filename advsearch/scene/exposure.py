@@ -75,10 +75,7 @@ def visible_irradiance(scene: SceneDescription) -> float | None:
 
 def irradiance(scene: SceneDescription, normals: Doubles) -> Doubles:
     """Return the irradiance (N, 3) on unshadowed surfaces at the middle of the object, with normals (N, 3)."""
-    directions, solid, power = _arriving(scene.environment)
-    turn = math.radians(scene.number("environment.rotation"))
-    cosine, sine = math.cos(turn), math.sin(turn)
-    directions = directions @ np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+    directions, solid, power = arriving(scene)
     upper = directions[:, 2] > 0.0
     on_ground = (power[upper] * directions[upper, 2:]).sum(axis=0)
     bounced = srgb_to_linear(np.array(scene.ground_color, np.float32)) * on_ground / math.pi
@@ -101,6 +98,15 @@ def irradiance(scene: SceneDescription, normals: Doubles) -> Doubles:
             facing = np.maximum(np.einsum("nk,fk->nf", normals, ways), 0.0)
             irradiances = irradiances + np.einsum("nf,fc->nc", facing, faced)
     return irradiances
+
+
+def arriving(scene: SceneDescription) -> tuple[Doubles, Doubles, Doubles]:
+    """Return unit directions (N, 3) from which the environment lights the scene, their solid angles (N,), and radiance
+    times these (N, 3)."""
+    directions, solid, power = _arriving(scene.environment)
+    turn = math.radians(scene.number("environment.rotation"))
+    cosine, sine = math.cos(turn), math.sin(turn)
+    return directions @ np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]]), solid, power
 
 
 def _emitted(part: MeshPart, emission: Floats, place: Doubles) -> tuple[Doubles, Doubles]:

@@ -62,8 +62,8 @@ _PLY = (
     + rb"element face (\d+)\nproperty list uchar uint vertex_indices\n"
 )
 """The header of a bundled mesh."""
-_MAP_HINT = "A path to an .hdr or .exr file works too."
-_OBJECT_HINT = f"A path to a file that ends in {either(MESHES)} works too."
+MAP_HINT = "A path to an .hdr or .exr file works too."
+OBJECT_HINT = f"A path to a file that ends in {either(MESHES)} works too."
 
 
 def _data() -> Traversable:
@@ -101,7 +101,7 @@ def load_object(name: str) -> ObjectAsset:
     """
     known = list_objects()
     if name not in known:
-        raise UnknownNameError("object", name, known, _OBJECT_HINT)
+        raise UnknownNameError("object", name, known, OBJECT_HINT)
     folder = _data() / "objects" / name
     try:
         facts = json.loads((folder / "object.json").read_text("utf-8"))
@@ -136,7 +136,7 @@ def load_environment(name: str) -> EnvironmentAsset:
     """
     known = list_environments()
     if name not in known:
-        raise UnknownNameError("environment", name, known, _MAP_HINT)
+        raise UnknownNameError("environment", name, known, MAP_HINT)
     try:
         radiance = _exr((_data() / "environments" / f"{name}.exr").read_bytes())
     except (OSError, ValueError, KeyError, RuntimeError) as error:

@@ -232,6 +232,37 @@ class BeamLamp(ScenePart):
 Lamp = PointLamp | SpotLamp | BallLamp | BeamLamp
 
 
+PATTERN = ".pattern"
+"""What the name of an input ends in that is the picture of a projector."""
+
+
+@dataclass(frozen=True, eq=False)
+class ProjectorPart(ScenePart):
+    """A projector, as Mitsuba's `projector`: a point that throws a picture, and that the camera does not see.
+
+    Takes `NAME.pose` (4, 4), as a camera's, and `NAME.pattern` (h, w, 3): what a white matt screen shows that faces it
+    at distance 1, linear radiance. The interior adjoint is right for the pattern.
+
+    Attributes:
+        name: of the projector.
+        fov: angle of the picture's width, degrees.
+        sides: rows and columns of the picture.
+    """
+
+    fov: float = 30.0
+    sides: tuple[int, int] = (2, 2)
+
+    @property
+    def aspect(self) -> float:
+        """Width over height."""
+        return self.sides[1] / self.sides[0]
+
+    @property
+    def area(self) -> float:
+        """What it covers of a screen at distance 1."""
+        return 4.0 * math.tan(math.radians(self.fov) / 2.0) ** 2 / self.aspect
+
+
 @dataclass(frozen=True, eq=False)
 class PlacedCamera:
     """A camera with a pose of its own.

@@ -13,9 +13,11 @@ from __future__ import annotations
 
 import copy
 import io
+import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
+from functools import lru_cache
 from typing import Any, Protocol
 
 import numpy as np
@@ -27,11 +29,14 @@ from torch import Tensor
 from advsearch import seeds
 from advsearch.errors import InputError
 from advsearch.scene.assembly import ON_PICTURE, Motion, central, steps_for
-from advsearch.scene.description import OBJECT
+from advsearch.scene.description import OBJECT, SceneDescription
 from advsearch.scene.formation import ImageFormation, levels_of
+from advsearch.scene.geometry import camera_to_world, middle
 from advsearch.scene.gradients import BY_ADJOINT, BY_DIFFERENCES, TURN_STEP, Group, first_order, first_plan
 from advsearch.scene.mitsuba_backend.denoise import denoise
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
+from advsearch.scene.moments import Moment
+from advsearch.scene.rig import Mount
 from advsearch.scene.surfaces import Surfaces
 
 MAX_SPP = 65536
@@ -92,6 +97,7 @@ class Renderer:
         space: maps u to scene inputs.
         formation: how radiance becomes the picture.
         root_seed: seeds of different roots never meet, whatever is passed as `seed`.
+        moments: that a picture is the mean of, while something moves; empty of a still.
         motion: measures how fast coordinates move points; None takes the default step for all.
         estimators: estimators forced by "control.parameter", "control" or "*".
     """
@@ -105,7 +111,9 @@ class Renderer:
         *,
         motion: Motion | None = None,
         estimators: Mapping[str, str] | None = None,
+        moments: Sequence[Moment] = (),
     ) -> None:
+        self.moments = tuple(moments)
         self.scene = scene
         self.space = space
         self.formation = formation
@@ -137,6 +145,14 @@ class Renderer:
         held = io.BytesIO()
         Image.fromarray(levels.numpy()).save(held, "PNG")
         return held.getvalue()
+
+    @property
+    def composed(self) -> str:
+        """Why a picture is not that of one scene as one camera sees it; empty where it is, so that others may predict
+        it from light that was collected once."""
+        if self.scene.made[0].rig:
+            return "a picture is made of those of several cameras"
+        return "a picture is made of several moments" if self.moments else ""
 
     def like(self, scene: MitsubaScene | None = None, **formation: Any) -> Renderer:
         """Return a renderer of the same space with another scene, or other fields of the image formation.
@@ -230,17 +246,19 @@ class Renderer:
         """
         return self.surfaces(u).seen(OBJECT)
 
-    def surfaces(self, u: Configuration, fineness: int = 1) -> Surfaces:
+    def surfaces(self, u: Configuration, fineness: int = 1, camera: int = 0) -> Surfaces:
         """Return what the camera sees first through the middle of each pixel; as of `mask`.
 
         Args:
             u: (d,) in [0, 1].
             fineness: into how many parts each side of a pixel is cut, to be looked at each.
+            camera: number of the camera of a rig; 0 is the first, or the only one.
         """
         u, _ = self._given(u, 1)
         with torch.no_grad():
-            inputs = self.scene.assembly(self.space.inputs(u))
-        seen = self.scene.surfaces({name: inputs[name] for name in inputs if name not in ON_PICTURE}, fineness)
+            rig = self.scene.made[0].rig
+            inputs = self._seen(rig[camera] if rig else None, self.scene.assembly(self.space.inputs(u)))
+        seen = self.scene.surfaces(_traced(inputs), fineness)
         metres = self.scene.made[0].metres
         return replace(seen, depth=seen.depth * metres, z_depth=seen.z_depth * metres)
 
@@ -307,11 +325,51 @@ class Renderer:
             return u, u.detach() + mask * (u - u.detach())
 
     def _picture(self, u: Tensor, seed: int, spp: int, *, display: bool = True) -> Tensor:
-        """The picture of u, or else the radiance that is to be displayed."""
-        inputs = self.scene.assembly(self.space.inputs(u))
+        """The picture of u, or else the radiance that is to be displayed; of a rig those of its cameras side by side,
+        (H, K W, 3)."""
+        rig = self.scene.made[0].rig
+        if not rig:
+            return self._view(None, u, seed, spp, display=display)
+        renders, seeds_of = self.renders, [seed, *(seeds.stream(seed, "camera", k) for k in range(1, len(rig)))]
+        each = [self._view(one, u, noise, spp, display=display) for one, noise in zip(rig, seeds_of, strict=True)]
+        self.renders = renders + 1  # one configuration, as budgets count it
+        return torch.cat(each, dim=1)
+
+    def _view(self, mount: Mount | None, u: Tensor, seed: int, spp: int, *, display: bool) -> Tensor:
+        """The picture of one camera of a rig, or of the only one; as of `_picture`."""
+        inputs = self._seen(mount, self.scene.assembly(self.space.inputs(u)))
         hide = "backdrop.color" in inputs
-        traced = {name: value for name, value in inputs.items() if name not in ON_PICTURE}
-        return self.finished(self.rendered(traced, seed, spp, hide), inputs, u, display=display)
+        if self.moments:
+            return self.finished(self._exposed(mount, u, seed, spp, hide), inputs, u, display=display)
+        return self.finished(self.rendered(_traced(inputs), seed, spp, hide), inputs, u, display=display)
+
+    def _seen(self, mount: Mount | None, inputs: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Scene inputs as a camera of a rig sees them."""
+        if mount is None:
+            return inputs
+        description = self.scene.made[0]
+        return mount.seen(inputs, *_standing(description), description.metres)
+
+    def _exposed(self, mount: Mount | None, u: Tensor, seed: int, spp: int, hide: bool) -> Tensor:
+        """The mean radiance of the moments of u, denoised once; as of `rendered`, and it counts as one render."""
+        renders, exposed, guides = self.renders, torch.zeros(()), torch.zeros(())
+        for number, moment in enumerate(self.moments):
+            inputs = _traced(self._seen(mount, self.scene.assembly(moment.inputs(u))))
+            noise = seeds.stream(seed, "moment", number)
+            rows, samples = moment.rows[:, None, None], max(1, math.ceil(spp * moment.samples))
+            exposed = exposed + rows * self.rendered(inputs, noise, samples, hide, denoised=False)
+            if self.formation.denoiser == "oidn":
+                with torch.no_grad():
+                    noise = seeds.stream(self.root_seed, "guides", noise)
+                    guides = guides + rows * torch.cat(self.scene.guides(inputs, noise, samples), dim=-1)
+        self.renders = renders + 1
+        if self.formation.denoiser != "oidn":
+            return exposed
+        with torch.no_grad():
+            noisy, quick = exposed[..., :3].contiguous(), self.formation.quick
+            clean = denoise(noisy, guides[..., :3].contiguous(), guides[..., 3:].contiguous(), quick=quick)
+            change = torch.cat([clean - noisy, torch.zeros_like(exposed[..., 3:])], dim=-1)
+        return exposed + change  # whose derivative is that without a denoiser
 
     def finished(self, rendered: Tensor, inputs: Mapping[str, Tensor], u: Tensor, *, display: bool = True) -> Tensor:
         """Return the picture of rendered radiance, or the radiance that is to be displayed: exposure and backdrop of
@@ -325,12 +383,15 @@ class Renderer:
             radiance = radiance + uncovered * (backdrop / self.formation.gain)
         return self.space.picture(u, self.formation.display(radiance)) if display else radiance
 
-    def rendered(self, inputs: Mapping[str, Tensor], seed: int, spp: int, hide: bool) -> Tensor:
+    def rendered(
+        self, inputs: Mapping[str, Tensor], seed: int, spp: int, hide: bool, *, denoised: bool = True
+    ) -> Tensor:
         """Return linear radiance of scene inputs, (H, W, 3), or (H, W, 4) with coverage if the environment is to `hide`
-        behind a backdrop; with a graph. What is traced counts in `renders`."""
+        behind a backdrop; with a graph; `denoised` if the formation says so. What is traced counts in `renders`."""
         if self._predict is not None:
             return self._predict(inputs)
-        found: Tensor = _Radiance.apply(self, tuple(inputs), seed, spp, hide, *inputs.values())  # type: ignore[no-untyped-call]
+        called = self, tuple(inputs), seed, spp, hide, denoised, *inputs.values()
+        found: Tensor = _Radiance.apply(*called)  # type: ignore[no-untyped-call]
         return found
 
     def finite(self, values: Tensor) -> Tensor:
@@ -405,6 +466,18 @@ class Renderer:
         return {name: frozenset(found) for name, found in routes.items()}
 
 
+@lru_cache(maxsize=4)
+def _standing(description: SceneDescription) -> tuple[Tensor, Tensor]:  # which takes a look at every vertex
+    """The pose (4, 4) of a scene's camera, and the middle (3,) of its object."""
+    pose, center = camera_to_world(description), middle(description)
+    return torch.from_numpy(pose).float(), torch.from_numpy(center).float()
+
+
+def _traced(inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The inputs that Mitsuba takes."""
+    return {name: value for name, value in inputs.items() if name not in ON_PICTURE}
+
+
 def _tensor(u: Configuration) -> Tensor:
     """u as float32."""
     try:
@@ -418,7 +491,14 @@ class _Radiance(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, renderer: Renderer, names: tuple[str, ...], seed: int, spp: int, hide: bool, *tensors: Tensor
+        ctx: Any,
+        renderer: Renderer,
+        names: tuple[str, ...],
+        seed: int,
+        spp: int,
+        hide: bool,
+        denoised: bool,
+        *tensors: Tensor,
     ) -> Tensor:
         """Radiance of given scene inputs, with coverage if hidden."""
         ctx.renderer, ctx.names, ctx.seed, ctx.spp, ctx.hide = renderer, names, seed, spp, hide
@@ -426,7 +506,7 @@ class _Radiance(torch.autograd.Function):
         inputs, noise = dict(zip(names, tensors, strict=True)), seeds.stream(renderer.root_seed, "primal", seed)
         if renderer._source is None:
             wanted = {"hidden" if hide else "path": noise}
-            if renderer.formation.denoiser == "oidn":
+            if denoised and renderer.formation.denoiser == "oidn":
                 wanted["guides"] = seeds.stream(renderer.root_seed, "guides", seed)
             rendered, *guides = renderer.scene.pictures(inputs, wanted, spp)
         else:
@@ -469,7 +549,7 @@ class _Radiance(torch.autograd.Function):
             renderer.gradients += 1
             for name, gradient in gradients.items():
                 found[name] = renderer.finite(gradient)
-        return None, None, None, None, None, *(found.get(name) for name in ctx.names)
+        return None, None, None, None, None, None, *(found.get(name) for name in ctx.names)
 
 
 class _Differences(torch.autograd.Function):

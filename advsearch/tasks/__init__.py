@@ -18,6 +18,7 @@ from advsearch.tasks.base import Facts, Judgement, Mark, Prediction, Sight, Task
 from advsearch.tasks.classification import Classification
 from advsearch.tasks.depth import Depth
 from advsearch.tasks.detection import Detection
+from advsearch.tasks.rig import Rig
 from advsearch.tasks.segmentation import Segmentation
 from advsearch.tasks.similarity import Similarity
 from advsearch.tasks.together import Together
@@ -101,7 +102,7 @@ def function_of(task: Task) -> Callable[..., Tensor] | None:
 
 TASKS: Registry[type[Task]] = Registry(
     "advsearch.tasks",
-    {kind.name: kind for kind in (Classification, Detection, Segmentation, Depth, Similarity, FreeAnswer)},
+    {kind.name: kind for kind in (Classification, Detection, Segmentation, Depth, Similarity, FreeAnswer, Rig)},
     "a subclass of Task whose name is that of the entry point",
     lambda name, entry: isinstance(entry, type) and issubclass(entry, Task) and entry.name == name,
 )
@@ -136,7 +137,8 @@ def make_task(task: AnyTask) -> Task:
         raise UnknownNameError("task", name, TASKS)
     check_options("task", name, TASKS[name], options)
     build: Callable[..., Task] = TASKS[name]
-    return build(**options)
+    made = build(**options)
+    return replace(made, part=make_task(made.task)) if isinstance(made, Rig) else made
 
 
 def _together(names: Sequence[str], options: Mapping[str, Any]) -> Together:

@@ -114,10 +114,12 @@ def test_envelopes_regions_curves_and_hardening_are_claims_as_far_as_they_were_c
     (region,) = claims_of(samples.region())
     assert "pose.yaw 10 to 55.5 degrees" in region.statement and "by sampling" in region.statement
     assert nothing(claims_of(samples.region(samples=None, same=None))[0])
-    (held,) = claims_of(ExplainResult.of(samples.EXPLAIN))
-    assert "camera.elevation over 60 degrees" in held.statement and not nothing(held)
+    rule, held = claims_of(ExplainResult.of(samples.EXPLAIN))
+    assert "rule 1" in rule.statement and "camera.elevation over 60 degrees" in held.statement and not nothing(held)
     for box in (None, {**samples.EXPLAIN["envelope"], "held": False}):
-        assert nothing(claims_of(ExplainResult.of({**samples.EXPLAIN, "envelope": box}))[0])
+        alone = {**samples.EXPLAIN, "envelope": box}
+        assert [one.kind for one in claims_of(ExplainResult.of(alone))] == ["measured"], "of the rule"
+        assert nothing(claims_of(ExplainResult.of({**alone, "rules": []}))[0])
     assert [NO_PROOF in one.statement for one in claims_of(samples.curve())] == [True]
     table = [{**row, "renders": {"search": 40, "baseline": 30}} for row in samples.CURVE["table"]]
     (counted,) = claims_of(samples.curve(table=table))

@@ -215,7 +215,7 @@ def test_an_objective_of_another_task_is_refused() -> None:
         InputError, match=r"expected an objective of task yaw \(score\), got margin, which takes outputs of class"
     ):
         check_objective("margin", "yaw")
-    assert {kind.task for kind in OBJECTIVE_KINDS.values()} == {*TASKS, Together.name, None} - {"answer"}
+    assert {kind.task for kind in OBJECTIVE_KINDS.values()} == {*TASKS, Together.name, None} - {"answer", "rig"}
 
 
 def test_a_model_of_a_task_answers_with_what_the_task_reads() -> None:
@@ -274,7 +274,7 @@ def test_every_command_maximises_what_is_the_tasks_own(command: str, monkeypatch
 
 
 def test_tasks_have_names() -> None:
-    assert list(TASKS) == ["classification", "detection", "segmentation", "depth", "similarity", "answer"]
+    assert list(TASKS) == ["classification", "detection", "segmentation", "depth", "similarity", "answer", "rig"]
     assert make_task("classification") == Classification()
     mine = Yaw(tolerance=5.0)
     assert make_task(mine) is mine

@@ -211,7 +211,10 @@ def test_a_sweep_is_explored_from_the_server(browser: Browser, sweep: Path) -> N
 def test_a_sweep_is_explored_from_a_folder_that_any_server_serves(
     browser: Browser, sweep: Path, tmp_path: Path
 ) -> None:
-    write_bundle([sweep], tmp_path / "site")
+    index = write_bundle([sweep], tmp_path / "site")
+    with opened(browser, index.as_uri()) as page:  # as a double click does
+        explored(page)
+        until(page, lambda: width_of_first_picture(page) == 16)
     with ThreadingHTTPServer(("127.0.0.1", 0), partial(QuietHandler, directory=str(tmp_path / "site"))) as server:
         thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True)
         thread.start()

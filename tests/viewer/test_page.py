@@ -59,13 +59,16 @@ def test_texts_of_a_run_are_no_markup(tmp_path: Path) -> None:
     assert page.count("</script>") == 3  # what runs, what the explorer reads, and its own
 
 
-def test_the_folder_has_page_rows_and_pictures(tmp_path: Path) -> None:
+@pytest.mark.parametrize("many", [False, True])
+def test_the_folder_has_page_rows_and_pictures(many: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    if many:
+        monkeypatch.setattr(sweep_page, "MOST_ROWS", 0)
     first, second = make_sweep(tmp_path / "a", keep="wrong"), make_sweep(tmp_path / "b")
     index = write_bundle([first, second], tmp_path / "site")
     runs = json.loads(re.findall(r'id="runs">(.*?)</script>', index.read_text())[0])
     assert [one["name"] for one in runs] == ["a", "b"]
     for one in runs:
-        assert (index.parent / one["rows"]).is_file()
+        assert (index.parent / one["rows"]).is_file() if many else one["embedded"]
     kept = runs[0]["pictures"]
     assert len(kept["kept"]) == 6
     for number in kept["kept"]:

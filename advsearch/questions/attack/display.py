@@ -74,6 +74,7 @@ def _shown_attack(summary: AttackSummary) -> ShownResult:
     sections = [ResultPart(heads=heads, rows=_rates(summary))]
     if summary.failures and summary.failures.tried:
         sections.append(failures_part(summary.failures, tried=True))
+    sections += ambient_part(summary)
     cautions = [text for text in wording.remarks(summary) if text not in summary.warnings]
     return ShownResult(wording.attack_verdict(summary), sections, _facts(summary), cautions=cautions)
 
@@ -119,6 +120,24 @@ def _facts(summary: AttackSummary) -> dict[str, str]:
         "environment": "",
         "seed": "",
     }
+
+
+def ambient_part(summary: AttackSummary) -> list[ResultPart]:
+    """Return a table of the ambient light that was tried; none where none was."""
+    light = summary.ambient
+    if light is None:
+        return []
+    ends = "also in direct sun" if light.ends_at is None else f"no longer at {light.ends_at:.3g} lux"
+    more = light.holds_to / light.lux
+    text = f"Works up to {light.holds_to:.3g} lux, {more:.3g} times the light that is there, and {ends}."
+    columns: Mapping[str, Column] = {
+        "ambient light": "{0.lux:.3g} lux",
+        "wrong": lambda point: tally(wording.success(summary), point.verified.successes, point.verified.trials),
+        "95 % interval": lambda point: interval_text(point.verified.interval),
+        "": lambda point: "holds" if point.holds else "ends",
+    }
+    note = "Exposure follows the ambient light: the projector alone is darker beside it."
+    return [ResultPart.table(light.points, columns, title="Ambient light", text=[text], note=note)]
 
 
 def failures_text(known: DifferentFailures) -> str:

@@ -175,6 +175,7 @@ def _summary(
         ),
         answer_from="random" if findings.beaten is not None else None,
         policy_verified=_verified(findings.beaten),
+        ambient=_ambient(findings) if findings.ambient else None,
         average=_average(findings) if findings.average else None,
         smallest=None if findings.smallest is None else _smallest(findings.smallest, problem),
         printability=_printability(problem, findings) if config.printable else None,
@@ -203,6 +204,21 @@ def _summary(
         seconds={"total": 0.0},
         seed=problem.seed,
         command_line=config.command_line(),
+    )
+
+
+def _ambient(findings: Findings) -> results.AmbientLight:
+    tried = sorted(findings.ambient.items())
+    points = [
+        results.AmbientPoint(lux=lux, holds=checked.ending is Ending.FOUND, verified=verified_rate(checked))
+        for lux, checked in tried
+    ]
+    ends = next((number for number, point in enumerate(points) if not point.holds), len(points))
+    return results.AmbientLight(
+        lux=points[0].lux,
+        holds_to=points[ends - 1].lux,
+        ends_at=points[ends].lux if ends < len(points) else None,
+        points=points,
     )
 
 

@@ -16,7 +16,14 @@ import numpy as np
 from PIL import Image, ImageSequence
 
 from advsearch.questions.attack import wording
-from advsearch.questions.attack.display import failures_part, failures_text, most_predicted, range_text, shown
+from advsearch.questions.attack.display import (
+    ambient_part,
+    failures_part,
+    failures_text,
+    most_predicted,
+    range_text,
+    shown,
+)
 from advsearch.questions.attack.summary import AttackSummary, FoundValue, PicturedPrediction
 from advsearch.report.figures import search_axes
 from advsearch.report.shown import Picture, ResultPart
@@ -65,6 +72,7 @@ def page(run: Path, result: Result) -> str | None:
         _textures(run),
         *_failures(result),
         _rates(result, given.sections[0]),
+        *ambient_part(result),
         _curve(result, curves),
         ResultPart("How the search worked", rows=_named(wording.method_facts(result)), folded=True),
         ResultPart(wording.plan_text(result), heads=wording.PLAN_HEADS, rows=wording.plan_rows(result), folded=True),

@@ -157,6 +157,14 @@ class AttackConfig(DerivativeConfig):
         "several with commas between them, one is drawn each time",
         otherwise="approach", min_length=1,
     )
+    shutter: float | None = setting(
+        None, "search", "how long each row of a picture is exposed along a path: motion blur", otherwise="a still",
+        unit="seconds", gt=0.0, le=60.0,
+    )
+    rolling: float | None = setting(
+        None, "search", "how long the rows of a picture are read, one after the other, along a path: a rolling shutter",
+        otherwise="all at once", unit="seconds", gt=0.0, le=60.0,
+    )
     draws: int | None = setting(
         None, "search", "how many random conditions each step looks at, with --over",
         otherwise=f"{OVER_PREDICTED[1]} where pictures are predicted and more than one number varies, otherwise "

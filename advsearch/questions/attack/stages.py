@@ -40,6 +40,7 @@ from advsearch.engine.surface_light import SurfaceLight
 from advsearch.engine.transport import CleanMatrix, PredictedSearch, Transport, reason_against, remark
 from advsearch.engine.verifier import Verifier, ladder_of
 from advsearch.interrupts import interruptible
+from advsearch.questions.attack.ambient import find_ambient
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.report.wording import count
 from advsearch.scene.transport.matrix import TransportTooLargeError
@@ -247,6 +248,8 @@ class Attack:
             self._take_the_worse(answered, baseline)
         if not self.config.smallest:
             check_failures(self._verifier, answered)
+        if findings.verification.ending is Ending.FOUND:
+            find_ambient(self._verifier, findings.verification.u)
 
     def _take_the_worse(self, result: SearchResult, baseline: SearchResult) -> None:
         """Let what the random search found be the run's if it is found and the worse one for the model, and remember

@@ -213,6 +213,23 @@ class Printability(Fields):
     )
 
 
+class AmbientPoint(Fields):
+    """The adversarial scene in one ambient light."""
+
+    lux: float
+    holds: bool = Field(description="whether it is verified there")
+    verified: VerifiedRate
+
+
+class AmbientLight(Fields):
+    """In how much ambient light the picture of a projector still makes the model wrong."""
+
+    lux: float = Field(description="on the object in the scene, without the projector")
+    holds_to: float = Field(description="lux, the most in which it was verified, as in all less that was tried")
+    ends_at: float | None = Field(description="lux, the least in which it was not; null: it holds in direct sun")
+    points: list[AmbientPoint] = Field(description="what was tried, by lux; the first is the verification itself")
+
+
 class AttackSummary(SceneResult):
     """The worst configuration of a scene that was found, how sure that is, and what it cost."""
 
@@ -246,6 +263,10 @@ class AttackSummary(SceneResult):
     policy_verified: VerifiedRate | None = Field(default=None, description="of what the policy itself found then")
     drive: AlongDrive | None = Field(
         default=None, description="[along a drive](drives.md), with `over` a path; absent without"
+    )
+    ambient: AmbientLight | None = Field(
+        default=None,
+        description="with [a projector](controls/projector.md) that is found: how much other light it bears",
     )
     average: AverageCase | None = Field(default=None, description="only with `average`")
     smallest: SmallestEpsilon | None = Field(default=None, description="only with `smallest`")

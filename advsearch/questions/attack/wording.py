@@ -57,13 +57,22 @@ def attack_verdict(summary: AttackSummary) -> str:
     rate = rate_text(verified) + another_text(summary.over, several_paths(summary))
     claim = _claim(summary, thing)
     if ending == "found":
-        return f"{_how_it_errs(summary, verified, thing)} in {rate}."
+        return f"{_how_it_errs(summary, verified, thing)} in {rate}.{_as_random(summary)}"
     if ending == "interrupted":
         return f"Interrupted; so far {claim} in {rate}."
     if ending == "not verified":
         return f"The search claims a wrong prediction that is not confirmed: {claim} in {rate}."
     why = _REASONS.get(ending, f"The search ended: {ending}.")
     return f"No {budget_text(summary)} was found that {_wanted(summary, thing)}: {claim} in {rate}. {why}"
+
+
+def _as_random(summary: AttackSummary) -> str:
+    """Return that the search did nothing that random search does not do, as a sentence; nothing where it did."""
+    ours, random = summary.verified, summary.baseline.verified if summary.baseline else None
+    if summary.answer_from == "random":
+        return " Random search found it, and the policy nothing as bad."
+    alike = ours is not None and random is not None and random.rate >= ours.rate > 0
+    return " Random search finds as much." if alike else ""
 
 
 def several_paths(summary: AttackSummary) -> bool:

@@ -31,7 +31,8 @@ class CompareConfig(SweepConfig):
 
     command: ClassVar[str] = "compare"
     without: ClassVar[tuple[str, ...]] = (
-        *("model", "adversarial_of", "surface", "aov", "metrics", "log", "trials", "verify_spp", "path", "fps"),
+        *("model", "adversarial_of", "surface", "aov", "metrics", "log", "trials", "verify_spp", "path", "shutter"),
+        *("rolling", "fps"),
     )
 
     compared: str = setting(

@@ -265,9 +265,19 @@ def _kinds(found: FailureClusters) -> ResultPart:
 
 
 def claims(result: ExplainResult) -> Iterator[Claim]:
-    """Yield what the envelope stands for."""
+    """Yield what the rules and the envelope stand for."""
+    for number, rule in enumerate(result.rules, 1):
+        counted, how = (
+            rule.confirmed or rule,
+            "fresh renders" if rule.confirmed else "rows that did not choose the rule",
+        )
+        extent = Extent(what=f"right, of {how}", count=counted.right, total=counted.total, interval=counted.interval)
+        text = f"Where {conditions_text(rule.conditions)} (rule {number}) the model is right in {share_text(extent)}"
+        yield claim("measured", f"{text} {how}; elsewhere in {rule.elsewhere.text}.", extent)
     box = result.envelope
     if box is None or not box.held or not box.total:
+        if result.rules:
+            return
         yield nothing_claimed(
             "no box of values was shown to keep the accuracy that was asked for", envelope_text(result)
         )

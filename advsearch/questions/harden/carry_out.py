@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.stats import binomtest
 
 from advsearch import seeds
 from advsearch.api.keywords import asks, configured
@@ -25,6 +26,7 @@ from advsearch.progress import Progress, Watched, watcher
 from advsearch.question import Asked
 from advsearch.questions.attack.parts import LOADING, executor_for
 from advsearch.questions.harden import scenes, training
+from advsearch.questions.harden.detectors import DetectorRounds, Loss, Student, check_detector, read_coco
 from advsearch.questions.harden.lessons import FOLDER, Lesson
 from advsearch.questions.harden.result import (
     PLAIN_SCENES,
@@ -56,6 +58,7 @@ def harden(
     *,
     optimiser: MakeOptimiser | None = None,
     beside: Examples | None = None,
+    loss: Loss | None = None,
     resume: bool = False,
     progress: Watched = None,
     **settings: Any,
@@ -70,7 +73,10 @@ def harden(
         optimiser: makes one of the list of parameters, such as ``lambda p: torch.optim.SGD(p, 0.01)``; its learning
             rate is then the highest, in place of `rate`.
         beside: batches of further examples, such as a `DataLoader`: images (N, H, W, 3) sRGB in [0, 1], class indices
-            (N,). One is taken with each step.
+            (N,). One is taken with each step. Not of a detector, which `data` is for.
+        loss: of a detector whose network returns none in training: a function of the network, its input (N, 3, H, W)
+            and, for each picture, a mapping with "boxes" (K, 4), x0, y0, x1, y1 in pixels of that input, and "labels"
+            (K,), indices of the model's labels. It returns a number that is smaller where the network is better.
         resume: go on with the run of that name, if there is one, where it was stopped; everything else has to be as it
             was.
     """
@@ -79,7 +85,7 @@ def harden(
     config = configured(HardenConfig, model=model_name(model), **settings)
     path = run_path(config.run) if resume and config.run is not None else None
     resumed = path if path is not None and is_run(path) else None
-    given = {"model": model, "optimiser": optimiser, "beside": beside}
+    given = {"model": model, "optimiser": optimiser, "beside": beside, "loss": loss}
     result: HardenResult = made_question("harden").from_config(
         config, progress=watcher(progress), resumed=resumed, **given
     )
@@ -92,6 +98,7 @@ def hardened(
     model: AnyModel | None = None,
     optimiser: MakeOptimiser | None = None,
     beside: Examples | None = None,
+    loss: Loss | None = None,
 ) -> HardenResult:
     """Do what a configuration describes, or go on with it; see `harden`. None takes the configuration's model."""
     config = asked.config
@@ -100,10 +107,24 @@ def hardened(
     try:
         (loaded, *_), warnings = load_models([model or config.model], make_task(config.task), config)
     except ModelError as error:
-        raise ModelError(f"{str(error).partition(': use `task=')[0]}; harden trains classifiers") from error
-    course = Course(trainable(loaded, config.layers), loaded, config, optimiser, beside)
+        if config.task_name != "classification":
+            raise
+        said = str(error).partition(": use `task=")[0]
+        raise ModelError(f"{said}; harden trains classifiers and, with `task=detection`, detectors") from error
+    finds = config.task_name == "detection"
+    if not finds and (config.task_name != "classification" or config.data or loss):
+        raise InputError("task: harden trains for classification and detection; `data` and `loss` are of detection")
+    if finds:
+        check_detector(config, beside)
     work = SceneWork(config, loaded, scenes.splits_of(config, loaded))
-    _same_means(asked.run, {"optimiser": optimiser is not None, "beside": beside is not None})
+    course: Course | DetectorRounds
+    if finds:
+        own = [] if config.data is None else read_coco(Path(config.data), loaded)
+        course = DetectorRounds(asked.run, work, Student.of(loaded, loss), own, optimiser, asked.progress)
+    else:
+        course = Course(trainable(loaded, config.layers), loaded, config, optimiser, beside)
+    means = {"optimiser": optimiser, "beside": beside, **({"loss": loss} if finds else {})}
+    _same_means(asked.run, {name: one is not None for name, one in means.items()})
     check_made_of(asked.run, [loaded])
     run = Hardening(asked.run, course, work, asked.progress)
     with asked.until_interrupted():
@@ -128,14 +149,18 @@ class Hardening:
     """One run of `harden`: a course that trains a copy of the model, and scenes, with what was asked and the model as
     it was given. `wrong` says of what is measured, and of the number of a scene, whether it is not robust."""
 
-    def __init__(self, run: RunDirectory, course: Course, work: SceneWork, progress: Progress) -> None:
+    def __init__(self, run: RunDirectory, course: Course | DetectorRounds, work: SceneWork, progress: Progress) -> None:
         self.run, self.course, self.scenes, self.progress, self.config = run, course, work, progress, work.config
-        self.rounds = training.TrainingRounds(run, course, self.drawn, progress)
+        self.rounds: DetectorRounds | training.TrainingRounds
+        if isinstance(course, DetectorRounds):
+            self.rounds, self.further = course, 0
+        else:
+            self.rounds = training.TrainingRounds(run, course, self.drawn, progress)
+            self.further = RENDERED_SCENES if work.rendered else PLAIN_SCENES
         self.wrong = {(row.kind, row.step): bool(row.success) for row in run.store.rows()}
         self.clean: dict[str, Share] = {}
         self.stages = Stages(progress)
         self._executor: Executor = InProcess(work)
-        self.further = RENDERED_SCENES if work.rendered else PLAIN_SCENES
         searched = self.config.scenes * self.config.rounds
         held = scenes.CLEAN_SCENES * self.config.measured  # of which a part is attacked
         self.counts = {TRAINING: searched, FURTHER: self.further * searched, VALIDATION: self.rounds.judged}
@@ -160,7 +185,7 @@ class Hardening:
             self.progress.stage("looking at plain pictures of held-out scenes", len(wanted))
             seen = [lesson for _, some in self._each(wanted) for lesson in some]
             for which, model in (("before", self.scenes.model), ("after", self.course.student.model)):
-                self.clean[which] = _share(round(training.right_share(model, seen, "plain") * len(seen)), len(seen))
+                self.clean[which] = _share(round(self.rounds.right_share(model, seen) * len(seen)), len(seen))
         finally:
             stages.end()
             gc.unfreeze()
@@ -237,6 +262,21 @@ class Hardening:
             return None
         return _share(sum(not any(wrong) for wrong in found), len(found))
 
+    def paired(self, controls: Sequence[str]) -> dict[str, Any]:
+        """How many scenes are robust after and were not before, the other way round, and how likely that is by
+        chance; nothing where not all are known."""
+        scenes_of = range(self.config.measured)
+        sides = {
+            which: [[self.wrong.get((f"{which} {control}", number)) for control in controls] for number in scenes_of]
+            for which in ("before", "after")
+        }
+        if any(None in wrong for side in sides.values() for wrong in side):
+            return {}
+        pairs = list(zip(*([any(wrong) for wrong in side] for side in sides.values()), strict=True))
+        gained, lost = pairs.count((True, False)), pairs.count((False, True))
+        p = float(binomtest(gained, gained + lost).pvalue) if gained + lost else 1.0
+        return {"gained": gained, "lost": lost, "p": p}
+
     def result(self, asked: Asked[HardenConfig], warnings: list[str]) -> HardenResult:
         """Return what is known."""
         config, done, names = self.config, asked.ending == "done", list(self.config.controls)
@@ -261,6 +301,7 @@ class Hardening:
         facts, (name, _) = self._executor.facts, split_weights(config.model)
         return asked.result(
             HardenResult,
+            **self.paired(names),
             environment=",".join(taught.environments),
             objects=list(taught.objects),
             before=self._robust("before", names),

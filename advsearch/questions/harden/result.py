@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any, ClassVar, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, JsonValue, model_validator
 
 from advsearch.questions.attack.settings import STEPS, AttackConfig
 from advsearch.report import wording
@@ -38,7 +38,8 @@ class HardenConfig(AttackConfig):
     several: ClassVar[tuple[str, ...]] = ("object", "environment")
     without: ClassVar[tuple[str, ...]] = (
         "smallest", "ensemble", "printable", "aov", "metrics", "log", "target", "minimise", "over", "draws", "path",
-        "average", "baseline", "seconds", "camera", "up", "size", "unit", "label", "task", "measure", "estimators",
+        "shutter", "rolling",
+        "average", "baseline", "seconds", "camera", "up", "size", "unit", "label", "measure", "estimators",
         "things", "judge",
     )
 
@@ -60,6 +61,13 @@ class HardenConfig(AttackConfig):
         None, "scene", "what lights the measurement, and never the training",
         "names of environments or files, separated by commas",
         otherwise="the bundled environments that the reference model was not trained in", min_length=1,
+    )
+    task: str | dict[str, JsonValue] = setting_as_in(
+        AttackConfig, "task", description="what the model does: classification or detection"
+    )
+    data: str | None = setting(
+        None, "training", "pictures of your own that a detector is trained on too: `annotations.json` and `images/`",
+        "a folder, as `export --format coco` writes it", otherwise="none", min_length=1,
     )
     layers: Literal["all", "last"] = setting("all", "training", "layers that are trained")
     rounds: int = setting(2, "training", "rounds of search and training", ge=1, le=1000)
@@ -169,6 +177,13 @@ class HardenResult(InNotebook, RunResult):
     after: Share | None = Field(description="the same, of the hardened model, searched again")
     clean_before: Share | None = Field(description="plain renders of held-out scenes that are right")
     clean_after: Share | None
+    gained: int | None = Field(
+        default=None, description="held-out scenes that are robust after and were not before; absent of older runs"
+    )
+    lost: int | None = Field(default=None, description="held-out scenes that were robust before and are not after")
+    p: float | None = Field(
+        default=None, description="how likely it is by chance that one is so much larger: McNemar's exact test"
+    )
     table: list[HardenedControl]
     search: str = Field(description="policy and steps of the searches of `before` and `after`")
     stronger_search: str = Field(description="another policy with three times the steps")
@@ -245,6 +260,8 @@ def shown(result: HardenResult) -> ShownResult:
             f"Of {after.count} held-out scenes the searches leave {after.right} right, before {before.right}; "
             f"of {left.count} plain pictures {left.right} are right, before {clean.right}."
         )
+        if result.lost is not None:
+            said += f" Scene by scene: {result.gained} got better, {result.lost} worse (p = {result.p:.2g})."
     chart: dict[str, Any] = {"draw": draw, "size": (6.4, 1.4 + 0.45 * len(shares))} if shares else {}
     sections = [
         ResultPart("Before and after", heads=HEADS, rows=measured, note=ROBUST, height=110 + 44 * len(shares), **chart),

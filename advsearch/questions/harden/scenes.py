@@ -9,6 +9,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from safetensors import torch as safetensors
@@ -24,11 +25,12 @@ from advsearch.engine.problem import Problem
 from advsearch.errors import InputError
 from advsearch.files import JsonObject
 from advsearch.models import Model
-from advsearch.models.reference import trainable
+from advsearch.models.reference import copied_network
+from advsearch.models.source import frozen
 from advsearch.questions.attack.carry_out import attack_on
 from advsearch.questions.attack.parts import problem_of
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.harden.lessons import Lesson, has_matrix, lessons, plain_lessons
+from advsearch.questions.harden.lessons import Lesson, examples, has_matrix, lessons, plain_lessons
 from advsearch.questions.harden.result import ALL, HardenConfig
 from advsearch.runs.results import INTERRUPTED
 from advsearch.scene.assets import ObjectAsset
@@ -96,9 +98,9 @@ class Attacking:
         answer would have to be wrong in."""
         config, model = work.config, work.model
         if self.weights is not None:
-            student = trainable(model)
-            student.net.load_state_dict(safetensors.load(self.weights))
-            model = student.model
+            network = copied_network(model)
+            network.load_state_dict(safetensors.load(self.weights))
+            model = replace(model, module=frozen(network, model.name))
         name, scene = work.splits[HELD_OUT].scene(self.number, scene_settings(config))
         seed = seeds.stream(config.seed, f"measured {self.control}", self.number)
         harder = {} if self.times == 1 else {"policy": STRONGER, "steps": self.times * config.steps}
@@ -111,9 +113,11 @@ class Looking:
 
     number: int
 
-    def done(self, work: SceneWork) -> list[Lesson]:
+    def done(self, work: SceneWork) -> list[Any]:
         side = work.splits[HELD_OUT]
         problem, _ = work.problem(side, self.number, tuple(work.config.controls)[:1])
+        if work.config.task_name != "classification":
+            return list(examples(problem, side.seed, range(self.number * CLEAN_VIEWS, (self.number + 1) * CLEAN_VIEWS)))
         right = tuple(int(index) for index in problem.truth())
         drawn = [seeds.stream(side.seed, "plain", self.number * CLEAN_VIEWS + view) for view in range(CLEAN_VIEWS)]
         return [Lesson(right, levels_of(problem.picture(problem.domain.start, seed, CLEAN_SPP))) for seed in drawn]
@@ -166,7 +170,7 @@ class SceneWork:
     model: Model
     splits: Mapping[str, Split]
 
-    def __call__(self, wanted: Iterable[Wanted]) -> list[list[Lesson] | str]:
+    def __call__(self, wanted: Iterable[Wanted]) -> list[list[Any] | str]:
         """Return what came of each: lessons, or how an attack ended."""
         return [one.done(self) for one in wanted]
 

@@ -233,6 +233,11 @@ class TrainingRounds:
         self.run, self.course, self.draw, self.progress = run, course, draw, progress
         self.done = [TrainingRound.of(noted) for noted in json.loads(run.store.note(ROUNDS) or "[]")]
 
+    @staticmethod
+    def right_share(model: Model, chosen: Sequence[Lesson]) -> float:
+        """Return the share of plain pictures that a model has right."""
+        return right_share(model, chosen, "plain")
+
     @property
     def judged(self) -> int:
         """Scenes by which weights are chosen, for each control: a third as many as a round adds, up to `JUDGED`."""

@@ -12,7 +12,7 @@ HELP = "write what runs show, and no more than that, for a model card or a safet
 MORE = ": a page, Markdown and JSON"
 EXAMPLES = (
     "report mug-texture-001 mug-sweep-001 --evidence",
-    "report mug-texture-001 mug-sweep-001 --evidence --out card --json",
+    "report mug-texture-001 mug-sweep-001 --evidence --criterion 0.9 --out card --json",
 )
 NAME = "evidence"
 
@@ -21,6 +21,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.add_argument("runs", nargs="+", metavar="RUN", help="names or folders of runs; of a recipe, its parts")
     parser.add_argument("--evidence", action="store_true", help="claims with what a reader needs to judge them")
+    parser.add_argument("--criterion", metavar="SHARE", type=float, help="share of right predictions that is asked for")
+    parser.add_argument(
+        "--exposure",
+        metavar="FILE",
+        help="how common conditions are: YAML such as environment: {street: 0.8, noon: 0.2}",
+    )
+    parser.add_argument("--by", metavar="NAME", help="who answers for it, as it is to be written", default="")
     parser.add_argument("--out", metavar="FOLDER", help="where the three files go (default: %(default)s)", default=NAME)
     parser.add_argument("--overwrite", action="store_true", help="replace what is there")
     output.add_flags(parser)
@@ -29,9 +36,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Write the files."""
     # late, so that --help answers at once
+    from advsearch.questions.report.answer import read_exposure
     from advsearch.questions.report.evidence import collected
     from advsearch.questions.report.result import evidence_page, markdown
-    from advsearch.runs.files import write_text
+    from advsearch.runs.files import write_bytes, write_text
     from advsearch.runs.summary import to_json
 
     if not args.evidence:
@@ -44,12 +52,17 @@ def run(args: argparse.Namespace) -> int:
     there = [one for one in names if one.exists()]
     if there and not args.overwrite:
         raise InputError(f"{there[0]}: exists already; add --overwrite or choose another folder with --out")
-    evidence = collected(args.runs)
+    if args.criterion is not None and not 0.0 < args.criterion <= 1.0:
+        raise InputError(f"--criterion: expected a share over 0 and at most 1, such as 0.9, got {args.criterion:g}")
+    exposure = {} if args.exposure is None else read_exposure(args.exposure)
+    evidence, pictures = collected(args.runs, criterion=args.criterion, exposure=exposure, by=args.by)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"--out: cannot make the folder {folder}: {error.strerror}") from None
-    texts = (evidence_page(evidence), markdown(evidence), to_json(evidence) + "\n")
+    texts = (evidence_page(evidence, pictures), markdown(evidence), to_json(evidence) + "\n")
+    for name, data in pictures.items():
+        write_bytes(folder / name, data)
     for path, text in zip(names, texts, strict=True):
         write_text(path, text)
     if args.json:

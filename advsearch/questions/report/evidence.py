@@ -6,21 +6,33 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import fields
+from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
 from advsearch import __version__, rooms
 from advsearch.errors import AdvsearchError
+from advsearch.files import read_bytes
 from advsearch.options import FROM_RUN
 from advsearch.questions.attack import wording as attack_wording
 from advsearch.questions.attack.summary import AttackSummary
 from advsearch.questions.photographs.result import FOLDER, PhotoAgreement
-from advsearch.questions.report.result import Evidence, EvidenceRun
+from advsearch.questions.report.answer import (
+    Exposure,
+    conditions_of,
+    criterion_lines,
+    domain_of,
+    exposure_lines,
+    not_shown,
+    pictures_of,
+    triggering_conditions,
+)
+from advsearch.questions.report.result import CROSSWALK, CROSSWALK_HEADS, Evidence, EvidenceRun
 from advsearch.questions.sweep.summary import SweepSummary
 from advsearch.report import wording
 from advsearch.report.shown import Claim, Extent, claim, nothing_claimed, share_text
 from advsearch.runs.directory import CONFIG, IMAGES, PARTS, find_run, is_run, typed_name
-from advsearch.runs.results import Result, VariedValue
+from advsearch.runs.results import RUNNING, Result, VariedValue
 from advsearch.runs.store import NAME as STORE
 from advsearch.runs.store import Store
 from advsearch.runs.summary import MADE_WITH, read_result
@@ -45,7 +57,8 @@ def claims_of(result: Result) -> list[Claim]:
     """Return what a run stands for; one that stands for nothing says so in a claim of that kind."""
     if result.goes_on:
         told = f"; so far: {result.brief}" if result.brief else ""
-        return [nothing_claimed(f"the run is not finished{told}")]
+        state = "is running" if getattr(result, "ending", "") == RUNNING else "is not finished"
+        return [nothing_claimed(f"the run {state}{told}")]
     room = rooms.room(result.command)
     if room and room.claims:
         return list(room.claims(result)) or [nothing_claimed("nothing in this run came to its end")]
@@ -232,10 +245,28 @@ def _renders(renders: object) -> str:
     return "those of its parts" if renders is None else str(renders)
 
 
-def collected(runs: list[str]) -> Evidence:
-    """Return runs, by their names or folders, as evidence."""
+MOST_OF_PICTURE = 16 << 20
+"""Bytes of a picture that is taken along."""
+
+
+def collected(
+    runs: list[str], *, criterion: float | None = None, exposure: Exposure | None = None, by: str = ""
+) -> tuple[Evidence, dict[str, bytes]]:
+    """Return runs, by their names or folders, as evidence, with the pictures that it names.
+
+    Args:
+        criterion: share of right predictions that is asked for.
+        exposure: how common the values of axes are (`answer.read_exposure`).
+        by: who answers for it.
+    """
     folders = {part.resolve(): part for name in runs for part in _with_parts(find_run(name))}
-    found = [_run(folder) for folder in folders.values()]
+    found, pictures = list[EvidenceRun](), dict[str, bytes]()
+    for number, folder in enumerate(folders.values(), 1):
+        shown = {f"pictures/{number}-{one.name}": read_bytes(one, "a picture", MOST_OF_PICTURE)
+                 for one in pictures_of(folder)}  # fmt: skip
+        pictures |= shown
+        one = _run(folder, criterion, exposure or {})
+        found.append(one.model_copy(update={"pictures": list(shown), "begun": _begun(folder)}))
     models = [one.about.get("Model", "") for one in found]
     files = [(model, model.rpartition("@")[2]) for model in models]
     digests = [
@@ -243,7 +274,26 @@ def collected(runs: list[str]) -> Evidence:
         for one, own in zip(found, files, strict=True)
     ]
     warnings = warnings_over([one for one in models if one], [d for d, m in zip(digests, models, strict=True) if m])
-    return Evidence(runs=found, warnings=warnings, rules=list(RULES), version=__version__)
+    unused = set(exposure or {}) - {row.axis for one in found for row in one.conditions}
+    warnings += [f"exposure: no run has the axis {axis}." for axis in sorted(unused)]
+    evidence = Evidence(
+        runs=found,
+        warnings=warnings,
+        rules=list(RULES),
+        version=__version__,
+        written=f"{datetime.now(timezone.utc):%Y-%m-%d %H:%M} UTC",
+        by=by,
+        criterion=criterion,
+        crosswalk=[dict(zip(CROSSWALK_HEADS, row, strict=True)) for row in CROSSWALK],
+    )
+    return evidence, pictures
+
+
+def _begun(folder: Path) -> str:
+    """When its settings were written, in UTC."""
+    with suppress(OSError):
+        return f"{datetime.fromtimestamp((folder / CONFIG).stat().st_mtime, timezone.utc):%Y-%m-%d %H:%M} UTC"
+    return ""
 
 
 def _with_parts(folder: Path) -> Iterator[Path]:
@@ -268,7 +318,7 @@ def _settings(folder: Path) -> Mapping[str, object]:
     return {}
 
 
-def _run(folder: Path) -> EvidenceRun:
+def _run(folder: Path, criterion: float | None, exposure: Exposure) -> EvidenceRun:
     """One run; of one that has no summary, that it claims nothing."""
     name, settings = typed_name(folder), _settings(folder)
     made = _made_with(folder)
@@ -288,9 +338,21 @@ def _run(folder: Path) -> EvidenceRun:
             command_line=f"advsearch run {folder / CONFIG}",
         )
     result = read_result(folder)
-    found = evidence_of(name, result, [*claims_of(result), *_photos(folder)], settings, made, _judged_by(settings))
+    photographs = _photos(folder)
+    found = evidence_of(name, result, [*claims_of(result), *photographs], settings, made, _judged_by(settings))
     few = [QUICK] if _of_quick_recipe(folder) else []
-    return found.model_copy(update={"excluded": [*few, *found.excluded]})
+    domain, conditions = domain_of(result, settings, found.searched), conditions_of(result)
+    return found.model_copy(
+        update={
+            "excluded": [*few, *found.excluded],
+            "criterion": [] if criterion is None else criterion_lines(found.claims, conditions, criterion),
+            "triggering": triggering_conditions(result),
+            "exposure": exposure_lines(result, conditions, exposure),
+            "conditions": conditions,
+            "domain": domain,
+            "not_shown": not_shown(domain, sum(one.extent.total for one in photographs if one.extent)),
+        }
+    )
 
 
 def _judged_by(settings: Mapping[str, object]) -> dict[str, object]:

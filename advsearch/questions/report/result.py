@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import ClassVar
 
 from pydantic import Field
@@ -9,8 +10,19 @@ from pydantic import Field
 from advsearch.report.markup import Html, element, join_html
 from advsearch.report.shown import Claim
 from advsearch.report.wording import interval_text
-from advsearch.runs.results import Fields, Result
-from advsearch.viewer.document import document, facts_table, heading, study_table
+from advsearch.runs.results import Fields, Interval, Result
+from advsearch.viewer.document import data_url, document, facts_table, heading, study_table
+
+
+class ConditionShare(Fields):
+    """In how many configurations under one condition the model is right."""
+
+    condition: str = Field(description="in words, with its unit")
+    axis: str
+    value: str
+    right: int
+    total: int = Field(alias="of", description="configurations")
+    interval: Interval = Field(description="of the share, 95 %")
 
 
 class EvidenceRun(Fields):
@@ -20,6 +32,14 @@ class EvidenceRun(Fields):
     command: str
     ending: str
     claims: list[Claim]
+    begun: str = Field("", description="when the run was begun, UTC; empty where that is not known")
+    criterion: list[str] = Field([], description="what the criterion comes to; absent without one")
+    triggering: list[str] = Field([], description="rules under which the model is wrong more often; absent without")
+    exposure: list[str] = Field([], description="shares weighted by how common conditions are; absent without weights")
+    conditions: list[ConditionShare] = Field([], description="by each value of each axis; absent without")
+    domain: dict[str, str] = Field({}, description="the operational design domain in words, by its parts")
+    not_shown: list[str] = Field([], description="what a reader must not take from it")
+    pictures: list[str] = Field([], description="files beside this one")
     about: dict[str, str] = Field(description="object, environment, model, task and what counts as right")
     searched: list[str] = Field(description="what could change, and how far")
     measured: dict[str, str] = Field(description="policy, seed, samples and the like, by name")
@@ -38,6 +58,34 @@ class Evidence(Result):
     warnings: list[str] = Field(description="what has to be known of all of them together")
     rules: list[str] = Field(description="how the claims are to be read")
     version: str = Field(description="of advsearch, that wrote this")
+    written: str = Field("", description="when, UTC")
+    by: str = Field("", description="who, as given; absent otherwise")
+    criterion: float | None = Field(None, description="share of right predictions that was asked for; absent otherwise")
+    crosswalk: list[dict[str, str]] = Field([], description="which heading of a standard each figure serves")
+
+
+CROSSWALK_HEADS = ("in the evidence", "ISO 21448", "ISO/PAS 8800", "AI Act, article 15")
+CROSSWALK = (
+    ("What varied, operational design domain", "5 specification", "9 requirements; 11 data", "15(1) purpose"),
+    ("Triggering conditions (rules of explain)", "7 triggering conditions", "13 safety analysis", "15(4) robustness"),
+    ("Shares by condition, drives, criterion", "10 known scenarios", "12 verification", "15(1), 15(3) accuracy"),
+    ("Searches: found and not found", "11 unknown scenarios", "12 verification", "15(4), 15(5) attacks"),
+    ("Before and after harden", "8 modification", "10 measures", "15(4) robustness"),
+    ("Exposure", "6 hazards; 12 achievement", "13 safety analysis", ""),
+    ("Suites in a pipeline (test)", "13 operation phase", "14 measures in operation", "15(1) through the lifecycle"),
+    ("Excluded, not shown, photographs", "12 achievement", "8 assurance argument", "15(3) instructions for use"),
+    ("Versions, hashes, commands", "9 strategy", "15 confidence in tools", ""),
+)  # fmt: skip
+NO_CONFORMITY = (
+    "The table says under which clause a figure may be read: ISO 21448:2022, ISO/PAS 8800:2024, Regulation (EU) "
+    "2024/1689. Compare it with your edition. It claims no conformity with any of them."
+)
+CONDITION_HEADS = ("condition", "right", "of", "95 % interval")
+
+
+def condition_rows(one: EvidenceRun) -> list[list[str]]:
+    """Return a row for each condition, under `CONDITION_HEADS`."""
+    return [[row.condition, str(row.right), str(row.total), interval_text(row.interval)] for row in one.conditions]
 
 
 def markdown(evidence: Evidence) -> str:
@@ -50,6 +98,8 @@ def markdown(evidence: Evidence) -> str:
             *(f"- **{claim.kind}**: {_plain(claim.statement)}" for claim in one.claims),
             "",
         ]
+        lines += [*_table(CONDITION_HEADS, condition_rows(one)), ""] if one.conditions else []
+        lines += [f"![{name}]({name})" for name in one.pictures] + [""] * bool(one.pictures)
         for title, facts in sections(one).items():
             lines += [f"{title}:", "", *(f"- {_plain(text)}" for text in facts), ""]
         lines += (
@@ -58,19 +108,36 @@ def markdown(evidence: Evidence) -> str:
             else []
         )
     lines += ["## How to read this", "", *(f"- {text}" for text in evidence.rules), ""]
-    lines.append(f"Written by advsearch {evidence.version}.")
+    lines += ["## Where it belongs", "", *_table(CROSSWALK_HEADS, CROSSWALK), "", NO_CONFORMITY, ""]
+    lines.append(_signed(evidence))
     return "\n".join(line for line in lines if line is not None) + "\n"
+
+
+def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """A table as Markdown has it."""
+    return [f"| {' | '.join(map(_plain, row))} |" for row in (heads, ["---"] * len(heads), *rows)]
+
+
+def _signed(evidence: Evidence) -> str:
+    by = f" by {_plain(evidence.by)}" if evidence.by else ""
+    return f"Written{by}, {evidence.written or 'at a time that is not noted'}, with advsearch {evidence.version}."
 
 
 def sections(one: EvidenceRun) -> dict[str, list[str]]:
     """Return what stands beside the claims of a run, in lines under their headings."""
     found = {
+        "Criterion": one.criterion,
+        "Triggering conditions": one.triggering,
+        "Exposure": one.exposure,
+        "Operational design domain": [f"{name}: {text}" for name, text in one.domain.items()],
+        "Not shown": one.not_shown,
         "On what": [f"{name}: {text}" for name, text in one.about.items()],
         "What varied": one.searched,
         "Measured how": [f"ended as: {one.ending}", *(f"{name}: {text}" for name, text in one.measured.items())],
         "Excluded, and to be known": one.excluded,
         "Budget": [f"{name}: {text}" for name, text in one.cost.items()],
-        "Made with": [f"{name}: {text}" for name, text in one.made_with.items()],
+        "Made with": [f"begun: {one.begun}"] * bool(one.begun)
+        + [f"{name}: {text}" for name, text in one.made_with.items()],
     }
     return {title: lines for title, lines in found.items() if lines}
 
@@ -86,23 +153,26 @@ def _plain(text: str) -> str:
 CLAIM_HEADS = ("claim", "in words", "counted", "95 % interval")
 
 
-def evidence_page(evidence: Evidence) -> str:
-    """Return the page."""
+def evidence_page(evidence: Evidence, pictures: Mapping[str, bytes] | None = None) -> str:
+    """Return the page; `pictures` has the contents of those that the runs name."""
     claims = [claim for one in evidence.runs for claim in one.claims]
     carried = sum(claim.kind != "nothing claimed" for claim in claims)
     runs = f"{len(evidence.runs)} run{'' if len(evidence.runs) == 1 else 's'}"
     said = f"What {runs} show{'s' if len(evidence.runs) == 1 else ''}, and no more than that."
     main = element(
         "main",
-        *(_run_html(one) for one in evidence.runs),
+        *(_run_html(one, pictures or {}) for one in evidence.runs),
         element("h2", "How to read this"),
         element("ul", *(element("li", text.replace("`", "")) for text in evidence.rules)),
+        element("h2", "Where it belongs"),
+        study_table(CROSSWALK_HEADS, CROSSWALK),
+        element("p", f"{NO_CONFORMITY} {_signed(evidence)}", class_="soft"),
     )
     header = heading(f"evidence; {carried} of {len(claims)} statements carry a claim", said, evidence.warnings)
     return document("evidence", header, main, footer="evidence. This page needs no other file.")
 
 
-def _run_html(one: EvidenceRun) -> Html:
+def _run_html(one: EvidenceRun, pictures: Mapping[str, bytes]) -> Html:
     rows = [
         [
             claim.kind,
@@ -117,6 +187,24 @@ def _run_html(one: EvidenceRun) -> Html:
     return join_html(
         element("h2", f"{one.run} ({one.command})"),
         study_table(CLAIM_HEADS, rows),
+        element(
+            "div",
+            *(
+                element("figure", element("img", src=data_url(pictures[name], "image/png"), alt=name))
+                for name in one.pictures
+                if name in pictures
+            ),
+            class_="pictures",
+        )
+        if one.pictures
+        else None,
+        element(
+            "details",
+            element("summary", f"Right by condition, {len(one.conditions)} rows"),
+            study_table(CONDITION_HEADS, condition_rows(one)),
+        )
+        if one.conditions
+        else None,
         beside,
         join_html(element("h2", "Do it again"), element("pre", one.command_line, class_="wrap"))
         if one.command_line

@@ -270,7 +270,8 @@ def scenes_of(config: SweepConfig) -> Scenes:
 def _job(
     config: SweepConfig, places: Sequence[NamedScene], models: Sequence[AnyModel], task: AnyTask, controls: Controls
 ) -> Job:
-    check_run_settings(config.model_copy(update={"path": None}))  # where no control travels, one is added
+    travels = ("path", "shutter", "rolling") if config.path is not None else ()  # where no control does, one is added
+    check_run_settings(config.model_copy(update=dict.fromkeys(travels)))
     drawn, grid = given_to(config, controls), config.grid
     if config.path is not None:
         drawn, grid = with_frames(config, drawn)

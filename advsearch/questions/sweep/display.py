@@ -110,7 +110,8 @@ def _verdict(summary: SweepSummary) -> str:
         return f"Interrupted after {seen} of {summary.planned} configurations: right in {correct} ({rate})."
     if summary.beside and summary.beside.pairs:
         return " ".join(beside_text(summary.beside.answer, pair) for pair in summary.beside.pairs)
-    return f"The model is right in {correct} of {wording.count(seen, 'configuration')} ({rate})."
+    grid = "" if summary.sampler is not None or not summary.grid else " of this grid; another has another share"
+    return f"The model is right in {correct} of {wording.count(seen, 'configuration')} ({rate}){grid}."
 
 
 def _beside(summary: SweepSummary) -> list[ResultPart]:
@@ -205,7 +206,10 @@ def claims(result: SweepSummary) -> Iterator[Claim]:
         note = " How these were chosen is not known; the interval takes them as a sample."
     elif result.sampler is None:
         how = "points of the grid" if not result.drives else f"{thing}, whose ways and moments are given"
-        note = " Nothing is said of what lies between or beside these points; the interval takes them as a sample."
+        note = (
+            " Nothing is said of what lies between or beside these points, and another grid gives another share; the "
+            "interval takes them as a sample."
+        )
     elif result.drives:  # the frames are the grid, and what a drive has besides is drawn
         how = f"{thing}; what else differs between drives is drawn at random ({result.sampler})"
         note = " The interval is over drives, as if these were independent." * (result.sampler != "random")
@@ -221,6 +225,12 @@ def claims(result: SweepSummary) -> Iterator[Claim]:
         yield claim(
             "measured", f"The model {row.value} is right in {share_text(own)} {how}{_in_each(result)}.{note}", own
         )
+    if far := distance_of(result):
+        yield claim("measured", distance_sentence(far), None)
+    for drive in result.drives or ():
+        told = [f"{name}: {mean} (95 % interval {ends}), {least}" for name, mean, ends, least in drive_rows(drive)]
+        heads = "mean, with its interval over drives, then the worst drive"
+        yield claim("measured", f"{drive_title(drive)} ({heads}): {'; '.join(told)}.", None)
     worst = result.worst.verified if result.worst else None
     if worst is not None:
         text = f"In the worst of these configurations the model is wrong in {wording.rate_text(worst)}."

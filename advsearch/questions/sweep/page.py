@@ -94,7 +94,7 @@ def page(run: Path, summary: SweepSummary, columns: pd.DataFrame | None = None) 
 def sweep_page_html(runs: Sequence[tuple[Path, SweepSummary | None]], sources: Sequence[SweepSource]) -> str:
     """Return the page of sweeps as HTML, of each its folder, its result (None where it has none yet) and what its
     explorer reads."""
-    connects = any(isinstance(one.rows, str) for one in sources)
+    connects = any(isinstance(one.rows, str) or one.folder for one in sources)
     summaries = [(path, summary) for path, summary in runs if summary is not None]
     title = ", ".join(path.name for path, _ in runs)
     described, data, left_out = [], [], []
@@ -104,7 +104,7 @@ def sweep_page_html(runs: Sequence[tuple[Path, SweepSummary | None]], sources: S
         if source.embedded:
             zipped = base64.b64encode(gzip.compress(packed(source.rows), 6, mtime=0)).decode()
             data.append(element("script", Html(zipped), type="application/octet-stream", id=f"rows-{number}"))
-            left_out.append(_left_out(described[-1], source))
+            left_out += [] if source.folder else [_left_out(described[-1], source)]
     main = element(
         "main",
         element("div", id="explorer", hidden="hidden") if shown else _too_many(runs),
@@ -201,7 +201,8 @@ def sweep_verdict(summary: SweepSummary) -> str:
     over = sweeps.over_drives(summary)
     share = f"{percent(summary.accuracy)}, 95 % interval {wording.interval_text(summary.interval)}{over}"
     ended = "" if summary.configurations == summary.planned else f" so far, of {summary.planned} planned"
-    return f"Right in {summary.correct} of {summary.configurations} configurations{ended} ({share})."
+    grid = "" if summary.sampler is not None or not summary.grid else " of this grid; another has another share"
+    return f"Right in {summary.correct} of {summary.configurations} configurations{ended} ({share}){grid}."
 
 
 def _still(path: Path, summary: SweepSummary) -> Html:
@@ -282,11 +283,14 @@ def write_bundle(runs: Sequence[Path], folder: Path) -> Path:
 
 
 def _copied(run: Path, folder: Path, number: int) -> SweepSource:
-    """Write rows and thumbnails of a sweep into the folder, and say where they are."""
-    rows, pictures = f"rows-{number}.bin", f"pictures-{number}"
-    write_bytes(folder / rows, packed(read_columns(run)))
+    """Write the thumbnails of a sweep into the folder, and its rows where a page would be too large with them, and say
+    where they are. A page that was opened by a double click may load pictures beside it, and no rows."""
+    columns, pictures, rows = read_columns(run), f"pictures-{number}", f"rows-{number}.bin"
+    embedded = len(columns) <= MOST_ROWS
+    if not embedded:
+        write_bytes(folder / rows, packed(columns))
     kept = kept_pictures(run)
     for one in kept.numbers if kept else ():
         place = path_of(folder / pictures, one)
         write_bytes(folder / pictures / place.parent.name / place.name, read_thumbnail(run, one))
-    return SweepSource(run.name, rows, pictures=kept, folder=pictures)
+    return SweepSource(run.name, columns if embedded else rows, pictures=kept, folder=pictures)

@@ -247,6 +247,8 @@ class PredictedSweep:
     def _reason_against(self, way: BasisPictures | LightOnSurfaces) -> str | None:
         if not way.moves:
             return ""
+        if self.renderer.composed:
+            return self.renderer.composed
         return way.reason_against(self._fall, self.problem.spp) if self.specialise else "nothing is left out"
 
     def _fall(self, follows: frozenset[str]) -> Groups:

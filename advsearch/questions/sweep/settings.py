@@ -80,6 +80,8 @@ class SweepConfig(SceneConfig):
         description="sweep the frames of a drive, in which camera or object travel along this path",
         otherwise="no path",
     )
+    shutter: float | None = setting_as_in(AttackConfig, "shutter", group="sweep")
+    rolling: float | None = setting_as_in(AttackConfig, "rolling", group="sweep")
     fps: float = setting(
         2.0, "sweep", "frames of the drive that are looked at", unit="frames a second", gt=0.0, le=1000.0
     )

@@ -30,6 +30,7 @@ from advsearch.questions.test.counterexamples import (
 from advsearch.questions.test.result import (
     FAILED,
     NOT_TRIED,
+    NOT_YET,
     STOPPED,
     TIME_OVER,
     UNDECIDED,
@@ -195,7 +196,8 @@ class _SuiteRun:
         """Return what the claims so far come to."""
         configs = [one.config for one in self.planned]
         changes: list[str] = []
-        results = self.results
+        rest = [self._not_tried(one, NOT_YET) for one in self.planned[len(self.results) :]]
+        results = [*self.results, *rest]
         if self.config.update and ending == "done":
             now = {one.name: one.answer for one in results if NOT_TRIED not in one.reason}
             changes = write_expected(self.config.suite, now)

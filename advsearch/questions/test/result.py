@@ -28,7 +28,7 @@ from advsearch.questions.test.settings import (
 from advsearch.report.markup import InNotebook
 from advsearch.report.shown import Claim, Kind, Picture, ResultPart, ShownResult
 from advsearch.report.wording import count, interval_text, number_text, percent, seconds_text, short_name, with_article
-from advsearch.runs.results import Fields, Interval, JsonFloat, RunResult
+from advsearch.runs.results import INTERRUPTED, RUNNING, Fields, Interval, JsonFloat, RunResult
 
 HELD, UNDECIDED, FAILED = "held", "undecided", "failed"
 VERDICTS = (HELD, UNDECIDED, FAILED)
@@ -121,6 +121,7 @@ NOTE = (
 TIME_OVER = "the time of the suite was over"
 STOPPED = "it was interrupted"
 NOT_TRIED = "not tried, since a counterexample failed"
+NOT_YET = "not tried yet"
 
 
 def shown(result: SuiteResult) -> ShownResult:
@@ -233,7 +234,8 @@ def suite_text(result: SuiteResult) -> str:
         return f"Kept as {result.added}."
     known = sum(one.answer != HELD and one.accepted for one in result.claims)
     beside = f", {known} of them as expected" if known else ""
-    return f"{result.answer[:1].upper()}{result.answer[1:]}: {result.brief or 'no claims'}{beside}."
+    said = {RUNNING: "Running, so far", INTERRUPTED: "Stopped, so far"}.get(result.ending, result.answer.capitalize())
+    return f"{said}: {result.brief or 'no claims'}{beside}."
 
 
 def facts(result: SuiteResult) -> dict[str, str]:

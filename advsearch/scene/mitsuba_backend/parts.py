@@ -45,6 +45,7 @@ from advsearch.scene.parts import (
     PluginNumbers,
     PluginPart,
     PointLamp,
+    ProjectorPart,
     ScenePart,
     SpotLamp,
 )
@@ -276,6 +277,19 @@ def _ball(part: BallLamp) -> Translation:
         SceneInput(f"{name}.radiance", f"{name}.emitter.radiance.value", color, interior=True, shape=(3,)),
     )
     return Translation({name: ball}, inputs)
+
+
+@translation.register
+def _projector(part: ProjectorPart) -> Translation:
+    """Mitsuba's texture times pi is the irradiance at distance 1, so that it is a white screen's radiance."""
+    name = part.name
+    inputs = (
+        SceneInput(f"{name}.pose", f"{name}.to_world", transform, shape=(4, 4)),
+        SceneInput(f"{name}.pattern", f"{name}.irradiance.data", interior=True),
+    )
+    picture = {"type": "bitmap", "bitmap": mi.Bitmap(np.zeros((*part.sides, 3), np.float32)), "raw": True}
+    projector = {"type": "projector", "fov": part.fov, "fov_axis": "x", "irradiance": {**picture, "wrap_mode": "clamp"}}
+    return Translation({name: projector}, inputs)
 
 
 @translation.register

@@ -40,7 +40,7 @@ from advsearch.scene.mitsuba_backend.parts import (
 from advsearch.scene.mitsuba_backend.transport import Paths, collect, first_hits
 from advsearch.scene.mitsuba_backend.variant import Plugin, dr, media_in, mi, one_at_a_time, population, recorded
 from advsearch.scene.parts import BASE_COLOR as BASE_COLOR_PLACE
-from advsearch.scene.parts import LampGlass, plugins_in
+from advsearch.scene.parts import PATTERN, LampGlass, plugins_in
 from advsearch.scene.surfaces import Surfaces
 
 MAX_DEPTH = 6
@@ -364,12 +364,12 @@ class MitsubaScene:
             return found | {f"{name}.normals": one for name, one in zip(names, by_normals, strict=True)}
 
     def transport(self, inputs: Mapping[str, Tensor], name: str, seed: int, spp: int) -> Paths:
-        """Return what the vertices of light paths add to their pixels for a unit more of a base colour, and the picture
-        of these paths.
+        """Return what the vertices of light paths add to their pixels for a unit more of a base colour, or of a
+        projector's pattern, and the picture of these paths.
 
         Args:
             inputs: as in `radiance`.
-            name: an input that is a base colour.
+            name: an input that is one of these.
             seed: number of the noise.
             spp: samples a pixel.
         """
@@ -379,8 +379,26 @@ class MitsubaScene:
             noise = mi.load_dict({"type": self.sampler, "sample_count": spp})
             noise.set_samples_per_wavefront(spp)
             noise.seed(dr.opaque(mi.UInt32, seed), self.resolution[0] * self.resolution[1] * spp)
-            found = collect(self._scene, self.parameters, key, noise, self.resolution, depth=self._depth, spp=spp)
-            surface = self.made[0].meshes[name.partition(".")[0]].surface
+            part = name.partition(".")[0]
+            projector = next(
+                (one for one in self._scene.emitters() if one.id() == part and name.endswith(PATTERN)), None
+            )
+            found = collect(
+                self._scene,
+                self.parameters,
+                key,
+                noise,
+                self.resolution,
+                depth=self._depth,
+                spp=spp,
+                projector=projector,
+            )
+            if projector is not None:  # its picture ends at the border, where lookups of a matrix go on
+                half = 0.5 / torch.tensor(self.parameters[key].shape[1::-1])
+                return replace(
+                    found, vertices=[replace(one, uv=one.uv.clamp(half, 1.0 - half)) for one in found.vertices]
+                )
+            surface = self.made[0].meshes[part].surface
             if surface is None:
                 return found
             options = next(one for one in plugins_in(surface) if one["type"] == BASE_COLOR_PLACE)

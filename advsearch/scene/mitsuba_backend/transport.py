@@ -8,8 +8,8 @@ the power heuristic; Veach 1997, section 9.2) and keeps, for each vertex on a su
 so that, to first order, the radiance of the pixel changes by the sum of weight x change of the base colour at the
 vertex. The derivative of the BSDF is a difference: it is evaluated with all texels `STEP` larger too. For a base colour
 in which the BSDF is affine (the diffuse and the metallic lobe of the principled BSDF) that is exact. Dr.Jit's forward
-mode finds the same, at the price of more kernels. The whole path is one kernel, which also makes the picture itself and
-what guides its denoiser.
+mode finds the same, at the price of more kernels. Of a projector's picture the weight is that of its light, white, at
+the vertex. The whole path is one kernel, which also makes the picture itself and what guides its denoiser.
 
 And `first_hits`: what the camera sees first.
 """
@@ -85,13 +85,24 @@ def mean_of(passes: Sequence[Paths]) -> Paths:
     return Paths(mean("radiance"), mean("coverage"), mean("background"), mean("albedo"), mean("normal"), [])
 
 
-def collect(scene: Any, parameters: Any, key: str, noise: Any, size: tuple[int, int], *, depth: int, spp: int) -> Paths:
+def collect(
+    scene: Any,
+    parameters: Any,
+    key: str,
+    noise: Any,
+    size: tuple[int, int],
+    *,
+    depth: int,
+    spp: int,
+    projector: Any = None,
+) -> Paths:
     """Trace one pass. It is not recorded: Dr.Jit 1.5.0 crashes when it replays so long a kernel.
 
     Args:
         scene: Mitsuba's, with its camera.
         parameters: of the scene.
         key: Mitsuba's name of the texture, (h, w, 3).
+        projector: the emitter whose picture the texture is; None where it is a base colour.
         noise: the sampler, seeded.
         size: height and width in pixels.
         depth: segments of the longest path.
@@ -106,14 +117,18 @@ def collect(scene: Any, parameters: Any, key: str, noise: Any, size: tuple[int, 
     ray, weight = sensor.sample_ray(0.0, 0.5, place, aperture)
     first, bounces = _traced(scene, ray, weight, noise, depth)
 
-    # The same BSDFs once more, now that the base colour is larger by `STEP`: their differences are the derivatives
-    base_color = mi.TensorXf(parameters[key])
+    # The same BSDFs once more, now that the base colour is larger by `STEP`: their differences are the derivatives. Or
+    # the light of the projector alone, now that it throws white
+    texture, slopes, lit = mi.TensorXf(parameters[key]), [(0.0, 0.0)] * len(bounces), list[tuple[Any, Any]]()
     try:
-        parameters[key] = base_color + STEP
+        parameters[key] = texture + STEP if projector is None else dr.full(mi.TensorXf, 1.0, texture.shape)
         parameters.update()
-        slopes = [bounce.slopes() for bounce in bounces]
+        if projector is None:
+            slopes = [bounce.slopes() for bounce in bounces]
+        else:
+            lit = [bounce.lit_by(scene, projector) for bounce in bounces]
     finally:
-        parameters[key] = base_color
+        parameters[key] = texture
         parameters.update()
 
     # From the last vertex back to the camera: what leaves each towards the one before it, and what of that is a
@@ -126,6 +141,10 @@ def collect(scene: Any, parameters: Any, key: str, noise: Any, size: tuple[int, 
         vertices.append((mi.Point2f(bounce.si.uv), weight, bounce.sharp))
         L = bounce.bsdf_value_em * bounce.em_weight + bounce.bsdf_weight * incoming
     vertices.reverse()
+    if projector is not None:
+        vertices = [
+            (uv, bounce.throughput * light, bounce.sharp) for bounce, (uv, light) in zip(bounces, lit, strict=True)
+        ]
     L = dr.select(dr.isfinite(L), L, 0.0)
 
     every = dr.full(mi.Bool, True, height * width * spp)
@@ -213,6 +232,15 @@ class Bounce:
         value = self.bsdf.eval(context, self.si, self.wo, self.active_bsdf)
         slope = _slope(value, self.bsdf_value, self.active_bsdf)
         return slope_em, slope / dr.select(self.active_bsdf, self.pdf, 1.0)
+
+    def lit_by(self, scene: Any, projector: Any) -> tuple[Any, Any]:
+        """Where in its picture the vertex sees a projector, and what of that light leaves it along the path."""
+        seen = self.si.is_valid()
+        ds, light = projector.sample_direction(self.si, mi.Point2f(0.5), seen)
+        seen &= dr.any(light != 0.0)
+        seen &= ~scene.ray_test(self.si.spawn_ray_to(ds.p), seen)
+        value = self.bsdf.eval(mi.BSDFContext(), self.si, self.si.to_local(ds.d), seen)
+        return mi.Point2f(ds.uv), dr.select(seen, value * light, 0.0)
 
 
 def _traced(scene: Any, ray: Any, weight: Any, noise: Any, depth: int) -> tuple[FirstHit, list[Bounce]]:

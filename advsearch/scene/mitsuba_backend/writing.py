@@ -33,6 +33,7 @@ from advsearch.scene.parts import (
     PluginNumbers,
     PluginPart,
     PointLamp,
+    ProjectorPart,
     ScenePart,
     SpotLamp,
 )
@@ -174,6 +175,10 @@ def _part(part: ScenePart, left: Plugin) -> Plugin:
         plugin = translation(replace(part, **_triples(inputs))).plugins[part.name]
         if ball is not None:
             plugin["to_world"] = mi.ScalarTransform4f(ball)
+    elif isinstance(part, ProjectorPart):
+        plugin = translation(part).plugins[part.name]
+        plugin["to_world"] = mi.ScalarTransform4f(inputs.pop("pose"))
+        plugin["irradiance"] |= {"bitmap": mi.Bitmap(inputs.pop("pattern"))}
     elif isinstance(part, BeamLamp):
         pose = inputs.pop("to_world", part.to_world)
         plugin = translation(replace(part, to_world=pose)).plugins[part.name]

@@ -23,7 +23,7 @@ from advsearch import seeds
 from advsearch.scene.assembly import ON_PICTURE
 from advsearch.scene.geometry import real_harmonics
 from advsearch.scene.gradients import Group
-from advsearch.scene.parts import PluginPart
+from advsearch.scene.parts import PATTERN, PluginPart
 from advsearch.scene.predictor import NOISE, Predictor, differs
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.transport.matrix import SPP, LinearRenderer, Tick, linear_inputs, passes
@@ -222,10 +222,15 @@ class Lights:
     """
 
     def __init__(self, renderer: Renderer, lighting: Lighting, inputs: Inputs) -> None:
-        every = light_inputs(renderer)
+        patterns = {name for name in renderer.scene.names if name.endswith(PATTERN)}  # light that stands still here
+        every = light_inputs(renderer) | patterns
         own = {name: inputs[name] if name in inputs else renderer.scene.base(name) for name in sorted(every)}
         dark = {name: torch.zeros_like(value) for name, value in own.items()}
-        still = {name: value for name, value in own.items() if name not in lighting.moved and bool((value > 0.0).any())}
+        still = {
+            name: value
+            for name, value in own.items()
+            if name in patterns or (name not in lighting.moved and bool((value > 0.0).any()))
+        }
         self._lamps = sorted(lighting.moved & every - {ENVIRONMENT})
         lit = ENVIRONMENT in lighting.moved
         self._still = bool(still) or not (self._lamps or lit)
@@ -279,8 +284,17 @@ class BasisRenderer(Predictor):
             moving = moving or lighting(traced)
             brightest = traced.scene.assembly(traced.space.inputs(moving.at_its_brightest(u)))
             self._lights = Lights(traced, moving, brightest)
+            linear = traced.scene.assembly(traced.space.inputs(u)).keys() & linear_inputs(traced)
+            elsewhere = {name for name in linear if not name.endswith(PATTERN)}  # projectors are in the first alone
             self._of_each = [
-                LinearRenderer(traced, u, seeds.stream(seed, "light", number), tick, light=alone)
+                LinearRenderer(
+                    traced,
+                    u,
+                    seeds.stream(seed, "light", number),
+                    tick,
+                    names=elsewhere if number else linear,
+                    light=alone,
+                )
                 for number, alone in enumerate(self._lights.alone)
             ]
         self.non_finite = sum(one.non_finite for one in self._of_each)

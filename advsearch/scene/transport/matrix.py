@@ -32,6 +32,7 @@ from advsearch.scene.assembly import ON_PICTURE
 from advsearch.scene.assets import Floats, Ints
 from advsearch.scene.mitsuba_backend.denoise import denoise
 from advsearch.scene.mitsuba_backend.transport import Paths, Vertices, mean_of
+from advsearch.scene.parts import PATTERN
 from advsearch.scene.predictor import MOST_BYTES, LinearMap, Predictor
 from advsearch.scene.renderer import InputSpace, Renderer
 
@@ -256,8 +257,8 @@ PASS = 2**20
 MOST = 4.0
 """Factor by which the noise of the base picture corrects a row at most."""
 TOO_LARGE = "the matrix would take more than"
-LINEAR = ".base_color"
-"""What the names of inputs end in to which radiance is linear, but for light that meets them twice."""
+LINEAR = (".base_color", PATTERN)
+"""What the names of inputs end in to which radiance is linear, but for light that meets a base colour twice."""
 
 Tick = Callable[[int], None]
 """Told of samples a pixel as they are traced."""

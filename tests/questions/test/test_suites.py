@@ -28,6 +28,7 @@ from advsearch.cli.main import main
 from advsearch.cluster import InProcess
 from advsearch.engine.problem import Problem
 from advsearch.errors import AdvsearchError
+from advsearch.progress import NullProgress
 from advsearch.questions.attack.carry_out import attack_once
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.report.evidence import claims_of
@@ -39,10 +40,12 @@ from advsearch.questions.test.counterexamples import _Block as Block
 from advsearch.questions.test.counterexamples import counterexamples, folder_of
 from advsearch.questions.test.result import ClaimResult, SuiteResult
 from advsearch.questions.test.settings import BLIND, HARMLESS, NoWorseClaim, SuiteConfig
+from advsearch.runs.listing import listed_run
 from advsearch.runs.store import Store
 from advsearch.runs.summary import read_result
 from advsearch.scene.color import linear_to_srgb
 from advsearch.testing import assert_no_worse, assert_not_broken, assert_right, assert_suite
+from advsearch.viewer.dashboard import following_page
 
 EASY, HARD = "small_models:easy", "small_models:hard"
 SMALL: dict[str, Any] = {"resolution": 32, "denoise": "none"}
@@ -638,3 +641,22 @@ def test_the_pytest_file_of_the_docs_passes(tmp_path: Path, monkeypatch: pytest.
     for one in tests:
         one()
     assert len(list(Path("runs").iterdir())) == 3, "each keeps its run"
+
+
+def test_a_suite_at_work_is_running(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    said: list[str] = []
+
+    class Watching(NullProgress):
+        def message(self, text: str) -> None:
+            if text.startswith("no-worse:"):  # the summary of the first claim is there, which a kill would leave
+                said.extend([listed_run(tmp_path / "run").state, following_page("run", tmp_path / "run")])
+                assert main(["show", str(tmp_path / "run")]) == 0
+                said.append(capsys.readouterr().out)
+
+    config = SuiteConfig(suite=written(tmp_path, CLAIMS), only="in-front,no-worse,too-few", run=str(tmp_path / "run"))
+    carry_out(config, progress=Watching())
+    state, page, shown = said
+    assert state == "running" and "A process is working on it." in page
+    assert "Running, so far: 1 held, 2 undecided" in shown and "not tried yet" in shown
+    assert "nterrupted" not in shown and "Go on with" not in shown
+    assert main(["show", str(tmp_path / "run")]) == 0 and "unning" not in capsys.readouterr().out

@@ -1,0 +1,271 @@
+"""The `projector` control: a picture thrown onto the object, whose texels may be searched. It only adds light.
+
+A projector of `lumens` that throws a picture of width `w` and height `h` at distance 1 puts the same light on all of a
+screen; at a distance of D metres that is `lumens / (w h D^2)` lux. How bright it is in the scene follows from the light
+that is there without it: `ambient` lux are the irradiance that the camera's exposure is metered for. So more ambient
+light is a darker projector in an equally bright picture, as a camera that meters would show it.
+
+    pattern = linear(texels) (1 - black) + black,        E(D) = E(ambient) lumens / (w h D^2 ambient) pattern
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from advsearch.controls.base import NOTHING, WHOLE_RANGE, Budget, Choice, Parameter, Value, change_in_colour
+from advsearch.controls.numbers import NumberControl, Values
+from advsearch.controls.patch import PRINT_SIDE, enlarged
+from advsearch.controls.ranges import Range
+from advsearch.controls.texture import NORMS, radius
+from advsearch.controls.values import LARGEST_EPSILON, Fixed, Number, Spec
+from advsearch.errors import FileFormatError, InputError
+from advsearch.scene.color import srgb_to_linear
+from advsearch.scene.description import SceneDescription
+from advsearch.scene.exposure import METERED_WHITE, WHITE, metered_gain
+from advsearch.scene.formation import to_8_bit
+from advsearch.scene.geometry import camera_axes, camera_to_world, middle
+from advsearch.scene.importing.pictures import read_picture
+from advsearch.scene.parts import ProjectorPart
+from advsearch.scene.settings import LIT, moving
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+BESIDE = 15.0
+"""Degrees around the object between the camera and a projector that nobody has placed."""
+AMBIENT = 100.0
+"""Lux of a place whose brightness has no unit: a lit hall, a street at late dusk."""
+LUMENS, TIMES = 3000.0, 20.0
+"""Of a projector that nobody has described: it is dimmed to so many times the light of the place."""
+GREY = 0.5
+
+
+class ProjectorControl(NumberControl):
+    """A picture thrown onto the object: its texels are searched, and numbers where they get a range."""
+
+    part: ProjectorPart
+    kind = "projector"
+    summary = "A picture that a projector throws onto the object."
+    parameters = (
+        Parameter(
+            "pattern", (None, None, 3), "sRGB", 0.0, 1.0, "black, or grey",
+            "Display-referred texels of the picture, rounded to 8 bits.", search=(0.0, 1.0), estimators=("adjoint",),
+        ),
+        moving(
+            ("differences",), "azimuth", "degrees", -3600.0, 3600.0, f"{BESIDE:g} from the camera",
+            "Direction of the projector around the object.", periodic=True,
+        ),
+        moving(
+            ("differences",), "elevation", "degrees", -89.0, 89.0, "the camera's",
+            "Height of the projector above the ground plane.",
+        ),
+        moving(
+            ("differences",), "distance", "object sizes", 0.01, 1e4, "the camera's",
+            "Distance to the object's middle; in metres where the object's size is known.", log=True,
+        ),
+        Parameter(
+            "lumens", (), "lumens", 0.0, 1e6, f"{LUMENS:g}, or what is {TIMES:g} times as bright as the place",
+            "Light of a white picture.", estimators=LIT,
+        ),
+        Parameter(
+            "ambient", (), "lux", 1e-3, 2e5, f"the place's, or {AMBIENT:g}",
+            "Light on the object without the projector.", log=True, estimators=LIT,
+        ),
+        Parameter(
+            "black", (), "1", 0.0, 1.0, 0.0, "Share of white that a black texel still throws: 0.001 at a contrast of "
+            "1000.", estimators=LIT,
+        ),
+    )  # fmt: skip
+    choices = (
+        Choice("resolution", 64, "Rows of texels.", whole=(2, 512)),
+        Choice("aspect", 1.0, "Width of the picture over its height.", most=4.0),
+        Choice("fov", None, "Angle of the picture's width, degrees; by default it just covers the object.", most=150.0),
+        Choice("start", "black", "What the search begins with: black or grey.", options=("black", "grey")),
+        Choice(
+            "norm", "linf", "Norm of the ball around that start: linf (per texel value) or l2 (over all of them).",
+            "norm", options=NORMS,
+        ),
+        Choice(
+            "epsilon", None, "Radius of that ball, display-referred; by default every picture is inside.", "epsilon",
+            most=LARGEST_EPSILON,
+        ),
+        Choice("picture", None, "A picture file to project as it is; then the pattern is not searched.",
+               fixes="pattern"),
+    )  # fmt: skip
+
+    def check_choices(self) -> None:
+        pattern, picture = self._given.get("pattern"), self.chosen["picture"]
+        if pattern is not None and [*pattern] != [0.0, 1.0] if isinstance(pattern, (list, tuple)) else pattern:
+            raise InputError(
+                f"{self.name}.pattern: expected no value but [0, 1], got {pattern!r}; a file is {self.name}.picture, "
+                f"and how far texels may go {self.name}.epsilon"
+            )
+        if picture is None:
+            return
+        if not isinstance(picture, (str, Path)):
+            raise InputError(f"{self.name}.picture: expected the path of a picture, got {picture!r}")
+        self._given["picture"] = self.chosen["picture"] = str(picture)
+        beside = [one for one in ("pattern", "epsilon", "norm", "resolution", "aspect") if one in self._given]
+        if beside:
+            raise InputError(
+                f"{self.name}.{beside[0]}: expected none beside {self.name}.picture; leave one of them out"
+            )
+
+    # ---- in a scene -------------------------------------------------------------------------------------------------
+
+    def prepare(self, scene: SceneDescription) -> SceneDescription:
+        picture = self._read()
+        rows = int(self.chosen["resolution"]) if picture is None else len(picture)
+        columns = max(2, round(rows * self.chosen["aspect"])) if picture is None else picture.shape[1]
+        there = self.within(scene)
+        part = ProjectorPart(self.name, there._fov(columns / rows), (rows, columns))
+        if scene.environment is None or scene.environment.candelas is None:
+            told = self.specs.get("ambient")
+            note = (
+                f"The place's brightness has no unit: its light is taken for {AMBIENT:g} lux; "
+                f"{self.name}.ambient says otherwise."
+            )
+            scene = scene if told is not None else replace(scene, remarks=(*scene.remarks, note))
+        return scene.with_part(part)
+
+    def in_scene(self, parameter: Parameter) -> Parameter:
+        metres = parameter.name == "distance" and self.scene.object.metres is not None
+        return replace(parameter, unit="metres") if metres else parameter
+
+    def size(self, parameter: Parameter) -> int:
+        return 3 * math.prod(self.part.sides) if parameter.shape else 1
+
+    def default(self, parameter: Parameter) -> Number:
+        if parameter.name == "pattern":
+            return GREY if self.chosen["start"] == "grey" else 0.0
+        if parameter.name == "ambient":
+            place = self.scene.environment
+            unit = None if place is None else place.candelas
+            return AMBIENT if unit is None else min(max(unit * ambient_irradiance(self.scene), 1e-3), 2e5)
+        if parameter.name == "lumens":
+            ambient, distance = (next(one for one in self.own if one.name == name) for name in ("ambient", "distance"))
+            spec = self.specs.get("distance")
+            at = float(spec.value) if isinstance(spec, Fixed) else float(self.default(distance))
+            return min(LUMENS, TIMES * float(self.default(ambient)) * self.part.area * at**2)
+        away = camera_to_world(self.scene)[:3, 3] - middle(self.scene)
+        far = float(np.linalg.norm(away))
+        if parameter.name == "azimuth":
+            return math.degrees(math.atan2(away[1], away[0])) + BESIDE
+        if parameter.name == "elevation":
+            return min(max(math.degrees(math.asin(away[2] / far)), -89.0), 89.0)
+        return far * self.scene.metres if parameter.name == "distance" else parameter.default
+
+    def spec(self, parameter: Parameter, value: Number) -> Spec:
+        if parameter.name == "pattern":
+            return Range(0.0, 1.0) if self.chosen["picture"] is None else Fixed(0.0)
+        return self.specs.get(parameter.name, Fixed(value))
+
+    def budget_of(self, parameter: Parameter) -> Budget:
+        if parameter.name != "pattern":
+            return WHOLE_RANGE
+        norm, epsilon = self.chosen["norm"], self.chosen["epsilon"]
+        whole = 1.0 if norm == "linf" else math.sqrt(self.size(parameter))
+        return Budget(norm, whole if epsilon is None else radius(norm, epsilon, self.size(parameter)))
+
+    def fit(self) -> None:
+        parts = [one for one in self.scene.parts if isinstance(one, ProjectorPart) and one.name == self.name]
+        (self.part,) = parts
+        self._picture = self._read()
+        super().fit()
+
+    def _read(self) -> Tensor | None:
+        if self.chosen["picture"] is None:
+            return None
+        try:
+            picture = torch.from_numpy(read_picture(Path(self.chosen["picture"])))
+        except FileFormatError as error:
+            raise FileFormatError(f"{self.name}.picture: {error}") from error
+        if min(picture.shape[:2]) < 2:
+            got = f"{picture.shape[1]} x {picture.shape[0]}"
+            raise InputError(f"{self.name}.picture: expected at least 2 texels a side, got {got}")
+        return picture
+
+    def _fov(self, aspect: float) -> float:
+        """Degrees: what was chosen, or with which the picture covers the object from where it stands at the start."""
+        if self.chosen["fov"] is not None:
+            return float(self.chosen["fov"])
+        distances = next(one for one in self.own if one.name == "distance")
+        spec, far = self.specs.get("distance"), float(self.default(distances))
+        far = float(spec.value) if isinstance(spec, Fixed) else far
+        vertices = self.scene.base_vertices - middle(self.scene)
+        reach = float(np.linalg.norm(vertices, axis=1).max()) * max(1.0, aspect) * self.scene.metres
+        return min(math.degrees(2.0 * math.atan(reach / far)), 150.0)
+
+    @property
+    def ambient(self) -> float | None:
+        """Lux beside it; None where that is searched."""
+        slot = next(one for one in self.slots if one.parameter.name == "ambient")
+        return float(slot.spec.value) if isinstance(slot.spec, Fixed) else None
+
+    def in_light(self, times: float) -> Self:
+        """Return the bound control in so many times the ambient light."""
+        if self.ambient is None:
+            return self
+        there = copy.copy(self)
+        there.specs = {**self.specs, "ambient": Fixed(times * self.ambient)}
+        there.fit()
+        return there
+
+    # ---- at a configuration ------------------------------------------------------------------------------------------
+
+    def values(self, u: Tensor) -> dict[str, Tensor]:
+        values, picture = super().values(u), self._picture
+        pattern = values["pattern"].reshape(*self.part.sides, 3) if picture is None else picture.to(u.device)
+        rounded = pattern + (to_8_bit(pattern.detach()) - pattern.detach())  # a projector gets 8 bits
+        return values | {"pattern": rounded}
+
+    def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        azimuth, elevation = (float(values[name].detach()) for name in ("azimuth", "elevation"))
+        left, up, outwards = torch.from_numpy(camera_axes(azimuth, elevation, 0.0)).to(values["pattern"])
+        pose = torch.eye(4).to(left)
+        pose[:3, 0], pose[:3, 1], pose[:3, 2] = left, up, -outwards
+        far = values["distance"].detach() / self.scene.metres
+        pose[:3, 3] = torch.from_numpy(middle(self.scene)).to(left) + far * outwards
+        light = srgb_to_linear(values["pattern"]) * (1.0 - values["black"]) + values["black"]
+        at_one = self._beside(values) * (values["distance"].detach() / self.scene.metres) ** 2
+        white = at_one * ambient_irradiance(self.scene) / math.pi
+        return {f"{self.name}.pose": pose, f"{self.name}.pattern": light * white}
+
+    def _lux(self, values: Values) -> Tensor:
+        """Illuminance () of a white picture where it meets the object's middle head-on."""
+        return values["lumens"] / (self.part.area * values["distance"].detach() ** 2)
+
+    def _beside(self, values: Values) -> Tensor:
+        return self._lux(values) / values["ambient"]
+
+    def measured(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Value]:
+        return {
+            "white": {"value": float(self._lux(values)), "unit": "lux"},
+            "beside_ambient": {"value": float(self._beside(values)), "unit": "times the ambient light"},
+            "mean": {"value": float(srgb_to_linear(values["pattern"]).mean()), "unit": "of white"},
+        }
+
+    def describe(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Value]:
+        described = super().describe(u, so_far)
+        if self._picture is not None:
+            return described
+        here, start = (self.values(at)["pattern"] for at in (u.detach(), self.start.to(u.device)))
+        return {**change_in_colour(self.name, here - start), **described}
+
+    def kept_pictures(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        pattern = values["pattern"]
+        return {self.name: pattern, f"{self.name}-large": enlarged(pattern, -(-PRINT_SIDE // len(pattern)))}
+
+
+def ambient_irradiance(scene: SceneDescription) -> float:
+    """Return the irradiance for which the exposure of a scene's pictures is metered, in scene units."""
+    return METERED_WHITE * math.pi / (WHITE * metered_gain(scene))

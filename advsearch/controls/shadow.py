@@ -1,0 +1,183 @@
+"""The `shadow` control: a dark card between the strongest light and the object, out of the camera's sight.
+
+The card is a polygon around a place in the plane across the way to the light:
+
+    place = middle of the object + distance towards the light + size (x, y),     corner k = size radius_k at k / n turns
+
+It is a real card: how soft its shadow is follows from the light's size and its own distance. Where the camera would see
+it, it goes farther from the object, up to `FARTHEST` times as far; where that does not help it is put away.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from functools import lru_cache
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from advsearch.controls.base import Choice, Parameter, Value
+from advsearch.controls.numbers import NumberControl, Values
+from advsearch.controls.occlusion import SURROUNDINGS
+from advsearch.controls.values import Number
+from advsearch.scene.assets import Doubles, Material, Mesh
+from advsearch.scene.description import SceneDescription
+from advsearch.scene.exposure import arriving
+from advsearch.scene.geometry import affine, camera_axes, camera_to_world, middle
+from advsearch.scene.parts import MeshPart
+from advsearch.scene.settings import moving
+
+SMALLEST = 0.01
+"""A smaller card is put away."""
+FARTHEST, STEPS = 8.0, 12
+"""How many times as far it may be so that the camera does not see it, and in how many steps that is looked for."""
+BELOW_LAMP = 0.7
+"""Where it is at most on the way to a lamp."""
+LOW = 5.0
+"""Degrees above the ground that light counts from: lower, the card would stand on it."""
+
+
+class ShadowControl(NumberControl):
+    """A dark card between the strongest light and the object, that the camera does not see."""
+
+    kind = "shadow"
+    amount = "size"
+    refines = frozenset(SURROUNDINGS)  # none is changed; but it comes after whatever moves the camera
+    summary = "A dark card that throws a shadow onto the object, out of the camera's sight."
+    parameters = (
+        moving(("differences",), "x", "object sizes", -10.0, 10.0, 0.0, "Shift of the shadow to the right, seen from "
+               "the light.", (-0.5, 0.5)),
+        moving(("differences",), "y", "object sizes", -10.0, 10.0, 0.0, "Shift of the shadow upwards.", (-0.5, 0.5)),
+        moving(("differences",), "size", "object sizes", 0.0, 10.0, 0.0, "Radius of the card; at 0 there is none.",
+               (0.0, 0.6)),
+        moving(("differences",), "turn", "degrees", -3600.0, 3600.0, 0.0, "Turn of the card, counter-clockwise.",
+               (0.0, 360.0), periodic=True),
+        Parameter("radii", (None,), "1", 0.05, 1.0, 1.0, "Radius at each corner, as a share of the size.",
+                  moves_silhouettes=True, search=(0.2, 1.0)),
+        moving(("differences",), "azimuth", "degrees", -3600.0, 3600.0, "the strongest light's",
+               "Direction from the object to the card.", periodic=True),
+        moving(("differences",), "elevation", "degrees", LOW, 90.0, "the strongest light's",
+               "Height of that direction above the ground plane."),
+        moving(("differences",), "distance", "object sizes", 0.1, 1000.0, 2.0, "From the object's middle to the card; "
+               "farther where the camera would see it.", log=True),
+    )  # fmt: skip
+    choices = (Choice("corners", 6, "Corners of the card.", whole=(3, 64)),)
+
+    def prepare(self, scene: SceneDescription) -> SceneDescription:
+        texel = np.full((2, 2, 3), 0.1, dtype=np.float32)
+        away = _put_away(torch.from_numpy(camera_to_world(scene))).numpy()
+        card = polygon(int(self.chosen["corners"]))
+        return scene.with_part(MeshPart(self.name, card, texel, Material(roughness=1.0), to_world=away))
+
+    def size(self, parameter: Parameter) -> int:
+        return int(self.chosen["corners"]) if parameter.shape else 1
+
+    def default(self, parameter: Parameter) -> Number:
+        if parameter.name not in ("azimuth", "elevation"):
+            return parameter.default
+        towards, _ = strongest_light(self.scene)
+        if parameter.name == "azimuth":
+            return math.degrees(math.atan2(towards[1], towards[0]))
+        return max(math.degrees(math.asin(min(towards[2], 1.0))), LOW)
+
+    def unchanged(self, parameter: Parameter) -> Number:
+        return self.default(parameter)
+
+    def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        radii = values["radii"]
+        rim = torch.from_numpy(polygon(len(radii)).vertices[1:].copy()).to(radii)
+        offsets = torch.cat([torch.zeros(1, 3).to(radii), rim * (radii[:, None] - 1.0)])
+        camera = so_far.get("camera.to_world", torch.from_numpy(camera_to_world(self.scene))).to(radii)
+        far = self._distance(values, so_far)
+        pose = _put_away(camera) if far is None else self._pose(values, far)
+        return {f"{self.name}.to_world": pose, f"{self.name}.offsets": offsets}
+
+    def measured(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Value]:
+        far = self._distance(values, so_far)
+        return {"true_distance": {"value": 0.0 if far is None else far, "unit": "object sizes, 0 where it is put away"}}
+
+    # ---- inside -----------------------------------------------------------------------------------------------------
+
+    def _pose(self, values: Values, far: float) -> Tensor:
+        right, up, outwards = torch.from_numpy(self._axes(values)).to(values["x"])
+        turn = torch.deg2rad(values["turn"])
+        along = torch.cos(turn) * right + torch.sin(turn) * up
+        across = torch.cos(turn) * up - torch.sin(turn) * right
+        place = torch.from_numpy(middle(self.scene)).to(right) + far * outwards + values["x"] * right + values["y"] * up
+        size = values["size"].clamp_min(SMALLEST)
+        return affine(size * torch.stack([along, -across, -outwards], dim=1), place)
+
+    def _axes(self, values: Values) -> Doubles:
+        """Rows: to the right and upwards as seen from the light, and towards it."""
+        left, up, outwards = camera_axes(float(values["azimuth"].detach()), float(values["elevation"].detach()), 0.0)
+        return np.stack([-left, up, outwards])
+
+    def _distance(self, values: Values, so_far: Mapping[str, Tensor]) -> float | None:
+        """How far it is, so that the camera does not see it; None where it is put away."""
+        size, asked = (float(values[name].detach()) for name in ("size", "distance"))
+        if size < SMALLEST:
+            return None
+        right, up, outwards = self._axes(values)
+        aside = float(values["x"].detach()) * right + float(values["y"].detach()) * up
+        _, lamp = strongest_light(self.scene)
+        for share in np.geomspace(1.0, FARTHEST, STEPS):
+            far = min(asked * share, BELOW_LAMP * lamp)
+            if not self._seen(middle(self.scene) + far * outwards + aside, size, so_far):
+                return float(far)
+        return None
+
+    def _seen(self, place: Doubles, size: float, so_far: Mapping[str, Tensor]) -> bool:
+        """Whether a ball around the card is in the camera's picture: within the cone around its corners."""
+        camera = so_far.get("camera.to_world", torch.from_numpy(camera_to_world(self.scene))).detach().double().numpy()
+        way = (place - camera[:3, 3]) @ camera[:3, :3]
+        far = float(np.linalg.norm(way))
+        if far <= size:
+            return True
+        model, fov = self.scene.camera_model, so_far.get("camera.fov")
+        widest = (
+            2.0 * math.atan(math.hypot(*model.tangents))
+            if model is not None
+            else math.radians(self.scene.number("camera.fov") if fov is None else float(fov.detach()))
+        )
+        larger = math.tan(min(widest, 3.0) / 2.0)
+        corner = math.atan(larger * math.hypot(1.0, min(self.scene.aspect, 1.0 / self.scene.aspect)))
+        shift = so_far.get("camera.shift")
+        if shift is not None:
+            corner += 2.0 * float(shift.detach().abs().max())
+        return math.acos(min(max(way[2] / far, -1.0), 1.0)) - math.asin(size / far) < corner
+
+
+@lru_cache(maxsize=8)
+def polygon(corners: int) -> Mesh:
+    """Return a regular polygon of radius 1 in the plane z = 0 that faces +z: its middle, then its corners."""
+    turns = 2.0 * np.pi * np.arange(corners) / corners
+    rim = np.stack([np.cos(turns), np.sin(turns), np.zeros(corners)], axis=1)
+    vertices = np.concatenate([np.zeros((1, 3)), rim]).astype(np.float32)
+    first = np.arange(corners)
+    faces = np.stack([np.zeros(corners, np.int64), first + 1, (first + 1) % corners + 1], axis=1).astype(np.uint32)
+    normals = np.tile(np.array([0.0, 0.0, 1.0], dtype=np.float32), (corners + 1, 1))
+    return Mesh(vertices, faces, normals, vertices[:, :2] / 2.0 + np.float32(0.5))
+
+
+@lru_cache(maxsize=8)
+def strongest_light(scene: SceneDescription) -> tuple[Doubles, float]:
+    """Return the unit way (3,) from the object's middle to what puts most light on a surface that faces it, and how far
+    that is: a lamp, or the brightest place of the environment above the ground, infinitely far."""
+    found, far, most = np.array([0.0, 0.0, 1.0]), math.inf, 0.0
+    directions, _, power = arriving(scene)
+    above = directions[:, 2] >= math.sin(math.radians(LOW))
+    if above.any():
+        strength = np.where(above, power.mean(axis=1), 0.0)
+        found, most = directions[int(strength.argmax())], float(strength.max())
+    for lamp in scene.lamps.values():
+        way, lit = lamp.lighting(middle(scene))
+        if float(lit.mean()) > most and way[2] > 0.0:
+            far = float(np.linalg.norm(way))
+            found, most = way / far, float(lit.mean())
+    return found, far
+
+
+def _put_away(camera: Tensor) -> Tensor:
+    return affine(1e-3 * torch.eye(3).to(camera), camera[:3, 3] - camera[:3, 2])

@@ -1,0 +1,76 @@
+"""Names that nothing is called by are told before anything heavy is imported."""
+
+from __future__ import annotations
+
+import shlex
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from advsearch.api.names import LABEL_SETS, own_names
+from advsearch.attacks.policies import POLICIES
+from advsearch.cli.main import main
+from advsearch.controls import OWN
+from advsearch.models.labels import SETS
+from advsearch.runs.directory import CONFIG, HEADER
+from advsearch.tasks import TASKS
+
+WRONG = """
+attack --object mgu --control texture                                       'mug'
+attack --object mug --control textur                                        'texture'
+attack --object mug --control texture --environment studioo                 'studio'
+attack --object mug --control texture --over camra                          'camera'
+attack --object mug --control texture --policy pgdd                         'pgd'
+attack --object mug --control texture --task detecton                       'detection'
+attack --object mug --control texture --model referenc                      'reference'
+attack --object mug --control texture --labels coc0                         'coco90'
+attack --object car --environment street --with cra@3,1 --control pose      'car'
+attack --object car --with car@3,1 --judge carr --control pose              'car'
+sweep --object mug,bowll --grid pose.yaw=0:330:30                           'bowl'
+sweep --object mug --environment studio,noonn --grid pose.yaw=0:330:30      'noon'
+sweep --object mug --control camra --samples 4                              'camera'
+sweep --object mug --control camera --samples 4 --label mug --model refrence 'reference'
+harden --control textur --quick                                             'texture'
+harden --object mgu --control texture                                       'mug'
+harden --control texture --held-out-environment noonn                       'noon'
+gap --object mug --control poze                                             'pose'
+explain mug-sweep-01                                                        'mug-sweep-001'
+compare mug-swep-001 mug-sweep-001                                          'mug-sweep-001'
+test sute.yaml                                                              suite.yaml
+"""
+
+
+@pytest.mark.parametrize("line", WRONG.strip().splitlines())
+def test_a_slip_is_told_with_what_was_meant(
+    line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    run = tmp_path / "runs" / "mug-sweep-001"
+    run.mkdir(parents=True)
+    (run / CONFIG).write_text(HEADER)
+    (tmp_path / "suite.yaml").touch()
+    *words, meant = shlex.split(line, posix=False)
+    assert main(words) == 2
+    said = capsys.readouterr().err
+    assert f"id you mean {meant}" in said and "PyTorch" not in said
+    assert [one.name for one in (tmp_path / "runs").iterdir()] == ["mug-sweep-001"]
+
+
+def test_nothing_heavy_is_imported_to_tell_it() -> None:
+    code = (
+        "import sys; from advsearch.cli.main import main; main(['attack', '--object', 'mug', '--control', 'textur']);"
+        "sys.exit('torch' in sys.modules or 'mitsuba' in sys.modules)"
+    )
+    begun = time.process_time()
+    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert told.returncode == 0 and "'texture'" in told.stderr and time.process_time() - begun < 1.0
+
+
+def test_names_that_are_read_from_files_are_those_of_the_registries() -> None:
+    assert sorted(own_names("control")) == sorted(OWN)
+    assert sorted(own_names("policy")) == sorted(POLICIES._own)
+    assert sorted(own_names("task")) == sorted(TASKS._own)
+    assert LABEL_SETS == SETS

@@ -1,0 +1,288 @@
+"""The projector control: its light in the scene's units, its derivatives, its matrix, its files, and in which ambient
+light it ends."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from samples import make_attacked
+from torch import Tensor, nn
+
+import advsearch
+from advsearch.api.projection import write_projection
+from advsearch.controls import make_control
+from advsearch.controls.projector import AMBIENT, ProjectorControl, ambient_irradiance
+from advsearch.errors import InputError
+from advsearch.questions.attack.settings import AttackConfig
+from advsearch.runs.images import read_png, write_png
+from advsearch.scene.assets import EnvironmentAsset
+from advsearch.scene.description import describe
+from advsearch.scene.geometry import camera_to_world, middle
+from advsearch.scene.mitsuba_backend.scene import MitsubaScene
+from advsearch.scene.renderer import Renderer
+from advsearch.scene.transport.lights import BasisRenderer, predicting, why_not
+from advsearch.scene.transport.matrix import LinearRenderer
+
+DARK = EnvironmentAsset("dark", np.zeros((4, 8, 3), np.float32))
+SIDE = 32
+ROUNDING = 0.003
+"""Relative: no sample depends on the pattern, so that at one seed adjoint and difference are of the same paths."""
+SCENES = [("mug", "studio"), ("bowl", "kitchen"), ("bottle", "noon"), ("stop-sign", "avenue-dusk"), ("car", "street")]
+
+
+def renderer_of(object: str = "mug", environment: str = "studio", side: int = SIDE, **settings: Any) -> Renderer:
+    scene = advsearch.load_scene(object, environment=environment)
+    return scene.renderer([make_control("projector", {"resolution": 16, **settings})], resolution=side)
+
+
+def raw(renderer: Renderer, u: Tensor, spp: int) -> Tensor:
+    """Radiance (H, W, 3) without the denoiser, at one seed."""
+    return renderer.scene.radiance(renderer.scene.assembly(renderer.space.inputs(u)), 1, spp)
+
+
+def smooth(renderer: Renderer, seed: int) -> Tensor:
+    """A smooth change of a pattern of 16 x 16: random blocks of 4 x 4 texels."""
+    blocks = torch.randn(4, 4, 3, generator=torch.Generator().manual_seed(seed))
+    return blocks.repeat_interleave(4, 0).repeat_interleave(4, 1).reshape(-1)
+
+
+def test_white_puts_its_lumens_over_its_area_on_what_faces_it() -> None:
+    """White ground below a projector in the dark: radiance = E(ambient) / pi x lux / ambient lux."""
+    scene = describe("mug", DARK, given={"pose.x": 50.0, "ground.red": 1.0, "ground.green": 1.0, "ground.blue": 1.0})
+    control = ProjectorControl(elevation=89, distance=3 * scene.metres, fov=20, lumens=5, ambient=50, resolution=4)
+    prepared = control.prepare(scene)
+    bound = control.bind(prepared)
+    white = torch.ones_like(bound.start)
+    seen = MitsubaScene(prepared, (SIDE, SIDE)).radiance(bound.inputs(white), 0, 64)
+    lux = 5.0 / (2.0 * 3.0 * scene.metres * math.tan(math.radians(10.0))) ** 2
+    described = bound.describe(white)
+    assert described["projector.white"]["value"] == pytest.approx(lux)
+    assert described["projector.beside_ambient"]["value"] == pytest.approx(lux / 50.0)
+    farther = (3.0 / (3.0 + middle(scene)[2])) ** 2  # the ground is below the middle
+    expected = lux / 50.0 * ambient_irradiance(scene) / math.pi * farther
+    camera = camera_to_world(scene)
+    x, y, z = -camera[:3, 3] @ camera[:3, :3]
+    scale = SIDE / 2.0 / math.tan(math.radians(scene.number("camera.fov") / 2.0)) / z
+    row, column = int(SIDE / 2.0 - scale * y), int(SIDE / 2.0 - scale * x)
+    under = seen[row - 1 : row + 2, column - 1 : column + 2]
+    assert torch.allclose(under, torch.full_like(under, expected), rtol=0.02)
+
+
+def test_lux_are_those_of_the_place_where_it_has_a_unit() -> None:
+    lit = {name: renderer_of(object, name).space for object, name in (("stop-sign", "avenue-dusk"), ("mug", "studio"))}
+    dusk, studio = (space.controls[0] for space in lit.values())
+    assert isinstance(dusk, ProjectorControl) and isinstance(studio, ProjectorControl)
+    assert dusk.ambient is not None and 5.0 < dusk.ambient < 50.0  # civil dusk
+    assert studio.ambient == AMBIENT
+    assert any("lux" in note for note in lit["studio"].notes(studio.scene))
+    assert not any("lux" in note for note in lit["avenue-dusk"].notes(dusk.scene))
+
+
+def test_the_picture_without_light_is_that_without_a_projector_and_all_others_are_brighter() -> None:
+    renderer = renderer_of()
+    some = torch.rand(len(renderer.start), generator=torch.Generator().manual_seed(0))
+    dark, lit = (raw(renderer, u, 16) for u in (renderer.start, some))
+    assert bool((lit >= dark - 1e-6).all()) and float((lit - dark).mean()) > 0.01
+    without = advsearch.load_scene("mug").renderer(["lens"], resolution=SIDE)
+    ours, plain = raw(renderer, renderer.start, 4096), raw(without, without.start, 4096)
+    assert float((ours - plain).abs().mean()) < 0.01 * float(plain.mean())
+
+
+def test_the_adjoint_is_the_difference() -> None:
+    renderer = renderer_of()
+    scene, generator = renderer.scene, torch.Generator().manual_seed(2)
+    inputs = renderer.scene.assembly(renderer.space.inputs(0.5 + 0.0 * renderer.start))
+    change = torch.rand(inputs["projector.pattern"].shape, generator=generator)
+    weight = torch.randn(SIDE, SIDE, 3, generator=generator)
+    (gradient,) = scene.adjoint(inputs, weight, 3, 16, wrt=["projector.pattern"]).values()
+    moved = {**inputs, "projector.pattern": inputs["projector.pattern"] + change}
+    before, after = (float((scene.radiance(one, 3, 16) * weight).sum()) for one in (inputs, moved))
+    assert float((gradient * change).sum()) == pytest.approx(after - before, rel=ROUNDING)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("object", "environment"), SCENES, ids=lambda one: one)
+def test_derivatives_along_smooth_patterns_are_those_of_differences(object: str, environment: str) -> None:
+    renderer = renderer_of(object, environment, start="grey")
+    scene, u = renderer.scene, renderer.start
+    weight = torch.randn(SIDE, SIDE, 3, generator=torch.Generator().manual_seed(4))
+    weight = nn.functional.avg_pool2d(weight.permute(2, 0, 1)[None], 5, 1, 2)[0].permute(1, 2, 0)
+    inputs = scene.assembly(renderer.space.inputs(u))
+    pattern = inputs["projector.pattern"]
+    ours, theirs = [], []
+    for number in range(6):
+        change = 0.5 * float(pattern.mean()) * smooth(renderer, number).reshape(pattern.shape)
+        gradients = [
+            scene.adjoint(inputs, weight, 10 * number + k, 64, wrt=["projector.pattern"])["projector.pattern"]
+            for k in range(2)
+        ]
+        ours.append(float((torch.stack(gradients).mean(dim=0) * change).sum()))
+        ends = [{**inputs, "projector.pattern": pattern + sign * change} for sign in (-0.5, 0.5)]
+        low, high = (float((scene.radiance(one, 1000 + number, 256) * weight).sum()) for one in ends)
+        theirs.append(high - low)
+    cosine = float(nn.functional.cosine_similarity(torch.tensor(ours), torch.tensor(theirs), dim=0))
+    assert cosine > 0.99, (ours, theirs)
+
+
+@pytest.mark.parametrize("object", ["mug", "stop-sign"])
+def test_the_matrix_predicts_what_is_traced(object: str) -> None:
+    renderer = renderer_of(object, "studio", side=24)
+    assert why_not(renderer) is None
+    linear = predicting(renderer, renderer.start, seed=1)
+    assert isinstance(linear, LinearRenderer) and linear.entries > 100
+    u = (0.5 + 0.2 * smooth(renderer, 1)).clamp(0.0, 1.0)
+    before, after = (renderer.radiance(one, seed=7, spp=1024) for one in (renderer.start, u))
+    predicted = [linear.renderer.radiance(one) for one in (renderer.start, u)]
+    traced, told = after - before, predicted[1] - predicted[0]
+    assert float((told - traced).norm()) < 0.15 * float(traced.norm())
+    assert float(told.sum()) == pytest.approx(float(traced.sum()), rel=0.03)
+
+
+def test_beside_moving_lamps_and_textures_its_light_counts_once() -> None:
+    scene = advsearch.load_scene("mug")
+    controls = [
+        make_control("projector", {"resolution": 8}),
+        make_control("light", {"power": [0, 8]}),
+        make_control("texture", {"resolution": 8}),
+    ]
+    renderer = scene.renderer(controls, resolution=24)
+    basis = predicting(renderer, renderer.start, seed=1)
+    assert isinstance(basis, BasisRenderer)
+    u = renderer.start.clone()
+    u[: 8 * 8 * 3] = 0.6
+    u[8 * 8 * 3] = 0.5
+    traced, told = renderer.radiance(u, seed=3, spp=1024), basis.renderer.radiance(u)
+    assert float((told - traced).abs().mean()) < 0.03 * float(traced.mean())
+
+
+def test_the_stored_png_throws_the_same_picture_and_texels_have_eight_bits(tmp_path: Path) -> None:
+    renderer = renderer_of()
+    u = torch.rand(len(renderer.start), generator=torch.Generator().manual_seed(3))
+    pattern = renderer.space.artifacts(u)["projector"]
+    file = write_png(tmp_path / "pattern.png", pattern)
+    assert torch.equal(torch.from_numpy(read_png(file)), pattern)
+    lumens = next(one for one in renderer.space.controls[0].slots if one.parameter.name == "lumens").default
+    again = advsearch.load_scene("mug").renderer(
+        [make_control("projector", {"picture": str(file), "lumens": [0, lumens]})], resolution=SIDE
+    )
+    assert torch.equal(renderer(u, seed=5, spp=8), again(torch.ones(1), seed=5, spp=8))
+
+
+CASES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
+    "no lumens": ({"lumens": 0}, {}),
+    "a million lumens": ({"lumens": 1e6}, {}),
+    "grazing": ({"elevation": 0.5}, {}),
+    "behind the object": ({"azimuth": 220}, {}),
+    "inside the object": ({"distance": 0.01, "fov": 30}, {}),
+    "into a mirror": ({}, {"material.metallic": 1.0, "material.roughness": 0.0}),
+    "on black, which is never quite black": ({"black": 0.01}, {}),
+}
+ONE_TEXEL = 16 * 16 * 3 // 2
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_pictures_and_gradients_are_finite_at_the_ends(case: str) -> None:
+    settings, given = CASES[case]
+    scene = advsearch.load_scene("mug", settings=given)
+    renderer = scene.renderer([make_control("projector", {"resolution": 16, **settings})], resolution=16)
+    one = torch.zeros(len(renderer.start))
+    one[ONE_TEXEL : ONE_TEXEL + 3] = 1.0
+    for u in (renderer.start, torch.ones_like(one), one):
+        u = u.clone().requires_grad_()
+        picture = renderer(u, seed=0, spp=4)
+        picture.mean().backward()
+        assert bool(torch.isfinite(picture).all())
+        assert case == "no lumens" or (u.grad is not None and bool(torch.isfinite(u.grad).all()))
+
+
+def test_light_reaches_a_glass_and_its_gradient_is_finite() -> None:
+    renderer = renderer_of("wine-glass", side=16)
+    u = torch.full_like(renderer.start, 0.5).requires_grad_()
+    picture = renderer(u, seed=0, spp=8)
+    picture.mean().backward()
+    assert bool(torch.isfinite(picture).all()) and u.grad is not None and bool(torch.isfinite(u.grad).all())
+    assert float((picture.detach() - renderer(renderer.start, seed=0, spp=8)).mean()) > 0.0
+
+
+@pytest.mark.parametrize(
+    ("settings", "says"),
+    [
+        ({"pattern": 0.5}, "expected no value but"),
+        ({"picture": "a.png", "epsilon": 0.1}, "leave one of them out"),
+        ({"picture": "nowhere.png"}, "nowhere.png"),
+        ({"lumens": -1}, "lumens"),
+        ({"fov": 170}, "fov"),
+    ],
+)
+def test_what_it_cannot_be_set_to_is_refused(settings: dict[str, Any], says: str) -> None:
+    with pytest.raises(InputError, match=says):
+        renderer_of(**settings) if "picture" not in settings else advsearch.load_scene("mug").renderer(
+            [make_control("projector", settings)], resolution=16
+        )
+
+
+class Glare(nn.Module):
+    """Class 1 where the middle of the picture is brighter than a threshold."""
+
+    def __init__(self, threshold: float) -> None:
+        super().__init__()
+        self.threshold = threshold
+
+    def forward(self, images: Tensor) -> Tensor:
+        light = 40.0 * (images[:, :, 6:10, 6:10].mean(dim=(1, 2, 3)) - self.threshold)
+        return torch.stack([-light, light], dim=1)
+
+
+@pytest.fixture(scope="module")
+def glare() -> advsearch.Model:
+    return advsearch.load_model(Glare(0.8), labels=("mug", "glare"), input_size=16, name="glare")
+
+
+def test_the_result_says_in_which_ambient_light_it_ends(glare: advsearch.Model, tmp_path: Path) -> None:
+    result = advsearch.attack(
+        "mug", glare, controls={"projector": {"resolution": 4}}, resolution=16, steps=16, trials=6,
+        verify_spp=16, baseline=False, measure="no", run=tmp_path / "run",
+    )  # fmt: skip
+    light = result.summary.ambient
+    assert result.found and light is not None and light.lux == AMBIENT
+    assert [point.lux for point in light.points] == sorted(point.lux for point in light.points)
+    assert light.points[0].verified == result.summary.verified
+    assert light.ends_at is not None and light.lux < light.ends_at <= 1.2 * light.holds_to
+    last = [point for point in light.points if point.lux > light.holds_to]
+    assert last and not last[0].holds and last[-1].verified.successes == 0
+    page = (tmp_path / "run" / "report.html").read_text("utf-8")
+    assert f"Works up to {light.holds_to:.3g} lux" in page
+    kinds = {row.kind for row in result.rows()}
+    assert any(kind.startswith("ambient ") for kind in kinds)
+
+
+def test_the_export_has_the_picture_marks_and_what_to_set(tmp_path: Path) -> None:
+    settings = {"resolution": 4, "lumens": 10}
+    config = AttackConfig(object="mug", controls={"projector": settings}, resolution=16)
+    u = np.linspace(0.0, 1.0, 4 * 4 * 3)
+    run = make_attacked(tmp_path / "run", config, u)
+    notes = write_projection(run, tmp_path / "out")
+    assert "10 lumens" in notes[0]
+    texels = torch.from_numpy(read_png(tmp_path / "out" / "texels.png"))
+    assert torch.equal(texels, renderer_of(**settings).space.artifacts(torch.from_numpy(u).float())["projector"])
+    marks, seen = (read_png(tmp_path / "out" / name) for name in ("marks.png", "seen.png"))
+    assert marks.max() == 1.0 and marks.mean() < 0.1 and seen.shape == (16, 16, 3)
+    assert {one.name for one in (tmp_path / "out").iterdir()} == {
+        "picture.png", "texels.png", "marks.png", "seen.png", "README.txt",
+    }  # fmt: skip
+    with pytest.raises(InputError, match="there already"):
+        write_projection(run, tmp_path / "out")
+
+
+def test_one_picture_holds_over_cameras(glare: advsearch.Model) -> None:
+    result = advsearch.attack(
+        "mug", glare, controls={"projector": {"resolution": 4}},
+        over={"camera": {"azimuth": [30, 50]}}, resolution=16, steps=16, draws=2, trials=30, verify_spp=4,
+        baseline=False, measure="no",
+    )  # fmt: skip
+    assert result.found and result.summary.transport is not None and result.summary.transport.used

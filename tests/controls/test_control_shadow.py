@@ -1,0 +1,83 @@
+"""The shadow control: it takes light away from the object, from where the camera does not see it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+import advsearch
+from advsearch.controls import make_control
+from advsearch.controls.shadow import polygon, strongest_light
+from advsearch.scene.description import describe
+from advsearch.scene.geometry import camera_to_world, middle
+from advsearch.scene.renderer import Renderer
+
+SIDE = 32
+
+
+def renderer_of(environment: str = "noon", side: int = SIDE, **settings: object) -> Renderer:
+    scene = advsearch.load_scene("mug", environment=environment)
+    return scene.renderer([make_control("shadow", settings)], resolution=side)
+
+
+def test_there_is_none_at_the_start() -> None:
+    renderer = renderer_of()
+    without = advsearch.load_scene("mug", environment="noon").renderer(["lens"], resolution=SIDE)
+    ours, theirs = (one.radiance(one.start, seed=1, spp=64) for one in (renderer, without))
+    assert float((ours - theirs).abs().mean()) < 1e-3 * float(theirs.mean())
+
+
+def test_it_takes_light_away_and_the_camera_sees_no_card() -> None:
+    renderer = renderer_of(size=[0, 1])
+    low, high = (renderer.radiance(torch.tensor([u]), seed=1, spp=256) for u in (0.0, 0.6))
+    assert float(high.mean()) < 0.97 * float(low.mean())
+    seen = renderer.surfaces(torch.tensor([0.6]))
+    assert not bool((seen.id == seen.names.index("shadow") + 1).any())
+
+
+@pytest.mark.parametrize("azimuth", [0, 40, 120, 220, 300])
+@pytest.mark.parametrize("size", [0.2, 0.9])
+def test_it_is_out_of_sight_from_wherever_it_stands_or_put_away(azimuth: float, size: float) -> None:
+    renderer = renderer_of(side=24, size=size, azimuth=azimuth, elevation=30, x=[-1, 1])
+    for u in (0.0, 0.5, 1.0):
+        seen = renderer.surfaces(torch.tensor([u]))
+        assert not bool((seen.id == seen.names.index("shadow") + 1).any())
+    told = renderer.space.describe(torch.tensor([0.5]))["shadow.true_distance"]["value"]
+    assert isinstance(told, float) and (told == 0.0 or told >= 2.0)
+
+
+def test_the_strongest_light_is_that_of_the_map_or_a_lamp() -> None:
+    low, far = strongest_light(describe("mug", "low-sun"))
+    assert math.isinf(far) and 0.0 < low[2] < 0.5 and np.linalg.norm(low) == pytest.approx(1.0, abs=1e-3)
+    turned, _ = strongest_light(describe("mug", "low-sun", given={"environment.rotation": 90.0}))
+    assert turned[0] == pytest.approx(-low[1], abs=1e-6) and turned[1] == pytest.approx(low[0], abs=1e-6)
+
+
+def test_the_card_is_a_polygon_that_faces_the_object() -> None:
+    card = polygon(5)
+    first, second, third = (card.vertices[card.faces[:, k]] for k in range(3))
+    assert bool((np.cross(second - first, third - first)[:, 2] > 0.0).all())
+    renderer = renderer_of(corners=5, size=0.5)
+    inputs = renderer.space.inputs(torch.full_like(renderer.start, 0.25))
+    pose, offsets = inputs["shadow.to_world"], inputs["shadow.offsets"]
+    scene = describe("mug", "noon")
+    towards = torch.from_numpy(middle(scene)).float() - pose[:3, 3]
+    assert float(pose[:3, 2] @ towards) > 0.0 and float(torch.linalg.det(pose[:3, :3])) > 0.0
+    rim = torch.from_numpy(card.vertices) + offsets
+    assert torch.allclose(rim[1:].norm(dim=1), torch.full((5,), 0.4), atol=1e-6)  # u of 0.25 in 0.2 to 1
+    assert float((torch.from_numpy(camera_to_world(scene))[:3, 3].float() - pose[:3, 3]).norm()) > 0.5
+
+
+def test_it_is_searched_with_a_projector_and_differentiated_by_differences() -> None:
+    scene = advsearch.load_scene("mug", environment="noon")
+    controls = [make_control("shadow", {"size": [0, 1]}), make_control("projector", {"resolution": 4})]
+    renderer = scene.renderer(controls, resolution=16)
+    plan = {group.name: group.estimator for group in renderer.plan.groups}
+    assert plan == {"shadow.size": "differences", "projector.pattern": "adjoint"}
+    u = renderer.start.clone() + 0.3
+    u.requires_grad_()
+    renderer(u, seed=0, spp=4).mean().backward()
+    assert u.grad is not None and bool(torch.isfinite(u.grad).all()) and bool(u.grad.any())

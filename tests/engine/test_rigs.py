@@ -1,0 +1,164 @@
+"""Several cameras, one verdict: where they look, rules by hand, and attacks on a network that takes all pictures."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor, nn
+
+import advsearch
+from advsearch.errors import FileFormatError, InputError
+from advsearch.models.all_at_once import AllAtOnce
+from advsearch.scene.geometry import camera_to_world, middle
+from advsearch.scene.rig import read_rig
+from advsearch.tasks import make_task
+
+RING = "cameras: [{name: front}, {around: 90}, {around: 180}, {around: 270}]"
+STEREO = "cameras: [{name: left}, {name: right, place: [0.6, 0, 0]}]"
+CAMERA = {"camera_model": "pinhole", "intrinsics": [30.0, 30.0, 16.0, 16.0], "resolution": [32, 32]}
+STEPS = "  T_cn_cnm1: [[1, 0, 0, -0.6], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]"
+SMALL: dict[str, Any] = {"environment": "street", "resolution": 24, "spp": 2, "verify_spp": 4, "denoise": "none"}
+
+
+class Blue(nn.Module):
+    """Says "car" where all pictures (N, K, 3, H, W) together are bluer than red."""
+
+    def forward(self, pictures: Tensor) -> Tensor:
+        assert pictures.ndim == 5
+        blue = (pictures[:, :, 2] - pictures[:, :, 0]).mean(dim=(1, 2, 3))
+        score = 60.0 * (blue - 0.06)
+        return torch.stack([score, -score], dim=1)
+
+
+class EachBlue(nn.Module):
+    """The same of single pictures."""
+
+    def forward(self, pictures: Tensor) -> Tensor:
+        assert pictures.ndim == 4
+        return Blue()(pictures[:, None])
+
+
+def rig(folder: Path, text: str) -> str:
+    (folder / "rig.yaml").write_text(text)
+    return str(folder / "rig.yaml")
+
+
+def camchain(folder: Path) -> str:
+    lines = [f"cam{number}:" for number in range(2)]
+    text = ""
+    for number, line in enumerate(lines):
+        text += line + "\n"
+        for name, value in CAMERA.items():
+            text += f"  {name}: {value}\n"
+        text += f"  distortion_model: radtan\n  distortion_coeffs: [{-0.1 * number}, 0.0, 0.0, 0.0]\n"
+        text += STEPS + "\n" if number else ""
+    return rig(folder, text)
+
+
+@pytest.mark.parametrize("kind", ["list", "camchain"])
+def test_each_camera_takes_the_picture_that_it_takes_alone(tmp_path: Path, kind: str) -> None:
+    """The first bit for bit; the second as a camera of the same pose in a scene of its own."""
+    file = rig(tmp_path, STEREO) if kind == "list" else camchain(tmp_path)
+    both = advsearch.load_scene("car", "street", camera=file).renderer(["light"], resolution=32, denoise="none")
+    alone = None if kind == "list" else f"{file}#cam0"
+    first = advsearch.load_scene("car", "street", camera=alone).renderer(["light"], resolution=32, denoise="none")
+    with torch.no_grad():
+        seen, own = both(both.start, 3, 4), first(first.start, 3, 4)
+    assert seen.shape == (32, 64, 3)
+    torch.testing.assert_close(seen[:, :32], own, atol=0.0, rtol=0.0)
+    assert float((seen[:, 32:] - own).abs().mean()) > 0.02
+    description = both.scene.made[0]
+    base = torch.from_numpy(camera_to_world(description)).float()
+    pose = description.rig[1].seen({}, base, torch.zeros(3), description.metres)["camera.to_world"]
+    shift = (pose[:3, 3] - base[:3, 3]) * description.metres
+    torch.testing.assert_close(shift, -0.6 * base[:3, 0], atol=1e-5, rtol=0.0)  # 0.6 m to the right: +x is to the left
+    torch.testing.assert_close(pose[:3, :3], base[:3, :3], atol=1e-6, rtol=0.0)
+
+
+def test_cameras_around_the_object_are_those_of_as_many_azimuths(tmp_path: Path) -> None:
+    ring = advsearch.load_scene("car", "street", camera=rig(tmp_path, RING)).description
+    base = torch.from_numpy(camera_to_world(ring)).float()
+    center = torch.from_numpy(middle(ring)).float()
+    for number, mount in enumerate(ring.rig):
+        turned = ring.with_values(camera__azimuth=ring.number("camera.azimuth") + 90.0 * number)
+        pose = mount.seen({}, base, center, ring.metres)["camera.to_world"]
+        np.testing.assert_allclose(pose.numpy(), camera_to_world(turned), atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("rule", "right"), [("any", [1, 1, 1, 0]), ("all", [1, 0, 0, 0]), ("vote", [1, 1, 0, 0]), ("mean", [1, 1, 0, 0])]
+)
+def test_rules_are_those_worked_out_by_hand(rule: str, right: list[int]) -> None:
+    """Of three pictures, 3, 2, 1 and 0 are right, each by the same margin; a target is reached by the same rule."""
+    model = advsearch.load_model(EachBlue(), labels=("car", "road"), input_size=8)
+    task = make_task({"name": "rig", "rule": rule}).on(replace(model, cameras=3))
+    sides = [[1, 1, 1], [1, 1, -1], [1, -1, -1], [-1, -1, -1]]
+    output = [tuple(torch.tensor([[2.0 * side, 0.0]]) for side in row) for row in sides]
+    said = task.judge(output, ((0,), (0,), (0,)))
+    assert [int(one.right) for one in said] == right
+    assert [int(one.success) for one in said] == [1 - one for one in right]
+    aimed = make_task({"name": "rig", "rule": rule}).on(replace(model, cameras=3), target="road")
+    reached = [int(one.success) for one in aimed.judge(output, ((0,), (0,), (0,)))]
+    assert reached == right[::-1]
+
+
+@pytest.mark.parametrize("text", [STEREO, RING])
+def test_an_attack_on_a_network_that_takes_all_pictures_is_found_and_verified(tmp_path: Path, text: str) -> None:
+    file = rig(tmp_path, text)
+    cameras = len(read_rig(file))
+    network = AllAtOnce(Blue(), cameras, "NKCHW")
+    model = advsearch.load_model(network, labels=("car", "road"), input_size=24, name="blue")
+    found = advsearch.attack(
+        "car", model, camera=file, task="rig", controls="texture", epsilon=0.4, steps=6, trials=6, policy="pgd",
+        baseline=False, run=tmp_path / "run", **SMALL,
+    )  # fmt: skip
+    assert found.summary.ending == "found", found.summary
+    assert tuple(found.adversarial.shape) == (24, 24 * cameras, 3)
+    kept = found.summary.adversarial
+    assert kept is not None and len(kept.payload["pictures"]) == cameras
+
+
+def test_a_sweep_judges_each_picture_and_the_rig_by_its_rule(tmp_path: Path) -> None:
+    model = advsearch.load_model(EachBlue(), labels=("car", "road"), input_size=24, name="blue")
+    file, rights = rig(tmp_path, "cameras: [{}, {turn: [180, 0, 0]}]"), {}
+    for rule in ("any", "all"):
+        swept = advsearch.sweep(
+            "car", model, grid={"camera.azimuth": "0:360:4"}, camera=file, task={"name": "rig", "rule": rule}, trials=0,
+            environment="street", resolution=24, spp=2, denoise="none",
+        )  # fmt: skip
+        rights[rule] = swept.summary.correct
+    assert rights["any"] == 4 > rights["all"]  # the second looks away from the car
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("cameras: [{}]", "2 to 16 cameras"),
+        ("cameras: [" + "{}," * 17 + "]", "2 to 16 cameras"),
+        ("cameras: [{}, {fov: 0}]", "fov"),
+        ("cameras: [{}, {fov: .inf}]", "fov"),
+        ("cameras: [{}, {place: [1, 2]}]", "place"),
+        ("cameras: [{}, {place: [1, 2, .nan]}]", "place"),
+        ("cameras: [{place: [1, 0, 0]}, {}]", "first camera"),
+        ("cameras: [{}, {code: x}]", "entries among"),
+        ("cameras: [{}, 5]", "entries among"),
+        ("cameras: [{name: a}, {name: a}]", "name of its own"),
+        ("{cameras: [{}, {}], more: 1}", "`cameras` alone"),
+    ],
+)
+def test_files_that_are_no_rig_are_refused(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(FileFormatError, match=message):
+        advsearch.load_scene("car", "street", camera=rig(tmp_path, text))
+
+
+def test_a_rig_and_its_task_belong_together(tmp_path: Path) -> None:
+    model = advsearch.load_model(EachBlue(), labels=("car", "road"), input_size=24)
+    with pytest.raises(InputError, match="has 2 cameras"):
+        advsearch.attack("car", model, camera=rig(tmp_path, STEREO), controls="texture", **SMALL)
+    with pytest.raises(InputError, match="expected a rig, got one camera"):
+        advsearch.attack("car", model, task="rig", controls="texture", **SMALL)

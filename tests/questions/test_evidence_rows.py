@@ -1,0 +1,108 @@
+"""Evidence, line by line against the rows of the runs that it is of."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from pathlib import Path
+
+import pytest
+import samples
+import small_models
+
+import advsearch
+from advsearch.attacks import clopper_pearson
+from advsearch.cli.main import main
+from advsearch.errors import InputError
+from advsearch.questions.explain.result import ExplainResult
+from advsearch.questions.report.answer import (
+    criterion_lines,
+    is_confirmed,
+    met,
+    read_exposure,
+    triggering_conditions,
+)
+from advsearch.questions.report.evidence import claims_of
+from advsearch.report.wording import interval_text, percent
+from advsearch.runs.store import NAME, Store
+
+pytestmark = pytest.mark.usefixtures("two_threads")
+
+
+def test_every_share_is_that_of_the_rows(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    advsearch.sweep(
+        "mug", small_models.easy(), {"camera.azimuth": [20.0, 140.0], "camera.elevation": [10.0, 50.0]},
+        environment=["studio", "noon"], spp=1, resolution=32, denoise="none", trials=0, run=tmp_path / "run",
+        keep_pictures="none",
+    )  # fmt: skip
+    (tmp_path / "common.yaml").write_text("environment: {studio: 3, noon: 1}\n")
+    out = tmp_path / "card"
+    asked = ["report", str(tmp_path / "run"), "--evidence", "--out", str(out), "--criterion", "0.5"]
+    assert main([*asked, "--exposure", str(tmp_path / "common.yaml"), "--by", "A. N. Other", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    (run,) = told["runs"]
+    with Store(tmp_path / "run" / NAME, read_only=True) as store:
+        rows = list(store.rows("sweep"))
+    right, seen = Counter[tuple[str, str]](), Counter[tuple[str, str]]()
+    for row in rows:
+        for axis in ("environment", "camera.azimuth", "camera.elevation"):
+            value = row.values[axis]["value"]
+            key = axis, value if isinstance(value, str) else f"{float(str(value)):g}"
+            seen[key] += 1
+            right[key] += bool(row.correct)
+    counted = {(one["axis"], one["value"]): (one["right"], one["of"]) for one in run["conditions"]}
+    assert counted == {key: (right[key], seen[key]) for key in seen} and len(rows) == 8
+    for one in run["conditions"]:
+        assert one["interval"] == pytest.approx(clopper_pearson(one["right"], one["of"]))
+    total = sum(bool(row.correct) for row in rows)
+    interval = clopper_pearson(total, 8)
+    assert run["criterion"][0].startswith(f"At least 50 %: {met(0.5, interval)} by {total} of 8")
+    mean = sum(
+        share * right["environment", name] / seen["environment", name]
+        for name, share in (("studio", 0.75), ("noon", 0.25))
+    )
+    (weighted,) = run["exposure"]
+    assert f"right in {percent(mean)}, 95 % interval" in weighted and "studio 75 %" in weighted
+    text, page = ((out / f"evidence.{kind}").read_text() for kind in ("md", "html"))
+    for one in run["conditions"]:
+        cells = [one["condition"].replace("_", "\\_"), str(one["right"]), str(one["of"])]
+        assert f"| {' | '.join(cells)} | {interval_text(one['interval'])} |" in text
+    for said in ("another grid gives another share", "Not shown", "ISO 21448", "no conformity", "A. N. Other"):
+        assert said in text and said in page
+    assert run["domain"]["weather"] == "not varied" and "studio" in run["domain"]["place"]
+    assert any("weather" in one for one in run["not_shown"])
+    for name in run["pictures"]:
+        assert (out / name).read_bytes() == (tmp_path / "run" / "images" / name.split("-", 1)[1]).read_bytes()
+    assert "bundled object mug" in run["made_with"] and "bundled environment noon" in run["made_with"]
+
+
+def test_rules_are_claims_and_triggering_conditions_and_say_whether_they_are_confirmed() -> None:
+    result = ExplainResult.of(samples.EXPLAIN)
+    first, *_ = claims_of(result)
+    assert first.kind == "measured" and first.extent is not None and first.extent.total == 97
+    assert "camera.elevation over 60 degrees (rule 1)" in first.statement and "fresh renders" in first.statement
+    assert is_confirmed(result.rules[0]) is False
+    elsewhere = {"right": 90, "of": 97, "interval": [0.85, 0.97]}
+    apart = ExplainResult.of({**samples.EXPLAIN, "rules": [{**samples.EXPLAIN["rules"][0], "elsewhere": elsewhere}]})
+    assert is_confirmed(apart.rules[0]) is True and triggering_conditions(apart)[0].startswith("Confirmed: ")
+    unasked = ExplainResult.of({**samples.EXPLAIN, "rules": [{**samples.EXPLAIN["rules"][0], "confirmed": None}]})
+    assert is_confirmed(unasked.rules[0]) is None and "not rendered" in triggering_conditions(unasked)[0]
+
+
+def test_a_criterion_is_met_not_met_or_open() -> None:
+    assert [met(0.9, ends) for ends in ((0.91, 0.99), (0.5, 0.89), (0.85, 0.95))] == ["met", "not met", "open"]
+    assert criterion_lines([], [], 0.9) == []
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("environment: studio", "expected values with a weight each"),
+        ("environment: {studio: much}", "expected a number of at least 0"),
+        ("environment: {studio: 0}", "expected a weight over 0"),
+    ],
+)
+def test_weights_that_are_none_are_refused(text: str, said: str, tmp_path: Path) -> None:
+    (tmp_path / "common.yaml").write_text(text)
+    with pytest.raises(InputError, match=said):
+        read_exposure(str(tmp_path / "common.yaml"))
