@@ -53,11 +53,12 @@ def test_layers_are_read_back_with_what_they_mean(tmp_path: Path) -> None:
 def test_depth_normal_and_texture_coordinates_are_those_of_the_triangle(seen: tuple[MitsubaScene, Surfaces]) -> None:
     scene, found = seen
     mesh = scene.assembly.meshes["object"]
-    vertices, faces = mesh.place(None, None)[0], torch.from_numpy(mesh._mesh.faces.astype(np.int64))
+    metres = scene.made[0].metres
+    vertices, faces = metres * mesh.place(None, None)[0], torch.from_numpy(mesh._mesh.faces.astype(np.int64))
     uvs = torch.from_numpy(mesh._mesh.uvs)
     there = found.seen("object")
     assert int(there.sum()) > SIZE
-    eye = scene.base("camera.to_world")[:3, 3]
+    eye = metres * scene.base("camera.to_world")[:3, 3]
     corners = faces[found.face[there]]
     for low, high, value in (
         (

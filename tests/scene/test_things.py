@@ -201,7 +201,7 @@ def test_a_thing_on_the_pavement_stands_on_it() -> None:
 def test_a_render_refuses_to_judge_what_is_not_there(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     for judge, words in {
         "person": "unknown thing to judge: 'person'. Known: all, object.",
-        "all": "nothing stands",
+        "all": "expected things beside the object",
     }.items():
         assert main(["render", "--object", "mug", "--judge", judge, "--out", str(tmp_path / "a.png")]) == 2
         assert words in capsys.readouterr().err and not (tmp_path / "a.png").exists()
