@@ -44,6 +44,12 @@ def write_summary(folder: Path, result: Result) -> Path:
 def read_result(folder: Path) -> Result:
     """Return the result of the run in `folder`, `RUNNING` if a process works on it and has not come to its end; a
     FileFormatError says if there is none, or not what this version writes."""
+    result = stored_result(folder)
+    return result.model_copy(update={"ending": RUNNING}) if result.goes_on and is_held(folder) else result
+
+
+def stored_result(folder: Path) -> Result:
+    """Return the result of the run in `folder` as it was written, whoever works on it."""
     path = folder / NAME
     try:
         values = parse_json(read_text(path, "the summary of a run", LARGEST), finite=True)
@@ -57,8 +63,7 @@ def read_result(folder: Path) -> Result:
     if kind is None:
         raise other_summary(path, f"one of the command {str(values.get('command'))[:40]!r}")
     try:
-        result = kind.of(values)
-        return result.model_copy(update={"ending": RUNNING}) if result.goes_on and is_held(folder) else result
+        return kind.of(values)
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
         what = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"[:120]
