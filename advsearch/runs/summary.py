@@ -165,14 +165,13 @@ def bundled_digests(settings: Mapping[str, object]) -> dict[str, str]:
     """Return the SHA-256 of what is bundled and settings name: objects, environments and the reference model."""
     package, found = Path(__file__).parent.parent, dict[str, str]()
     said = " ".join(str(settings.get(name) or "") for name in ("object", "environment", "things", "held_out", "grid"))
-    words = {*re.findall(r"[a-z][a-z0-9-]*", said), "" if settings.get("environment") else "studio"}
+    words = {*re.findall(r"[a-z][a-z0-9-]*", said), *([] if settings.get("environment") else ["studio"])}
     for folder, kind in BUNDLED.items():
-        for word in sorted(words - {""}):
-            place = package / "bundled" / "data" / folder
-            files = sorted((place / word).glob("*")) or sorted(place.glob(f"{word}.*"))
-            if files:
-                parts = "".join(f"{one.name} {_digest(one)}\n" for one in files if one.is_file())
-                found[f"bundled {kind} {word}"] = hashlib.sha256(parts.encode()).hexdigest()
+        for place in sorted((package / "bundled" / "data" / folder).iterdir()):
+            if place.stem in words:
+                files = sorted(place.iterdir()) if place.is_dir() else [place]
+                parts = "".join(f"{file.name} {_digest(file)}\n" for file in files if file.is_file())
+                found[f"bundled {kind} {place.stem}"] = hashlib.sha256(parts.encode()).hexdigest()
     weights = package / "models" / "data" / "reference.safetensors"
     if re.search(r"(^|,)reference(,|$)", str(settings.get("model") or "reference")) and weights.is_file():
         found["bundled model reference"] = _digest(weights)
