@@ -139,7 +139,7 @@ def test_what_is_shown_says_where_the_time_went() -> None:
 
 
 def test_what_is_loaded_already_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="workers: expected names of objects, models"):
+    with pytest.raises(InputError, match="workers: other processes load objects, models"):
         advsearch.sweep("mug", advsearch.load_model("reference"), {"pose.yaw": [0, 90]}, workers=2)
 
 

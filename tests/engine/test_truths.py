@@ -23,7 +23,7 @@ def test_a_truth_is_remembered_where_only_base_colours_differ(route: str, asks: 
         SimpleNamespace(name="a.colour", coordinates=slice(0, 1)),
         SimpleNamespace(name="b.time", coordinates=slice(1, 2)),
     ]
-    space = SimpleNamespace(groups=groups, start=torch.zeros(2), describe=lambda whole: {})
+    space = SimpleNamespace(groups=groups, start=torch.zeros(2), describe=lambda whole: {}, scene=None)
     routes = {"a.colour": frozenset({route}), "b.time": frozenset({"camera.to_world"})}
     renderer = SimpleNamespace(
         routes=routes,

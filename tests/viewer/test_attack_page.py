@@ -114,7 +114,7 @@ def test_the_page_says_it_all(tmp_path: Path) -> None:
     ):
         assert text in page.text, text
     text = page.text
-    for empty in ("texture: {}", "set: {}", "estimator: {}", "over: {}", "metrics: {}"):
+    for empty in ("texture: {}", "set: {}", "ask: {}", "estimator: {}", "over: {}", "metrics: {}"):
         text = text.replace(empty, "")
     assert not re.search(r"None|nan|\{|\}|\$", text)
 

@@ -158,11 +158,11 @@ class AttackConfig(DerivativeConfig):
         otherwise="approach", min_length=1,
     )
     shutter: float | None = setting(
-        None, "search", "how long each row of a picture is exposed along a path: motion blur", otherwise="a still",
+        None, "search", "how long each row of a picture is exposed along a path (motion blur)", otherwise="a still",
         unit="seconds", gt=0.0, le=60.0,
     )
     rolling: float | None = setting(
-        None, "search", "how long the rows of a picture are read, one after the other, along a path: a rolling shutter",
+        None, "search", "how long the rows of a picture are read one after the other along a path (rolling shutter)",
         otherwise="all at once", unit="seconds", gt=0.0, le=60.0,
     )
     draws: int | None = setting(
