@@ -33,8 +33,8 @@ from advsearch.settings import (
     split_names,
 )
 
-FOLDERS = ("references",)
-"""Options that are a folder. It is kept by its absolute path, so that a run may go on from anywhere."""
+FOLDERS = ("references", "state")
+"""Options that may be a folder or a file. It is kept by its absolute path, so that a run may go on from anywhere."""
 
 
 def read_named(value: Any, setting: str, otherwise: str) -> Any:

@@ -132,17 +132,30 @@ def _expected(kind: str, value: object) -> str | None:
     }.get(kind)
 
 
+def _as_json(value: object) -> JsonValue:
+    """Return a finite number, a truth value, a text, or lists and mappings of these; None of all else."""
+    if isinstance(value, Mapping):
+        mapping = {name: _as_json(one) for name, one in value.items() if isinstance(name, str)}
+        return mapping if len(mapping) == len(value) and None not in mapping.values() else None
+    if isinstance(value, (list, tuple)):
+        listed = [_as_json(one) for one in value]
+        return None if None in listed else listed
+    finite = isinstance(value, float) and math.isfinite(value)
+    return value if finite or isinstance(value, (bool, int, str)) else None  # type: ignore[return-value]
+
+
 def as_setting(entry: Any) -> str | dict[str, JsonValue]:
     """Return what a file says of a policy or a task: its name, with the options that differ from their defaults.
 
-    An option that is no finite number, truth value or text has no form there and is left out.
+    An option that is no finite number, truth value, text, or list or mapping of these, has no form there and is left
+    out.
     """
     name, given = str(entry.name), {}
     for option, declared in declared_options(type(entry)).items():
         value = getattr(entry, option)
-        plain = isinstance(value, (bool, int, str)) or (isinstance(value, float) and math.isfinite(value))
-        if plain and value != default_of(declared):
-            given[option] = value
+        plain = _as_json(value)
+        if plain is not None and value != default_of(declared):
+            given[option] = plain
     return {"name": name, **given} if given else name
 
 

@@ -141,14 +141,15 @@ def _with_signature(source: Source, program: torch.export.ExportedProgram) -> So
     inputs = program.graph_signature.user_inputs
     nodes = {node.name: node for node in program.graph.nodes if node.op == "placeholder"}
     values = [nodes[key].meta.get("val") for key in inputs if key in nodes]
-    if len(values) != 1 or not isinstance(values[0], torch.Tensor) or values[0].dim() != 4:
+    tensors = bool(values) and all(isinstance(one, torch.Tensor) for one in values)
+    if not tensors or values[0].dim() != 4 or any(one.dim() != 2 for one in values[1:]):
         raise ModelError(f"model {name}: expected a program with one input, a batch of images of 4 dimensions")
     value = values[0]
     if not value.is_floating_point():
         raise ModelError(f"model {name}: expected a floating-point image as input, the program takes {value.dtype}")
     layout = "NHWC" if value.shape[3] == 3 and value.shape[1] != 3 else "NCHW"
     limits = _batch_limits(program, value.shape[0])
-    source = replace(source, dtype=value.dtype, batch_limits=limits, layout=layout)
+    source = replace(source, dtype=value.dtype, batch_limits=limits, layout=layout, takes_more=len(values) > 1)
     height, width = value.shape[1:3] if layout == "NHWC" else value.shape[2:4]
     fixed = isinstance(height, int) and isinstance(width, int)
     return replace(source, input_size=(height, width)) if fixed else source

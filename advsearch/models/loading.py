@@ -13,13 +13,14 @@ from typing import Any
 
 from torch import Tensor, nn
 
-from advsearch.errors import InputError, UnknownNameError, resembling
+from advsearch.errors import InputError, ModelError, UnknownNameError, resembling
 from advsearch.models import address, files, reference
 from advsearch.models.guards import called_under, plainly, turned_by_code
 from advsearch.models.labels import fitting_labels, labels_origin, names_in, read_labels, read_prompts
 from advsearch.models.model import PRESETS, Model, Preprocessing, Read, Triple
 from advsearch.models.probe import probe
 from advsearch.models.source import Purpose, Source, load_callable, source_of, split_weights
+from advsearch.models.with_state import WithState
 from advsearch.models.zoo import named, transformers
 from advsearch.registry import Registry
 
@@ -124,6 +125,10 @@ def load_model(
         found = found.finish(Purpose(wanted, names, prompts, *lengths, ask or {}))
     if isinstance(found, Source) and isinstance(found.module, nn.Module):
         called_under(found.module, switches)
+    if task:
+        found = dataclasses.replace(found, module=task.wrapped(found.module))
+    if isinstance(found, Source) and found.takes_more and not isinstance(found.module, WithState):
+        raise ModelError(f"model {found.name}: takes more than pictures; give task command the `state` that it takes")
     if isinstance(found, Model):
         found = dataclasses.replace(found, read=read or found.read)
         found = found if names is None and name is None else dataclasses.replace(found, asked=None)

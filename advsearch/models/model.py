@@ -43,6 +43,7 @@ GIVEN_BY = {
     "segmentation": "a score for each pixel is what a segmenter gives",
     "depth": "a number for each pixel is what a model of depth gives",
     "similarity": "features are what a network without a head gives",
+    "command": "actions are what a policy gives",
 }
 """What networks of a task return, by task, for messages."""
 
@@ -275,7 +276,8 @@ def read_by(read: Read, returned: Any, count: int, name: str) -> Any:
         output = read(returned, count)
     except ValueError as error:
         meant, own = _task_of(returned), getattr(getattr(read, "__self__", None), "name", None)
-        other = _other_task(meant) if meant and meant != own else "wrap the network, or ask for another task"
+        known = meant and own not in (meant, "command")  # actions look like rows of scores
+        other = _other_task(str(meant)) if known else "wrap the network, or ask for another task"
         advice = _no_scores(returned) or other
         raise ModelError(f"model {name}: {error}, got {described(returned)}; {advice}") from None
     if len(output) != count:

@@ -19,6 +19,7 @@ from advsearch.models.all_at_once import AllAtOnce
 from advsearch.models.guards import TookTooLong, within
 from advsearch.models.labels import fitting_labels
 from advsearch.models.model import Detaching, Model, ModelWarning, each_tensor, logits_of, read_by
+from advsearch.models.with_state import WithState
 
 #: Rows that are non-negative and sum to 1 within this are taken for probabilities.
 PROBABILITY_TOLERANCE = 1e-3
@@ -171,15 +172,24 @@ def _guarded(model: Model, call: Callable[[], Any]) -> Any:
 
     A program has to end, for nothing ends it; code of one's own that does not is ended by Ctrl-C.
     """
+    network = model.module
+    while isinstance(network, (AllAtOnce, WithState)):
+        network = network.network
     try:
-        stop = getattr(model.module, "stop", None)
-        return within(call, stop) if stop or isinstance(model.module, PROGRAMS) else call()
+        stop = getattr(network, "stop", None)
+        return within(call, stop) if stop or isinstance(network, PROGRAMS) else call()
     except TookTooLong as error:
         raise ModelError(f"model {model.name}: {error}") from None
     except Exception as error:  # any network may raise anything
         height, width = model.input_size
         preprocessing = model.preprocessing
-        if why := _unlike_pictures(model.module, str(error)):
+        if isinstance(model.module, WithState) and model.module.state:
+            sizes = ", ".join(f"{name} (N, {len(numbers)})" for name, numbers in model.module.state.items())
+            raise ModelError(
+                f"model {model.name}: cannot be called with pictures and a state of {sizes[:200]} "
+                f"({first_line(error)}). Give the `state` that it was made for"
+            ) from error
+        if why := _unlike_pictures(network, str(error)):
             raise ModelError(f"model {model.name}: {why} ({first_line(error)})") from error
         raise ModelError(
             f"model {model.name}: cannot be run on a {preprocessing.channels} image of {height} x {width} pixels in "

@@ -82,6 +82,7 @@ class Source:
         finish: of a network that is built for what it is asked: makes its source, or the model. None where the network
             is ready.
         reads_text: whether it is given texts beside the picture.
+        takes_more: whether it is called with more than pictures.
     """
 
     module: Callable[[torch.Tensor], Any]
@@ -98,6 +99,7 @@ class Source:
     device: torch.device = CPU
     finish: Callable[[Purpose], Source | Model] | None = None
     reads_text: bool = False
+    takes_more: bool = False
 
 
 def source_of(module: nn.Module, name: str, **fields: Any) -> Source:

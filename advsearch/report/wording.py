@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 CLASSIFICATION, DETECTION, SEGMENTATION = "classification", "detection", "segmentation"
-DEPTH, SIMILARITY = "depth", "similarity"
+DEPTH, SIMILARITY, COMMAND = "depth", "similarity", "command"
 """Tasks whose predictions have words of their own; others are quoted."""
 
 _MARGINS = {
@@ -24,6 +24,7 @@ _MARGINS = {
     SEGMENTATION: "the lead of wrong classes at the pixel that decides, in logits; over 0 where too few are right",
     DEPTH: "the logarithm of the factor by which the object's distance is off, less that of the tolerance",
     SIMILARITY: "how far the nearest wrong name leads the right one, in logits",
+    COMMAND: "how many envelopes the action is from the clean one, less 1; over 0 outside of it",
 }
 _MARKS = {
     DETECTION: "Blue is the true box, orange what the model finds with a score that counts.",
@@ -63,7 +64,7 @@ WHOLE = ("background", "itself", "something else")
 _NONE, _ELSEWHERE = "no ", " elsewhere"
 
 _DOING = {"calls": "calling", "finds": "finding", "sees": "seeing", "takes": "taking", "judges": "judging"}
-_DOING |= {"predicts": "predicting"}
+_DOING |= {"predicts": "predicting", "commands": "commanding"}
 
 
 Said = Any
@@ -153,6 +154,8 @@ def prediction_cells(task: str, prediction: Said) -> list[str]:
     0.12"]``.
     """
     label, share = prediction.label, prediction.probability
+    if task == COMMAND:
+        return [label, (getattr(prediction, "payload", None) or {}).get("text", "")]
     if share is None:
         return [label, ""]
     if task == SIMILARITY:
@@ -216,6 +219,8 @@ def calls(task: str, thing: str, label: str) -> str:
         return f"sees {with_article(label.removesuffix(_ELSEWHERE))} where there is none"
     if task == CLASSIFICATION:
         return f"calls {thing} {with_article(label)}"
+    if task == COMMAND:
+        return f"commands {with_article(label)}"
     if task == DEPTH:
         return f"judges {thing} {label}"
     if task in (DETECTION, SEGMENTATION, SIMILARITY):

@@ -16,6 +16,7 @@ from advsearch.registry import Registry
 from advsearch.tasks.answers import FreeAnswer
 from advsearch.tasks.base import Facts, Judgement, Mark, Prediction, Sight, Task
 from advsearch.tasks.classification import Classification
+from advsearch.tasks.command import Command
 from advsearch.tasks.depth import Depth
 from advsearch.tasks.detection import Detection
 from advsearch.tasks.rig import Rig
@@ -102,7 +103,10 @@ def function_of(task: Task) -> Callable[..., Tensor] | None:
 
 TASKS: Registry[type[Task]] = Registry(
     "advsearch.tasks",
-    {kind.name: kind for kind in (Classification, Detection, Segmentation, Depth, Similarity, FreeAnswer, Rig)},
+    {
+        kind.name: kind
+        for kind in (Classification, Detection, Segmentation, Depth, Similarity, FreeAnswer, Command, Rig)
+    },
     "a subclass of Task whose name is that of the entry point",
     lambda name, entry: isinstance(entry, type) and issubclass(entry, Task) and entry.name == name,
 )
@@ -155,6 +159,7 @@ __all__ = [
     "TASKS",
     "AnyTask",
     "Classification",
+    "Command",
     "Depth",
     "Detection",
     "Facts",

@@ -323,6 +323,10 @@ class Task(ABC):
             return returned.float()
         raise ValueError(f"expected a tensor with {count} rows, one for each picture")
 
+    def wrapped(self, network: Callable[..., Any]) -> Callable[..., Any]:
+        """Return a network as it is called with pictures alone; its own, unless the task gives it more."""
+        return network
+
     @property
     def calibrates(self) -> bool:
         """Whether the task is to be shown an output for a clean picture of the scene (`after_calibration`) before it

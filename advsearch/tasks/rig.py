@@ -12,8 +12,10 @@ from torch import Tensor
 
 from advsearch.errors import InputError
 from advsearch.models import Model
+from advsearch.models.all_at_once import AllAtOnce
 from advsearch.options import FROM_RUN
 from advsearch.tasks.base import Facts, Judgement, Mark, Prediction, Task, Truth
+from advsearch.tasks.command import Command
 
 RULES = ("any", "all", "mean", "vote")
 """When the rig is right: in any picture, in all, on average of the margins, or in more than half."""
@@ -62,6 +64,11 @@ class Rig(Task):
         if model.cameras < 2:
             raise InputError("task rig: expected a rig, got one camera; give it with `camera=rig.yaml`")
         part = self.part.on(replace(model, cameras=1), target=target, minimise=minimise)
+        if isinstance(part, Command) and not isinstance(model.module, AllAtOnce):
+            raise InputError(
+                "task rig: task command is of one action for all pictures; give a policy that takes them at once, as "
+                "advsearch.models.all_at_once.AllAtOnce"
+            )
         return replace(self, part=part, cameras=model.cameras, target=part.target, minimise=minimise)
 
     def seeking(self, objective: str) -> Rig:

@@ -215,7 +215,8 @@ def test_an_objective_of_another_task_is_refused() -> None:
         InputError, match=r"expected an objective of task yaw \(score\), got margin, which takes outputs of class"
     ):
         check_objective("margin", "yaw")
-    assert {kind.task for kind in OBJECTIVE_KINDS.values()} == {*TASKS, Together.name, None} - {"answer", "rig"}
+    without = {"answer", "command", "rig"}
+    assert {kind.task for kind in OBJECTIVE_KINDS.values()} == {*TASKS, Together.name, None} - without
 
 
 def test_a_model_of_a_task_answers_with_what_the_task_reads() -> None:
@@ -274,7 +275,8 @@ def test_every_command_maximises_what_is_the_tasks_own(command: str, monkeypatch
 
 
 def test_tasks_have_names() -> None:
-    assert list(TASKS) == ["classification", "detection", "segmentation", "depth", "similarity", "answer", "rig"]
+    names = ["classification", "detection", "segmentation", "depth", "similarity", "answer", "command", "rig"]
+    assert list(TASKS) == names
     assert make_task("classification") == Classification()
     mine = Yaw(tolerance=5.0)
     assert make_task(mine) is mine

@@ -70,7 +70,8 @@ def claims(result: AttackSummary | CurveResult | MatrixResult) -> Iterator[Claim
 
 
 def _shown_attack(summary: AttackSummary) -> ShownResult:
-    heads = ("", "prediction", "probability", "rate", "95 % interval")
+    number = "action" if summary.task == wording.COMMAND else "probability"
+    heads = ("", "prediction", number, "rate", "95 % interval")
     sections = [ResultPart(heads=heads, rows=_rates(summary))]
     if summary.failures and summary.failures.tried:
         sections.append(failures_part(summary.failures, tried=True))

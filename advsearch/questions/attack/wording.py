@@ -10,6 +10,7 @@ from typing import Any
 from advsearch.questions.attack.summary import AttackSummary
 from advsearch.report.wording import (
     CLASSIFICATION,
+    COMMAND,
     SUCCESS_ABOVE_ZERO,
     calling,
     calls,
@@ -131,7 +132,8 @@ def success(summary: AttackSummary) -> str:
 def goal_text(summary: AttackSummary) -> str:
     """Return what was asked for, where it was not just any wrong prediction."""
     if summary.target:
-        return f"the model should predict {' or '.join(summary.target)}"
+        verb = "command" if summary.task == COMMAND else "predict"
+        return f"the model should {verb} {' or '.join(summary.target)}"
     return "easier to recognise" if summary.minimises else ""
 
 
@@ -232,6 +234,9 @@ def _how_it_errs(summary: AttackSummary, verified: VerifiedRate, thing: str) -> 
     if summary.minimises:
         return f"The model recognises {thing}, more surely than in the clean scene,"
     labels = verified.labels
+    if summary.task == COMMAND:
+        where = ", ".join(labels).replace("action outside its envelope ", "") if len(labels) == 1 else ""
+        return f"The commanded action {_left(summary)}{'' if summary.target or not where else f' {where}'}"
     if len(labels) == 1:
         return f"The model {calls(summary.task, thing, next(iter(labels)))}"
     if labels:
@@ -248,6 +253,8 @@ def _claim(summary: AttackSummary, thing: str) -> str:
     """Return what a trial counts as, as a clause: "the model is wrong about this mug"."""
     if summary.minimises:
         return f"the model recognises {thing}, more surely than in the clean scene,"
+    if summary.task == COMMAND:
+        return f"the commanded action {_left(summary)}"
     if summary.target and summary.task == CLASSIFICATION:
         return f"the model calls {thing} {_a_target(summary)}"
     if summary.target:
@@ -259,7 +266,14 @@ def _wanted(summary: AttackSummary, thing: str) -> str:
     """Return what was looked for, as a clause: "makes the model miss this mug"."""
     if summary.minimises:
         return f"makes {thing} easier to recognise"
+    if summary.task == COMMAND:
+        return f"makes the commanded action {_left(summary, 'leave', 'reach')}"
     return f"makes the model call {thing} {_a_target(summary)}" if summary.target else wanted(summary.objective, thing)
+
+
+def _left(summary: AttackSummary, left: str = "left", reached: str = "reached") -> str:
+    """Return what a commanded action did that counts, and no more than that: nothing has moved."""
+    return f"{reached} the envelope of {' or '.join(summary.target)}" if summary.target else f"{left} its envelope"
 
 
 def _a_target(summary: AttackSummary) -> str:
