@@ -23,7 +23,8 @@ import math
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -69,6 +70,7 @@ class Drawn:
     rule: Rule = field(init=False)
     conditions: Any = field(init=False)
     domain: Domain = DOMAIN
+    searched_space: ClassVar[Any] = SimpleNamespace(controls=())
 
     def __post_init__(self) -> None:
         self.seed, self.conditions = self.root, object() if self.over else None

@@ -16,6 +16,8 @@ import time
 from pathlib import Path
 from typing import Any
 
+from PIL import Image
+
 import advsearch
 from advsearch.questions.recipe import recipe
 from advsearch.questions.recipe.carry_out import NOTE
@@ -155,7 +157,8 @@ def told(name: str, result: RecipeResult, suffix: str) -> dict[str, Any]:
     for number in SHOWN[name]:
         image = IMAGES / "-".join(filter(None, [name, suffix, f"{number}.png"]))
         image.parent.mkdir(parents=True, exist_ok=True)
-        image.write_bytes((Path(str(result.run)) / "images" / f"figure-{number}.png").read_bytes())
+        with Image.open(Path(str(result.run)) / "images" / f"figure-{number}.png") as figure:
+            figure.convert("RGB").quantize(256, dither=Image.Dither.NONE).save(image, optimize=True)
         made = result.figures[number - 1]
         figures.append({"title": made.title, "text": texts[number - 1], "image": image.name})
     return {

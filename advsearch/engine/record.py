@@ -23,7 +23,7 @@ from advsearch.report.wording import count
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results import INTERRUPTED, OUT_OF_TIME, ControlGroup, Fields, Result, VerifiedRate
 from advsearch.runs.store import Row
-from advsearch.runs.summary import NAME, read_result
+from advsearch.runs.summary import NAME, stored_result
 from advsearch.tasks import Judgement, Prediction
 from advsearch.tasks.base import mean
 from advsearch.viewer.pages import keep_result
@@ -294,6 +294,6 @@ def kept_rows(
     if run is None:
         return made
     if ending == INTERRUPTED and not results.made and (run.path / NAME).is_file():
-        before = read_result(run.path)
+        before = stored_result(run.path)
         return before if isinstance(before, type(made)) else made
     return keep_result(run, made)

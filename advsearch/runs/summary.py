@@ -44,6 +44,12 @@ def write_summary(folder: Path, result: Result) -> Path:
 def read_result(folder: Path) -> Result:
     """Return the result of the run in `folder`, `RUNNING` if a process works on it and has not come to its end; a
     FileFormatError says if there is none, or not what this version writes."""
+    result = stored_result(folder)
+    return result.model_copy(update={"ending": RUNNING}) if result.goes_on and is_held(folder) else result
+
+
+def stored_result(folder: Path) -> Result:
+    """Return the result of the run in `folder` as it was written, whoever works on it."""
     path = folder / NAME
     try:
         values = parse_json(read_text(path, "the summary of a run", LARGEST), finite=True)
@@ -57,8 +63,7 @@ def read_result(folder: Path) -> Result:
     if kind is None:
         raise other_summary(path, f"one of the command {str(values.get('command'))[:40]!r}")
     try:
-        result = kind.of(values)
-        return result.model_copy(update={"ending": RUNNING}) if result.goes_on and is_held(folder) else result
+        return kind.of(values)
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
         what = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"[:120]
@@ -160,14 +165,13 @@ def bundled_digests(settings: Mapping[str, object]) -> dict[str, str]:
     """Return the SHA-256 of what is bundled and settings name: objects, environments and the reference model."""
     package, found = Path(__file__).parent.parent, dict[str, str]()
     said = " ".join(str(settings.get(name) or "") for name in ("object", "environment", "things", "held_out", "grid"))
-    words = {*re.findall(r"[a-z][a-z0-9-]*", said), "" if settings.get("environment") else "studio"}
+    words = {*re.findall(r"[a-z][a-z0-9-]*", said), *([] if settings.get("environment") else ["studio"])}
     for folder, kind in BUNDLED.items():
-        for word in sorted(words - {""}):
-            place = package / "bundled" / "data" / folder
-            files = sorted((place / word).glob("*")) or sorted(place.glob(f"{word}.*"))
-            if files:
-                parts = "".join(f"{one.name} {_digest(one)}\n" for one in files if one.is_file())
-                found[f"bundled {kind} {word}"] = hashlib.sha256(parts.encode()).hexdigest()
+        for place in sorted((package / "bundled" / "data" / folder).iterdir()):
+            if place.stem in words:
+                files = sorted(place.iterdir()) if place.is_dir() else [place]
+                parts = "".join(f"{file.name} {_digest(file)}\n" for file in files if file.is_file())
+                found[f"bundled {kind} {place.stem}"] = hashlib.sha256(parts.encode()).hexdigest()
     weights = package / "models" / "data" / "reference.safetensors"
     if re.search(r"(^|,)reference(,|$)", str(settings.get("model") or "reference")) and weights.is_file():
         found["bundled model reference"] = _digest(weights)

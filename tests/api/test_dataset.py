@@ -269,6 +269,7 @@ def test_a_drive_has_every_thing_where_rays_meet_it(driven: tuple[Path, Path]) -
     assert seen == {("object", False), ("oncoming", False), ("oncoming", True), ("person", False)}
 
 
+@pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")  # of pycocotools itself
 def test_pycocotools_reads_it(driven: tuple[Path, Path]) -> None:
     found = pytest.importorskip("pycocotools.coco").COCO(str(driven[1] / "annotations.json"))
     assert len(found.getImgIds()) == 3 and found.getCatIds(catNms=["car"]) == [1]

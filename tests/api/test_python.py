@@ -47,6 +47,7 @@ def test_signatures_have_every_setting_as_it_is_declared(name: str) -> None:
         "resume",
         "progress",
         "optimiser",
+        "loss",
         "beside",
     }
     assert set(parameters) - set(names) <= own

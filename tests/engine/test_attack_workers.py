@@ -110,5 +110,5 @@ def test_two_processes_have_the_rows_of_none(policy: Any, tmp_path: Path) -> Non
 
 
 def test_what_is_loaded_already_is_not_shared() -> None:
-    with pytest.raises(InputError, match="workers: expected names of objects, models, controls and an objective"):
+    with pytest.raises(InputError, match=r"workers: other processes load objects, models, controls .* by name"):
         advsearch.attack(advsearch.load_scene("mug"), workers=2)

@@ -15,9 +15,8 @@ from advsearch.attacks import clopper_pearson
 from advsearch.cli.main import main
 from advsearch.errors import InputError
 from advsearch.questions.explain.result import ExplainResult
-from advsearch.questions.report.answer import (
+from advsearch.questions.report.engineering import (
     criterion_lines,
-    is_confirmed,
     met,
     read_exposure,
     triggering_conditions,
@@ -81,12 +80,14 @@ def test_rules_are_claims_and_triggering_conditions_and_say_whether_they_are_con
     first, *_ = claims_of(result)
     assert first.kind == "measured" and first.extent is not None and first.extent.total == 97
     assert "camera.elevation over 60 degrees (rule 1)" in first.statement and "fresh renders" in first.statement
-    assert is_confirmed(result.rules[0]) is False
-    elsewhere = {"right": 90, "of": 97, "interval": [0.85, 0.97]}
-    apart = ExplainResult.of({**samples.EXPLAIN, "rules": [{**samples.EXPLAIN["rules"][0], "elsewhere": elsewhere}]})
-    assert is_confirmed(apart.rules[0]) is True and triggering_conditions(apart)[0].startswith("Confirmed: ")
-    unasked = ExplainResult.of({**samples.EXPLAIN, "rules": [{**samples.EXPLAIN["rules"][0], "confirmed": None}]})
-    assert is_confirmed(unasked.rules[0]) is None and "not rendered" in triggering_conditions(unasked)[0]
+    (rule, *_) = samples.EXPLAIN["rules"]
+    for confirmed, said in (
+        ({**rule["confirmed"], "held": True}, "Confirmed: "),
+        ({**rule["confirmed"], "held": False}, "Not confirmed: "),
+        (None, "Counted on rows that did not choose it, not rendered: "),
+    ):
+        told = ExplainResult.of({**samples.EXPLAIN, "rules": [{**rule, "confirmed": confirmed}]})
+        assert triggering_conditions(told)[0].startswith(said)
 
 
 def test_a_criterion_is_met_not_met_or_open() -> None:

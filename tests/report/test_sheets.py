@@ -160,14 +160,18 @@ def test_a_patch_is_printed_at_its_share_of_the_object(runs: dict[str, Path]) ->
 
 
 def test_the_command_writes_a_pdf_and_says_what_it_needs(
-    runs: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    runs: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "sheet.pdf"
     run = str(runs["patch"])
     assert main(["export", run, "--format", "print", "--out", str(out), "--json", "--size", "95"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert told["pages"] == len(pypdf.PdfReader(out).pages) == 2 and told["size_mm"] == 95.0
-    assert main(["export", run, "--format", "print", "--out", str(tmp_path / "usual.pdf")]) == 0
+    assert main(["export", run, "--format", "print", "--out", str(tmp_path / "usual.pdf"), "--json"]) == 0
+    own = json.loads(capsys.readouterr().out)
+    assert own["size_mm"] == pytest.approx(109.5, abs=0.1)
+    monkeypatch.setattr("advsearch.api.export.real_size", lambda run: None)  # of a file without a unit
+    assert main(["export", run, "--format", "print", "--out", str(tmp_path / "unknown.pdf")]) == 0
     assert "longest side is taken for 100 mm; --size says otherwise" in capsys.readouterr().err
     for wrong, message in (
         (["--format", "print", "--size", "95"], "--out"),

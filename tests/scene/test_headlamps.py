@@ -128,7 +128,7 @@ def test_the_ground_ahead_has_the_lux_of_both_headlamps() -> None:
     assert place[2] == pytest.approx(EGO[2]) and camera[:3, 2] == pytest.approx([1.0, 0.0, 0.0], abs=1e-6)
     eye = place - [EGO[0], 0.0, EGO[2] - 1.3]
     # from depth to places: the picture's rows are at known angles below the camera's axis, its middle column ahead
-    depth = seen.depth.numpy()[:, 47:49].mean(axis=1) * described.metres
+    depth = seen.depth.numpy()[:, 47:49].mean(axis=1)  # metres
     rows = np.flatnonzero(seen.seen("ground").numpy()[:, 47:49].all(axis=1) & (depth < 22.0) & (depth > 4.5))
     assert len(rows) > 15
     x = eye[0] + np.sqrt(depth[rows] ** 2 - 1.3**2)

@@ -820,7 +820,7 @@ BAD: dict[str, tuple[Callable[[Path], Path], str]] = {
     "empty": (raw("thing.ply", b""), r"thing\.ply: the object file is empty; export or download it again"),
     "ending": (
         raw("thing.thing", b"x"),
-        r"ending in .*\.glb or \.blend, got '\.thing'; convert it",
+        r"ending in .*\.blend, .*\.usdc or \.usdz, got '\.thing'; convert it",
     ),
     "no ending": (raw("thing", b"x"), r"got a name without ending; convert it to one of these"),
     "png as obj": (raw("thing.obj", png()), r"expected a Wavefront OBJ file .*, got a PNG picture; export or download"),

@@ -67,7 +67,7 @@ class HardenConfig(AttackConfig):
     )
     data: str | None = setting(
         None, "training", "pictures of your own that a detector is trained on too: `annotations.json` and `images/`",
-        "a folder, as `export --format coco` writes it", otherwise="none", min_length=1,
+        "a folder, as of `export --format coco`", otherwise="none", min_length=1,
     )
     layers: Literal["all", "last"] = setting("all", "training", "layers that are trained")
     rounds: int = setting(2, "training", "rounds of search and training", ge=1, le=1000)

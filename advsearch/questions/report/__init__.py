@@ -36,7 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Write the files."""
     # late, so that --help answers at once
-    from advsearch.questions.report.answer import read_exposure
+    from advsearch.questions.report.engineering import read_exposure
     from advsearch.questions.report.evidence import collected
     from advsearch.questions.report.result import evidence_page, markdown
     from advsearch.runs.files import write_bytes, write_text

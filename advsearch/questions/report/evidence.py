@@ -17,7 +17,7 @@ from advsearch.options import FROM_RUN
 from advsearch.questions.attack import wording as attack_wording
 from advsearch.questions.attack.summary import AttackSummary
 from advsearch.questions.photographs.result import FOLDER, PhotoAgreement
-from advsearch.questions.report.answer import (
+from advsearch.questions.report.engineering import (
     Exposure,
     conditions_of,
     criterion_lines,

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from advsearch.attacks import clopper_pearson
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.questions.explain.result import ExplainResult, RuleRow, rule_text
+from advsearch.questions.explain.result import ExplainResult, rule_text
 from advsearch.questions.report.result import ConditionShare
 from advsearch.questions.sweep.summary import SweepSummary
 from advsearch.report.shown import Claim
@@ -56,16 +56,14 @@ def _value(value: object) -> str:
 
 
 def triggering_conditions(result: Result) -> list[str]:
-    """Return the rules of `explain`, and whether fresh renders confirm each: under it the model is right surely less
-    often than elsewhere."""
-    rules = result.rules if isinstance(result, ExplainResult) else []
-    state = {True: "Confirmed", False: "Not confirmed", None: "Counted on rows that did not choose it, not rendered"}
-    return [f"{state[is_confirmed(one)]}: {rule_text(number, one)}" for number, one in enumerate(rules, 1)]
-
-
-def is_confirmed(rule: RuleRow) -> bool | None:
-    """Whether the intervals of fresh renders under a rule and of the rows elsewhere are apart; None of no renders."""
-    return None if rule.confirmed is None else rule.confirmed.interval[1] < rule.elsewhere.interval[0]
+    """Return the rules of `explain`, and whether fresh renders confirm each."""
+    lines = []
+    for number, rule in enumerate(result.rules if isinstance(result, ExplainResult) else [], 1):
+        state = "Counted on rows that did not choose it, not rendered"
+        if rule.confirmed is not None:
+            state = "Confirmed" if rule.confirmed.held else "Not confirmed"
+        lines.append(f"{state}: {rule_text(number, rule)}")
+    return lines
 
 
 def met(criterion: float, interval: Interval) -> str:
