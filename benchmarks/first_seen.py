@@ -4,11 +4,11 @@
 
 A sweep over the distance for each light. What differs between the draws is where in the lane the camera is, how high
 and how level it is, how much it sees and where in the picture the car is. The exposure is absolute. The camera has a
-lens of F/2, exposes at most 1/30 s, and has ISO 100 at least; its noise grows with its gain. The table has
-how many pictures are right at each distance, and the distance at which half of them are: by a logistic curve over the
-logarithm of the distance, and as `advsearch sweep` says it, which supposes no curve and so has a wider interval. Then
-what the car looks like at the distance `--look`: the mean of its 8-bit levels, that of what is around it, and the
-spread within the car.
+lens of F/2, exposes at most 1/30 s, and has ISO 100 at least; its noise grows with its gain. The table has how many
+pictures are right at each distance, and the distance at which half of them are: by a logistic curve over the logarithm
+of the distance, and as `advsearch sweep` says it, which supposes no curve and so has a wider interval. Then what
+the car looks like at the distance `--look`: the mean of its 8-bit levels, that of what is around it, and the spread
+within the car.
 
     python benchmarks/first_seen.py --simulated 600
 
@@ -31,8 +31,8 @@ from torch.nn.functional import max_pool2d
 import advsearch
 from advsearch.questions.sweep.display import distance_of, distance_sentence
 
-SECONDS_MOST, F_NUMBER, ELECTRONS, READ = 1.0 / 30.0, 2.0, 10_000.0, 3.0
-"""Of the camera: the longest exposure, the lens, what a pixel holds at ISO 100, and electrons of noise in the dark."""
+SECONDS_MOST, F_NUMBER, READ = 1.0 / 30.0, 2.0, 3.0
+"""Of the camera: the longest exposure, the lens, and electrons of noise in the dark."""
 JITTER: dict[str, Any] = {
     "camera": {
         "azimuth": [-0.8, 0.8],
@@ -64,13 +64,13 @@ LIGHTS = {
 }
 
 
-def noise(ev: float) -> dict[str, float]:
+def noise(ev: float, electrons: float) -> dict[str, float]:
     """Return the settings of `sensor`: shot noise in white, and read noise, both relative to white.
 
     What the lens and the longest exposure leave out is gain, which leaves fewer electrons for white.
     """
     gain = max(1.0, F_NUMBER**2 / SECONDS_MOST / 2.0**ev)
-    return {"shot": (gain / ELECTRONS) ** 0.5, "read": READ * gain / ELECTRONS}
+    return {"shot": (gain / electrons) ** 0.5, "read": READ * gain / electrons}
 
 
 def levels(light: Light, distance: float, size: int) -> tuple[float, float, float]:
@@ -123,6 +123,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--draws", type=int, default=8, help="at each distance (default 8)")
     parser.add_argument("--size", type=int, default=300, help="side of a picture, pixels (default 300)")
     parser.add_argument("--look", type=float, default=18.0, help="metres at which levels are measured (default 18)")
+    parser.add_argument("--electrons", type=float, default=1e4, help="of white at ISO 100; 1e9 has no noise")
     parser.add_argument("--simulated", type=int, default=0, help="tables that are drawn, in place of renders")
     parser.add_argument("--only", default="", help="lights whose names contain this")
     args = parser.parse_args(argv)
@@ -151,7 +152,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 advsearch.load_model(model, labels=args.labels, task="detection"),
                 {"camera.distance": distances},
                 task="detection",
-                controls=JITTER | {"sensor": noise(light.ev)},
+                controls=JITTER | {"sensor": noise(light.ev, args.electrons)},
                 label=args.label,
                 samples=args.draws,
                 resolution=args.size,
