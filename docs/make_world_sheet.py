@@ -2,8 +2,9 @@
 
 python docs/make_world_sheet.py [--size 300] [--spp 64] [--texture shirt.png] [--folder FOLDER]
 
-All pictures of the avenue have an absolute exposure. The shirt is searched by a short attack, unless `--texture` names
-one that an attack has found. `--folder` keeps each picture by itself, and takes those that are there.
+All pictures of the avenue have an absolute exposure. From 60 and 100 m an inset has the car as large as from 10 m. The
+shirt is searched by a short attack, unless `--texture` names one that an attack has found. `--folder` keeps each
+picture by itself, and takes those that are there.
 """
 
 from __future__ import annotations
@@ -17,14 +18,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from PIL import Image
+from PIL import Image, ImageOps
 
 import advsearch
 from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.formation import to_8_bit
 
 SHEET = Path(__file__).resolve().parent / "images" / "world.webp"
-COLUMNS = 4
+COLUMNS, WIDE = 4, 60.0
+"""Pictures beside each other, and the field of view of a dashcam."""
 LIGHTS: dict[str, tuple[str, dict[str, Any]]] = {
     "day": ("avenue", {"camera.ev": 14.0}),
     "wet": ("avenue-wet", {"camera.ev": 11.5}),
@@ -51,7 +53,7 @@ def asked(own_car: Path, shirt: Any) -> Iterator[Asked]:
     """Yield the pictures of the sheet, row by row."""
     for light, (environment, given) in LIGHTS.items():
         for metres in (10.0, 30.0, 60.0, 100.0):
-            behind = {"camera.distance": metres, "camera.fov": 60.0, **given}
+            behind = {"camera.distance": metres, "camera.fov": WIDE, **given}
             scene = {"object": "car", "environment": environment, "settings": behind, "camera": "dashcam"}
             yield Asked(f"{light}-{metres:.0f}", scene, {})
     for light, turn in (("day", 32.0), ("night", 28.0)):
@@ -150,7 +152,13 @@ def rendered(one: Asked, size: int, spp: int) -> Image.Image:
     render = loaded.renderer({**still, **one.controls}, resolution=size)
     with torch.no_grad():
         levels = to_8_bit(render(render.start, 0, spp)) * 255.0
-    return Image.fromarray(levels.round().byte().numpy())
+    picture = Image.fromarray(levels.round().byte().numpy())
+    view = one.scene["settings"]
+    if view.get("camera.fov") == WIDE and view["camera.distance"] > 50.0:  # as large as from 10 m, from where it is
+        narrow = view | {"camera.fov": 10.0 * WIDE / view["camera.distance"]}
+        inset = rendered(one._replace(scene=one.scene | {"settings": narrow}), round(size * 0.36), spp)
+        picture.paste(ImageOps.expand(inset, max(1, size // 200), "white"), (0, size - inset.height))
+    return picture
 
 
 def main(argv: Sequence[str] | None = None) -> int:
