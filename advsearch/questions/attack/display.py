@@ -36,6 +36,7 @@ from advsearch.report.shown import (
     share_text,
 )
 from advsearch.report.wording import (
+    COMMAND,
     count,
     interval_text,
     margin_text,
@@ -70,7 +71,7 @@ def claims(result: AttackSummary | CurveResult | MatrixResult) -> Iterator[Claim
 
 
 def _shown_attack(summary: AttackSummary) -> ShownResult:
-    number = "action" if summary.task == wording.COMMAND else "probability"
+    number = "action" if summary.task == COMMAND else "probability"
     heads = ("", "prediction", number, "rate", "95 % interval")
     sections = [ResultPart(heads=heads, rows=_rates(summary))]
     if summary.failures and summary.failures.tried:
