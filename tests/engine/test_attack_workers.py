@@ -65,17 +65,18 @@ def test_a_picture_of_which_every_worker_dies_is_a_row_that_says_so(
     assert any("2 pictures have no answer" in text for text in result.summary.warnings)
 
 
+class Impatient(advsearch.progress.NullProgress):
+    done = 0
+
+    def advance(self, n: int = 1, **info: float | str) -> None:
+        self.done += n
+        if self.done > 20:
+            raise KeyboardInterrupt
+
+
 def test_what_is_stored_is_not_asked_of_workers(
     alone: AttackResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    class Impatient(advsearch.progress.NullProgress):
-        done = 0
-
-        def advance(self, n: int = 1, **info: float | str) -> None:
-            self.done += n
-            if self.done > 20:
-                raise KeyboardInterrupt
-
     config = AttackConfig(**SMALL, workers=2, run=str(tmp_path / "run"))
     whole = shared(monkeypatch, SMALL)
     assert attack_once(config, progress=Impatient()).summary.ending == "interrupted"
@@ -83,6 +84,21 @@ def test_what_is_stored_is_not_asked_of_workers(
     attack_once(config, resumed=tmp_path / "run")
     assert alone.run is not None and rows(tmp_path / "run") == rows(alone.run)
     assert 0 < len(rest.given) < 9 + 9 + 2 * 6 + 6 + 3 and whole.given
+
+
+@pytest.mark.parametrize("control", ["projector", "shadow"])
+def test_light_is_searched_by_workers_and_goes_on(
+    control: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    options = {"resolution": 2} if control == "projector" else {}
+    settings = {**SMALL, "environment": "low-sun", "controls": {control: options}}
+    attack_once(AttackConfig(**settings, run=str(tmp_path / "alone")))
+    config = AttackConfig(**settings, workers=2, run=str(tmp_path / "run"))
+    shared(monkeypatch, settings)
+    assert attack_once(config, progress=Impatient()).summary.ending == "interrupted"
+    rest = shared(monkeypatch, settings)
+    attack_once(config, resumed=tmp_path / "run")
+    assert rest.given and rows(tmp_path / "run") == rows(tmp_path / "alone")
 
 
 RESTARTS = {"name": "restarts", "times": 3}
