@@ -291,7 +291,7 @@ def test_a_network_that_writes_into_its_input_changes_no_picture(layout: str, pr
 
 
 UNTOUCHED: dict[Any, set[str]] = {
-    Task: {"read", "on", "seeking", "check", "truth", "check_numbers"},
+    Task: {"read", "on", "seeking", "check", "truth", "check_numbers", "wrapped"},
     Policy: {"propose", "takes_differences", "counts", "distribution", "failures"},
     NumberControl: {
         *("declared", "setting", "settings", "chosen_form", "mesh_in", "within", "allowed", "searches", "in_scene"),
