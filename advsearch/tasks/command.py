@@ -107,9 +107,7 @@ class Command(Task):
         if model.read is None:
             raise InputError(f'model {model.name}: it was loaded for its logits; load it with task="command"')
         if model.labels:
-            raise InputError(
-                "labels: task command has no classes; leave them out, or name a policy with `model`: this is a classifier"
-            )
+            raise InputError("labels: task command has no classes; this is a classifier: give a policy as `model`")
         if self.envelope is None:
             raise InputError(
                 "task command: envelope: expected how far an action may be off, in its unit, or a list with a number "
