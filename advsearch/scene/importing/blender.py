@@ -10,14 +10,13 @@ from __future__ import annotations
 import importlib.util
 import os
 import shutil
-import subprocess
 import sys
 import tempfile
 from pathlib import Path
 
 from advsearch import files
 from advsearch.errors import FileFormatError
-from advsearch.scene.importing.files import LARGEST_FILE, damaged, looks_like, read_bytes, shown
+from advsearch.scene.importing.files import LARGEST_FILE, damaged, looks_like, read_bytes, run_converter, shown
 from advsearch.scene.importing.usd import USD, converted
 
 BLEND = ".blend"
@@ -110,23 +109,9 @@ def _exported(path: Path) -> bytes:
         script.write_text(EXPORT, "utf-8")
         names = [str(path.resolve()), str(target), str(files.scaled(LARGEST_FILE))]
         between = [] if "-I" in program else ["--"]
+        started = [*program, str(script), *between, *names]
         try:
-            done = subprocess.run(
-                [*program, str(script), *between, *names],
-                cwd=folder,
-                env=surroundings(folder),
-                stdin=subprocess.DEVNULL,
-                capture_output=True,
-                text=True,
-                errors="replace",
-                timeout=files.scaled(LONGEST),
-                check=False,
-            )
-        except subprocess.TimeoutExpired:
-            raise FileFormatError(
-                f"{path}: Blender had not read it after {files.scaled(LONGEST)} seconds; export glTF (.glb) from it "
-                f"yourself, or give it longer: {files.FACTOR}=10 in the environment makes all limits ten times as large"
-            ) from None
+            done = run_converter(path, "Blender", started, folder=folder, seconds=LONGEST, env=surroundings(folder))
         except OSError as error:
             raise FileFormatError(f"{path}: Blender can't be started ({error.strerror}); check {program[0]}") from error
         if done.returncode or not target.is_file():

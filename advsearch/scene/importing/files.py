@@ -9,9 +9,10 @@ from __future__ import annotations
 import difflib
 import errno
 import os
+import subprocess
 import warnings
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from urllib.parse import unquote
 
@@ -279,3 +280,31 @@ class References:
         if size > most:
             raise files.too_large(path, f"files of at most {most:,} bytes in all", f"{size:,}")
         self._contents[path], self._size = data, size
+
+
+def run_converter(
+    path: Path, program: str, command: Sequence[str], *, folder: str | Path, seconds: int, env: Mapping[str, str] | None
+) -> subprocess.CompletedProcess[str]:
+    """Run a program that makes glTF of the file at `path`, in a folder, and return what it said.
+
+    Raises:
+        FileFormatError: it takes longer than so many seconds, before `advsearch.files.scaled`.
+        OSError: it can't be started.
+    """
+    try:
+        return subprocess.run(
+            command,
+            cwd=folder,
+            env=env,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            errors="replace",
+            timeout=files.scaled(seconds),
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        raise FileFormatError(
+            f"{path}: {program} had not read it after {files.scaled(seconds)} seconds; export glTF (.glb) from it "
+            f"yourself, or give it longer: {files.FACTOR}=10 in the environment makes all limits ten times as large"
+        ) from None

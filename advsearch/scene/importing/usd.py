@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import importlib.util
 import json
-import subprocess
 import sys
 import tempfile
 from pathlib import Path
@@ -13,7 +12,7 @@ from pathlib import Path
 from advsearch import files
 from advsearch.errors import FileFormatError
 from advsearch.registry import OWN_FOLDER
-from advsearch.scene.importing.files import LARGEST_FILE, damaged, looks_like, shown
+from advsearch.scene.importing.files import LARGEST_FILE, damaged, looks_like, run_converter, shown
 
 PACKAGE = ".usdz"
 LAYERS = (".usd", ".usda", ".usdc")
@@ -64,22 +63,8 @@ def converted(path: Path, data: bytes) -> bytes:
         target, inside = Path(folder) / "scene.glb", Path(folder) / "package"
         inside.mkdir()
         names = [str(files.scaled(MEMORY)), str(path.resolve()), str(target), str(inside)]
-        try:
-            done = subprocess.run(
-                [sys.executable, "-W", "ignore", "-c", _LIMITED, *names],
-                cwd=OWN_FOLDER,
-                stdin=subprocess.DEVNULL,
-                capture_output=True,
-                text=True,
-                errors="replace",
-                timeout=files.scaled(LONGEST),
-                check=False,
-            )
-        except subprocess.TimeoutExpired:
-            raise FileFormatError(
-                f"{path}: it was not read within {files.scaled(LONGEST)} seconds; export glTF (.glb) of it, or give it "
-                f"longer: {files.FACTOR}=10 in the environment makes all limits ten times as large"
-            ) from None
+        program = [sys.executable, "-W", "ignore", "-c", _LIMITED, *names]
+        done = run_converter(path, "usd-core", program, folder=OWN_FOLDER, seconds=LONGEST, env=None)
         if done.returncode or not target.is_file():
             lines = [line for line in done.stderr.splitlines() if line.strip()] or ["without a word"]
             last = lines[-1]
