@@ -143,6 +143,10 @@ def test_a_coco_folder_is_read_by_the_names_of_its_categories(tmp_path: Path) ->
     for number, name in enumerate(("../secret.png", "/etc/passwd", "none.png")):
         with pytest.raises(FileFormatError):
             read_coco(coco(tmp_path / f"bad{number}", images=[{**image, "file_name": name}]), model())
+    linked = coco(tmp_path / "linked", images=[{**image, "file_name": "there/a.png"}])
+    (linked / "images" / "there").symlink_to(tmp_path / "good" / "images")
+    with pytest.raises(FileFormatError, match="names of files in images/"):
+        read_coco(linked, model())
     with pytest.raises(FileFormatError, match="COCO's JSON"):
         read_coco(coco(tmp_path / "size", images=[{**image, "file_name": "a.png", "width": 9}]), model())
 

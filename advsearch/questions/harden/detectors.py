@@ -60,7 +60,7 @@ def read_coco(folder: Path, model: Model) -> list[Example]:
         FileFormatError: the folder is something else, or names files outside of it.
         InputError: no category is one of the model's labels.
     """
-    path = folder / "annotations.json"
+    path, inside = folder / "annotations.json", (folder / "images").resolve()
     try:
         told: Any = parse_json(read_text(path, "a COCO file", LARGEST))
         indices = dict[Any, int]()
@@ -76,9 +76,10 @@ def read_coco(folder: Path, model: Model) -> list[Example]:
         found = []
         for image in told["images"]:
             name = Path(str(image["file_name"]))
-            if name.is_absolute() or ".." in name.parts or (folder / "images" / name).is_symlink():
+            file = inside / name
+            if name.is_absolute() or ".." in name.parts or file.is_symlink() or inside not in file.resolve().parents:
                 raise FileFormatError(f"{path}: expected names of files in images/, got {str(name)[:100]}")
-            picture = torch.from_numpy(upright(folder / "images" / name, LARGEST_SIDE))
+            picture = torch.from_numpy(upright(file, LARGEST_SIDE))
             if picture.shape[:2] != (image["height"], image["width"]):
                 raise ValueError(f"{name} of another size than it says")
             here = things.get(image["id"], [])
