@@ -24,8 +24,9 @@ from torch import Tensor, nn
 sys.path.insert(0, str(Path(__file__).parent.parent))
 
 import advsearch
-from advsearch.questions.harden.detectors import Student
-from advsearch.questions.harden.lessons import examples
+from advsearch import seeds
+from advsearch.models.reference import trainable
+from advsearch.questions.harden.detectors import DetectorCourse, Example
 from advsearch.questions.harden.result import HardenConfig
 from advsearch.questions.harden.scenes import TRAINING, SceneWork, splits_of
 from advsearch.tasks import make_task
@@ -87,22 +88,20 @@ def trained(folder: Path, scenes: int, views: int, epochs: int) -> str:
     torch.manual_seed(0)
     config = HardenConfig(
         object=",".join(LABELS), model="benchmarks.harden_detector:Tiny", task=TASK, labels=",".join(LABELS), seed=100,
-        controls={"texture": {}}, resolution=SIDE, measured=1, threads=1,
+        controls={"texture": {}}, resolution=SIDE, measured=1, threads=1, epochs=epochs, rate=3e-3,
     )  # fmt: skip
     model = advsearch.load_model(Tiny(), task=make_task(TASK), labels=LABELS, input_size=SIDE, name="tiny")
     work = SceneWork(config, model, splits_of(config, model))
-    pictures: list[Any] = []
+    pictures: list[Example] = []
     for number in range(scenes):
         problem, seed = work.problem(work.splits[TRAINING], number, ("texture",))
-        pictures += examples(problem, seed, range(views))
-    student = Student.of(model, None)
-    student.fit(pictures, epochs, 3e-3, seed=0)
+        pictures += [Example.of(problem, seeds.stream(seed, "plain", view)) for view in range(views)]
+    student = trainable(model, logits=False)
+    DetectorCourse(work, student).round(0, pictures)
     right = sum(one.right(student.model) for one in pictures)
     print(f"trained on {len(pictures)} pictures, right in {right} of them", flush=True)
     folder.mkdir(parents=True, exist_ok=True)
-    save_file(
-        {name: one.contiguous() for name, one in student.network.state_dict().items()}, folder / "tiny.safetensors"
-    )
+    save_file({name: one.contiguous() for name, one in student.net.state_dict().items()}, folder / "tiny.safetensors")
     name = f"benchmarks.harden_detector:Tiny@{folder / 'tiny.safetensors'}"
     print(f"--model {name}", flush=True)
     return name
