@@ -12,10 +12,23 @@ import advsearch
 from advsearch.attacks import clopper_pearson
 from advsearch.questions.report.engineering import conditions_of
 from advsearch.questions.sweep.display import distance_of
+from advsearch.questions.sweep.result import Predictions
 from advsearch.runs.summary import read_result
+from advsearch.tasks import Judgement, Prediction
 from advsearch.viewer.columns import UNKNOWN, packed, read_columns
 
 pytestmark = pytest.mark.usefixtures("two_threads")
+
+
+def test_the_worst_is_a_picture_that_shows_it() -> None:
+    found = Predictions(4)
+    for number, (label, margin) in enumerate([("car", -3.0), ("out of view", -1.0), ("no car", 2.0)]):
+        found.add(number, Judgement.of(margin, margin, Prediction(label)))
+    assert found.hidden.tolist() == [False, True, False, False] and found.worst == 2
+    found = Predictions(2)
+    for number, (label, margin) in enumerate([("car", -3.0), ("out of view", -1.0)]):
+        found.add(number, Judgement.of(margin, margin, Prediction(label)))
+    assert found.worst == 0
 
 
 def test_they_are_told_and_not_counted(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,11 +12,20 @@ from test_browser import browser, faults, opened, until  # noqa: F401  the fixtu
 
 import advsearch
 from advsearch.questions.sweep.page import write_bundle
+from advsearch.viewer.columns import Boxes
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
 
 HOSTILE = "<img src=x onerror=document.title='planted'>"
+
+
+def test_boxes_of_all_rows_are_one_list_with_an_end_for_each_row() -> None:
+    boxes = Boxes()
+    found = [{"box": [1.0, 2.0, 3.5, 4.0], "label": "car", "score": 0.25}]
+    boxes.put({"box": None, "found": found, "things": {"near": {"box": [0, 0, 9000.0, 2]}, "hidden": {"box": None}}})
+    assert list(boxes.numbers) == [0, 0, 65534, 16, 0, 65535, 8, 16, 28, 32, 1, 2500]
+    assert boxes.names == {"near": 0, "car": 1} and copy.deepcopy(boxes) is boxes
 
 
 def sought(page: Page, text: str) -> int:
@@ -133,9 +143,7 @@ def test_the_page_of_a_drive_begins_with_the_drive(browser: Browser, tmp_path: P
                 page.wait_for_selector("[data-cell]")
                 roles = [page.get_by_label(f"{name}: how it is shown") for name in ("path.time", "drive")]
                 assert [one.input_value() for one in roles] == ["across", "up"]
-                assert (
-                    page.locator("[data-cell]:not(.none)").count() == 2 * frames
-                )  # no diagonal
+                assert page.locator("[data-cell]:not(.none)").count() == 2 * frames  # no diagonal
                 heads = page.locator("#explorer h3").all_inner_texts()
                 assert heads == [f"Drive 1, pose.yaw 0 {frames}", f"Drive 2, pose.yaw 90 {frames}"]
                 first = page.locator(".card").first

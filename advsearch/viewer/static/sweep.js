@@ -793,7 +793,7 @@
         choice("Show", SHOWS.filter(([name]) => several || name !== "differ"), state.show, (show) => this.change({ show })),
         choice("First", [...ORDERS, ...this.numbers()], state.order, (order) => this.change({ order })),
         choice("Group by", this.groups(), state.group || "", (group) => this.change({ group: group || null })),
-        make("span", { class: "soft" }, `${rows.length} of ${all.toLocaleString("en")}${state.cell ? " in this cell" : ""}${state.find ? " found" : ""}`),
+        make("span", { class: "soft" }, `${state.group ? "" : `${rows.length} of `}${all.toLocaleString("en")}${state.cell ? " in this cell" : ""}${state.find ? " found" : ""}`),
         boxes ? make("span", { class: "soft boxes" }, "Boxes: ", make("span", { class: "true" }, "where the object is"), ", ", make("span", { class: "said" }, "where the model says it is"), ", ", make("span", { class: "other" }, "what else it says")) : "",
         ...(state.cell ? [make("button", { type: "button", onclick: () => this.change({ cell: null }) }, "All cells")] : []),
       );
