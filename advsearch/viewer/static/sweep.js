@@ -868,7 +868,14 @@
       if (!marks.length) return make("span", { class: "picture" }, image);
       const [high, wide] = this.table.sources[this.table.columns.source[k]].size;
       const letters = wide / 28;
-      const text = ({ name, label, score, x, y, height: tall }) => drawn("text", { class: name, x: Math.max(0, x), y: y > letters ? y - letters / 4 : Math.min(high, y + tall) - letters / 4, "font-size": letters }, score === null ? label : `${label} ${score.toFixed(2)}`);
+      const written = [];
+      const text = ({ name, label, score, x, y, height: tall }) => {
+        const left = Math.max(0, x);
+        let line = y > letters ? y - letters / 4 : Math.min(high, y + tall) - letters / 4;
+        while (written.some(([other, at]) => Math.abs(other - left) < 9 * letters && Math.abs(at - line) < letters)) line += letters;
+        written.push([left, line]);
+        return drawn("text", { class: name, x: left, y: line, "font-size": letters }, score === null ? label : `${label} ${score.toFixed(2)}`);
+      };
       const drawings = marks.map(({ name, x, y, width, height }) => drawn("rect", { class: name, x, y, width, height }));
       if (named) drawings.push(...marks.filter((one) => one.label).map(text));
       return make("span", { class: "picture" }, image, drawn("svg", { viewBox: `0 0 ${wide} ${high}`, "aria-hidden": "true" }, ...drawings));
