@@ -276,8 +276,8 @@ def slerp(first: Tensor, second: Tensor, share: Tensor) -> Tensor:
     cosine = first @ second
     second, cosine = torch.where(cosine < 0.0, -second, second), cosine.abs()
     if float(cosine) > NEARLY_ONE:
-        found = first + share * (second - first)
-        return found / found.norm()
+        found: Tensor = first + share * (second - first)
+        return found.div(found.norm())
     angle = torch.arccos(cosine)
     return (torch.sin((1.0 - share) * angle) * first + torch.sin(share * angle) * second) / torch.sin(angle)
 
