@@ -155,3 +155,15 @@ def test_the_losses_at_hand_make_what_printable_makes(scene: advsearch.Scene) ->
     ours = advsearch.attack(scene, easy(), objective=own, **settings)
     theirs = advsearch.attack(scene, easy(), printable=True, **settings)
     assert ours.found and torch.allclose(ours.u, theirs.u, atol=1e-5)
+
+
+def test_controls_may_be_given_as_on_the_command_line(scene: advsearch.Scene) -> None:
+    for controls in ("pose={yaw: [0, 90], pitch: 5},light:key", ["pose={yaw: [0, 90], pitch: 5}", "light:key"]):
+        render = scene.renderer(controls, resolution=8)
+        assert render.space.groups[0].name == "pose.yaw" and len(render.start) == 9
+    found = advsearch.sweep(scene, easy(), controls="pose={yaw: [0, 90]}", samples=2, trials=0, resolution=16, spp=2)
+    assert found.summary.controls == ["pose"]
+    with pytest.raises(InputError, match=r"controls pose: expected \{PARAMETER: VALUE .* close every bracket"):
+        scene.renderer("pose={yaw: [0, 90}")
+    with pytest.raises(InputError, match="controls: light is given twice"):
+        scene.renderer("light,light")

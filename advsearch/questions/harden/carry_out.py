@@ -27,6 +27,7 @@ from advsearch.questions.harden.detectors import DetectorCourse, Loss, read_coco
 from advsearch.questions.harden.result import HardenConfig, HardenedControl, HardenResult, Share, SplitSide
 from advsearch.questions.harden.rounds import PICTURES, WEIGHTS, Course, MakeOptimiser, Rounds
 from advsearch.questions.harden.scenes import FURTHER, HELD_OUT, ROBUST, TRAINING, VALIDATION, SceneWork
+from advsearch.questions.harden.segmenters import SegmenterCourse
 from advsearch.questions.harden.training import ClassifierCourse, Examples
 from advsearch.rooms import made_question
 from advsearch.runs.directory import ARTIFACTS, RunDirectory, is_run, run_path
@@ -56,14 +57,16 @@ def harden(
     is given stays as it is.
 
     Args:
-        model: a classifier: what `load_model` takes, and no exported program.
+        model: a classifier, a detector or a segmenter: what `load_model` takes, and no exported program.
         optimiser: makes one of the list of parameters, such as ``lambda p: torch.optim.SGD(p, 0.01)``; its learning
             rate is then the highest, in place of `rate`.
         beside: batches of further examples, such as a `DataLoader`: images (N, H, W, 3) sRGB in [0, 1], class indices
             (N,). One is taken with each step. Not of a detector, which `data` is for.
         loss: of a detector whose network returns none in training: a function of the network, its input (N, 3, H, W)
             and, for each picture, a mapping with "boxes" (K, 4), x0, y0, x1, y1 in pixels of that input, and "labels"
-            (K,), indices of the model's labels. It returns a number that is smaller where the network is better.
+            (K,), indices of the model's labels; of a segmenter with "classes" (h, w) int64, the class that each pixel
+            of its output should have, and "object" (h, w) bool, those of the object. It returns a number that is
+            smaller where the network is better.
         resume: go on with the run of that name, if there is one, where it was stopped; everything else has to be as it
             was.
     """
@@ -91,26 +94,34 @@ def hardened(
     config = asked.config
     asked.progress.stage(LOADING)
     check_run_settings(config)
-    finds = config.task_name == "detection"
-    if not finds and (config.task_name != "classification" or config.data or loss):
-        raise InputError("task: harden trains for classification and detection; `data` and `loss` are of detection")
-    if finds and beside is not None:
+    finds, segments = config.task_name == "detection", config.task_name == "segmentation"
+    places = finds or segments
+    if not places and (config.task_name != "classification" or config.data or loss):
+        raise InputError(
+            "task: harden trains for classification, detection and segmentation; `data` is of detection, and `loss` of "
+            "both of the others"
+        )
+    if segments and config.data:
+        raise InputError("data: is of detection; leave it out")
+    if places and beside is not None:
         raise InputError("beside: is of classifiers; give a detector a COCO folder as `data`")
-    if finds and config.layers != "all":
-        raise InputError("layers: expected all of a detector; leave it out")
+    if places and config.layers != "all":
+        raise InputError("layers: expected all of a detector or a segmenter; leave it out")
     try:
         (loaded, *_), warnings = load_models([model or config.model], make_task(config.task), config)
     except ModelError as error:
         if config.task_name != "classification":
             raise
         said = str(error).partition(": use `task=")[0]
-        raise ModelError(f"{said}; harden trains classifiers and, with `task=detection`, detectors") from error
+        raise ModelError(f"{said}; harden trains classifiers, and with `task` detectors and segmenters") from error
     work = SceneWork(config, loaded, scenes.splits_of(config, loaded), asked.progress)
-    student, means = trainable(loaded, config.layers, logits=not finds), {"optimiser": optimiser is not None}
+    student, means = trainable(loaded, config.layers, logits=not places), {"optimiser": optimiser is not None}
     course: Course[Any]
     if finds:
         own = [] if config.data is None else read_coco(Path(config.data), loaded)
         course, means["loss"] = DetectorCourse(work, student, optimiser, own, loss), loss is not None
+    elif segments:
+        course, means["loss"] = SegmenterCourse(work, student, optimiser, loss), loss is not None
     else:
         course, means["beside"] = ClassifierCourse(work, student, optimiser, beside), beside is not None
     _same_means(asked.run, means)

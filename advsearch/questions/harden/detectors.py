@@ -30,6 +30,7 @@ from advsearch.runs.images import write_png
 from advsearch.scene.formation import levels_of
 from advsearch.tasks import Task
 from advsearch.tasks.boxes import Place
+from advsearch.tasks.segmentation import Region
 
 Target = dict[str, Tensor]
 """What is in a picture: "boxes" (K, 4), x0, y0, x1, y1 in pixels of the network's input, and "labels" (K,) indices."""
@@ -53,15 +54,16 @@ class Example(NamedTuple):
     boxes: Tensor
     labels: Tensor
     task: Task | None = None
-    truth: Place | None = None
+    truth: Place | Region | None = None
     found: bool = False
 
     @classmethod
     def of(cls, problem: Problem, seed: int, u: Tensor | None = None) -> Example:
         """Render a configuration, or the scene as it is, with the conditions that a seed draws."""
         at = problem.domain.start if u is None else u
-        truth: Place = problem.truth(problem.whole(at, seed))
-        boxes = torch.tensor([truth.box] if truth.box else [], dtype=torch.float32).reshape(-1, 4)
+        truth: Place | Region = problem.truth(problem.whole(at, seed))
+        box = truth.box if isinstance(truth, Place) else None
+        boxes = torch.tensor([box] if box else [], dtype=torch.float32).reshape(-1, 4)
         labels = torch.tensor([truth.labels[0]] * len(boxes), dtype=torch.int64)
         return cls(levels_of(problem.picture(at, seed, SPP)), boxes, labels, problem.task, truth, u is not None)
 
