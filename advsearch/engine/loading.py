@@ -26,7 +26,7 @@ from advsearch.registry import names_code
 from advsearch.scene import settings
 from advsearch.scene.assembly import Assembly, Motion
 from advsearch.scene.assets import EnvironmentAsset, Floats, ObjectAsset
-from advsearch.scene.camera_model import bundled
+from advsearch.scene.camera_model import bundled, pinhole
 from advsearch.scene.description import (
     ENVIRONMENT,
     NO_MAP,
@@ -268,6 +268,11 @@ def framed(description: SceneDescription, resolution: int | tuple[int, int]) -> 
     """Return the scene as it is seen in a picture of this size (side, or height and width)."""
     height, width = (resolution, resolution) if isinstance(resolution, int) else resolution
     model, remarks = description.camera_model, description.remarks
+    if description.number("camera.drops") > 0.0:
+        if description.rig:
+            raise InputError("`set` camera.drops: of one camera, not of several; leave it out")
+        if model is None or not model.name:  # drops are before a camera whose rays are worked out one by one
+            model = pinhole(description.number("camera.fov"), width / height)
     if model is not None:
         model = bundled(width / height).get(model.name, model)
         remarks = tuple(dict.fromkeys((*remarks, *model.scaling((height, width)))))
