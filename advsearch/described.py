@@ -14,3 +14,8 @@ class Value(TypedDict):
 
 NOT_A_NUMBER = "not a number"
 """What an output of a model is called that has NaN or infinity in it: it has said nothing."""
+
+
+def rounded(number: float) -> str:
+    """Return a number that was worked out as sentences have it: with three significant digits."""
+    return f"{float(f'{number:.3g}'):g}"
