@@ -137,11 +137,11 @@ def load_environment(name: str) -> EnvironmentAsset:
     known = list_environments()
     if name not in known:
         raise UnknownNameError("environment", name, known, MAP_HINT)
+    facts = _environments()[name]
     try:
-        radiance = _exr((_data() / "environments" / f"{name}.exr").read_bytes())
+        radiance = _exr((_data() / "environments" / f"{facts.get('map', name)}.exr").read_bytes())
     except (OSError, ValueError, KeyError, RuntimeError) as error:
         raise FileFormatError(f"bundled environment {name!r} cannot be read ({error}); reinstall advsearch") from error
-    facts = _environments()[name]
     return EnvironmentAsset(
         name, radiance, source=BUNDLED_ENVIRONMENT, ground=facts.get("ground"), candelas=facts.get("candelas")
     )

@@ -37,6 +37,7 @@ class EnvironmentFamily:
         height: rows of the map; it has twice as many columns.
         ground: the kind of ground that belongs to it; None for the usual table.
         lux: illuminance on an open level surface, where the map stands for light of a known strength.
+        map: the environment whose map it has; its own unless given.
     """
 
     name: str
@@ -47,6 +48,7 @@ class EnvironmentFamily:
     height: int = HEIGHT
     ground: str | None = None
     lux: float | None = None
+    map: str = ""
 
     def make(self) -> EnvironmentAsset:
         """Return the (height, 2 height, 3) map at the common brightness, every value a half-precision number."""
