@@ -54,7 +54,7 @@ PLACES = (
     ("room-near", "mug", "room", 65.0, 25.0, 0.35, LAID),
 )
 """Other places: a name, object, environment, azimuth and elevation of the camera, its distance, and things beside."""
-EV = {"crossing": 14.0, "crossing-night": 5.0, "car-park": 14.0, "car-park-dusk": 5.5}
+EV = {"crossing": 14.0, "crossing-night": 3.5, "car-park": 14.0, "car-park-dusk": 4.5}
 
 
 class Asked(NamedTuple):
