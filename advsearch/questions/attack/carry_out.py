@@ -41,6 +41,7 @@ from advsearch.models import Model
 from advsearch.models.address import Asked
 from advsearch.options import as_setting, told
 from advsearch.progress import NullProgress, Progress, Watched, watcher
+from advsearch.questions.attack.ambient import problems_by_name
 from advsearch.questions.attack.outcome import summarise
 from advsearch.questions.attack.parts import (
     LOADING,
@@ -261,7 +262,7 @@ def _carry_out(job: AttackParts, progress: Progress, resumed: str | Path | None 
 def attack_worker(settings: JsonObject) -> Call:
     """Return what evaluates the queries of the attack that the settings describe: what a worker does."""
     problem = problem_on(parts_of(AttackConfig(**settings)))
-    return worker_call(lambda name: problem)
+    return worker_call(problems_by_name(problem))
 
 
 def _policy(job: AttackParts, problem: Problem) -> Policy[Any]:

@@ -12,6 +12,7 @@ from torch import Tensor
 from advsearch.attacks import Ending, SearchResult, Verification, count_right
 from advsearch.attacks.candidates import Bracket, FoundFailure
 from advsearch.attacks.rate_samples import MOST_TIMES, MOVED, OVER_LADDER
+from advsearch.described import OUT_OF_VIEW
 from advsearch.engine.journal import Journal
 from advsearch.engine.objective import domain_of, print_terms
 from advsearch.engine.problem import Problem
@@ -356,8 +357,9 @@ def _gradients(search: SearchResult) -> results.SearchGradients:
 
 
 def _average(findings: Findings) -> AverageCase:
-    counted = count_right(findings.average, findings.spp)
-    scores = [trial.score for trial in findings.average]
+    shown = [trial for trial in findings.average if trial.prediction.label != OUT_OF_VIEW] or findings.average
+    counted = count_right(shown, findings.spp)
+    scores = [trial.score for trial in shown]
     return AverageCase(
         configurations=counted.trials,
         correct=counted.successes,

@@ -99,6 +99,17 @@ class AttackResult:
         return self.found
 
     @property
+    def path(self) -> Path | None:
+        """The same as `run`."""
+        return self.run
+
+    @property
+    def values(self) -> dict[str, Any]:
+        """The adversarial configuration by name, such as `pose.yaw`, without units; of a texture, numbers that
+        describe it. Empty where nothing was searched; `summary.configuration` has the units."""
+        return {name: one.value for name, one in (self.summary.configuration or {}).items()}
+
+    @property
     def images(self) -> dict[str, Tensor]:
         """The two pictures by name, `clean` and `adversarial`: (H, W, 3) display-referred sRGB in [0, 1]."""
         return {"clean": self.clean, "adversarial": self.adversarial}

@@ -103,6 +103,8 @@ def test_from_config(
 
     with RunDirectory.of(config, resumed) as run:
         run.store.set_note(NOTE, json.dumps(described.model_dump(mode="json")))
+        for one in planned:
+            run.note_sitting(one.config)
         trial = Trial(
             run,
             described.confidence,
