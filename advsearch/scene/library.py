@@ -79,7 +79,8 @@ def list_environments(split: str | None = None) -> tuple[str, ...]:
     """Return the names of the bundled environments, sorted.
 
     Args:
-        split: "train" or "heldout" to list only that half, "street" for the streets; None for all.
+        split: "train" or "heldout" to list only that half, "street" for the streets, "place" for other places; None for
+            all.
     """
     facts = _environments().items()
     return tuple(sorted(name for name, fact in facts if split is None or fact["split"] == split))

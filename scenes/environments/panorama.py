@@ -30,7 +30,7 @@ class EnvironmentFamily:
     Attributes:
         name: usable on the command line.
         split: "train" when models may be trained under it, "heldout" when it is kept for testing; "street" for streets,
-            which the reference model never sees.
+            which the reference model never sees; "place" for those whose map is nothing by itself.
         paint: maps unit directions (N, 3), z up, to linear radiance (N, 3).
         script: the file that makes it, within this repository.
         needs_mitsuba: whether making it runs Mitsuba.
@@ -41,7 +41,7 @@ class EnvironmentFamily:
     """
 
     name: str
-    split: Literal["train", "heldout", "street"]
+    split: Literal["train", "heldout", "street", "place"]
     paint: Callable[[Array], Array]
     script: str
     needs_mitsuba: bool = False

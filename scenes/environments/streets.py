@@ -268,12 +268,12 @@ STREETS: tuple[EnvironmentFamily, ...] = (
     EnvironmentFamily("avenue-night", "street", _open_night, _SCRIPT, ground="avenue", lux=0.3),
 )
 STREETS += tuple(
-    replace(one, name=one.name.replace("avenue", place), ground=place, map=one.name)
+    replace(one, name=one.name.replace("avenue", place), split="place", ground=place, map=one.name)
     for place in ("crossing", "car-park")
     for one in STREETS
     if one.ground == "avenue"
 )
 STREETS += (  # the room is closed: the map stands for what its walls throw back, which exposure is metered with
-    EnvironmentFamily("room", "street", _even, _SCRIPT, height=4, ground="room", lux=200.0),
-    EnvironmentFamily("room-evening", "street", _even, _SCRIPT, height=4, ground="lit-room", lux=120.0),
+    EnvironmentFamily("room", "place", _even, _SCRIPT, height=4, ground="room", lux=200.0),
+    EnvironmentFamily("room-evening", "place", _even, _SCRIPT, height=4, ground="lit-room", lux=120.0),
 )
