@@ -137,7 +137,7 @@ def on_its_ground(scene: SceneDescription) -> SceneDescription:
     """Return the scene with the road or the place that its environment and its settings ask for, and no other."""
     kind = _kind(scene)
     others = tuple(part for part in scene.parts if not (isinstance(part, MeshPart) and part.laid))
-    if kind in PLACES:
+    if kind in settings.PLACES:
         unit = None if scene.environment is None else scene.environment.candelas
         place = PLACES[kind](scene.metres, unit, wet=kind == settings.WET_AVENUE, dark=_dark(scene, kind))
         return replace(scene, parts=(*others, *place))

@@ -12,6 +12,7 @@ import torch
 import advsearch
 from advsearch.controls import Space, compose, make_control, make_space
 from advsearch.errors import InputError, UnknownNameError
+from advsearch.questions.sweep.axes import on_grid, read_axes
 from advsearch.scene.assembly import Assembly
 from advsearch.scene.description import SceneDescription, describe
 from advsearch.scene.things import Footprint, footprint, overlapping
@@ -164,6 +165,18 @@ def test_a_setting_is_for_all_things_or_for_one(scene: SceneDescription) -> None
     one = compose([make_control("things.chair.heading")], scene)
     assert [group.name for group in one.groups] == ["things.chair.heading"]
     assert one.inputs(one.start).keys() == {"chair.to_world"}
+
+
+def test_a_grid_may_be_of_one_thing(scene: SceneDescription) -> None:
+    axes = read_axes({"things.chair.heading": "0:315:8", "things.stop-sign.presence": ["there", "away"]}, ())
+    assert [(axis.name, len(axis.values)) for axis in axes] == [
+        ("things.chair.heading", 8),
+        ("things.stop-sign.presence", 2),
+    ]
+    space = make_space(on_grid((), axes, scene), scene)
+    assert [group.name for group in space.groups] == ["things.chair.heading", "things.stop-sign.presence"]
+    with pytest.raises(UnknownNameError, match=r"parameter of control things .chair.hight"):
+        read_axes({"things.chair.hight": "0:1:2"}, ())
 
 
 def test_what_cannot_be_is_refused(scene: SceneDescription) -> None:

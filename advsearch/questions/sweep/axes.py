@@ -94,11 +94,12 @@ def _read_axis(name: str, given: Any, instances: Mapping[str, Control]) -> Axis:
             f"`grid` {name}: expected CONTROL.PARAMETER, got no parameter; choose one of {', '.join(known)}"
         )
     check_instance(f"`grid` {name}", late or early, colon or early_colon)
-    if parameter_name not in known:
+    declared = {one.name: one for one in control.declared({parameter_name: given})}
+    if len(own) > len(control.parameters):
+        declared |= {one.name: one for one in own}
+    if parameter_name not in declared:
         raise UnknownNameError(f"parameter of control {control.kind}", parameter_name, known, f"In `grid` {name}.")
-    parameter = (own if len(own) > len(control.parameters) else control.declared({parameter_name: given}))[
-        known.index(parameter_name)
-    ]
+    parameter = declared[parameter_name]
     pictures = any(len(one.shape) > 1 for one in control.parameters)
     if pictures or not issubclass(control, NumberControl) or parameter.shape != ():
         raise InputError(
