@@ -84,11 +84,11 @@ def load_models(models: Sequence[Any], task: Task, config: SceneConfig) -> tuple
                 f"made of several, as in `task='rig={{task: {task.name}, rule: any}}'`"
             )
         loaded = tuple(replace(one, cameras=len(rig)) for one in loaded)
-    for one in loaded:
-        if isinstance(one.module, AllAtOnce) and one.module.cameras != one.cameras:
+    for model in loaded:
+        if isinstance(model.module, AllAtOnce) and model.module.cameras != model.cameras:
             raise InputError(
-                f"model: {one.name} takes {one.module.cameras} pictures at once, and {one.cameras} "
-                f"{'is' if one.cameras == 1 else 'are'} taken; give a `camera` that is a rig of as many"
+                f"model: {model.name} takes {model.module.cameras} pictures at once, and {model.cameras} "
+                f"{'is' if model.cameras == 1 else 'are'} taken; give a `camera` that is a rig of as many"
             )
     return (together(loaded, config.resolution),) if isinstance(task, Together) else loaded, sentences
 

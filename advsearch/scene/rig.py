@@ -234,7 +234,7 @@ def _of_colmap(path: str, which: str) -> tuple[Mount, ...]:
             [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
         ]
         seen[:3, 3] = shift
-        poses.append(np.linalg.inv(seen))
+        poses.append(np.asarray(np.linalg.inv(seen), np.float64))
         cameras = Path(path).with_name("cameras.txt")
         models.append(read_camera(f"{cameras}#{words[8]}"))
     return _mounted(path, names, poses, models)
