@@ -37,7 +37,7 @@ _HOMES = {
 """The public names, and the module of each; besides, every question that
 `advsearch.question` makes."""
 
-_MODULES = ("losses", "testing")
+_MODULES = ("controls", "losses", "testing")
 """Public modules."""
 
 __all__ = [*_HOMES, *_MODULES, *made_questions()]

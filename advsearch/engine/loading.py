@@ -117,6 +117,14 @@ class Scene:
         lit = replace(own, environment=environment, environment_spec=name, given=given)
         return Scene(with_lamps(on_its_ground(lit)), self.only_here)
 
+    def __getattr__(self, name: str) -> Any:
+        if name == "render":
+            raise AttributeError(
+                "a scene has no `render`: advsearch.render(scene) makes a picture and asks a model, and "
+                "scene.renderer(controls) returns render(u, seed, spp), which is differentiable"
+            )
+        raise AttributeError(f"'Scene' object has no attribute {name!r}")
+
     def __repr__(self) -> str:
         described = self.description
         fixed = "".join(f", {name}={value!r}" for name, value in sorted(described.given_values.items()))

@@ -8,6 +8,7 @@ import math
 import shutil
 import tempfile
 from pathlib import Path
+from typing import Any
 
 from advsearch.cli import output
 from advsearch.errors import InputError
@@ -97,11 +98,12 @@ def _take_in(folder: str, name: str) -> None:
     from advsearch.settings import read_yaml
 
     run = find_run(name)
+    task: Any = read_yaml(run / CONFIG).get("task") or "classification"
     with tempfile.TemporaryDirectory() as named:
         place = Path(folder)
         if (place / POSES).is_file():
             place = _named_by_pose(place, run, Path(named))
-        files = photographs_in(place, read_yaml(run / CONFIG).get("task") or "classification")
+        files = photographs_in(place, task)
         if loose := [one.name for one in files if not one.stem.startswith("rendering-")]:
             raise InputError(
                 f"photographs: {loose[0]}: expected the number of a rendering in its name, such as rendering-12.jpg, "

@@ -202,6 +202,11 @@ class SweepResult:
     in_memory: tuple[store.Row, ...] = ()
 
     @property
+    def path(self) -> Path | None:
+        """The same as `run`."""
+        return self.run
+
+    @property
     def accuracy(self) -> float | None:
         """Share of the configurations that the model got right; None where there was none."""
         return self.summary.accuracy
