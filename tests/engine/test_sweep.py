@@ -1128,7 +1128,7 @@ def test_an_adversarial_scene_needs_a_run_that_has_one(tmp_path: Path, attacked:
 # ---- changed pictures -----------------------------------------------------------------------------------------------
 
 
-CHANGES = {"must_change": "black,covered,away", "must_not_change": "exposure,shift,jpeg"}
+CHANGES: dict[str, Any] = {"must_change": "black,covered,away", "must_not_change": "exposure,shift,jpeg"}
 
 
 def test_a_model_that_looks_is_told_from_one_that_does_not_really_rendered(tmp_path: Path) -> None:
@@ -1156,7 +1156,7 @@ def test_changes_of_a_stopped_sweep_are_counted_from_its_rows(tmp_path: Path) ->
     first = advsearch.sweep("mug", model(), {"pose.yaw": "0:360:6"}, **asked).summary
     assert first.ending == "interrupted" and first.changes is not None and first.changes[0].configurations == 3
     FakeRenderer.stops_at = None
-    (one,) = advsearch.sweep("mug", model(), {"pose.yaw": "0:360:6"}, **asked).summary.changes or ()
+    (one,) = advsearch.sweep("mug", model(), {"pose.yaw": "0:360:6"}, **asked).summary.changes or []
     assert (one.configurations, one.correct) == (6, 6 if one.row is None else one.correct)
 
 
@@ -1169,7 +1169,8 @@ def test_changes_that_are_none_and_objects_that_come_back_are_refused() -> None:
 
 def test_an_object_is_taken_away_however_it_is_posed_really_rendered() -> None:
     """Where the controls move it, too; its shadow goes with it."""
-    for controls in ({"pose": {"y": [-0.1, 0.1], "yaw": [0.0, 360.0]}}, {"light": {}}):
+    cases: list[Any] = [{"pose": {"y": [-0.1, 0.1], "yaw": [0.0, 360.0]}}, {"light": {}}]
+    for controls in cases:
         check_away(advsearch.load_scene("mug").renderer(controls, resolution=32))
 
 

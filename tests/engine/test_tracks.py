@@ -99,10 +99,10 @@ def test_a_sweep_says_of_a_drive_whose_detector_is_blind_for_three_frames_what_b
     boxes = [[float(side) for side in one["box"] or (0, 0, 1, 1)] for one in payloads]
     seen = sum(one["box"] is not None for one in payloads)
     assert len(boxes) == 16 and seen > 10
-    (seeing,) = advsearch.sweep("mug", detector(boxes, []), task=task, **DRIVE).summary.drives or ()
+    (seeing,) = advsearch.sweep("mug", detector(boxes, []), task=task, **DRIVE).summary.drives or []
     assert seeing.tracks is not None and seeing.tracks.lost.mean == 0.0 == seeing.tracks.switches.mean
     result = advsearch.sweep("mug", detector(boxes, [4, 5, 6]), task=task, run=tmp_path / "run", **DRIVE)
-    (blind,) = result.summary.drives or ()
+    (blind,) = result.summary.drives or []
     assert blind.tracks is not None and blind.tracks.tracker == "ConstantVelocity"
     assert blind.tracks.lost.mean == pytest.approx(3 / seen)
     assert blind.tracks.longest_gap.mean == pytest.approx(3 * blind.seconds / 15)
@@ -138,7 +138,7 @@ def test_paint_that_fools_a_detector_along_a_drive_breaks_the_track(tmp_path: Pa
     swept = advsearch.sweep(
         None, model, adversarial_of=tmp_path / "paint", path="approach", fps=1.0, trials=0, spp=8, **asked
     )
-    clean, painted = swept.summary.drives or ()
+    clean, painted = swept.summary.drives or []
     assert clean.tracks is not None and painted.tracks is not None
     assert clean.tracks.lost.mean == 0.0 and painted.tracks.lost.mean > 0.8
     assert painted.tracks.longest_gap.mean > 5.0 > clean.tracks.longest_gap.mean

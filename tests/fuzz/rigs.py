@@ -47,7 +47,8 @@ def rig(random: Random) -> Case:
     what = random.choice(sorted(kinds))
     name, made = kinds[what]
     files = {name: made(), "cameras.txt": damaged(random, CAMERAS)[1] if random.random() < 0.3 else CAMERAS}
-    links, pipes = {}, ()
+    links: dict[str, str] = {}
+    pipes: tuple[str, ...] = ()
     if name == "images.txt" and random.random() < 0.2:
         del files["cameras.txt"]
         links, pipes = ({"cameras.txt": "/dev/zero"}, ()) if random.random() < 0.5 else ({}, ("cameras.txt",))
