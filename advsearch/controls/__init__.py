@@ -244,10 +244,10 @@ def _suggestion(control: Control) -> str:
 
 
 def __getattr__(name: str) -> Any:
-    """Import the class of a control when it is asked for by name."""
+    """Import the class of a control when it is asked for by name: TextureControl, or Texture for short."""
     for module, class_name in OWN.items():
-        if class_name == name:
-            return getattr(import_module(f"{__name__}.{module}"), name)
+        if class_name in (name, f"{name}Control"):
+            return getattr(import_module(f"{__name__}.{module}"), class_name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
