@@ -276,10 +276,11 @@ def slerp(first: Tensor, second: Tensor, share: Tensor) -> Tensor:
     cosine = first @ second
     second, cosine = torch.where(cosine < 0.0, -second, second), cosine.abs()
     if float(cosine) > NEARLY_ONE:
-        found = first + share * (second - first)
-        return found / found.norm()
+        chord: Tensor = first + share * (second - first)
+        return chord / chord.norm()
     angle = torch.arccos(cosine)
-    return (torch.sin((1.0 - share) * angle) * first + torch.sin(share * angle) * second) / torch.sin(angle)
+    arc: Tensor = torch.sin((1.0 - share) * angle) * first + torch.sin(share * angle) * second
+    return arc / torch.sin(angle)
 
 
 def rotation(quaternions: Tensor) -> Tensor:

@@ -129,7 +129,7 @@ def spherical(first: np.ndarray, second: np.ndarray, share: float) -> np.ndarray
 
 def expected(seconds: float | None, fat: float | None = None, turn: np.ndarray | None = None) -> np.ndarray:
     """All vertices in the file's axes; `turn` (3, 3) is put before the upper bone's own rotation."""
-    rotation, scale, shift, share = [0, 0, 0, 1], [1, 1, 1], [0, 0, 0], 0.0
+    rotation, scale, shift, share = np.eye(4)[3], np.ones(3), np.zeros(3), 0.0
     if seconds is not None:
         k = 0 if seconds < TIMES[1] else 1
         span = TIMES[k + 1] - TIMES[k]
@@ -170,14 +170,14 @@ def in_mesh(points: np.ndarray) -> np.ndarray:
 UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
 
-def moved(path: Path, clip: str | None = None, **values: float) -> np.ndarray:
+def moved(path: Path, clip: str | None = None, /, **values: float) -> np.ndarray:
     """Where the mesh's vertices are, in the file's order."""
     mesh = import_object(path).mesh
     assert isinstance(mesh.rig, SkeletonRig)
     offsets = mesh.rig.offsets({name.replace("__", "."): torch.tensor(v) for name, v in values.items()}, clip)
     apart = np.linalg.norm(mesh.vertices[None] - in_mesh(expected(None))[:, None], axis=2)
     assert apart.min(axis=1).max() < 1e-5 and apart.min(axis=0).max() < 1e-5, "the rest pose is not the format's"
-    return (mesh.vertices + offsets.numpy())[apart.argmin(axis=1)]
+    return np.asarray((mesh.vertices + offsets.numpy())[apart.argmin(axis=1)])
 
 
 @pytest.mark.parametrize("kind", ["f4", "u1", "u2"])
