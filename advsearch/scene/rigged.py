@@ -276,13 +276,8 @@ def slerp(first: Tensor, second: Tensor, share: Tensor) -> Tensor:
     cosine = first @ second
     second, cosine = torch.where(cosine < 0.0, -second, second), cosine.abs()
     if float(cosine) > NEARLY_ONE:
-<<<<<<< HEAD
-        chord: Tensor = first + share * (second - first)
-        return chord / chord.norm()
-=======
         found: Tensor = first + share * (second - first)
         return found.div(found.norm())
->>>>>>> w-int
     angle = torch.arccos(cosine)
     arc: Tensor = torch.sin((1.0 - share) * angle) * first + torch.sin(share * angle) * second
     return arc / torch.sin(angle)
