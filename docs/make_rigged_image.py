@@ -111,7 +111,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     with tempfile.TemporaryDirectory() as folder:
         path, pictures = Path(folder) / "lamp.glb", []
         write_lamp(path)
-        view = {"camera.azimuth": -70.0, "camera.elevation": 14.0, "camera.distance": 0.9}
+        view = {"camera.azimuth": -70.0, "camera.elevation": 14.0, "camera.distance": 1.15}
         scene = advsearch.load_scene(str(path), "day-room", settings=view)
         for pose in POSES:
             render = scene.renderer({"camera": {"roll": [-1, 1]}, "body": dict(pose)}, resolution=args.size)

@@ -279,7 +279,8 @@ def slerp(first: Tensor, second: Tensor, share: Tensor) -> Tensor:
         found: Tensor = first + share * (second - first)
         return found.div(found.norm())
     angle = torch.arccos(cosine)
-    return (torch.sin((1.0 - share) * angle) * first + torch.sin(share * angle) * second) / torch.sin(angle)
+    arc: Tensor = torch.sin((1.0 - share) * angle) * first + torch.sin(share * angle) * second
+    return arc / torch.sin(angle)
 
 
 def rotation(quaternions: Tensor) -> Tensor:

@@ -819,8 +819,8 @@ def test_what_is_no_list_of_values_is_refused(given: Any) -> None:
         (
             "object",
             "",
-            "--object: expected names of objects or .obj, .ply, .stl, .gltf, .glb, .blend, .usd, .usda, .usdc or .usdz "
-            "files, got ''",
+            "--object: expected names of objects or .obj, .ply, .stl, .gltf, .glb, .vrm, .blend, .usd, .usda, .usdc or "
+            ".usdz files, got ''",
         ),
     ],
 )

@@ -1225,7 +1225,8 @@ def _elsewhere(header: dict[str, Any]) -> None:
 
 
 def _morphed(header: dict[str, Any]) -> None:
-    header["meshes"][0]["primitives"][0]["targets"] = [{"POSITION": 0}]
+    primitive = header["meshes"][0]["primitives"][0]
+    primitive["targets"] = [{"POSITION": primitive["attributes"]["POSITION"]}]
 
 
 @pytest.mark.parametrize(

@@ -129,8 +129,7 @@ def spherical(first: np.ndarray, second: np.ndarray, share: float) -> np.ndarray
 
 def expected(seconds: float | None, fat: float | None = None, turn: np.ndarray | None = None) -> np.ndarray:
     """All vertices in the file's axes; `turn` (3, 3) is put before the upper bone's own rotation."""
-    rotation: Any
-    rotation, scale, shift, share = [0, 0, 0, 1], [1, 1, 1], [0, 0, 0], 0.0
+    rotation, scale, shift, share = np.eye(4)[3], np.ones(3), np.zeros(3), 0.0
     if seconds is not None:
         k = 0 if seconds < TIMES[1] else 1
         span = TIMES[k + 1] - TIMES[k]
@@ -171,7 +170,7 @@ def in_mesh(points: np.ndarray) -> np.ndarray:
 UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
 
-def moved(path: Path, clip: str | None = None, **values: Any) -> np.ndarray:
+def moved(path: Path, clip: str | None = None, /, **values: float) -> np.ndarray:
     """Where the mesh's vertices are, in the file's order."""
     mesh = import_object(path).mesh
     assert isinstance(mesh.rig, SkeletonRig)
@@ -213,11 +212,11 @@ def test_joints_turn_about_the_axes_that_the_object_has_at_rest(tmp_path: Path) 
     )
     ends = np.append(shares_of(tube()[0]) == 1.0, np.zeros(len(SQUARE), bool))
     for axis, name in enumerate("xyz"):
-        found = moved(path, None, **{f"upper-L__{name}": 40.0})
+        found = moved(path, **{f"upper-L__{name}": 40.0})
         wanted = joint + (rest - joint) @ about(axis, 40.0).T
         assert np.abs(found - wanted)[ends].max() < 3e-6, name
         assert np.abs(found - rest)[shares_of(tube()[0]).tolist().index(0.0)].max() < 1e-6
-    both = moved(path, None, **{"upper-L__x": 30.0, "upper-L__z": -50.0})
+    both = moved(path, **{"upper-L__x": 30.0, "upper-L__z": -50.0})
     wanted = joint + (rest - joint) @ (about(2, -50.0) @ about(0, 30.0)).T
     assert np.abs(both - wanted)[ends].max() < 3e-6
 

@@ -365,7 +365,7 @@ def test_a_scene_with_nothing_for_an_object_and_none_at_all_are_said(
 def test_import_names_every_ending(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "room.json").write_text("{}")
     assert main(["import", str(tmp_path / "room.json")]) == 2
-    endings = ".obj, .ply, .stl, .gltf, .glb, .blend, .usd, .usda, .usdc, .usdz or .xml"
+    endings = ".obj, .ply, .stl, .gltf, .glb, .vrm, .blend, .usd, .usda, .usdc, .usdz or .xml"
     assert f"expected an object file ending in {endings}, got '.json'; convert it" in capsys.readouterr().err
     assert main(["render", "--object", "bottl", "--out", str(tmp_path / "a.png")]) == 2
     assert "A path to a file that ends in .obj, .ply, .stl, .gltf, .glb, " in capsys.readouterr().err

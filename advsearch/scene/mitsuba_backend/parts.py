@@ -428,10 +428,12 @@ def _lens(description: SceneDescription) -> Plugin:
                 "background: it would show where the camera's lens sees nothing as well; leave the plain background "
                 "out, or take a lens that fills the picture"
             )
-        drops = {name: description.number(f"camera.{name}") for name in ("drops", "drop_size", "drop_seed")}
-        tangent = max(model.tangents) if model.name else math.tan(math.radians(description.number("camera.fov")) / 2.0)
-        drops |= {"drop_tangent": tangent}
-        return {"type": "advsearch_camera", "kind": model.kind, "reach": model.reach, **model.values, **drops}
+        camera: Plugin = {"type": "advsearch_camera", "kind": model.kind, "reach": model.reach, **model.values}
+        if description.number("camera.drops") > 0.0:
+            half = math.radians(description.number("camera.fov")) / 2.0
+            camera |= {name: description.number(f"camera.{name}") for name in ("drops", "drop_size", "drop_seed")}
+            camera["drop_tangent"] = max(model.tangents) if model.name else math.tan(half)
+        return camera
     pinhole: Plugin = {"type": "perspective", "fov": description.number("camera.fov"), "fov_axis": "larger"}
     if description.thin_lens:
         pinhole |= {"type": "thinlens", "aperture_radius": 1e-4, "focus_distance": 1.0}
