@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -87,3 +88,14 @@ def test_it_is_searched_with_a_projector_and_differentiated_by_differences() -> 
     u.requires_grad_()
     renderer(u, seed=0, spp=4).mean().backward()
     assert u.grad is not None and bool(torch.isfinite(u.grad).all()) and bool(u.grad.any())
+
+
+@pytest.mark.parametrize("control", ["projector", "shadow"])
+def test_light_is_searched_over_cameras_and_environments_and_along_a_path(control: str) -> None:
+    settings: dict[str, Any] = {"projector": {"resolution": 4}, "shadow": {"size": [0, 1]}}[control]
+    few: dict[str, Any] = {"resolution": 16, "steps": 2, "draws": 2, "trials": 6, "verify_spp": 1, "measure": "no"}
+    over = {"camera": {"azimuth": [30, 50]}, "environment": {"rotation": [0, 90]}}
+    for conditions in ({"over": over}, {"path": "approach", "over": "path"}):
+        result = advsearch.attack("mug", "reference", controls={control: settings}, baseline=False, **conditions, **few)
+        assert result.summary.ending and result.summary.conditions, conditions
+        assert result.summary.configuration, conditions

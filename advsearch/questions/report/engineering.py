@@ -18,7 +18,7 @@ from advsearch.settings import read_yaml
 
 DOMAIN = {
     "place": ("environment", "background"),
-    "light": ("light", "sky", "exposure", "shadow", "projector"),
+    "light": ("light", "sky", "exposure", "shadow", "projector", "spot"),
     "weather": ("haze",),
     "road users and things": ("object", "pose", "body", "occlusion", "contents"),
     "surfaces": ("texture", "material", "patch", "geometry"),
