@@ -30,13 +30,14 @@ _HOMES = {
     "load_model": "advsearch.api.render",
     "load_run": "advsearch.api.render",
     "load_scene": "advsearch.engine.loading",
+    "measured_palette": "advsearch.api.chart",
     "photo_agreement": "advsearch.questions.photographs.carry_out",
     "render": "advsearch.api.render",
 }
 """The public names, and the module of each; besides, every question that
 `advsearch.question` makes."""
 
-_MODULES = ("losses", "testing")
+_MODULES = ("controls", "losses", "testing")
 """Public modules."""
 
 __all__ = [*_HOMES, *_MODULES, *made_questions()]

@@ -72,12 +72,18 @@ def unexpected(function: str, given: Mapping[str, object], known: Sequence[str])
     for name in given:
         if name in known:
             continue
-        meant = [one for one, others in SYNONYMS.items() if one in known and name.lower() in others.split()]
+        meant, reason = meant_by(name, known)
         meant = meant or ([] if name.lower() in DEVICES else resembling(name, known)[:2])
         hint = f"; did you mean {' or '.join(f'`{one}`' for one in meant)}?" if meant else ""
-        reason = f" ({NOWHERE[name.lower()]})" if name.lower() in NOWHERE else ""
+        reason = f" ({reason})" if reason else ""
         return TypeError(f"{function}() got an unexpected keyword argument {name!r}{hint}{reason}")
     return None
+
+
+def meant_by(name: str, known: Sequence[str]) -> tuple[list[str], str]:
+    """Return which of the known keywords other libraries call so, and why there is none like it here."""
+    meant = [one for one, others in SYNONYMS.items() if one in known and name.lower() in others.split()]
+    return meant, NOWHERE.get(name.lower(), "")
 
 
 def check_types(parameters: Mapping[str, inspect.Parameter], given: Mapping[str, object]) -> None:

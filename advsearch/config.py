@@ -27,6 +27,7 @@ from advsearch.settings import (
     number_or_text,
     parse_assignment,
     power,
+    read_controls,
     setting,
     setting_as_in,
     shown,
@@ -364,11 +365,10 @@ class SceneConfig(Config):
     @field_validator("controls", "over", mode="before", check_fields=False)
     @classmethod
     def _controls_from_names(cls, value: Any) -> Any:
-        """Accept ``"texture"`` and ``["texture", "pose"]`` for controls with nothing set, and an empty YAML value."""
-        names = [part.strip() for part in value.split(",") if part.strip()] if isinstance(value, str) else value
+        """Accept ``"texture"`` and ``["texture", "pose={yaw: [0, 90]}"]``, and an empty YAML value."""
+        names = [value] if isinstance(value, str) else value
         if isinstance(names, (list, tuple)) and all(isinstance(name, str) for name in names):
-            check_once(names, "controls")
-            return {name: {} for name in names}
+            return read_controls(names, "controls")
         if isinstance(names, Mapping):
             return {name: {} if given is None else given for name, given in by_key(names).items()}
         return value

@@ -15,6 +15,23 @@ from collections.abc import Iterable, Sequence
 SIMILAR, SIMILAR_WORD = 0.6, 0.75
 """Least ratio of `difflib` at which a name, or one word of it, is spelled nearly like another."""
 
+ELSEWHERE = {
+    "pgd": "fgsm bim ifgsm mifgsm mi-fgsm apgd autoattack",
+    "cmaes": "cma cma-es",
+    "cross_entropy": "ce xent nll crossentropy",
+    "margin": "cw carlini_wagner carlini-wagner",
+    "pose": "rotation orientation transform",
+    "camera": "view viewpoint",
+    "material": "colour color roughness bsdf",
+    "light": "lighting lamp",
+    "environment": "hdri envmap",
+    "haze": "fog weather",
+    "occlusion": "occluder",
+    "car": "sedan vehicle",
+    "person": "pedestrian human",
+}
+"""Names here, and what others call nearly the same."""
+
 
 class AdvsearchError(Exception):
     """Base of every error that is the input's fault or the machine's, not a bug of advsearch."""
@@ -36,7 +53,8 @@ class UnknownNameError(InputError):
 
     def __init__(self, kind: str, name: str, known: Iterable[str], hint: str = "") -> None:
         names = sorted(known)
-        near = resembling(name, names)[:3]
+        near = [one for one in names if name.casefold() in ELSEWHERE.get(one, "").split()]
+        near = near or resembling(name, names)[:3]
         guess = f" Did you mean {' or '.join(repr(n) for n in near)}?" if near else ""
         super().__init__(f"unknown {kind} {name!r}.{guess} Known: {', '.join(names)}.{' ' + hint if hint else ''}")
         self.near = tuple(near)

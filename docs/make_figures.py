@@ -65,7 +65,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--check", action="store_true", help="write nothing; exit 3 if a file is not as it should be")
     check = parser.parse_args(argv).check
-    wrong = differing()
+    try:
+        wrong = differing()
+    except ValueError as error:
+        parser.exit(2, f"{error}\n")
     for path, text in wrong.items():
         print(f"{'differs' if check else 'written'}: {path.relative_to(DOCS.parent)}", file=sys.stderr)
         if not check:

@@ -84,6 +84,11 @@ def form_of(function: Callable[..., Any]) -> Form:
     except ValueError:  # built in: nothing to look at
         return Form()
     by_position = [one.name for one in signature.parameters.values() if one.kind in (0, 1)]
+    if by_position[:1] and by_position[0] in IMAGES:  # as a metric takes them
+        raise InputError(
+            f"objective {name_of(function)!r}: its first argument is called {by_position[0]!r}, but gets what the "
+            "model says; write (output, images, truth)"
+        )
     asked = tuple(
         one.name for one in signature.parameters.values() if one.name in ASKED and one.name not in by_position[:2]
     )

@@ -16,7 +16,16 @@ from advsearch.config import CONFIGS
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.registry import allow_named
-from advsearch.settings import Config, Setting, check_once, parse_assignment, read_yaml, settings, shown, split_names
+from advsearch.settings import (
+    Config,
+    Setting,
+    check_once,
+    parse_assignment,
+    read_controls,
+    read_yaml,
+    settings,
+    split_names,
+)
 
 _NO_SETTINGS = {"code": "--code", "sheets": "--sheets", "paper": "--paper", "size": "--size"}
 """Flags which messages name too and which are no setting of a configuration."""
@@ -158,37 +167,5 @@ def _axes(given: Sequence[str], flag: str) -> dict[str, object]:
     return _assignments(quoted, flag)
 
 
-def _controls(given: Sequence[str], flag: str) -> dict[str, object]:
-    """Return control to settings from ``texture,pose``, ``texture={resolution: 64}`` and ``pose={...},x={...}``."""
-    controls: list[tuple[str, Any]] = []
-    for part in (part for text in given for part in _parts(text) if part.strip()):
-        name, settings = parse_assignment(part, flag) if "=" in part else (part.strip(), {})
-        if isinstance(settings, str) and settings.startswith("{"):
-            raise InputError(
-                f"{flag} {name}: expected {{PARAMETER: VALUE or [LOW, HIGH], ...}}, got {shown(settings)}; write a "
-                "colon and a space behind each parameter, close every bracket, and put a comma before the next control"
-            )
-        controls.append((name, settings))
-    check_once((name for name, _ in controls), flag)
-    return dict(controls)
-
-
-def _parts(text: str) -> list[str]:
-    """Return what stands between the commas of a text that are in no brackets."""
-    parts, depth, quote = [""], 0, ""
-    for sign in text:
-        if quote:
-            quote = "" if sign == quote else quote
-        elif depth and sign in "\"'":
-            quote = sign
-        else:
-            depth += (sign in "{[") - (sign in "}]")
-        if sign == "," and depth <= 0:
-            parts.append("")
-        else:
-            parts[-1] += sign
-    return parts
-
-
-READERS = {"assignments": _assignments, "choices": _choices, "axes": _axes, "controls": _controls}
+READERS = {"assignments": _assignments, "choices": _choices, "axes": _axes, "controls": read_controls}
 """What reads the flags of each form that is not left to the configuration."""

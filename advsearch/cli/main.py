@@ -179,16 +179,22 @@ def add_command(
 
 def _unknown_argument(argument: str, parser: argparse.ArgumentParser) -> InputError:
     # late, so that --help answers at once
+    from advsearch.calls import meant_by
     from advsearch.config import CONFIGS
     from advsearch.settings import settings
 
     name = argument.partition("=")[0]
-    if not name.startswith("--"):
-        return InputError(f"expected flags, got {argument!r}; see {parser.prog} --help")
     known = re.findall(r"(?<!\S)--[a-z][a-z-]*", parser.format_help())
+    if not name.startswith("--"):
+        hint = f"; for the object write --object {argument}" if "--object" in known else ""
+        return InputError(f"expected flags, got {argument!r}{hint}; see {parser.prog} --help")
     owners = [one for one, config in CONFIGS.items() if name in (setting.flag for setting in settings(config))]
     if owners:
         return InputError(f"{parser.prog} has no {name}, a flag of advsearch {', '.join(owners)}; leave it out")
+    meant, reason = meant_by(name[2:].replace("-", "_"), [flag[2:] for flag in known])
+    if meant or reason:
+        hint = f"; did you mean {' or '.join(f'--{one}' for one in meant)}?" if meant else ""
+        return InputError(f"{parser.prog} has no {name}{hint}{f' ({reason})' if reason else ''}")
     return UnknownNameError("flag", name, set(known))
 
 

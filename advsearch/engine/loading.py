@@ -26,7 +26,7 @@ from advsearch.registry import names_code
 from advsearch.scene import settings
 from advsearch.scene.assembly import Assembly, Motion
 from advsearch.scene.assets import EnvironmentAsset, Floats, ObjectAsset
-from advsearch.scene.camera_model import bundled
+from advsearch.scene.camera_model import bundled, pinhole
 from advsearch.scene.description import (
     ENVIRONMENT,
     NO_MAP,
@@ -44,7 +44,7 @@ from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.moments import A_PIXEL, FEWEST, MOST, Moment, moments_of
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.settings import ORBIT_CAMERA, Given
-from advsearch.settings import as_python
+from advsearch.settings import as_python, read_controls
 
 Controls = str | Control | Sequence[str | Control] | Mapping[str, object]
 """One control or several, by name or instance; a mapping gives each name its settings or
@@ -116,6 +116,14 @@ class Scene:
             check_one_environment(own.parts, f"`environment={name}`")
         lit = replace(own, environment=environment, environment_spec=name, given=given)
         return Scene(with_lamps(on_its_ground(lit)), self.only_here)
+
+    def __getattr__(self, name: str) -> Any:
+        if name == "render":
+            raise AttributeError(
+                "a scene has no `render`: advsearch.render(scene) makes a picture and asks a model, and "
+                "scene.renderer(controls) returns render(u, seed, spp), which is differentiable"
+            )
+        raise AttributeError(f"'Scene' object has no attribute {name!r}")
 
     def __repr__(self) -> str:
         described = self.description
@@ -260,6 +268,11 @@ def framed(description: SceneDescription, resolution: int | tuple[int, int]) -> 
     """Return the scene as it is seen in a picture of this size (side, or height and width)."""
     height, width = (resolution, resolution) if isinstance(resolution, int) else resolution
     model, remarks = description.camera_model, description.remarks
+    if description.number("camera.drops") > 0.0:
+        if description.rig:
+            raise InputError("`set` camera.drops: of one camera, not of several; leave it out")
+        if model is None or not model.name:  # drops are before a camera whose rays are worked out one by one
+            model = pinhole(description.number("camera.fov"), width / height)
     if model is not None:
         model = bundled(width / height).get(model.name, model)
         remarks = tuple(dict.fromkeys((*remarks, *model.scaling((height, width)))))
@@ -375,12 +388,13 @@ def _plain(given: object) -> object:
 
 
 def _listed(controls: str | Control | Iterable[object]) -> dict[str, object]:
-    """Return controls that were given without settings, by name: an instance, or None."""
-    if isinstance(controls, str):
-        controls = [part.strip() for part in controls.split(",") if part.strip()]
-    listed: list[object] = list(controls) if isinstance(controls, Iterable) else [controls]
+    """Return controls that were given in a list or a text, by name: an instance, or what the text says of it."""
+    given = [controls] if isinstance(controls, (str, Control)) or not isinstance(controls, Iterable) else controls
+    listed: list[tuple[object, object]] = []
+    for one in given:
+        listed += read_controls([one], "controls").items() if isinstance(one, str) else [(one, None)]
     found: dict[str, object] = {}
-    for one in listed:
+    for one, said in listed:
         if not isinstance(one, (str, Control)):
             raise InputError(f"controls: expected names or Control instances, got {told(one)}")
         name = one if isinstance(one, str) else one.name
@@ -389,7 +403,7 @@ def _listed(controls: str | Control | Iterable[object]) -> dict[str, object]:
                 f"controls: every instance needs a name of its own, got {name} twice; write KIND:NAME, such as "
                 "light:key,light:fill"
             )
-        found[name] = one if isinstance(one, Control) else None
+        found[name] = one if isinstance(one, Control) else said
     return found
 
 

@@ -107,6 +107,8 @@ def _not_an_archive(path: Path, head: bytes) -> str:
             "safetensors hold weights but no network; name what builds it: "
             "'package.module:callable@weights.safetensors' or 'torchvision:NAME@weights.safetensors'"
         )
+    if path.suffix.lower() == ".py":
+        return f"is Python code; name what makes the network in it: '{path.stem}:NAME', from the folder of the file"
     if head[:1] == b"\x80" or path.suffix.lower() in (".pkl", ".pickle", ".pth", ".ckpt", ".bin"):
         return f"is a pickle, or something like it, which is never opened. {EXPORT_HINT}"
     return f"expected a torch.export archive (.pt2) or TorchScript, got other bytes. {EXPORT_HINT}"

@@ -16,6 +16,7 @@ from advsearch.settings.values import (
     is_shallow,
     number_or_text,
     parse_assignment,
+    read_controls,
     read_yaml,
     shown,
     split_names,
@@ -24,6 +25,6 @@ from advsearch.settings.values import (
 
 __all__ = [
     "FILES", "HEADER", "Clash", "Config", "Setting", "all_finite", "as_python", "as_text", "check_once", "each_once",
-    "is_shallow", "number_or_text", "parse_assignment", "read_yaml", "setting", "setting_as_in", "settings", "shown",
-    "split_names", "texts",
+    "is_shallow", "number_or_text", "parse_assignment", "read_controls", "read_yaml", "setting", "setting_as_in",
+    "settings", "shown", "split_names", "texts",
 ]  # fmt: skip

@@ -109,6 +109,38 @@ def parse_assignment(text: str, where: str) -> tuple[str, Any]:
         return name.strip(), value.strip()
 
 
+def read_controls(given: Iterable[str], where: str) -> dict[str, object]:
+    """Return control to settings from texts: ``texture,pose``, ``texture={resolution: 64}``, ``pose={...},x={...}``."""
+    controls: list[tuple[str, Any]] = []
+    for part in (part for text in given for part in _parts(text) if part.strip()):
+        name, settings = parse_assignment(part, where) if "=" in part else (part.strip(), {})
+        if isinstance(settings, str) and settings.startswith("{"):
+            raise InputError(
+                f"{where} {name}: expected {{PARAMETER: VALUE or [LOW, HIGH], ...}}, got {shown(settings)}; write a "
+                "colon and a space behind each parameter, close every bracket, and put a comma before the next control"
+            )
+        controls.append((name, settings))
+    check_once((name for name, _ in controls), where)
+    return dict(controls)
+
+
+def _parts(text: str) -> list[str]:
+    """Return what stands between the commas of a text that are in no brackets."""
+    parts, depth, quote = [""], 0, ""
+    for sign in text:
+        if quote:
+            quote = "" if sign == quote else quote
+        elif depth and sign in "\"'":
+            quote = sign
+        else:
+            depth += (sign in "{[") - (sign in "}]")
+        if sign == "," and depth <= 0:
+            parts.append("")
+        else:
+            parts[-1] += sign
+    return parts
+
+
 def split_names(text: str) -> tuple[str, ...]:
     """Return the parts of ``mug,bowl``; a file whose name has a comma is one part."""
     if "," not in text or is_file(text):

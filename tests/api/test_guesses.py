@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,8 +16,9 @@ import advsearch
 from advsearch import losses
 from advsearch.attacks import Random
 from advsearch.attacks.objectives import form_of
+from advsearch.cli.main import main
 from advsearch.controls.pose import PoseControl
-from advsearch.errors import InputError
+from advsearch.errors import FileFormatError, InputError
 from advsearch.tasks import Classification, Facts, make_task
 
 SMALL: dict[str, Any] = {
@@ -155,3 +157,60 @@ def test_the_losses_at_hand_make_what_printable_makes(scene: advsearch.Scene) ->
     ours = advsearch.attack(scene, easy(), objective=own, **settings)
     theirs = advsearch.attack(scene, easy(), printable=True, **settings)
     assert ours.found and torch.allclose(ours.u, theirs.u, atol=1e-5)
+
+
+def test_controls_may_be_given_as_on_the_command_line(scene: advsearch.Scene) -> None:
+    for controls in ("pose={yaw: [0, 90], pitch: 5},light:key", ["pose={yaw: [0, 90], pitch: 5}", "light:key"]):
+        render = scene.renderer(controls, resolution=8)
+        assert render.space.groups[0].name == "pose.yaw" and len(render.start) == 9
+    found = advsearch.sweep(scene, easy(), controls="pose={yaw: [0, 90]}", samples=2, trials=0, resolution=16, spp=2)
+    assert found.summary.controls == ["pose"]
+    with pytest.raises(InputError, match=r"controls pose: expected \{PARAMETER: VALUE .* close every bracket"):
+        scene.renderer("pose={yaw: [0, 90}")
+    with pytest.raises(InputError, match="controls: light is given twice"):
+        scene.renderer("light,light")
+
+
+def test_names_that_are_guessed(scene: advsearch.Scene, tmp_path: Path) -> None:
+    assert advsearch.controls.Texture is advsearch.controls.TextureControl
+    with pytest.raises(
+        AttributeError, match=r"advsearch.render\(scene\) makes a picture .* scene.renderer\(controls\)"
+    ):
+        scene.render  # noqa: B018
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        scene.nothing  # noqa: B018
+    controls = {"pose": {"yaw": [0, 90]}}
+    found = advsearch.attack(scene, easy(), controls=controls, policy="random", run=tmp_path / "run", **SMALL)
+    assert found.path == found.run == tmp_path / "run" == advsearch.load_run(found.path).path  # type: ignore
+    assert found.values.keys() == {"pose.yaw"} and 0.0 <= found.values["pose.yaw"] <= 90.0
+
+
+def test_an_objective_that_takes_the_picture_first_is_told(scene: advsearch.Scene) -> None:
+    for function in (lambda image, output, truth: output, lambda images, labels: images):
+        with pytest.raises(InputError, match=r"gets what the model says; write \(output, images, truth\)"):
+            advsearch.attack(scene, easy(), objective=function)
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["mug"], "expected flags, got 'mug'; for the object write --object mug"),
+        (["--width", "3"], "has no --width; did you mean --resolution?"),
+        (["--num-steps=3"], "has no --num-steps; did you mean --steps?"),
+        (["--device", "cuda"], "has no --device (pictures are made on the processor"),
+        (["--policy", "fgsm"], "unknown policy 'fgsm'. Did you mean 'pgd'?"),
+        (["--objective", "ce"], "unknown objective 'ce'. Did you mean 'cross_entropy'?"),
+        (["--control", "color"], "unknown control 'color'. Did you mean 'material'?"),
+    ],
+)
+def test_words_of_other_tools_are_told_what_they_are_called_here(
+    words: list[str], told: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["attack", "--object", "mug", *words]) == 2
+    assert told in capsys.readouterr().err
+
+
+def test_a_python_file_is_no_model(tmp_path: Path) -> None:
+    (tmp_path / "nets.py").write_text("net = 1\n")
+    with pytest.raises(FileFormatError, match="is Python code; name what makes the network in it: 'nets:NAME'"):
+        advsearch.load_model(tmp_path / "nets.py")

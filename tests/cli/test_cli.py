@@ -61,12 +61,12 @@ def noting(given: list[Any], answer: Any) -> Api:
 
 @pytest.fixture
 def api(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
-    """Put a stand-in in the place of `advsearch.api.carry_out`."""
+    """Put a stand-in in the place of `advsearch.question.carry_out`."""
 
     def not_wanted(config: Config, **named: Any) -> Any:
         raise AssertionError(f"the command line asked for {config.command}")
 
-    return lambda answering=not_wanted: monkeypatch.setattr("advsearch.api.carry_out", answering)
+    return lambda answering=not_wanted: monkeypatch.setattr("advsearch.question.carry_out", answering)
 
 
 @pytest.fixture
@@ -152,9 +152,9 @@ def test_no_command_prints_help_and_version_is_told(capsys: pytest.CaptureFixtur
         (["atack"], "unknown command 'atack'. Did you mean 'attack'? Known: attack, check, "),
         (["--jsn"], "unknown flag '--jsn'."),
         (["attack", "--epsilom", "1"], "unknown flag '--epsilom'. Did you mean '--epsilon'"),
-        (["attack", "--eps", "1"], "unknown flag '--eps'."),
+        (["attack", "--eps", "1"], "advsearch attack has no --eps; did you mean --epsilon?"),
         (["region", "--workers", "2"], "advsearch region has no --workers, a flag of advsearch attack, sweep"),
-        (["attack", "mug"], "expected flags, got 'mug'; see advsearch attack --help"),
+        (["attack", "mug"], "expected flags, got 'mug'; for the object write --object mug; see advsearch attack -"),
         (["attack", "--steps"], "argument --steps: expected one argument; see advsearch attack --help"),
         (["attack"], "--object: expected the name of an object or a .obj, .ply, .stl, "),
         (["attack", "--object", "mug", "--epsilon", "nan"], "--epsilon: expected a number greater than 0 and at"),
@@ -211,9 +211,9 @@ def test_a_message_names_the_argument_in_python_and_the_flag_on_the_command_line
 
 def test_a_bug_keeps_its_traceback_and_ends_with_1() -> None:
     code = (
-        "import sys, advsearch.api\n"
+        "import sys, advsearch.question\n"
         "def carry_out(config, *, progress, resumed): raise ValueError('a bug')\n"
-        "advsearch.api.carry_out = carry_out\n"
+        "advsearch.question.carry_out = carry_out\n"
         "from advsearch.cli.main import main; sys.exit(main(['attack', '--object', 'mug', '--json']))"
     )
     done = python(code, cwd=Path(__file__).parent, env={**os.environ, "PYTHONPATH": str(ROOT / "tests")})
@@ -260,21 +260,23 @@ def interrupted():
         print("swallowed", flush=True)
 
 def carry_out(config, *, progress, resumed):
+    import heavy
     {loading}
     print("searched", flush=True)
     sys.exit("expected nothing to be searched")
 
 class Swallows(importlib.abc.MetaPathFinder, importlib.abc.Loader):
     def find_spec(self, name, path, target=None):
-        return importlib.util.spec_from_loader(name, self) if name.startswith("advsearch.api") else None
+        return importlib.util.spec_from_loader(name, self) if name == "heavy" else None
 
     def exec_module(self, module):
-        vars(module).update(carry_out=carry_out, __path__=[])
         {importing}
 
 sys.meta_path.insert(0, Swallows())
 sys.argv[1:] = ["attack", "--object", "mug", "--json", *sys.argv[1:]]
+import advsearch.question
 from advsearch.cli.main import main
+advsearch.question.carry_out = carry_out
 sys.exit(main())
 """
 

@@ -12,19 +12,19 @@ import numpy as np
 import pytest
 
 import advsearch
-from advsearch.api import carry_out
 from advsearch.attacks import clopper_pearson, make_policy
 from advsearch.cli.main import main
 from advsearch.engine.surface_light import reason_against
 from advsearch.errors import AdvsearchError, FileFormatError, InputError, UnknownNameError
+from advsearch.question import carry_out
 from advsearch.questions.attack import studies
-from advsearch.questions.attack.parts import parts_of, problem_of_parts
+from advsearch.questions.attack.carry_out import parts_of, problem_of_parts
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.summary import FoundValue, SearchDistribution
 from advsearch.questions.recipe import carry_out as carrying_out
 from advsearch.questions.recipe import recipe as asked
+from advsearch.questions.recipe.carry_out import FIGURES, check_figures, files_of, make, read_options
 from advsearch.questions.recipe.description import Recipe, planned, read_recipe, recipe_names, titles
-from advsearch.questions.recipe.figures import FIGURES, check_figures, files_of, make, read_options
 from advsearch.questions.recipe.frame import MadeFigure, Rows, Tally, frame_of
 from advsearch.questions.recipe.given import CuesOptions, all_triangles, fitting, predicted, triangle_of
 from advsearch.questions.recipe.result import RecipeConfig, RecipeFigure, RecipeResult, told_once

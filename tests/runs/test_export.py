@@ -103,7 +103,7 @@ def test_the_command_writes_by_the_name_of_the_file(run: Path, format: str, caps
 def test_what_is_wrong_is_told(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for words, message in (
         (["export", "two"], "unknown run 'two'"),
-        (["export", "one", "--format", "xls"], "unknown format 'xls'. Known: 3db, coco, csv, gltf, json, mitsuba, "),
+        (["export", "one", "--format", "xls"], "unknown format 'xls'. Known: 3db, coco, csv, gltf, json, "),
         (
             ["export", "one", "--format", "fiftyone", "--out", "x"],
             "fiftyone was removed, since FiftyOne reads COCO; use ",

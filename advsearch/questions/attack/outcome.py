@@ -12,12 +12,14 @@ from torch import Tensor
 from advsearch.attacks import Ending, SearchResult, Verification, count_right
 from advsearch.attacks.candidates import Bracket, FoundFailure
 from advsearch.attacks.rate_samples import MOST_TIMES, MOVED, OVER_LADDER
+from advsearch.described import OUT_OF_VIEW
 from advsearch.engine.journal import Journal
 from advsearch.engine.objective import domain_of, print_terms
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Findings, Stages, control_group, lost_remarks, mean_number, verified_rate
 from advsearch.engine.transport import remark
 from advsearch.questions.attack import summary as results
+from advsearch.questions.attack.page import attack_page
 from advsearch.questions.attack.result import (
     AttackResult,
     KeptPicture,
@@ -32,8 +34,8 @@ from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.stages import UNPRINTED
 from advsearch.questions.attack.summary import AttackSummary, PicturedPrediction
 from advsearch.report.wording import number_text
-from advsearch.runs.directory import RunDirectory
-from advsearch.runs.files import write_bytes
+from advsearch.runs.directory import REPORT, RunDirectory
+from advsearch.runs.files import write_bytes, write_text
 from advsearch.runs.results import (
     AverageCase,
     DescribedValue,
@@ -48,7 +50,6 @@ from advsearch.runs.results import (
 from advsearch.runs.summary import write_configuration
 from advsearch.tasks import Judgement
 from advsearch.tasks.base import mean
-from advsearch.viewer.pages import write_page
 
 T = TypeVar("T")
 
@@ -83,16 +84,16 @@ def summarise(
         for name, data in space.files(u).items():
             write_bytes(run.path / "artifacts" / name, data)
         write_configuration(run.path, u.numpy())
-    summary = _summary(config, objective, problem, findings, clean, adversarial)
     drive = None if findings.interrupted else along_drive(problem, None if search is None else u, findings.spp, run)
-    kept = {"run": None if run is None else str(run.path), "warnings": warnings, "drive": drive}
-    shared = SharedWork.of_facts(journal.traced.facts, journal.machines.known)
-    summary = summary.model_copy(
-        update={**kept, "shared": shared, "seconds": {**stages.seconds, "total": stages.total}}
-    )
+    summary = _summary(
+        config, objective, problem, findings, clean, adversarial,
+        run=None if run is None else str(run.path), warnings=warnings, drive=drive,
+        shared=SharedWork.of_facts(journal.traced.facts, journal.machines.known),
+        seconds={**stages.seconds, "total": stages.total},
+    )  # fmt: skip
     if run is not None:
         run.write_summary(summary)
-        write_page(run.path, summary)
+        write_text(run.path / REPORT, attack_page(run.path, summary), durable=False)
         if not findings.interrupted:
             run.finish()
     return AttackResult(
@@ -117,8 +118,9 @@ def _summary(
     findings: Findings,
     clean: KeptPicture,
     adversarial: KeptPicture,
+    **kept: Any,
 ) -> AttackSummary:
-    """All but where it is kept, how long it took and what there is to say."""
+    """The summary, of which some fields are `kept` as they are given."""
     task, search, baseline = problem.task, findings.search, findings.baseline
     controls = problem.searched_space.controls
     budgets = {bound.name: bound.budget for bound in controls}
@@ -134,7 +136,7 @@ def _summary(
     if distribution is not None and distribution.mean.numel() > MOST_NUMBERS:
         distribution = None
     return AttackSummary(
-        run=None,
+        **kept,
         object=config.object,
         judge=config.judge,
         model=problem.model.name,
@@ -200,8 +202,6 @@ def _summary(
             objectives=search.non_finite_objectives if search else 0,
             gradient_elements=search.non_finite_elements if search else 0,
         ),
-        warnings=[],
-        seconds={"total": 0.0},
         seed=problem.seed,
         command_line=config.command_line(),
     )
@@ -356,8 +356,9 @@ def _gradients(search: SearchResult) -> results.SearchGradients:
 
 
 def _average(findings: Findings) -> AverageCase:
-    counted = count_right(findings.average, findings.spp)
-    scores = [trial.score for trial in findings.average]
+    shown = [trial for trial in findings.average if trial.prediction.label != OUT_OF_VIEW] or findings.average
+    counted = count_right(shown, findings.spp)
+    scores = [trial.score for trial in shown]
     return AverageCase(
         configurations=counted.trials,
         correct=counted.successes,

@@ -26,7 +26,6 @@ from advsearch.engine.problem import Problem
 from advsearch.engine.record import KEPT, Findings
 from advsearch.engine.rendering import Rendering, pictures_of, render
 from advsearch.errors import InputError
-from advsearch.questions.attack.parts import AttackParts
 from advsearch.questions.attack.summary import AlongDrive, AttackSummary
 from advsearch.registry import names_code
 from advsearch.report.figures import new_axes, search_axes
@@ -47,6 +46,8 @@ from advsearch.tasks import Judgement, Mark
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
+
+    from advsearch.questions.attack.carry_out import AttackParts
 
 
 class RenderKeywords(TypedDict, total=False):
@@ -97,6 +98,17 @@ class AttackResult:
     def success(self) -> bool:
         """The same as `found`."""
         return self.found
+
+    @property
+    def path(self) -> Path | None:
+        """The same as `run`."""
+        return self.run
+
+    @property
+    def values(self) -> dict[str, Any]:
+        """The adversarial configuration by name, such as `pose.yaw`, without units; of a texture, numbers that
+        describe it. Empty where nothing was searched; `summary.configuration` has the units."""
+        return {name: one.value for name, one in (self.summary.configuration or {}).items()}
 
     @property
     def images(self) -> dict[str, Tensor]:

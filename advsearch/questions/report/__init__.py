@@ -3,7 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import csv
+import math
+import shutil
+import tempfile
 from pathlib import Path
+from typing import Any
 
 from advsearch.cli import output
 from advsearch.errors import InputError
@@ -15,6 +20,8 @@ EXAMPLES = (
     "report mug-texture-001 mug-sweep-001 --evidence --criterion 0.9 --out card --json",
 )
 NAME = "evidence"
+POSES, LARGEST_POSES = "poses.csv", 1 << 20
+"""The file that says where photographs were taken, and its most bytes."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -27,9 +34,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="how common conditions are: YAML such as environment: {street: 0.8, noon: 0.2}",
     )
+    parser.add_argument(
+        "--photographs",
+        metavar="FOLDER",
+        help="photographs aligned with renderings of the first run, by their names: rendering-12.jpg, "
+        "rendering-12-again.jpg; its model judges them, and the run keeps them",
+    )
     parser.add_argument("--by", metavar="NAME", help="who answers for it, as it is to be written", default="")
     parser.add_argument("--out", metavar="FOLDER", help="where the three files go (default: %(default)s)", default=NAME)
     parser.add_argument("--overwrite", action="store_true", help="replace what is there")
+    output.add_code_flag(parser)
     output.add_flags(parser)
 
 
@@ -55,6 +69,8 @@ def run(args: argparse.Namespace) -> int:
     if args.criterion is not None and not 0.0 < args.criterion <= 1.0:
         raise InputError(f"--criterion: expected a share over 0 and at most 1, such as 0.9, got {args.criterion:g}")
     exposure = {} if args.exposure is None else read_exposure(args.exposure)
+    if args.photographs is not None:
+        _take_in(args.photographs, args.runs[0])
     evidence, pictures = collected(args.runs, criterion=args.criterion, exposure=exposure, by=args.by)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -73,3 +89,60 @@ def run(args: argparse.Namespace) -> int:
     print("".join(f"\nNote: {text}" for text in evidence.warnings))
     print("\n".join(map(str, names)))
     return 0
+
+
+def _take_in(folder: str, name: str) -> None:
+    """Have a run's model judge the photographs in a folder that the run does not have yet."""
+    from advsearch.questions.photographs.carry_out import Photographs, photographs_in  # they bring torch
+    from advsearch.runs.directory import CONFIG, find_run
+    from advsearch.settings import read_yaml
+
+    run = find_run(name)
+    with tempfile.TemporaryDirectory() as named:
+        place = Path(folder)
+        if (place / POSES).is_file():
+            place = _named_by_pose(place, run, Path(named))
+        task: Any = read_yaml(run / CONFIG).get("task") or "classification"
+        files = photographs_in(place, task)
+        if loose := [one.name for one in files if not one.stem.startswith("rendering-")]:
+            raise InputError(
+                f"photographs: {loose[0]}: expected the number of a rendering in its name, such as rendering-12.jpg, "
+                f"or {POSES} beside it; advsearch dashboard aligns photographs by phone"
+            )
+        if not files:
+            raise InputError(f"photographs: {folder}: expected a folder with photographs, got none in it")
+        Photographs().add_files(run, files)
+
+
+def _named_by_pose(folder: Path, run: Path, out: Path) -> Path:
+    """Copy the photographs that `POSES` lists, each under the name of the rendering that has its pose."""
+    # late, so that --help answers at once
+    from advsearch.files import read_text
+    from advsearch.runs.store import NAME as STORE
+    from advsearch.runs.store import Store
+
+    with Store(run / STORE, read_only=True) as store:
+        rows = [(row.step, {name: one["value"] for name, one in row.values.items()}) for row in store.rows("sweep")]
+    for line, said in enumerate(csv.DictReader(read_text(folder / POSES, "poses", LARGEST_POSES).splitlines()), 2):
+        where, file = f"photographs: {folder / POSES}, line {line}", folder / Path(str(said.pop("file", ""))).name
+        if not file.is_file():
+            raise InputError(f"{where}: expected the name of a photograph beside it under `file`, got {file.name!r}")
+        found = [step for step, values in rows if all(_is_at(values.get(name), text) for name, text in said.items())]
+        if len(found) != 1:
+            told = ", ".join(f"{name} {text}" for name, text in said.items())
+            raise InputError(
+                f"{where}: expected a pose that one rendering of {run.name} has, got {told}, which {len(found)} have; "
+                "sweep a grid of the poses"
+            )
+        shutil.copyfile(file, out / f"rendering-{found[0]}-{file.name}")
+    return out
+
+
+def _is_at(value: object, text: str | None) -> bool:
+    """Whether a rendering has what a file says, to a thousandth."""
+    if text is None or value is None or isinstance(value, str):
+        return text is not None and value == text.strip()
+    try:
+        return math.isclose(float(str(value)), float(text), rel_tol=1e-3, abs_tol=1e-3)
+    except ValueError:
+        return False
