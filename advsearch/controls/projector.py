@@ -196,6 +196,8 @@ class ProjectorControl(NumberControl):
         (self.part,) = parts
         self._picture = self._read()
         super().fit()
+        rate = next(slot.spec for slot in self.slots if slot.parameter.name == "flicker")
+        self.flashes = rate.high if isinstance(rate, Range) else max(map(float, self.allowed("flicker", 0.0)))
 
     def _read(self) -> Tensor | None:
         if self.chosen["picture"] is None:
