@@ -312,6 +312,14 @@ def make_renderer(
     )
     scene = MitsubaScene(description, size, filter=formation.filter, leave_out=leave_out, sampler=sampler)
     exposed = any(space.exposure)
+    if any(mount.later for mount in description.rig):
+        moved = any(one is not then for one, then in zip(space.controls, space.later(1.0).controls, strict=True))
+        if exposed or not moved:
+            wrong = "have motion blur or a rolling shutter" if exposed else "show the same: nothing knows a time"
+            raise InputError(
+                f"camera: the pictures of {description.rig_spec} are taken one after the other, and "
+                f"{'can not ' if exposed else ''}{wrong}; {'leave that out' if exposed else 'add a `path`'}"
+            )
     motion = Motion(description, size, scene.assembly) if differentiated or exposed else None
     moments = exposed_in(space, motion, scene.assembly, size[0]) if exposed and motion is not None else ()
     measured = motion if differentiated else None
