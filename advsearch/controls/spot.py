@@ -42,7 +42,7 @@ class SpotControl(ProjectorControl):
                   search=(0.05, 0.6), log=True, estimators=LIT),
         *colors("of its light.", (0.0, 1.0)),
         Parameter("lumens", (), "lumens", 0.0, 1e6, "0, or what is 20 times as bright as the place", "All of its "
-                  "light.", search=(0.0, 1e6), estimators=LIT),
+                  "light.", search=(0.0, LUMENS), estimators=LIT),
         *(one for one in ProjectorControl.parameters if one.name in OF_THE_SOURCE),
     )  # fmt: skip
     choices = (
