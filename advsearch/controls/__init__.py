@@ -29,6 +29,7 @@ ORDER = (
         "material",
         "light",
         "projector",
+        "spot",
         "shadow",
         "environment",
         "sky",
