@@ -126,7 +126,7 @@ def newcombe(both: int, first: int, second: int, neither: int) -> tuple[float, I
     product = one * (n - one) * other * (n - other)
     phi = 0.0
     if product:
-        covered = both * neither - first * second
+        covered = float(both * neither - first * second)
         covered = max(covered - n / 2.0, 0.0) if covered > 0 else covered
         phi = covered / math.sqrt(product)
     p1, p2, d = one / n, other / n, (other - one) / n
@@ -261,12 +261,13 @@ def drives(found: Counted, run: Path, rows: Sequence[Row]) -> None:
     first = [next((away for _, away, what in one if what == "r"), None) for one in frames]
     seen = [one for one in first if one is not None]
     changes = [sum(a + b in ("rw", "wr") for a, b in itertools.pairwise(one)) / seconds for one in said]
-    away = [distance for one in frames for _, distance, _ in one]
+    distances = [distance for one in frames for _, distance, _ in one]
     shares = [one.count("r") / len(one.replace(" ", "")) for one in said]
-    for values, (low, high), worst in (
-        (shares, (0.0, 1.0), min), (gaps, (0.0, len(times) * step), max), (seen, (min(away), max(away)), min),
+    sides: list[tuple[list[float], Interval, Any]] = [
+        (shares, (0.0, 1.0), min), (gaps, (0.0, len(times) * step), max), (seen, (min(distances), max(distances)), min),
         (changes, (0.0, (len(times) - 1) / seconds), max),
-    ):  # fmt: skip
+    ]  # fmt: skip
+    for values, (low, high), worst in sides:
         if not values:
             continue
         for value in (sum(values) / len(values), worst(values), *mean_interval(values, low, high)):
@@ -354,7 +355,7 @@ def pairs_in(found: Counted, rows: Sequence[Row]) -> tuple[float, float, float, 
     half = len(rows) // 2
     pairs = [(bool(a.correct), bool(b.correct)) for a, b in zip(rows[:half], rows[half:], strict=True)
              if len(shown([a, b])) == 2]  # fmt: skip
-    both, first, second, neither = (pairs.count(one) for one in itertools.product((True, False), repeat=2))
+    both, first, second, neither = (pairs.count((a, b)) for a, b in itertools.product((True, False), repeat=2))
     difference, ends = newcombe(both, first, second, neither)
     for right in (both + first, both + second):
         found.share(right, len(pairs))

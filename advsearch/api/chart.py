@@ -47,7 +47,7 @@ def chart_page(title: str, paper: tuple[float, float], convert: Any) -> Figure:
 
     def square(x: float, y: float, side: float, colour: object) -> None:
         at = (left + x - side / 2, top + y - side / 2)
-        axes.add_patch(Rectangle(at, side, side, facecolor=colour, linewidth=0.0, antialiased=False))  # type: ignore[arg-type]
+        axes.add_patch(Rectangle(at, side, side, facecolor=colour, linewidth=0.0, antialiased=False))
 
     sent = Image.fromarray(np.round(255.0 * COLOURS[None]).astype(np.uint8))
     levels = np.asarray(sent if convert is None else ImageCms.applyTransform(sent, convert))[0] / 255.0

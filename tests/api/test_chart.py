@@ -30,8 +30,8 @@ def photographed(path: Path, *, lamp: tuple[float, float, float], slope: float, 
     on a grey table."""
     canvas = FigureCanvasAgg(chart_page("t", PAPERS["a4"], None))
     canvas.figure.set_dpi(110.0)
-    canvas.draw()
-    page = np.asarray(canvas.buffer_rgba())[..., :3] / 255.0
+    canvas.draw()  # type: ignore[no-untyped-call]
+    page = np.asarray(canvas.buffer_rgba())[..., :3] / 255.0  # type: ignore[no-untyped-call]
     white, black = (page > 0.99).all(axis=2, keepdims=True), (page < 0.01).all(axis=2, keepdims=True)
     page = np.where(white, 1.0, np.where(black, 0.12, printed(page)))
     height, width = page.shape[:2]

@@ -22,7 +22,7 @@ from advsearch.models import Model
 from advsearch.models.reference import Trainable, copied_network, load
 from advsearch.progress import NullProgress
 from advsearch.question import Question
-from advsearch.questions.attack.parts import executor_for, problem_of
+from advsearch.questions.attack.carry_out import executor_for, problem_of
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.harden import carry_out as hardening
 from advsearch.questions.harden import harden as asked

@@ -25,7 +25,7 @@ from advsearch.engine.loading import load_scene
 from advsearch.errors import InputError, ModelError
 from advsearch.models import load_model, reference
 from advsearch.models.reference import Trainable, trainable
-from advsearch.questions.attack.parts import problem_of
+from advsearch.questions.attack.carry_out import problem_of
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.harden.lessons import (
     Disguise,

@@ -103,6 +103,7 @@ def test_a_shown_picture_is_the_encoded_one() -> None:
         at = radiance.clone().requires_grad_()
         picture = shown(at)
         picture.backward(cotangent)
+        assert at.grad is not None
         found.append((picture.detach(), at.grad))
     assert torch.equal(found[0][0], found[1][0]) and torch.equal(found[0][1], found[1][1])
     assert torch.autograd.gradgradcheck(formation.display, torch.linspace(0.02, 0.6, 9).double().requires_grad_())

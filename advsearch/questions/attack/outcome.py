@@ -19,6 +19,7 @@ from advsearch.engine.problem import Problem
 from advsearch.engine.record import Findings, Stages, control_group, lost_remarks, mean_number, verified_rate
 from advsearch.engine.transport import remark
 from advsearch.questions.attack import summary as results
+from advsearch.questions.attack.page import attack_page
 from advsearch.questions.attack.result import (
     AttackResult,
     KeptPicture,
@@ -33,8 +34,8 @@ from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.stages import UNPRINTED
 from advsearch.questions.attack.summary import AttackSummary, PicturedPrediction
 from advsearch.report.wording import number_text
-from advsearch.runs.directory import RunDirectory
-from advsearch.runs.files import write_bytes
+from advsearch.runs.directory import REPORT, RunDirectory
+from advsearch.runs.files import write_bytes, write_text
 from advsearch.runs.results import (
     AverageCase,
     DescribedValue,
@@ -49,7 +50,6 @@ from advsearch.runs.results import (
 from advsearch.runs.summary import write_configuration
 from advsearch.tasks import Judgement
 from advsearch.tasks.base import mean
-from advsearch.viewer.pages import write_page
 
 T = TypeVar("T")
 
@@ -93,7 +93,7 @@ def summarise(
     )
     if run is not None:
         run.write_summary(summary)
-        write_page(run.path, summary)
+        write_text(run.path / REPORT, attack_page(run.path, summary), durable=False)
         if not findings.interrupted:
             run.finish()
     return AttackResult(

@@ -21,7 +21,7 @@ from advsearch.models.reference import trainable
 from advsearch.models.source import split_weights
 from advsearch.progress import Watched, watcher
 from advsearch.question import Asked
-from advsearch.questions.attack.parts import LOADING, executor_for
+from advsearch.questions.attack.carry_out import LOADING, executor_for
 from advsearch.questions.harden import scenes
 from advsearch.questions.harden.detectors import DetectorCourse, Loss, read_coco
 from advsearch.questions.harden.result import HardenConfig, HardenedControl, HardenResult, Share, SplitSide

@@ -22,8 +22,7 @@ from advsearch.files import parse_json, read_text
 from advsearch.models import Model
 from advsearch.models.reference import Trainable
 from advsearch.pictures import upright
-from advsearch.questions.attack.carry_out import attack_on
-from advsearch.questions.attack.parts import problem_of
+from advsearch.questions.attack.carry_out import attack_on, problem_of
 from advsearch.questions.harden.rounds import Course, MakeOptimiser, Score, Take
 from advsearch.questions.harden.scenes import SceneWork
 from advsearch.runs.files import write_bytes

@@ -29,8 +29,7 @@ from advsearch.models import Model
 from advsearch.models.reference import copied_network
 from advsearch.models.source import frozen
 from advsearch.progress import NullProgress, Progress
-from advsearch.questions.attack.carry_out import attack_on
-from advsearch.questions.attack.parts import problem_of
+from advsearch.questions.attack.carry_out import attack_on, problem_of
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.harden.lessons import Lesson, has_matrix, lessons, plain_lessons
 from advsearch.questions.harden.result import ALL, HardenConfig

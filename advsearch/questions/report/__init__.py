@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 from advsearch.cli import output
 from advsearch.errors import InputError
@@ -91,7 +92,8 @@ def _take_in(folder: str, name: str) -> None:
     from advsearch.settings import read_yaml
 
     run = find_run(name)
-    files = photographs_in(Path(folder), read_yaml(run / CONFIG).get("task") or "classification")
+    task: Any = read_yaml(run / CONFIG).get("task") or "classification"
+    files = photographs_in(Path(folder), task)
     if loose := [one.name for one in files if not one.stem.startswith("rendering-")]:
         raise InputError(
             f"--photographs: {loose[0]}: expected the number of a rendering in its name, such as rendering-12.jpg; "

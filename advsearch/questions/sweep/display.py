@@ -220,15 +220,16 @@ def claims(result: SweepSummary) -> Iterator[Claim]:
     elif result.sampler != "random" or result.grid:
         how = f"configurations drawn at random ({result.sampler})" + (" at each point of a grid" * bool(result.grid))
         note = " The interval is that of independent draws, which these are not."
-    for pair in result.beside.pairs if result.beside else ():  # the share of both together is of neither
-        for what, one in (
-            ("the clean scene", pair.clean),
-            (f"the adversarial scene of {result.beside.answer}", pair.answer),
-        ):
-            of = f"configurations of {what} in which {pair.model} is right"
-            own = Extent(what=of, count=one.correct, total=one.configurations, interval=one.interval or (0.0, 1.0))
-            yield claim("measured", f"With {what} {pair.model} is right in {share_text(own)} {how}.{note}", own)
-        yield claim("measured", beside_text(result.beside.answer, pair), None)
+    if result.beside:
+        for pair in result.beside.pairs:  # the share of both together is of neither
+            for what, one in (
+                ("the clean scene", pair.clean),
+                (f"the adversarial scene of {result.beside.answer}", pair.answer),
+            ):
+                of = f"configurations of {what} in which {pair.model} is right"
+                own = Extent(what=of, count=one.correct, total=one.configurations, interval=one.interval or (0.0, 1.0))
+                yield claim("measured", f"With {what} {pair.model} is right in {share_text(own)} {how}.{note}", own)
+            yield claim("measured", beside_text(result.beside.answer, pair), None)
     if result.beside and result.beside.pairs:
         return
     models = [row for row in result.axes if row.axis == "model"]

@@ -149,7 +149,7 @@ def _judged(summary: SweepSummary) -> JsonObject:
     are told in them."""
     formed = summary.image_formation
     size = None if formed is None or "," in summary.model else list[JsonValue](formed.resolution)
-    grid = list(dict.fromkeys(one.axis for one in summary.axes))
+    grid = list[JsonValue](dict.fromkeys(one.axis for one in summary.axes))
     return {"task": summary.task, "size": size, "grid": grid, "drives": bool(summary.drives)}
 
 

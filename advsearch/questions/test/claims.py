@@ -24,7 +24,7 @@ from advsearch.engine.verifier import ladder_of
 from advsearch.errors import InputError
 from advsearch.files import JsonObject
 from advsearch.progress import Progress
-from advsearch.questions.attack.parts import executor_for, parts_of, problem_of
+from advsearch.questions.attack.carry_out import executor_for, parts_of, problem_of
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.studies import carry_out_part
 from advsearch.questions.attack.summary import AttackSummary
