@@ -100,6 +100,14 @@ def asked(own_car: Path, shirt: Any) -> Iterator[Asked]:
         {"object": "car", "environment": "avenue-night", "settings": wet, "things": "car@-8,3.5,heading=180,lamps=low"},
         {},
     )
+    for light in ("day", "night"):
+        environment, given = LIGHTS[light]
+        view = {"camera.distance": 12.0, "camera.fov": WIDE, **given, "camera.drops": 70.0}
+        yield Asked(
+            f"rain-{light}",
+            {"object": "car", "environment": environment, "settings": view, "camera": "dashcam"},
+            {},
+        )
     for name, pose in POSES.items():
         view = {"camera.distance": 3.4, "camera.azimuth": 20.0, "camera.elevation": 6.0, "camera.ev": 14.0}
         scene = {"object": "person", "environment": "avenue", "settings": view, "texture": shirt}

@@ -167,6 +167,13 @@ EV = Parameter(
     "Absolute exposure in place of the metered one, in the avenue: 14 is for sun, 5 for lit streets.",
     estimators=(),
 )
+DROPS = (
+    Parameter(
+        "drops", (), "1", 0.0, 2000.0, 0.0, "Raindrops on a sheet of glass 6 cm before the camera.", estimators=()
+    ),
+    Parameter("drop_size", (), "mm", 0.2, 10.0, 1.5, "Median of the radii of these drops.", estimators=()),
+    Parameter("drop_seed", (), "1", 0.0, 1e6, 0.0, "Where they are, and how large: a whole number.", estimators=()),
+)
 LAMPS = ("off", "low", "high")
 """What the lamps of a car may be: with either beam its tail lamps shine too."""
 
@@ -241,7 +248,7 @@ MATERIAL = (
     _surface("clearcoat", "Strength of a clear coat on top.", (0.0, 1.0)),
 )
 FAMILIES = {
-    "camera": (*CAMERA, EV, _lamps("the car that the camera is in")), "pose": POSE, "environment": ENVIRONMENT,
+    "camera": (*CAMERA, EV, *DROPS, _lamps("the car that the camera is in")), "pose": POSE, "environment": ENVIRONMENT,
     "ground": GROUND, "material": MATERIAL, "object": (_lamps("the object, a car"),),
 }  # fmt: skip
 

@@ -90,7 +90,7 @@ def doubts(asset: ObjectAsset, *, asked: bool, laid: bool) -> tuple[str, ...]:
     extent = 0.0 if asset.extent is None or kind is None else asset.extent
     fits = [unit for unit, metres in UNITS.items() if low <= extent * metres <= high]
     what = [
-        f"its longest side is {rounded(asset.metres)} m" if strange else "its size in metres is not known",
+        f"its longest side is {rounded(asset.metres or 0.0)} m" if strange else "its size in metres is not known",
         f"it is {rounded(extent)} in its file" if missing and extent else "",
         f"a {kind}'s is {low:g} to {high:g} m" if kind else "",
         "it is taken for 1 m, as the road is in metres" if missing and laid else "",
