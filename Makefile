@@ -19,7 +19,7 @@ SOURCES := advsearch scenes tests benchmarks docs tools
 export TORCH_INDEX
 
 .DEFAULT_GOAL := help
-.PHONY: help setup attack test test-quick test-slow test-zoo fuzz check lint format typecheck docs bench study reference wheel check-wheel clean
+.PHONY: help setup attack test test-quick test-slow test-zoo fuzz check lint format typecheck docs bench study reference wheel check-wheel check-channels docs-versions clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  %-14s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -90,6 +90,13 @@ wheel: $(STAMP) ## build the wheel into dist/, with a list of what it was built 
 
 check-wheel: $(STAMP) ## build the wheel, install it in a new environment and use it from another folder
 	@bash tools/check_wheel.sh "$(VENV)"
+
+check-channels: $(STAMP) ## check wheel, Dockerfile and conda recipe by twine, hadolint and rattler-build; says which are missing
+	@bash tools/check_channels.sh "$(VENV)"
+
+docs-versions: $(STAMP) ## build the pages of every tag and of this commit into build/versions
+	@$(BIN)/python -m pip install -qq --disable-pip-version-check --no-build-isolation -c constraints.txt -e '.[docs]'
+	@PATH="$(abspath $(BIN)):$$PATH" bash tools/docs_versions.sh
 
 clean: ## remove .venv, caches and what was built; runs/ stays
 	rm -rf $(VENV) build dist *.egg-info .cache .hypothesis .pytest_cache .mypy_cache .ruff_cache
