@@ -148,7 +148,8 @@ class Scenes:
         self.labels, self.task, self.spp, self.seed = tuple(labels), task, spp, seed
         description = self.renderer.scene.made[0]
         self.right = find_label_set(label or description.object.label or description.object_name, self.labels)
-        domain = domain_of(self.renderer.space.controls)
+        self.space: Any = self.renderer.space
+        domain = domain_of(self.space.controls)
         self.us = domain.sample(torch.Generator().manual_seed(seed), count)
         index2label = dict(enumerate(self.labels))
         self.metadata = {"id": f"advsearch-{description.object_name}-{seed}", "index2label": index2label}
@@ -161,7 +162,7 @@ class Scenes:
         u = self.us[number]
         with torch.no_grad():
             picture = to_8_bit(self.renderer(u, seed=number, spp=self.spp)).permute(2, 0, 1).contiguous()
-        values = self.renderer.space.describe(u)
+        values = self.space.describe(u)
         metadata = {"id": number, **{name: value["value"] for name, value in values.items()}}
         return picture, self._target(u), metadata
 
