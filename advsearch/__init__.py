@@ -30,6 +30,7 @@ _HOMES = {
     "load_model": "advsearch.api.render",
     "load_run": "advsearch.api.render",
     "load_scene": "advsearch.engine.loading",
+    "measured_palette": "advsearch.api.chart",
     "photo_agreement": "advsearch.questions.photographs.carry_out",
     "render": "advsearch.api.render",
 }

@@ -1,6 +1,7 @@
 """Made by tools/stubs.py of the settings of each question."""
 
 from advsearch import controls as controls, losses as losses, maite as maite, testing as testing
+from advsearch.api.chart import measured_palette as measured_palette
 from advsearch.api.keywords import Names
 from advsearch.api.render import load_model as load_model
 from advsearch.api.render import load_run as load_run
@@ -22,8 +23,8 @@ from advsearch.questions.compare.result import CompareResult
 from advsearch.questions.explain.result import ExplainResult
 from advsearch.questions.gap import GapResult
 from advsearch.questions.harden.result import HardenResult
+from advsearch.questions.harden.rounds import MakeOptimiser
 from advsearch.questions.harden.training import Examples
-from advsearch.questions.harden.training import MakeOptimiser
 from advsearch.questions.photographs.carry_out import photo_agreement as photo_agreement
 from advsearch.questions.precision.result import PrecisionResult
 from advsearch.questions.recipe.result import RecipeResult

@@ -27,7 +27,7 @@ JsonValue = bool | int | float | str | list["JsonValue"] | dict[str, "JsonValue"
 JsonObject = dict[str, JsonValue]
 """A JSON object, before a type has taken it or once it has been written out."""
 
-MESHES = (".obj", ".ply", ".stl", ".gltf", ".glb", ".blend", ".usd", ".usda", ".usdc", ".usdz")
+MESHES = (".obj", ".ply", ".stl", ".gltf", ".glb", ".vrm", ".blend", ".usd", ".usda", ".usdc", ".usdz")
 """Endings of the files that an object can be read from."""
 
 DEPTH = 100

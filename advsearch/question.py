@@ -12,18 +12,19 @@ from __future__ import annotations
 import inspect
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import cached_property, partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Generic, TypeVar, get_args, get_type_hints
 
+from advsearch import rooms
 from advsearch.interrupts import interruptible
 from advsearch.progress import NullProgress, Progress, watcher
 from advsearch.report.markup import result_figure
 from advsearch.report.shown import shown
-from advsearch.runs.directory import RunDirectory
+from advsearch.runs.directory import RunDirectory, begun
 from advsearch.runs.files import write_bytes
 from advsearch.runs.results import INTERRUPTED, Result
 from advsearch.settings import Config
@@ -94,6 +95,31 @@ def carried_out(function: Callable[[Asked[Settings]], AnyResult], asked: Asked[S
         for suffix, data in result_figure(shown(result)).items():
             write_bytes(asked.run.path / "images" / f"{asked.config.command}.{suffix}", data)
         return keep_result(asked.run, result)
+
+
+def carry_out(config: Config, *, progress: Progress | None = None, resumed: Path | None = None) -> Result:
+    """Ask the question that a configuration asks, and keep the run in a directory.
+
+    Args:
+        config: of any command.
+        progress: told how far it is.
+        resumed: the folder of a run to go on with; None for a new run.
+
+    Raises:
+        InputError: anything that whoever asked can put right; nothing is written then.
+    """
+    from advsearch.api.names import check_names  # imports scipy
+
+    check_names(config)
+    keeps_run = resumed is None and getattr(config, "out", None) is None
+    with begun(config) if keeps_run else nullcontext(resumed) as folder:  # before what is heavy is imported
+        room = rooms.room(config.command)
+        own = room.from_config if room else None
+        if own is None:
+            own = getattr(import_module(f"advsearch.api.{config.command}"), f"{config.command}_from_config")
+        made = own(config, progress=progress, **({} if folder is None else {"resumed": folder}))
+    result: Result = made if isinstance(made, Result) else made.summary
+    return result
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,7 @@ import pandas as pd
 
 from advsearch import seeds
 from advsearch.attacks.units import fewer_by_chance, per_unit, share_interval
+from advsearch.described import OUT_OF_VIEW
 from advsearch.errors import InputError
 from advsearch.runs.results import ConditionRow
 
@@ -70,6 +71,11 @@ def observed(rows: pd.DataFrame, names: Iterable[str]) -> pd.DataFrame:
     found = pd.DataFrame({**table, "correct": rows["correct"] == 1, "unit": rows["unit"]})
     found.attrs["units"] = units
     return found
+
+
+def is_shown(rows: pd.DataFrame) -> Mask:
+    """Return in which rows of a sweep (n,) what is judged is in the picture."""
+    return np.asarray(rows["label"] != OUT_OF_VIEW)
 
 
 def is_independent(table: pd.DataFrame) -> bool:

@@ -25,7 +25,7 @@ from advsearch import seeds, threads
 from advsearch.attacks import Query, make_policy, search
 from advsearch.config import CLOSE_LOOKS
 from advsearch.engine.problem import Problem
-from advsearch.questions.attack.parts import problem_from_config
+from advsearch.questions.attack.carry_out import problem_from_config
 from advsearch.questions.attack.settings import AttackConfig
 
 TRIALS, TRIAL_SPP = 8, 64

@@ -35,7 +35,7 @@ from torch import Tensor
 from advsearch import threads
 from advsearch.attacks import Block, Domain, Evaluation, Policy, Query, StepRecord, make_policy, search
 from advsearch.engine.problem import Problem
-from advsearch.questions.attack.parts import problem_from_config
+from advsearch.questions.attack.carry_out import problem_from_config
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.seeds import stream
 

@@ -35,7 +35,7 @@ threads.configure()
 
 from advsearch.engine.gradients import Loss, estimated, inside, smooth_loss  # noqa: E402
 from advsearch.engine.loading import load_scene  # noqa: E402
-from advsearch.questions.attack.parts import problem_from_config  # noqa: E402
+from advsearch.questions.attack.carry_out import problem_from_config  # noqa: E402
 from advsearch.questions.attack.settings import AttackConfig  # noqa: E402
 from advsearch.scene.formation import EVERYTHING  # noqa: E402
 from advsearch.scene.gradients import Group  # noqa: E402

@@ -33,7 +33,7 @@ threads.configure()
 from advsearch.attacks import Evaluate, Query, make_policy  # noqa: E402
 from advsearch.engine.surface_light import SurfaceLight  # noqa: E402
 from advsearch.engine.transport import Transport  # noqa: E402
-from advsearch.questions.attack.parts import parts_of, problem_of_parts  # noqa: E402
+from advsearch.questions.attack.carry_out import parts_of, problem_of_parts  # noqa: E402
 from advsearch.questions.attack.settings import AttackConfig  # noqa: E402
 
 

@@ -1,7 +1,7 @@
 """A small detector of the bundled objects, trained here in a minute, and hardened against its own paint.
 
     python benchmarks/harden_detector.py                 # trains it, hardens it, prints before and after
-    python benchmarks/harden_detector.py --run NAME --control texture --epsilon 0.1 --scenes 24 --measured 24
+    python benchmarks/harden_detector.py --run NAME --control texture --epsilon 0.1 --scenes 48 --measured 48
 
 It is trained on pictures of four objects from all sides in the training's rooms, and measured on other instances of
 these in rooms that no training saw. The network is made by ``benchmarks.harden_detector:make``.
@@ -24,8 +24,9 @@ from torch import Tensor, nn
 sys.path.insert(0, str(Path(__file__).parent.parent))
 
 import advsearch
-from advsearch.questions.harden.detectors import Student
-from advsearch.questions.harden.lessons import examples
+from advsearch import seeds
+from advsearch.models.reference import trainable
+from advsearch.questions.harden.detectors import DetectorCourse, Example
 from advsearch.questions.harden.result import HardenConfig
 from advsearch.questions.harden.scenes import TRAINING, SceneWork, splits_of
 from advsearch.tasks import make_task
@@ -87,22 +88,20 @@ def trained(folder: Path, scenes: int, views: int, epochs: int) -> str:
     torch.manual_seed(0)
     config = HardenConfig(
         object=",".join(LABELS), model="benchmarks.harden_detector:Tiny", task=TASK, labels=",".join(LABELS), seed=100,
-        controls={"texture": {}}, resolution=SIDE, measured=1, threads=1,
+        controls={"texture": {}}, resolution=SIDE, measured=1, threads=1, epochs=epochs, rate=3e-3,
     )  # fmt: skip
     model = advsearch.load_model(Tiny(), task=make_task(TASK), labels=LABELS, input_size=SIDE, name="tiny")
     work = SceneWork(config, model, splits_of(config, model))
-    pictures: list[Any] = []
+    pictures: list[Example] = []
     for number in range(scenes):
         problem, seed = work.problem(work.splits[TRAINING], number, ("texture",))
-        pictures += examples(problem, seed, range(views))
-    student = Student.of(model, None)
-    student.fit(pictures, epochs, 3e-3, seed=0)
+        pictures += [Example.of(problem, seeds.stream(seed, "plain", view)) for view in range(views)]
+    student = trainable(model, logits=False)
+    DetectorCourse(work, student).round(0, pictures)
     right = sum(one.right(student.model) for one in pictures)
     print(f"trained on {len(pictures)} pictures, right in {right} of them", flush=True)
     folder.mkdir(parents=True, exist_ok=True)
-    save_file(
-        {name: one.contiguous() for name, one in student.network.state_dict().items()}, folder / "tiny.safetensors"
-    )
+    save_file({name: one.contiguous() for name, one in student.net.state_dict().items()}, folder / "tiny.safetensors")
     name = f"benchmarks.harden_detector:Tiny@{folder / 'tiny.safetensors'}"
     print(f"--model {name}", flush=True)
     return name
@@ -114,8 +113,9 @@ def main() -> None:
     parser.add_argument("--run", default="harden-detector")
     parser.add_argument("--control", default="texture")
     parser.add_argument("--model", help="as it was printed by a run before, which is not trained again then")
-    parser.add_argument("--epsilon", type=float, default=0.1)
-    for name, value in {"plain": 60, "views": 8, "epochs": 40, "scenes": 16, "measured": 12, "steps": 12}.items():
+    parser.add_argument("--epsilon", type=float, default=0.05)
+    numbers = {"plain": 60, "views": 8, "epochs": 40, "rounds": 3, "scenes": 24, "measured": 16, "steps": 12}
+    for name, value in numbers.items():
         parser.add_argument(f"--{name}", type=int, default=value)
     args = parser.parse_args()
     folder = Path("build") / "tiny-detector"
@@ -123,12 +123,17 @@ def main() -> None:
     advsearch.allow_code(model.partition("@")[0])
     result = advsearch.harden(
         model, task=TASK, labels=",".join(LABELS), object=",".join(LABELS), controls={args.control: {}},
-        epsilon=args.epsilon, resolution=SIDE, rounds=1, scenes=args.scenes, epochs=20, rate=1e-3, steps=args.steps,
-        measured=args.measured, verify_spp=8, spp=4, run=args.run, overwrite=True, clean_loss=0.05,
+        epsilon=args.epsilon, resolution=SIDE, rounds=args.rounds, scenes=args.scenes, epochs=20, rate=1e-3,
+        steps=args.steps, measured=args.measured, verify_spp=8, spp=4, run=args.run, overwrite=True, clean_loss=0.05,
         threads=1,
     )  # fmt: skip
+    for number, one in enumerate(result.rounds):
+        kept = ", kept" if one.kept else ""
+        print(f"round {number}: {one.lessons} pictures, plain {one.clean:.2f}, worst {one.robust:.2f}{kept}")
+    stronger = result.table[0]
     for what, share in (
         ("robust before", result.before), ("robust after", result.after),
+        ("against a stronger search before", stronger.stronger_before), ("and after", stronger.stronger),
         ("plain right before", result.clean_before), ("plain right after", result.clean_after),
     ):  # fmt: skip
         assert share is not None

@@ -28,7 +28,7 @@ from advsearch.questions.harden.scenes import (  # noqa: E402
     SceneWork,
     splits_of,
 )
-from advsearch.questions.harden.training import Course  # noqa: E402
+from advsearch.questions.harden.training import ClassifierCourse  # noqa: E402
 
 VIEWS = 4
 RENDERED = ("pose", "light")
@@ -77,8 +77,8 @@ def step_seconds(model: Model, chosen: list[Lesson], repetitions: int) -> list[f
     """Medians of seconds of a step, in float32 and as it is."""
     timed: list[list[float]] = [[], []]
     made = trainable(model)
-    config = HardenConfig(rate=1e-6, epochs=1, views=6)
-    courses = [Course(one, model, config) for one in (InSinglePrecision(made.net, made.model), made)]
+    work = SceneWork(HardenConfig(rate=1e-6, epochs=1, views=6), model, {})
+    courses = [ClassifierCourse(work, one) for one in (InSinglePrecision(made.net, made.model), made)]
     for _ in range(1 + repetitions):
         for kept, course in zip(timed, courses, strict=True):
             begun = time.perf_counter()

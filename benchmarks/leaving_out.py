@@ -41,7 +41,7 @@ from advsearch.engine.loading import as_controls, framed, load_scene, make_rende
 from advsearch.engine.planning import bounces_of
 from advsearch.engine.problem import Problem
 from advsearch.errors import InputError
-from advsearch.questions.attack.parts import problem_from_config
+from advsearch.questions.attack.carry_out import problem_from_config
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.scene.formation import EVERYTHING, NOTHING
 from advsearch.scene.settings import FAMILIES, MATERIAL, SETTINGS

@@ -118,14 +118,14 @@ def step(args: argparse.Namespace) -> None:
         begun = time.perf_counter()
         result = advsearch.attack(
             scene, model, controls={"projector": {"epsilon": 0.3}}, steps=args.steps, label=args.label,
-            specialise=specialise, measure="no", baseline=False,
+            specialise=specialise, measure="no", baseline=False, trials=6,
         )  # fmt: skip
         searched = result.summary.seconds["search"] + result.summary.seconds.get("transport", 0.0)
         rated = result.summary.verified
         print(
             f"  {args.steps} steps {title}: search {searched:.1f} s of {time.perf_counter() - begun:.1f} s, "
-            f"{result.summary.ending}, margin {rated.margin if rated else float('nan'):.2f}"
-        )
+            f"{result.summary.ending}, margin {rated.margin if rated else float('nan'):.2f}", flush=True,
+        )  # fmt: skip
 
 
 def sign(args: argparse.Namespace) -> None:

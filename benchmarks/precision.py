@@ -24,7 +24,7 @@ from advsearch import threads
 threads.configure()
 
 from advsearch.engine.gradients import inside, smooth_loss  # noqa: E402
-from advsearch.questions.attack.parts import problem_from_config  # noqa: E402
+from advsearch.questions.attack.carry_out import problem_from_config  # noqa: E402
 from advsearch.questions.precision.benches import GradientBench, PictureBench, TimeBudget, gradient_parts  # noqa: E402
 from advsearch.questions.precision.carry_out import precision_from_config  # noqa: E402
 from advsearch.questions.precision.result import PrecisionConfig, Recommended  # noqa: E402

@@ -37,7 +37,7 @@ from advsearch import seeds, threads
 from advsearch.attacks import Evaluation, Query, make_policy, search
 from advsearch.engine.problem import Problem
 from advsearch.engine.transport import Transport
-from advsearch.questions.attack.parts import problem_from_config
+from advsearch.questions.attack.carry_out import problem_from_config
 from advsearch.questions.attack.settings import AttackConfig
 
 TRIALS, TRIAL_SPP = 12, 64

@@ -2,7 +2,8 @@
 
     python benchmarks/transport.py [--object mug] [--environment studio] [--model reference] [--label mug] [--repeats 5]
 
-Each figure is the median of turns that are taken one after the other in one process:
+Each figure is the median of turns that are taken one after the other in one process; of steps by the matrix and the
+model alone, of the ratio of their processor time in each turn, which other programs disturb least:
 
 - a step (picture, model, derivative) by the matrix, and by rendering and the adjoint, over the model's forward and
   backward pass alone;
@@ -33,6 +34,7 @@ from advsearch.scene.transport.matrix import LinearRenderer  # noqa: E402
 
 EPSILON = 0.1
 SPP = 8
+QUICK = 20
 TRACED, HALVES = 512, 2
 
 
@@ -76,14 +78,18 @@ def times(renderer: Renderer, loss: Callable[[Tensor], Tensor], repeats: int) ->
         "making": lambda: LinearRenderer(renderer, renderer.start, seed=2),
     }
     seconds: dict[str, list[float]] = {name: [] for name in turns}
-    for turn in range(repeats + 1):
-        for name, work in turns.items():
-            begun = time.perf_counter()
-            work()
+    busy: dict[str, list[float]] = {name: [] for name in turns}
+    for turn in range(QUICK * repeats + 1):  # what takes milliseconds is looked at more often
+        for name in ("model", "matrix", "rendered", "making") if turn <= repeats else ("model", "matrix"):
+            begun, spent = time.perf_counter(), time.process_time()
+            turns[name]()
             if turn:
                 seconds[name].append(time.perf_counter() - begun)
+                busy[name].append(time.process_time() - spent)
     middle = {name: statistics.median(found) for name, found in seconds.items()}
-    print(f"  a step by the matrix, over the model alone       {middle['matrix'] / middle['model']:8.2f}")
+    each = [by / alone for alone, by in zip(busy["model"], busy["matrix"], strict=True)]
+    low, ratio, high = statistics.quantiles(each, n=4)
+    print(f"  a step by the matrix, over the model alone       {ratio:8.2f} (quartiles {low:.2f} to {high:.2f})")
     print(f"  a rendered step, over the model alone            {middle['rendered'] / middle['model']:8.2f}")
     print(f"  making the matrix, in rendered steps             {middle['making'] / middle['rendered']:8.2f}")
     print(f"  entries {linear.entries:,}, {linear.bytes / 2**20:.0f} MiB")

@@ -58,7 +58,7 @@ from advsearch.attacks.verification import (
     TRIAL_LOOKS,
     WORST_CASE,
 )
-from advsearch.questions.attack.parts import problem_from_config
+from advsearch.questions.attack.carry_out import problem_from_config
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.seeds import stream
 from advsearch.tasks import Judgement, Prediction

@@ -21,9 +21,8 @@ from advsearch.engine.journal import Journal, Shared
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Findings, Stages
 from advsearch.progress import NullProgress
-from advsearch.questions.attack import parts as attacking
-from advsearch.questions.attack.carry_out import attack_worker
-from advsearch.questions.attack.parts import search_size
+from advsearch.questions.attack import carry_out as attacking
+from advsearch.questions.attack.carry_out import attack_worker, search_size
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.stages import Attack
 from advsearch.runs.directory import RunDirectory

@@ -373,7 +373,7 @@ def test_an_attack_on_what_is_bundled_needs_little() -> None:
     scipy.stats, which draws from nets."""
     code = (
         "import sys, advsearch.questions.attack.carry_out, advsearch.models.reference\n"
-        "advsearch.questions.attack.carry_out.load_scene('mug', 'studio')\n"
+        "advsearch.engine.loading.load_scene('mug', 'studio')\n"
         "print([m for m in ('torch._dynamo', 'networkx', 'scipy.stats') if m in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

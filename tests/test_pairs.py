@@ -20,7 +20,7 @@ from advsearch.controls import CONTROLS, OWN, NumberControl, compose, make_contr
 from advsearch.engine.loading import framed, make_renderer
 from advsearch.engine.objective import domain_of
 from advsearch.engine.problem import Problem
-from advsearch.questions.attack.parts import problem_from_config
+from advsearch.questions.attack.carry_out import problem_from_config
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.sweep.axes import on_grid, read_axes
 from advsearch.questions.sweep.points import Points

@@ -12,13 +12,13 @@ import pytest
 import torch
 from stand_ins import StandInProblem, attack_on, carry_out, configuration, rows
 
-from advsearch.api import carry_out as answered
 from advsearch.attacks import Evaluation, Query, make_policy
 from advsearch.attacks.trials import choose_spp, most_samples
 from advsearch.cli.flags import with_flags
 from advsearch.cli.output import shown_text as check_text
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Findings, Stages
+from advsearch.question import carry_out as answered
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.check.carry_out import check_from_config
 from advsearch.questions.check.result import CheckConfig

@@ -327,14 +327,14 @@ FAULTS = (
     Fault(
         "hardening: what judges is trained on",
         "advsearch/questions/harden/training.py",
-        "own = [copy.copy(one) for one in held_back]",
-        "own = list(held_back)",
+        "own, model = [copy.copy(one) for one in held_back], self.student.model",
+        "own, model = list(held_back), self.student.model",
         ("tests/questions/test_hardening.py",),
     ),
     Fault(
         "hardening: plain pictures may be lost",
-        "advsearch/questions/harden/training.py",
-        "return clean >= self.done[0].clean - self.course.config.clean_loss - 1e-9",
+        "advsearch/questions/harden/rounds.py",
+        "return clean >= self.done[0].clean - self.config.clean_loss - 1e-9",
         "return True",
         ("tests/questions/test_hardening.py",),
     ),

@@ -26,7 +26,7 @@ from advsearch.files import JsonObject
 from advsearch.models import find_label_set
 from advsearch.models.labels import names_nothing
 from advsearch.progress import Progress
-from advsearch.questions.attack.parts import SEARCHED_WITH, parts_in, problem_of_parts
+from advsearch.questions.attack.carry_out import SEARCHED_WITH, parts_in, problem_of_parts
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.summary import attack_of
 from advsearch.questions.sweep.carry_out import scenes_of

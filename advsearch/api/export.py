@@ -27,7 +27,7 @@ from advsearch.engine.loading import Scene, as_controls, load_scene
 from advsearch.engine.problem import Problem
 from advsearch.engine.verifier import kept_configuration
 from advsearch.errors import FileFormatError, InputError
-from advsearch.questions.attack.parts import judged_alone, problem_from_config
+from advsearch.questions.attack.carry_out import judged_alone, problem_from_config
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.summary import AttackSummary, attack_of
 from advsearch.report.sheets import Mask, Piece

@@ -27,7 +27,7 @@ from advsearch.errors import InputError
 from advsearch.files import read_bytes
 from advsearch.models import Model
 from advsearch.progress import NullProgress, Progress, shows_progress
-from advsearch.questions.attack.parts import parts_in
+from advsearch.questions.attack.carry_out import parts_in
 from advsearch.questions.attack.result import AttackResult
 from advsearch.questions.attack.summary import AttackSummary
 from advsearch.questions.sweep.result import SweepResult

@@ -58,7 +58,7 @@ class QuestionCommand:
     """A command that asks a question.
 
     Attributes:
-        name: of the command; `advsearch.config.CONFIGS` has its settings, and `advsearch.api.carry_out` asks with them.
+        name: of the command; `advsearch.config.CONFIGS` has its settings, and `question.carry_out` asks with them.
         text: makes a text for a person of its result; what is shown of it where it has no other.
         short: whether a result falls short of what was checked.
         about: the setting that names runs, or a file, which the question is about; `--code` allows Python code that
@@ -149,7 +149,7 @@ class QuestionCommand:
         """Ask what `config` describes, or go on with it; print the result and return the exit status."""
         with at_work(as_json=as_json, quiet=quiet) as progress:
             # late, so that --help answers at once
-            from advsearch.api import carry_out
+            from advsearch.question import carry_out
 
             result = carry_out(config, progress=progress, resumed=resumed)
         status = output.finish(result, self.text, as_json=as_json)

@@ -85,6 +85,7 @@ USUAL_SIZE = 100.0
 
 def _print(args: argparse.Namespace, out: Path) -> Written:
     with at_work(as_json=True, quiet=False):
+        from advsearch.api.chart import chart_page  # draws with matplotlib
         from advsearch.api.export import printable, real_size  # takes seconds
         from advsearch.report.sheets import MOST_SHEETS, write_sheets  # draws with matplotlib
 
@@ -95,7 +96,7 @@ def _print(args: argparse.Namespace, out: Path) -> Written:
         title = f"{Path(args.run).name}, object of {longest:g} mm"
         with placed_by("out"), replacing(out) as part:
             paper, most = (args.paper or "a4").lower(), MOST_SHEETS if args.sheets is None else args.sheets
-            pages = write_sheets(part, pieces, title, paper=paper, profile=profile, most=most)
+            pages = write_sheets(part, pieces, title, paper=paper, profile=profile, most=most, last=chart_page)
     sizes = [{"name": piece.name, "width_mm": piece.size[0], "height_mm": piece.size[1]} for piece in pieces]
     text = f"{pages} pages in {out}; print them at 100 % and measure the square on the first"
     if known is None:

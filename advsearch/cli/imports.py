@@ -60,6 +60,12 @@ def _tell_mesh_file(args: argparse.Namespace, found: Contents) -> int:
     nodes = [
         {"name": one.name, "mesh": one.mesh, "triangles": one.triangles, "size": list(one.size)} for one in found.nodes
     ]
+    rig = whole.mesh.rig
+    moves: dict[str, list[str]] = {"clips": [], "joints": [], "targets": []}
+    if rig is not None:
+        moves["clips"] = list(rig.clips)
+        moves["joints"] = [name.removesuffix(".x") for name in rig.defaults if name.endswith(".x")]
+        moves["targets"] = [name.removesuffix(".weight") for name in rig.defaults if name.endswith(".weight")]
     if args.json:
         told = {
             "file": args.file,
@@ -68,6 +74,7 @@ def _tell_mesh_file(args: argparse.Namespace, found: Contents) -> int:
             "nodes": nodes,
             "lights": list(found.lights),
             "cameras": list(found.cameras),
+            **moves,
         }
         said = {"slow": slow, "warnings": list(whole.warnings), "out": args.out}
         output.print_json({"schema": 1, "command": "import", **told, **said})
@@ -84,7 +91,14 @@ def _tell_mesh_file(args: argparse.Namespace, found: Contents) -> int:
         if len(found.nodes) > 1:
             print(f"Another one moves with it: --control pose,pose:{found.nodes[0].mesh}")
     paint = "materials (--control 'texture={materials: [NAME]}')"
-    for what, names in ((paint, materials), ("lights", found.lights), ("cameras (--camera NAME)", found.cameras)):
+    turns, mixes = (
+        "joints (--control 'body={NAME.x: [-30, 30]}')",
+        "morph targets (--control 'body={NAME.weight: [0, 1]}')",
+    )
+    plays = "clips (--control 'body={clip: NAME, time: [0, 1]}')"
+    listed = {paint: materials, "lights": found.lights, "cameras (--camera NAME)": found.cameras}
+    listed |= {plays: moves["clips"], turns: moves["joints"], mixes: moves["targets"]}
+    for what, names in listed.items():
         if names:
             print(f"{what}: {', '.join(names)}")
     for note in (*whole.warnings, *slow):

@@ -186,8 +186,8 @@ def _unknown_argument(argument: str, parser: argparse.ArgumentParser) -> InputEr
     name = argument.partition("=")[0]
     known = re.findall(r"(?<!\S)--[a-z][a-z-]*", parser.format_help())
     if not name.startswith("--"):
-        instead = f"; for the object write --object {argument}" if "--object" in known else ""
-        return InputError(f"expected flags, got {argument!r}{instead}; see {parser.prog} --help")
+        hint = f"; for the object write --object {argument}" if "--object" in known else ""
+        return InputError(f"expected flags, got {argument!r}{hint}; see {parser.prog} --help")
     owners = [one for one, config in CONFIGS.items() if name in (setting.flag for setting in settings(config))]
     if owners:
         return InputError(f"{parser.prog} has no {name}, a flag of advsearch {', '.join(owners)}; leave it out")

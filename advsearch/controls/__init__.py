@@ -187,7 +187,7 @@ def make_space(controls: Sequence[Control], scene: SceneDescription) -> Space:
         names = ", ".join(control.name for control in controls)
         raise InputError(
             f"`controls` {names}: every parameter is fixed, so there is nothing to search; give one a range, "
-            f"such as {_suggestion(controls[0])}"
+            f"such as {_suggestion(space.controls[0])}"
         )
     return space
 
@@ -238,7 +238,7 @@ def _suggestion(control: Control) -> str:
     """A range that could be given, for a message."""
     if not control.parameters:
         return f"{control.name}:KEY=[0.2, 0.8]"
-    one = next((one for one in control.parameters if one.search is not None), control.parameters[0])
+    one = next((one for one in control.own if one.search is not None), control.own[0])
     low, high = one.search or (one.low, one.high)
     return f"{control.name}={{{one.name}: [{low:g}, {high:g}]}}"
 

@@ -1,44 +1,84 @@
-"""The `body` control: what someone is like and how they stand or walk, by the rig of the object or another mesh."""
+"""The `body` control: how a mesh with joints stands or moves, and what a person is like, by the rig of the mesh."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 from torch import Tensor
 
-from advsearch.controls.base import Parameter, Value
+from advsearch.controls.base import Choice, Parameter, Value
 from advsearch.controls.numbers import NumberControl, Values
+from advsearch.controls.ranges import is_number
 from advsearch.controls.values import Number
-from advsearch.errors import InputError
+from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.assets import Rig
 from advsearch.scene.people import PARAMETERS
+from advsearch.scene.rigged import TIME, part_of_a_rig
 
 
 class BodyControl(NumberControl):
-    """What a person is like, and how they stand or walk."""
+    """What a person is like, how they stand or walk, and how a rigged file of your own moves."""
 
     kind = "body"
     of_a_mesh = True
-    summary = "What a person is like, and how they stand or walk."
-    parameters = PARAMETERS
+    summary = "What a person is like, how they stand or walk, and how a rigged file of your own moves."
+    parameters = (*PARAMETERS, TIME)
+    choices = (Choice("clip", None, "Name or number of the animation that `time` is of; by itself the first."),)
+
+    @classmethod
+    def declared(cls, settings: Iterable[str]) -> tuple[Parameter, ...]:
+        known = {one.name for one in cls.parameters}
+        named = (part_of_a_rig(name) for name in settings if name not in known)
+        return (*cls.parameters, *(one for one in named if one is not None))
 
     @property
     def rig(self) -> Rig:
         """What moves the mesh."""
         mesh = self.mesh_in(self.scene)
         if mesh.mesh.rig is None:
-            raise InputError(f"`controls` {self.name}: {mesh.name} has no joints; take `object=person`")
+            raise InputError(
+                f"`controls` {self.name}: {mesh.name} has no joints; take `object=person`, or a rigged file (.glb, "
+                ".gltf, .vrm)"
+            )
         return mesh.mesh.rig
 
+    @property
+    def clip(self) -> str | None:
+        """The name of the animation that is played; None for none."""
+        clips, asked = self.rig.clips, self.chosen["clip"]
+        if asked is None:
+            timed = TIME.name in self.specs or not self._given
+            return clips[0] if clips and timed else None
+        number = int(asked) if is_number(asked) or str(asked).isdigit() else -1
+        if asked not in clips and not 0 <= number < len(clips):
+            raise UnknownNameError(f"{self.name}.clip", str(asked), clips, f"Animations of {self.mesh}.")
+        return str(asked) if asked in clips else clips[number]
+
     def fit(self) -> None:
-        self.rig  # noqa: B018 - refuses a mesh without
+        known = [one.name for one in self.rig.parameters]
+        for name in self.specs:
+            if name not in known:
+                raise UnknownNameError(
+                    f"parameter of {self.mesh}", name, known, f"It stands in `controls` {self.name}."
+                )
+        if not self._given and not any(map(self.search_range, self.parameters)):
+            example = next((name for name in known if name.endswith(".x")), known[0])
+            raise InputError(
+                f"`controls` {self.name}: {self.mesh} has no animation to play; give ranges, as in "
+                f"{self.name}={{{example}: [-20, 20]}}"
+            )
+        self.own = tuple(one for one in self.own if one.name in known)
+        self.clip  # noqa: B018 - refuses one that is not there
         super().fit()
+
+    def search_range(self, parameter: Parameter) -> tuple[float, float] | None:
+        return parameter.search if parameter.name in self.rig.defaults else None
 
     def default(self, parameter: Parameter) -> Number:
         return self.rig.defaults.get(parameter.name, super().default(parameter))
 
     def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        return {f"{self.mesh}.offsets": self.rig.offsets(values)}
+        return {f"{self.mesh}.offsets": self.rig.offsets(values, self.clip)}
 
     def measured(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Value]:
-        return dict(self.rig.measured(values))
+        return dict(self.rig.measured(values, self.clip))

@@ -14,6 +14,7 @@ import copy
 import math
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -229,12 +230,8 @@ class ProjectorControl(NumberControl):
         return values | {"pattern": rounded}
 
     def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        azimuth, elevation = (float(values[name].detach()) for name in ("azimuth", "elevation"))
-        left, up, outwards = torch.from_numpy(camera_axes(azimuth, elevation, 0.0)).to(values["pattern"])
-        pose = torch.eye(4).to(left)
-        pose[:3, 0], pose[:3, 1], pose[:3, 2] = left, up, -outwards
-        far = values["distance"].detach() / self.scene.metres
-        pose[:3, 3] = torch.from_numpy(middle(self.scene)).to(left) + far * outwards
+        place = (float(values[name].detach()) for name in ("azimuth", "elevation", "distance"))
+        pose = looking_from(self.scene, *place).to(values["pattern"])
         light = srgb_to_linear(values["pattern"]) * (1.0 - values["black"]) + values["black"]
         at_one = self._beside(values) * (values["distance"].detach() / self.scene.metres) ** 2
         white = at_one * ambient_irradiance(self.scene) / math.pi
@@ -264,6 +261,17 @@ class ProjectorControl(NumberControl):
     def kept_pictures(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
         pattern = values["pattern"]
         return {self.name: pattern, f"{self.name}-large": enlarged(pattern, -(-PRINT_SIDE // len(pattern)))}
+
+
+@lru_cache(maxsize=64)
+def looking_from(scene: SceneDescription, azimuth: float, elevation: float, distance: float) -> Tensor:
+    """The pose (4, 4) of what looks at the object's middle along its own +z from somewhere around it; degrees, and the
+    distance as `ProjectorControl` has it. It is not to be written into."""
+    left, up, outwards = torch.from_numpy(camera_axes(azimuth, elevation, 0.0)).float()
+    pose = torch.eye(4)
+    pose[:3, 0], pose[:3, 1], pose[:3, 2] = left, up, -outwards
+    pose[:3, 3] = torch.from_numpy(middle(scene)).float() + distance / scene.metres * outwards
+    return pose
 
 
 def ambient_irradiance(scene: SceneDescription) -> float:

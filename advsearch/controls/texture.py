@@ -109,7 +109,7 @@ class TextureControl(Control):
 
     def _named_material(self, scene: SceneDescription) -> list[str]:
         """The materials of the object that its name means, as in `texture:paint`, where no mesh is called so."""
-        from advsearch.scene.importing.scenes import clean  # takes time, and most do without
+        from advsearch.scene.importing.files import clean  # takes time, and most do without
 
         if self.mesh in scene.meshes:
             return []

@@ -15,7 +15,9 @@ from torch.overrides import TorchFunctionMode
 
 from advsearch.errors import InputError, ModelError
 from advsearch.interrupts import INTERRUPTS
+from advsearch.models.all_at_once import AllAtOnce
 from advsearch.models.labels import LabelSet, find_label_set
+from advsearch.models.recomputed import recomputed
 
 CPU = torch.device("cpu")
 
@@ -36,6 +38,9 @@ SMALLEST_PROBABILITY = 1e-30
 
 #: How far outside [0, 1] a pixel may lie (finite differences overshoot a little) before the image is refused.
 RANGE_TOLERANCE = 0.01
+
+#: Pictures of a rig of which all that the network has computed is kept for the gradient; of more, it computes it again.
+KEPT = 4
 
 GIVEN_BY = {
     "classification": "a row of scores is what a classifier gives",
@@ -175,14 +180,18 @@ class Model:
             InputError: not an image, or values that are clearly not in [0, 1].
             ModelError: the network's output is not (N, classes), or `read` finds no output in it.
         """
-        images, most = checked_images(images), self.batch_limits[1]
+        images, most, again = checked_images(images), self.batch_limits[1], False
         if self.cameras > 1:
             images = images.unflatten(2, (self.cameras, -1)).movedim(2, 1).flatten(0, 1)
             most = max(most - most % self.cameras, min(most, self.cameras))
-        parts = [
-            each_tensor(self.ask(self.prepared(part))[: len(part)], lambda one: _kept(one, images.device))
-            for part in images.split(most)
-        ]
+            alone = not isinstance(self.module, AllAtOnce)
+            again = alone and len(images) > KEPT and images.requires_grad and torch.is_grad_enabled()
+            most = min(most, KEPT) if again else most
+
+        def asked(part: Tensor) -> Any:
+            return each_tensor(self.ask(self.prepared(part))[: len(part)], lambda one: _kept(one, images.device))
+
+        parts = [recomputed(asked, part) if again else asked(part) for part in images.split(most)]
         found = parts[0] if len(parts) == 1 else joined(parts)
         if self.cameras == 1:
             return found

@@ -204,7 +204,7 @@ class Trainable:
         return torch.autocast("cpu", torch.bfloat16, enabled=bfloat16)
 
 
-def trainable(model: Model, layers: str = "all") -> Trainable:
+def trainable(model: Model, layers: str = "all", *, logits: bool = True) -> Trainable:
     """Return a copy of a model's network to train further.
 
     It stays in evaluation mode: statistics of batches stay what they were learned as, and nothing is dropped.
@@ -212,12 +212,13 @@ def trainable(model: Model, layers: str = "all") -> Trainable:
     Args:
         model: of `load_model`.
         layers: "all", or "last" for the last layer that has parameters.
+        logits: whether it has to return logits.
 
     Raises:
         ModelError: the network is no `nn.Module` that can be copied, is a program that was exported or scripted, or
             returns something other than logits.
     """
-    if model.probabilities or model.read is not None:
+    if logits and (model.probabilities or model.read is not None):
         raise ModelError(f"model {model.name}: only a classifier that returns logits can be hardened")
     net = copied_network(model)
     net.eval().requires_grad_(True)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import io
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -40,6 +40,15 @@ MARK, AWAY = 5.0, 1.0
 MOST_SHEETS = 200
 """Sheets that are written unless more are asked for."""
 SHEETS_EVER = 10_000
+CHECKLIST = (
+    "\u2610 Print all pages, and measure the square.",
+    "\u2610 Photograph the colour chart on the last page: upright and whole, in even light, without gloss.",
+    "\u2610 advsearch.measured_palette(PHOTOGRAPH) says what came out. Where that is far off, search within it.",
+    "\u2610 Cut the pieces out, and stick them on.",
+    "\u2610 Align the object with renderings by phone (advsearch dashboard), and photograph it.",
+    "\u2610 Compare: advsearch show, and advsearch report, say how often photographs and renderings agree.",
+)
+"""What is to be done, to tick off."""
 LARGEST_PROFILE = 16 << 20
 
 
@@ -85,6 +94,7 @@ def write_sheets(
     paper: str = "a4",
     profile: Path | None = None,
     most: int = MOST_SHEETS,
+    last: Callable[[str, tuple[float, float], Any], Figure] | None = None,
 ) -> int:
     """Write the PDF and return how many pages it has.
 
@@ -95,6 +105,7 @@ def write_sheets(
         paper: one of `PAPERS`.
         profile: an ICC profile of an RGB printer, into which the colours are converted; None leaves them sRGB.
         most: sheets that may follow the first page, 1 to `SHEETS_EVER`.
+        last: makes one more page, of the title, the size of the paper and the conversion of the profile, if any.
 
     Raises:
         InputError: there is no such paper, or there would be more sheets; the message says how many.
@@ -115,7 +126,9 @@ def write_sheets(
         file.savefig(_cover(pieces, title, PAPERS[paper], len(pages), profile))
         for number, page in enumerate(pages, 1):
             file.savefig(_page(page, f"{title}: sheet {number} of {len(pages)}", PAPERS[paper], convert))
-    return len(pages) + 1
+        if last is not None:
+            file.savefig(last(title, PAPERS[paper], convert))
+    return len(pages) + 1 + (last is not None)
 
 
 def pages_of(pieces: Sequence[Piece], paper: tuple[float, float]) -> Iterator[list[Placed]]:
@@ -179,7 +192,7 @@ def _extent(part: Placed) -> tuple[float, float]:
 # ---- drawing --------------------------------------------------------------------------------------------------------
 
 
-def _blank(paper: tuple[float, float]) -> tuple[Figure, Axes]:
+def blank(paper: tuple[float, float]) -> tuple[Figure, Axes]:
     """A page and its axes in millimetres from the upper left corner."""
     figure = Figure(figsize=(paper[0] / INCH, paper[1] / INCH))
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
@@ -196,7 +209,7 @@ def _line(axes: Axes, xs: Sequence[float], ys: Sequence[float]) -> None:
 def _cover(
     pieces: Sequence[Piece], title: str, paper: tuple[float, float], sheets: int, profile: Path | None
 ) -> Figure:
-    figure, axes = _blank(paper)
+    figure, axes = blank(paper)
     x, y = MARGIN, MARGIN + 5.0
     axes.text(x, y, title, fontsize=14, va="top")
     colours = "sRGB" if profile is None else f"converted from sRGB by {profile.name}"
@@ -205,6 +218,8 @@ def _cover(
         f"{SQUARE:g} mm a side.",
         "Cut along the lines between the marks; the colour beyond them is bleed.",
         f"Colours: {colours}.",
+        "",
+        *CHECKLIST,
         "",
         *[f"{piece.name}: {piece.size[0]:.1f} x {piece.size[1]:.1f} mm" for piece in pieces[:30]],
         *([f"and {len(pieces) - 30} more"] if len(pieces) > 30 else []),
@@ -225,7 +240,7 @@ def _ruler(axes: Axes, paper: tuple[float, float]) -> None:
 
 
 def _page(page: Sequence[Placed], title: str, paper: tuple[float, float], convert: Any) -> Figure:
-    figure, axes = _blank(paper)
+    figure, axes = blank(paper)
     for part in page:
         _draw(axes, part, convert)
     axes.text(paper[0] - MARGIN, paper[1] - MARGIN, title, fontsize=7, ha="right", va="bottom")

@@ -162,7 +162,7 @@ class RunDirectory:
         try:
             if config is not None:
                 opened._check_same(config)
-                opened._note_sitting(config)
+                opened.note_sitting(config)
         except BaseException:
             opened.close()
             raise
@@ -211,10 +211,10 @@ class RunDirectory:
         self.store.set_note(BEGUN_WITH, json.dumps(config.deciding()))
         if config.only_here:
             self.store.set_note(ONLY_HERE, json.dumps(config.only_here))
-        self._note_sitting(config)
+        self.note_sitting(config)
         return write_text(self.path / CONFIG, config.to_repeat().to_yaml())
 
-    def _note_sitting(self, config: Config) -> None:
+    def note_sitting(self, config: Config) -> None:
         """Note what this sitting is made with, after those before it; refuse files that are other ones now."""
         noted = self.store.noted(summary.MADE_WITH)
         before = noted if isinstance(noted, list) else []

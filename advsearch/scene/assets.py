@@ -35,6 +35,7 @@ class Rig(Protocol):
     Attributes:
         parameters: what can be asked for, each a number.
         defaults: what the mesh has where nothing is said, by name.
+        clips: names of its animations.
     """
 
     @property
@@ -43,10 +44,13 @@ class Rig(Protocol):
     @property
     def defaults(self) -> Mapping[str, float]: ...
 
-    def offsets(self, values: Mapping[str, Tensor]) -> Tensor:
+    @property
+    def clips(self) -> tuple[str, ...]: ...
+
+    def offsets(self, values: Mapping[str, Tensor], clip: str | None = None) -> Tensor:
         """Return how far each vertex goes from the mesh's own, (V, 3) in its units; differentiable."""
 
-    def measured(self, values: Mapping[str, Tensor]) -> Mapping[str, Value]:
+    def measured(self, values: Mapping[str, Tensor], clip: str | None = None) -> Mapping[str, Value]:
         """Return what else is worth storing, by name."""
 
 

@@ -13,6 +13,9 @@ if TYPE_CHECKING:
 
 Values = TypeVar("Values", Floats, "Tensor")
 
+LOW_END = 0.0031308
+"""Linear values up to which the encoding is straight."""
+
 
 def srgb_to_linear(display: Values) -> Values:
     """Decode display-referred sRGB in [0, 1] to linear values; any shape, float32; differentiable everywhere."""
@@ -26,8 +29,8 @@ def srgb_to_linear(display: Values) -> Values:
 def linear_to_srgb(linear: Values) -> Values:
     """Encode linear values as display-referred sRGB, clipped to [0, 1]; any shape, float32; differentiable."""
     clipped = linear.clip(0.0, 1.0)
-    low_end, low = clipped <= 0.0031308, clipped * 12.92
-    curve = 1.055 * clipped.clip(0.0031308, None) ** (1.0 / 2.4) - 0.055
+    low_end, low = clipped <= LOW_END, clipped * 12.92
+    curve = 1.055 * clipped.clip(LOW_END, None) ** (1.0 / 2.4) - 0.055
     if isinstance(linear, np.ndarray):
         return np.where(low_end, low, curve).astype(np.float32)
     return low.where(low_end, curve)

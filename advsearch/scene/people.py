@@ -97,11 +97,13 @@ class Person:
     Attributes:
         parameters: what can be asked for.
         defaults: what this one has where nothing is said.
+        clips: none.
         size: its largest extent in metres at its defaults.
         data: the arrays of body.npz.
     """
 
     parameters = PARAMETERS
+    clips = ()
 
     def __init__(self, data: Mapping[str, np.ndarray], defaults: Mapping[str, float] = MappingProxyType({})) -> None:
         self.data, self.defaults = data, {one.name: float(one.default) for one in PARAMETERS} | dict(defaults)
@@ -116,7 +118,7 @@ class Person:
         self.standing = self.posed({})
         self.size = float((self.standing.amax(dim=0) - self.standing.amin(dim=0)).max())
 
-    def offsets(self, values: Mapping[str, Tensor]) -> Tensor:
+    def offsets(self, values: Mapping[str, Tensor], clip: str | None = None) -> Tensor:
         """Return how far each vertex (V, 3) goes from the defaults, in sizes; values as `posed` has them."""
         posed = self.posed(values)
         return (posed - self.standing.to(posed.device)) / self.size
@@ -141,7 +143,7 @@ class Person:
         floor = torch.cat([pelvis[:2], posed[:, 2].amin()[None]])
         return (factor * (posed - floor)).index_select(0, self._on("index", device))
 
-    def measured(self, values: Mapping[str, Tensor]) -> Mapping[str, Value]:
+    def measured(self, values: Mapping[str, Tensor], clip: str | None = None) -> Mapping[str, Value]:
         """Return its mass without clothes, between those of MakeHuman's extremes."""
         mixed, factor = self._phenotype(self._numbers(values))
         return {"mass": {"value": float((mixed * self._on("mass", mixed.device)).sum() * factor**3), "unit": "kg"}}

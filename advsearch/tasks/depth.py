@@ -18,7 +18,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from advsearch.described import NOT_A_NUMBER
+from advsearch.described import NOT_A_NUMBER, OUT_OF_VIEW
 from advsearch.errors import InputError
 from advsearch.files import JsonValue
 from advsearch.models import Model
@@ -348,7 +348,7 @@ class Depth(Task):
 
     def _said(self, one: Map, truth: Distances, *, right: bool) -> Said:
         if not truth.seen:
-            return Prediction("out of view"), None
+            return Prediction(OUT_OF_VIEW), None
         factors = self._factors(one, truth)
         mean, relief = float(factors.mean()), float(self._relief(factors, truth))
         if not math.isfinite(mean):

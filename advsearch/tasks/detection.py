@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from advsearch.described import NOT_A_NUMBER
+from advsearch.described import NOT_A_NUMBER, OUT_OF_VIEW
 from advsearch.errors import InputError
 from advsearch.models import Model
 from advsearch.models.labels import names_nothing
@@ -401,7 +401,7 @@ class Detection(ClassTask):
         if self.seek == "create" and float(self._create(one, truth)) > 0.0:
             return self._named(one, self._rivals(one, ()), self._elsewhere(one, truth), f"{{}} {ELSEWHERE}")
         if truth.box is None:
-            return Prediction("out of view")
+            return Prediction(OUT_OF_VIEW)
         near, right, wrong = self._at(one, truth), self._of(one, truth.labels), self._rivals(one, truth.labels)
         best = float(best_of(right, near))
         if best >= self.confidence:

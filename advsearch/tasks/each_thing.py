@@ -14,6 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from advsearch.described import OUT_OF_VIEW
 from advsearch.errors import InputError
 from advsearch.tasks.base import Facts, Judgement, Mark, Output, Prediction, Task, Truth, mean
 from advsearch.tasks.together import Together
@@ -88,9 +89,11 @@ class EachThing(Task):
     def _judged(said: Mapping[str, Judgement], score: float, margin: float) -> Judgement:
         if any(one.not_a_number for one in said.values()):
             return Judgement.of(score, math.nan, Prediction(""))
-        worst = max(said, key=lambda name: said[name].margin)
+        seen = [name for name in said if said[name].prediction.label != OUT_OF_VIEW] or list(said)
+        worst = max(seen, key=lambda name: said[name].margin)
         things = {
             name: {"right": one.right, "margin": one.margin, "answer": one.prediction.label}
+            | ({"box": one.payload.get("box")} if isinstance(one.payload, dict) and "box" in one.payload else {})
             for name, one in said.items()
         }
         kept: Any = said[worst].payload if isinstance(said[worst].payload, dict) else {}

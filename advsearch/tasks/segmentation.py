@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from advsearch.described import NOT_A_NUMBER
+from advsearch.described import NOT_A_NUMBER, OUT_OF_VIEW
 from advsearch.tasks.base import Facts, Mark, Prediction, Said
 from advsearch.tasks.classification import NO, ClassTask, Labels, members, target_lead, wrong_lead
 
@@ -164,7 +164,7 @@ class Segmentation(ClassTask):
         overlap."""
         pixels = self._pixels(logits[None], truth)
         if pixels is None:
-            return Prediction("out of view"), None
+            return Prediction(OUT_OF_VIEW), None
         correct = members(pixels, truth.labels)
         hits = self._correct(logits, truth)
         mask = truth.at((logits.shape[1], logits.shape[2])).to(hits.device)

@@ -18,7 +18,7 @@ import advsearch
 from advsearch.cli.output import shown_text as text_of
 from advsearch.errors import InputError, RunExistsError, UnknownNameError
 from advsearch.progress import NullProgress
-from advsearch.questions.attack.parts import problem_from_config
+from advsearch.questions.attack.carry_out import problem_from_config
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.runs.listing import can_resume, listed_runs
 from advsearch.runs.store import Row, Store

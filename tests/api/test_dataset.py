@@ -19,7 +19,7 @@ from small_models import easy
 import advsearch
 from advsearch.api.dataset import _runs
 from advsearch.cli.main import main
-from advsearch.questions.attack.parts import parts_in, problem_of_parts
+from advsearch.questions.attack.carry_out import parts_in, problem_of_parts
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.runs.directory import PARTS, RunDirectory
 from advsearch.runs.images import read_png

@@ -188,7 +188,7 @@ def test_names_that_are_guessed(scene: advsearch.Scene, tmp_path: Path) -> None:
 def test_an_objective_that_takes_the_picture_first_is_told(scene: advsearch.Scene) -> None:
     for function in (lambda image, output, truth: output, lambda images, labels: images):
         with pytest.raises(InputError, match=r"gets what the model says; write \(output, images, truth\)"):
-            advsearch.attack(scene, easy(), objective=function)  # type: ignore[arg-type]
+            advsearch.attack(scene, easy(), objective=function)
 
 
 @pytest.mark.parametrize(

@@ -34,7 +34,7 @@ from advsearch.errors import AdvsearchError, InputError
 from advsearch.models import ModelWarning
 from advsearch.progress import NullProgress
 from advsearch.questions.attack import carry_out as attacking
-from advsearch.questions.attack.parts import problem_from_config
+from advsearch.questions.attack.carry_out import problem_from_config
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.wording import objective_text
 from advsearch.questions.region.result import RegionConfig
@@ -470,7 +470,7 @@ def test_an_objective_of_ones_own_stands_beside_the_score_of_every_trial(
 
 def test_a_run_that_is_killed_while_it_loads_goes_on(tmp_path: Path) -> None:
     """By the command line and from Python: the folder is there before anything is loaded."""
-    from advsearch.api import carry_out
+    from advsearch.question import carry_out
 
     run = tmp_path / "new" / "run"
 
@@ -489,7 +489,7 @@ def test_a_run_that_is_killed_while_it_loads_goes_on(tmp_path: Path) -> None:
         lambda: carry_out(RegionConfig(object="mug", controls="pose", run=str(run))),
     ):
         with pytest.MonkeyPatch.context() as patch:
-            for module in ("questions.attack.parts", "questions.sweep.carry_out"):
+            for module in ("questions.attack.carry_out", "questions.sweep.carry_out"):
                 patch.setattr(f"advsearch.{module}.load_models", killed)
             with pytest.raises(InterruptedError):
                 ask()

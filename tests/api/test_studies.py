@@ -15,13 +15,12 @@ from samples import ATTACK, AVERAGE, rated
 from samples import attack as attacked
 
 import advsearch
-from advsearch.api import carry_out
 from advsearch.cli.main import main
 from advsearch.cli.output import shown_text as region_text
 from advsearch.cli.output import shown_text as text_of
 from advsearch.engine.transport import CleanMatrix
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.question import Asked, carried_out
+from advsearch.question import Asked, carried_out, carry_out
 from advsearch.questions.attack import studies as attacking
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.studies import curve

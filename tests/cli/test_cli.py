@@ -61,12 +61,12 @@ def noting(given: list[Any], answer: Any) -> Api:
 
 @pytest.fixture
 def api(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
-    """Put a stand-in in the place of `advsearch.api.carry_out`."""
+    """Put a stand-in in the place of `advsearch.question.carry_out`."""
 
     def not_wanted(config: Config, **named: Any) -> Any:
         raise AssertionError(f"the command line asked for {config.command}")
 
-    return lambda answering=not_wanted: monkeypatch.setattr("advsearch.api.carry_out", answering)
+    return lambda answering=not_wanted: monkeypatch.setattr("advsearch.question.carry_out", answering)
 
 
 @pytest.fixture
@@ -211,9 +211,9 @@ def test_a_message_names_the_argument_in_python_and_the_flag_on_the_command_line
 
 def test_a_bug_keeps_its_traceback_and_ends_with_1() -> None:
     code = (
-        "import sys, advsearch.api\n"
+        "import sys, advsearch.question\n"
         "def carry_out(config, *, progress, resumed): raise ValueError('a bug')\n"
-        "advsearch.api.carry_out = carry_out\n"
+        "advsearch.question.carry_out = carry_out\n"
         "from advsearch.cli.main import main; sys.exit(main(['attack', '--object', 'mug', '--json']))"
     )
     done = python(code, cwd=Path(__file__).parent, env={**os.environ, "PYTHONPATH": str(ROOT / "tests")})
@@ -260,21 +260,23 @@ def interrupted():
         print("swallowed", flush=True)
 
 def carry_out(config, *, progress, resumed):
+    import heavy
     {loading}
     print("searched", flush=True)
     sys.exit("expected nothing to be searched")
 
 class Swallows(importlib.abc.MetaPathFinder, importlib.abc.Loader):
     def find_spec(self, name, path, target=None):
-        return importlib.util.spec_from_loader(name, self) if name.startswith("advsearch.api") else None
+        return importlib.util.spec_from_loader(name, self) if name == "heavy" else None
 
     def exec_module(self, module):
-        vars(module).update(carry_out=carry_out, __path__=[])
         {importing}
 
 sys.meta_path.insert(0, Swallows())
 sys.argv[1:] = ["attack", "--object", "mug", "--json", *sys.argv[1:]]
+import advsearch.question
 from advsearch.cli.main import main
+advsearch.question.carry_out = carry_out
 sys.exit(main())
 """
 

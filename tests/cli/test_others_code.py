@@ -25,7 +25,7 @@ from advsearch.cli.main import main
 from advsearch.cluster import Work
 from advsearch.cluster.worker import Failure, Files, prepare, version
 from advsearch.errors import InputError
-from advsearch.questions.attack.parts import parts_in
+from advsearch.questions.attack.carry_out import parts_in
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.studies import attacks_of
 from advsearch.questions.photographs.carry_out import Photographs

@@ -21,7 +21,7 @@ from advsearch.controls.ranges import DrawnRange
 from advsearch.distributions import as_setting
 from advsearch.engine.loading import as_controls, load_scene, only_here, settings_of
 from advsearch.errors import InputError
-from advsearch.questions.attack.parts import controls_given
+from advsearch.questions.attack.carry_out import controls_given
 from advsearch.questions.attack.settings import AttackConfig
 
 MUG = load_scene("mug").description

@@ -17,7 +17,7 @@ from advsearch.engine.bank import Bank
 from advsearch.engine.problem import Problem
 from advsearch.engine.transport import PredictedSearch, Transport
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.questions.attack.parts import problem_of
+from advsearch.questions.attack.carry_out import problem_of
 from advsearch.questions.attack.settings import AttackConfig
 
 SMALL: dict[str, Any] = {

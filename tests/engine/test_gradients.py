@@ -28,7 +28,7 @@ from advsearch.engine.gradients import (
 )
 from advsearch.engine.planning import TELLS, contested, cosines, measured_plan, status_of, tuned
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.questions.attack.parts import problem_from_config
+from advsearch.questions.attack.carry_out import problem_from_config
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.check.carry_out import check_from_config
 from advsearch.questions.check.result import CheckConfig, shown

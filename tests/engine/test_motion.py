@@ -55,6 +55,17 @@ def test_every_row_is_exposed_around_its_own_time_and_as_long(shutter: float, ro
     assert not rows[~within].any()
 
 
+def test_motion_blur_is_the_mean_of_64_stills(stills: Callable[[float, int, int], Tensor]) -> None:
+    """With the same noise: every value, within two levels."""
+    blurred = renderer([PathControl(**DRIVE, shutter=0.15)])
+    assert len(blurred.moments) == 64  # half a pixel from one to the next
+    times = 0.9 + 0.15 * ((torch.arange(64) + 0.5) / 64 - 0.5)
+    each = [stills(float(time), 2, seeds.stream(1, "moment", k)) for k, time in enumerate(times)]
+    mean = levels(torch.stack(each).mean(dim=0), blurred)
+    assert float((blurred(blurred.start, 1, 128) - mean).abs().max()) < LEVELS
+    assert float((levels(stills(0.9, 64, 5), blurred) - mean).abs().max()) > 20 * LEVELS
+
+
 @pytest.mark.slow
 def test_motion_blur_is_the_mean_of_many_stills(stills: Callable[[float, int, int], Tensor]) -> None:
     blurred = renderer([PathControl(**DRIVE, shutter=0.15)])

@@ -8,7 +8,6 @@ import pytest
 
 import advsearch
 from advsearch.api import render as rendering
-from advsearch.attacks import make_policy
 from advsearch.cli.flags import with_flags
 from advsearch.cli.main import main
 from advsearch.config import RenderConfig
@@ -19,7 +18,6 @@ from advsearch.controls.texture import TextureControl
 from advsearch.engine.naming import RUN_SETTINGS, check_run_settings, given_to
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.questions.attack import carry_out as attacking
-from advsearch.questions.attack.parts import with_derivatives
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.gap import GapConfig, gap
 from advsearch.questions.sweep.carry_out import job_of
@@ -240,10 +238,8 @@ def test_an_instance_says_its_own(setting: str) -> None:
 
 @pytest.mark.parametrize("given", [{"estimators": {"*": "secant"}}, {"measure": "full"}])
 def test_settings_of_derivatives_are_refused_beside_a_policy_that_takes_none(given: dict[str, Any]) -> None:
-    config = AttackConfig(object="mug", policy="random", **given)
     with pytest.raises(InputError, match="policy random takes no derivatives; leave one of the two out"):
-        with_derivatives(make_policy("random"), config)
-    assert with_derivatives(make_policy("pgd"), config).name == "pgd"
+        advsearch.attack("mug", policy="random", resolution=16, **given)
 
 
 def test_a_region_has_no_samples_of_a_search(capsys: pytest.CaptureFixture[str]) -> None:

@@ -9,6 +9,8 @@ from pathlib import Path
 import pytest
 import samples
 import small_models
+from PIL import Image
+from stored_sweeps import make_sweep
 
 import advsearch
 from advsearch.attacks import clopper_pearson
@@ -68,8 +70,9 @@ def test_every_share_is_that_of_the_rows(tmp_path: Path, capsys: pytest.CaptureF
         assert f"| {' | '.join(cells)} | {interval_text(one['interval'])} |" in text
     for said in ("another grid gives another share", "Not shown", "ISO 21448", "no conformity", "A. N. Other"):
         assert said in text and said in page
-    assert run["domain"]["weather"] == "not varied" and "studio" in run["domain"]["place"]
-    assert any("weather" in one for one in run["not_shown"])
+    assert run["domain"]["weather"] == "as each environment has it" and "studio" in run["domain"]["place"]
+    assert any("surfaces" in one and "weather" not in one for one in run["not_shown"])
+    assert any("weights say" in one for one in run["not_shown"]) and run["exposure"]
     for name in run["pictures"]:
         assert (out / name).read_bytes() == (tmp_path / "run" / "images" / name.split("-", 1)[1]).read_bytes()
     assert "bundled object mug" in run["made_with"] and "bundled environment noon" in run["made_with"]
@@ -88,6 +91,25 @@ def test_rules_are_claims_and_triggering_conditions_and_say_whether_they_are_con
     ):
         told = ExplainResult.of({**samples.EXPLAIN, "rules": [{**rule, "confirmed": confirmed}]})
         assert triggering_conditions(told)[0].startswith(said)
+
+
+def test_photographs_from_a_folder_agree_by_condition(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run, photographs = make_sweep(tmp_path / "run", keep="all"), tmp_path / "photographs"
+    photographs.mkdir()
+    for name in ("rendering-4", "rendering-6-again"):  # at 45 degrees, right and wrong in the rendering
+        Image.new("RGB", (64, 64), (128, 128, 128)).save(photographs / f"{name}.jpg")  # which no model calls a mug
+    asked = ["report", str(run), "--evidence", "--photographs", str(photographs), "--json", "--overwrite"]
+    for out in ("first", "again"):  # what the run has already is not judged again
+        assert main([*asked, "--out", str(tmp_path / out)]) == 0
+        (told,) = json.loads(capsys.readouterr().out)["runs"]
+        (row,) = told["photographs"]
+        assert (row["condition"], row["right"], row["of"]) == ("pose.yaw 45 degrees", 1, 2)
+        assert row["interval"] == pytest.approx(clopper_pearson(1, 2))
+    assert "| pose.yaw 45 degrees | 1 | 2 |" in (tmp_path / "again" / "evidence.md").read_text()
+    assert "Only 2 photographs" in "".join(told["not_shown"])
+    (photographs / "mine.jpg").touch()
+    assert main([*asked, "--out", str(tmp_path / "card")]) == 2
+    assert "rendering-12.jpg" in capsys.readouterr().err
 
 
 def test_a_criterion_is_met_not_met_or_open() -> None:

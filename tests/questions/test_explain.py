@@ -107,7 +107,7 @@ def test_a_rule_is_confirmed_by_what_is_rendered_inside_it(
         asked.append(config)
         outside = np.arange(10) == 9
         elevation = np.where(outside, 10.0, 70.0)
-        return pd.DataFrame({"camera.elevation": elevation, "correct": outside, "unit": np.arange(10)})
+        return pd.DataFrame({"camera.elevation": elevation, "correct": outside, "unit": np.arange(10), "label": ""})
 
     monkeypatch.setattr(explaining.Renders, "_rendered", rendered)
     result = advsearch.explain(swept, confirm=10, pairs=0, clusters=0, run=tmp_path / "run")
@@ -153,7 +153,8 @@ def test_fresh_pictures_vary_as_the_sweep_did_and_count_beyond_the_rules_before(
 
     def rendered(self: Any, name: str, config: SweepConfig) -> pd.DataFrame:
         elevation = np.linspace(20.0, 80.0, 40)
-        return pd.DataFrame({"camera.elevation": elevation, "correct": elevation <= 70, "unit": np.arange(40)})
+        made = {"camera.elevation": elevation, "correct": elevation <= 70, "unit": np.arange(40)}
+        return pd.DataFrame({**made, "label": ""})
 
     monkeypatch.setattr(explaining.Renders, "_rendered", rendered)
     rows = explaining.read_predictions([explaining.AskedSweep.of(swept)])

@@ -5,11 +5,11 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
+from safetensors import torch as safetensors
 
 import advsearch
 from advsearch.attacks import make_policy
@@ -19,18 +19,20 @@ from advsearch.engine.loading import Scene
 from advsearch.engine.surface_light import reason_against
 from advsearch.errors import InputError, ModelError
 from advsearch.models import Model
-from advsearch.models.reference import Trainable, load
+from advsearch.models.reference import Trainable, copied_network, load
 from advsearch.progress import NullProgress
 from advsearch.question import Question
-from advsearch.questions.attack.parts import executor_for, problem_of
+from advsearch.questions.attack.carry_out import executor_for, problem_of
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.harden import carry_out as hardening
 from advsearch.questions.harden import harden as asked
 from advsearch.questions.harden import scenes as harden_scenes
+from advsearch.questions.harden import training
 from advsearch.questions.harden.lessons import Lesson, RenderedLesson, TextureLesson
 from advsearch.questions.harden.result import QUICK, HardenConfig
+from advsearch.questions.harden.rounds import ROUNDS, Rounds, Score
 from advsearch.questions.harden.scenes import FURTHER, TRAINING, VALIDATION, Drawing, SceneWork
-from advsearch.questions.harden.training import ROUNDS, Course, Score, TrainingRounds
+from advsearch.questions.harden.training import ClassifierCourse
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.summary import read_result
 
@@ -53,8 +55,8 @@ def attacks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[tuple[str, 
 
     monkeypatch.setattr(harden_scenes, "attacked", attacked)
     monkeypatch.setattr(harden_scenes, "CLEAN_SCENES", 1)
-    monkeypatch.setattr(hardening, "PLAIN_SCENES", 1)
-    monkeypatch.setattr(hardening, "RENDERED_SCENES", 2)
+    monkeypatch.setattr(training, "PLAIN_SCENES", 1)
+    monkeypatch.setattr(training, "RENDERED_SCENES", 2)
     return done
 
 
@@ -64,19 +66,19 @@ def test_a_run_trains_measures_and_goes_on(
     given = {**SMALL, "labels": "labels.json", "run": "run"}
     config = HardenConfig(**given)
     given.pop("model")
-    taught = Course.round
+    taught = ClassifierCourse.round
 
     def stopped(self: Any, number: int, *args: Any) -> None:
         if number == 2:
             raise KeyboardInterrupt
         taught(self, number, *args)
 
-    monkeypatch.setattr(Course, "round", stopped)
+    monkeypatch.setattr(ClassifierCourse, "round", stopped)
     first = asked.from_config(config)
     assert (first.ending, len(first.rounds), first.after, first.hardened) == ("interrupted", 2, None, None)
     both = [("ball", 40), ("book", 40), ("ball", 120)]  # what was found is not sought any harder
     assert attacks == both
-    monkeypatch.setattr(Course, "round", taught)
+    monkeypatch.setattr(ClassifierCourse, "round", taught)
     with pytest.raises(InputError, match="cannot resume: it began without `beside`, which only Python gives"):
         advsearch.harden(SMALL["model"], beside=[], resume=True, **given)
     result = advsearch.harden(SMALL["model"], resume=True, **given)
@@ -103,20 +105,20 @@ def test_a_run_trains_measures_and_goes_on(
     )
 
 
-def work_of(config: HardenConfig, run: RunDirectory, course: Course) -> hardening.Hardening:
-    """What carries out a run with the reference model."""
-    scenes = SceneWork(config, load(), harden_scenes.splits_of(config, load()))
-    return hardening.Hardening(run, course, scenes, NullProgress())
+def course_of(config: HardenConfig, net: torch.nn.Module | None = None) -> ClassifierCourse:
+    """The training of a small network in the place of the reference model."""
+    work = SceneWork(config, load(), harden_scenes.splits_of(config, load()))
+    return ClassifierCourse(work, Trainable(net or torch.nn.Linear(2, 3), load()))
 
 
 def test_what_is_rendered_is_searched_together_and_in_further_scenes_too(attacks: list[tuple[str, int | None]]) -> None:
     config = HardenConfig(**{**SMALL, "controls": "texture,pose,light", "labels": "labels.json"})
+    course = course_of(config)
+    found = course.draw("scenes", TRAINING, range(1))
+    held_back = course.draw("scenes", VALIDATION, range(1))
     with RunDirectory.create_for(config) as run:
-        course = Course(Trainable(torch.nn.Linear(2, 3), load()), load(), config)
-        work = work_of(config, run, course)
-        found = work.drawn("scenes", TRAINING, range(1), 1)
-        held_back = work.drawn("scenes", VALIDATION, range(1), 2)
-        assert work.counts[FURTHER] == 2 * work.counts[TRAINING]
+        counts = hardening.Hardening(run, course).counts
+    assert counts[FURTHER] == 2 * counts[TRAINING]
     assert [type(one) for one in held_back] == [TextureLesson] * 2 + [Lesson] + [RenderedLesson] * 2
     rendered = [RenderedLesson, Lesson, RenderedLesson, RenderedLesson]  # one scene as it is, too
     assert [type(one) for one in found] == [TextureLesson, Lesson, *rendered]
@@ -129,19 +131,16 @@ def test_in_half_of_the_scenes_with_a_texture_what_is_rendered_varies_too(
     attacks: list[tuple[str, int | None]],
 ) -> None:
     config = HardenConfig(**{**SMALL, "controls": "texture,pose,haze", "labels": "labels.json"})
-    with RunDirectory.create_for(config) as run:
-        course = Course(Trainable(torch.nn.Linear(2, 3), load()), load(), config)
-        work = work_of(config, run, course)
-        assert work.scenes.beside == ("pose",)  # no matrix says what haze does
-        drawn = [work.chance("texture", number) for number in range(400)]
-        for share, which in ((hardening.SHARED, 0), (hardening.MOVED, 1)):
-            for part in (drawn[::2], drawn[1::2]):  # objects take turns, and each has as many
-                assert abs(sum(one[which] for one in part) / 200 - share) < 0.08
-        seen = work.scenes([Drawing(TRAINING, 0, ("texture",), 1, 0, beside=beside) for beside in ((), ("pose",))])
-        one, other = (some[0] for some in seen)
-        assert isinstance(one, TextureLesson) and isinstance(other, TextureLesson)
-        assert len(other.numbers) == len(one.numbers) + 6 and not torch.equal(one.plain, other.plain)
-    shutil.rmtree(run.path)
+    course = course_of(config)
+    assert course.work.beside == ("pose",)  # no matrix says what haze does
+    drawn = [course.chance("texture", number) for number in range(400)]
+    for share, which in ((training.SHARED, 0), (training.MOVED, 1)):
+        for part in (drawn[::2], drawn[1::2]):  # objects take turns, and each has as many
+            assert abs(sum(one[which] for one in part) / 200 - share) < 0.08
+    seen = course.work([Drawing(TRAINING, 0, ("texture",), 1, 0, beside=beside) for beside in ((), ("pose",))])
+    one, other = (some[0] for some in seen)
+    assert isinstance(one, TextureLesson) and isinstance(other, TextureLesson)
+    assert len(other.numbers) == len(one.numbers) + 6 and not torch.equal(one.plain, other.plain)
 
 
 def test_a_measurement_over_viewpoints_may_be_predicted() -> None:
@@ -160,13 +159,14 @@ def test_workers_do_what_this_process_does(attacks: list[tuple[str, int | None]]
     wanted: list[harden_scenes.Wanted] = [
         Drawing(TRAINING, 1, ("texture",), 1, 1),
         Drawing(TRAINING, 0, ("pose",), 1, 0),
-        harden_scenes.Looking(0),
+        harden_scenes.Looking(0, safetensors.save(copied_network(load()).state_dict())),
     ]
     here = SceneWork(config, load(), harden_scenes.splits_of(config, load()))(wanted)
     shared = config.model_copy(update={"workers": 1})
     with executor_for(shared, "advsearch.questions.harden.scenes:scenes_of", NullProgress()) as pool:
         assert pool is not None
         there = {wanted.index(done.items[0]): done.value[0] for done in pool.results([one] for one in wanted)}
+    assert there.pop(2) == here.pop() == (2, 2)
     for place, lessons in enumerate(here):
         assert isinstance(lessons, list) and len(lessons) == len(there[place])
         for one, other in zip(lessons, there[place], strict=True):
@@ -182,8 +182,8 @@ def test_the_weights_that_are_kept_are_within_the_clean_loss(attacks: list[tuple
         noted = [{"lessons": 1, "part": 1.0, "clean": clean, "robust": robust, "kept": False} for clean, robust in rows]
         run.store.set_note(ROUNDS, json.dumps(noted))
         for loss, best in ((0.02, 3), (0.05, 2), (0.0, 0)):
-            course: Any = SimpleNamespace(config=config.model_copy(update={"clean_loss": loss}))
-            assert work_of(config, run, course).rounds.best == best
+            course = course_of(config.model_copy(update={"clean_loss": loss}))
+            assert Rounds(run, course).best == best
     shutil.rmtree(run.path)
 
 
@@ -192,26 +192,23 @@ def test_a_round_ends_with_the_part_of_the_way_that_is_best(
 ) -> None:
     config = HardenConfig(**SMALL, labels="labels.json")
     net = torch.nn.Linear(2, 3)
-    student = Trainable(net, load())
     given = {name: one.clone() for name, one in net.state_dict().items()}
 
     judged_at = list[float]()
 
-    def judged(model: Model, held_back: Any) -> Score:
+    def judged(self: ClassifierCourse, held_back: Any) -> Score:
         part = float(net.weight.detach()[0, 0] - given["weight"][0, 0])
         judged_at.append(part)
         return Score(1.0 - 0.1 * part, 0.5 + 0.2 * part)
 
-    monkeypatch.setattr("advsearch.questions.harden.training.score", judged)
+    monkeypatch.setattr(ClassifierCourse, "score", judged)
     with RunDirectory.create_for(config) as run:
-        work = work_of(config, run, Course(student, load(), config))
-        assert isinstance(work.rounds, TrainingRounds)
-        work.rounds.keep(0, [], Score(1.0, 0.5), 0, 0.0)
+        Rounds(run, course_of(config, net)).keep(0, [], Score(1.0, 0.5), 0, 0.0)
         for loss, expected, looked_at in ((0.05, 0.4, 6), (0.2, 1.0, 2), (0.001, 0.25, 6)):
             judged_at.clear()
             net.load_state_dict({name: one + 1.0 for name, one in given.items()})
-            work.course.config = config.model_copy(update={"clean_loss": loss})
-            found, part = work.rounds.mixed([])
+            rounds = Rounds(run, course_of(config.model_copy(update={"clean_loss": loss}), net))
+            found, part = rounds.mixed([])
             assert part == expected and found.robust == pytest.approx(0.5 + 0.2 * part)
             assert len(judged_at) == looked_at, "less than the best part is looked at once"
             torch.testing.assert_close(net.bias.detach(), given["bias"] + part)

@@ -16,8 +16,10 @@ from torch import Tensor, nn
 
 import advsearch
 from advsearch.errors import FileFormatError, InputError, ModelError
-from advsearch.questions.harden.detectors import Student, own_loss, read_coco
-from advsearch.questions.harden.lessons import Example
+from advsearch.models.reference import trainable
+from advsearch.questions.harden.detectors import DetectorCourse, Example, own_loss, read_coco
+from advsearch.questions.harden.result import HardenConfig
+from advsearch.questions.harden.scenes import SceneWork
 from advsearch.runs.images import write_png
 from advsearch.tasks import make_task
 from advsearch.tasks.boxes import Place
@@ -53,6 +55,11 @@ def model() -> advsearch.Model:
     return advsearch.load_model(OneBox(), task=TASK, labels=LABELS, input_size=SIDE, name="one box")
 
 
+def course_of(loss: Any = None, **settings: Any) -> DetectorCourse:
+    work = SceneWork(HardenConfig(task=TASK, **settings), model(), {})
+    return DetectorCourse(work, trainable(work.model, logits=False), loss=loss)
+
+
 def example(seed: int) -> Example:
     """A square on grey, red or green by its class, in a picture twice as large as the network's input."""
     rng = np.random.default_rng(seed)
@@ -66,17 +73,18 @@ def example(seed: int) -> Example:
 
 
 def test_a_copy_learns_by_the_networks_own_loss_and_keeps_its_statistics() -> None:
-    given, seen, held_out = model(), [example(k) for k in range(24)], [example(k) for k in range(100, 112)]
-    student = Student.of(given, None)
-    student.fit(seen, 60, 0.02, seed=0)
-    before, after = ([one.right(which) for one in held_out] for which in (given, student.model))
+    course, seen = course_of(epochs=60, rate=0.02), [example(k) for k in range(24)]
+    course.round(1, seen)
+    models, held_out = (course.work.model, course.student.model), [example(k) for k in range(100, 112)]
+    before, after = ([one.right(which) for one in held_out] for which in models)
     assert sum(before) <= 3 and sum(after) >= 9
-    assert isinstance(student.network, OneBox) and not student.network.norm.running_mean.any()  # type: ignore[union-attr]
+    network = course.student.net
+    assert isinstance(network, OneBox) and not network.norm.running_mean.any()  # type: ignore[union-attr]
 
 
 def test_a_mirrored_picture_has_mirrored_boxes() -> None:
-    student, one = Student.of(model(), None), example(4)
-    (plain, target), (mirrored, other) = (student._input(one, which) for which in (False, True))
+    course, one = course_of(), example(4)
+    (plain, target), (mirrored, other) = (course.shown(one, which) for which in (False, True))
     assert torch.allclose(mirrored, plain.flip(3), atol=1e-5)
     assert target["boxes"].tolist() == (one.boxes / 2).tolist()
     left, top, right, bottom = target["boxes"][0].tolist()
@@ -116,7 +124,7 @@ def test_losses_are_torchvisions_transformers_or_the_callers() -> None:
         asked.append(len(targets))
         return network(x)[0].sum()  # type: ignore[no-any-return]
 
-    Student.of(model(), mine).fit([example(k) for k in range(3)], 1, 0.01, seed=0)
+    course_of(mine, epochs=1).round(1, [example(k) for k in range(3)])
     assert asked == [3]
 
 
@@ -157,16 +165,28 @@ def test_a_run_trains_on_what_it_found_and_measures_scene_by_scene(
     monkeypatch.chdir(tmp_path)
     given: dict[str, Any] = {
         "task": TASK, "labels": ",".join(LABELS), "object": "mug,ball", "controls": {"light": {}}, "resolution": SIDE,
-        "rounds": 1, "scenes": 1, "epochs": 2, "measured": 1, "steps": 2, "spp": 1, "verify_spp": 1, "denoise": "none",
+        "rounds": 2, "scenes": 1, "epochs": 2, "measured": 1, "steps": 2, "spp": 1, "verify_spp": 1, "denoise": "none",
         "threads": 1, "run": "run", "environment": "studio", "held_out_environment": "noon",
     }  # fmt: skip
     monkeypatch.setattr("advsearch.questions.harden.scenes.CLEAN_SCENES", 1)
     with pytest.raises(InputError, match="COCO folder as `data`"):
         advsearch.harden(OneBox(), beside=[], **given)
-    result = advsearch.harden(OneBox(), data=str(coco(tmp_path / "own")), **given)
+    given["data"], taught = str(coco(tmp_path / "own")), DetectorCourse.round
+
+    def stopped(self: DetectorCourse, number: int, *args: Any) -> None:
+        if number == 2:
+            raise KeyboardInterrupt
+        taught(self, number, *args)
+
+    monkeypatch.setattr(DetectorCourse, "round", stopped)
+    first = advsearch.harden(OneBox(), **given)
+    assert first.ending == "interrupted" and first.after is None
+    monkeypatch.setattr(DetectorCourse, "round", taught)
+    result = advsearch.harden(OneBox(), resume=True, **given)
+    assert [one.robust for one in result.rounds[:2]] == [one.robust for one in first.rounds]
     assert result.ending == "done" and result.weights and result.hardened is None
     assert result.before is not None and result.before.count == 1 and result.gained is not None
-    assert [one.lessons for one in result.rounds] == [0, 1 + 3 + 5] and sum(one.kept for one in result.rounds) == 1
+    assert [one.lessons for one in result.rounds] == [0, 5, 9] and sum(one.kept for one in result.rounds) == 1
     kept = json.loads((Path(str(result.pictures)) / "round-001" / "annotations.json").read_text())
     assert [one["file_name"][6:] for one in kept["images"]] == ["plain.png"] * 3 + ["worst.png"]
     assert {one["category_id"] for one in kept["annotations"]} == {0}

@@ -25,8 +25,7 @@ from advsearch.engine.loading import load_scene
 from advsearch.errors import InputError, ModelError
 from advsearch.models import load_model, reference
 from advsearch.models.reference import Trainable, trainable
-from advsearch.progress import NullProgress
-from advsearch.questions.attack.parts import problem_of
+from advsearch.questions.attack.carry_out import problem_of
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.harden.lessons import (
     Disguise,
@@ -38,18 +37,19 @@ from advsearch.questions.harden.lessons import (
     save_pictures,
     surprise,
     tried,
-    write_archive,
 )
 from advsearch.questions.harden.result import HardenConfig, TrainingRound
+from advsearch.questions.harden.rounds import Rounds, Score
 from advsearch.questions.harden.scenes import (
     HELD_OUT,
     TRAINING,
+    SceneWork,
     Split,
     check_disjoint,
     check_unmeasured,
     fingerprint,
 )
-from advsearch.questions.harden.training import Course, Gradients, Score, TrainingRounds, score
+from advsearch.questions.harden.training import ClassifierCourse, Gradients
 from advsearch.scene.formation import levels_of, to_8_bit
 from advsearch.scene.library import load_environment
 
@@ -58,6 +58,10 @@ LABELS = [f"class {number}" for number in range(14)]
 
 def student(layers: str = "all") -> Trainable:
     return trainable(load_model(Colours(), labels=LABELS, input_size=16), layers)
+
+
+def course_of(made: Trainable, *given: Any, **settings: Any) -> ClassifierCourse:
+    return ClassifierCourse(SceneWork(HardenConfig(**settings), student().model, {}), made, *given)
 
 
 def coloured(right: int, level: float, seed: int) -> Tensor:
@@ -134,7 +138,7 @@ def test_lessons_of_textures_let_go_of_their_scene() -> None:
     harder([lesson], model, 2)
     assert lesson.worst.shape == (16, 16, 3) and not torch.equal(lesson.worst, lesson.plain)
     for views, steps in ((6, 2), (2, 2), (1, 4)):  # of 24 pictures, in two epochs: 20 plain ones, and 6 / views of this
-        assert Course(student(), model, HardenConfig(epochs=2, views=views)).steps([lesson, *plain * 20]) == steps
+        assert course_of(student(), epochs=2, views=views).steps([lesson, *plain * 20]) == steps
 
 
 def test_an_epoch_looks_six_times_at_a_scene_with_a_texture() -> None:
@@ -264,21 +268,21 @@ def test_the_worst_picture_is_the_one_whose_loss_was_highest_when_a_model_last_l
 
 def test_a_round_teaches_plain_and_worst_pictures() -> None:
     made, lessons = student(), pupils()
-    before = score(made.model, lessons)
     ticks: list[int] = []
-    course = Course(made, student().model, HardenConfig(rate=0.04, epochs=12))
-    course.round(1, lessons, lambda: ticks.append(1))
-    after = score(made.model, lessons)
+    course = course_of(made, rate=0.04, epochs=12)
+    before = course.score(lessons)
+    course.round(1, lessons, tick=lambda: ticks.append(1))
+    after = course.score(lessons)
     assert len(ticks) == course.steps(lessons) == 12
     more = [Lesson((5,), levels_of(coloured(0, 0.4, 1)))] * 24  # nothing makes them harder
-    assert score(made.model, [*lessons, *more]) == Score(after.clean / 2, after.robust)
+    assert course.score([*lessons, *more]) == Score(after.clean / 2, after.robust)
     assert before.robust < 0.6 and after.clean >= 0.9 and after.robust >= 0.9
 
 
 def test_to_judge_a_model_leaves_the_lessons_as_they_are() -> None:
     pictures = to_8_bit(torch.stack([coloured(0, level, 7) for level in (0.0, 0.3)]))
     lesson = RenderedLesson.of((1,), pictures[0], pictures)
-    score(student().model, [lesson])
+    course_of(student()).score([lesson])
     assert bool(lesson.losses.isinf().all())
 
 
@@ -287,9 +291,8 @@ def test_the_weights_that_are_kept_lose_no_more_plain_pictures_than_they_may(cle
     scores = ((0.9, 0.1), (0.82, 0.9), (0.89, 0.5))
     done = [TrainingRound(lessons=1, part=1.0, clean=clean, robust=robust, kept=False) for clean, robust in scores]
     noted = json.dumps([one.model_dump() for one in done])
-    run: Any = SimpleNamespace(store=SimpleNamespace(note=lambda key: noted))
-    course: Any = SimpleNamespace(config=SimpleNamespace(clean_loss=clean_loss))
-    assert TrainingRounds(run, course, lambda *_: [], NullProgress()).best == best
+    run: Any = SimpleNamespace(store=SimpleNamespace(note=lambda key: noted), path=Path())
+    assert Rounds(run, course_of(student(), clean_loss=clean_loss)).best == best
 
 
 def test_the_given_model_is_asked_about_scenes_as_they_are_alone() -> None:
@@ -314,7 +317,7 @@ def test_a_round_comes_to_the_same_whatever_the_number_of_threads() -> None:
         made = student()
         torch.set_num_threads(count)
         try:
-            Course(made, student().model, HardenConfig(rate=0.04, epochs=2)).round(1, pupils())
+            course_of(made, rate=0.04, epochs=2).round(1, pupils())
             assert torch.get_num_threads() == count
         finally:
             torch.set_num_threads(before)
@@ -369,7 +372,7 @@ def test_a_round_takes_the_users_optimiser_and_their_batches() -> None:
         return torch.optim.SGD(parameters, 0.5)  # type: ignore[arg-type]
 
     further = [(torch.stack([coloured(2, 0.4, n) for n in range(8)]), torch.full((8,), 9))]
-    Course(made, student().model, HardenConfig(epochs=10), optimiser, further).round(1, pupils())
+    course_of(made, optimiser, further, epochs=10).round(1, pupils())
     assert asked == [1]
     assert (made.model(further[0][0]).argmax(dim=1) == 9).float().mean() > 0.5  # only the batches beside say 9
 
@@ -385,7 +388,6 @@ def test_pictures_are_a_folder_for_each_class_and_a_webdataset(tmp_path: Path) -
         "0001-mug/001-00001-plain.png",
         "0001-mug/001-00001-worst.png",
     ]
-    assert write_archive(tmp_path / "pictures", tmp_path / "pictures.tar") == 4
     with tarfile.open(tmp_path / "pictures.tar") as tar:
         names = tar.getnames()
         assert [name.rpartition(".")[2] for name in names] == ["png", "cls", "json"] * 4

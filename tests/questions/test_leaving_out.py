@@ -17,7 +17,7 @@ from advsearch.cli.output import shown_text as text_of
 from advsearch.controls import CameraControl, LightControl, MaterialControl, TextureControl
 from advsearch.engine.gradients import inside, smooth_loss
 from advsearch.engine.planning import BOUND, measured_bounces
-from advsearch.questions.attack.parts import problem_from_config
+from advsearch.questions.attack.carry_out import problem_from_config
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.check.carry_out import ALL, WHAT, check_from_config, measured_gains, resolved_texels
 from advsearch.questions.check.result import CheckConfig

@@ -18,7 +18,7 @@ from advsearch.engine.gradients import smooth_loss
 from advsearch.engine.loading import load_scene
 from advsearch.errors import InputError
 from advsearch.progress import NullProgress
-from advsearch.questions.attack.parts import problem_from_config
+from advsearch.questions.attack.carry_out import problem_from_config
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.precision import carry_out as measuring
 from advsearch.questions.precision.benches import (

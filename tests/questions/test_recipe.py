@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 
 import advsearch
-from advsearch.api import carry_out
 from advsearch.attacks import clopper_pearson, make_policy
 from advsearch.cli.main import main
 from advsearch.engine.surface_light import reason_against
 from advsearch.errors import AdvsearchError, FileFormatError, InputError, UnknownNameError
+from advsearch.question import carry_out
 from advsearch.questions.attack import studies
-from advsearch.questions.attack.parts import parts_of, problem_of_parts
+from advsearch.questions.attack.carry_out import parts_of, problem_of_parts
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.summary import FoundValue, SearchDistribution
 from advsearch.questions.recipe import carry_out as carrying_out

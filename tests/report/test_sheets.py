@@ -166,7 +166,7 @@ def test_the_command_writes_a_pdf_and_says_what_it_needs(
     run = str(runs["patch"])
     assert main(["export", run, "--format", "print", "--out", str(out), "--json", "--size", "95"]) == 0
     told = json.loads(capsys.readouterr().out)
-    assert told["pages"] == len(pypdf.PdfReader(out).pages) == 2 and told["size_mm"] == 95.0
+    assert told["pages"] == len(pypdf.PdfReader(out).pages) == 3 and told["size_mm"] == 95.0
     assert main(["export", run, "--format", "print", "--out", str(tmp_path / "usual.pdf"), "--json"]) == 0
     own = json.loads(capsys.readouterr().out)
     assert own["size_mm"] == pytest.approx(109.5, abs=0.1)

@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 
 from advsearch.errors import FileFormatError
-from advsearch.scene.importing.files import Notes
+from advsearch.scene.importing.files import Names, Notes
 from advsearch.scene.importing.mtl import map_of
 from advsearch.scene.importing.objects import read_parts
-from advsearch.scene.importing.scenes import _Names, node_names
+from advsearch.scene.importing.scenes import node_names
 from advsearch.scene.importing.wavefront import MOST_NAMED
 from advsearch.scene.mitsuba_backend.xml_files import MOST_ELEMENTS, read_scene
 
@@ -37,7 +37,7 @@ def notes(folder: Path) -> None:
 
 
 def names(folder: Path) -> None:
-    free = _Names()
+    free = Names()
     free.free("a-3")
     assert [free.free("a") for _ in range(100_000)][:3] == ["a", "a-2", "a-4"]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,8 @@ from torch import Tensor
 
 import advsearch
 from advsearch.controls.geometry import _Solve
+from advsearch.scene.color import LOW_END, linear_to_srgb
+from advsearch.scene.formation import ImageFormation
 from advsearch.scene.mitsuba_backend.transport import Vertices
 from advsearch.scene.surface.arrangement import product
 from advsearch.scene.transport.matrix import COARSE, TextureTransport
@@ -49,6 +52,8 @@ def transport() -> Callable[[Tensor], Tensor]:
 
 
 OPERATIONS = {"_Solve": [solved], "LinearMap": [sparse, transport]}
+CURVES = {"_Shown"}
+"""Not linear: `test_a_shown_picture_is_the_encoded_one` has them."""
 
 
 @pytest.mark.parametrize("made", [one for several in OPERATIONS.values() for one in several])
@@ -85,4 +90,20 @@ def test_every_operation_is_one_of_these() -> None:
         for node in ast.walk(ast.parse(text)) if "autograd.Function" in text else ():
             if isinstance(node, ast.ClassDef) and "Function" in "".join(map(ast.unparse, node.bases)):
                 found.add(node.name)
-    assert found == ONCE | OPERATIONS.keys()
+    assert found == ONCE | OPERATIONS.keys() | CURVES
+
+
+def test_a_shown_picture_is_the_encoded_one() -> None:
+    """Picture and derivative bit for bit, below black, above white and at the bend too; and a second derivative."""
+    formation, generator = ImageFormation(gain=1.37), torch.Generator().manual_seed(0)
+    radiance = torch.rand(8, 8, 3, generator=generator) - 0.1
+    radiance[0, :5, 0] = torch.tensor([0.0, 1.0 / 1.37, LOW_END / 1.37, math.inf, -1.0])
+    cotangent, found = torch.randn(8, 8, 3, generator=generator), []
+    for shown in (formation.display, lambda one: linear_to_srgb(one * 1.37)):
+        at = radiance.clone().requires_grad_()
+        picture = shown(at)
+        picture.backward(cotangent)
+        assert at.grad is not None
+        found.append((picture.detach(), at.grad))
+    assert torch.equal(found[0][0], found[1][0]) and torch.equal(found[0][1], found[1][1])
+    assert torch.autograd.gradgradcheck(formation.display, torch.linspace(0.02, 0.6, 9).double().requires_grad_())

@@ -21,7 +21,7 @@ from advsearch.config import CONFIGS
 from advsearch.errors import InputError, ModelError, UnknownNameError
 from advsearch.models import load_model
 from advsearch.options import as_setting
-from advsearch.questions.attack.parts import problem_from_config
+from advsearch.questions.attack.carry_out import problem_from_config
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.tasks import TASKS, Classification, Facts, Judgement, Prediction, Task, make_task
 from advsearch.tasks.base import typical
@@ -266,8 +266,8 @@ def test_python_takes_a_task_with_options_of_its_own(tolerance: float, right: in
 @pytest.mark.parametrize("command", ["precision", "check", "attack"])
 def test_every_command_maximises_what_is_the_tasks_own(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
     network = load_model(Level(), input_size=8, read=Yaw().reader)
-    monkeypatch.setattr("advsearch.questions.attack.parts.make_task", lambda name: Yaw())
-    monkeypatch.setattr("advsearch.questions.attack.parts.load_models", lambda *_, **__: ((network,), []))
+    monkeypatch.setattr("advsearch.questions.attack.carry_out.make_task", lambda name: Yaw())
+    monkeypatch.setattr("advsearch.questions.attack.carry_out.load_models", lambda *_, **__: ((network,), []))
     config: Any = CONFIGS[command]
     problem, _ = problem_from_config(config(object="mug", resolution=16, controls={"pose": {"yaw": [0, 90]}}))
     image = torch.full((16, 16, 3), 0.5)

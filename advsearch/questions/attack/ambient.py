@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import lru_cache, partial
 
 from torch import Tensor
 
@@ -15,6 +17,8 @@ from advsearch.engine.verifier import Verifier
 
 BRIGHTEST = 1e5
 """Lux of direct sun: nothing is tried beyond."""
+IN_LIGHT = "ambient x "
+"""What the names of problems for workers begin with, before how many times the ambient light they have."""
 HALVED = 2
 """How often the step between the last ambient light in which it holds and the first in which it does not is halved: to
 a factor of 1.19."""
@@ -36,7 +40,9 @@ def find_ambient(verifier: Verifier, u: Tensor) -> None:
     def holds(lux: float) -> bool:
         title = f"trying it in ambient light of {lux:.3g} lux"
         verifier.begin(title, 2 * verifier.count, name="ambient", at_most=True)
-        journal = replace(verifier.journal, traced=Shared(_lit(problem, lux / own)))
+        shared = verifier.journal.traced
+        there = Shared(in_light(problem, lux / own), shared.executor, f"{IN_LIGHT}{lux / own!r}")
+        journal = replace(verifier.journal, traced=there)
         tried[lux] = verify(
             replace(verifier, journal=journal).evaluate_all,
             problem.domain,
@@ -65,8 +71,14 @@ def ambient_of(problem: Problem) -> float | None:
     return projectors[0].ambient if projectors else None
 
 
-def _lit(problem: Problem, times: float) -> Problem:
-    """The same problem in so many times the ambient light."""
+def problems_by_name(problem: Problem) -> Callable[[str], Problem]:
+    """Return what gives a worker the problem of a query by its name: that of the run, or the same in other light."""
+    lit = lru_cache(maxsize=2)(partial(in_light, problem))
+    return lambda name: lit(float(name.removeprefix(IN_LIGHT))) if name.startswith(IN_LIGHT) else problem
+
+
+def in_light(problem: Problem, times: float) -> Problem:
+    """Return the same problem in so many times the ambient light."""
     brighter = [one.in_light(times) if isinstance(one, ProjectorControl) else one for one in problem.space.controls]
     space, renderer = replace(problem.space, controls=tuple(brighter)), problem.renderer.like()
     renderer.space = space

@@ -1,167 +1,72 @@
-"""`attack`: the worst configuration of a scene inside a budget, searched for and verified, beside a random search."""
+"""`attack`: the worst configuration of a scene inside a budget, searched for and verified, beside a random search.
+
+What a configuration names is found and loaded, and makes a problem: everything that renders and judges single
+configurations begins with `problem_from_config` or `problem_of`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack, nullcontext
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, ExitStack
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from torch import Tensor
 
-from advsearch import losses
-from advsearch.api.keywords import asks
+from advsearch import seeds
 from advsearch.attacks import Policy, make_policy
-from advsearch.attacks.objectives import OBJECTIVE_KINDS
-from advsearch.attacks.policies import WithoutAscent
-from advsearch.cluster import Call
-from advsearch.config import SceneConfig
-from advsearch.controls.values import sentences
+from advsearch.attacks.objectives import OBJECTIVE_KINDS, asked_by, check_objective
+from advsearch.attacks.policies import POLICIES, WithoutAscent
+from advsearch.cluster import Call, Executor, Work
+from advsearch.cluster.dask_pool import executor_of
+from advsearch.config import SceneConfig, has_address, one_only
+from advsearch.controls import make_space
+from advsearch.controls.base import Control
+from advsearch.controls.values import by_distribution, sentences
 from advsearch.engine.journal import Journal, Shared, check_made_of, worker_call
-from advsearch.engine.judging import Metric, check_shared, load_metrics, metrics_as_settings
-from advsearch.engine.judging import only_here as metrics_only_here
-from advsearch.engine.loading import Controls, Scene, load_scene, only_here, scene_as_settings, settings_of
-from advsearch.engine.naming import (
-    OF_SCENE,
-    AnyModel,
-    check_not_of_scene,
-    check_not_spread,
-    exists_here,
-    model_name,
-    several,
-    told_of_scene,
-)
+from advsearch.engine.judging import Described, Looked, Metrics, check_truth, facts_of, load_metrics, shown
+from advsearch.engine.loading import SCENE, Controls, Scene, framed, lent, make_renderer
+from advsearch.engine.naming import AnyModel, check_run_settings, given_to, load_models, scene_of, several
+from advsearch.engine.objective import AnyObjective, objective_for, print_terms, task_for
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Stages
-from advsearch.engine.transport import CleanMatrix
+from advsearch.engine.transport import CleanMatrix, reason_against
 from advsearch.errors import InputError
 from advsearch.files import JsonObject
 from advsearch.models import Model
 from advsearch.models.address import Asked
-from advsearch.options import as_setting, told
-from advsearch.progress import NullProgress, Progress, Watched, watcher
+from advsearch.options import as_setting
+from advsearch.progress import NullProgress, Progress
+from advsearch.questions.attack.ambient import problems_by_name
 from advsearch.questions.attack.outcome import summarise
-from advsearch.questions.attack.parts import (
-    LOADING,
-    AttackParts,
-    controls_given,
-    executor_for,
-    is_named,
-    models_as_one,
-    parts_given,
-    parts_of,
-    problem_on,
-    task_and_objective,
-    with_derivatives,
-)
 from advsearch.questions.attack.result import AttackResult
-from advsearch.questions.attack.settings import AttackConfig
+from advsearch.questions.attack.settings import (
+    OVER_NUMBERS,
+    OVER_ONE,
+    OVER_PREDICTED,
+    OVER_RENDERED,
+    STEPS,
+    AttackConfig,
+)
 from advsearch.questions.attack.stages import Attack
 from advsearch.report.wording import count
-from advsearch.runs.directory import RunDirectory, begun, check_free, is_run, run_path
-from advsearch.tasks import AnyTask, OwnTask, Task, function_of, make_task
+from advsearch.runs.directory import CONFIG, RunDirectory, check_free
+from advsearch.runs.directory import only_here as only_python_has
+from advsearch.scene.formation import EVERYTHING, NOTHING, next_count
+from advsearch.scene.surfaces import aovs_of
+from advsearch.scene.things import ALL
+from advsearch.settings import FILES
+from advsearch.tasks import AnyTask, Facts, Task, function_of, make_task
+from advsearch.tasks.each_thing import each_thing
+from advsearch.tasks.together import Together, together
 
-PREPARING = "preparing the scene for rendering"
+LOADING, PREPARING = "loading the scene and the model", "preparing the scene for rendering"
 """What a person who waits is told before the first picture."""
 
-
-@asks(AttackConfig)
-def attack(
-    scene: Scene | str | Path | Mapping[str, object],
-    model: AnyModel | Sequence[AnyModel] = "reference",
-    *,
-    object: str | None = None,
-    task: AnyTask = "classification",
-    controls: Controls = ("texture",),
-    objective: str | Callable[..., Tensor] | None = None,
-    policy: str | Mapping[str, object] | Policy[Any] = "auto",
-    over: Controls = (),
-    metrics: Mapping[str, str | Metric] | None = None,
-    run: str | Path | None = None,
-    resume: bool = False,
-    progress: Watched = None,
-    **settings: Any,
-) -> AttackResult:
-    """Search for the worst configuration of a scene, verify it, and return everything that is known about it.
-
-    All other arguments are the settings of `advsearch attack`; `environment`, `up`, `set` and `exposure` belong to a
-    scene that is named here, not to one that is loaded.
-
-    Args:
-        scene: from `load_scene`, or what that takes.
-        model: from `load_model`, or what that takes; with `ensemble`, several.
-        object: the node or shape that is the object, where `scene` is a file or dictionary that holds several.
-        task: what judges the model's output: a name, a mapping with a `name` and options, an instance, or a function
-            (output, truth) that says how wrong it is, over 0 where it is wrong (docs/tasks.md).
-        controls: what may vary: names, instances, or a mapping from names to settings.
-        objective: "margin", "log_odds", "cross_entropy", "dlr", "feature_distance", "score", or a function of (output,
-            images (N, H, W, 3), truth, or the target where there is one) or of (output, labels) that returns (N,)
-            values, which are maximised; in classification the output is logits (N, C) and the truth the index of the
-            right label, (N,), or a tuple of several. It may ask for more by the names of further parameters: `u`,
-            `texture`, `inputs`, `configuration` (docs/own-loss.md). None takes the task's own.
-        policy: a name, a mapping with a `name` and options, or an instance.
-        over: controls that vary by chance: the configuration has to hold for all of their values.
-        metrics: columns of the rows, by name: functions of (image (H, W, 3) sRGB in [0, 1], output of that picture,
-            truth: the index of the right class) that return a number or a dict. `workers` need functions of a module.
-        run: folder to keep the run in; None keeps it in memory only.
-        resume: go on with the run of that name, if there is one, where it was stopped; everything else has to be as it
-            was.
-    """
-    options = {name: value for name, value in settings.items() if value is not None}
-    task = make_task(task) if callable(task) else task
-    loaded_already = not all(isinstance(network, (str, Path)) for network in (scene, *several(model)))
-    if loaded_already or callable(objective) or only_here(controls) or only_here(over) or isinstance(task, OwnTask):
-        check_not_spread(options)
-    if not isinstance(policy, (str, Mapping, Policy)) or not policy:
-        raise InputError(
-            f"policy: expected a name, a mapping with a `name` and options, or an instance, got {told(policy)}"
-        )
-    scene = _scene(scene, object, settings)
-    described = {
-        **scene_as_settings(scene),
-        "model": ",".join(map(model_name, several(model))),
-        "controls": settings_of(controls),
-        "over": settings_of(over),
-        "task": as_setting(task) if isinstance(task, Task) else task,
-        "objective": _own_name(objective) if callable(objective) else objective,
-        "policy": as_setting(policy) if isinstance(policy, Policy) else policy,
-        "set": _set_by(scene, settings.get("exposure")),
-        "metrics": metrics_as_settings(metrics or {}),
-    }
-    config = AttackConfig(**{**described, **options, "run": None if run is None else str(run)})
-    losses.check_aim(objective, targeted=config.target is not None)
-    parts = [f"the model {model_name(network)}" for network in several(model) if exists_here(network)]
-    parts += ["the scene"] if scene.only_here else []
-    parts += [f"the task {task.name}"] if isinstance(task, Task) and not is_named(task, make_task) else []
-    parts += [f"the objective {config.objective}"] if callable(objective) else []
-    parts += [f"the policy {policy.name}"] if isinstance(policy, Policy) and not is_named(policy, _policy_of) else []
-    parts += [f"the control {name}" for name in (*only_here(controls), *only_here(over))]
-    parts += [f"the metric {name}" for name in metrics_only_here(config.metrics)]
-    if config.workers is not None or config.cluster is not None:
-        check_shared(config.metrics)
-    config = config.with_only_here(parts)
-    if config.is_matrix and config.ensemble is None:
-        raise InputError(
-            "model: expected one, got several; add `ensemble`, which attacks them together, or attack each by itself"
-        )
-    if config.epsilons:
-        listed = ", ".join(f"{one:g}" for one in config.epsilons)
-        raise InputError(
-            f"epsilon: expected one, got {listed}; attack with each, or have `advsearch attack` draw the curve"
-        )
-    if config.aov is not None and config.run is None:
-        raise InputError("aov: expected `run` beside it, the folder that keeps the layers; name one")
-    searched, drawn = controls_given(config, controls, over)
-    policy = policy if isinstance(policy, Policy) else config.policy_name
-    named = config.objective if objective is None or isinstance(objective, str) else objective
-    asked, objective = task_and_objective(config, task if isinstance(task, Task) else config.task, named)
-    stopped = run_path(run) if resume and run is not None and is_run(run_path(run)) else None
-    with begun(config) if run is not None and stopped is None else nullcontext(stopped) as folder:
-        loaded = models_as_one(model, config, asked)
-        measured = load_metrics(config.metrics, metrics)
-        job = AttackParts(config, scene, loaded, asked, searched, drawn, objective, policy, run is not None, measured)
-        return _carry_out(job, watcher(progress), folder)
+SEARCHED_WITH = ("the objective", "the policy", "the metric")
+"""How the parts of a run begin that say nothing of whether its result is right."""
 
 
 def attack_once(
@@ -180,7 +85,7 @@ def attack_once(
     progress = progress or NullProgress()
     progress.stage(LOADING)
     job = replace(parts_of(config), clean=clean or CleanMatrix())
-    return _carry_out(job, progress, resumed)
+    return carry_out(job, progress, resumed)
 
 
 def attack_on(config: AttackConfig, scene: Scene, model: Model) -> AttackResult:
@@ -189,43 +94,10 @@ def attack_on(config: AttackConfig, scene: Scene, model: Model) -> AttackResult:
     Raises:
         InputError: as for `attack`.
     """
-    return _carry_out(parts_given(config, scene, model), NullProgress())
+    return carry_out(parts_given(config, scene, model), NullProgress())
 
 
-def _own_name(objective: Callable[..., Tensor]) -> str:
-    """What an objective of the caller's is called; never as one of ours."""
-    name = str(getattr(objective, "__name__", None) or type(objective).__name__)
-    return f"own {name}" if name in OBJECTIVE_KINDS else name
-
-
-def _policy_of(setting: str | Mapping[str, Any]) -> Policy[Any]:
-    config = AttackConfig(object="mug", policy=setting)
-    return make_policy(config.policy_name, **config.policy_options)
-
-
-def _scene(scene: Scene | str | Path | Mapping[str, Any], object: str | None, settings: Mapping[str, Any]) -> Scene:
-    """The scene as it was given, or the one that a name and the settings describe."""
-    if isinstance(scene, Scene):
-        check_not_of_scene({**settings, "object": object})
-        return scene
-    said = SceneConfig(**{"object": "mug", **{name: one for name, one in settings.items() if name in OF_SCENE}})
-    given = told_of_scene(said)
-    if object is not None:
-        return load_scene(object, said.environment, scene=scene, **given)
-    if isinstance(scene, Mapping):
-        raise InputError("object: which shape of the scene is it? Give its id")
-    return load_scene(scene, said.environment, **given)
-
-
-def _set_by(scene: Scene, exposure: float | None) -> dict[str, float | str]:
-    """The parameters of the scene that were fixed, but for the exposure where an option says it."""
-    fixed = scene.description.given_values
-    if exposure:
-        fixed.pop("camera.exposure", None)
-    return fixed
-
-
-def _carry_out(job: AttackParts, progress: Progress, resumed: str | Path | None = None) -> AttackResult:
+def carry_out(job: AttackParts, progress: Progress, resumed: str | Path | None = None) -> AttackResult:
     """Do it all, or what is left of a run, in a run directory if it is kept."""
     with ExitStack() as stack:
         kept = None if resumed is None else stack.enter_context(RunDirectory.of(job.config, resumed))
@@ -261,26 +133,250 @@ def _carry_out(job: AttackParts, progress: Progress, resumed: str | Path | None 
 def attack_worker(settings: JsonObject) -> Call:
     """Return what evaluates the queries of the attack that the settings describe: what a worker does."""
     problem = problem_on(parts_of(AttackConfig(**settings)))
-    return worker_call(lambda name: problem)
+    return worker_call(problems_by_name(problem))
 
 
 def _policy(job: AttackParts, problem: Problem) -> Policy[Any]:
     """The policy. Where a model lets no gradient through, `auto` climbs by differences of whole pictures. A model
     behind an address has none, so that `auto` climbs nowhere else, and others that climb are refused."""
-    balls = all(block.norm != "box" for block in problem.domain.blocks)
-    name = job.policy if isinstance(job.policy, str) else job.policy.name
+    config, norms = job.config, {block.norm for block in problem.domain.blocks}
+    policy = make_policy(job.policy, **config.policy_options) if isinstance(job.policy, str) else job.policy
     if isinstance(problem.model.module, Asked):
-        if name == "auto":
-            boxes = all(block.norm == "box" for block in problem.domain.blocks)
-            return with_derivatives(WithoutAscent() if boxes else make_policy("nes"), job.config)
-        policy = make_policy(job.policy, **job.config.policy_options) if isinstance(job.policy, str) else job.policy
-        if policy.uses_gradient:
+        if policy.name == "auto":
+            policy = WithoutAscent() if norms == {"box"} else make_policy("nes")
+        elif policy.uses_gradient:
             raise InputError(
-                f"policy: {name} follows the model's gradient, and {problem.model.name}, behind an address, has none; "
-                "use auto, cmaes, nes, random, sobol or grid"
+                f"policy: {policy.name} follows the model's gradient, and {problem.model.name}, behind an address, has "
+                "none; use auto, cmaes, nes, random, sobol or grid"
             )
-    if name == "auto" and balls and not problem.model.differentiable:
+    elif policy.name == "auto" and "box" not in norms and not problem.model.differentiable:
         return make_policy("nes")
-    if not isinstance(job.policy, str):
-        return with_derivatives(job.policy, job.config)
-    return with_derivatives(make_policy(job.policy, **job.config.policy_options), job.config)
+    asked = "estimators" if config.estimators else "measure" if config.measure == "full" else None
+    if asked and not policy.uses_gradient:
+        raise InputError(f"{asked}: policy {policy.name} takes no derivatives; leave one of the two out")
+    return policy
+
+
+# ---- what is asked for ----------------------------------------------------------------------------------------------
+
+
+@dataclass
+class AttackParts:
+    """Everything that was asked for, found and loaded: the model and what was said of it, a task that is not yet on the
+    model, the controls that are searched and those `over` that vary by chance; objective and policy may be the caller's
+    own. Attacks may share `clean`, the matrix of light transport of the clean scene. A run is kept in a folder, or
+    (`keep`) not."""
+
+    config: AttackConfig
+    scene: Scene
+    loaded: tuple[Model, list[str]]
+    task: Task
+    controls: tuple[Any, ...]
+    over: tuple[Any, ...]
+    objective: str | Callable[..., Tensor]
+    policy: str | Policy[Any]
+    keep: bool
+    metrics: Metrics = field(default_factory=dict)
+    clean: CleanMatrix = field(default_factory=CleanMatrix)
+
+
+def parts_of(config: AttackConfig) -> AttackParts:
+    """Find and load everything that a configuration names; nothing is rendered."""
+    if len(config.objects) > 1:
+        raise one_only("object", config.objects)
+    searched, drawn = controls_given(config, config.controls, config.over)
+    task, objective = task_and_objective(config, config.task, config.objective)
+    policy = make_policy(config.policy_name, **config.policy_options)
+    scene = lent(SCENE, config.object) or scene_of(config)
+    model = models_as_one(config.model, config, task)
+    metrics = load_metrics(config.metrics)
+    return AttackParts(config, scene, model, task, searched, drawn, objective, policy, True, metrics)
+
+
+def parts_in(run: Path) -> AttackParts:
+    """Find and load everything that the run of an attack was asked with, as its result is judged."""
+    if needed := [one for one in only_python_has(run) if not one.startswith(SEARCHED_WITH)]:
+        raise InputError(f"{run}: {', '.join(needed)}: only the Python session that asked has what judges its result")
+    return parts_of(judged_alone(AttackConfig.from_yaml(run / CONFIG)))
+
+
+def parts_given(config: AttackConfig, scene: Scene, model: Model) -> AttackParts:
+    """Find what a configuration names besides its scene and its model."""
+    searched, drawn = controls_given(config, config.controls, config.over)
+    task, objective = task_and_objective(config, config.task, config.objective)
+    policy = make_policy(config.policy_name, **config.policy_options)
+    return AttackParts(config, scene, (model, []), task, searched, drawn, objective, policy, False)
+
+
+def controls_given(
+    config: AttackConfig, searched: Controls, drawn: Controls
+) -> tuple[tuple[Control, ...], tuple[Control, ...]]:
+    """The controls that are searched and those that vary by chance, with the run's settings; only a search has a
+    budget."""
+    check_run_settings(config)
+    without_budget = config.model_copy(update={"epsilon": None})
+    searched_controls = given_to(config, searched)
+    for control in searched_controls:
+        likely = [name for name, spec in getattr(control, "specs", {}).items() if by_distribution(spec)]
+        if likely:
+            raise InputError(
+                f"`controls` {control.name}.{likely[0]}: expected values to search, which are all as good, got how "
+                "likely each is; give a range, or put it into `over`, under which it varies by chance"
+            )
+    return searched_controls, given_to(without_budget, drawn)
+
+
+def task_and_objective(
+    config: AttackConfig, task: AnyTask, objective: AnyObjective | None
+) -> tuple[Task, AnyObjective]:
+    """The task, and the objective that was asked for or else the task's own, checked before anything is loaded."""
+    made = make_task(task)
+    wanted = made.objective if objective is None else objective
+    check_objective(wanted, made.name, targeted=config.target is not None, minimise=config.minimise)
+    return made, wanted
+
+
+def models_as_one(model: AnyModel | Sequence[AnyModel], config: AttackConfig, task: Task) -> tuple[Model, list[str]]:
+    """Load the model, or the models of an ensemble as one; their warnings become sentences of the run."""
+    models, warnings = load_models(several(model), task, config)
+    return models[0] if len(models) == 1 else together(models, config.resolution), warnings
+
+
+def check_from_config(config: AttackConfig) -> None:
+    """Refuse what a configuration names that is not there, contradicts itself, or could not be judged; nothing is
+    rendered."""
+    job = parts_of(config)
+    _task(job, shows=False)
+    size = config.resolution or job.loaded[0].input_size
+    make_space((*job.controls, *job.over), framed(job.scene.description, size))
+
+
+def problem_from_config(config: SceneConfig, *, denoise: str | None = None) -> tuple[Problem, list[str]]:
+    """Load what a configuration describes without searching: the problem, and warnings on the way."""
+    return problem_of_parts(parts_of(AttackConfig.of(config, denoise=denoise or config.denoise)))
+
+
+def problem_of_parts(parts: AttackParts, **changes: object) -> tuple[Problem, list[str]]:
+    """Return the problem that an attack was asked with, other settings in `changes` (of another `model`, its name), and
+    warnings on the way."""
+    config = parts.config.model_copy(update=changes)
+    model = (
+        models_as_one(config.model, config, parts.task) if "model" in changes else (parts.loaded[0], [*parts.loaded[1]])
+    )
+    job = replace(parts, config=config, loaded=model)
+    problem = problem_on(job)
+    return problem, [*job.loaded[1], *sentences(problem.space.moved)]
+
+
+def problem_of(config: AttackConfig, scene: Scene, model: Model, *, differentiated: bool = True) -> Problem:
+    """Return the problem of a configuration on a scene and a model that are there, in place of those that it names."""
+    return problem_on(parts_given(config, scene, model), differentiated=differentiated)
+
+
+def problem_on(job: AttackParts, *, differentiated: bool = True) -> Problem:
+    """Return the problem that parts make; `differentiated` as for `problem_of`."""
+    config, (model, _) = job.config, job.loaded
+    description = job.scene.description
+    task, facts = _task(job)
+    resolution = config.resolution or model.input_size
+    description = framed(description, resolution)
+    space = make_space((*job.controls, *job.over), description)
+    renderer = make_renderer(
+        description,
+        space,
+        resolution,
+        config.denoise,
+        config.seed,
+        config.estimators,
+        leave_out=EVERYTHING if config.specialise else NOTHING,
+        sampler=config.pixel_sampler,
+        differentiated=differentiated,
+    )
+    features_seed = seeds.stream(config.seed, "clean features")
+    objective, note = objective_for(job.objective, task, model, renderer, features_seed, config.ensemble)
+    if note:
+        job.loaded[1].append(note)
+    if config.printable:
+        searched = make_space(job.controls, description)
+        print_terms(searched, searched.start)  # refuses where nothing can be printed
+    problem = Problem(
+        renderer,
+        space,
+        model,
+        task,
+        facts,
+        objective,
+        next_count(config.pixel_sampler, config.search_spp),
+        config.seed,
+        searched=len(job.controls),
+        aovs=aovs_of(config.aov),
+        metrics=job.metrics,
+    )
+    for name in asked_by(job.objective):
+        problem.asked(problem.whole(problem.domain.start))(name)  # refuses what is not there
+    problem.steps, problem.draws = search_size(config, problem)
+    return problem
+
+
+def _task(job: AttackParts, *, shows: bool = True) -> tuple[Task, Callable[[Described, Looked], Facts]]:
+    """The task on the model, and what gives it facts; refuses what cannot be judged.
+
+    With `shows`, the task is shown a clean picture where it asks for one.
+    """
+    config, (model, _) = job.config, job.loaded
+    asked = job.task.seeking(job.objective) if isinstance(job.objective, str) else job.task
+    task = task_for(asked, model).on(model, target=config.target, minimise=config.minimise)
+    facts = partial(facts_of, job.scene, config.object, config)
+    alone = zip(task.tasks, task.models, strict=True) if isinstance(task, Together) else [(task, model)]
+    tasks = list[Task]()
+    for one, network in alone:
+        known = task.told(one, facts(dict)) if isinstance(task, Together) else facts(dict)
+        check_truth(one, network, job.scene, known, config)
+        tasks.append(shown(one, network, [job.scene], config) if shows else one)
+        job.loaded[1].extend(remark for remark in tasks[-1].remarks if remark not in job.loaded[1])
+    task = replace(task, tasks=tuple(tasks)) if isinstance(task, Together) else tasks[0]
+    return each_thing(task) if config.judge == ALL else task, facts
+
+
+def search_size(config: AttackConfig, problem: Problem) -> tuple[int, int]:
+    """Return the steps of a search, and how many conditions each looks at: what was asked for, or what is right for
+    one picture, or for many conditions: predicted, rendered, or rendered where only a few numbers are searched."""
+    if problem.conditions is None:
+        return config.steps or STEPS, 1
+    usual = OVER_ONE if problem.conditions.dim == 1 else OVER_PREDICTED
+    predicted = reason_against(problem, config.steps or usual[0], config.specialise) is None
+    balls = any(block.norm != "box" for block in problem.domain.blocks)
+    steps, draws = usual if predicted else OVER_RENDERED if balls else OVER_NUMBERS
+    return config.steps or steps, config.draws or draws
+
+
+def is_named(entry: Task | Policy[Any], make: Callable[[Any], object]) -> bool:
+    """Whether a file can name a task or a policy, with all of its options."""
+    try:
+        return bool(make(as_setting(entry)) == entry)
+    except InputError:
+        return False
+
+
+def judged_alone(config: AttackConfig) -> AttackConfig:
+    """Return what the adversarial scene of a run is judged with: what counts as success needs no metric, and neither an
+    objective nor a policy that only the session had which searched with them."""
+    change: dict[str, object] = {"metrics": {}}
+    if config.objective is not None and config.objective not in OBJECTIVE_KINDS:
+        change["objective"] = None
+    if config.policy_name not in POLICIES:
+        change["policy"] = AttackConfig.model_fields["policy"].default
+    return config.model_copy(update=change)
+
+
+def executor_for(config: SceneConfig, function: str, progress: Progress) -> AbstractContextManager[Executor | None]:
+    """Return what carries out a function of a configuration, as its workers and cluster say; None for this process."""
+    settings = config.to_repeat().model_copy(update={"workers": None, "cluster": None}).plain()
+    work = Work(function, settings, FILES, config.used_threads or 1)
+    workers, cluster = (getattr(config, name, None) for name in ("workers", "cluster"))
+    if (workers or cluster) and has_address(config.model):
+        raise InputError(
+            f"{'workers' if workers else 'cluster'}: a model behind an address is asked by one process, which counts "
+            "its calls; leave it out"
+        )
+    return executor_of(work, workers=workers, cluster=cluster, tell=progress.message)

@@ -12,12 +12,14 @@ from torch import Tensor
 from advsearch.attacks import Ending, SearchResult, Verification, count_right
 from advsearch.attacks.candidates import Bracket, FoundFailure
 from advsearch.attacks.rate_samples import MOST_TIMES, MOVED, OVER_LADDER
+from advsearch.described import OUT_OF_VIEW
 from advsearch.engine.journal import Journal
 from advsearch.engine.objective import domain_of, print_terms
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Findings, Stages, control_group, lost_remarks, mean_number, verified_rate
 from advsearch.engine.transport import remark
 from advsearch.questions.attack import summary as results
+from advsearch.questions.attack.page import attack_page
 from advsearch.questions.attack.result import (
     AttackResult,
     KeptPicture,
@@ -32,8 +34,8 @@ from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.stages import UNPRINTED
 from advsearch.questions.attack.summary import AttackSummary, PicturedPrediction
 from advsearch.report.wording import number_text
-from advsearch.runs.directory import RunDirectory
-from advsearch.runs.files import write_bytes
+from advsearch.runs.directory import REPORT, RunDirectory
+from advsearch.runs.files import write_bytes, write_text
 from advsearch.runs.results import (
     AverageCase,
     DescribedValue,
@@ -48,7 +50,6 @@ from advsearch.runs.results import (
 from advsearch.runs.summary import write_configuration
 from advsearch.tasks import Judgement
 from advsearch.tasks.base import mean
-from advsearch.viewer.pages import write_page
 
 T = TypeVar("T")
 
@@ -92,7 +93,7 @@ def summarise(
     )
     if run is not None:
         run.write_summary(summary)
-        write_page(run.path, summary)
+        write_text(run.path / REPORT, attack_page(run.path, summary), durable=False)
         if not findings.interrupted:
             run.finish()
     return AttackResult(
@@ -356,8 +357,9 @@ def _gradients(search: SearchResult) -> results.SearchGradients:
 
 
 def _average(findings: Findings) -> AverageCase:
-    counted = count_right(findings.average, findings.spp)
-    scores = [trial.score for trial in findings.average]
+    shown = [trial for trial in findings.average if trial.prediction.label != OUT_OF_VIEW] or findings.average
+    counted = count_right(shown, findings.spp)
+    scores = [trial.score for trial in shown]
     return AverageCase(
         configurations=counted.trials,
         correct=counted.successes,

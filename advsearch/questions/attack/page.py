@@ -61,8 +61,11 @@ def page(run: Path, result: Result) -> str | None:
     Raises:
         FileFormatError: the results are damaged.
     """
-    if not isinstance(result, AttackSummary):
-        return None
+    return attack_page(run, result) if isinstance(result, AttackSummary) else None
+
+
+def attack_page(run: Path, result: AttackSummary) -> str:
+    """See `page`."""
     given, thing = shown(result), read_object(run)
     frames, curves = _read_frames(run / directory.IMAGES / "search.gif"), _read_curves(run / store.NAME)
     sections = [

@@ -26,7 +26,6 @@ from advsearch.engine.problem import Problem
 from advsearch.engine.record import KEPT, Findings
 from advsearch.engine.rendering import Rendering, pictures_of, render
 from advsearch.errors import InputError
-from advsearch.questions.attack.parts import AttackParts
 from advsearch.questions.attack.summary import AlongDrive, AttackSummary
 from advsearch.registry import names_code
 from advsearch.report.figures import new_axes, search_axes
@@ -47,6 +46,8 @@ from advsearch.tasks import Judgement, Mark
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
+
+    from advsearch.questions.attack.carry_out import AttackParts
 
 
 class RenderKeywords(TypedDict, total=False):

@@ -18,7 +18,6 @@ import torch
 from torch import Tensor
 
 from advsearch import seeds
-from advsearch.api import carry_out
 from advsearch.attacks import clopper_pearson
 from advsearch.attacks.verification import WORST_CASE
 from advsearch.cluster import Call, Work
@@ -34,9 +33,14 @@ from advsearch.engine.verifier import RetrialCondition, Retrials
 from advsearch.errors import ClusterError
 from advsearch.files import JsonObject
 from advsearch.progress import Progress
-from advsearch.question import Asked
-from advsearch.questions.attack.carry_out import attack_once
-from advsearch.questions.attack.parts import LOADING, check_from_config, executor_for, problem_from_config
+from advsearch.question import Asked, carry_out
+from advsearch.questions.attack.carry_out import (
+    LOADING,
+    attack_once,
+    check_from_config,
+    executor_for,
+    problem_from_config,
+)
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.summary import (
     AttackSummary,

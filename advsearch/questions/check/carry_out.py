@@ -32,7 +32,7 @@ from advsearch.engine.planning import (
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Results, kept_rows
 from advsearch.progress import NullProgress, Progress
-from advsearch.questions.attack.parts import LOADING, problem_from_config
+from advsearch.questions.attack.carry_out import LOADING, problem_from_config
 from advsearch.questions.check.result import CheckConfig, CheckedRow, CheckResult, GainRow, SearchPlan, TexelRow
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results import Measured, PathLength

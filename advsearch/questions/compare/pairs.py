@@ -28,7 +28,7 @@ from advsearch.questions.sweep.job import Scenes
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.questions.sweep.summary import SweepSummary
 from advsearch.report.wording import short_names
-from advsearch.rules import FEWEST_ROWS, find_rules, halves, interval_of, observed
+from advsearch.rules import FEWEST_ROWS, find_rules, halves, interval_of, is_shown, observed
 from advsearch.runs.directory import CONFIG
 from advsearch.runs.files import write_bytes
 from advsearch.runs.summary import read_result
@@ -105,16 +105,20 @@ def read_sides(folders: Sequence[Path]) -> list[Side]:
         names = [", ".join(filter(None, (side.folder.name, name))) for side, name in zip(sides, names, strict=True)]
     if len(set(names)) < len(names):
         names = [f"{number + 1}: {name}" for number, name in enumerate(names)]
-    return [replace(side, name=name) for side, name in zip(sides, names, strict=True)]
+    shown = np.logical_and.reduce([is_shown(side.rows) for side in sides])
+    if not shown.any():
+        raise InputError(f"compared: expected pictures with the object in them, got none in {folders[0]}")
+    rows = [side.rows[shown].reset_index(drop=True) for side in sides]
+    return [replace(side, name=name, rows=own) for side, name, own in zip(sides, names, rows, strict=True)]
 
 
 def _sides_of(folder: Path, *, alone: bool) -> Iterator[Side]:
     summary = read_result(folder)
     if not isinstance(summary, SweepSummary):
         raise FileFormatError(f"{folder}: expected the run of a sweep, got one of {summary.command}; sweep first")
-    if summary.goes_on or summary.configurations != summary.planned:
+    if summary.goes_on or summary.looked_at != summary.planned:
         raise FileFormatError(
-            f"{folder}: expected a sweep that has ended, got one with {summary.configurations} of {summary.planned} "
+            f"{folder}: expected a sweep that has ended, got one with {summary.looked_at} of {summary.planned} "
             f"predictions; go on with it: advsearch resume {folder}"
         )
     config, rows = SweepConfig.from_yaml(folder / CONFIG), read_sweep(folder)

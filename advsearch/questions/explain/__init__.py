@@ -96,12 +96,13 @@ def explain(asked: Asked[ExplainConfig]) -> ExplainResult:
         rule_counts,
     )
     from advsearch.questions.explain.renders import AskedSweep, Renders, read_predictions
-    from advsearch.rules import FEWEST_ROWS, find_rules, halves, is_independent, observed
+    from advsearch.rules import FEWEST_ROWS, find_rules, halves, is_independent, is_shown, observed
 
     config, progress = asked.config, asked.progress
     progress.stage("reading rows")
     sweeps = [AskedSweep.of(folder) for name in split_names(config.sweeps) for folder in _sweeps_of(find_run(name))]
     rows = read_predictions(sweeps)
+    rows = rows[is_shown(rows)].reset_index(drop=True)
     if len(rows) < FEWEST_ROWS:
         raise InputError(f"explain: expected at least {FEWEST_ROWS} rows, got {len(rows)}; sweep more configurations")
     table = observed(rows, rows.attrs["units"])

@@ -30,7 +30,7 @@ from advsearch.questions.sweep.carry_out import scenes_of
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.questions.sweep.summary import SweepSummary
 from advsearch.report.wording import figure_value
-from advsearch.rules import CountedRule, Mask, RuleConditions, covered
+from advsearch.rules import CountedRule, Mask, RuleConditions, covered, is_shown
 from advsearch.runs.directory import CONFIG, PARTS
 from advsearch.runs.summary import read_result
 from advsearch.runs.tables import read_sweep
@@ -88,7 +88,7 @@ def read_predictions(sweeps: Sequence[AskedSweep]) -> pd.DataFrame:
     draw_of = [sorted({*draws}).index(one) for one in draws]
     named = [f"{unit} {draw_of[sweep]}" for unit, sweep in zip(found["unit"], found["sweep"], strict=True)]
     found["unit"] = np.unique(named, return_inverse=True)[1]
-    found["correct"] = found["correct"] == 1
+    found["correct"] = (found["correct"] == 1) & is_shown(found)
     found.attrs["units"] = units
     return found
 
@@ -280,7 +280,7 @@ class Renders:
                 own = sweep_inside(one.config, self.table, rule.conditions, samples, seed, side)
                 rows = self._rendered(f"rule-{number + 1}-{place}" + (f"-{side}" if side else ""), own)
                 if rows is not None:
-                    inside = rows[covered(rule.conditions, rows) & beyond(before, rows)]
+                    inside = rows[covered(rule.conditions, rows) & beyond(before, rows) & is_shown(rows)]
                     fresh.append(inside.assign(unit=inside["unit"].astype(str) + f" of {part}"))
         kept = pd.concat(fresh) if fresh else self.rows[:0]
         if kept.empty:

@@ -5,40 +5,30 @@ from __future__ import annotations
 
 import gc
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
-
-import numpy as np
-from scipy.stats import binomtest
 
 from advsearch import seeds
 from advsearch.api.keywords import asks, configured
 from advsearch.attacks import clopper_pearson
-from advsearch.cluster import Executor, InProcess
+from advsearch.attacks.trials import mcnemar
 from advsearch.engine.journal import check_made_of
 from advsearch.engine.naming import AnyModel, check_not_spread, check_run_settings, load_models, model_name
 from advsearch.engine.record import Stages
-from advsearch.errors import ClusterError, InputError, ModelError
+from advsearch.errors import InputError, ModelError
 from advsearch.models.reference import trainable
 from advsearch.models.source import split_weights
-from advsearch.progress import Progress, Watched, watcher
+from advsearch.progress import Watched, watcher
 from advsearch.question import Asked
-from advsearch.questions.attack.parts import LOADING, executor_for
-from advsearch.questions.harden import scenes, training
-from advsearch.questions.harden.detectors import DetectorRounds, Loss, Student, check_detector, read_coco
-from advsearch.questions.harden.lessons import FOLDER, Lesson
-from advsearch.questions.harden.result import (
-    PLAIN_SCENES,
-    RENDERED_SCENES,
-    HardenConfig,
-    HardenedControl,
-    HardenResult,
-    Share,
-    SplitSide,
-)
-from advsearch.questions.harden.scenes import FURTHER, HELD_OUT, ROBUST, TRAINING, VALIDATION, SceneWork, Wanted
-from advsearch.questions.harden.training import WEIGHTS, Course, Examples, MakeOptimiser
+from advsearch.questions.attack.carry_out import LOADING, executor_for
+from advsearch.questions.harden import scenes
+from advsearch.questions.harden.detectors import DetectorCourse, Loss, read_coco
+from advsearch.questions.harden.result import HardenConfig, HardenedControl, HardenResult, Share, SplitSide
+from advsearch.questions.harden.rounds import PICTURES, WEIGHTS, Course, MakeOptimiser, Rounds
+from advsearch.questions.harden.scenes import FURTHER, HELD_OUT, ROBUST, TRAINING, VALIDATION, SceneWork
+from advsearch.questions.harden.segmenters import SegmenterCourse
+from advsearch.questions.harden.training import ClassifierCourse, Examples
 from advsearch.rooms import made_question
 from advsearch.runs.directory import ARTIFACTS, RunDirectory, is_run, run_path
 from advsearch.runs.results import SharedWork
@@ -48,8 +38,6 @@ from advsearch.tasks import make_task
 MEANS = "means"  # the note of what a training has from Python
 MEASUREMENTS = ("before", "stronger_before", "after", "stronger")
 """What is measured over each control, by its name in the table."""
-SHARED, MOVED = 0.25, 0.5
-"""Shares of the scenes with a texture in which all views have the same, and in which rendered controls vary too."""
 
 
 @asks(HardenConfig)
@@ -69,14 +57,16 @@ def harden(
     is given stays as it is.
 
     Args:
-        model: a classifier: what `load_model` takes, and no exported program.
+        model: a classifier, a detector or a segmenter: what `load_model` takes, and no exported program.
         optimiser: makes one of the list of parameters, such as ``lambda p: torch.optim.SGD(p, 0.01)``; its learning
             rate is then the highest, in place of `rate`.
         beside: batches of further examples, such as a `DataLoader`: images (N, H, W, 3) sRGB in [0, 1], class indices
             (N,). One is taken with each step. Not of a detector, which `data` is for.
         loss: of a detector whose network returns none in training: a function of the network, its input (N, 3, H, W)
             and, for each picture, a mapping with "boxes" (K, 4), x0, y0, x1, y1 in pixels of that input, and "labels"
-            (K,), indices of the model's labels. It returns a number that is smaller where the network is better.
+            (K,), indices of the model's labels; of a segmenter with "classes" (h, w) int64, the class that each pixel
+            of its output should have, and "object" (h, w) bool, those of the object. It returns a number that is
+            smaller where the network is better.
         resume: go on with the run of that name, if there is one, where it was stopped; everything else has to be as it
             was.
     """
@@ -104,32 +94,42 @@ def hardened(
     config = asked.config
     asked.progress.stage(LOADING)
     check_run_settings(config)
-    finds = config.task_name == "detection"
-    if not finds and (config.task_name != "classification" or config.data or loss):
-        raise InputError("task: harden trains for classification and detection; `data` and `loss` are of detection")
-    if finds:
-        check_detector(config, beside)
+    finds, segments = config.task_name == "detection", config.task_name == "segmentation"
+    places = finds or segments
+    if not places and (config.task_name != "classification" or config.data or loss):
+        raise InputError(
+            "task: harden trains for classification, detection and segmentation; `data` is of detection, and `loss` of "
+            "both of the others"
+        )
+    if segments and config.data:
+        raise InputError("data: is of detection; leave it out")
+    if places and beside is not None:
+        raise InputError("beside: is of classifiers; give a detector a COCO folder as `data`")
+    if places and config.layers != "all":
+        raise InputError("layers: expected all of a detector or a segmenter; leave it out")
     try:
         (loaded, *_), warnings = load_models([model or config.model], make_task(config.task), config)
     except ModelError as error:
         if config.task_name != "classification":
             raise
         said = str(error).partition(": use `task=")[0]
-        raise ModelError(f"{said}; harden trains classifiers and, with `task=detection`, detectors") from error
-    work = SceneWork(config, loaded, scenes.splits_of(config, loaded))
-    course: Course | DetectorRounds
+        raise ModelError(f"{said}; harden trains classifiers, and with `task` detectors and segmenters") from error
+    work = SceneWork(config, loaded, scenes.splits_of(config, loaded), asked.progress)
+    student, means = trainable(loaded, config.layers, logits=not places), {"optimiser": optimiser is not None}
+    course: Course[Any]
     if finds:
         own = [] if config.data is None else read_coco(Path(config.data), loaded)
-        course = DetectorRounds(asked.run, work, Student.of(loaded, loss), own, optimiser, asked.progress)
+        course, means["loss"] = DetectorCourse(work, student, optimiser, own, loss), loss is not None
+    elif segments:
+        course, means["loss"] = SegmenterCourse(work, student, optimiser, loss), loss is not None
     else:
-        course = Course(trainable(loaded, config.layers), loaded, config, optimiser, beside)
-    means = {"optimiser": optimiser, "beside": beside, **({"loss": loss} if finds else {})}
-    _same_means(asked.run, {name: one is not None for name, one in means.items()})
+        course, means["beside"] = ClassifierCourse(work, student, optimiser, beside), beside is not None
+    _same_means(asked.run, means)
     check_made_of(asked.run, [loaded])
-    run = Hardening(asked.run, course, work, asked.progress)
+    run = Hardening(asked.run, course)
     with asked.until_interrupted():
-        with executor_for(config, "advsearch.questions.harden.scenes:scenes_of", asked.progress) as executor:
-            run.carry_out(executor or InProcess(work))
+        with executor_for(config, "advsearch.questions.harden.scenes:scenes_of", asked.progress) as work.executor:
+            run.carry_out()
     return run.result(asked, warnings)
 
 
@@ -146,29 +146,22 @@ def _same_means(run: RunDirectory, given: dict[str, bool]) -> None:
 
 
 class Hardening:
-    """One run of `harden`: a course that trains a copy of the model, and scenes, with what was asked and the model as
-    it was given. `wrong` says of what is measured, and of the number of a scene, whether it is not robust."""
+    """One run of `harden`. `wrong` says of what is measured, and of the number of a scene, whether it is not robust;
+    `clean` how many plain pictures are right, before and after, of all."""
 
-    def __init__(self, run: RunDirectory, course: Course | DetectorRounds, work: SceneWork, progress: Progress) -> None:
-        self.run, self.course, self.scenes, self.progress, self.config = run, course, work, progress, work.config
-        self.rounds: DetectorRounds | training.TrainingRounds
-        if isinstance(course, DetectorRounds):
-            self.rounds, self.further = course, 0
-        else:
-            self.rounds = training.TrainingRounds(run, course, self.drawn, progress)
-            self.further = RENDERED_SCENES if work.rendered else PLAIN_SCENES
+    def __init__(self, run: RunDirectory, course: Course[Any]) -> None:
+        self.run, self.course, self.scenes, self.config = run, course, course.work, course.config
+        self.rounds, self.stages = Rounds(run, course), Stages(course.work.progress)
         self.wrong = {(row.kind, row.step): bool(row.success) for row in run.store.rows()}
-        self.clean: dict[str, Share] = {}
-        self.stages = Stages(progress)
-        self._executor: Executor = InProcess(work)
-        searched = self.config.scenes * self.config.rounds
-        held = scenes.CLEAN_SCENES * self.config.measured  # of which a part is attacked
-        self.counts = {TRAINING: searched, FURTHER: self.further * searched, VALIDATION: self.rounds.judged}
-        self.counts[HELD_OUT] = held
+        self.clean: Mapping[str, Share] = {}
+        searched, held_out = self.config.scenes * self.config.rounds, scenes.CLEAN_SCENES * self.config.measured
+        self.counts = {
+            TRAINING: searched, FURTHER: course.further * searched, VALIDATION: self.rounds.judged, HELD_OUT: held_out
+        }  # fmt: skip
 
-    def carry_out(self, executor: Executor) -> None:
-        """Measure, train, and measure again; the executor does what there is to do with scenes."""
-        self._executor, sides, stages = executor, self.scenes.splits, self.stages
+    def carry_out(self) -> None:
+        """Measure, train, and measure again."""
+        sides, stages = self.scenes.splits, self.stages
         scenes.check_disjoint(sides[HELD_OUT], [sides[name] for name in (TRAINING, FURTHER, VALIDATION)])
         gc.freeze()  # as of `scenes_of`
         try:
@@ -181,56 +174,15 @@ class Hardening:
             stages.begin("measurement", "attacking the hardened model")
             self._measure("after", "attacking the hardened model", weights)
             self._measure("stronger", "attacking it with a stronger search", weights, known="after")
-            wanted = [scenes.Looking(number) for number in range(self.counts[HELD_OUT])]
-            self.progress.stage("looking at plain pictures of held-out scenes", len(wanted))
-            seen = [lesson for _, some in self._each(wanted) for lesson in some]
-            for which, model in (("before", self.scenes.model), ("after", self.course.student.model)):
-                self.clean[which] = _share(round(self.rounds.right_share(model, seen) * len(seen)), len(seen))
+            looks = [scenes.Looking(number, weights) for number in range(self.counts[HELD_OUT])]
+            right = [both for _, both in self.scenes.each("looking at plain pictures of held-out scenes", looks)]
+            seen = len(right) * scenes.CLEAN_VIEWS
+            self.clean = {
+                name: _share(sum(both[k] for both in right), seen) for k, name in enumerate(("before", "after"))
+            }
         finally:
             stages.end()
             gc.unfreeze()
-
-    def _each(self, wanted: Sequence[Wanted]) -> Iterator[tuple[int, Any]]:
-        """Have done what is wanted of scenes; yield the place of each and what came of it, in any order."""
-        places = {id(one): place for place, one in enumerate(wanted)}
-        for done in self._executor.results([one] for one in wanted):
-            (one,) = done.items
-            if done.lost:
-                raise ClusterError(f"harden, scene {one.number}: {done.lost}")
-            facts = self._executor.facts
-            self.progress.advance(1, **({} if facts is None else facts.told))
-            yield places[id(one)], done.value[0]
-
-    def drawn(self, title: str, split: str, places: Sequence[int], views: int) -> list[Lesson]:
-        """Return lessons of scenes: for each control whose pictures a matrix says, and for all others together.
-
-        In the training a fourth of the scenes have one texture for all views, in half of them the controls that are
-        rendered vary by chance, and further scenes come on top: of what is rendered new scenes teach more than further
-        views. Of what is rendered one in so many scenes is drawn as it is, too: there the given model's predictions
-        count.
-        """
-        linear, rendered, training = self.scenes.linear, self.scenes.rendered, split == TRAINING
-        wanted, draw = list[Wanted](), scenes.Drawing
-        for control in linear:
-            for number in places:
-                shared, moved = self.chance(control, number) if training else (False, False)
-                wanted.append(draw(split, number, (control,), views, 1, shared, self.scenes.beside if moved else ()))
-        more = [self.further * place + one for place in places for one in range(self.further)] if training else []
-        if rendered:
-            harder, plain = (1, 1) if training else (views, 0)
-            wanted += [draw(split, number, rendered, harder, plain) for number in places]
-            wanted += [draw(FURTHER, number, rendered, 1, 0) for number in more]
-        else:
-            wanted += [draw(FURTHER, number, linear[:1], 0, 1) for number in more]
-        self.progress.stage(title, len(wanted))
-        found = dict(self._each(wanted))
-        return [lesson for place in range(len(wanted)) for lesson in found[place]]
-
-    def chance(self, control: str, number: int) -> tuple[bool, bool]:
-        """Return whether all views of a scene have one texture, and whether other controls vary beside it. Not by
-        turns, as the objects take turns."""
-        shared, moved = np.random.default_rng(seeds.stream(self.config.seed, f"views of {control}", number)).random(2)
-        return bool(shared < SHARED), bool(moved < MOVED)
 
     def _measure(self, which: str, title: str, weights: bytes | None = None, *, known: str | None = None) -> None:
         """Attack the model, as it was given or with other weights, on every held-out scene over each control; what is
@@ -245,8 +197,7 @@ class Hardening:
                     self._note(which, control, number, wrong=True)
                 else:
                     wanted.append(scenes.Attacking(control, number, times, weights))
-        self.progress.stage(title, len(wanted), hint="`measured` and `steps` shorten it")
-        for place, ending in self._each(wanted):
+        for place, ending in self.scenes.each(title, wanted, hint="`measured` and `steps` shorten it"):
             self._note(which, wanted[place].control, wanted[place].number, wrong=ending != ROBUST)
 
     def _note(self, which: str, control: str, number: int, *, wrong: bool) -> None:
@@ -254,58 +205,42 @@ class Hardening:
         self.wrong[kind, number] = wrong
         self.run.record(Row(kind, number, seed=seed, spp=self.config.verify_spp, success=wrong))
 
-    def _robust(self, which: str, controls: Sequence[str]) -> Share | None:
-        """Scenes that are robust to the searches over all of some controls; None where some are not known."""
-        scenes_of = range(self.config.measured)
-        found = [[self.wrong.get((f"{which} {control}", number)) for control in controls] for number in scenes_of]
-        if any(None in wrong for wrong in found):
-            return None
-        return _share(sum(not any(wrong) for wrong in found), len(found))
-
-    def paired(self, controls: Sequence[str]) -> dict[str, Any]:
-        """How many scenes are robust after and were not before, the other way round, and how likely that is by
-        chance; nothing where not all are known."""
-        scenes_of = range(self.config.measured)
-        sides = {
-            which: [[self.wrong.get((f"{which} {control}", number)) for control in controls] for number in scenes_of]
-            for which in ("before", "after")
-        }
-        if any(None in wrong for side in sides.values() for wrong in side):
-            return {}
-        pairs = list(zip(*([any(wrong) for wrong in side] for side in sides.values()), strict=True))
-        gained, lost = pairs.count((True, False)), pairs.count((False, True))
-        p = float(binomtest(gained, gained + lost).pvalue) if gained + lost else 1.0
-        return {"gained": gained, "lost": lost, "p": p}
+    def _robust(self, which: str, controls: Sequence[str]) -> list[bool] | None:
+        """Whether each scene is robust to the searches over all of some controls; None where some are not known."""
+        numbers = range(self.config.measured)
+        wrong = [[self.wrong.get((f"{which} {control}", number)) for control in controls] for number in numbers]
+        return None if any(None in each for each in wrong) else [not any(each) for each in wrong]
 
     def result(self, asked: Asked[HardenConfig], warnings: list[str]) -> HardenResult:
         """Return what is known."""
-        config, done, names = self.config, asked.ending == "done", list(self.config.controls)
-        table = []
-        for control in names:
-            shares = {which: self._robust(which, [control]) for which in MEASUREMENTS}
+        config, done, table = self.config, asked.ending == "done", list[HardenedControl]()
+        for control in config.controls:
+            shares = {which: _share_of(self._robust(which, [control])) for which in MEASUREMENTS}
             if None not in shares.values():
                 table.append(HardenedControl.of({"control": control, **shares}))
+        before, after = (self._robust(which, list(config.controls)) for which in ("before", "after"))
+        paired: dict[str, Any] = {}
+        if before is not None and after is not None:
+            pairs = list(zip(before, after, strict=True))
+            gained, lost = pairs.count((False, True)), pairs.count((True, False))
+            paired = {"gained": gained, "lost": lost, "p": mcnemar(gained, lost)}
         if done and self.rounds.best == 0:
             warnings = [*warnings, "No round kept the clean accuracy, so the weights are the model's own."]
         weights, taught = self.run.path / ARTIFACTS / WEIGHTS, self.scenes.splits[TRAINING]
-        views = {
-            TRAINING: config.views,
-            FURTHER: 1,
-            VALIDATION: training.VALIDATION_VIEWS,
-            HELD_OUT: scenes.CLEAN_VIEWS,
-        }
+        views = dict(zip(self.counts, (self.course.views[0], 1, self.course.views[1], scenes.CLEAN_VIEWS), strict=True))
         split = {
             name: SplitSide.of({**vars(side), "scenes": self.counts[name], "views": views[name]})
             for name, side in self.scenes.splits.items()
         }
-        facts, (name, _) = self._executor.facts, split_weights(config.model)
+        name, _ = split_weights(config.model)
+        facts = self.scenes.executor and self.scenes.executor.facts
         return asked.result(
             HardenResult,
-            **self.paired(names),
+            **paired,
             environment=",".join(taught.environments),
             objects=list(taught.objects),
-            before=self._robust("before", names),
-            after=self._robust("after", names),
+            before=_share_of(before),
+            after=_share_of(after),
             clean_before=self.clean.get("before"),
             clean_after=self.clean.get("after"),
             table=table,
@@ -318,11 +253,15 @@ class Hardening:
             ],
             hardened=f"{name}@{weights}" if done and (name == "reference" or ":" in name) else None,  # or code makes it
             weights=str(weights) if done else None,
-            pictures=str(self.run.path / ARTIFACTS / FOLDER) if done else None,
+            pictures=str(self.run.path / ARTIFACTS / PICTURES) if done else None,
             shared=SharedWork.of_facts(facts, facts.machines if facts else {}),
             warnings=warnings,
             seconds=self.stages.seconds,
         )
+
+
+def _share_of(flags: Sequence[bool] | None) -> Share | None:
+    return None if flags is None else _share(sum(flags), len(flags))
 
 
 def _share(right: int, count: int) -> Share:

@@ -1,55 +1,77 @@
-"""`harden` for detectors: a copy is trained on pictures that searches got wrong, with what is true in them, beside the
+"""How a detector is hardened: it is trained on pictures that searches got wrong, with what is true in them, beside the
 same scenes as they are and pictures of one's own. Losses are the network's, or a function of the caller's."""
 
 from __future__ import annotations
 
 import inspect
 import json
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from safetensors import torch as safetensors
 from torch import Tensor, nn
 from torch.nn.modules.batchnorm import _BatchNorm
 
 from advsearch import seeds
+from advsearch.engine.problem import Problem
 from advsearch.errors import FileFormatError, InputError, ModelError
 from advsearch.files import parse_json, read_text
 from advsearch.models import Model
-from advsearch.models.reference import copied_network
-from advsearch.models.source import frozen
+from advsearch.models.reference import Trainable
 from advsearch.pictures import upright
-from advsearch.progress import Progress
-from advsearch.questions.attack.carry_out import attack_on
-from advsearch.questions.attack.parts import problem_of
-from advsearch.questions.harden import scenes
-from advsearch.questions.harden.lessons import EXAMPLE_SPP, FOLDER, Example, examples
-from advsearch.questions.harden.result import HardenConfig, TrainingRound
+from advsearch.questions.attack.carry_out import attack_on, problem_of
+from advsearch.questions.harden.rounds import Course, MakeOptimiser, Score, Take
 from advsearch.questions.harden.scenes import SceneWork
-from advsearch.questions.harden.training import WEIGHTS
-from advsearch.runs.directory import ARTIFACTS, RunDirectory
 from advsearch.runs.files import write_bytes
 from advsearch.runs.images import write_png
 from advsearch.scene.formation import levels_of
+from advsearch.tasks import Task
+from advsearch.tasks.boxes import Place
+from advsearch.tasks.segmentation import Region
 
 Target = dict[str, Tensor]
 """What is in a picture: "boxes" (K, 4), x0, y0, x1, y1 in pixels of the network's input, and "labels" (K,) indices."""
 Loss = Callable[[nn.Module, Tensor, Sequence[Target]], Tensor]
 """From a network, its input (N, ...) and what is in each picture to a number that training makes smaller."""
 
-BATCH, WEIGHT_DECAY, LARGEST_GRADIENT_NORM = 8, 1e-4, 2.0
-PARTS = (1.0, 0.8, 0.6, 0.4, 0.2)
-"""Of the way from the weights that were given to the trained ones, which are judged (Wortsman et al. 2022)."""
-VIEWS = 2
-"""Pictures of a scene as it is beside those that were attacked, from other sides."""
+SPP = 8  # samples a pixel of a picture
+TRIALS = 6  # of a search
+SIDES = 3  # from which a scene is seen as it is
 SEEN = 5
 """How often an epoch looks at a picture that a search made, for each look at one as it is."""
 LARGEST, LARGEST_SIDE = 256 << 20, 8192
 """Bytes of a COCO file, and pixels along a picture of it."""
+
+
+class Example(NamedTuple):
+    """A picture (H, W, 3) uint8, all that is in it, boxes (K, 4) in its pixels and their classes (K,), and whether a
+    search has found it. What is not of one's own has the place of the thing in it, with the task that judges it."""
+
+    levels: Tensor
+    boxes: Tensor
+    labels: Tensor
+    task: Task | None = None
+    truth: Place | Region | None = None
+    found: bool = False
+
+    @classmethod
+    def of(cls, problem: Problem, seed: int, u: Tensor | None = None) -> Example:
+        """Render a configuration, or the scene as it is, with the conditions that a seed draws."""
+        at = problem.domain.start if u is None else u
+        truth: Place | Region = problem.truth(problem.whole(at, seed))
+        box = truth.box if isinstance(truth, Place) else None
+        boxes = torch.tensor([box] if box else [], dtype=torch.float32).reshape(-1, 4)
+        labels = torch.tensor([truth.labels[0]] * len(boxes), dtype=torch.int64)
+        return cls(levels_of(problem.picture(at, seed, SPP)), boxes, labels, problem.task, truth, u is not None)
+
+    def right(self, model: Model) -> bool:
+        """Whether the model is right about it."""
+        assert self.task is not None
+        with torch.no_grad():
+            return bool(self.task.margin(model(self.levels[None] / 255.0), self.truth)[0] <= 0.0)
 
 
 def read_coco(folder: Path, model: Model) -> list[Example]:
@@ -122,163 +144,86 @@ def own_loss(network: nn.Module, x: Tensor, targets: Sequence[Target]) -> Tensor
     return returned.sum()
 
 
-@dataclass(frozen=True, eq=False)
-class Student:
-    """A copy of a detector that is trained, and the model that asks the same weights."""
+class DetectorCourse(Course[Example]):
+    """Trains on the worst pictures that searches find for the student as it is, on the same scenes as they are, from
+    there and from other sides, and on examples of one's own; half of the time mirrored. Statistics of batches stay as
+    they are."""
 
-    network: nn.Module
-    model: Model
-    loss: Loss
+    batch, weight_decay, warm_up, views = 8, 1e-4, 0.3, (SIDES, SIDES)
 
-    @classmethod
-    def of(cls, model: Model, loss: Loss | None) -> Student:
-        """Return a copy to train; a ModelError where it has no weights."""
-        network = copied_network(model).requires_grad_(True)
-        if not list(network.parameters()):
-            raise ModelError(f"model {model.name}: has no parameters to train")
-        return cls(network, replace(model, module=frozen(network, model.name)), loss or own_loss)
-
-    def fit(
-        self, examples: Sequence[Example], epochs: int, rate: float, seed: int,
-        optimiser: Any = None, tick: Callable[[], None] = lambda: None,
+    def __init__(
+        self, work: SceneWork, student: Trainable, optimiser: MakeOptimiser | None = None,
+        own: Sequence[Example] = (), loss: Loss | None = None,
     ) -> None:  # fmt: skip
-        """Train on examples, half of the time mirrored. Statistics of batches stay as they are."""
-        network, rng = self.network.train(), np.random.default_rng(seed)
+        super().__init__(work, student, optimiser, own)
+        self.loss = loss or own_loss
+
+    def draw(self, title: str, split: str, places: Sequence[int]) -> list[Example]:
+        """Return pictures of scenes as they are, then the worst that a search finds over each control, whether or not
+        the student is wrong about it."""
+        side, controls, progress = self.work.splits[split], tuple(self.config.controls), self.work.progress
+        plain, worst = list[Example](), list[Example]()
+        progress.stage(title, len(places) * len(controls))
+        for number in places:
+            name, scene = side.scene(number)
+            for control in controls:
+                seed = seeds.stream(side.seed, f"search {control}", number)
+                config = self.work.attack((control,), name, seed=seed, trials=TRIALS, verify_spp=SPP)
+                searched = attack_on(config, scene, self.student.model)
+                problem = problem_of(config, scene, self.student.model, differentiated=False)
+                plain.append(Example.of(problem, seeds.stream(seed, "plain", 0)))
+                worst.append(Example.of(problem, seeds.stream(seed, "worst", 0), searched.u))
+                progress.advance(1)
+            around, _ = self.work.problem(side, number, controls[-1:])
+            plain += [Example.of(around, seeds.stream(seed, "plain", view)) for view in range(1, SIDES)]
+        return plain + worst
+
+    def looks(self, item: Example) -> int:
+        return SEEN if item.found else 1
+
+    @contextmanager
+    def gradients(self, new: Sequence[Example]) -> Iterator[Take]:
+        network = self.student.net.train()
         for part in network.modules():
             if isinstance(part, (_BatchNorm, nn.Dropout)):
                 part.eval()
-        parameters = list(network.parameters())
-        usual = torch.optim.AdamW(parameters, lr=rate, weight_decay=WEIGHT_DECAY)
-        moved = usual if optimiser is None else optimiser(parameters)
-        highest = [float(group["lr"]) for group in moved.param_groups]
-        steps = epochs * -(-len(examples) // BATCH)
-        rates = torch.optim.lr_scheduler.OneCycleLR(moved, highest, total_steps=steps + 1, cycle_momentum=False)
-        for _ in range(epochs):
-            order = rng.permutation(len(examples))
-            for begin in range(0, len(order), BATCH):
-                batch = [self._input(examples[place], bool(rng.random() < 0.5)) for place in order[begin:][:BATCH]]
-                moved.zero_grad()
-                loss = self.loss(network, torch.cat([x for x, _ in batch]), [target for _, target in batch])
-                loss.backward()
-                nn.utils.clip_grad_norm_(parameters, LARGEST_GRADIENT_NORM)
-                moved.step()
-                rates.step()
-                tick()
+
+        def take(batch: Sequence[Example], rng: np.random.Generator) -> None:
+            shown = [self.shown(item, bool(rng.random() < 0.5)) for item in batch]
+            network.zero_grad()
+            self.loss(network, torch.cat([x for x, _ in shown]), [target for _, target in shown]).backward()
+
+        yield take
         network.eval()
 
-    def _input(self, one: Example, mirrored: bool) -> tuple[Tensor, Target]:
-        """What the network is given for a picture, with what is in it in pixels of that."""
-        levels, boxes, (height, width) = one.levels, one.boxes, one.levels.shape[:2]
+    def shown(self, item: Example, mirrored: bool) -> tuple[Tensor, Target]:
+        """Return what the network is given for a picture, with what is in it in pixels of that."""
+        levels, boxes, (height, width) = item.levels, item.boxes, item.levels.shape[:2]
         if mirrored:
             levels = levels.flip(1)
             boxes = torch.stack([width - boxes[:, 2], boxes[:, 1], width - boxes[:, 0], boxes[:, 3]], dim=1)
-        rows, columns = self.model.input_size
+        rows, columns = self.student.model.input_size
         scale = torch.tensor([columns / width, rows / height] * 2)
-        x = self.model.prepared(levels[None] / 255.0)[:1]
-        return x, {"boxes": (boxes * scale).to(x.device), "labels": one.labels.to(x.device)}
+        x = self.student.model.prepared(levels[None] / 255.0)[:1]
+        return x, {"boxes": (boxes * scale).to(x.device), "labels": item.labels.to(x.device)}
 
+    def score(self, held_back: Sequence[Example]) -> Score:
+        right = [(item.found, item.right(self.student.model)) for item in held_back]
+        return Score(*(float(np.mean([known for found, known in right if found == which])) for which in (False, True)))
 
-class DetectorRounds:
-    """The rounds of a run: searches in scenes of the training, a training on what they found, and the choice of
-    weights by scenes that were not trained on."""
-
-    def __init__(
-        self, run: RunDirectory, work: SceneWork, student: Student, own: Sequence[Example], optimiser: Any,
-        progress: Progress,
-    ) -> None:  # fmt: skip
-        self.run, self.work, self.student, self.own, self.optimiser = run, work, student, own, optimiser
-        self.progress, self.config, self.done, self.best = progress, work.config, list[TrainingRound](), 0
-        self.given = {name: one.clone() for name, one in student.network.state_dict().items()}
-        self.judged = max(1, -(-self.config.scenes // 3))
-
-    @staticmethod
-    def right_share(model: Model, chosen: Sequence[Example]) -> float:
-        """Return the share of pictures that a model has right."""
-        return sum(one.right(model) for one in chosen) / len(chosen)
-
-    def carry_out(self) -> None:
-        """Train; the student has the best weights afterwards, which the run keeps. A run that goes on trains anew."""
-        pool, kept = list[Example](self.own), self.given
-        self.done.clear()
-        self.student.network.load_state_dict(kept)
-        plain, worst = self.found(scenes.VALIDATION, range(self.judged), "searching in scenes to choose weights by")
-        clean = self.right_share(self.student.model, plain)
-        self._note(0, 0.0, clean, self.right_share(self.student.model, worst))
-        for number in range(1, self.config.rounds + 1):
-            places = range((number - 1) * self.config.scenes, number * self.config.scenes)
-            new, failures = self.found(scenes.TRAINING, places, f"round {number}: searching in scenes")
-            self._save_pictures(FOLDER, number, new, failures)
-            pool += [*new, *failures * SEEN]
-            self.progress.stage(f"round {number}: training", self.config.epochs * -(-len(pool) // BATCH))
-            seed = seeds.stream(self.config.seed, "order", number)
-            self.student.fit(
-                pool, self.config.epochs, self.config.rate, seed, self.optimiser, lambda: self.progress.advance(1)
-            )
-            learned = {name: one.clone() for name, one in self.student.network.state_dict().items()}
-            scored = dict[float, tuple[float, float]]()
-            for part in PARTS:
-                self._take(learned, part)
-                scored[part] = self.right_share(self.student.model, plain), self.right_share(self.student.model, worst)
-            allowed = [part for part in PARTS if scored[part][0] >= clean - self.config.clean_loss - 1e-9]
-            part = max(allowed or PARTS, key=lambda part: (scored[part][1 if allowed else 0], part))
-            self._take(learned, part)
-            self._note(len(pool), part, *scored[part])
-            if allowed and self.done[-1].robust >= self.done[self.best].robust:
-                self.best, kept = number, {name: one.clone() for name, one in self.student.network.state_dict().items()}
-        self.student.network.load_state_dict(kept)
-        state = {name: one.contiguous() for name, one in kept.items()}
-        write_bytes(self.run.path / ARTIFACTS / WEIGHTS, safetensors.save(state))
-
-    def found(self, side: str, places: Sequence[int], title: str) -> tuple[list[Example], list[Example]]:
-        """Return pictures of scenes as they are, and the worst that a search finds for the student over each control,
-        whether or not the student is wrong about it."""
-        self.progress.stage(title, len(places) * len(self.config.controls))
-        plain, worst = list[Example](), list[Example]()
-        for number in places:
-            name, scene = self.work.splits[side].scene(number)
-            for control in self.config.controls:
-                seed = seeds.stream(self.work.splits[side].seed, f"search {control}", number)
-                config = self.work.attack((control,), name, seed=seed, trials=6, verify_spp=EXAMPLE_SPP)
-                searched = attack_on(config, scene, self.student.model)
-                problem = problem_of(config, scene, self.student.model, differentiated=False)
-                plain += examples(problem, seed, range(1))
-                worst += [Example.of(problem, searched.u, seeds.stream(seed, "worst", 0))]
-                self.progress.advance(1)
-            around, _ = self.work.problem(self.work.splits[side], number, (control,))
-            plain += examples(around, seed, range(1, 1 + VIEWS))
-        return plain, worst
-
-    def _take(self, learned: Mapping[str, Tensor], part: float) -> None:
-        mixed = {
-            name: torch.lerp(self.given[name], one, part) if one.is_floating_point() else one
-            for name, one in learned.items()
-        }
-        self.student.network.load_state_dict(mixed)
-
-    def _note(self, lessons: int, part: float, clean: float, robust: float) -> None:
-        self.done.append(TrainingRound(lessons=lessons, part=part, clean=clean, robust=robust, kept=False))
-
-    def _save_pictures(self, folder: str, number: int, plain: Sequence[Example], worst: Sequence[Example]) -> None:
-        """Keep what a round was trained on as COCO has it, for one's own training."""
-        place, images, things = self.run.path / ARTIFACTS / folder / f"round-{number:03d}", [], list[Any]()
-        for at, one in enumerate([*plain, *worst], 1):
-            name = f"{at:05d}-{'plain' if at <= len(plain) else 'worst'}.png"
+    def save(self, folder: Path, number: int, new: Sequence[Example]) -> None:
+        """Write them as COCO has it, for one's own training."""
+        place, images, things = folder / f"round-{number:03d}", [], list[Any]()
+        for at, item in enumerate(new, 1):
+            name, (height, width) = f"{at:05d}-{'worst' if item.found else 'plain'}.png", item.levels.shape[:2]
             (place / "images").mkdir(parents=True, exist_ok=True)
-            write_png(place / "images" / name, one.levels / 255.0)
-            height, width = one.levels.shape[:2]
+            write_png(place / "images" / name, item.levels / 255.0)
             images.append({"id": at, "file_name": name, "height": height, "width": width})
-            for (left, top, right, bottom), label in zip(one.boxes.tolist(), one.labels.tolist(), strict=True):
+            for (left, top, right, bottom), label in zip(item.boxes.tolist(), item.labels.tolist(), strict=True):
                 box = [left, top, right - left, bottom - top]
                 things.append({"id": len(things) + 1, "image_id": at, "category_id": label, "bbox": box,
                                "area": box[2] * box[3], "iscrowd": 0})  # fmt: skip
-        named = [{"id": at, "name": name} for at, name in enumerate(self.student.model.labels)]
-        told = {"images": images, "annotations": things, "categories": named}
-        write_bytes(place / "annotations.json", json.dumps(told).encode())
-
-
-def check_detector(config: HardenConfig, beside: object) -> None:
-    """Refuse, by an InputError, settings that a detector is not trained by."""
-    if beside is not None:
-        raise InputError("beside: is of classifiers; give a detector a COCO folder as `data`")
-    if config.layers != "all":
-        raise InputError("layers: expected all of a detector; leave it out")
+        if new:
+            named = [{"id": at, "name": name} for at, name in enumerate(self.student.model.labels)]
+            told = {"images": images, "annotations": things, "categories": named}
+            write_bytes(place / "annotations.json", json.dumps(told).encode())

@@ -15,11 +15,10 @@ import io
 import json
 import re
 import tarfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -35,14 +34,11 @@ from advsearch.runs.images import write_png
 from advsearch.scene.formation import levels_of, to_8_bit
 from advsearch.scene.transport.lights import why_not
 from advsearch.scene.transport.matrix import LinearRenderer
-from advsearch.tasks import Task
-from advsearch.tasks.boxes import Place
 
 SPP, MATRIX_SPP, DEPTH = 2, 4, 4
 """Samples a pixel of a lesson's pictures, and of a matrix of light transport; segments of the longest path: many
 lessons with some noise teach more than few without."""
 STEP = 0.5  # a step of an adversarial texture, as a share of its budget
-EXAMPLE_SPP = 8  # samples a pixel of a picture for a detector
 TOGETHER = 32  # pictures that a model is asked about at once
 
 
@@ -112,38 +108,6 @@ class RenderedLesson(Lesson):
     def worst(self) -> Tensor:
         """(H, W, 3) the picture whose loss was highest."""
         return self.pictures[int(self.losses.argmax())] / 255.0
-
-
-class Example(NamedTuple):
-    """A picture (H, W, 3) uint8, and the place of the thing in it with the task that judges it, or all that is in a
-    picture of one's own: boxes (K, 4) in its pixels and their classes (K,)."""
-
-    levels: Tensor
-    boxes: Tensor
-    labels: Tensor
-    task: Task | None = None
-    truth: Place | None = None
-
-    @classmethod
-    def of(cls, problem: Problem, u: Tensor, seed: int) -> Example:
-        """Render a configuration, with the conditions that a seed draws."""
-        whole = problem.whole(u, seed)
-        truth: Place = problem.truth(whole)
-        boxes = torch.tensor([truth.box] if truth.box else [], dtype=torch.float32).reshape(-1, 4)
-        labels = torch.tensor([truth.labels[0]] * len(boxes), dtype=torch.int64)
-        return cls(levels_of(problem.picture(u, seed, EXAMPLE_SPP)), boxes, labels, problem.task, truth)
-
-    def right(self, model: Model) -> bool:
-        """Whether the model is right about it."""
-        assert self.task is not None
-        with torch.no_grad():
-            return bool(self.task.margin(model(self.levels[None] / 255.0), self.truth)[0] <= 0.0)
-
-
-def examples(problem: Problem, seed: int, numbers: Sequence[int]) -> Iterator[Example]:
-    """Yield pictures of a scene as it is, each under conditions that its number draws."""
-    for number in numbers:
-        yield Example.of(problem, problem.domain.start, seeds.stream(seed, "plain", number))
 
 
 def plain_lessons(problem: Problem, views: int, seed: int) -> list[Lesson]:
@@ -267,30 +231,22 @@ def slopes(
     return torch.autograd.grad(surprise(model(change(pictures)), [one.right for one in chosen]).sum(), leaves)
 
 
-FOLDER, ARCHIVE = "pictures", "pictures.tar"
-
-
 def save_pictures(folder: Path, number: int, chosen: Sequence[Lesson], labels: Sequence[str]) -> None:
-    """Write the pictures of a round's lessons: ``CLASS/ROUND-LESSON-plain.png`` and ``...-worst.png``."""
+    """Write the pictures of a round's lessons, ``CLASS/ROUND-LESSON-plain.png`` and ``...-worst.png``, and those of all
+    rounds as a WebDataset beside the folder: of each picture a ``.png``, a ``.cls`` with the index of its class and a
+    ``.json`` with that and the kind of picture. Members have no time and no owner, so that equal pictures make equal
+    files."""
     for place, lesson in enumerate(chosen):
         name = re.sub(r"[^a-z0-9]+", "-", labels[lesson.right[0]].lower()).strip("-")
         for kind in ("plain", "worst") if with_worst([lesson]) else ("plain",):
             path = folder / f"{lesson.right[0]:04d}-{name}" / f"{number:03d}-{place:05d}-{kind}.png"
             path.parent.mkdir(parents=True, exist_ok=True)
             write_png(path, getattr(lesson, kind))
-
-
-def write_archive(folder: Path, archive: Path) -> int:
-    """Write the pictures of a data set as a WebDataset and return how many there are: of each a ``.png``, a ``.cls``
-    with the index of its class and a ``.json`` with that and the kind of picture. Members have no time and no owner, so
-    that equal pictures make equal files."""
-    pictures = sorted(folder.glob("*/*.png"))
-    with replacing(archive) as part, tarfile.open(part, "w") as tar:
-        for path in pictures:
+    with replacing(folder.with_suffix(".tar")) as part, tarfile.open(part, "w") as tar:
+        for path in sorted(folder.glob("*/*.png")):
             index, kind = int(path.parent.name[:4]), path.stem.rpartition("-")[2]
             facts = json.dumps({"class": index, "kind": kind})
             for suffix, data in {"png": path.read_bytes(), "cls": str(index).encode(), "json": facts.encode()}.items():
                 member = tarfile.TarInfo(f"{path.parent.name}-{path.stem}.{suffix}")
                 member.size = len(data)
                 tar.addfile(member, io.BytesIO(data))
-    return len(pictures)

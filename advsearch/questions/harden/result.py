@@ -63,7 +63,7 @@ class HardenConfig(AttackConfig):
         otherwise="the bundled environments that the reference model was not trained in", min_length=1,
     )
     task: str | dict[str, JsonValue] = setting_as_in(
-        AttackConfig, "task", description="what the model does: classification or detection"
+        AttackConfig, "task", description="what the model does: classification, detection or segmentation"
     )
     data: str | None = setting(
         None, "training", "pictures of your own that a detector is trained on too: `annotations.json` and `images/`",

@@ -12,29 +12,29 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from safetensors import torch as safetensors
 
 from advsearch import seeds
 from advsearch.attacks.verification import WORST_CASE
 from advsearch.bundled.changed_light import varied, white_light_changed
 from advsearch.bundled.objects import OBJECTS
-from advsearch.cluster import Call
+from advsearch.cluster import Call, Executor, InProcess
 from advsearch.engine.loading import Scene, load_scene
 from advsearch.engine.naming import RUN_SETTINGS, load_models, scene_settings, settings_alone
 from advsearch.engine.problem import Problem
-from advsearch.errors import InputError
+from advsearch.errors import ClusterError, InputError
 from advsearch.files import JsonObject
 from advsearch.models import Model
 from advsearch.models.reference import copied_network
 from advsearch.models.source import frozen
-from advsearch.questions.attack.carry_out import attack_on
-from advsearch.questions.attack.parts import problem_of
+from advsearch.progress import NullProgress, Progress
+from advsearch.questions.attack.carry_out import attack_on, problem_of
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.harden.lessons import Lesson, examples, has_matrix, lessons, plain_lessons
+from advsearch.questions.harden.lessons import Lesson, has_matrix, lessons, plain_lessons
 from advsearch.questions.harden.result import ALL, HardenConfig
 from advsearch.runs.results import INTERRUPTED
 from advsearch.scene.assets import ObjectAsset
-from advsearch.scene.formation import levels_of
 from advsearch.scene.library import list_environments
 from advsearch.scene.settings import Given
 from advsearch.settings import split_names
@@ -96,31 +96,33 @@ class Attacking:
     def done(self, work: SceneWork) -> str:
         """How it ended: `ROBUST` where it found nothing and the clean scene is right in as many trials as a verified
         answer would have to be wrong in."""
-        config, model = work.config, work.model
-        if self.weights is not None:
-            network = copied_network(model)
-            network.load_state_dict(safetensors.load(self.weights))
-            model = replace(model, module=frozen(network, model.name))
+        config = work.config
         name, scene = work.splits[HELD_OUT].scene(self.number, scene_settings(config))
         seed = seeds.stream(config.seed, f"measured {self.control}", self.number)
         harder = {} if self.times == 1 else {"policy": STRONGER, "steps": self.times * config.steps}
-        return attacked(work.attack((self.control,), name, seed=seed, **harder), scene, model)
+        asked = work.attack((self.control,), name, seed=seed, **harder)
+        return attacked(asked, scene, work.model if self.weights is None else work.with_weights(self.weights))
 
 
 @dataclass(frozen=True)
 class Looking:
-    """Plain pictures that are wanted of a held-out scene."""
+    """A look at plain pictures of a held-out scene, with these weights and those that the model was given with."""
 
     number: int
+    weights: bytes = field(repr=False)
 
-    def done(self, work: SceneWork) -> list[Any]:
-        side = work.splits[HELD_OUT]
+    def done(self, work: SceneWork) -> tuple[int, int]:
+        """How many of them are right with the given weights, and with these."""
+        side, right = work.splits[HELD_OUT], [0, 0]
         problem, _ = work.problem(side, self.number, tuple(work.config.controls)[:1])
-        if work.config.task_name != "classification":
-            return list(examples(problem, side.seed, range(self.number * CLEAN_VIEWS, (self.number + 1) * CLEAN_VIEWS)))
-        right = tuple(int(index) for index in problem.truth())
-        drawn = [seeds.stream(side.seed, "plain", self.number * CLEAN_VIEWS + view) for view in range(CLEAN_VIEWS)]
-        return [Lesson(right, levels_of(problem.picture(problem.domain.start, seed, CLEAN_SPP))) for seed in drawn]
+        for view in range(CLEAN_VIEWS):
+            seed = seeds.stream(side.seed, "plain", self.number * CLEAN_VIEWS + view)
+            picture = problem.picture(problem.domain.start, seed, CLEAN_SPP)[None]
+            truth = problem.truth(problem.whole(problem.domain.start, seed))
+            for place, model in enumerate((work.model, work.with_weights(self.weights))):
+                with torch.no_grad():
+                    right[place] += bool(problem.task.margin(model(picture), truth)[0] <= 0.0)
+        return right[0], right[1]
 
 
 Wanted = Drawing | Attacking | Looking
@@ -156,23 +158,42 @@ def splits_of(config: HardenConfig, model: Model) -> dict[str, Split]:
 def scenes_of(settings: JsonObject) -> Call:
     """Return what does what is wanted of scenes of the hardening that the settings describe: what a worker does."""
     config = HardenConfig(**settings)
-    task = make_task(config.task)
-    (model, *_), _ = load_models([config.model], task, config)
+    (model, *_), _ = load_models([config.model], make_task(config.task), config)
     gc.freeze()  # what a scene leaves is collected after each; a sixth of the time goes into looking at all the rest
     return SceneWork(config, model, splits_of(config, model))
 
 
 @dataclass
 class SceneWork:
-    """What is done with single scenes, with the model as it was given; pure functions of what is wanted."""
+    """What is done with single scenes, with the model as it was given; pure functions of what is wanted, which this
+    process does, or an executor."""
 
     config: HardenConfig
     model: Model
     splits: Mapping[str, Split]
+    progress: Progress = field(default_factory=NullProgress)
+    executor: Executor | None = None
 
-    def __call__(self, wanted: Iterable[Wanted]) -> list[list[Any] | str]:
-        """Return what came of each: lessons, or how an attack ended."""
+    def __call__(self, wanted: Iterable[Wanted]) -> list[Any]:
+        """Return what came of each."""
         return [one.done(self) for one in wanted]
+
+    def each(self, title: str, wanted: Sequence[Wanted], hint: str = "") -> Iterator[tuple[int, Any]]:
+        """Have done what is wanted of scenes; yield the place of each and what came of it, in any order."""
+        self.progress.stage(title, len(wanted), hint=hint)
+        places, executor = {id(one): place for place, one in enumerate(wanted)}, self.executor or InProcess(self)
+        for done in executor.results([one] for one in wanted):
+            (one,) = done.items
+            if done.lost:
+                raise ClusterError(f"harden, scene {one.number}: {done.lost}")
+            self.progress.advance(1, **({} if executor.facts is None else executor.facts.told))
+            yield places[id(one)], done.value[0]
+
+    def with_weights(self, weights: bytes) -> Model:
+        """Return the model with other weights, safetensors."""
+        network = copied_network(self.model)
+        network.load_state_dict(safetensors.load(weights))
+        return replace(self.model, module=frozen(network, self.model.name))
 
     @cached_property
     def linear(self) -> tuple[str, ...]:

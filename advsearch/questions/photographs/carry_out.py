@@ -26,7 +26,7 @@ from advsearch.engine.verifier import kept_configuration
 from advsearch.errors import FileFormatError, InputError
 from advsearch.files import JsonObject, read_bytes
 from advsearch.models import Model
-from advsearch.questions.attack.parts import judged_alone, problem_from_config
+from advsearch.questions.attack.carry_out import judged_alone, problem_from_config
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.photographs import result
 from advsearch.questions.photographs.result import LOOSE_PHOTO, PHOTO, PhotoAgreement, PhotographedRendering

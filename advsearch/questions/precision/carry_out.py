@@ -20,7 +20,7 @@ from advsearch.engine.problem import Problem
 from advsearch.engine.record import Results, kept_rows
 from advsearch.errors import InputError
 from advsearch.progress import NullProgress, Progress
-from advsearch.questions.attack.parts import LOADING, problem_from_config
+from advsearch.questions.attack.carry_out import LOADING, problem_from_config
 from advsearch.questions.precision.benches import (
     OIDN,
     GradientBench,

@@ -14,7 +14,7 @@ from advsearch.config import DEFAULT_ENVIRONMENT, SceneConfig, name_in
 from advsearch.controls import CONTROLS
 from advsearch.errors import InputError
 from advsearch.question import Asked
-from advsearch.questions.attack.parts import check_from_config
+from advsearch.questions.attack.carry_out import check_from_config
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.studies import carry_out_part
 from advsearch.questions.attack.summary import AttackSummary, FoundValue, SearchDistribution, attack_of

@@ -15,6 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from advsearch.attacks.trials import CONFIDENCE
 from advsearch.attacks.units import per_unit, share_interval
+from advsearch.described import OUT_OF_VIEW
 from advsearch.errors import InputError
 from advsearch.questions.attack.summary import AttackSummary
 from advsearch.questions.sweep.summary import SweepSummary
@@ -53,7 +54,7 @@ def read_rows(
             # without draws, samples of a point differ by noise alone
             drawn, alike = units_of(store), 1 if summary.sampler is not None else summary.samples
         for row in store.rows():
-            if row.kind not in kinds:
+            if row.kind not in kinds or (row.kind == "sweep" and row.label == OUT_OF_VIEW):
                 continue
             values = {name: told["value"] for name, told in row.values.items()}
             units |= {name: told["unit"] for name, told in row.values.items()}

@@ -20,8 +20,8 @@ from advsearch.engine.surface_light import LIGHTS, SurfaceLight
 from advsearch.engine.verifier import Verifier, ladder_of
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.question import Asked
+from advsearch.questions.attack.carry_out import LOADING, problem_from_config
 from advsearch.questions.attack.outcome import transport_of
-from advsearch.questions.attack.parts import LOADING, problem_from_config
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.region.result import AxisRange, BoxSide, GrownRegion, MarginMap, RegionConfig, RegionResult
 from advsearch.questions.sweep.predicting import pays_from

@@ -23,7 +23,7 @@ from advsearch.engine.verifier import RetrialCondition, Retrials, kept_configura
 from advsearch.errors import InputError
 from advsearch.progress import Progress, Watched, watcher
 from advsearch.question import Asked, carried_out
-from advsearch.questions.attack.parts import LOADING, SEARCHED_WITH, AttackParts, parts_in, problem_of_parts
+from advsearch.questions.attack.carry_out import LOADING, SEARCHED_WITH, AttackParts, parts_in, problem_of_parts
 from advsearch.questions.attack.result import AttackResult
 from advsearch.questions.attack.summary import AttackSummary, attack_of
 from advsearch.questions.replay.result import NOT_DONE, ReplayConfig, ReplayResult, ReplayRow

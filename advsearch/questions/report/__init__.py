@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 from advsearch.cli import output
 from advsearch.errors import InputError
@@ -27,9 +28,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="how common conditions are: YAML such as environment: {street: 0.8, noon: 0.2}",
     )
+    parser.add_argument(
+        "--photographs",
+        metavar="FOLDER",
+        help="photographs aligned with renderings of the first run, by their names: rendering-12.jpg, "
+        "rendering-12-again.jpg; its model judges them, and the run keeps them",
+    )
     parser.add_argument("--by", metavar="NAME", help="who answers for it, as it is to be written", default="")
     parser.add_argument("--out", metavar="FOLDER", help="where the three files go (default: %(default)s)", default=NAME)
     parser.add_argument("--overwrite", action="store_true", help="replace what is there")
+    output.add_code_flag(parser)
     output.add_flags(parser)
 
 
@@ -55,6 +63,8 @@ def run(args: argparse.Namespace) -> int:
     if args.criterion is not None and not 0.0 < args.criterion <= 1.0:
         raise InputError(f"--criterion: expected a share over 0 and at most 1, such as 0.9, got {args.criterion:g}")
     exposure = {} if args.exposure is None else read_exposure(args.exposure)
+    if args.photographs is not None:
+        _take_in(args.photographs, args.runs[0])
     evidence, pictures = collected(args.runs, criterion=args.criterion, exposure=exposure, by=args.by)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -73,3 +83,22 @@ def run(args: argparse.Namespace) -> int:
     print("".join(f"\nNote: {text}" for text in evidence.warnings))
     print("\n".join(map(str, names)))
     return 0
+
+
+def _take_in(folder: str, name: str) -> None:
+    """Have a run's model judge the photographs in a folder that the run does not have yet."""
+    from advsearch.questions.photographs.carry_out import Photographs, photographs_in  # they bring torch
+    from advsearch.runs.directory import CONFIG, find_run
+    from advsearch.settings import read_yaml
+
+    run = find_run(name)
+    task: Any = read_yaml(run / CONFIG).get("task") or "classification"
+    files = photographs_in(Path(folder), task)
+    if loose := [one.name for one in files if not one.stem.startswith("rendering-")]:
+        raise InputError(
+            f"--photographs: {loose[0]}: expected the number of a rendering in its name, such as rendering-12.jpg; "
+            "advsearch dashboard aligns photographs by phone"
+        )
+    if not files:
+        raise InputError(f"--photographs: {folder}: expected a folder with photographs, got none in it")
+    Photographs().add_files(run, files)

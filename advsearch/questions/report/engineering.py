@@ -3,24 +3,28 @@ conditions are, the operational design domain in words, and what is not shown.""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from advsearch.attacks import clopper_pearson
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.questions.explain.result import ExplainResult, rule_text
 from advsearch.questions.report.result import ConditionShare
-from advsearch.questions.sweep.summary import SweepSummary
+from advsearch.questions.sweep.summary import AxisValue, SweepSummary
 from advsearch.report.shown import Claim
 from advsearch.report.wording import interval_text, number_text, percent
 from advsearch.runs.results import Interval, Result
+from advsearch.runs.store import Row
 from advsearch.settings import read_yaml
 
 DOMAIN = {
     "place": ("environment", "background"),
     "light": ("light", "sky", "exposure", "shadow", "projector"),
     "weather": ("haze",),
-    "road users and things": ("object", "pose", "body", "occlusion", "contents"),
+    "road users and things": ("object", "answer", "things", "pose", "body", "occlusion", "contents"),
     "surfaces": ("texture", "material", "patch", "geometry"),
     "ways and speeds": ("path",),
     "camera and picture": ("camera", "lens", "sensor", "corruption"),
@@ -47,6 +51,42 @@ def conditions_of(result: Result) -> list[ConditionShare]:
             if row.configurations and row.interval is not None
         ]
     return []
+
+
+def photograph_conditions(result: Result, photographs: Iterable[Row]) -> list[ConditionShare]:
+    """Return the share of photographs that agree with the rendering that they were aligned with, by each value of each
+    axis of a sweep: right in both or wrong in both."""
+    rows, found = list(photographs), list[ConditionShare]()
+    for one in result.axes if isinstance(result, SweepSummary) else ():
+        of_it = [row for row in rows if one.axis in row.values and _has(row.values[one.axis]["value"], one.value)]
+        payloads: list[Any] = [row.payload for row in of_it]
+        agreeing = sum(
+            bool(row.correct) == bool(kept["photo"]["right"]) for row, kept in zip(of_it, payloads, strict=True)
+        )
+        if of_it:
+            found.append(
+                ConditionShare(
+                    condition=f"{one.axis} {_value(one.value)} {'' if one.unit == '1' else one.unit}".strip(),
+                    axis=one.axis,
+                    value=_value(one.value),
+                    right=agreeing,
+                    total=len(of_it),
+                    interval=clopper_pearson(agreeing, len(of_it)),
+                )
+            )
+    return found
+
+
+def _agrees(photograph: Row) -> bool:
+    kept: Any = photograph.payload
+    return bool(photograph.correct) == bool(kept["photo"]["right"])
+
+
+def _has(value: float | str, of: AxisValue) -> bool:
+    """Whether a value of a row is that of an axis, or lies in that part of its range."""
+    if isinstance(value, str) or isinstance(of, str):
+        return value == of
+    return of[0] <= value <= of[1] if isinstance(of, tuple) else math.isclose(value, of)
 
 
 def _value(value: object) -> str:
@@ -145,24 +185,37 @@ def domain_of(result: Result, settings: Mapping[str, object], searched: Sequence
         "camera and picture": str(settings.get("camera") or ""),
     }
     drives = getattr(result, "drives", None) or []
+    moving = [*getattr(result, "controls", ()), *getattr(result, "over", ())]
     found = {}
     for part, names in DOMAIN.items():
-        varied = [one for one in searched if one.replace(":", ".").replace(",", ".").split(".")[0].strip() in names]
+        varied = [one for one in searched if _first_word(one) in names]
+        if not varied:  # one of several that a sentence is about
+            varied = [one for one in moving if _first_word(one) in names]
         if part == "ways and speeds":
             varied += [f"{one.drives} drives of {one.seconds:g} s, {one.frames} frames each" for one in drives[:1]]
         alone = f"not varied: {fixed[part]}" if fixed.get(part) else "not varied"
         found[part] = "; ".join(varied) or alone
+    if not found["place"].startswith("not varied"):
+        for part in ("light", "weather"):
+            found[part] = found[part].replace("not varied", "as each environment has it")
     return found
 
 
-def not_shown(domain: Mapping[str, str], photographs: int) -> list[str]:
-    """Return what a reader must not take from a run."""
+def _first_word(line: str) -> str:
+    match = re.match(r"\w+", line)
+    return match[0] if match else ""
+
+
+def not_shown(domain: Mapping[str, str], photographs: int, *, weighted: bool = False) -> list[str]:
+    """Return what a reader must not take from a run; `weighted` where shares are weighted by how common values are."""
     still = [part for part, text in domain.items() if text.startswith("not varied")]
     compared = f"Only {photographs} photographs were compared with renderings" if photographs else "No photograph was"
     return [
         f"{compared}{'' if photographs else ' compared with renderings'}: all else is about renderings.",
         *([f"Nothing is said of other values of: {', '.join(still)}."] if still else []),
-        "Nothing is said of how common the conditions are on the road, unless weights are given.",
+        "How common the conditions are is what the weights say, of their axes alone."
+        if weighted
+        else "Nothing is said of how common the conditions are: no weights were given.",
     ]
 
 

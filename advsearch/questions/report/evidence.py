@@ -16,7 +16,7 @@ from advsearch.files import read_bytes
 from advsearch.options import FROM_RUN
 from advsearch.questions.attack import wording as attack_wording
 from advsearch.questions.attack.summary import AttackSummary
-from advsearch.questions.photographs.result import FOLDER, PhotoAgreement
+from advsearch.questions.photographs.result import FOLDER, PHOTO, PhotoAgreement
 from advsearch.questions.report.engineering import (
     Exposure,
     conditions_of,
@@ -24,6 +24,7 @@ from advsearch.questions.report.engineering import (
     domain_of,
     exposure_lines,
     not_shown,
+    photograph_conditions,
     pictures_of,
     triggering_conditions,
 )
@@ -34,7 +35,7 @@ from advsearch.report.shown import Claim, Extent, claim, nothing_claimed, share_
 from advsearch.runs.directory import CONFIG, IMAGES, PARTS, find_run, is_run, typed_name
 from advsearch.runs.results import RUNNING, Result, VariedValue
 from advsearch.runs.store import NAME as STORE
-from advsearch.runs.store import Store
+from advsearch.runs.store import Row, Store
 from advsearch.runs.summary import MADE_WITH, read_result
 from advsearch.runs.summary import NAME as SUMMARY
 from advsearch.settings import read_yaml
@@ -232,8 +233,8 @@ def _excluded(result: Result, claims: Sequence[Claim]) -> list[str]:
         ]
     if isinstance(result, SweepSummary) and result.not_finite:
         lines.append(f"{result.not_finite} predictions were not numbers; they count as not right.")
-    if isinstance(result, SweepSummary) and result.configurations < result.planned:
-        lines.append(f"Only {result.configurations} of {result.planned} planned configurations were looked at.")
+    if isinstance(result, SweepSummary) and result.looked_at < result.planned:
+        lines.append(f"Only {result.looked_at} of {result.planned} planned configurations were looked at.")
     if all(one.kind == "nothing claimed" for one in claims):
         lines.append("The run carries no claim; it is listed so that it is not left out unseen.")
     return lines + list(getattr(result, "warnings", ()))
@@ -244,6 +245,9 @@ def _renders(renders: object) -> str:
         return ", ".join(f"{number} {name}" for name, number in renders.items() if number) or "none"
     return "those of its parts" if renders is None else str(renders)
 
+
+SUITE = "suite"
+"""The note of a run of `test` that has its claims."""
 
 MOST_OF_PICTURE = 16 << 20
 """Bytes of a picture that is taken along."""
@@ -341,18 +345,55 @@ def _run(folder: Path, criterion: float | None, exposure: Exposure) -> EvidenceR
     photographs = _photos(folder)
     found = evidence_of(name, result, [*claims_of(result), *photographs], settings, made, _judged_by(settings))
     few = [QUICK] if _of_quick_recipe(folder) else []
-    domain, conditions = domain_of(result, settings, found.searched), conditions_of(result)
+    basis = list(_read_by(result))
+    searched = list(dict.fromkeys(line for one in basis for line in searched_lines(*one)))
+    searched = searched or (_of_a_suite(folder) if result.command == "test" else found.searched)
+    domain, conditions = domain_of(basis[0][0] if basis else result, settings, searched), conditions_of(result)
+    weighted = exposure_lines(result, conditions, exposure)
     return found.model_copy(
         update={
+            "searched": searched,
             "excluded": [*few, *found.excluded],
             "criterion": [] if criterion is None else criterion_lines(found.claims, conditions, criterion),
             "triggering": triggering_conditions(result),
-            "exposure": exposure_lines(result, conditions, exposure),
+            "exposure": weighted,
             "conditions": conditions,
+            "photographs": photograph_conditions(result, _photograph_rows(folder)) if photographs else [],
             "domain": domain,
-            "not_shown": not_shown(domain, sum(one.extent.total for one in photographs if one.extent)),
+            "not_shown": not_shown(
+                domain, sum(one.extent.total for one in photographs if one.extent), weighted=bool(weighted)
+            ),
         }
     )
+
+
+def _read_by(result: Result) -> Iterator[tuple[Result, Mapping[str, object]]]:
+    """The sweeps whose rows a run reads, with their settings, as far as they are to be had: it is about what varied
+    there."""
+    for name in dict.fromkeys([*getattr(result, "sweeps", ()), *(one.run for one in getattr(result, "sides", ()))]):
+        with suppress(AdvsearchError):
+            folder = find_run(str(name))
+            yield read_result(folder), _settings(folder)
+
+
+def _of_a_suite(folder: Path) -> list[str]:
+    """What the claims of a suite vary, as the run has kept it."""
+    lines = dict[str, list[str]]()
+    try:
+        with Store(folder / STORE, read_only=True) as store:
+            suite: Any = store.noted(SUITE)
+        for name, claim in suite["claims"].items():
+            given = {**suite["settings"], **claim["settings"]}
+            controls = given.get("controls") or {}
+            for control in controls if isinstance(controls, Mapping) else str(controls).split(","):
+                own = controls[control] if isinstance(controls, Mapping) else None
+                said = json.dumps(own, ensure_ascii=False) if own else "everything it searches by default"
+                lines.setdefault(f"{control}: {said}", []).append(str(name))
+            if given.get("environment"):
+                lines.setdefault(f"environment: {given['environment']}", []).append(str(name))
+    except (AdvsearchError, KeyError, AttributeError, TypeError, ValueError):
+        return ["as the claims of its suite say, which cannot be read any more"]
+    return [f"{told} ({', '.join(names)})" for told, names in lines.items()]
 
 
 def _judged_by(settings: Mapping[str, object]) -> dict[str, object]:
@@ -381,6 +422,11 @@ def _photos(folder: Path) -> list[Claim]:
     from advsearch.questions.photographs.carry_out import photo_agreement  # it brings torch, which takes a second
 
     return photo_claims(photo_agreement(folder))
+
+
+def _photograph_rows(folder: Path) -> list[Row]:
+    with Store(folder / STORE, read_only=True) as store:
+        return list(store.rows(PHOTO))
 
 
 def _made_with(folder: Path) -> dict[str, str]:

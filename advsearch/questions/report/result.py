@@ -11,7 +11,7 @@ from advsearch.report.markup import Html, element, join_html
 from advsearch.report.shown import Claim
 from advsearch.report.wording import interval_text
 from advsearch.runs.results import Fields, Interval, Result
-from advsearch.viewer.document import data_url, document, facts_table, heading, study_table
+from advsearch.viewer.document import data_url, document, heading, study_table
 
 
 class ConditionShare(Fields):
@@ -37,6 +37,10 @@ class EvidenceRun(Fields):
     triggering: list[str] = Field([], description="rules under which the model is wrong more often; absent without")
     exposure: list[str] = Field([], description="shares weighted by how common conditions are; absent without weights")
     conditions: list[ConditionShare] = Field([], description="by each value of each axis; absent without")
+    photographs: list[ConditionShare] = Field(
+        [], description="`right`: how many of the photographs agree with the rendering that they were aligned with, by "
+        "each value of each axis; absent without"
+    )  # fmt: skip
     domain: dict[str, str] = Field({}, description="the operational design domain in words, by its parts")
     not_shown: list[str] = Field([], description="what a reader must not take from it")
     pictures: list[str] = Field([], description="files beside this one")
@@ -65,27 +69,46 @@ class Evidence(Result):
 
 
 CROSSWALK_HEADS = ("in the evidence", "ISO 21448", "ISO/PAS 8800", "AI Act, article 15")
+# Compared in November 2026 with what is public: article 15 whole; the contents of ISO 21448 (clauses 4 to 8) and of
+# ISO/PAS 8800 (5 to 7), and for its clause 11 a published overview. The other clauses are from memory.
 CROSSWALK = (
-    ("What varied, operational design domain", "5 specification", "9 requirements; 11 data", "15(1) purpose"),
-    ("Triggering conditions (rules of explain)", "7 triggering conditions", "13 safety analysis", "15(4) robustness"),
-    ("Shares by condition, drives, criterion", "10 known scenarios", "12 verification", "15(1), 15(3) accuracy"),
-    ("Searches: found and not found", "11 unknown scenarios", "12 verification", "15(4), 15(5) attacks"),
-    ("Before and after harden", "8 modification", "10 measures", "15(4) robustness"),
-    ("Exposure", "6 hazards; 12 achievement", "13 safety analysis", ""),
+    (
+        "What varied, operational design domain",
+        "5 Specification and design",
+        "9 AI safety requirements; 11 data",
+        "15(4) environment of use",
+    ),
+    (
+        "Triggering conditions (rules of explain)",
+        "7 Triggering conditions",
+        "13 safety analysis",
+        "15(4) errors, inconsistencies",
+    ),
+    (
+        "Shares by condition, drives, criterion",
+        "6.5 Acceptance criteria; 10 known scenarios",
+        "12 verification",
+        "15(1), 15(3) accuracy",
+    ),
+    ("Searches: found and not found", "11 unknown scenarios", "12 verification", "15(5) adversarial examples"),
+    ("Before and after harden", "8 Functional modifications", "10 measures", "15(4) resilience"),
+    ("Exposure", "6.4 Risk evaluation", "13 safety analysis", ""),
     ("Suites in a pipeline (test)", "13 operation phase", "14 measures in operation", "15(1) through the lifecycle"),
-    ("Excluded, not shown, photographs", "12 achievement", "8 assurance argument", "15(3) instructions for use"),
+    ("Excluded, not shown, photographs", "12 achievement", "8 assurance argument", "15(3) instructions of use"),
     ("Versions, hashes, commands", "9 strategy", "15 confidence in tools", ""),
-)  # fmt: skip
+)
 NO_CONFORMITY = (
     "The table says under which clause a figure may be read: ISO 21448:2022, ISO/PAS 8800:2024, Regulation (EU) "
-    "2024/1689. Compare it with your edition. It claims no conformity with any of them."
+    "2024/1689. Of the two standards only clauses 4 to 8 of ISO 21448, and 11 of ISO/PAS 8800, were compared with "
+    "published contents: compare the others with your edition. It claims no conformity with any of them."
 )
 CONDITION_HEADS = ("condition", "right", "of", "95 % interval")
+PHOTOGRAPH_HEADS = ("photographs of", "agree", "of", "95 % interval")
 
 
-def condition_rows(one: EvidenceRun) -> list[list[str]]:
-    """Return a row for each condition, under `CONDITION_HEADS`."""
-    return [[row.condition, str(row.right), str(row.total), interval_text(row.interval)] for row in one.conditions]
+def condition_rows(conditions: Sequence[ConditionShare]) -> list[list[str]]:
+    """Return a row for each condition, under `CONDITION_HEADS` or `PHOTOGRAPH_HEADS`."""
+    return [[row.condition, str(row.right), str(row.total), interval_text(row.interval)] for row in conditions]
 
 
 def markdown(evidence: Evidence) -> str:
@@ -98,7 +121,8 @@ def markdown(evidence: Evidence) -> str:
             *(f"- **{claim.kind}**: {_plain(claim.statement)}" for claim in one.claims),
             "",
         ]
-        lines += [*_table(CONDITION_HEADS, condition_rows(one)), ""] if one.conditions else []
+        for heads, conditions in ((CONDITION_HEADS, one.conditions), (PHOTOGRAPH_HEADS, one.photographs)):
+            lines += [*_table(heads, condition_rows(conditions)), ""] if conditions else []
         lines += [f"![{name}]({name})" for name in one.pictures] + [""] * bool(one.pictures)
         for title, facts in sections(one).items():
             lines += [f"{title}:", "", *(f"- {_plain(text)}" for text in facts), ""]
@@ -182,8 +206,12 @@ def _run_html(one: EvidenceRun, pictures: Mapping[str, bytes]) -> Html:
         ]
         for claim in one.claims
     ]
-    facts = {name: "; ".join(lines) for name, lines in sections(one).items()}
-    beside = element("details", element("summary", "On what, how, and what is left out"), facts_table(facts), open="")
+    facts = [
+        element("tr", element("th", name, scope="row"), element("td", *(element("div", line) for line in lines)))
+        for name, lines in sections(one).items()
+    ]
+    table = element("table", element("tbody", *facts), class_="facts")
+    beside = element("details", element("summary", "On what, how, and what is left out"), table, open="")
     return join_html(
         element("h2", f"{one.run} ({one.command})"),
         study_table(CLAIM_HEADS, rows),
@@ -198,13 +226,18 @@ def _run_html(one: EvidenceRun, pictures: Mapping[str, bytes]) -> Html:
         )
         if one.pictures
         else None,
-        element(
-            "details",
-            element("summary", f"Right by condition, {len(one.conditions)} rows"),
-            study_table(CONDITION_HEADS, condition_rows(one)),
-        )
-        if one.conditions
-        else None,
+        *(
+            element(
+                "details",
+                element("summary", f"{said} by condition, {len(conditions)} rows"),
+                study_table(heads, condition_rows(conditions)),
+            )
+            for said, heads, conditions in (
+                ("Right", CONDITION_HEADS, one.conditions),
+                ("Photographs that agree", PHOTOGRAPH_HEADS, one.photographs),
+            )
+            if conditions
+        ),
         beside,
         join_html(element("h2", "Do it again"), element("pre", one.command_line, class_="wrap"))
         if one.command_line

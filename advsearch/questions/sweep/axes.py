@@ -87,8 +87,9 @@ def _read_axis(name: str, given: Any, instances: Mapping[str, Control]) -> Axis:
         raise UnknownNameError("control", kind, {*CONTROLS, *instances}, hint)
     if kind == BY_KEY:
         return _axis_by_key(control, name, given)
-    own = instances[instance].own if instance in instances else control.parameters
-    known = [one.name for one in own]
+    there = instances[instance].own if instance in instances else ()
+    own = {one.name: one for one in (*control.declared({parameter_name: given}), *there)}
+    known = list(own)
     if not parameter_name:
         raise InputError(
             f"`grid` {name}: expected CONTROL.PARAMETER, got no parameter; choose one of {', '.join(known)}"
@@ -96,9 +97,7 @@ def _read_axis(name: str, given: Any, instances: Mapping[str, Control]) -> Axis:
     check_instance(f"`grid` {name}", late or early, colon or early_colon)
     if parameter_name not in known:
         raise UnknownNameError(f"parameter of control {control.kind}", parameter_name, known, f"In `grid` {name}.")
-    parameter = (own if len(own) > len(control.parameters) else control.declared({parameter_name: given}))[
-        known.index(parameter_name)
-    ]
+    parameter = own[parameter_name]
     pictures = any(len(one.shape) > 1 for one in control.parameters)
     if pictures or not issubclass(control, NumberControl) or parameter.shape != ():
         raise InputError(

@@ -43,7 +43,7 @@ from advsearch.files import JsonObject
 from advsearch.models import Model
 from advsearch.options import as_setting
 from advsearch.progress import NullProgress, Progress, Watched, watcher
-from advsearch.questions.attack.parts import LOADING, executor_for, is_named
+from advsearch.questions.attack.carry_out import LOADING, executor_for, is_named
 from advsearch.questions.attack.result import AttackResult
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.summary import attack_of

@@ -103,11 +103,15 @@ def _page_parts(summary: SweepSummary) -> Iterator[ResultPart]:
 
 def _verdict(summary: SweepSummary) -> str:
     seen, correct = summary.configurations, summary.correct
+    if summary.out_of_view and not seen:
+        return "The object is in no picture."
     if not seen:
         return "Interrupted before the first configuration."
     rate = f"{percent(summary.accuracy)}, 95 % interval {wording.interval_text(summary.interval)}{over_drives(summary)}"
-    if summary.ending == INTERRUPTED and seen < summary.planned:
-        return f"Interrupted after {seen} of {summary.planned} configurations: right in {correct} ({rate})."
+    if summary.ending == INTERRUPTED and summary.looked_at < summary.planned:
+        return (
+            f"Interrupted after {summary.looked_at} of {summary.planned} configurations: right in {correct} ({rate})."
+        )
     if summary.beside and summary.beside.pairs:
         return " ".join(beside_text(summary.beside.answer, pair) for pair in summary.beside.pairs)
     grid = "" if summary.sampler is not None or not summary.grid else " of this grid; another has another share"
@@ -216,6 +220,18 @@ def claims(result: SweepSummary) -> Iterator[Claim]:
     elif result.sampler != "random" or result.grid:
         how = f"configurations drawn at random ({result.sampler})" + (" at each point of a grid" * bool(result.grid))
         note = " The interval is that of independent draws, which these are not."
+    if result.beside:
+        for pair in result.beside.pairs:  # the share of both together is of neither
+            for what, one in (
+                ("the clean scene", pair.clean),
+                (f"the adversarial scene of {result.beside.answer}", pair.answer),
+            ):
+                of = f"configurations of {what} in which {pair.model} is right"
+                own = Extent(what=of, count=one.correct, total=one.configurations, interval=one.interval or (0.0, 1.0))
+                yield claim("measured", f"With {what} {pair.model} is right in {share_text(own)} {how}.{note}", own)
+            yield claim("measured", beside_text(result.beside.answer, pair), None)
+    if result.beside and result.beside.pairs:
+        return
     models = [row for row in result.axes if row.axis == "model"]
     if len(split_names(result.model)) < 2 or not models:
         how += _in_each(result)

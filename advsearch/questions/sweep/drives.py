@@ -12,6 +12,7 @@ import numpy.typing as npt
 from advsearch.attacks.units import mean_interval
 from advsearch.controls import Control
 from advsearch.controls.path import WAY, PathControl
+from advsearch.described import OUT_OF_VIEW
 from advsearch.engine.naming import given_to
 from advsearch.questions.attack.result import evenly, write_drive
 from advsearch.questions.sweep.axes import Axis
@@ -26,7 +27,7 @@ ANIMATED = 60
 MOST_LISTED = 1000
 """Drives of a model whose own numbers are kept."""
 
-UNKNOWN = -1
+UNKNOWN, HIDDEN = -1, 2
 
 Flags = npt.NDArray[np.int8]
 
@@ -68,7 +69,7 @@ class Drives:
         which = f"{axis.instance}.{WAY}"
         name, self._unit = f"{axis.instance}.distance", "object sizes"
         for row in rows:
-            right.flat[row.step] = bool(row.correct)
+            right.flat[row.step] = HIDDEN if row.label == OUT_OF_VIEW else bool(row.correct)
             if name in row.values:
                 distance = row.values[name]
                 away.flat[row.step // len(job.models)] = float(str(distance["value"]))
@@ -88,28 +89,32 @@ class Drives:
             mine = [number for number, one in enumerate(places) if one.beside_clean == beside_clean]
             for model, network in enumerate(self._job.models):
                 right = self._right[mine][..., model, :].reshape(len(mine), -1, len(self.times))
-                whole = (right != UNKNOWN).all(axis=2)
+                whole = (right != UNKNOWN).all(axis=2) & (right != HIDDEN).any(axis=2)
                 away = self._away[mine].reshape(right.shape)[whole]
                 if whole.any():
                     begins = self._numbers[mine][..., model, :].reshape(right.shape)[whole][:, 0]
-                    found.append(self._rates(network.name, beside_clean, right[whole] == 1, away, begins))
+                    found.append(self._rates(network.name, beside_clean, right[whole], away, begins))
         return found
 
     def _rates(
         self,
         model: str,
         beside_clean: str,
-        right: npt.NDArray[np.bool_],
+        flags: Flags,
         away: npt.NDArray[np.float64],
         begins: npt.NDArray[np.int64],
     ) -> DriveRates:
-        """What is said of drives: (n, frames) whether the model is right, and how far away it is; (n,) first rows."""
+        """What is said of drives: (n, frames) whether the model is right, and how far away it is; (n,) first rows.
+        Frames without the object are neither right nor a gap."""
+        right, wrong, shown = flags == 1, flags == 0, flags != HIDDEN
+        share = right.sum(axis=1) / shown.sum(axis=1)
         seconds, frames = float(self.times[-1] - self.times[0]), len(self.times)
         step = seconds / (frames - 1)
         seen: npt.NDArray[np.bool_] = np.asarray(right.any(axis=1))
         at_first = away[np.arange(len(right)), right.argmax(axis=1)]
-        first, gaps = at_first[seen], np.array([longest(~one) for one in right]) * step
-        changes = (right[:, 1:] != right[:, :-1]).sum(axis=1) / seconds
+        first, gaps = at_first[seen], np.array([longest(one) for one in wrong]) * step
+        together = shown[:, 1:] & shown[:, :-1]
+        changes = ((right[:, 1:] != right[:, :-1]) & together).sum(axis=1) / seconds
         ends = float(away.min()), float(away.max())
         return DriveRates(
             model=model,
@@ -117,7 +122,7 @@ class Drives:
             drives=len(right),
             frames=right.shape[1],
             seconds=seconds,
-            right=over_drives(right.mean(axis=1), worst=min),
+            right=over_drives(share, worst=min),
             longest_gap=over_drives(gaps, max, (0.0, frames * step)),
             first_seen=over_drives(first, min, ends) if len(first) and np.isfinite(ends).all() else None,
             unit=self._unit,
@@ -127,7 +132,7 @@ class Drives:
                 OneDrive(
                     row=int(begins[k]),
                     path=self._ways.get(int(begins[k])),
-                    right=float(right[k].mean()),
+                    right=float(share[k]),
                     first_seen=float(at_first[k]) if seen[k] and np.isfinite(at_first[k]) else None,
                     longest_gap=float(gaps[k]),
                     flicker=float(changes[k]),
@@ -140,10 +145,11 @@ class Drives:
         """Write a strip and an animation of the drive in which the first model is right least often, with its marks."""
         right = self._right[..., 0, :].reshape(-1, len(self.times))
         numbers = self._numbers[..., 0, :].reshape(-1, len(self.times)) // len(self._job.models)
-        whole = (right != UNKNOWN).all(axis=1)
+        whole = (right != UNKNOWN).all(axis=1) & (right != HIDDEN).any(axis=1)
         if not whole.any():
             return
-        worst = numbers[whole][(right[whole] == 1).mean(axis=1).argmin()]
+        share = (right[whole] == 1).sum(axis=1) / (right[whole] != HIDDEN).sum(axis=1)
+        worst = numbers[whole][share.argmin()]
         pictures = [picture_of(scenes, int(number)) for number in worst[evenly(len(worst), ANIMATED)]]
         write_drive(run, "drive", pictures, float(self.times[-1] - self.times[0]))
 

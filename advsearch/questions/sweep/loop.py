@@ -211,8 +211,8 @@ class Sweep:
         now = time.monotonic()
         if now - self._told >= TELL_SECONDS:
             facts, told = self._executor.facts, dict[str, float | str]()
-            if seen := int(predictions.seen.sum()):
-                told["accuracy"] = int(predictions.right.sum()) / seen
+            if seen := int((predictions.seen & ~predictions.hidden).sum()):
+                told["accuracy"] = int((predictions.right & ~predictions.hidden).sum()) / seen
             if facts is not None:
                 told |= {**facts.told, "a second": self._rendered / max(1e-9, now - self._begun)}
             self.stages.progress.advance(self._untold, **told)
@@ -324,7 +324,7 @@ class Sweep:
         formation = Formation.of(next(iter(view.renderers.values())).formation) if view else None
         gains = self._gains() if formation else {}
         models, adversarial = [model.name for model in job.models], job.places[-1].beside_clean
-        numbers = np.flatnonzero(predictions.seen)
+        numbers = np.flatnonzero(predictions.seen & ~predictions.hidden)
         right, units, axes = predictions.right[numbers], self.units.of(numbers), self._axes(numbers)
         if formation is not None and len(set(gains.values())) != 1:
             formation = formation.model_copy(update={"gain": None})
@@ -341,6 +341,7 @@ class Sweep:
             drawn={one.name: one.varied for one in self._shown},
             planned=self.total,
             **vars(counted_by_unit(right, units)),
+            out_of_view=int(predictions.hidden.sum()),
             units=len(np.unique(units)) if self.units.size > 1 and len(units) else None,
             not_finite=predictions.not_finite,
             answers=predictions.frequent,
@@ -394,6 +395,11 @@ class Sweep:
             remarks.append(
                 f"{count(few, 'drive')} can show little: were the model right in all their frames, the interval of "
                 f"that share would begin at {100 * most_shown(few):.0f} %."
+            )
+        if hidden := int(predictions.hidden.sum()):
+            remarks.append(
+                f"In {hidden} of {count(int(predictions.seen.sum()), 'picture')} nothing of the object is to be seen: "
+                "they are not counted."
             )
         if predictions.not_finite:
             remarks.append(

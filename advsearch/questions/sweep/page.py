@@ -149,7 +149,8 @@ def _judged(summary: SweepSummary) -> JsonObject:
     are told in them."""
     formed = summary.image_formation
     size = None if formed is None or "," in summary.model else list[JsonValue](formed.resolution)
-    return {"task": summary.task, "size": size, "grid": list(dict.fromkeys(one.axis for one in summary.axes))}
+    grid = list[JsonValue](dict.fromkeys(one.axis for one in summary.axes))
+    return {"task": summary.task, "size": size, "grid": grid, "drives": bool(summary.drives)}
 
 
 def _header(runs: Sequence[tuple[Path, SweepSummary | None]]) -> Html:
@@ -195,12 +196,12 @@ def _left_out(described: JsonObject, source: SweepSource) -> Html | None:
 def sweep_verdict(summary: SweepSummary) -> str:
     """Return what a sweep came to, in one sentence."""
     if not summary.configurations:
-        return "No configuration was looked at."
+        return "The object is in no picture." if summary.out_of_view else "No configuration was looked at."
     if summary.beside and summary.beside.pairs:
         return " ".join(beside_text(summary.beside.answer, one) for one in summary.beside.pairs)
     over = sweeps.over_drives(summary)
     share = f"{percent(summary.accuracy)}, 95 % interval {wording.interval_text(summary.interval)}{over}"
-    ended = "" if summary.configurations == summary.planned else f" so far, of {summary.planned} planned"
+    ended = "" if summary.looked_at == summary.planned else f" so far, of {summary.planned} planned"
     grid = "" if summary.sampler is not None or not summary.grid else " of this grid; another has another share"
     return f"Right in {summary.correct} of {summary.configurations} configurations{ended} ({share}){grid}."
 

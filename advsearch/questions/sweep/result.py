@@ -19,6 +19,7 @@ from PIL import Image
 
 from advsearch.attacks import clopper_pearson
 from advsearch.attacks.units import paired_by_unit, per_unit, share_interval
+from advsearch.described import OUT_OF_VIEW
 from advsearch.errors import FileFormatError
 from advsearch.pictures import FORMATS
 from advsearch.questions.sweep.figures import sweep_axes, sweep_figure
@@ -73,23 +74,26 @@ def rate(correct: int, seen: int) -> CountedPredictions:
 
 class Predictions:
     """What is predicted so far, by the number of the configuration (n,): whether there is a prediction, whether it is
-    right and whether it is wrong, its margin, NaN where that is no number, and what it is."""
+    right and whether it is wrong, its margin, NaN where that is no number, and what it is. `hidden` are those with
+    nothing of what is judged in the picture."""
 
     def __init__(self, total: int) -> None:
         self.seen: npt.NDArray[np.bool_] = np.zeros(total, dtype=bool)
-        self.right, self._wrong = self.seen.copy(), self.seen.copy()
+        self.right, self._wrong, self.hidden = self.seen.copy(), self.seen.copy(), self.seen.copy()
         self.margin = np.full(total, np.nan)
         self._labels, self._names = np.zeros(total, np.uint32), dict[str, int]()
 
     def add(self, number: int, said: Judgement) -> None:
         self.seen[number], self.right[number], self._wrong[number] = True, said.right, said.success
         self.margin[number] = said.margin
+        self.hidden[number] = said.prediction.label == OUT_OF_VIEW
         self._labels[number] = self._names.setdefault(said.prediction.label, len(self._names))
 
     @property
     def worst(self) -> int | None:
         """The first configuration of the largest margin; None where none is a number."""
-        return None if np.isnan(self.margin).all() else int(np.nanargmax(self.margin))
+        margin = self.margin if self.hidden[self.seen].all() else np.where(self.hidden, np.nan, self.margin)
+        return None if np.isnan(margin).all() else int(np.nanargmax(margin))
 
     @property
     def not_finite(self) -> int:
@@ -108,7 +112,7 @@ class Predictions:
         the second half of the configurations are the first with the adversarial scene."""
         halves = (2, -1, len(models))
         found = list[PairedRates]()
-        seen: npt.NDArray[np.bool_] = np.logical_and(*self.seen.reshape(halves))
+        seen: npt.NDArray[np.bool_] = np.logical_and(*(self.seen & ~self.hidden).reshape(halves))
         for model, name in enumerate(models):
             known = np.flatnonzero(seen[:, model])
             before, after = self.right.reshape(halves)[:, known, model]

@@ -201,6 +201,10 @@ class SweepSummary(CountedPredictions, RunResult):
     task: str = Field(description="what judges the predictions")
     image_formation: Formation | None
     planned: int = Field(description="how many configurations there are")
+    out_of_view: int = Field(
+        default=0,
+        description="configurations with nothing of the object in the picture; `configurations` is without them",
+    )
     not_finite: int = Field(description="outputs that were not numbers; they count as not right")
     answers: dict[str, int] = Field(description="how often each wrong prediction was given, the 20 most frequent")
     axes: list[AxisRow] = Field(description="a row for every value of every axis")
@@ -251,6 +255,11 @@ class SweepSummary(CountedPredictions, RunResult):
         description="pictures of the sweep; null where nothing was rendered now", json_schema_extra=as_fact("{:.3g}")
     )
     warnings: list[str] = Field(description="sentences that a reader has to know")
+
+    @property
+    def looked_at(self) -> int:
+        """Of how many configurations there is a prediction, those out of view too."""
+        return self.configurations + self.out_of_view
 
     @property
     def brief(self) -> str:

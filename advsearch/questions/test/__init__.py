@@ -32,7 +32,7 @@ class _Test(QuestionCommand):
         _check_files(config)
         with at_work(as_json=as_json, quiet=quiet) as progress:
             # late, so that --help answers at once
-            from advsearch.api import carry_out
+            from advsearch.question import carry_out
 
             result: Any = carry_out(config, progress=progress, resumed=resumed)
         write_files(config, result)

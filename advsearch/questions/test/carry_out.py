@@ -15,7 +15,7 @@ from advsearch.engine.record import Results
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.interrupts import interruptible
 from advsearch.progress import NullProgress, Progress
-from advsearch.questions.attack.parts import check_from_config
+from advsearch.questions.attack.carry_out import check_from_config
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.test.changes import OTHER_SCENE
 from advsearch.questions.test.claims import Trial, check_pictures, with_scene
@@ -103,6 +103,8 @@ def test_from_config(
 
     with RunDirectory.of(config, resumed) as run:
         run.store.set_note(NOTE, json.dumps(described.model_dump(mode="json")))
+        for one in planned:
+            run.note_sitting(one.config)
         trial = Trial(
             run,
             described.confidence,

@@ -17,13 +17,14 @@ from advsearch.attacks import Evaluation
 from advsearch.attacks.evaluation import Query
 from advsearch.attacks.trials import ConfidenceSequence, clopper_pearson, draws_needed
 from advsearch.config import SceneConfig
+from advsearch.described import OUT_OF_VIEW
 from advsearch.engine.journal import Journal, Shared, worker_call
 from advsearch.engine.problem import Problem
 from advsearch.engine.verifier import ladder_of
 from advsearch.errors import InputError
 from advsearch.files import JsonObject
 from advsearch.progress import Progress
-from advsearch.questions.attack.parts import executor_for, parts_of, problem_of
+from advsearch.questions.attack.carry_out import executor_for, parts_of, problem_of
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.studies import carry_out_part
 from advsearch.questions.attack.summary import AttackSummary
@@ -97,7 +98,7 @@ class Trial:
 
     def _right(self, asked: ClaimResult, claim: RightClaim, config: SceneConfig) -> ClaimResult:
         problem, shared = self._problem(config), self._shared(config)
-        sequence, right = ConfidenceSequence(self.confidence, sides=1), 0
+        sequence, right, hidden = ConfidenceSequence(self.confidence, sides=1), 0, 0
         wrong: list[tuple[float, Query, str]] = []
         self.progress.stage(asked.name, claim.pictures, hint="fewer pictures in the suite shorten it", at_most=True)
         with executor_for(shared, "advsearch.questions.attack.carry_out:attack_worker", self.progress) as executor:
@@ -106,6 +107,9 @@ class Trial:
             verdict = UNDECIDED
             for query, evaluation in self._evaluations(journal, queries):
                 said = evaluation.said
+                if said.prediction.label == OUT_OF_VIEW:
+                    hidden += 1
+                    continue
                 sequence.add(1.0 if said.right else 0.0)
                 right += said.right
                 if not said.right:
@@ -120,6 +124,7 @@ class Trial:
             worst = f"most wrong where it says {label}: {self._described(problem, query)}"
             picture = self._picture(asked.name, problem, query)
         reason = share_reason("right", verdict, right, sequence.count, sequence.interval, worst)
+        reason += f"; the object is not to be seen in {hidden} more, which are not counted" if hidden else ""
         return self._decided(asked, verdict, reason, sequence, config, picture, (0.0, 1.0))
 
     def _no_worse(self, asked: ClaimResult, claim: NoWorseClaim, config: SceneConfig) -> ClaimResult:

@@ -25,7 +25,7 @@ from advsearch.engine.problem import Problem
 from advsearch.engine.verifier import kept_configuration
 from advsearch.errors import FileFormatError, InputError
 from advsearch.files import parse_json, read_text
-from advsearch.questions.attack.parts import parts_in, problem_of_parts
+from advsearch.questions.attack.carry_out import parts_in, problem_of_parts
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.summary import attack_of
 from advsearch.questions.test.result import HELD, VERDICTS

@@ -9,10 +9,11 @@ from __future__ import annotations
 import difflib
 import errno
 import os
+import re
 import subprocess
 import warnings
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from urllib.parse import unquote
 
@@ -141,6 +142,30 @@ def safe_name(path: Path) -> str:
     """Return the file's name without ending, with everything but letters, digits, '.', '_' and '-' made a '-'."""
     kept = "".join(c if c.isascii() and (c.isalnum() or c in "._-") else "-" for c in path.stem)
     return kept.strip(".-") or "imported"
+
+
+class Names:
+    """Gives names that are free, and that a setting may have; `taken` are not."""
+
+    def __init__(self, taken: Iterable[str] = ()) -> None:
+        self._taken = set(taken)
+        self._last: dict[str, int] = {}
+
+    def free(self, wanted: str) -> str:
+        """Return the name, or the first free one with a number behind it."""
+        base = name = clean(wanted)
+        number = self._last.get(base, 1)
+        while name in self._taken:
+            number += 1
+            name = f"{base}-{number}"
+        self._last[base] = number
+        self._taken.add(name)
+        return name
+
+
+def clean(name: str) -> str:
+    """Return a name of letters, digits, dashes and underscores, 60 at most."""
+    return re.sub(r"[^\w-]+", "-", name).strip("-")[:60] or "part"
 
 
 def _near(path: Path, suffixes: Sequence[str]) -> str:

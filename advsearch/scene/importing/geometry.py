@@ -17,6 +17,9 @@ from advsearch.errors import InputError
 from advsearch.scene.assets import Bools, Doubles, Ints, Mesh
 from advsearch.scene.importing.parts import ImportedPart
 
+UPRIGHT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+"""From y up to z up."""
+
 WELD = 1e-6
 """Points closer than this share of the largest extent are one point; text and 32-bit files round to about that."""
 
@@ -42,6 +45,8 @@ class Soup:
         uvs: (F, 3, 2) float64; NaN where unknown.
         colors: (F, 3, 3) float64 linear factors of the base colour; 1 where the file gives none.
         flat: (F,) the faces that are flat where they have no normals; None where none are.
+        stored: (F, 3) the vertices of the parts, one part after the other, that the corners were; None where they need
+            not be known.
     """
 
     points: Doubles
@@ -51,12 +56,13 @@ class Soup:
     uvs: Doubles
     colors: Doubles
     flat: Bools | None = None
+    stored: Ints | None = None
 
     def only(self, keep: Bools) -> Soup:
         """Return the soup with a part of its faces; `keep` is (F,)."""
         return Soup(
             self.points, self.faces[keep], self.part[keep], self.normals[keep], self.uvs[keep], self.colors[keep],
-            None if self.flat is None else self.flat[keep],
+            None if self.flat is None else self.flat[keep], None if self.stored is None else self.stored[keep],
         )  # fmt: skip
 
     def reversed(self, turn: Bools) -> Soup:
@@ -69,6 +75,7 @@ class Soup:
             normals=self.normals[rows, order],
             uvs=self.uvs[rows, order],
             colors=self.colors[rows, order],
+            stored=None if self.stored is None else self.stored[rows, order],
         )
 
     def face_vectors(self) -> Doubles:
@@ -98,7 +105,7 @@ def join(parts: Sequence[ImportedPart], source: str, *, y_up: bool) -> Soup:
             f" coordinates (the first: {vertices[first].tolist()}); repair the mesh or export it again"
         )
     faces = np.concatenate([part.faces + start for part, start in zip(parts, starts[:-1], strict=True)])
-    turn = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]]) if y_up else np.eye(3)
+    turn = UPRIGHT if y_up else np.eye(3)
     low, size = vertices[np.unique(faces)].min(axis=0), extent_of(parts)
     if not 0.0 < size < np.inf:
         what = "all vertices coincide" if size == 0.0 else "its extent is too large to compute with"
@@ -113,6 +120,7 @@ def join(parts: Sequence[ImportedPart], source: str, *, y_up: bool) -> Soup:
         uvs=np.concatenate([_corners(part.uvs, part.faces, 2) for part in parts]),
         colors=np.concatenate([np.ones((len(p.faces), 3, 3)) if p.colors is None else p.colors for p in parts]),
         flat=np.concatenate([np.full(len(part.faces), part.flat) for part in parts]),
+        stored=faces if any(part.movable is not None for part in parts) else None,
     )
 
 
@@ -148,18 +156,22 @@ def repaired(soup: Soup, source: str) -> tuple[Soup, list[str]]:
     return soup, notes + winding + shading
 
 
-def assemble(soup: Soup) -> Mesh:
-    """Return the soup as a mesh: corners with the same point, normal and UV become one vertex."""
+def assemble(soup: Soup) -> tuple[Mesh, Ints | None]:
+    """Return the soup as a mesh, and which stored vertex each of its vertices was: corners with the same point, normal
+    and UV, and the same stored vertex where that is known, become one."""
     normals, uvs = soup.normals.astype(np.float32) + np.float32(0.0), soup.uvs.astype(np.float32) + np.float32(0.0)
     corners = soup.faces.reshape(-1)
     keys = np.column_stack([corners, normals.reshape(-1, 3).view(np.int32), uvs.reshape(-1, 2).view(np.int32)])
+    if soup.stored is not None:
+        keys = np.column_stack([keys, soup.stored.reshape(-1)])
     _, first, index = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-    return Mesh(
+    mesh = Mesh(
         vertices=soup.points[corners[first]].astype(np.float32),
         faces=index.reshape(-1, 3).astype(np.uint32),
         normals=normals.reshape(-1, 3)[first],
         uvs=uvs.reshape(-1, 2)[first],
     )
+    return mesh, None if soup.stored is None else soup.stored.reshape(-1)[first]
 
 
 # --- winding ----------------------------------------

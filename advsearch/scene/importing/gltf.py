@@ -130,6 +130,8 @@ READ = (
     "KHR_materials_pbrSpecularGlossiness",
     "KHR_mesh_quantization",
     "KHR_texture_transform",
+    "VRM",
+    "VRMC_vrm",
 )
 """Extensions that are understood."""
 
@@ -191,7 +193,17 @@ def _references(header: Header) -> Iterator[tuple[str, int | None, Sequence[obje
     for primitive in (primitive for mesh in header.meshes for primitive in mesh.primitives):
         for index in (*primitive.attributes.values(), primitive.indices):
             yield "accessors", index, header.accessors
+        for index in (index for target in primitive.targets for index in target.values()):
+            yield "accessors", index, header.accessors
         yield "materials", primitive.material, header.materials
+    for animation in header.animations:
+        for channel in animation.channels:
+            yield "samplers of an animation", channel.sampler, animation.samplers
+            yield "nodes", channel.target.node, header.nodes
+        for index in (index for sampler in animation.samplers for index in (sampler.input, sampler.output)):
+            yield "accessors", index, header.accessors
+    for bone in (*header.vrm.values(), *header.vrm_0):
+        yield "nodes", bone.node, header.nodes
     for node in header.nodes:
         yield "meshes", node.mesh, header.meshes
         yield "skins", node.skin, header.skins

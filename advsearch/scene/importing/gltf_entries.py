@@ -93,12 +93,17 @@ class Primitive(_Entry):
     indices: Index | None = None
     material: Index | None = None
     mode: Annotated[int, Field(ge=0, le=6)] = 4
-    targets: Unread = None
+    targets: List[dict[str, Index]] = []
+    """Morph targets: how far each attribute goes where their weight is 1."""
 
 
 class MeshEntry(_Entry):
     primitives: List[Primitive]
     name: str | None = None
+    weights: List[float] = []
+    """Of its morph targets, where a node says none of its own."""
+    extras: Unread = None
+    """`targetNames` in it are what they are called: not of the format, but exporters write them."""
 
 
 class Node(_Entry):
@@ -112,6 +117,7 @@ class Node(_Entry):
     translation: Annotated[list[float], Field(min_length=3, max_length=3)] | None = None
     rotation: Annotated[list[float], Field(min_length=4, max_length=4)] | None = None
     scale: Annotated[list[float], Field(min_length=3, max_length=3)] | None = None
+    weights: List[float] = []
     name: str | None = None
 
 
@@ -120,6 +126,39 @@ class Skin(_Entry):
 
     joints: Annotated[list[Index], FailFast(), Field(min_length=1)]
     inverseBindMatrices: Index | None = None
+
+
+class Target(_Entry):
+    """What a channel moves; without a node nothing (an extension may know what)."""
+
+    path: str
+    node: Index | None = None
+
+
+class Channel(_Entry):
+    sampler: Index
+    target: Target
+
+
+class AnimationSampler(_Entry):
+    """Accessors of times in seconds and of what holds at them."""
+
+    input: Index
+    output: Index
+    interpolation: Literal["LINEAR", "STEP", "CUBICSPLINE"] = "LINEAR"
+
+
+class Animation(_Entry):
+    channels: List[Channel] = []
+    samplers: List[AnimationSampler] = []
+    name: str | None = None
+
+
+class HumanBone(_Entry):
+    """The node that is a bone of a person, in VRM; its name is here in VRM 0 alone."""
+
+    node: Index
+    bone: str = ""
 
 
 class SceneEntry(_Entry):
@@ -319,11 +358,19 @@ class Header(_Entry):
     samplers: List[Sampler] = []
     cameras: List[CameraEntry] = []
     skins: List[Skin] = []
-    animations: Unread = None
+    animations: List[Animation] = []
+    vrm: dict[str, HumanBone] = _extension("VRMC_vrm", "humanoid", "humanBones", default={})
+    """The bones of a person by the names of VRM 1."""
+    vrm_0: List[HumanBone] = _extension("VRM", "humanoid", "humanBones", default=[])
     lights: List[LightEntry] = _extension("KHR_lights_punctual", "lights", default=[])
     """The lights that nodes may carry."""
     extensionsUsed: List[str] = []
     extensionsRequired: List[str] = []
+
+    @property
+    def bones(self) -> dict[int, str]:
+        """What nodes are called as bones of a person, by their numbers."""
+        return {one.node: one.bone for one in self.vrm_0} | {one.node: name for name, one in self.vrm.items()}
 
     def label(self, index: int) -> str:
         """Return what a node is called: by its name, its mesh's, or its number."""

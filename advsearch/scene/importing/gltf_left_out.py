@@ -13,6 +13,7 @@ from advsearch.scene.importing.files import Notes, shown
 from advsearch.scene.importing.gltf import READ
 from advsearch.scene.importing.gltf_entries import CUT_OUTS, Header
 from advsearch.scene.importing.usd import GENERATOR
+from advsearch.scene.skeleton import Skeleton
 
 _OPAQUE = " lets light pass through surfaces with {name}; here they are opaque"
 
@@ -45,9 +46,6 @@ def left_out(header: Header, notes: Notes) -> None:
     absent = sum(node.mesh is not None for index, node in enumerate(header.nodes) if index not in drawn)
     found = {
         "occlusion map{s}: left out": sum(one.occlusionTexture is not None for one in header.materials),
-        "mesh{es} with morph targets, which are left out": sum(
-            any(primitive.targets for primitive in mesh.primitives) for mesh in header.meshes
-        ),
         "normal map{s} with other texture coordinates than the base colour: left out": sum(
             not one.reads(one.normalTexture) for one in header.materials
         ),
@@ -57,7 +55,6 @@ def left_out(header: Header, notes: Notes) -> None:
         "material{s} with an alphaMode that glTF does not have: opaque": sum(
             one.alphaMode not in ("OPAQUE", *CUT_OUTS) for one in header.materials
         ),
-        "animation{s}: left out": _length(header.animations),
         "further scene{s}: left out": max(0, len(header.scenes) - 1),
         "node{s} with a mesh outside of its scene: left out": absent,
     }
@@ -65,6 +62,13 @@ def left_out(header: Header, notes: Notes) -> None:
         if count:
             notes.say(counted(count, what))
     _note_unread(header, notes)
+
+
+def moves(skeleton: Skeleton) -> str:
+    """Say what of a file moves, and how."""
+    names = [one.name for one in skeleton.clips]
+    clips = f", and plays {', '.join(names[:5])}{', ...' if len(names) > 5 else ''}" if names else ""
+    return f" is shown at rest: the control body moves it{clips}"
 
 
 WORDS = {
@@ -137,10 +141,6 @@ def lights_and_cameras(header: Header) -> Iterator[str]:
 
 def counted(count: int, what: str) -> str:
     return f"{count} {what.format(s='' if count == 1 else 's', es='' if count == 1 else 'es')}"
-
-
-def _length(entries: object) -> int:
-    return len(entries) if isinstance(entries, list) else 0
 
 
 def in_the_scene(header: Header) -> set[int]:

@@ -6,7 +6,7 @@ What materials look like is said in glTF 2.0, section 3.9; how their textures go
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -26,13 +26,24 @@ from advsearch.scene.importing.gltf_entries import (
     NEAREST,
     Header,
     MaterialEntry,
-    Node,
     Primitive,
     Sampler,
-    Skin,
     TextureUse,
 )
-from advsearch.scene.importing.gltf_left_out import counted, left_out
+from advsearch.scene.importing.gltf_left_out import counted, left_out, moves
+from advsearch.scene.importing.gltf_skeleton import (
+    Bound,
+    bound,
+    check_moving,
+    joint_matrices,
+    morphed,
+    movable,
+    posed,
+    poses,
+    skeleton_of,
+    targets_of,
+    weights_of,
+)
 from advsearch.scene.importing.parts import (
     ImportedPart,
     ImportedSurface,
@@ -44,6 +55,7 @@ from advsearch.scene.importing.parts import (
 )
 from advsearch.scene.importing.pictures import Kind, Pictures
 from advsearch.scene.importing.texture import mean_over
+from advsearch.scene.skeleton import Target
 
 Fit = Callable[[Doubles], Doubles]
 """Takes texture coordinates (V, 2) of the format to those of the pictures that were made."""
@@ -255,87 +267,6 @@ def _differ_at_edges(pictures: Sequence[Floats], side: int) -> bool:
     )
 
 
-# --- skins: meshes that joints move, in the pose that the file's nodes have (section 3.7.3) --------------------------
-
-
-@dataclass(frozen=True, eq=False)
-class Bound:
-    """To which joints vertices are bound.
-
-    Attributes:
-        joints: (V, 4 n) their numbers in the skin.
-        weights: (V, 4 n) of each; they add up to 1.
-    """
-
-    joints: Ints
-    weights: Doubles
-
-
-def bound(path: Path, header: Header, buffers: Buffers, primitive: Primitive, used: Ints) -> Bound | None:
-    """Return to which joints the used vertices of a primitive are bound; None where it says nothing of joints.
-
-    Raises:
-        FileFormatError: it says it of other vertices, or without weights.
-    """
-    held = primitive.attributes
-    joints: list[Ints] = []
-    weights: list[Doubles] = []
-    while f"JOINTS_{len(joints)}" in held:
-        pair = [held.get(f"{kind}_{len(joints)}") for kind in ("JOINTS", "WEIGHTS")]
-        for one in pair:
-            given = None if one is None else header.accessors[one]
-            if given is None or given.type != "VEC4" or given.count != header.accessors[held["POSITION"]].count:
-                raise damaged(path, "four joints and four weights of each vertex", "others")
-        first, second = (index for index in pair if index is not None)
-        joints.append(buffers.values(first)[used].astype(np.int64))
-        weights.append(buffers.numbers(second, used))
-    if not joints:
-        return None
-    shares = np.concatenate(weights, axis=1)
-    total = shares.sum(axis=1, keepdims=True)
-    shares = np.where(total > 0.0, shares / np.where(total > 0.0, total, 1.0), np.eye(1, shares.shape[1]))
-    return Bound(np.concatenate(joints, axis=1), shares)
-
-
-def joint_matrices(path: Path, skin: Skin, buffers: Buffers, poses: Mapping[int, Doubles]) -> Doubles:
-    """Return (J, 4, 4) from the mesh to the scene, one of each joint; `poses` are those of all nodes.
-
-    Raises:
-        FileFormatError: it has too few inverse bind matrices, or numbers of another kind.
-    """
-    found = np.stack([poses[joint] for joint in skin.joints])
-    if skin.inverseBindMatrices is None:
-        return found
-    values = buffers.values(skin.inverseBindMatrices)
-    if values.shape[1:] != (16,) or len(values) < len(found):
-        raise damaged(
-            path, f"{len(found)} inverse bind matrices of 4 x 4", f"{len(values)} of {values.shape[1]} numbers"
-        )
-    return np.asarray(found @ values[: len(found)].astype(np.float64).reshape(-1, 4, 4).transpose(0, 2, 1))
-
-
-def posed(path: Path, part: ImportedPart, by: Bound, matrices: Doubles) -> ImportedPart:
-    """Return a part as its joints place it in the scene; the transform of its own node does not count.
-
-    Raises:
-        FileFormatError: it is bound to joints that its skin does not have.
-    """
-    if by.joints.max(initial=0) >= len(matrices) or by.joints.min(initial=0) < 0:
-        raise damaged(path, f"joints under {len(matrices)}, as its skin has", f"number {int(by.joints.max())}")
-    moves = np.zeros((len(part.vertices), 3, 4))
-    for joint, weight in zip(by.joints.T, by.weights.T, strict=True):
-        moves += weight[:, None, None] * matrices[joint, :3]
-    turns, normals = moves[:, :, :3], part.normals
-    vertices = np.einsum("vij,vj->vi", turns, part.vertices) + moves[:, :, 3]
-    if normals is not None:  # which turn with the cofactors
-        normals = np.einsum("vij,vj->vi", np.cross(turns[:, [1, 2, 0]], turns[:, [2, 0, 1]]), normals)
-    if not (np.linalg.det(turns) < 0.0).all():
-        return replace(part, vertices=vertices, normals=normals)
-    colors = None if part.colors is None else part.colors[:, ::-1]
-    mirrored = None if normals is None else -normals
-    return replace(part, vertices=vertices, faces=part.faces[:, ::-1], normals=mirrored, colors=colors)
-
-
 # --- primitives in their places --------------------------------------------------------------------------------------
 
 TRIANGLES, STRIP, FAN = 4, 5, 6
@@ -355,8 +286,9 @@ def read_gltf(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
     drawn.sort(key=lambda item: item[0])
     meshes = {mesh: header.meshes[mesh] for node, _ in drawn if (mesh := header.nodes[node].mesh) is not None}
     skinned = {header.nodes[node].mesh for node, _ in drawn if header.nodes[node].skin is not None}
+    moving = check_moving(path, header, [node for node, _ in drawn])
     pieces = {
-        (mesh, number): _piece(path, header, buffers, primitive, skinned=mesh in skinned)
+        (mesh, number): _piece(path, header, buffers, primitive, skinned=mesh in skinned, extras=entry.extras)
         for mesh, entry in meshes.items()
         for number, primitive in enumerate(entry.primitives)
     }
@@ -391,11 +323,19 @@ def read_gltf(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
         if number is not None
     }
 
+    skeleton = skeleton_of(path, header, buffers, moving)
+    if skeleton is not None:
+        notes.say(moves(skeleton))
+
     def in_place(key: tuple[int, int], node: int, pose: Doubles) -> ImportedPart:
-        skin, by = header.nodes[node].skin, with_faces[key].bound
-        if skin is None or by is None:
-            return placed(finished[key], pose)
-        return posed(path, finished[key], by, skins[skin])
+        skin, piece, part = header.nodes[node].skin, with_faces[key], finished[key]
+        if skeleton is not None:
+            rest = weights_of(path, header, node, len(piece.targets))
+            stored = movable(path, header, buffers, skeleton, node, part.vertices, piece.bound, piece.targets, rest)
+            part = replace(morphed(part, piece.targets, piece.turns, rest), movable=stored)
+        if skin is None or piece.bound is None:
+            return placed(part, pose)
+        return posed(path, part, piece.bound, skins[skin])
 
     parts = [
         replace(in_place((mesh, number), node, pose), node=node)
@@ -417,15 +357,20 @@ class _Piece:
         material: its number.
         see_through: it has vertex colours whose alpha would count.
         bound: to which joints; None where it is to none.
+        targets, turns: its morph targets, and how far each turns its normals.
     """
 
     part: ImportedPart
     material: int | None
     see_through: bool
     bound: Bound | None
+    targets: tuple[Target, ...]
+    turns: tuple[Doubles | None, ...]
 
 
-def _piece(path: Path, header: Header, buffers: Buffers, primitive: Primitive, *, skinned: bool) -> _Piece | None:
+def _piece(
+    path: Path, header: Header, buffers: Buffers, primitive: Primitive, *, skinned: bool, extras: object
+) -> _Piece | None:
     """Return a primitive; None for points, lines and what has no places."""
     held = primitive.attributes
     if primitive.mode < TRIANGLES or "POSITION" not in held:
@@ -451,7 +396,8 @@ def _piece(path: Path, header: Header, buffers: Buffers, primitive: Primitive, *
     normals = buffers.numbers(held["NORMAL"], used) if "NORMAL" in held else None
     part = ImportedPart(vertices, faces, normals, uvs, colors, ImportedSurface(), flat=True)
     by = bound(path, header, buffers, primitive, used) if skinned else None
-    return _Piece(part, primitive.material, see_through, by)
+    targets, turns = targets_of(path, header, buffers, primitive, used, extras)
+    return _Piece(part, primitive.material, see_through, by, targets, turns)
 
 
 def _triangles(order: Ints, mode: int) -> Ints:
@@ -476,37 +422,3 @@ def _moved(uvs: Doubles, use: TextureUse | None) -> Doubles:
     sine, cosine = np.sin(given.rotation), np.cos(given.rotation)
     u, v = (uvs * given.scale).T
     return np.stack([cosine * u + sine * v, cosine * v - sine * u], axis=1) + given.offset
-
-
-def poses(header: Header) -> Iterator[tuple[int, Doubles]]:
-    """Yield the nodes of the file's scene with their poses (4, 4) in it."""
-    children = {child for node in header.nodes for child in node.children}
-    roots = [index for index in range(len(header.nodes)) if index not in children]
-    if header.scenes:
-        roots = list(header.scenes[header.scene or 0].nodes)
-    level = [(index, np.eye(4)) for index in roots]
-    while level:
-        index, above = level.pop()
-        pose = above @ _matrix(header.nodes[index])
-        yield index, pose
-        level.extend((child, pose) for child in header.nodes[index].children)
-
-
-def _matrix(node: Node) -> Doubles:
-    """The transform (4, 4) of one node."""
-    if node.matrix is not None:
-        return np.asarray(np.array(node.matrix, dtype=np.float64).reshape(4, 4).T)
-    matrix = np.eye(4)
-    x, y, z, w = np.array(node.rotation or [0.0, 0.0, 0.0, 1.0]) / max(
-        float(np.linalg.norm(node.rotation or 1.0)), 1e-12
-    )
-    turn = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-    matrix[:3, :3] = turn * np.array(node.scale or [1.0, 1.0, 1.0])
-    matrix[:3, 3] = node.translation or [0.0, 0.0, 0.0]
-    return matrix

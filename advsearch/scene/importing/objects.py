@@ -28,7 +28,7 @@ from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.importing import gltf, gltf_left_out
 from advsearch.scene.importing.blender import read_mesh_bytes
 from advsearch.scene.importing.files import Notes, check_faces, damaged, looks_like, safe_name, shown, text_of
-from advsearch.scene.importing.geometry import Soup, assemble, extent_of, join, repaired
+from advsearch.scene.importing.geometry import UPRIGHT, Soup, assemble, extent_of, join, repaired
 from advsearch.scene.importing.gltf_parts import read_gltf
 from advsearch.scene.importing.parts import NEUTRAL, ImportedPart, ImportedSurface, visible
 from advsearch.scene.importing.ply import read_ply
@@ -118,7 +118,7 @@ def _colors(head: bytes, attributes: Attributes, notes: Notes) -> Doubles | None
     return np.asarray(srgb_to_linear(found), dtype=np.float64)
 
 
-GLTF = (".glb", ".gltf", ".blend", *USD)
+GLTF = (".glb", ".gltf", ".vrm", ".blend", *USD)
 """Endings of glTF files, which have conventions of their own: y up, linear colours; and of what is read as glTF."""
 
 Reader = Callable[[Path, bytes, Notes], list[ImportedPart]]
@@ -229,7 +229,7 @@ def object_of(parts: list[ImportedPart], notes: list[str], file: Path, name: str
     more = len(warnings) - len(kept)
     return ObjectAsset(
         name=name,
-        mesh=_mesh(soup, surfaces, file),
+        mesh=_mesh(soup, surfaces, file, parts, UPRIGHT if axis.axis == "y" else np.eye(3)),
         base_color=np.ascontiguousarray(maps.color[:, :, :3]),
         material=material,
         source=str(file),
@@ -243,14 +243,22 @@ def object_of(parts: list[ImportedPart], notes: list[str], file: Path, name: str
     )
 
 
-def _mesh(soup: Soup, surfaces: list[ImportedSurface], file: Path) -> Mesh:
+def _mesh(soup: Soup, surfaces: list[ImportedSurface], file: Path, parts: list[ImportedPart], upright: Doubles) -> Mesh:
     names, number = by_material(soup, surfaces)
     faces = np.split(np.argsort(number, kind="stable"), np.cumsum(np.bincount(number, minlength=len(names)))[:-1])
     materials = {name: group for name, group in zip(names, faces, strict=True) if name and len(group)}
     try:
-        return replace(normalised(assemble(soup)), materials=materials)
+        mesh, stored = assemble(soup)
+        made = replace(normalised(mesh), materials=materials)
     except InputError as error:  # which knows of no file
         raise InputError(f"{file}: {error}") from None
+    moving = [part.movable for part in parts if part.movable is not None]
+    if stored is None:
+        return made
+    from advsearch.scene.rigged import SkeletonRig  # torch takes seconds, and most have no joints
+
+    size = extent_of(parts) * float(np.ptp(mesh.vertices.astype(np.float64), axis=0).max())
+    return replace(made, rig=SkeletonRig(moving, stored, upright / size))
 
 
 def _let_out(emission: Floats | None, opacity: Floats | None) -> Floats | None:

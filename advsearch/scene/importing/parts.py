@@ -16,6 +16,7 @@ from scipy.ndimage import distance_transform_edt
 
 from advsearch.scene.assets import Doubles, Floats, Ints
 from advsearch.scene.color import srgb_to_linear
+from advsearch.scene.skeleton import Movable
 
 FLAT = np.array([0.5, 0.5, 1.0], np.float32)
 """The texel of a normal map that changes nothing."""
@@ -162,6 +163,7 @@ class ImportedPart:
         surface: the part's material.
         node: number of its node in a glTF file; -1 in others.
         flat: where the file gives no normals, its faces are flat; otherwise smooth normals are made.
+        movable: of a glTF file in which something moves, the part as it is stored, with its vertices in this order.
     """
 
     vertices: Doubles
@@ -172,6 +174,7 @@ class ImportedPart:
     surface: ImportedSurface
     node: int = -1
     flat: bool = False
+    movable: Movable | None = None
 
 
 def visible(parts: Sequence[ImportedPart]) -> list[ImportedPart]:

@@ -20,17 +20,15 @@ from advsearch.files import MESHES
 from advsearch.scene.assets import Doubles, ObjectAsset
 from advsearch.scene.importing import gltf, gltf_left_out
 from advsearch.scene.importing.blender import read_mesh_bytes
-from advsearch.scene.importing.files import safe_name, shown
-from advsearch.scene.importing.geometry import FLAT
+from advsearch.scene.importing.files import Names, clean, safe_name, shown
+from advsearch.scene.importing.geometry import FLAT, UPRIGHT
 from advsearch.scene.importing.gltf_entries import CameraEntry, Header, LightEntry
-from advsearch.scene.importing.gltf_parts import poses
+from advsearch.scene.importing.gltf_skeleton import poses
 from advsearch.scene.importing.objects import GLTF, object_of, read_parts
 from advsearch.scene.importing.parts import ImportedPart, visible
 from advsearch.scene.importing.usd import GENERATOR
 from advsearch.scene.parts import PlacedCamera, PointLamp, ScenePart, SpotLamp, mesh_part
 
-UPRIGHT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-"""From y up to z up."""
 BEHIND = np.diag([-1.0, 1.0, -1.0])
 """Cameras of glTF look along -z with +x to the right; ours along +z with +x to the left."""
 MITSUBA_FILE = ".xml"
@@ -102,7 +100,7 @@ def import_scene(path: Path, node: str) -> ImportedScene:
             f"{path}: expected at most {MOST_SURROUNDINGS} meshes and lights beside the object, got "
             f"{len(others) + len(lamps)}; join some of them in the file"
         )
-    frame, names = _frame(chosen_parts), _Names()
+    frame, names = _frame(chosen_parts), Names(TAKEN)
     called = _mesh_names(header, parts, names)
     surroundings: list[ScenePart] = []
     for number in others:
@@ -145,14 +143,14 @@ def node_names(path: Path) -> list[str]:
     return list(dict.fromkeys(map(header.label, sorted(_above(header, drawn)))))
 
 
-def _mesh_names(header: Header, parts: Sequence[ImportedPart], names: _Names) -> dict[int, str]:
+def _mesh_names(header: Header, parts: Sequence[ImportedPart], names: Names) -> dict[int, str]:
     """Names of the nodes with geometry by number, the same whichever of them is the object."""
     return {number: names.free(header.label(number)) for number in sorted({part.node for part in parts})}
 
 
 def _camera_names(header: Header, nodes: Iterable[int]) -> dict[int, str]:
     """Names of the cameras with perspective, by the number of their node."""
-    names, found = _Names(), {}
+    names, found = Names(TAKEN), {}
     for index in sorted(nodes):
         camera = header.nodes[index].camera
         if camera is not None and header.cameras[camera].perspective is not None:
@@ -209,7 +207,7 @@ def contents(path: Path) -> Contents:
     nodes: dict[int, list[ImportedPart]] = {}
     for part in parts:
         nodes.setdefault(part.node, []).append(part)
-    listed, called = [], _mesh_names(header, parts, _Names())
+    listed, called = [], _mesh_names(header, parts, Names(TAKEN))
     for index, group in sorted(nodes.items()):
         places = np.concatenate([part.vertices[part.faces].reshape(-1, 3) for part in group])
         x, y, z = map(float, np.ptp(places, axis=0))
@@ -244,30 +242,6 @@ def _frame(parts: Sequence[ImportedPart]) -> FileFrame:
         return FileFrame(1.0, np.zeros(3))  # refused with a reason when it is repaired
     low, high = places.min(axis=0), places.max(axis=0)
     return FileFrame(float((high - low).max()), np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]]))
-
-
-class _Names:
-    """Gives names that are free, and that a setting may have."""
-
-    def __init__(self) -> None:
-        self._taken = set(TAKEN)
-        self._last: dict[str, int] = {}
-
-    def free(self, wanted: str) -> str:
-        """Return the name, or the first free one with a number behind it."""
-        base = name = clean(wanted)
-        number = self._last.get(base, 1)
-        while name in self._taken:
-            number += 1
-            name = f"{base}-{number}"
-        self._last[base] = number
-        self._taken.add(name)
-        return name
-
-
-def clean(name: str) -> str:
-    """Return a name of letters, digits, dashes and underscores, 60 at most."""
-    return re.sub(r"[^\w-]+", "-", name).strip("-")[:60] or "part"
 
 
 def _named(path: Path, header: Header, name: str, with_mesh: set[int]) -> int:

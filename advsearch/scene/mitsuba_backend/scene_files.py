@@ -15,10 +15,10 @@ import numpy as np
 
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.assets import Doubles, Floats, Mesh, ObjectAsset, UpAxis, normalised
-from advsearch.scene.importing.files import safe_name, shown
+from advsearch.scene.importing.files import clean, safe_name, shown
 from advsearch.scene.importing.geometry import assemble, join
 from advsearch.scene.importing.parts import BRIGHTEST, ImportedPart, ImportedSurface
-from advsearch.scene.importing.scenes import TAKEN, ImportedScene, clean
+from advsearch.scene.importing.scenes import TAKEN, ImportedScene
 from advsearch.scene.importing.texture import textured
 from advsearch.scene.mitsuba_backend.meshes import plain
 from advsearch.scene.mitsuba_backend.shape_surfaces import ShapeSurface, constant, surface_of
@@ -233,7 +233,7 @@ def _painted(found: ShapeMesh, surface: ShapeSurface, kind: str, where: str) -> 
     color = ImportedSurface(color=surface.base_color[0, 0])
     part = ImportedPart(vertices, mesh.faces.astype(np.int64), normals, uvs if own else None, None, color)
     soup, maps, _ = textured(join([part], where, y_up=False), [color])
-    return assemble(soup), maps.color
+    return assemble(soup)[0], maps.color
 
 
 def _plugins(tree: Mapping[str, object]) -> Iterator[tuple[str, Mapping[str, object]]]:

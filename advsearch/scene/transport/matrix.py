@@ -49,16 +49,18 @@ class Halves:
 
     Args:
         picture: any shape.
+        small: unpack it each time it is asked for; otherwise once, where each step of a search asks.
     """
 
-    def __init__(self, picture: Tensor) -> None:
+    def __init__(self, picture: Tensor, small: bool = True) -> None:
         mean = float(picture.abs().mean()) if picture.numel() else 0.0
         self._scale = mean if 0.0 < mean < float("inf") else 1.0
         self._values = (picture / self._scale).clamp(-MOST_MEANS, MOST_MEANS).half()
+        self._unpacked = None if small else self._values.float() * self._scale
 
     def __call__(self) -> Tensor:
         """The picture, float32."""
-        return self._values.float() * self._scale
+        return self._values.float() * self._scale if self._unpacked is None else self._unpacked
 
 
 class ColouredRows:
@@ -88,9 +90,9 @@ class ColouredRows:
     @property
     def bytes(self) -> int:
         """Memory when it is finished: a share and its column an entry, a beginning and a colour a row; a share and its
-        row an entry and a beginning a column as well, where it is kept both ways."""
+        row an entry, a beginning a column and the unpacked colours as well, where it is kept both ways."""
         small = (2 + self._column.itemsize) * self.entries + (4 + 6) * self._shape[0]
-        return small if self._small else small + 10 * self.entries + 4 * self._shape[1]
+        return small if self._small else small + 10 * self.entries + 12 * self._shape[0] + 4 * self._shape[1]
 
     def add(self, rows: Ints, columns: Ints, shares: Floats, weights: Floats) -> None:
         """Add entries.
@@ -123,7 +125,7 @@ class ColouredRows:
             self._both_ways = by_rows(rows), by_rows(rows.T.tocsr())
         self._sum = scipy.sparse.csr_matrix(self._shape, dtype=np.float32)
         colours = torch.from_numpy(self._colours).reshape(*picture, 3)
-        self._kept_colours = Halves(colours if smooth is None else smooth(colours))
+        self._kept_colours = Halves(colours if smooth is None else smooth(colours), self._small)
         self._colours = np.zeros((0, 3), dtype=np.float32)
 
     def times(self, values: Tensor) -> Tensor:
@@ -132,7 +134,7 @@ class ColouredRows:
             product = self._both_ways[0] @ values
         else:
             product = torch.from_numpy(self._shares() @ values.numpy())
-        return product * self._kept_colours().reshape(-1, 3)
+        return product.mul_(self._kept_colours().reshape(-1, 3))
 
     def transposed_times(self, values: Tensor) -> Tensor:
         """Return the transpose times (rows, 3): (columns, 3)."""
@@ -214,7 +216,7 @@ class TextureTransport:
         whole = functional.pad(change, (0, 0, 0, right, 0, below)) if right or below else change
         across = whole.reshape(rows * COARSE, columns, COARSE, 3).sum(dim=2)
         pooled = across.reshape(rows, COARSE, columns, 3).sum(dim=1) / self._in_cell
-        radiance = self._first.times(change.reshape(-1, 3)) + self._later.times(pooled.reshape(-1, 3))
+        radiance = self._first.times(change.reshape(-1, 3)).add_(self._later.times(pooled.reshape(-1, 3)))
         return radiance.reshape(*self._picture, 3)
 
     def transposed_times(self, cotangent: Tensor) -> Tensor:
@@ -351,7 +353,7 @@ class LinearRenderer(Predictor):
         radiance = base[..., :3]
         for name, transport in self.collected.transports.items():
             radiance = radiance + transport(inputs[name] - self.there[name])
-        return torch.cat([radiance, base[..., 3:]], dim=-1)
+        return radiance if base.shape[-1] == 3 else torch.cat([radiance, base[..., 3:]], dim=-1)
 
     def shown(self, inputs: Mapping[str, Tensor], u: Tensor) -> Tensor:
         """The picture (H, W, 3) sRGB of scene inputs, of which only those to which radiance is linear count; what
@@ -384,7 +386,7 @@ def _collected(
     if not transports:
         base = renderer.rendered(traced, seed, spp, hide)
         tick(spp)
-        return Linearised(transports, there, applied, Halves(base), renderer.non_finite - before)
+        return Linearised(transports, there, applied, Halves(base, small=quick), renderer.non_finite - before)
     samples, count = passes(renderer, spp)
     traces: list[Paths] = []
     for name, transport in transports.items():
@@ -410,7 +412,7 @@ def _collected(
     for transport in transports.values():
         transport.finish(smooth)
     base = torch.cat([clean, seen.coverage], dim=-1) if hide else clean
-    return Linearised(transports, there, applied, Halves(base), renderer.non_finite - before)
+    return Linearised(transports, there, applied, Halves(base, small=quick), renderer.non_finite - before)
 
 
 def linear_inputs(renderer: Renderer) -> frozenset[str]:

@@ -8,7 +8,10 @@
   const FOLLOW = 3000; // milliseconds between two looks at a sweep that goes on
   const MAP = [[0, 34, 78], [42, 63, 108], [87, 93, 109], [127, 124, 117], [166, 157, 117], [210, 193, 101], [254, 232, 56]];
   const KINDS = { uint32: Uint32Array, float32: Float32Array, uint16: Uint16Array, uint8: Uint8Array };
-  const UNKNOWN = 2, NO_PROBABILITY = 65535, NO_BOX = 65535, BOX_STEPS = 8;
+  const UNKNOWN = 2, NO_PROBABILITY = 65535, NO_BOX = 65535, BOX_STEPS = 8, OF_A_BOX = 6;
+  const SURE = 0.5; // least score of a box that is drawn on a small picture
+  const MOST_GROUPS = 40, IN_A_GROUP = 12;
+  const DRIVE = "drive", BY = "by ";
   const PEEKED = 4; // pictures beside a cell that is pointed at
   const OVERALL = "all values", ACROSS = "across", UP = "up", ONE = "one value";
 
@@ -36,6 +39,13 @@
     const select = make("select", { "aria-label": label, onchange: (event) => told(event.target.value) });
     for (const [name, text] of options) select.append(make("option", { value: name, selected: name === value }, text));
     return make("label", {}, make("span", {}, label), select);
+  }
+
+  // Puts others in the place of what is in an element; who was on a list by keys stays on it.
+  function renewed(place, ...children) {
+    const was = place.contains(document.activeElement) ? document.activeElement.getAttribute("aria-label") : null;
+    place.replaceChildren(...children);
+    if (was) for (const one of place.querySelectorAll("[aria-label]")) if (one.getAttribute("aria-label") === was) one.focus();
   }
 
   // ---- numbers -----------------------------------------------------------------------------------------------------
@@ -114,7 +124,7 @@
     return intervals.get(key);
   }
 
-  const STAKES = [1, 0.9, 0.75, 0.5, 0.25, 0.125, 0.0625, 0.03125], SURE = Math.log(40);
+  const STAKES = [1, 0.9, 0.75, 0.5, 0.25, 0.125, 0.0625, 0.03125], ENOUGH = Math.log(40);
   const overUnits = new Map();
   // The interval over units (drives) that have several rows each, by bets (attacks/units.py), from what units come to:
   // [right, rows, how many units].
@@ -135,7 +145,7 @@
         }
         return (low + high) / 2;
       };
-      overUnits.set(key, [solve((mean) => won(mean, false) < SURE), solve((mean) => won(1 - mean, true) >= SURE)]);
+      overUnits.set(key, [solve((mean) => won(mean, false) < ENOUGH), solve((mean) => won(1 - mean, true) >= ENOUGH)]);
     }
     return overUnits.get(key);
   }
@@ -154,7 +164,7 @@
     const size = new DataView(buffer).getUint32(0, true);
     const head = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, size)));
     const arrays = {};
-    for (const one of head.columns) arrays[one.name] = new KINDS[one.type](buffer, 4 + size + one.at, head.count * (one.width || 1));
+    for (const one of head.columns) arrays[one.name] = new KINDS[one.type](buffer, 4 + size + one.at, one.length === undefined ? head.count * (one.width || 1) : one.length);
     return { head, arrays };
   }
 
@@ -165,7 +175,8 @@
       this.parameters = [];
       this.answers = [];
       this.sources = [];
-      this.columns = { step: new Uint32Array(0), unit: new Uint32Array(0), margin: new Float32Array(0), answer: new Uint16Array(0), probability: new Uint16Array(0), right: new Uint8Array(0), source: new Uint16Array(0), boxes: null };
+      this.columns = { step: new Uint32Array(0), unit: new Uint32Array(0), margin: new Float32Array(0), answer: new Uint16Array(0), probability: new Uint16Array(0), right: new Uint8Array(0), source: new Uint16Array(0), boxes: null, others: null };
+      this.things = [];
     }
 
     add({ head, arrays }, source) {
@@ -188,6 +199,7 @@
         if (arrays.boxes) boxes.set(arrays.boxes, 8 * before);
         this.columns.boxes = boxes;
       }
+      if (arrays.others) this.addOthers(arrays, this.places(this.things, head.things), before, count);
       this.columns.answer = grown(this.columns.answer, Uint16Array);
       this.put(this.columns.answer, arrays.answer, this.places(this.answers, head.answers), before);
       head.parameters.forEach((given, number) => {
@@ -205,12 +217,24 @@
         else mine.data.set(from, before);
       });
       this.count = count;
-      this.order = null;
+      this.order = this.pairs = null;
       for (const one of this.parameters) {
         if (one.data.length === count) continue;
         const missing = one.levels ? this.places(one.levels, ["none"])[0] : NaN;
         one.data = grown(one.data, one.data.constructor, missing);
       }
+    }
+
+    // All boxes of rows, one list behind the other: where each row's end is, and six numbers a box.
+    addOthers({ others, "others end": ends }, names, before, count) {
+      const { ends: old, list } = this.columns.others || { ends: new Uint32Array(0), list: new Uint16Array(0) };
+      const joined = new Uint16Array(list.length + others.length), places = new Uint32Array(count).fill(list.length / OF_A_BOX);
+      joined.set(list);
+      joined.set(others, list.length);
+      for (let at = list.length + 4; at < joined.length; at += OF_A_BOX) joined[at] = names[joined[at]];
+      places.set(old);
+      for (let k = 0; k < ends.length; k++) places[before + k] = ends[k] + list.length / OF_A_BOX;
+      this.columns.others = { ends: places, list: joined };
     }
 
     // The rows, those of one unit of sampling beside each other; empty where each is a unit of its own.
@@ -237,8 +261,25 @@
     // Each parameter with what it is shown by: names, its numbers one by one, or parts of its range.
     axes() {
       const made = this.parameters.map((one) => this.axis(one)).filter((one) => one.labels.length > 1);
+      const drives = this.drives(made);
+      if (drives) made.push(drives);
       if (this.sources.length > 1) made.unshift({ name: "run", unit: "", labels: this.sources.map((one) => one.name), level: this.columns.source, names: true });
       return made;
+    }
+
+    // Which drive each row is of, named by what stays the same in each; null where rows are of none.
+    drives(axes) {
+      const order = this.byUnit(), { unit, source } = this.columns;
+      if (!order.length || !this.sources.some((one) => one.drives)) return null;
+      const level = new Uint16Array(this.count), first = [];
+      const still = new Set(axes);
+      order.forEach((k, at) => {
+        if (!at || unit[k] !== unit[order[at - 1]] || source[k] !== source[order[at - 1]]) first.push(k);
+        else for (const axis of still) if (axis.level[k] !== axis.level[first[first.length - 1]]) still.delete(axis);
+        level[k] = first.length - 1;
+      });
+      const labels = first.map((k, at) => [`${at + 1}`, ...[...still].map((axis) => `${axis.names ? "" : `${axis.name} `}${axis.labels[axis.level[k]]}`)].join(", "));
+      return first.length > 65535 ? null : { name: DRIVE, unit: "", labels, full: labels, level, names: true };
     }
 
     axis({ name, unit, levels, edges, data }) {
@@ -283,15 +324,26 @@
 
   // ---- the explorer ------------------------------------------------------------------------------------------------
 
+  const SHOWS = [["all", "all"], ["wrong", "wrong predictions"], ["right", "right predictions"], ["differ", "where runs differ"]];
+  const ORDERS = [["worst", "worst margin"], ["best", "best margin"], ["first", "as they were made"]];
+
   class Explorer {
     constructor(place, table) {
       this.place = place;
       this.table = table;
-      this.state = { across: null, up: null, by: null, measure: "accuracy", fixed: {}, cell: null, show: "all", order: "worst" };
-      this.parts = { peek: make("div", { class: "peek", hidden: true, "aria-hidden": "true" }), controls: make("div", { class: "parameters" }), options: make("div", { class: "options" }), maps: make("div", { class: "maps" }), legend: make("div", { class: "legend" }), status: make("p", { class: "status", role: "status", "aria-live": "polite" }), alongs: make("div", { class: "alongs" }), gallery: make("div", { class: "gallery" }), bar: make("div", { class: "options" }) };
+      this.state = { across: null, up: null, by: null, measure: "accuracy", fixed: {}, cell: null, show: "all", order: "worst", find: "", group: null };
+      this.parts = { peek: make("div", { class: "peek", hidden: true, "aria-hidden": "true" }), controls: make("div", { class: "parameters" }), options: make("div", { class: "options" }), maps: make("div", { class: "maps" }), legend: make("div", { class: "legend" }), status: make("p", { class: "status", role: "status", "aria-live": "polite" }), alongs: make("div", { class: "alongs" }), gallery: make("div", {}), bar: make("div", { class: "options" }), find: this.finder() };
       const heading = (text) => make("h2", {}, text);
       place.append(heading("Accuracy over two parameters"), this.parts.options, this.parts.controls, this.parts.maps, this.parts.legend, this.parts.status, heading("Pictures"), this.parts.bar, this.parts.gallery, heading("Along each parameter"), make("p", { class: "soft" }, "Accuracy with its 95 % interval, over what is chosen above: Clopper and Pearson's, and where rows share a draw (frames of a drive, models that are shown one picture) one over draws, by bets."), this.parts.alongs, this.parts.peek);
       window.addEventListener("hashchange", () => this.arrive());
+    }
+
+    finder() {
+      let waits = null;
+      return make("label", { class: "find" }, make("span", {}, "Search"), make("input", { type: "search", placeholder: "truck, or camera.distance over 30", title: "Words of predictions and names, numbers of configurations, and conditions as rules say them: camera.distance over 30 and pose.yaw from 340 to 20", oninput: (event) => {
+        clearTimeout(waits);
+        waits = setTimeout(() => this.change({ find: event.target.value }), 200);
+      } }));
     }
 
     // The rows have grown.
@@ -316,6 +368,8 @@
       const grid = new Set(this.table.sources.flatMap((one) => one.grid || []));
       const rank = (axis) => (axis.names ? 3 : axis.parts ? 2 : grid.has(axis.name) ? 0 : 1);
       const order = [...this.axes].sort((a, b) => rank(a) - rank(b));
+      const drives = this.byName.get(DRIVE), time = this.axes.find((axis) => axis.name.endsWith(".time"));
+      if (drives && time && drives.labels.length <= MOST_LEVELS) order.unshift(time, drives); // a drive is seen from left to right
       const pick = (name, other) => (this.byName.has(name) ? name : (order.find((axis) => axis.name !== other) || {}).name || null);
       state.across = pick(given.get("across"), given.get("up"));
       state.up = pick(given.get("up") === state.across ? null : given.get("up"), state.across);
@@ -323,8 +377,12 @@
       const by = given.has("by") ? given.get("by") : "run"; // several runs stand side by side unless asked otherwise
       state.by = this.byName.has(by) && by !== state.across && by !== state.up ? by : null;
       state.measure = ["accuracy", "margin", "count"].includes(given.get("measure")) ? given.get("measure") : "accuracy";
-      state.show = ["all", "wrong", "right"].includes(given.get("show")) ? given.get("show") : "all";
-      state.order = ["worst", "best", "first"].includes(given.get("order")) ? given.get("order") : "worst";
+      state.show = SHOWS.map(([name]) => name).includes(given.get("show")) ? given.get("show") : "all";
+      const known = [...ORDERS, ...this.numbers()].map(([name]) => name);
+      state.order = known.includes(given.get("order")) ? given.get("order") : drives ? "first" : "worst";
+      state.find = given.get("find") || "";
+      const group = given.has("group") ? given.get("group") : drives ? DRIVE : null;
+      state.group = this.groups().some(([name]) => name && name === group) ? group : null;
       state.fixed = {};
       for (const axis of this.axes) {
         const level = axis.labels.indexOf(given.get(`at.${axis.name}`));
@@ -339,7 +397,10 @@
       for (const name of ["across", "up", "by"]) if (state[name] || (name === "by" && this.byName.has("run"))) out.set(name, state[name] || "");
       if (state.measure !== "accuracy") out.set("measure", state.measure);
       if (state.show !== "all") out.set("show", state.show);
-      if (state.order !== "worst") out.set("order", state.order);
+      const drives = this.byName.has(DRIVE);
+      if (state.order !== (drives ? "first" : "worst")) out.set("order", state.order);
+      if (state.group !== (drives ? DRIVE : null)) out.set("group", state.group || "");
+      if (state.find) out.set("find", state.find);
       for (const [name, level] of Object.entries(state.fixed)) out.set(`at.${name}`, this.byName.get(name).labels[level]);
       if (state.cell) out.set("cell", state.cell.join(","));
       return out.toString();
@@ -352,7 +413,7 @@
     }
 
     show() {
-      const fixed = JSON.stringify(this.state.fixed);
+      const fixed = JSON.stringify([this.state.fixed, this.state.find]);
       if (!this.known || this.known.fixed !== fixed) {
         this.known = { fixed, counts: new Map() };
         this.kept = this.chosen();
@@ -365,14 +426,58 @@
 
     // Which rows have the values that are fixed; null where all have.
     chosen() {
-      const fixed = Object.entries(this.state.fixed);
-      if (!fixed.length) return null;
+      const fixed = Object.entries(this.state.fixed), wanted = this.wanted(this.state.find);
+      if (!fixed.length && !wanted.length) return null;
       const kept = new Uint8Array(this.table.count).fill(1);
+      for (const holds of wanted) for (let k = 0; k < kept.length; k++) if (kept[k] && !holds(k)) kept[k] = 0;
       for (const [name, level] of fixed) {
         const levels = this.byName.get(name).level;
         for (let k = 0; k < kept.length; k++) if (levels[k] !== level) kept[k] = 0;
       }
       return kept;
+    }
+
+    // What is searched for, each a function of the row: conditions as rules say them ("camera.distance over 30 metres
+    // and pose.yaw from 340 to 20 degrees"), then words, each of which the prediction, a name or a number has.
+    wanted(text) {
+      const found = [], { answer, source, step } = this.table.columns, number = "(-?[\\d.]+(?:e[-+]?\\d+)?)";
+      const plain = (name) => name.toLowerCase().replace(/[.*+?^${}()|[\]\\]/g, "\\$&");
+      const end = `(over|at most) ${number}`, arc = `from ${number} to ${number}`;
+      let left = text.toLowerCase();
+      for (const { name, unit, levels, data } of [...this.table.parameters].sort((a, b) => b.name.length - a.name.length)) {
+        const one = levels ? `(?:${levels.map(plain).sort((a, b) => b.length - a.length).join("|")})` : "";
+        const said = levels ? `${one}(?: or ${one})*` : `(?:${end}(?: and ${end})?|${arc}(?: or ${arc})*)`;
+        left = left.replace(new RegExp(`(?<![\\w.])${plain(name)} (${said})(?: ${plain(unit || " ")})?(?![\\w.])`, "g"), (_, told) => {
+          if (levels) {
+            const names = told.split(" or "), has = levels.map((level) => names.includes(level.toLowerCase()));
+            found.push((k) => has[data[k]]);
+            return " ";
+          }
+          const ends = [...told.matchAll(new RegExp(end, "g"))].map(([, which, at]) => (k) => (which === "over" ? data[k] > at : data[k] <= at));
+          const arcs = [...told.matchAll(new RegExp(arc, "g"))].map(([, from, to]) => (k) => {
+            const low = Number(from), high = Number(to), value = ((data[k] % 360) + 360) % 360;
+            return low <= high ? value >= low && value <= high : value >= low || value <= high;
+          });
+          found.push((k) => ends.every((holds) => holds(k)) && (!arcs.length || arcs.some((holds) => holds(k))));
+          return " ";
+        });
+      }
+      for (const word of left.split(/[\s,]+/).filter((one) => one && one !== "and")) {
+        const has = (name) => name.toLowerCase().includes(word);
+        const answers = this.table.answers.map(has), runs = this.table.sources.map((one) => has(one.name));
+        const named = this.table.parameters.filter((one) => one.levels).map((one) => [one.data, one.levels.map(has)]);
+        found.push((k) => answers[answer[k]] || runs[source[k]] || String(step[k]) === word || named.some(([data, levels]) => levels[data[k]]));
+      }
+      return found;
+    }
+
+    // Parameters that are numbers, as orders of pictures.
+    numbers() {
+      return this.axes.filter((axis) => !axis.names).map((axis) => [`${BY}${axis.name}`, `${axis.name}, rising`]);
+    }
+
+    groups() {
+      return [["", "nothing"], ["prediction", "prediction"], ["verdict", "right or wrong"], ...this.axes.map((axis) => [axis.name, axis.name])];
     }
 
     // Counts over up to three axes, the last one fastest; kept until other rows are chosen.
@@ -441,11 +546,13 @@
     showControls() {
       const state = this.state;
       const names = [["", "nothing"], ...this.axes.filter((axis) => axis.names && axis.name !== state.across && axis.name !== state.up).map((axis) => [axis.name, axis.name])];
-      this.parts.options.replaceChildren(
+      renewed(this.parts.options,
         choice("Colour", [["accuracy", "accuracy"], ["margin", "mean margin"], ["count", "configurations"]], state.measure, (measure) => this.change({ measure })),
         names.length > 1 ? choice("Side by side", names, state.by || "", (by) => this.change({ by: by || null, cell: null })) : "",
+        this.parts.find,
         make("button", { type: "button", onclick: (event) => this.share(event.target) }, "Copy link to this view"),
       );
+      if (this.parts.find.lastChild !== document.activeElement) this.parts.find.lastChild.value = state.find;
       const open = document.activeElement && document.activeElement.id;
       this.parts.controls.replaceChildren(...this.axes.map((axis, number) => this.control(axis, number)));
       if (open && document.getElementById(open)) document.getElementById(open).focus();
@@ -647,17 +754,21 @@
     // ---- pictures ----------------------------------------------------------------------------------------------------
 
     // The first rows, of a cell or of all, in the order that is chosen, and how many there are.
-    found(cell, most) {
+    found(cell, most, inside = null) {
       const state = this.state, { across, up, by } = this.cells;
-      const { right, margin } = this.table.columns, kept = this.kept, found = [];
+      const { right, margin, source } = this.table.columns, kept = this.kept, found = [];
       let all = 0;
-      const sign = state.order === "worst" ? 1 : -1;
-      const better = (a, b) => sign * (value(a) - value(b));
-      const value = (k) => (margin[k] === margin[k] ? margin[k] : -sign * Infinity);
+      const sign = state.order === "worst" ? 1 : -1, sorted = state.order.startsWith(BY) && this.table.parameters.find((one) => BY + one.name === state.order);
+      const better = (a, b) => sign * (value(a) - value(b)) || b - a;
+      const numbers = sorted ? sorted.data : margin;
+      const value = (k) => (numbers[k] === numbers[k] ? numbers[k] : -sign * Infinity);
       for (let k = 0; k < this.table.count; k++) {
         if (kept && !kept[k]) continue;
         if (cell && (by.level[k] !== cell[0] || up.level[k] !== cell[1] || across.level[k] !== cell[2])) continue;
-        if (state.show !== "all" && right[k] !== (state.show === "right" ? 1 : 0)) continue;
+        if (inside && !inside(k)) continue;
+        const others = this.beside(k);
+        if (!cell && state.group !== "run" && others.some((other) => source[other] < source[k])) continue; // is shown with the first
+        if (state.show === "differ" ? others.every((other) => right[other] === right[k]) : state.show !== "all" && ![k, ...others].some((row) => right[row] === (state.show === "right" ? 1 : 0))) continue;
         all += 1;
         if (found.length < most) {
           found.push(k);
@@ -677,14 +788,53 @@
 
     showGallery() {
       const state = this.state, { rows, all } = this.found(state.cell, SHOWN), boxes = rows.some((k) => this.address(k) && this.marks(k).length);
-      this.parts.bar.replaceChildren(
-        choice("Show", [["all", "all"], ["wrong", "wrong predictions"], ["right", "right predictions"]], state.show, (show) => this.change({ show })),
-        choice("First", [["worst", "worst margin"], ["best", "best margin"], ["first", "as they were made"]], state.order, (order) => this.change({ order })),
-        make("span", { class: "soft" }, `${rows.length} of ${all.toLocaleString("en")}${state.cell ? " in this cell" : ""}`),
-        boxes ? make("span", { class: "soft boxes" }, "Boxes: ", make("span", { class: "true" }, "where the object is"), ", ", make("span", { class: "said" }, "where the model says it is")) : "",
+      const several = this.table.sources.length > 1;
+      renewed(this.parts.bar,
+        choice("Show", SHOWS.filter(([name]) => several || name !== "differ"), state.show, (show) => this.change({ show })),
+        choice("First", [...ORDERS, ...this.numbers()], state.order, (order) => this.change({ order })),
+        choice("Group by", this.groups(), state.group || "", (group) => this.change({ group: group || null })),
+        make("span", { class: "soft" }, `${state.group ? "" : `${rows.length} of `}${all.toLocaleString("en")}${state.cell ? " in this cell" : ""}${state.find ? " found" : ""}`),
+        boxes ? make("span", { class: "soft boxes" }, "Boxes: ", make("span", { class: "true" }, "where the object is"), ", ", make("span", { class: "said" }, "where the model says it is"), ", ", make("span", { class: "other" }, "what else it says")) : "",
         ...(state.cell ? [make("button", { type: "button", onclick: () => this.change({ cell: null }) }, "All cells")] : []),
       );
-      this.parts.gallery.replaceChildren(...rows.map((k, place) => this.card(k, () => this.details(rows, place))));
+      const gallery = (found) => make("div", { class: "gallery" }, ...found.map((k, place) => this.card(k, () => this.details(found, place))));
+      this.parts.gallery.replaceChildren(...(state.group ? this.grouped(gallery) : [gallery(rows)]));
+    }
+
+    // A gallery for each value of what is grouped by; the last ones, which have no room, are counted.
+    grouped(gallery) {
+      const { answer, right } = this.table.columns, name = this.state.group, axis = this.byName.get(name);
+      const { labels, level } = axis || (name === "verdict" ? { labels: ["wrong", "right", "not judged"], level: right } : { labels: this.table.answers, level: answer });
+      const made = [];
+      let shown = 0, left = 0;
+      labels.forEach((label, group) => {
+        if (shown >= MOST_GROUPS) {
+          left += 1;
+          return;
+        }
+        const { rows, all } = this.found(this.state.cell, name === DRIVE ? SHOWN : IN_A_GROUP, (k) => level[k] === group);
+        if (!all) return;
+        shown += 1;
+        const counted = rows.length < all ? `${rows.length} of ${all.toLocaleString("en")}` : `${all}`;
+        made.push(make("h3", {}, `${axis && !axis.names ? `${name} ` : ""}${name === DRIVE ? "Drive " : ""}${label || "no prediction"}`, make("span", { class: "soft" }, ` ${counted}`)), gallery(rows));
+      });
+      if (left) made.push(make("p", { class: "soft" }, `${left} further values are left out: search, or choose one value above.`));
+      return made;
+    }
+
+    // The rows of the other runs that are of the same configuration: its number, and the same numbers.
+    beside(k) {
+      const { step, source } = this.table.columns;
+      if (this.table.sources.length < 2) return [];
+      if (!this.table.pairs) {
+        this.table.pairs = new Map();
+        for (let row = 0; row < this.table.count; row++) {
+          if (!this.table.pairs.has(step[row])) this.table.pairs.set(step[row], []);
+          this.table.pairs.get(step[row]).push(row);
+        }
+      }
+      const same = (a, b) => this.table.parameters.every((one) => one.levels || one.data[a] === one.data[b] || Number.isNaN(one.data[a]) || Number.isNaN(one.data[b]));
+      return this.table.pairs.get(step[k]).filter((row) => source[row] !== source[k] && same(row, k));
     }
 
     address(k) {
@@ -692,21 +842,43 @@
       return this.table.sources[source[k]].picture(step[k]);
     }
 
-    // The boxes of a detector's prediction: a class and x, y, width, height in pixels of what it saw.
-    marks(k) {
-      const { boxes, source } = this.table.columns;
+    // The boxes of a detector's prediction: a class and x, y, width, height in pixels of what it saw. All that are known
+    // where they are `named`; else those that a small picture has room for.
+    marks(k, named = false) {
+      const { boxes, others, source } = this.table.columns;
       if (!boxes || !this.table.sources[source[k]].size) return [];
-      return ["true", "said"].map((name, number) => {
-        const [x0, y0, x1, y1] = Array.from(boxes.subarray(8 * k + 4 * number, 8 * k + 4 * number + 4), (x) => x / BOX_STEPS);
-        return { name, x: x0, y: y0, width: x1 - x0, height: y1 - y0 };
-      }).filter((one) => one.x < NO_BOX / BOX_STEPS);
+      const box = (name, from, at, label, score = null) => {
+        const [x0, y0, x1, y1] = Array.from(from.subarray(at, at + 4), (x) => x / BOX_STEPS);
+        return { name, label, score, x: x0, y: y0, width: x1 - x0, height: y1 - y0 };
+      };
+      const first = ["true", "said"].map((name, number) => box(name, boxes, 8 * k + 4 * number, "")).filter((one) => one.x < NO_BOX / BOX_STEPS);
+      const found = [];
+      for (let at = k ? others && others.ends[k - 1] : 0; others && at < others.ends[k]; at++) {
+        const place = OF_A_BOX * at, told = others.list[place + 5], score = told === NO_PROBABILITY ? null : told / 10000;
+        const one = box(score === null ? "true" : "other", others.list, place, this.table.things[others.list[place + 4]], score);
+        const twin = first.find((other) => ["x", "y", "width", "height"].every((end) => other[end] === one[end]) && (other.name === "true") === (one.name === "true"));
+        if (twin) Object.assign(twin, { label: twin.label || one.label, score: twin.score === null ? score : twin.score });
+        else if (named || score === null || score >= SURE) found.push(one);
+      }
+      return [...found, ...first];
     }
 
-    picture(k, alt) {
-      const marks = this.marks(k), image = make("img", { src: this.address(k), alt, loading: "lazy" });
+    picture(k, alt, named = false) {
+      const marks = this.marks(k, named), image = make("img", { src: this.address(k), alt, loading: "lazy" });
       if (!marks.length) return make("span", { class: "picture" }, image);
       const [high, wide] = this.table.sources[this.table.columns.source[k]].size;
-      return make("span", { class: "picture" }, image, drawn("svg", { viewBox: `0 0 ${wide} ${high}`, "aria-hidden": "true" }, ...marks.map(({ name, ...ends }) => drawn("rect", { class: name, ...ends }))));
+      const letters = wide / 28;
+      const written = [];
+      const text = ({ name, label, score, x, y, height: tall }) => {
+        const left = Math.max(0, x);
+        let line = y > letters ? y - letters / 4 : Math.min(high, y + tall) - letters / 4;
+        while (written.some(([other, at]) => Math.abs(other - left) < 9 * letters && Math.abs(at - line) < letters)) line += letters;
+        written.push([left, line]);
+        return drawn("text", { class: name, x: left, y: line, "font-size": letters }, score === null ? label : `${label} ${score.toFixed(2)}`);
+      };
+      const drawings = marks.map(({ name, x, y, width, height }) => drawn("rect", { class: name, x, y, width, height }));
+      if (named) drawings.push(...marks.filter((one) => one.label).map(text));
+      return make("span", { class: "picture" }, image, drawn("svg", { viewBox: `0 0 ${wide} ${high}`, "aria-hidden": "true" }, ...drawings));
     }
 
     // What was predicted, with its probability or score: of an object that was missed, the best score that did not count.
@@ -716,9 +888,13 @@
     }
 
     card(k, open) {
-      const { right } = this.table.columns, verdict = right[k] === UNKNOWN ? "not judged" : right[k] ? "right" : "wrong";
-      const picture = this.address(k) ? [this.picture(k, `${verdict}: ${this.predicted(k)}`)] : [];
-      return make("button", { type: "button", class: `card ${verdict.replace(" ", "-")}`, onclick: open }, ...picture, make("span", {}, make("strong", {}, verdict === "wrong" ? "✗ " : verdict === "right" ? "✓ " : ""), this.predicted(k)));
+      const { right, source } = this.table.columns, verdict = (row) => (right[row] === UNKNOWN ? "not judged" : right[row] ? "right" : "wrong");
+      const mark = (row) => make("strong", {}, { wrong: "\u2717 ", right: "\u2713 " }[verdict(row)] || "");
+      const others = this.beside(k), all = [k, ...others], here = (row) => (others.length ? `${this.table.sources[source[row]].name}: ` : "");
+      const shown = all.filter((row) => this.address(row)).map((row) => this.picture(row, `${here(row)}${verdict(row)}: ${this.predicted(row)}`));
+      return make("button", { type: "button", class: `card ${verdict(k).replace(" ", "-")}`, onclick: open },
+        shown.length > 1 ? make("span", { class: "beside" }, ...shown) : shown[0] || null,
+        ...all.map((row) => make("span", {}, mark(row), here(row), this.predicted(row))));
     }
 
     // The short names of a parameter's levels, which its axis has where it varies.
@@ -741,14 +917,14 @@
         onkeydown: (event) => { if (event.key === "ArrowLeft" || event.key === "ArrowRight") step(event.key === "ArrowLeft" ? -1 : 1); },
       });
       const show = () => {
-        const k = rows[place], { right, margin, step: number, source } = this.table.columns;
-        const facts = [["run", this.table.sources[source[k]].name], ["configuration", String(number[k])], ["prediction", this.predicted(k)], ["verdict", ["wrong", "right", "not judged"][right[k]]], ["margin", short(Number(margin[k].toPrecision(4)))]];
-        for (const one of this.table.parameters) facts.push([named(one.name, one.unit), one.levels ? this.named(one)[one.data[k]] : short(one.data[k]), one.levels && one.levels[one.data[k]]]);
+        const k = rows[place], all = [k, ...this.beside(k)], { right, margin, step: number, source } = this.table.columns;
+        const facts = [["run", (row) => this.table.sources[source[row]].name], ["configuration", (row) => String(number[row])], ["prediction", (row) => this.predicted(row)], ["verdict", (row) => ["wrong", "right", "not judged"][right[row]]], ["margin", (row) => short(Number(margin[row].toPrecision(4)))]];
+        for (const one of this.table.parameters) facts.push([named(one.name, one.unit), (row) => (one.levels ? this.named(one)[one.data[row]] : short(one.data[row])), (row) => one.levels && one.levels[one.data[row]]]);
         dialog.setAttribute("aria-label", `Configuration ${number[k]}`);
         count.textContent = `${place + 1} of ${rows.length}`;
         inside.replaceChildren(
-          ...(this.address(k) ? [this.picture(k, "what the model saw")] : []),
-          make("table", { class: "facts" }, make("tbody", {}, ...facts.map(([name, value, full]) => make("tr", {}, make("th", { scope: "row" }, name), make("td", { title: full }, value))))));
+          make("div", { class: "beside" }, ...all.filter((row) => this.address(row)).map((row) => this.picture(row, `what the model saw${all.length > 1 ? ` in ${this.table.sources[source[row]].name}` : ""}`, true))),
+          make("table", { class: "facts" }, make("tbody", {}, ...facts.map(([name, value, full]) => make("tr", {}, make("th", { scope: "row" }, name), ...all.map((row) => make("td", { title: full && full(row) }, value(row))))))));
       };
       dialog.append(make("p", { class: "options" }, button("Previous", () => step(-1)), button("Next", () => step(1)), count, button("Close", () => dialog.close())), inside);
       show();
@@ -787,7 +963,7 @@
     const body = make("div", {});
     place.append(body);
     const explorer = new Explorer(body, table);
-    table.sources = runs.map((run) => ({ name: run.name, picture: pictures(run), task: run.task, size: run.size, grid: run.grid }));
+    table.sources = runs.map((run) => ({ name: run.name, picture: pictures(run), task: run.task, size: run.size, grid: run.grid, drives: run.drives }));
     const renew = () => {
       for (const still of document.querySelectorAll("[data-still]")) still.hidden = true;
       explorer.renew();

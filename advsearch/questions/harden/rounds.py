@@ -1,0 +1,221 @@
+"""The rounds of a hardening, of any kind of model: scenes are drawn, a copy of the model is trained on all of them, and
+that part of the way to its weights is kept which is best on scenes that it was not trained on."""
+
+from __future__ import annotations
+
+import json
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
+
+import numpy as np
+import torch
+import torch._dynamo  # by optimisers, too: before there are scenes, whose changes make Python collect what is new
+from safetensors import torch as safetensors
+from torch import Tensor, nn
+
+from advsearch import seeds, threads
+from advsearch.models.reference import Trainable
+from advsearch.questions.harden.result import TrainingRound
+from advsearch.questions.harden.scenes import TRAINING, VALIDATION, SceneWork
+from advsearch.report.wording import percent
+from advsearch.runs.directory import ARTIFACTS, RunDirectory
+from advsearch.runs.files import write_bytes
+
+WEIGHTS, ROUND, PICTURES = "hardened.safetensors", "round-{:03d}.safetensors", "pictures"
+"""In `artifacts/`: the weights that are kept, those after each round, and what they were trained on."""
+ROUNDS = "rounds"  # the note of what each round came to
+LARGEST_GRADIENT_NORM = 2.0
+JUDGED = 168  # scenes by which weights are chosen, at most
+PARTS = (1.0, 0.85, 0.7, 0.55, 0.4, 0.25)
+"""Of the way from the weights that were given to the trained ones, which are judged."""
+
+Item = TypeVar("Item")
+MakeOptimiser = Callable[[Sequence[nn.Parameter]], torch.optim.Optimizer]
+Take = Callable[[Sequence[Any], np.random.Generator], None]
+"""Leaves the gradient of a batch with the parameters."""
+
+
+class Score(NamedTuple):
+    """How a model does on scenes that it was not trained on: its share of plain pictures, and of the worst ones."""
+
+    clean: float
+    robust: float
+
+
+class Course(ABC, Generic[Item]):
+    """How models of one kind are trained, on items of which each has one picture of a scene or more.
+
+    Attributes:
+        work: what draws from scenes, with the model as it was given.
+        student: the copy that is trained.
+        optimiser: makes one of the parameters, whose own learning rate counts; None for AdamW.
+        own: items that are trained on beside those that are drawn.
+        further: scenes that are drawn on top of each one of the training.
+        views: that are drawn of a scene of the training, and of one by which weights are chosen.
+        batch: items of a step.
+        warm_up: share of the steps in which the learning rate rises.
+        average: weight of the past in the average of the weights, per step, which a round ends with.
+    """
+
+    batch: ClassVar[int]
+    weight_decay: ClassVar[float]
+    warm_up: ClassVar[float]
+    average: ClassVar[float] = 0.0
+    views: tuple[int, int]
+
+    def __init__(
+        self, work: SceneWork, student: Trainable, optimiser: MakeOptimiser | None = None, own: Sequence[Item] = ()
+    ) -> None:
+        self.work, self.config, self.student, self.optimiser, self.own = work, work.config, student, optimiser, own
+
+    @property
+    def further(self) -> int:
+        return 0
+
+    @abstractmethod
+    def draw(self, title: str, split: str, places: Sequence[int]) -> list[Item]:
+        """Return items of the scenes with these numbers of a split; `title` is what the progress says."""
+
+    @abstractmethod
+    def looks(self, item: Item) -> int:
+        """Return how often an epoch looks at an item."""
+
+    @abstractmethod
+    def gradients(self, new: Sequence[Item]) -> AbstractContextManager[Take]:
+        """Begin a round in which these are new; inside there is what takes gradients."""
+
+    @abstractmethod
+    def score(self, held_back: Sequence[Item]) -> Score:
+        """Judge the student on items that it was not trained on, which stay as they are."""
+
+    @abstractmethod
+    def save(self, folder: Path, number: int, new: Sequence[Item]) -> None:
+        """Write the pictures of a round's new items."""
+
+    def steps(self, pool: Sequence[Item]) -> int:
+        """Return how many steps a round takes."""
+        return self.config.epochs * -(-sum(map(self.looks, pool)) // self.batch)
+
+    def round(
+        self, number: int, pool: Sequence[Item], new: Sequence[Item] = (), tick: Callable[[], None] = lambda: None
+    ) -> None:
+        """Train on items in an order that the number of the round decides."""
+        parameters, steps, done = self.student.parameters(), self.steps(pool), 0
+        usual = torch.optim.AdamW(parameters, lr=self.config.rate, weight_decay=self.weight_decay)
+        optimiser = usual if self.optimiser is None else self.optimiser(parameters)
+        highest = [float(group["lr"]) for group in optimiser.param_groups]
+        rates = torch.optim.lr_scheduler.OneCycleLR(
+            optimiser, highest, total_steps=steps + 1, pct_start=self.warm_up, cycle_momentum=False
+        )
+        average = [parameter.detach().clone() for parameter in parameters]
+        rng = np.random.default_rng([seeds.stream(self.config.seed, "order"), number])
+        places = [place for place, item in enumerate(pool) for _ in range(self.looks(item))]
+        with self.gradients(new) as take:
+            for _ in range(self.config.epochs):
+                order = rng.permutation(places)
+                for begin in range(0, len(order), self.batch):
+                    take([pool[place] for place in order[begin : begin + self.batch]], rng)
+                    nn.utils.clip_grad_norm_(parameters, LARGEST_GRADIENT_NORM)
+                    optimiser.step()
+                    rates.step()
+                    done += 1
+                    decay = min(self.average, done / (done + 5))
+                    for kept, parameter in zip(average, parameters, strict=True):
+                        kept.lerp_(parameter.detach(), 1.0 - decay)
+                    tick()
+        with torch.no_grad():
+            for kept, parameter in zip(average, parameters, strict=True):
+                parameter.copy_(kept)
+
+
+class Rounds:
+    """The rounds of a run; `done` is what each came to, of which the first is the model as it was."""
+
+    def __init__(self, run: RunDirectory, course: Course[Any]) -> None:
+        self.run, self.course, self.config = run, course, course.config
+        self.progress, self.folder = course.work.progress, run.path / ARTIFACTS
+        self.done = [TrainingRound.of(noted) for noted in json.loads(run.store.note(ROUNDS) or "[]")]
+
+    @property
+    def judged(self) -> int:
+        """Scenes by which weights are chosen, for each control: a third as many as a round adds, up to `JUDGED`."""
+        return min(-(-self.config.scenes // 3), JUDGED)
+
+    @property
+    def best(self) -> int:
+        """The round whose weights are kept: the most robust one whose clean accuracy is within what may be lost."""
+        allowed = [number for number, done in enumerate(self.done) if self._allowed(done.clean)]
+        return max(allowed, key=lambda number: (self.done[number].robust, number), default=0)
+
+    def _allowed(self, clean: float) -> bool:
+        return clean >= self.done[0].clean - self.config.clean_loss - 1e-9
+
+    def carry_out(self) -> None:
+        """Do what is left of the rounds; the student has the best weights afterwards, which the run keeps."""
+        course, config, net = self.course, self.config, self.course.student.net
+        if len(self.done) <= config.rounds:
+            pool, begun, title = list(course.own), 0, "drawing scenes to choose weights by"
+            held_back = course.draw(title, VALIDATION, range(self.judged))
+            if not self.done:
+                self.keep(0, [], course.score(held_back), 0, 0.0)
+            for number in range(1, config.rounds + 1):
+                net.load_state_dict(self._weights(number - 1))
+                places = range((number - 1) * config.scenes, number * config.scenes)
+                new = course.draw(f"round {number}: drawing scenes", TRAINING, places)
+                pool += new
+                if number < len(self.done):
+                    continue  # done before this run was stopped
+                self.progress.stage(f"round {number}: training", course.steps(pool))
+                with threads.all_for_torch():
+                    # others are as hard as their training left them
+                    course.round(number, pool, pool[begun:], lambda: self.progress.advance(1))
+                    judged, part = self.mixed(held_back)
+                begun = len(pool)
+                self.keep(number, new, judged, len(pool), part)
+        net.load_state_dict(self._weights(self.best))
+        self._save(WEIGHTS)
+
+    def mixed(self, held_back: Sequence[Any]) -> tuple[Score, float]:
+        """Leave the student with the best part of the way from the weights that were given; return its score and it.
+
+        The best one is right most often on the worst pictures among those that lose no more on plain ones than they
+        may; where all lose more, it is the one that loses least. Less of the way learned less: once that shows, the
+        smaller parts are not looked at, as each costs a search of its own.
+        """
+        net, given, found = self.course.student.net, self._weights(0), dict[float, Score]()
+        learned = {name: weight.clone() for name, weight in net.state_dict().items()}
+
+        def take(part: float) -> None:
+            mixed = {name: torch.lerp(given[name], weight, part) for name, weight in learned.items()
+                     if weight.is_floating_point()}  # fmt: skip
+            net.load_state_dict({**learned, **mixed})
+
+        for part in PARTS:
+            take(part)
+            found[part] = self.course.score(held_back)
+            allowed = {part: each.robust for part, each in found.items() if self._allowed(each.clean)}
+            if allowed and [*allowed.values()][-1] < max(allowed.values()):
+                break
+        best = max(allowed, key=lambda part: allowed[part], default=max(found, key=lambda part: found[part].clean))
+        take(best)
+        return found[best], best
+
+    def keep(self, number: int, new: Sequence[Any], judged: Score, trained: int, part: float) -> None:
+        """Keep the weights of a round, with its new pictures and what it came to."""
+        self._save(ROUND.format(number))
+        self.course.save(self.folder / PICTURES, number, new)
+        self.done.append(TrainingRound(lessons=trained, part=part, **judged._asdict(), kept=False))
+        self.run.store.set_note(ROUNDS, json.dumps([done.model_dump() for done in self.done]))
+        clean, worst = percent(judged.clean), percent(judged.robust)
+        self.progress.message(f"round {number}: {clean} of plain pictures right, {worst} of the worst")
+
+    def _save(self, name: str) -> None:
+        state = self.course.student.net.state_dict()  # two names may be of one tensor, which safetensors refuses
+        kept = {key: weight.clone(memory_format=torch.contiguous_format) for key, weight in state.items()}
+        write_bytes(self.folder / name, safetensors.save(kept))
+
+    def _weights(self, number: int) -> dict[str, Tensor]:
+        return safetensors.load((self.folder / ROUND.format(number)).read_bytes())

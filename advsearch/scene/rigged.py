@@ -1,0 +1,293 @@
+"""The rig of a glTF file: skins, morph targets and clips, evaluated in torch as the format says (glTF 2.0, Khronos).
+
+    world_n = world_parent T R S                               nodes, section 3.5
+    moved   = sum_j w_j world_j inverse_bind_j (p + sum_t m_t d_t)   skins and morph targets, sections 3.7.3 and 3.7.2.2
+
+A clip sets T, R, S or m at a time by steps, by linear interpolation (of rotations on the sphere) or by cubic Hermite
+splines (section 3.11 and appendix C). A joint's own turns come on top: about the axes of the object as it stands at
+rest (z up), first x, then y, then z, carried along by the joints above it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from advsearch.described import Value
+from advsearch.errors import InputError
+from advsearch.scene.assets import Doubles, Ints
+from advsearch.scene.people import about
+from advsearch.scene.settings import GEOMETRIC, Parameter, moving
+from advsearch.scene.skeleton import Clip, Movable, Track
+
+AXES = ("x", "y", "z")
+WEIGHT = "weight"
+TIME = moving(
+    GEOMETRIC, "time", "1", 0.0, 1.0, 0.0, "Of the clip of a rigged file: 0 is its beginning, 1 its end.", (0.0, 1.0)
+)
+NEARLY_ONE = 1.0 - 1e-9
+"""Cosine of the angle between two rotations beyond which there is nothing to choose between arc and chord."""
+
+
+def part_of_a_rig(name: str) -> Parameter | None:
+    """Return the parameter that `JOINT.x` (or y, z) or `TARGET.weight` means; None for another form."""
+    whose, dot, what = name.rpartition(".")
+    if not (whose and dot and what in (*AXES, WEIGHT)):
+        return None
+    if what == WEIGHT:
+        return moving(GEOMETRIC, name, "1", 0.0, 1.0, 0.0, f"How much of the morph target {whose} there is.")
+    return moving(GEOMETRIC, name, "degrees", -360.0, 360.0, 0.0, f"Turn of the joint {whose} about {what}.")
+
+
+class SkeletonRig:
+    """What moves the mesh of a glTF file.
+
+    Args:
+        parts: all that the mesh is made of, in order.
+        vertices: (V,) for each of the mesh's, its number among those of all parts one after the other.
+        to_mesh: (3, 3) from the file's axes and unit to the mesh's.
+    """
+
+    def __init__(self, parts: Sequence[Movable], vertices: Ints, to_mesh: Doubles) -> None:
+        self.skeleton = parts[0].skeleton
+        self._to_mesh = torch.from_numpy(to_mesh)
+        size = to_mesh / np.cbrt(np.linalg.det(to_mesh))
+        self._upright = torch.from_numpy(size)
+        self._gather(parts, vertices)
+        self._order()
+        self._rest = self.posed({})
+
+    def _gather(self, parts: Sequence[Movable], vertices: Ints) -> None:
+        """Lay the parts one after the other, and keep what the mesh has of them."""
+        widest = max(part.joints.shape[1] for part in parts)
+        counts = [len(part.vertices) for part in parts]
+        starts, slots = np.cumsum([0, *counts]), np.cumsum([0, *(len(part.nodes) for part in parts)])
+
+        def wide(values: np.ndarray) -> np.ndarray:
+            return np.pad(values, ((0, 0), (0, widest - values.shape[1])))
+
+        self._points = torch.from_numpy(np.concatenate([part.vertices for part in parts])[vertices])
+        joints = np.concatenate([wide(part.joints + slot) for part, slot in zip(parts, slots, strict=False)])
+        self._joints = torch.from_numpy(joints[vertices])
+        self._weights = torch.from_numpy(np.concatenate([wide(part.weights) for part in parts])[vertices])
+        self._nodes = torch.from_numpy(np.concatenate([part.nodes for part in parts]))
+        self._inverse = torch.from_numpy(np.concatenate([part.inverse for part in parts]))
+        self._targets: list[tuple[str, int, int, float, Tensor, Tensor]] = []
+        for part, start, count in zip(parts, starts, counts, strict=False):
+            mine = np.flatnonzero((vertices >= start) & (vertices < start + count))
+            for number, target in enumerate(part.targets):
+                place = np.full(count, -1)
+                place[target.rows] = np.arange(len(target.rows))
+                rows = place[vertices[mine] - start]
+                hit = rows >= 0
+                moves = torch.from_numpy(target.moves[rows[hit]])
+                rest = float(part.rest[number])
+                self._targets.append((target.name, part.node, number, rest, torch.from_numpy(mine[hit]), moves))
+
+    def _order(self) -> None:
+        """Sort the nodes by their depth, so that all of one depth are placed at once."""
+        skeleton = self.skeleton
+        depth = np.zeros(len(skeleton.parents), np.int64)
+        level, self._levels = np.flatnonzero(skeleton.parents < 0), list[tuple[Tensor, Tensor]]()
+        row = np.zeros(len(depth), np.int64)
+        while len(level):
+            self._levels.append((torch.from_numpy(level), torch.from_numpy(row[skeleton.parents[level]])))
+            row[level] = np.arange(len(level))
+            level = np.flatnonzero(np.isin(skeleton.parents, level))
+        order = torch.cat([one for one, _ in self._levels])
+        self._back = torch.argsort(order)
+        self._places = torch.from_numpy(skeleton.places)
+        self._resting = self._world(self._places)
+        # the nearest rotation to each node's place in the scene: what scale and shear leave of its axes
+        left, _, right = np.linalg.svd(self._resting[:, :3, :3].numpy())
+        self._axes = torch.from_numpy(left @ right)
+
+    # ---- what can be asked for ---------------------------------------------------------------------------------------
+
+    @property
+    def clips(self) -> tuple[str, ...]:
+        """Names of the animations."""
+        return tuple(one.name for one in self.skeleton.clips)
+
+    @cached_property
+    def joints(self) -> dict[str, int]:
+        """The nodes that move something, by name."""
+        found, level = set[int](), {int(node) for node in self._nodes}
+        while level:
+            found |= level
+            level = {int(self.skeleton.parents[node]) for node in level} - {-1} - found
+        return {self.skeleton.names[node]: node for node in sorted(found)}
+
+    @property
+    def targets(self) -> tuple[str, ...]:
+        """Names of the morph targets; those of one name move together."""
+        return tuple(dict.fromkeys(name for name, *_ in self._targets))
+
+    @property
+    def defaults(self) -> Mapping[str, float]:
+        """Every number at rest."""
+        turns = {f"{name}.{axis}": 0.0 for name in self.joints for axis in AXES}
+        return {
+            **({TIME.name: 0.0} if self.clips else {}),
+            **turns,
+            **{f"{name}.{WEIGHT}": rest for name, _, _, rest, _, _ in reversed(self._targets)},
+        }
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Time of a clip, turns of joints and weights of morph targets."""
+        named = (TIME if name == TIME.name else part_of_a_rig(name) for name in self.defaults)
+        return tuple(one for one in named if one is not None)
+
+    def measured(self, values: Mapping[str, Tensor], clip: str | None = None) -> Mapping[str, Value]:
+        """Return the seconds of a clip."""
+        if clip is None:
+            return {}
+        return {"seconds": {"value": float(self._seconds(self._clip(clip), values)), "unit": "s"}}
+
+    # ---- where the vertices are --------------------------------------------------------------------------------------
+
+    def offsets(self, values: Mapping[str, Tensor], clip: str | None = None) -> Tensor:
+        """Return how far each vertex goes from the mesh at rest, (V, 3) float32 in its unit; differentiable.
+
+        Args:
+            values: numbers by the names of `parameters`; those of the clip, and else at rest, where one is missing.
+            clip: name of the animation that `time` is of; None for none.
+
+        Raises:
+            InputError: a vertex is nowhere, because the file's numbers are too large.
+        """
+        posed = self.posed(values, clip)
+        moved = (posed - self._rest.to(posed.device)) @ self._to_mesh.to(posed.device).T
+        if not bool(torch.isfinite(moved.detach()).all()):
+            what = f"the clip {clip}" if clip else "such turns"
+            raise InputError(f"{self.skeleton.source}: {what} would put vertices infinitely far away; take another")
+        return moved.float()
+
+    def posed(self, values: Mapping[str, Tensor], clip: str | None = None) -> Tensor:
+        """Return the vertices (V, 3) in the file's axes and unit, float64; arguments as of `offsets`."""
+        some = next(iter(values.values()), torch.zeros(()))
+        number = {name: value.double() for name, value in values.items()}
+        here, weights = self._places.to(some.device), dict[int, Tensor]()
+        if clip is not None:
+            playing = self._clip(clip)
+            here, weights = self._played(playing, self._seconds(playing, number).to(some.device))
+        here = self._turned(here, number)
+        matrices = (self._world(here)[self._nodes.to(some.device)] @ self._inverse.to(some.device))[:, :3]
+        points, shares = self._morphed(number, weights, some.device), self._weights.to(some.device)
+        joints = self._joints.to(some.device)
+        moves = sum(shares[:, k, None, None] * matrices[joints[:, k]] for k in range(joints.shape[1]))
+        assert isinstance(moves, Tensor)
+        return torch.einsum("vij,vj->vi", moves[:, :, :3], points) + moves[:, :, 3]
+
+    def _clip(self, name: str) -> Clip:
+        return next(one for one in self.skeleton.clips if one.name == name)
+
+    def _seconds(self, clip: Clip, values: Mapping[str, Tensor]) -> Tensor:
+        time = values.get(TIME.name, torch.zeros(())).double()
+        return clip.begin + (clip.end - clip.begin) * time
+
+    def _played(self, clip: Clip, seconds: Tensor) -> tuple[Tensor, dict[int, Tensor]]:
+        """Places (N, 4, 4) of all nodes at a time of a clip, and weights of morph targets by node."""
+        skeleton, device = self.skeleton, seconds.device
+        made = {"translation": skeleton.translations, "rotation": skeleton.rotations, "scale": skeleton.scales}
+        parts = {path: torch.from_numpy(values).to(device) for path, values in made.items()}
+        for path in made:
+            mine = [track for track in clip.tracks if track.path == path]
+            if mine:
+                nodes = torch.tensor([track.node for track in mine], device=device)
+                parts[path] = parts[path].index_copy(0, nodes, torch.stack([sampled(one, seconds) for one in mine]))
+        turns = rotation(parts["rotation"]) * parts["scale"][:, None, :]
+        last = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64, device=device).expand(len(turns), 1, 4)
+        made_of = torch.cat([torch.cat([turns, parts["translation"][:, :, None]], dim=2), last], dim=1)
+        fixed = torch.from_numpy(skeleton.fixed).to(device)
+        places = torch.where(fixed[:, None, None], self._places.to(device), made_of)
+        return places, {one.node: sampled(one, seconds) for one in clip.tracks if one.path == "weights"}
+
+    def _turned(self, places: Tensor, number: Mapping[str, Tensor]) -> Tensor:
+        """Places (N, 4, 4) of all nodes, joints turned on top."""
+        upright = self._upright.to(places.device)
+        for joint in dict.fromkeys(name.rpartition(".")[0] for name in number if name.rpartition(".")[2] in AXES):
+            node, turn = self.joints[joint], torch.eye(3, dtype=torch.float64, device=places.device)
+            for axis in AXES:
+                if f"{joint}.{axis}" in number:
+                    turn = about(axis, number[f"{joint}.{axis}"]) @ turn
+            turn = upright.T @ turn @ upright
+            parent = int(self.skeleton.parents[node])
+            if parent >= 0:
+                axes = self._axes[parent].to(places.device)
+                turn = axes.T @ turn @ axes
+            row = torch.cat([torch.cat([turn @ places[node, :3, :3], places[node, :3, 3:]], dim=1), places[node, 3:]])
+            places = places.index_copy(0, torch.tensor([node], device=places.device), row[None])
+        return places
+
+    def _world(self, places: Tensor) -> Tensor:
+        """(N, 4, 4) from each node to the scene."""
+        above, found = None, list[Tensor]()
+        for level, parents in self._levels:
+            here = places[level.to(places.device)]
+            above = here if above is None else above[parents.to(places.device)] @ here
+            found.append(above)
+        return torch.cat(found)[self._back.to(places.device)]
+
+    def _morphed(self, number: Mapping[str, Tensor], weights: Mapping[int, Tensor], device: torch.device) -> Tensor:
+        """The vertices (V, 3) in their meshes' coordinates, morph targets added."""
+        points = self._points.to(device)
+        for name, node, index, rest, rows, moves in self._targets:
+            weight = number.get(f"{name}.{WEIGHT}")
+            if weight is None:
+                weight = weights[node][index] if node in weights else torch.tensor(rest, dtype=torch.float64)
+            if weight.requires_grad or float(weight) != 0.0:
+                points = points.index_add(0, rows.to(device), weight.to(device) * moves.to(device))
+        return points
+
+
+def sampled(track: Track, seconds: Tensor) -> Tensor:
+    """Return the value (W,) of a track at a time; before its first key and after its last it stays (appendix C)."""
+    times = torch.from_numpy(track.times).to(seconds.device)
+    values = torch.from_numpy(track.values).to(seconds.device)
+    middle = values.shape[1] // 2
+    after = int(torch.searchsorted(times, seconds.detach(), right=True))
+    if track.interpolation == "STEP" or not 0 < after < len(times):
+        held = values[max(0, after - 1), middle]
+        return held / held.norm() if track.path == "rotation" else held
+    before, span = after - 1, times[after] - times[after - 1]
+    share = (seconds - times[before]) / span
+    first, second = values[before, middle], values[after, middle]
+    if track.interpolation == "CUBICSPLINE":
+        square, cube = share**2, share**3
+        found = (
+            (2.0 * cube - 3.0 * square + 1.0) * first
+            + span * (cube - 2.0 * square + share) * values[before, 2]
+            + (3.0 * square - 2.0 * cube) * second
+            + span * (cube - square) * values[after, 0]
+        )
+        return found / found.norm().clamp_min(1e-12) if track.path == "rotation" else found
+    return slerp(first, second, share) if track.path == "rotation" else first + share * (second - first)
+
+
+def slerp(first: Tensor, second: Tensor, share: Tensor) -> Tensor:
+    """Return the rotation (4,) between two, along the shorter arc."""
+    first, second = first / first.norm(), second / second.norm()
+    cosine = first @ second
+    second, cosine = torch.where(cosine < 0.0, -second, second), cosine.abs()
+    if float(cosine) > NEARLY_ONE:
+        found: Tensor = first + share * (second - first)
+        return found.div(found.norm())
+    angle = torch.arccos(cosine)
+    return (torch.sin((1.0 - share) * angle) * first + torch.sin(share * angle) * second) / torch.sin(angle)
+
+
+def rotation(quaternions: Tensor) -> Tensor:
+    """Return the turns (N, 3, 3) of unit quaternions (N, 4), x, y, z, w."""
+    x, y, z, w = quaternions.unbind(dim=1)
+    rows = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w),
+        2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w),
+        2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    return torch.stack(rows, dim=1).reshape(-1, 3, 3)
