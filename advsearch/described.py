@@ -18,3 +18,8 @@ NOT_A_NUMBER = "not a number"
 OUT_OF_VIEW = "out of view"
 """What a prediction is called where nothing of what is judged is in the picture. It is not a success of a search, and
 no share of right predictions counts it."""
+
+
+def rounded(number: float) -> str:
+    """Return a number that was worked out as sentences have it: with three significant digits."""
+    return f"{float(f'{number:.3g}'):g}"

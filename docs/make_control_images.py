@@ -49,9 +49,13 @@ SCENES: Mapping[str, tuple[str, str | None, dict[str, float]]] = {
     "shadow": ("mug", "low-sun", {"environment.rotation": -30.0}),
     "path": ("teapot", "day-room", {}),
     "occlusion": ("teapot", "kitchen", {}),
+    "things": ("mug", "room", {"camera.distance": 0.75, "camera.elevation": 20.0}),
     "body": ("person", "street", {"camera.elevation": 6.0, "camera.azimuth": 30.0}),
 }
 """Object, environment and settings where the mug in the studio does not show it well."""
+
+BESIDE = {"things": "bottle@0.05,-0.2; book@0.15,0.2,heading=30; banana@0.2,0,heading=70"}
+"""What stands beside it."""
 
 CONTROLS: Mapping[str, Mapping[str, Any]] = {
     "camera": {"camera": {"azimuth": [0, 360], "elevation": [5, 70], "roll": [-20, 20], "fov": [20, 70]}},
@@ -63,6 +67,7 @@ CONTROLS: Mapping[str, Mapping[str, Any]] = {
     },
     "material": {"material.which": {}},
     "occlusion": {"occlusion": {"which": ["vase", "banana", "book", "card"], "coverage": [0.0, 0.5]}},
+    "things": {"things": {"x": [-0.15, 0.15], "y": [-0.15, 0.15], "heading": [-180, 180]}},
     "geometry": {"geometry": {"epsilon": 0.12}},
     "haze": {"haze": {"density": [0.0, 0.6]}},
     "mitsuba": {
@@ -81,7 +86,7 @@ CONTROLS: Mapping[str, Mapping[str, Any]] = {
 def row(name: str, size: int) -> Image.Image:
     """Return the pictures of one control side by side."""
     spec, environment, given = SCENES.get(name, ("mug", None, {}))
-    scene = load_scene(spec, environment, settings=given)
+    scene = load_scene(spec, environment, settings=given, things=BESIDE.get(name))
     controls = dict(CONTROLS.get(name, {name: {}}))
     space = make_space(as_controls(controls), scene.description)
     render = make_renderer(scene.description, space, size, "oidn", 0)

@@ -193,7 +193,12 @@ def environments(record: Record) -> str:
     """The bundled environments and the half that each belongs to."""
     from scenes.environments import ENVIRONMENTS
 
-    half = {"train": "training", "heldout": "held out", "street": "a street, in neither"}
+    half = {
+        "train": "training",
+        "heldout": "held out",
+        "street": "a street, in neither",
+        "place": "a place, in neither",
+    }
     return table(["environment", "half"], [[f"`{one.name}`", half[one.split]] for one in ENVIRONMENTS.values()])
 
 

@@ -1,6 +1,7 @@
-"""Renders `docs/images/world.webp`: cars near and far in four kinds of light, an own car, others beside it, a person.
+"""Renders `docs/images/world.webp`: cars near and far in four kinds of light, an own car, others beside it, a person;
+and `docs/images/places.webp`: a crossing, a car park and a room.
 
-python docs/make_world_sheet.py [--size 300] [--spp 64] [--texture shirt.png] [--folder FOLDER]
+python docs/make_world_sheet.py [--size 300] [--spp 64] [--texture shirt.png] [--folder FOLDER] [--sheet places]
 
 All pictures of the avenue have an absolute exposure. From 60 and 100 m an inset has the car as large as from 10 m. The
 shirt is searched by a short attack, unless `--texture` names one that an attack has found. `--folder` keeps each
@@ -24,7 +25,7 @@ import advsearch
 from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.formation import to_8_bit
 
-SHEET = Path(__file__).resolve().parent / "images" / "world.webp"
+IMAGES = Path(__file__).resolve().parent / "images"
 COLUMNS, WIDE = 4, 60.0
 """Pictures beside each other, and the field of view of a dashcam."""
 LIGHTS: dict[str, tuple[str, dict[str, Any]]] = {
@@ -39,6 +40,21 @@ POSES: dict[str, dict[str, float]] = {
     "walks": {"stride": 1.0, "walk": 40.0},
     "waves": {"left_shoulder_out": 130.0, "left_elbow": 40.0, "right_shoulder": 20.0, "right_elbow": 60.0},
 }
+
+
+LAID = "bottle@0.15,-0.25; vase@-0.2,0.3; book@0.1,0.45,heading=30"
+PLACES = (
+    ("crossing", "car", "crossing", 188.0, 9.0, 14.0, "person@6.4,2,heading=-90"),
+    ("crossing-night", "car", "crossing-night", 205.0, 9.0, 18.0, None),
+    ("car-park", "car", "car-park", 35.0, 14.0, 15.0, "car@0,2.5; car@11,-2.5,heading=180; person@4.5,3.6,heading=200"),
+    ("car-park-dusk", "car", "car-park-dusk", 310.0, 12.0, 20.0, "car@0,2.5; car@-5,-5,heading=180"),
+    ("room", "mug", "room", 40.0, 14.0, 1.3, LAID),
+    ("room-window", "mug", "room", 235.0, 12.0, 1.2, LAID),
+    ("room-evening", "mug", "room-evening", 20.0, 18.0, 1.2, LAID),
+    ("room-near", "mug", "room", 65.0, 25.0, 0.35, LAID),
+)
+"""Other places: a name, object, environment, azimuth and elevation of the camera, its distance, and things beside."""
+EV = {"crossing": 14.0, "crossing-night": 3.5, "car-park": 14.0, "car-park-dusk": 4.5}
 
 
 class Asked(NamedTuple):
@@ -84,10 +100,26 @@ def asked(own_car: Path, shirt: Any) -> Iterator[Asked]:
         {"object": "car", "environment": "avenue-night", "settings": wet, "things": "car@-8,3.5,heading=180,lamps=low"},
         {},
     )
+    for light in ("day", "night"):
+        environment, given = LIGHTS[light]
+        view = {"camera.distance": 12.0, "camera.fov": WIDE, **given, "camera.drops": 70.0}
+        yield Asked(
+            f"rain-{light}",
+            {"object": "car", "environment": environment, "settings": view, "camera": "dashcam"},
+            {},
+        )
     for name, pose in POSES.items():
         view = {"camera.distance": 3.4, "camera.azimuth": 20.0, "camera.elevation": 6.0, "camera.ev": 14.0}
         scene = {"object": "person", "environment": "avenue", "settings": view, "texture": shirt}
         yield Asked(f"person-{name}", scene, {"body": pose or {"stride": 0.0}})
+
+
+def places() -> Iterator[Asked]:
+    """Yield the pictures of the other places."""
+    for name, thing, environment, azimuth, elevation, metres, things in PLACES:
+        view = {"camera.distance": metres, "camera.azimuth": azimuth, "camera.elevation": elevation}
+        view |= {"camera.ev": EV[environment]} if environment in EV else {}
+        yield Asked(name, {"object": thing, "environment": environment, "settings": view, "things": things}, {})
 
 
 def write_van(path: Path) -> None:
@@ -168,12 +200,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--spp", type=int, default=64, help="samples per pixel (default 64)")
     parser.add_argument("--texture", type=Path, help="of the person; by default a shirt is searched")
     parser.add_argument("--folder", type=Path, help="pictures go there by their names; those that are there are taken")
+    parser.add_argument("--sheet", choices=("world", "places"), default="world", help="which sheet (default world)")
     parser.add_argument("--only", default="", help="pictures whose names contain this, and no sheet")
     args = parser.parse_args(argv)
     with tempfile.TemporaryDirectory() as folder:
         own = Path(folder) / "van.obj"
         write_van(own)
-        wanted = [one for one in asked(own, args.texture) if args.only in one.name]
+        every = asked(own, args.texture) if args.sheet == "world" else places()
+        wanted = [one for one in every if args.only in one.name]
         pictures, shirt = [], args.texture
         for one in wanted:
             kept = None if args.folder is None else args.folder / f"{one.name}.png"
@@ -192,8 +226,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         sheet = Image.new("RGB", (COLUMNS * args.size, -(-len(pictures) // COLUMNS) * args.size))
         for number, picture in enumerate(pictures):
             sheet.paste(picture, (number % COLUMNS * args.size, number // COLUMNS * args.size))
-        sheet.save(SHEET, quality=84, method=6)
-        print(f"written: {SHEET.name}, {SHEET.stat().st_size // 1024} KiB", file=sys.stderr)
+        path = IMAGES / f"{args.sheet}.webp"
+        sheet.save(path, quality=84, method=6)
+        print(f"written: {path.name}, {path.stat().st_size // 1024} KiB", file=sys.stderr)
     return 0
 
 

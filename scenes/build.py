@@ -59,8 +59,8 @@ def _runs(mesh: Mesh) -> list[tuple[str, int]]:
 
 
 def environment_files(family: EnvironmentFamily) -> dict[str, bytes]:
-    """Return an environment's file, by path below the data folder."""
-    return {f"environments/{family.name}.exr": exr(family.make().radiance)}
+    """Return an environment's file, by path below the data folder; none where it has the map of another one."""
+    return {} if family.map else {f"environments/{family.name}.exr": exr(family.make().radiance)}
 
 
 def everything() -> Iterator[tuple[str, bytes]]:
@@ -72,6 +72,7 @@ def everything() -> Iterator[tuple[str, bytes]]:
     facts = {
         name: {"split": family.split, "source": family.script}
         | ({"ground": family.ground} if family.ground else {})
+        | ({"map": family.map} if family.map else {})
         | ({"candelas": family.make().candelas} if family.lux else {})
         for name, family in ENVIRONMENTS.items()
     }

@@ -52,6 +52,7 @@ FORMS: dict[str, dict[str, Any]] = {
     "sky": {"azimuth": [0, 300], "elevation": [10, 80]},
     "geometry": {"modes": 4, "epsilon": 0.1},
     "patch": {"resolution": 4, "azimuth": [0, 360], "size": [0.2, 0.6]},
+    "things": {"x": [-0.05, 0.1], "y": [-0.2, 0.05], "heading": [-90, 90], "presence": ["there", "away"]},
     "occlusion": {"which": ["card", "sphere"], "coverage": [0.1, 0.5], "direction": [0, 300]},
     "contents": {"level": [0.3, 0.9], "milk": [0.2, 0.8]},
     "background": {"ground": "keep", "hue": [0, 300], "saturation": [0.5, 1.0]},
@@ -78,6 +79,11 @@ QUICK = ["camera-occlusion", "pose-contents", "material-patch"]
 def suited(kinds: Iterable[str]) -> str:
     """An object that some controls can change."""
     return "person" if "body" in kinds else "mug"
+
+
+def beside(kinds: Iterable[str]) -> str | None:
+    """What `things` moves."""
+    return "bottle@0.2,0.1" if "things" in kinds else None
 
 
 def pairs(quick: list[str]) -> list[Any]:
@@ -107,13 +113,13 @@ def model() -> advsearch.Model:
 def test_every_control_is_here_and_varies() -> None:
     assert set(FORMS) == set(OWN), "FORMS of tests/test_pairs.py names a control that there is not"
     for kind, form in FORMS.items():
-        varied = compose([make_control(kind, form)], describe(suited([kind]))).start.numel()
+        varied = compose([make_control(kind, form)], describe(suited([kind]), things=beside([kind]))).start.numel()
         assert varied, f"{kind} has no range: give a parameter `search=(low, high)`, or {kind} a form in FORMS"
 
 
 @pytest.mark.parametrize("pair", pairs(QUICK))
 def test_a_row_of_a_sweep_is_true_of_its_own_picture(pair: tuple[str, ...], model: advsearch.Model) -> None:
-    scene = advsearch.load_scene(suited(pair))
+    scene = advsearch.load_scene(suited(pair), things=beside(pair))
     controls = {kind: FORMS[kind] for kind in pair}
     grid = {} if {"camera", "path"} & set(pair) else GRID
     samples = ROWS // (2 if grid else 1)
@@ -161,10 +167,11 @@ def assert_true_of_fixed_values(
         for control in drawn
     }
     for name, value in said.items():
-        kind, parameter, *number = name.split(".")
-        if not number and parameter in {one.name for one in CONTROLS[kind].parameters}:
+        kind, _, parameter = name.partition(".")
+        declared = {one.name for one in CONTROLS[kind].declared([parameter])}
+        if parameter in declared:
             named.setdefault(kind, {})[parameter] = value["value"]
-        elif kind in PICTURES or (number and parameter in {one.name for one in CONTROLS[kind].parameters}):
+        elif kind in PICTURES or ("." in parameter and parameter.partition(".")[0] in declared):
             return  # one number of many cannot be fixed alone, and neither can a picture
     description = framed(scene.description, SIZE)
     space = compose([make_control(kind, given) for kind, given in named.items()], description)

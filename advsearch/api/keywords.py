@@ -98,7 +98,7 @@ def asks(config: type[Config]) -> Callable[[Function], Function]:
             except TypeError as error:
                 raise TypeError(f"{function.__name__}() {error}") from None
             allow_named({**bound.arguments, **given})
-            kept = ("scene", "model", "beside", "progress", "metrics")
+            kept = ("scene", "model", "beside", "progress", "metrics", "tracker")
             plain = {key: one if key in kept or not is_shallow(one) else as_python(one) for key, one in given.items()}
             with ExitStack() as stack:
                 stack.enter_context(in_turn())

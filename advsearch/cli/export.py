@@ -13,6 +13,7 @@ from typing import NamedTuple
 from advsearch.cli import output
 from advsearch.cli.commands import Command
 from advsearch.cli.output import at_work, output_errors
+from advsearch.described import rounded
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.runs.directory import PARTS, find_run
 from advsearch.runs.export import FORMATS, write_rows, write_threedb
@@ -93,14 +94,14 @@ def _print(args: argparse.Namespace, out: Path) -> Written:
         longest = USUAL_SIZE if known is None else known
         pieces = printable(args.run, longest)
         profile = None if args.icc is None else Path(args.icc)
-        title = f"{Path(args.run).name}, object of {longest:g} mm"
+        title = f"{Path(args.run).name}, object of {rounded(longest)} mm"
         with placed_by("out"), replacing(out) as part:
             paper, most = (args.paper or "a4").lower(), MOST_SHEETS if args.sheets is None else args.sheets
             pages = write_sheets(part, pieces, title, paper=paper, profile=profile, most=most, last=chart_page)
     sizes = [{"name": piece.name, "width_mm": piece.size[0], "height_mm": piece.size[1]} for piece in pieces]
     text = f"{pages} pages in {out}; print them at 100 % and measure the square on the first"
     if known is None:
-        text += f"\nThe real object's longest side is taken for {longest:g} mm; --size says otherwise."
+        text += f"\nThe real object's longest side is taken for {rounded(longest)} mm; --size says otherwise."
     return {"pages": pages, "size_mm": longest, "pieces": sizes}, text
 
 

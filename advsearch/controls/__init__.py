@@ -34,7 +34,19 @@ ORDER = (
         "sky",
         "geometry",
     ),
-    *("body", "patch", "occlusion", "contents", "background", "haze", "lens", "sensor", "corruption", "mitsuba"),
+    *(
+        "things",
+        "body",
+        "patch",
+        "occlusion",
+        "contents",
+        "background",
+        "haze",
+        "lens",
+        "sensor",
+        "corruption",
+        "mitsuba",
+    ),
 )
 """In which lists have controls; one that is not named comes last."""
 SHARED = ("base", "ranges", "numbers", "space", "values", "corruption_filters", "material_patterns")
@@ -132,7 +144,7 @@ def check_instance(where: str, name: str, colon: str = ":") -> None:
 
 
 def _default_range(control: type[Control], parameter: str) -> object:
-    for declared in control.parameters:
+    for declared in control.declared((parameter,)) if control.parameters else ():
         if declared.name == parameter:
             if declared.options:
                 return {"choices": list(declared.options)}

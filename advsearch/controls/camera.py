@@ -98,7 +98,7 @@ class CameraControl(NumberControl):
         shift = () if OF_KIND[model.kind] else ("shift_x", "shift_y")
         for name in (*own, *shift, "aperture", "focus"):
             if name in self.specs:
-                whose = f"the lens of `camera={model.name}`" if model.name else "a lens with distortion"
+                whose = f"the lens of `camera={model.name}`" if model.name else "a lens with distortion, or raindrops"
                 raise InputError(f"`controls` {self.name}: {name} is not supported with {whose}; leave one of them out")
 
     def in_scene(self, parameter: Parameter) -> Parameter:

@@ -35,6 +35,10 @@ COEFFICIENTS = 27
 """Degrees 0 to 2 of three colour channels."""
 
 
+MAPS = tuple(sorted({*library.list_environments()} - {*library.list_environments("place")}))
+"""The bundled environments that are a map; the others are a place around the object."""
+
+
 class EnvironmentControl(NumberControl):
     """Which environment lights the scene, how it is turned, how bright it is, and its colour."""
 
@@ -42,9 +46,9 @@ class EnvironmentControl(NumberControl):
     summary = "Which environment lights the scene, how it is turned, how bright it is, and its colour."
     parameters = (
         Parameter(
-            "which", (), "name", 0.0, float(len(library.list_environments())), OWN_MAP,
+            "which", (), "name", 0.0, float(len(MAPS)), OWN_MAP,
             "Another environment instead of the scene's own, metered afresh: bundled, or a .hdr or .exr file.",
-            options=(OWN_MAP, *library.list_environments()), estimators=(),
+            options=(OWN_MAP, *MAPS), estimators=(),
         ),
         *settings.ENVIRONMENT,
         *(

@@ -24,6 +24,7 @@ from torch import Tensor
 from advsearch.controls.base import Choice, Parameter, Value
 from advsearch.controls.numbers import NumberControl, Values
 from advsearch.controls.values import Number, OneOf, Spec
+from advsearch.described import rounded
 from advsearch.errors import FileFormatError, InputError
 from advsearch.files import read_text
 from advsearch.scene.assets import Doubles
@@ -208,8 +209,8 @@ class PathControl(NumberControl):
         shortest = min((float(one.times[-1]) for one in self._files), default=self.seconds)
         if len(self._paths) > 1 and shortest < self.seconds:
             wide.append(
-                f"path: the shortest of the files takes {shortest:g} s of {self.seconds:g}; who has arrived waits, and "
-                "these frames count"
+                f"path: the shortest of the files takes {rounded(shortest)} of {rounded(self.seconds)} s; who has "
+                "arrived waits, and these frames count"
             )
         return replace(scene, remarks=tuple(dict.fromkeys((*scene.remarks, *wide)))) if wide else scene
 

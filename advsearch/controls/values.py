@@ -23,6 +23,7 @@ import torch
 from torch import Tensor
 
 from advsearch.controls.ranges import DrawnRange, Range, is_number, read_drawn
+from advsearch.described import rounded
 from advsearch.distributions import CHOICES, DISTRIBUTION, WEIGHTS, as_setting
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.description import ENVIRONMENT, SceneDescription, check_one_environment
@@ -258,7 +259,7 @@ def check_prepared(control: str, before: SceneDescription, after: SceneDescripti
         if name in before.given:
             raise InputError(
                 f"`set` {name}={shown(scene)} and `controls` {control} contradict each other: the control makes it "
-                f"{shown(value)}; change one of the two, or leave one out"
+                f"{rounded(value)}; change one of the two, or leave one out"
             )
         yield Moved(control, name, SETTINGS[name].unit, scene, value)
 
@@ -309,4 +310,6 @@ def shown(value: Number) -> str:
 
 def _instead(one: Moved) -> str:
     unit = "" if one.unit in ("1", "name") or isinstance(one.used, str) else f" {one.unit}"
-    return f"{one.parameter} {shown(one.used)}{unit} instead of {shown(one.scene)}"
+    short = [value if isinstance(value, str) else rounded(value) for value in (one.used, one.scene)]
+    used, scene = short if short[0] != short[1] else (shown(one.used), shown(one.scene))
+    return f"{one.parameter} {used}{unit} instead of {scene}"

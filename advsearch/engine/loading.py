@@ -26,7 +26,7 @@ from advsearch.registry import names_code
 from advsearch.scene import settings
 from advsearch.scene.assembly import Assembly, Motion
 from advsearch.scene.assets import EnvironmentAsset, Floats, ObjectAsset
-from advsearch.scene.camera_model import bundled
+from advsearch.scene.camera_model import bundled, pinhole
 from advsearch.scene.description import (
     ENVIRONMENT,
     NO_MAP,
@@ -268,6 +268,11 @@ def framed(description: SceneDescription, resolution: int | tuple[int, int]) -> 
     """Return the scene as it is seen in a picture of this size (side, or height and width)."""
     height, width = (resolution, resolution) if isinstance(resolution, int) else resolution
     model, remarks = description.camera_model, description.remarks
+    if description.number("camera.drops") > 0.0:
+        if description.rig:
+            raise InputError("`set` camera.drops: of one camera, not of several; leave it out")
+        if model is None or not model.name:  # drops are before a camera whose rays are worked out one by one
+            model = pinhole(description.number("camera.fov"), width / height)
     if model is not None:
         model = bundled(width / height).get(model.name, model)
         remarks = tuple(dict.fromkeys((*remarks, *model.scaling((height, width)))))
@@ -307,6 +312,14 @@ def make_renderer(
     )
     scene = MitsubaScene(description, size, filter=formation.filter, leave_out=leave_out, sampler=sampler)
     exposed = any(space.exposure)
+    if any(mount.later for mount in description.rig):
+        moved = any(one is not then for one, then in zip(space.controls, space.later(1.0).controls, strict=True))
+        if exposed or not moved:
+            wrong = "have motion blur or a rolling shutter" if exposed else "show the same: nothing knows a time"
+            raise InputError(
+                f"camera: the pictures of {description.rig_spec} are taken one after the other, and "
+                f"{'can not ' if exposed else ''}{wrong}; {'leave that out' if exposed else 'add a `path`'}"
+            )
     motion = Motion(description, size, scene.assembly) if differentiated or exposed else None
     moments = exposed_in(space, motion, scene.assembly, size[0]) if exposed and motion is not None else ()
     measured = motion if differentiated else None

@@ -19,6 +19,7 @@ from advsearch.controls.ranges import is_number
 from advsearch.engine.loading import CONTROL, MODEL, Controls, Scene, as_controls, controls_by_name, lent, load_scene
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.models import Model, ModelWarning, load_model
+from advsearch.models.all_at_once import AllAtOnce
 from advsearch.models.guards import plainly
 from advsearch.models.loading import named_code
 from advsearch.scene.rig import read_rig
@@ -83,6 +84,12 @@ def load_models(models: Sequence[Any], task: Task, config: SceneConfig) -> tuple
                 f"made of several, as in `task='rig={{task: {task.name}, rule: any}}'`"
             )
         loaded = tuple(replace(one, cameras=len(rig)) for one in loaded)
+    for model in loaded:
+        if isinstance(model.module, AllAtOnce) and model.module.cameras != model.cameras:
+            raise InputError(
+                f"model: {model.name} takes {model.module.cameras} pictures at once, and {model.cameras} "
+                f"{'is' if model.cameras == 1 else 'are'} taken; give a `camera` that is a rig of as many"
+            )
     return (together(loaded, config.resolution),) if isinstance(task, Together) else loaded, sentences
 
 

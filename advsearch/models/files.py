@@ -15,7 +15,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
@@ -23,6 +23,7 @@ from torch import Tensor, nn
 from advsearch.errors import FileFormatError, ModelError
 from advsearch.files import open_regular
 from advsearch.models import exported
+from advsearch.models.all_at_once import AllAtOnce
 from advsearch.models.archive import LARGEST, Archive, open_archive, refused, rewritten_torchscript, runs_while_loading
 from advsearch.models.guards import TookTooLong, try_torchscript
 from advsearch.models.labels import names_in
@@ -144,6 +145,8 @@ def _with_signature(source: Source, program: torch.export.ExportedProgram) -> So
     nodes = {node.name: node for node in program.graph.nodes if node.op == "placeholder"}
     values = [nodes[key].meta.get("val") for key in inputs if key in nodes]
     tensors = bool(values) and all(isinstance(one, torch.Tensor) for one in values)
+    if tensors and len(values) == 1 and values[0].dim() == 5 and isinstance(values[0].shape[1], int):
+        return _of_a_rig(source, values[0], *_batch_limits(program, values[0].shape[0]))
     if not tensors or values[0].dim() != 4 or any(one.dim() != 2 for one in values[1:]):
         raise ModelError(f"model {name}: expected a program with one input, a batch of images of 4 dimensions")
     value = values[0]
@@ -155,6 +158,19 @@ def _with_signature(source: Source, program: torch.export.ExportedProgram) -> So
     height, width = value.shape[1:3] if layout == "NHWC" else value.shape[2:4]
     fixed = isinstance(height, int) and isinstance(width, int)
     return replace(source, input_size=(height, width)) if fixed else source
+
+
+def _of_a_rig(source: Source, value: Tensor, low: int, high: int) -> Source:
+    """The source of a program that takes (N, K, 3, H, W) or (N, K, H, W, 3), all pictures of a rig at once."""
+    if not value.is_floating_point():
+        raise ModelError(f"model {source.name}: expected floating-point images as input, got {value.dtype}")
+    last = value.shape[4] == 3 and value.shape[2] != 3
+    height, width = value.shape[2:4] if last else value.shape[3:5]
+    cameras = int(value.shape[1])
+    module = AllAtOnce(cast(nn.Module, source.module), cameras, "NKHWC" if last else "NKCHW")
+    size = (height, width) if isinstance(height, int) and isinstance(width, int) else None
+    limits = (low * cameras, high * cameras)
+    return replace(source, module=module, dtype=value.dtype, batch_limits=limits, input_size=size)
 
 
 def _batch_limits(program: torch.export.ExportedProgram, batch: int | torch.SymInt) -> tuple[int, int]:

@@ -272,7 +272,7 @@ def _batch_limits(model: Model, pair: Tensor, rows: Tensor | None) -> tuple[int,
     """Return the batch limits, lowered to one image at a time if the network does not take two."""
     low, high = model.batch_limits
     if isinstance(model.module, AllAtOnce):  # which takes the pictures of a rig together
-        return model.module.cameras, high - high % model.module.cameras
+        return max(low, model.module.cameras), max(low, high - high % model.module.cameras)
     if high < 2:
         return low, high
     try:

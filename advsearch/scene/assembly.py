@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from advsearch.scene.assets import Mesh
-from advsearch.scene.description import SceneDescription
+from advsearch.scene.description import OBJECT, SceneDescription
 from advsearch.scene.geometry import camera_to_world, driving, seated
 from advsearch.scene.gradients import DEFAULT_PIXELS, DEFAULT_STEP, STEP_RANGE, Group
 from advsearch.scene.parts import CAMERA, BeamLamp, LampGlass
@@ -98,20 +98,33 @@ class MovingMesh:
         return int(self._groups.max()) + 1
 
 
+AWAY = 1000.0
+"""Object sizes to the side, where a thing is under a pixel wide."""
+
+
 class Assembly:
     """Turns the inputs of a space into those of `MitsubaScene`.
 
     Args:
         description: the scene with all its parts.
+
+    Attributes:
+        away: whether the object is put so far away that neither it nor its shadow is in the picture. A scene in which
+            it was so has bounds from then on that change last bits of every picture: it is for such pictures alone.
     """
 
     def __init__(self, description: SceneDescription) -> None:
+        self.away = False
         self.meshes = {name: MovingMesh(part.mesh, part.to_world) for name, part in description.meshes.items()}
         self._carried = [one for one in description.parts if isinstance(one, (BeamLamp, LampGlass))]
         self._photograph = description.photograph
 
     def __call__(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return the inputs with poses, displacements and maps worked out; differentiable torch operations."""
+        if self.away:
+            pose = inputs.get(f"{OBJECT}.to_world", self.meshes[OBJECT].to_world).clone()
+            pose[1, 3] += AWAY
+            inputs = {**inputs, f"{OBJECT}.to_world": pose}
         parameters = dict(inputs)
         for one in self._carried:
             parameters |= _with_carrier(one, inputs)

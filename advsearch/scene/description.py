@@ -43,6 +43,7 @@ from advsearch.scene.parts import (
     mesh_part,
     plugins_in,
 )
+from advsearch.scene.places.road import FLOOR
 from advsearch.scene.rig import Mount, read_rig
 from advsearch.scene.settings import ORBIT_CAMERA
 from advsearch.scene.sizes import TRIPOD, doubts, on_roads, sized
@@ -165,7 +166,7 @@ class SceneDescription:
                 "its longest side in metres, such as `size=0.1`"
             )
         on_table = self.on_table and self.object.metres <= ON_TABLES
-        height = preset.height - (TABLE if on_table else 0.0)
+        height = preset.height - (TABLE if on_table or FLOOR in self.around else 0.0)
         azimuth = preset.azimuth
         if azimuth is not None and on_roads(self.object):
             azimuth += 180.0
@@ -506,7 +507,7 @@ def check_ground(given: settings.Given, lit_by: str | Path | EnvironmentAsset) -
         InputError: there is no photograph, or a table is described beside it.
     """
     kind = given.get("ground.kind")
-    if kind not in (settings.PHOTOGRAPH, *settings.ROADS, *settings.AVENUES):
+    if kind not in (settings.PHOTOGRAPH, *settings.ROADS, *settings.PLACES):
         return
     if lit_by == NO_MAP and kind == settings.PHOTOGRAPH:
         raise InputError(

@@ -1,8 +1,9 @@
-"""What things stand on beside a plain table: the floor of the environment's photograph, a road, or an avenue."""
+"""What things stand on beside a plain table: the floor of the environment's photograph, a road, or a place."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import lru_cache
 from typing import TYPE_CHECKING
@@ -15,7 +16,10 @@ from advsearch.scene import settings
 from advsearch.scene.assets import EnvironmentAsset, Floats, Mesh
 from advsearch.scene.parts import MeshPart
 from advsearch.scene.places.avenue import avenue
-from advsearch.scene.places.road import ROAD, road
+from advsearch.scene.places.car_park import car_park
+from advsearch.scene.places.crossing import crossing
+from advsearch.scene.places.road import LAID, ROAD, road
+from advsearch.scene.places.room import room
 
 if TYPE_CHECKING:
     from advsearch.scene.description import SceneDescription
@@ -113,8 +117,8 @@ def irradiance(radiance: Tensor) -> Tensor:
 
 
 def paved(scene: SceneDescription) -> bool:
-    """Tell whether the object stands on the road."""
-    return ROAD in scene.around
+    """Tell whether the object stands on the road, or in a room."""
+    return not scene.around.keys().isdisjoint(LAID)
 
 
 def enclosed(scene: SceneDescription) -> bool:
@@ -122,12 +126,21 @@ def enclosed(scene: SceneDescription) -> bool:
     return any(part.laid and part.name != ROAD for part in scene.around.values())
 
 
+PLACES: Mapping[str, Callable[..., tuple[MeshPart, ...]]] = {
+    settings.DRY_AVENUE: avenue, settings.WET_AVENUE: avenue, settings.CROSSING: crossing,
+    settings.CAR_PARK: car_park, settings.ROOM: room, settings.LIT_ROOM: room,
+}  # fmt: skip
+"""What makes the meshes of each kind of ground that is a place."""
+
+
 def on_its_ground(scene: SceneDescription) -> SceneDescription:
-    """Return the scene with the road or the avenue that its environment and its settings ask for, and no other."""
+    """Return the scene with the road or the place that its environment and its settings ask for, and no other."""
     kind = _kind(scene)
     others = tuple(part for part in scene.parts if not (isinstance(part, MeshPart) and part.laid))
-    if kind in settings.AVENUES:
-        return replace(scene, parts=(*others, *avenue(kind == settings.WET_AVENUE, scene.metres, _lit(scene))))
+    if kind in settings.PLACES:
+        unit = None if scene.environment is None else scene.environment.candelas
+        place = PLACES[kind](scene.metres, unit, wet=kind == settings.WET_AVENUE, dark=_dark(scene, kind))
+        return replace(scene, parts=(*others, *place))
     if kind in settings.ROADS:
         return replace(scene, parts=(*others, road(kind == settings.WET_ROAD, scene.metres)))
     return scene if len(others) == len(scene.parts) else replace(scene, parts=others)
@@ -137,14 +150,15 @@ DUSK = 70.0
 """Illuminance of the open sky at which street lamps are switched on, lux."""
 
 
-def _lit(scene: SceneDescription) -> float | None:
-    """The luminance of a radiance of 1, cd/m2, where it is so dark that lamps shine; None elsewhere."""
+def _dark(scene: SceneDescription, kind: str) -> bool:
+    """Whether it is so dark that lamps shine."""
     light = scene.environment
+    if kind in (settings.ROOM, settings.LIT_ROOM):
+        return kind == settings.LIT_ROOM
     if light is None or light.candelas is None:
-        return None
+        return False
     arriving = irradiance(torch.from_numpy(light.radiance.copy()))
-    lux = light.candelas * float(arriving @ torch.tensor(LUMINANCE))
-    return light.candelas if lux < DUSK else None
+    return light.candelas * float(arriving @ torch.tensor(LUMINANCE)) < DUSK
 
 
 def _kind(scene: SceneDescription) -> str | None:

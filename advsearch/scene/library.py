@@ -79,7 +79,8 @@ def list_environments(split: str | None = None) -> tuple[str, ...]:
     """Return the names of the bundled environments, sorted.
 
     Args:
-        split: "train" or "heldout" to list only that half, "street" for the streets; None for all.
+        split: "train" or "heldout" to list only that half, "street" for the streets, "place" for other places; None for
+            all.
     """
     facts = _environments().items()
     return tuple(sorted(name for name, fact in facts if split is None or fact["split"] == split))
@@ -137,11 +138,11 @@ def load_environment(name: str) -> EnvironmentAsset:
     known = list_environments()
     if name not in known:
         raise UnknownNameError("environment", name, known, MAP_HINT)
+    facts = _environments()[name]
     try:
-        radiance = _exr((_data() / "environments" / f"{name}.exr").read_bytes())
+        radiance = _exr((_data() / "environments" / f"{facts.get('map', name)}.exr").read_bytes())
     except (OSError, ValueError, KeyError, RuntimeError) as error:
         raise FileFormatError(f"bundled environment {name!r} cannot be read ({error}); reinstall advsearch") from error
-    facts = _environments()[name]
     return EnvironmentAsset(
         name, radiance, source=BUNDLED_ENVIRONMENT, ground=facts.get("ground"), candelas=facts.get("candelas")
     )

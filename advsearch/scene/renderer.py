@@ -35,7 +35,7 @@ from advsearch.scene.geometry import camera_to_world, middle
 from advsearch.scene.gradients import BY_ADJOINT, BY_DIFFERENCES, TURN_STEP, Group, first_order, first_plan
 from advsearch.scene.mitsuba_backend.denoise import denoise
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
-from advsearch.scene.moments import Moment
+from advsearch.scene.moments import Later, Moment
 from advsearch.scene.rig import Mount
 from advsearch.scene.surfaces import Surfaces
 
@@ -65,6 +65,9 @@ class InputSpace(Protocol):
 
     def inputs(self, u: Tensor) -> dict[str, Tensor]:
         """Map u to scene inputs by torch operations; differentiable."""
+
+    def later(self, seconds: float) -> Later:
+        """Return what maps u to scene inputs so many seconds later."""
 
     def picture(self, u: Tensor, image: Tensor) -> Tensor:
         """Change the finished picture; differentiable."""
@@ -257,7 +260,8 @@ class Renderer:
         u, _ = self._given(u, 1)
         with torch.no_grad():
             rig = self.scene.made[0].rig
-            inputs = self._seen(rig[camera] if rig else None, self.scene.assembly(self.space.inputs(u)))
+            mount = rig[camera] if rig else None
+            inputs = self._seen(mount, self.scene.assembly(self._then(mount).inputs(u)))
         seen = self.scene.surfaces(_traced(inputs), fineness)
         metres = self.scene.made[0].metres
         return replace(seen, depth=seen.depth * metres, z_depth=seen.z_depth * metres)
@@ -337,11 +341,15 @@ class Renderer:
 
     def _view(self, mount: Mount | None, u: Tensor, seed: int, spp: int, *, display: bool) -> Tensor:
         """The picture of one camera of a rig, or of the only one; as of `_picture`."""
-        inputs = self._seen(mount, self.scene.assembly(self.space.inputs(u)))
+        inputs = self._seen(mount, self.scene.assembly(self._then(mount).inputs(u)))
         hide = "backdrop.color" in inputs
         if self.moments:
             return self.finished(self._exposed(mount, u, seed, spp, hide), inputs, u, display=display)
         return self.finished(self.rendered(_traced(inputs), seed, spp, hide), inputs, u, display=display)
+
+    def _then(self, mount: Mount | None) -> Later:
+        """The space when a camera of a rig takes its picture."""
+        return self.space.later(mount.later) if mount is not None and mount.later else self.space
 
     def _seen(self, mount: Mount | None, inputs: dict[str, Tensor]) -> dict[str, Tensor]:
         """Scene inputs as a camera of a rig sees them."""

@@ -1,13 +1,14 @@
-"""Rigs: several cameras that take their pictures of one configuration at the same time.
+"""Rigs: several cameras that take pictures of one configuration, at the same time or one after the other (a clip).
 
 The first camera is the scene's own, which controls and paths move; the others are mounted on it, or stand around the
-object at the same height and distance. Files are a plain list of ours, or Kalibr's camchain with its extrinsics.
+object at the same height and distance. Files are a plain list of ours, Kalibr's camchain with its extrinsics, frames of
+nerfstudio's transforms.json, or COLMAP's images.txt with the cameras.txt beside it.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,18 +18,25 @@ import torch
 from torch import Tensor
 
 from advsearch.errors import FileFormatError
-from advsearch.files import read_text
+from advsearch.files import parse_json, read_text
 from advsearch.scene.assets import Doubles
-from advsearch.scene.camera_files import read_camera
+from advsearch.scene.camera_files import LARGEST_JSON, OF_A_FRAME, read_camera
 from advsearch.scene.camera_model import CameraModel
 from advsearch.yaml_text import LARGEST, parse_yaml
 
-MOST_CAMERAS = 16
+MOST_CAMERAS = 32
 FARTHEST = 1e4
 """Metres, or object sizes, that a camera may be from the first."""
-KEYS = ("name", "place", "turn", "around", "fov")
+KEYS = ("name", "place", "turn", "around", "fov", "later")
+LATEST = 60.0
+"""Seconds after the first picture."""
 AXES = np.diag([-1.0, -1.0, 1.0, 1.0])
 """From x to the right, y down, z ahead to Mitsuba's: x to the left, y up, z ahead."""
+FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+"""From nerfstudio's axes of a camera, x to the right, y up, z back, to x to the right, y down, z ahead."""
+COLMAPS = "images.txt"
+MOST_BYTES = 1 << 26
+"""Of COLMAP's images, whose lines of points are skipped."""
 STEP = "T_cn_cnm1"
 """Kalibr's: from points of the camera before to points of this one."""
 
@@ -44,6 +52,7 @@ class Mount:
         around: degrees that it stands further around the object than the first, counter-clockwise from above.
         fov: degrees along the larger side; None for the first's.
         model: intrinsics and distortion; None for the first's.
+        later: seconds after the first that it takes its picture, along the path of a control.
     """
 
     name: str
@@ -51,6 +60,7 @@ class Mount:
     around: float = 0.0
     fov: float | None = None
     model: CameraModel | None = None
+    later: float = 0.0
 
     def seen(self, inputs: Mapping[str, Tensor], first: Tensor, middle: Tensor, metres: float) -> dict[str, Tensor]:
         """Return scene inputs as this camera sees them.
@@ -78,10 +88,18 @@ class Mount:
 def read_rig(spec: str) -> tuple[Mount, ...]:
     """Read the cameras of a rig; empty where a file has one camera, or one of its cameras is named (``#cam1``).
 
+    Of a transforms.json, frames are named by their number, the first one first: ``transforms.json#0,4,8``. Of an
+    images.txt all images are cameras, or those named by their IMAGE_ID: ``images.txt#3,7``.
+
     Raises:
         FileFormatError: more than `MOST_CAMERAS`, numbers that no camera has, or models of different kinds.
     """
-    if "#" in spec or Path(spec).suffix.lower() not in (".yaml", ".yml"):
+    path, _, which = spec.partition("#")
+    if Path(path).name == COLMAPS:
+        return _of_colmap(path, which)
+    if Path(path).suffix.lower() == ".json" and "," in which:
+        return _of_transforms(path, which)
+    if which or Path(spec).suffix.lower() not in (".yaml", ".yml"):
         return ()
     try:
         data = parse_yaml(read_text(Path(spec), "a camera file", LARGEST))
@@ -100,8 +118,8 @@ def read_rig(spec: str) -> tuple[Mount, ...]:
         raise FileFormatError(f"{spec}: expected 2 to {MOST_CAMERAS} cameras, got {len(mounts)}")
     if len({one.name for one in mounts}) < len(mounts):
         raise FileFormatError(f"{spec}: expected a name of its own for each camera")
-    if mounts and (not np.allclose(mounts[0].pose, np.eye(4)) or mounts[0].around):
-        raise FileFormatError(f"{spec}: the first camera is the scene's own; it takes no place, turn or around")
+    if mounts and (not np.allclose(mounts[0].pose, np.eye(4)) or mounts[0].around or mounts[0].later):
+        raise FileFormatError(f"{spec}: the first camera is the scene's own; it takes no place, turn, around or later")
     return mounts
 
 
@@ -122,7 +140,10 @@ def _of_entry(spec: str, number: int, given: Any) -> Mount:
         (fov,) = _numbers(where, {"fov": [given["fov"]]}, "fov", 1, 170.0)
         if fov < 1.0:
             raise FileFormatError(f"{where}: fov: expected 1 to 170 degrees, got {fov:g}")
-    return Mount(name, pose, around, fov)
+    (later,) = _numbers(where, {"later": [given.get("later", 0.0)]}, "later", 1, LATEST)
+    if later < 0.0:
+        raise FileFormatError(f"{where}: later: expected 0 to {LATEST:g} seconds, got {later:g}")
+    return Mount(name, pose, around, fov, later=later)
 
 
 def _numbers(where: str, given: Mapping[str, Any], key: str, count: int, most: float) -> list[float]:
@@ -148,22 +169,107 @@ def _of_camchain(spec: str, data: Mapping[str, Any]) -> tuple[Mount, ...]:
     names = sorted(cameras, key=lambda name: (len(str(name)), str(name)))
     if len(names) < 2 or len(names) > MOST_CAMERAS or not all(STEP in cameras[name] for name in names[1:]):
         return ()
-    mounts, pose, kinds = list[Mount](), np.eye(4), set[str]()
-    for number, name in enumerate(names):
-        model = read_camera(f"{spec}#{name}")
-        kinds.add(model.kind)
-        if len(kinds) > 1:
-            raise FileFormatError(f"{spec}: expected cameras of one model, got {' and '.join(sorted(kinds))}")
-        if number:
-            rows = [one for row in cameras[name][STEP] for one in row] if _rows(cameras[name][STEP]) else []
-            step = np.array(_numbers(f"{spec}: {name}", {STEP: rows}, STEP, 16, FARTHEST)).reshape(4, 4)
-            turn = step[:3, :3]
-            if not np.allclose(turn @ turn.T, np.eye(3), atol=1e-3) or np.linalg.det(turn) < 0.0:
-                raise FileFormatError(f"{spec}: {name}: {STEP}: expected a rotation and a shift, got another map")
-            pose = pose @ np.linalg.inv(step)
-        mounts.append(Mount(str(name), pose, model=model))
-    return tuple(mounts)
+    poses = [np.eye(4)]
+    for name in names[1:]:
+        poses.append(poses[-1] @ np.linalg.inv(_rigid(f"{spec}: {name}", STEP, cameras[name][STEP])))
+    return _mounted(spec, names, poses, [read_camera(f"{spec}#{name}") for name in names])
 
 
-def _rows(given: Any) -> bool:
-    return isinstance(given, list) and all(isinstance(row, list) for row in given)
+def _of_transforms(path: str, which: str) -> tuple[Mount, ...]:
+    """Frames of nerfstudio's transforms.json by their numbers; `transform_matrix` is from the camera to the world."""
+    try:
+        data = parse_json(read_text(Path(path), "a camera file", LARGEST_JSON))
+    except OSError as error:
+        raise FileFormatError(f"{path}: expected a camera file, got {error.strerror}; check the path") from None
+    except ValueError as error:
+        raise FileFormatError(f"{path}: expected JSON, got {error}; correct the file") from None
+    frames = data.get("frames") if isinstance(data, dict) else None
+    if not isinstance(frames, list) or not all(isinstance(one, dict) for one in frames):
+        raise FileFormatError(f"{path}: expected `frames`, a list with a camera each, as nerfstudio writes it")
+    names = _named(path, which, [str(number) for number in range(len(frames))])
+    poses = [
+        _rigid(f"{path}: frame {name}", "transform_matrix", frames[int(name)].get("transform_matrix")) @ FROM_OPENGL
+        for name in names
+    ]
+    own = [{key: one for key, one in frames[int(name)].items() if key in OF_A_FRAME} for name in names]
+    first = read_camera(f"{path}#{names[0]}")
+    models = [first if lens == own[0] else read_camera(f"{path}#{name}") for name, lens in zip(names, own, strict=True)]
+    return _mounted(path, names, poses, models)
+
+
+def _of_colmap(path: str, which: str) -> tuple[Mount, ...]:
+    """COLMAP's images.txt: in every second line a rotation (quaternion, real part first) and a shift from the world to
+    the camera, whose model is in the cameras.txt beside it."""
+    try:
+        text = read_text(Path(path), "COLMAP's images", MOST_BYTES)
+    except OSError as error:
+        raise FileFormatError(f"{path}: expected COLMAP's images, got {error.strerror}; check the path") from None
+    lines = [line for line in text.splitlines() if not line.startswith("#")]
+    rows = {words[0]: words for line in lines[::2] if (words := line.split(maxsplit=9))}
+    if not rows:
+        raise FileFormatError(f"{path}: expected 2 to {MOST_CAMERAS} different cameras, got none")
+    if len(rows) < sum(bool(line.strip()) for line in lines[::2]):
+        raise FileFormatError(f"{path}: expected each image once, got one with the same number twice; correct the file")
+    names = _named(path, which or ",".join(rows), list(rows))
+    poses, models = list[Doubles](), list[CameraModel]()
+    for name in names:
+        where, words = f"{path}: image {name[:40]}", rows[name]
+        if len(words) != 10:
+            raise FileFormatError(
+                f"{where}: expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, got {len(words)} words; a line of "
+                "points, perhaps an empty one, stands between two images"
+            )
+        try:
+            numbers = [float(one) for one in words[1:8]]
+        except ValueError:
+            numbers = []
+        w, x, y, z, *shift = _numbers(where, {"pose": numbers}, "pose", 7, FARTHEST)
+        if not 0.99 < (length := math.sqrt(w * w + x * x + y * y + z * z)) < 1.01:
+            raise FileFormatError(f"{where}: expected a quaternion of length 1, got one of {length:.3g}")
+        w, x, y, z = (one / length for one in (w, x, y, z))
+        seen = np.eye(4)
+        seen[:3, :3] = [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+        seen[:3, 3] = shift
+        poses.append(np.asarray(np.linalg.inv(seen), np.float64))
+        cameras = Path(path).with_name("cameras.txt")
+        models.append(read_camera(f"{cameras}#{words[8]}"))
+    return _mounted(path, names, poses, models)
+
+
+def _named(path: str, which: str, known: Sequence[str]) -> list[str]:
+    names = list(map(str.strip, which.split(",")))
+    if not 2 <= len(names) <= MOST_CAMERAS or len(set(names)) < len(names):
+        raise FileFormatError(f"{path}: expected 2 to {MOST_CAMERAS} different cameras, got {len(names)}")
+    if unknown := [one for one in names if one not in known]:
+        listed = ", ".join(known[:8]) + (", ..." if len(known) > 8 else "")
+        raise FileFormatError(f"{path}: expected some of its cameras {listed}, got {unknown[0][:40]!r}")
+    return names
+
+
+def _mounted(
+    spec: str, names: Sequence[object], poses: Sequence[Doubles], models: Sequence[CameraModel]
+) -> tuple[Mount, ...]:
+    """Cameras whose poses go from their coordinates (x to the right, y down, z ahead) to common ones."""
+    if len(kinds := sorted({one.kind for one in models})) > 1:
+        raise FileFormatError(f"{spec}: expected cameras of one model, got {' and '.join(kinds)}")
+    each = zip(names, poses, models, strict=True)
+    return tuple(Mount(str(name), np.linalg.inv(poses[0]) @ pose, model=model) for name, pose, model in each)
+
+
+def _rigid(where: str, key: str, given: Any) -> Doubles:
+    """A rotation and a shift, (4, 4), from four rows."""
+    rows = [one for row in given for one in row] if isinstance(given, list) and all(map(_listed, given)) else []
+    step = np.array(_numbers(where, {key: rows}, key, 16, FARTHEST)).reshape(4, 4)
+    turn, last = step[:3, :3], step[3]
+    turns = np.allclose(turn @ turn.T, np.eye(3), atol=1e-3) and np.linalg.det(turn) > 0.0
+    if not turns or not np.allclose(last, [0.0, 0.0, 0.0, 1.0]):
+        raise FileFormatError(f"{where}: {key}: expected a rotation and a shift, got another map")
+    return step
+
+
+def _listed(given: Any) -> bool:
+    return isinstance(given, list)

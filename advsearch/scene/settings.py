@@ -167,6 +167,13 @@ EV = Parameter(
     "Absolute exposure in place of the metered one, in the avenue: 14 is for sun, 5 for lit streets.",
     estimators=(),
 )
+DROPS = (
+    Parameter(
+        "drops", (), "1", 0.0, 2000.0, 0.0, "Raindrops on a sheet of glass 6 cm before the camera.", estimators=()
+    ),
+    Parameter("drop_size", (), "mm", 0.2, 10.0, 1.5, "Median of the radii of these drops.", estimators=()),
+    Parameter("drop_seed", (), "1", 0.0, 1e6, 0.0, "Where they are, and how large: a whole number.", estimators=()),
+)
 LAMPS = ("off", "low", "high")
 """What the lamps of a car may be: with either beam its tail lamps shine too."""
 
@@ -193,10 +200,10 @@ ENVIRONMENT = (
         "exposure", (), "stops", -10.0, 10.0, 0.0, "Brightness, after metering.", search=(-1.0, 1.0), estimators=LIT
     ),
 )
-GROUND_KINDS = TABLE, PHOTOGRAPH, DRY_ROAD, WET_ROAD, DRY_AVENUE, WET_AVENUE = (
-    "table", "photograph", "road", "wet-road", "avenue", "wet-avenue",
+GROUND_KINDS = TABLE, PHOTOGRAPH, DRY_ROAD, WET_ROAD, DRY_AVENUE, WET_AVENUE, CROSSING, CAR_PARK, ROOM, LIT_ROOM = (
+    "table", "photograph", "road", "wet-road", "avenue", "wet-avenue", "crossing", "car-park", "room", "lit-room",
 )  # fmt: skip
-ROADS, AVENUES = (DRY_ROAD, WET_ROAD), (DRY_AVENUE, WET_AVENUE)
+ROADS, PLACES = (DRY_ROAD, WET_ROAD), (DRY_AVENUE, WET_AVENUE, CROSSING, CAR_PARK, ROOM, LIT_ROOM)
 PHOTOGRAPHED_FROM = 3.0
 """Height above the floor from which a photograph is taken of an object whose size is not known, object sizes."""
 TABLE_SETTINGS = ("ground.size", *(f"ground.{channel}" for channel in CHANNELS))
@@ -209,8 +216,8 @@ GROUND = (
         0.0,
         len(GROUND_KINDS) - 1.0,
         "what the environment has: photograph where the map is a file, a road in a street, else table",
-        "What the object stands on: a square table, the floor that the environment's photograph shows, a road, or an "
-        "avenue, a road with all that stands beside it.",
+        "What the object stands on: a square table, the floor that the environment's photograph shows, a road, or a "
+        "place with all that stands in it: an avenue, a crossing, a car park or a room.",
         options=GROUND_KINDS,
     ),
     Parameter("size", (), "object sizes", 0.0, 1000.0, 3.0, "Side of the table; 0 leaves the ground out."),
@@ -241,7 +248,7 @@ MATERIAL = (
     _surface("clearcoat", "Strength of a clear coat on top.", (0.0, 1.0)),
 )
 FAMILIES = {
-    "camera": (*CAMERA, EV, _lamps("the car that the camera is in")), "pose": POSE, "environment": ENVIRONMENT,
+    "camera": (*CAMERA, EV, *DROPS, _lamps("the car that the camera is in")), "pose": POSE, "environment": ENVIRONMENT,
     "ground": GROUND, "material": MATERIAL, "object": (_lamps("the object, a car"),),
 }  # fmt: skip
 

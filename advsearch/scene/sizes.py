@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 
+from advsearch.described import rounded
 from advsearch.errors import InputError
 from advsearch.scene.assets import ObjectAsset
 
@@ -89,12 +90,12 @@ def doubts(asset: ObjectAsset, *, asked: bool, laid: bool) -> tuple[str, ...]:
     extent = 0.0 if asset.extent is None or kind is None else asset.extent
     fits = [unit for unit, metres in UNITS.items() if low <= extent * metres <= high]
     what = [
-        f"its longest side is {asset.metres:.4g} m" if strange else "its size in metres is not known",
-        f"it is {extent:.4g} in its file" if missing and extent else "",
+        f"its longest side is {rounded(asset.metres or 0.0)} m" if strange else "its size in metres is not known",
+        f"it is {rounded(extent)} in its file" if missing and extent else "",
         f"a {kind}'s is {low:g} to {high:g} m" if kind else "",
         "it is taken for 1 m, as the road is in metres" if missing and laid else "",
     ]
     give = f"give its longest side in metres, such as `size={(low * high) ** 0.5:.2g}`"
     if fits:
-        give += f", or `unit={fits[0]}`, which makes it {extent * UNITS[fits[0]]:.3g} m"
+        give += f", or `unit={fits[0]}`, which makes it {rounded(extent * UNITS[fits[0]])} m"
     return (f"{asset.name}: {'; '.join(filter(None, what))}. {'If that is wrong, g' if strange else 'G'}{give[1:]}",)

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy.spatial import ConvexHull
@@ -23,7 +23,7 @@ from advsearch.scene.assets import Doubles, ObjectAsset
 from advsearch.scene.geometry import middle, rotation, standing
 from advsearch.scene.importing.files import safe_name
 from advsearch.scene.parts import MeshPart, mesh_part
-from advsearch.scene.places.road import ROAD
+from advsearch.scene.places.road import LAID
 from advsearch.scene.settings import LAMPS
 from advsearch.scene.sizes import LARGEST, SMALLEST, doubts, sized
 
@@ -37,7 +37,7 @@ MOST = 64
 OPTIONS = ("heading", "size", "name", "label", "lamps")
 ALL = "all"
 """What stands for the object and every thing beside it."""
-TAKEN = ("object", "environment", "ground", "camera", ROAD, ALL)
+TAKEN = ("object", "environment", "ground", "camera", *LAID, ALL)
 """What a thing can't be called."""
 
 
@@ -181,11 +181,12 @@ def _pose(scene: SceneDescription, asset: ObjectAsset, asked: AskedThing, metres
 
 
 def ground_height(scene: SceneDescription, place: Doubles) -> float:
-    """Return how high the ground lies at a place (2,), object sizes: that of the road, with its pavements, or 0."""
-    heights = [0.0]
-    for part in (one for name, one in scene.around.items() if name == ROAD):
+    """Return how high the ground lies at a place (2,), object sizes: that of the road, with its pavements, of a room's
+    table or floor, or 0."""
+    heights = list[float]()
+    for part in (one for name, one in scene.around.items() if name in LAID):
         heights += heights_over(standing(part)[part.mesh.faces.astype(np.int64)], place)
-    return max(heights)
+    return max(heights, default=0.0)
 
 
 def heights_over(corners: Doubles, place: Doubles) -> list[float]:
@@ -204,8 +205,8 @@ def heights_over(corners: Doubles, place: Doubles) -> list[float]:
 
 def _meeting(scene: SceneDescription) -> list[str]:
     """Sentences about things that stand in each other: convex outlines on the ground that overlap."""
-    places = {"the object": scene.base_vertices} | {
-        name: standing(part) for name, part in scene.meshes.items() if isinstance(part, ThingPart)
+    places = {"the object": footprint(scene.base_vertices)} | {
+        name: footprint(standing(part)) for name, part in scene.meshes.items() if isinstance(part, ThingPart)
     }
     return [
         f"{one[0].upper()}{one[1:]} and {other} stand in each other: their outlines on the ground overlap."
@@ -214,19 +215,39 @@ def _meeting(scene: SceneDescription) -> list[str]:
     ]
 
 
-def overlapping(one: Doubles, other: Doubles) -> bool:
-    """Return whether the convex outlines on the ground of two clouds of points (N, 3) overlap, at heights that both
-    have. By separating axes (Ericson 2005, Real-Time Collision Detection, section 5.2.1)."""
-    if min(one[:, 2].max(), other[:, 2].max()) <= max(one[:, 2].min(), other[:, 2].min()):
-        return False
-    low, high = np.maximum(one.min(axis=0), other.min(axis=0)), np.minimum(one.max(axis=0), other.max(axis=0))
-    if (low[:2] >= high[:2]).any():
-        return False
-    outlines = [points[ConvexHull(points[:, :2], qhull_options="QJ").vertices, :2] for points in (one, other)]
-    for outline in outlines:
-        edges = np.roll(outline, -1, axis=0) - outline
-        across = np.stack([edges[:, 1], -edges[:, 0]], axis=1)[edges.any(axis=1)]
-        first, second = (points @ across.T for points in outlines)
-        if ((first.max(axis=0) <= second.min(axis=0)) | (second.max(axis=0) <= first.min(axis=0))).any():
-            return False
-    return True
+class Footprint(NamedTuple):
+    """What something takes up: its convex outline on the ground, corners (K, 2), and between which heights."""
+
+    outline: Doubles
+    low: float
+    high: float
+
+
+def footprint(points: Doubles) -> Footprint:
+    """Return what a cloud of points (N, 3) takes up."""
+    corners = ConvexHull(points[:, :2], qhull_options="QJ").vertices
+    return Footprint(points[corners, :2], float(points[:, 2].min()), float(points[:, 2].max()))
+
+
+def overlapping(one: Footprint, other: Footprint) -> bool:
+    """Return whether two outlines overlap, at heights that both have."""
+    begin, end = blocked(one, other, np.array([1.0, 0.0]))
+    return begin < 0.0 < end
+
+
+def blocked(one: Footprint, other: Footprint, way: Doubles) -> tuple[float, float]:
+    """Return from where to where one thing overlaps with another as it is shifted along a way (2,), in lengths of that;
+    (inf, -inf) where it never does. By separating axes (Ericson 2005, Real-Time Collision Detection, section 5.2.1),
+    each of which says so of a stretch."""
+    if min(one.high, other.high) <= max(one.low, other.low):
+        return math.inf, -math.inf
+    edges = np.concatenate([np.roll(points, -1, axis=0) - points for points in (one.outline, other.outline)])
+    across = np.stack([edges[:, 1], -edges[:, 0]], axis=1)[edges.any(axis=1)]
+    first, second, speed = one.outline @ across.T, other.outline @ across.T, across @ way
+    reach = np.stack([second.min(axis=0) - first.max(axis=0), second.max(axis=0) - first.min(axis=0)])
+    still = speed == 0.0
+    if (still & ((reach[0] >= 0.0) | (reach[1] <= 0.0))).any():
+        return math.inf, -math.inf
+    stretches = np.sort(reach[:, ~still] / speed[~still], axis=0)
+    begin, end = float(stretches[0].max()), float(stretches[1].min())
+    return (begin, end) if begin < end else (math.inf, -math.inf)

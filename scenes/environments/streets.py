@@ -7,7 +7,7 @@ The viewer stands in the right lane of a road along x, 1.5 above it. What lies o
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -254,7 +254,11 @@ def _open_night(rays: Array) -> Array:
     return _open(rays, glow * (1.0 + 0.4 * _cumulus(rays)[:, None]), 1.0)
 
 
-STREETS = (
+def _even(rays: Array) -> Array:
+    return np.where(rays[:, 2:] > 0.0, 1.0, 0.8) * np.ones(3)
+
+
+STREETS: tuple[EnvironmentFamily, ...] = (
     EnvironmentFamily("street", "street", lambda rays: street(rays, DAY), _SCRIPT, height=ROWS, ground="road"),
     EnvironmentFamily("street-wet", "street", lambda rays: street(rays, RAIN), _SCRIPT, height=ROWS, ground="wet-road"),
     EnvironmentFamily("street-dusk", "street", lambda rays: street(rays, DUSK), _SCRIPT, height=ROWS, ground="road"),
@@ -262,4 +266,14 @@ STREETS = (
     EnvironmentFamily("avenue-wet", "street", _open_grey, _SCRIPT, ground="wet-avenue", lux=9000.0),
     EnvironmentFamily("avenue-dusk", "street", _open_dusk, _SCRIPT, ground="avenue", lux=12.0),
     EnvironmentFamily("avenue-night", "street", _open_night, _SCRIPT, ground="avenue", lux=0.3),
+)
+STREETS += tuple(
+    replace(one, name=one.name.replace("avenue", place), split="place", ground=place, map=one.name)
+    for place in ("crossing", "car-park")
+    for one in STREETS
+    if one.ground == "avenue"
+)
+STREETS += (  # the room is closed: the map stands for what its walls throw back, which exposure is metered with
+    EnvironmentFamily("room", "place", _even, _SCRIPT, height=4, ground="room", lux=200.0),
+    EnvironmentFamily("room-evening", "place", _even, _SCRIPT, height=4, ground="lit-room", lux=120.0),
 )

@@ -17,7 +17,7 @@ from advsearch.scene import library
 from advsearch.scene.assets import Mesh, ObjectAsset, normalised
 from scenes import build
 from scenes.environments import ENVIRONMENTS
-from scenes.environments.panorama import HEIGHT, LEVEL, WIDTH, brightness, directions, irradiance
+from scenes.environments.panorama import HEIGHT, LEVEL, brightness, directions, irradiance
 
 SEEDS = (None, 1, 2, 3)  # None is the canonical instance
 CLASSES = {
@@ -185,19 +185,27 @@ def test_half_of_the_environments_are_held_out() -> None:
     streets = {name for name, family in ENVIRONMENTS.items() if family.split == "street"}
     avenues = {"avenue", "avenue-wet", "avenue-dusk", "avenue-night"}
     assert streets == {"street", "street-wet", "street-dusk", *avenues} == set(library.list_environments("street"))
+    places = {f"{place}{light}" for place in ("crossing", "car-park") for light in ("", "-dusk", "-night")}
+    assert {*places, "room", "room-evening"} == set(library.list_environments("place"))
     splits = [family.split for family in ENVIRONMENTS.values()]
     assert splits.count("train") == splits.count("heldout") >= 4
     assert ENVIRONMENTS["studio"].split == ENVIRONMENTS["noon"].split == "train"
     assert ENVIRONMENTS["low-sun"].split == "heldout"
     halves = library.list_environments("train"), library.list_environments("heldout")
-    assert sorted((*halves[0], *halves[1], *streets)) == sorted(ENVIRONMENTS) == list(library.list_environments())
+    assert (
+        sorted((*halves[0], *halves[1], *streets, *library.list_environments("place")))
+        == sorted(ENVIRONMENTS)
+        == list(library.list_environments())
+    )
     assert all(ENVIRONMENTS[name].split == "train" for name in halves[0])
 
 
 @pytest.mark.parametrize("name", sorted(ENVIRONMENTS))
 def test_a_shipped_environment_is_light_of_the_common_brightness(name: str) -> None:
     radiance = library.load_environment(name).radiance
-    assert radiance.shape == ((320, 640, 3) if name.startswith("street") or name == "avenue" else (HEIGHT, WIDTH, 3))
+    rows = {"room": 4, "room-evening": 4, "avenue": 320, "crossing": 320, "car-park": 320}.get(name, HEIGHT)
+    rows = 320 if name.startswith("street") else rows
+    assert radiance.shape == (rows, 2 * rows, 3)
     assert radiance.dtype == np.float32
     assert np.isfinite(radiance).all()
     assert radiance.min() >= 0.0

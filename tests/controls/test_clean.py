@@ -134,6 +134,7 @@ MOVED: dict[str, tuple[dict[str, Any], str]] = {
     "a name": ({"environment": {"which": ["noon", "kitchen"]}}, "environment noon instead of studio"),
     "a sky": ({"sky": {}}, "environment sky instead of studio, which the control sky leaves out"),
     "a lamp that is on": ({"light": {"x": [0, 1]}}, "light.power 6 instead of 0"),
+    "a distance that was worked out": ({"camera": {"distance": [2, 3]}}, "camera.distance 2 metres instead of 0.238,"),
     "haze": ({"haze": {"density": [0.1, 0.2]}}, "haze.density 0.1 per object size instead of 0"),
     "a backdrop": (
         {"background": {}},

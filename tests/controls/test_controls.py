@@ -26,11 +26,15 @@ NEEDED: dict[str, dict[str, Any]] = {"mitsuba": {"ground.bsdf.brdf_0.reflectance
 
 SUITS = {"body": "person"}
 """Objects for controls that a mug does not suit."""
+BESIDE = "bottle@0.4,0.1; vase@-0.3,0.3"
+"""What `things` moves."""
 
 
 def bound(kind: str, object: str = "mug") -> Control:
     """A control with its defaults in a scene, alone."""
-    return make_space([make_control(kind, NEEDED.get(kind))], describe(SUITS.get(kind, object))).controls[0]
+    return make_space(
+        [make_control(kind, NEEDED.get(kind))], describe(SUITS.get(kind, object), things=BESIDE)
+    ).controls[0]
 
 
 def test_every_module_of_the_folder_is_a_control_or_shared_by_several() -> None:
@@ -127,7 +131,7 @@ def test_a_bound_control_says_its_configuration_in_values_with_units(kind: str) 
 def test_a_control_can_be_made_again_from_its_settings(kind: str) -> None:
     control = make_control(kind, NEEDED.get(kind))
     again = make_control(kind, control.settings())
-    scene = describe(SUITS.get(kind, "mug"))
+    scene = describe(SUITS.get(kind, "mug"), things=BESIDE)
     first, second = (make_space([one], scene).controls[0] for one in (control, again))
     assert torch.equal(first.start, second.start) and first.groups == second.groups
 

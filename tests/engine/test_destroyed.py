@@ -251,7 +251,8 @@ def test_a_control_that_destroys_what_it_is_handed() -> None:
 @pytest.mark.parametrize("kind", [one for one in CONTROLS if one not in ("path", "mitsuba")])
 def test_what_a_space_hands_out_may_be_destroyed(kind: str) -> None:
     """A loop of one's own gets tensors that nothing else reads."""
-    space = compose(as_controls([kind]), load_scene("person").description if kind == "body" else MUG)
+    scenes: dict[str, Any] = {"body": {"object": "person"}, "things": {"object": "mug", "things": "bottle@0.4,0.1"}}
+    space = compose(as_controls([kind]), load_scene(**scenes[kind]).description if kind in scenes else MUG)
     u = space.start.clone()
     first = {ask: copied(getattr(space, ask)(u)) for ask in ("inputs", "printed", "numbers")}
     for ask in first:

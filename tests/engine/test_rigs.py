@@ -139,8 +139,8 @@ def test_a_sweep_judges_each_picture_and_the_rig_by_its_rule(tmp_path: Path) -> 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("cameras: [{}]", "2 to 16 cameras"),
-        ("cameras: [" + "{}," * 17 + "]", "2 to 16 cameras"),
+        ("cameras: [{}]", "2 to 32 cameras"),
+        ("cameras: [" + "{}," * 33 + "]", "2 to 32 cameras"),
         ("cameras: [{}, {fov: 0}]", "fov"),
         ("cameras: [{}, {fov: .inf}]", "fov"),
         ("cameras: [{}, {place: [1, 2]}]", "place"),

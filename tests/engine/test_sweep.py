@@ -1123,3 +1123,68 @@ def test_an_adversarial_scene_needs_a_run_that_has_one(tmp_path: Path, attacked:
         write_configuration(attacked, np.array([0.5, 0.25], dtype=np.float32))
     with pytest.raises(InputError, match="scene: expected what load_scene returns or takes"):
         advsearch.sweep(grid={"camera.azimuth": [0, 9]})
+
+
+# ---- changed pictures -----------------------------------------------------------------------------------------------
+
+
+CHANGES: dict[str, Any] = {"must_change": "black,covered,away", "must_not_change": "exposure,shift,jpeg"}
+
+
+def test_a_model_that_looks_is_told_from_one_that_does_not_really_rendered(tmp_path: Path) -> None:
+    advsearch.allow_code("small_models:blind")
+    swept = advsearch.sweep(
+        "mug", "reference,small_models:blind", {"pose.yaw": "0:360:12"}, trials=0, resolution=64, run=tmp_path / "run",
+        **CHANGES,
+    )  # fmt: skip
+    rates = {(one.model, one.when): one for one in swept.summary.changes or ()}
+    assert len(rates) == 12 and {one.configurations for one in rates.values()} == {12}
+    for (name, when), one in rates.items():
+        looks = name == "reference" or one.claim == "must_not_change"
+        assert (one.correct >= 9) if looks else (one.correct == 0 and one.row == 1), (name, when, one)
+    assert sum("may not be looking" in text for text in swept.summary.warnings) == 3
+    row = next(iter(swept.rows()))
+    assert set(row.metrics) == {f"{claim} {when}" for claim, names in CHANGES.items() for when in names.split(",")}
+    assert "the picture is black" in text_of(swept.summary)
+    again = advsearch.load_run(tmp_path / "run")
+    assert again.summary.changes == swept.summary.changes  # type: ignore[union-attr]
+
+
+def test_changes_of_a_stopped_sweep_are_counted_from_its_rows(tmp_path: Path) -> None:
+    asked: dict[str, Any] = {"trials": 0, "batch": 1, "run": tmp_path / "run", "must_change": "black"}
+    FakeRenderer.stops_at = 3
+    first = advsearch.sweep("mug", model(), {"pose.yaw": "0:360:6"}, **asked).summary
+    assert first.ending == "interrupted" and first.changes is not None and first.changes[0].configurations == 3
+    FakeRenderer.stops_at = None
+    (one,) = advsearch.sweep("mug", model(), {"pose.yaw": "0:360:6"}, **asked).summary.changes or []
+    assert (one.configurations, one.correct) == (6, 6 if one.row is None else one.correct)
+
+
+def test_changes_that_are_none_and_objects_that_come_back_are_refused() -> None:
+    with pytest.raises(InputError, match="must_change"):
+        advsearch.sweep("mug", model(), {"pose.yaw": [0, 90]}, must_change="jpeg")
+    with pytest.raises(InputError, match="must_not_change"):
+        advsearch.sweep("mug", model(), {"pose.yaw": [0, 90]}, must_not_change="shift,shift")
+
+
+def test_an_object_is_taken_away_however_it_is_posed_really_rendered() -> None:
+    """Where the controls move it, too; its shadow goes with it."""
+    cases: list[Any] = [{"pose": {"y": [-0.1, 0.1], "yaw": [0.0, 360.0]}}, {"light": {}}]
+    for controls in cases:
+        check_away(advsearch.load_scene("mug").renderer(controls, resolution=32))
+
+
+def check_away(render: Any) -> None:
+    u = torch.full_like(render.start, 0.3)
+    there = render(u, 1, 4)
+    render.scene.assembly.away = True
+    gone, seen = render(u, 1, 4), int(render.mask(u).sum())
+    render.scene.assembly.away = False
+    assert seen == 0 < int(render.mask(u).sum()) and float((gone - there).abs().mean()) > 0.02
+
+
+def test_rows_are_the_same_with_and_without_changed_pictures_really_rendered() -> None:
+    asked: dict[str, Any] = {"trials": 0, "resolution": 24, "spp": 2, "denoise": "none", "batch": 1}
+    plain = advsearch.sweep("mug", "reference", {"pose.yaw": "0:360:4"}, **asked)
+    changed = advsearch.sweep("mug", "reference", {"pose.yaw": "0:360:4"}, **asked, **CHANGES)
+    assert [row.margin for row in changed.rows()] == [row.margin for row in plain.rows()]

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import random
 
-from fuzz import blender, gltf, meshes, mitsuba_scenes, models, pictures, run_folders, runs
+from fuzz import blender, gltf, meshes, mitsuba_scenes, models, pictures, rigs, run_folders, runs
 from fuzz.case import Case, Maker
 
 MAKERS: tuple[Maker, ...] = (
     *(*meshes.MAKERS, *gltf.MAKERS, *blender.MAKERS, *mitsuba_scenes.MAKERS),
-    *(*pictures.MAKERS, *models.MAKERS, *runs.MAKERS, *run_folders.MAKERS),
+    *(*pictures.MAKERS, *models.MAKERS, *rigs.MAKERS, *runs.MAKERS, *run_folders.MAKERS),
 )
 """They take turns, so that any few dozen cases in a row have some of everything."""
 

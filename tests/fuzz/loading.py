@@ -58,6 +58,13 @@ def load_picture(path: Path) -> None:
     advsearch.load_scene("book").renderer({"patch": {"picture": str(path), "size": [0.1, 0.2]}}, resolution=16)
 
 
+def load_rig(path: Path) -> None:
+    """Read a scene that several cameras see; of a transforms.json its first two frames."""
+    import advsearch
+
+    advsearch.load_scene("book", camera=f"{path}#0,1" if path.suffix == ".json" else str(path))
+
+
 def load_model(path: Path) -> None:
     """Read a model and ask it once; what is wrong with its answers names the model, so it is called as its file."""
     from advsearch.models import ModelWarning, load_model
@@ -268,6 +275,7 @@ LOADERS: dict[str, Callable[[Path], object]] = {
     "mitsuba": load_mitsuba,
     "environment": load_environment,
     "picture": load_picture,
+    "rig": load_rig,
     "model": load_model,
     "labels": load_labels,
     "settings": load_settings,

@@ -107,6 +107,20 @@ def test_photographs_from_a_folder_agree_by_condition(tmp_path: Path, capsys: py
         assert row["interval"] == pytest.approx(clopper_pearson(1, 2))
     assert "| pose.yaw 45 degrees | 1 | 2 |" in (tmp_path / "again" / "evidence.md").read_text()
     assert "Only 2 photographs" in "".join(told["not_shown"])
+    (photographs / "rendering-4.jpg").rename(photographs / "front.jpg")
+    poses = {"front.jpg,noon,45,10,0.504": 0, "front.jpg,noon,45,10,0.91": 2, "back.jpg,noon,45,10,0.504": 2}
+    for line, status in poses.items():
+        head = "file,environment,pose.yaw,camera.elevation,light.power"
+        (photographs / "poses.csv").write_text(f"{head}\n{line}\n")
+        again = make_sweep(tmp_path / line.replace(",", "-"), keep="all")
+        assert main(["report", str(again), *asked[2:], "--out", str(tmp_path / "posed")]) == status
+        told = capsys.readouterr()
+        if status == 0:
+            ((one,),) = ([row["of"] for row in run["photographs"]] for run in json.loads(told.out)["runs"])
+            assert one == 1
+        else:
+            assert "line 2" in told.err
+    (photographs / "poses.csv").unlink()
     (photographs / "mine.jpg").touch()
     assert main([*asked, "--out", str(tmp_path / "card")]) == 2
     assert "rendering-12.jpg" in capsys.readouterr().err

@@ -227,7 +227,7 @@ def test_quick_is_less_of_what_nothing_is_said_of() -> None:
         ({"object": "x.glb"}, "held_out: x.glb has no other instances"),
         ({"environment": "noon,studio", "held_out_environment": "studio"}, "held_out_environment: studio is an env"),
         ({"epsilon": 0.1, "controls": "pose"}, "the control has ranges and no epsilon"),
-        ({"task": "segmentation"}, "task: harden trains for classification and detection"),
+        ({"task": "depth"}, "task: harden trains for classification, detection and segmentation"),
     ],
 )
 def test_what_cannot_be_hardened_is_refused_in_words(

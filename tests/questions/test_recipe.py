@@ -23,8 +23,8 @@ from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.summary import FoundValue, SearchDistribution
 from advsearch.questions.recipe import carry_out as carrying_out
 from advsearch.questions.recipe import recipe as asked
+from advsearch.questions.recipe.carry_out import FIGURES, check_figures, files_of, make, read_options
 from advsearch.questions.recipe.description import Recipe, planned, read_recipe, recipe_names, titles
-from advsearch.questions.recipe.figures import FIGURES, check_figures, files_of, make, read_options
 from advsearch.questions.recipe.frame import MadeFigure, Rows, Tally, frame_of
 from advsearch.questions.recipe.given import CuesOptions, all_triangles, fitting, predicted, triangle_of
 from advsearch.questions.recipe.result import RecipeConfig, RecipeFigure, RecipeResult, told_once

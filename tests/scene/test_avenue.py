@@ -10,7 +10,7 @@ from advsearch.engine.loading import load_scene
 from advsearch.errors import InputError
 from advsearch.scene.description import SceneDescription, describe
 from advsearch.scene.grounds import LUMINANCE, enclosed, paved
-from advsearch.scene.places.avenue import END, KERB, LAMP_HEIGHT, lamp_places
+from advsearch.scene.places.avenue import AVENUE, END, KERB, LAMP_HEIGHT, lamp_places
 from advsearch.scene.places.paint import FRONTS
 from advsearch.scene.places.quads import SHOWN, Frame, Quads
 from advsearch.scene.places.road import KERBS, ROAD
@@ -42,7 +42,7 @@ def test_an_avenue_has_its_size_in_metres_whatever_stands_in_it(name: str) -> No
     assert places[ROAD][:, 2].max() == pytest.approx(KERB, abs=1e-4)
     inside = places["houses"][np.abs(places["houses"][:, 0]) < 100.0][:, 1]
     assert not ((inside > FRONTS[0] + 1.5) & (inside < FRONTS[1] - 1.5)).any(), "something of a house is in the street"
-    lamps = lamp_places()
+    lamps = lamp_places(AVENUE.posts)
     assert ((lamps[:, 1] > KERBS[0]) & (lamps[:, 1] < KERBS[1])).all()
     assert (np.hypot(lamps[:, 0], lamps[:, 1]) > 10.0).all(), "a lamp in the way of a camera around the object"
 
@@ -98,7 +98,7 @@ def test_lamps_shine_at_dusk_with_the_light_that_they_are_said_to_have() -> None
     luminance = float(lamps.emission[0, 0] @ np.array(LUMINANCE)) * unit.candelas
     corners = lamps.mesh.vertices[lamps.mesh.faces[: len(lamps.mesh.faces)]].astype(np.float64) * night.metres
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2
-    assert luminance * area / len(lamp_places()) / 7.5**2 == pytest.approx(15.0, rel=0.02)
+    assert luminance * area / len(lamp_places(AVENUE.posts)) / 7.5**2 == pytest.approx(15.0, rel=0.02)
 
 
 def test_an_absolute_exposure_shows_night_as_night() -> None:

@@ -20,7 +20,7 @@ from advsearch.scene.description import describe
 from advsearch.scene.geometry import standing
 from advsearch.scene.outlines import seen_things
 from advsearch.scene.surface.renderer import why_not
-from advsearch.scene.things import AskedThing, asked_things, overlapping
+from advsearch.scene.things import AskedThing, asked_things, blocked, footprint, overlapping
 from advsearch.scene.transport.matrix import LinearRenderer
 
 pytestmark = pytest.mark.usefixtures("two_threads")
@@ -84,15 +84,30 @@ def test_what_stands_in_another_thing_is_said() -> None:
     assert not any("stand in" in one for one in advsearch.load_scene("car", things=THREE).description.notes)
 
 
+SQUARE = np.array([[x, y, z] for x in (0.0, 1.0) for y in (0.0, 1.0) for z in (0.0, 1.0)])
+TURNED = SQUARE @ np.array([[0.7, 0.7, 0.0], [-0.7, 0.7, 0.0], [0.0, 0.0, 1.0]])
+
+
 def test_outlines_overlap_where_squares_do() -> None:
-    square = np.array([[x, y, z] for x in (0.0, 1.0) for y in (0.0, 1.0) for z in (0.0, 1.0)])
-    turned = square @ np.array([[0.7, 0.7, 0.0], [-0.7, 0.7, 0.0], [0.0, 0.0, 1.0]])
-    shift = np.array
-    assert overlapping(square, turned) and overlapping(square, square + shift((0.9, 0.9, 0.0)))
-    assert not overlapping(square, square + shift((1.1, 0.0, 0.0)))
-    assert not overlapping(square, square + shift((0.0, 0.0, 1.1)))
+    def overlap(one: np.ndarray, other: np.ndarray, shift: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> bool:
+        return overlapping(footprint(one), footprint(other + np.array(shift)))
+
+    assert overlap(SQUARE, TURNED) and overlap(SQUARE, SQUARE, (0.9, 0.9, 0.0))
+    assert not overlap(SQUARE, SQUARE, (1.1, 0.0, 0.0))
+    assert not overlap(SQUARE, SQUARE, (0.0, 0.0, 1.1))
     # boxes along the axes overlap, and these do not: a square on its corner beside the corner of another
-    assert not overlapping(square, turned + shift((1.55, 0.9, 0.0)))
+    assert not overlap(SQUARE, TURNED, (1.55, 0.9, 0.0))
+
+
+def test_a_square_that_passes_another_overlaps_with_it_over_one_stretch_of_its_way() -> None:
+    square, way = footprint(SQUARE), np.array([1.0, 0.0])
+    assert blocked(square, footprint(SQUARE + np.array([3.0, 0.4, 0.0])), way) == pytest.approx((2.0, 4.0))
+    assert blocked(square, footprint(SQUARE + np.array([3.0, 1.4, 0.0])), way) == (math.inf, -math.inf)
+    corner = footprint(TURNED + np.array([3.0, 0.0, 0.0]))  # from -0.7 to 0.7 in x at y = 0.7, and 0 to 1.4 in y
+    begin, end = blocked(square, corner, way)
+    for shift in np.linspace(0.003, 5.003, 501):
+        moved = footprint(SQUARE + np.array([shift, 0.0, 0.0]))
+        assert overlapping(moved, corner) == (begin < shift < end)
 
 
 def projected_box(thing: str, x: float, y: float, heading: float, size: float) -> tuple[float, ...]:

@@ -86,7 +86,7 @@ def test_pictures_are_grouped_and_ordered_by_keys(browser: Browser, tmp_path: Pa
         facts = page.locator("dialog .facts").inner_text()
         assert "camera.elevation [degrees]\t10" in facts
         page.keyboard.press("Escape")
-        assert page.locator("dialog").count() == 0
+        until(page, lambda: page.locator("dialog").count() == 0)
         assert page.evaluate("document.scrollingElement.scrollWidth <= innerWidth")
         assert faults(page) == []
 

@@ -7,7 +7,7 @@ import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from advsearch.errors import ModelError, resembling
+from advsearch.models.all_at_once import AllAtOnce
 from advsearch.models.probe import first_line
 from advsearch.models.source import Source
 from advsearch.models.zoo import language, named, outputs, zero_shot
@@ -124,6 +125,7 @@ def _kind(architecture: str, network: Any, spec: str) -> Family:
             return kind
     raise ModelError(
         f"model {spec}: is a {architecture}; expected one whose name has ForImageClassification, "
+        "ForVideoClassification, "
         "ForSemanticSegmentation, ForUniversalSegmentation, ForObjectDetection or ForDepthEstimation in it, one that "
         "compares pictures with texts, as CLIPModel, one that goes on in words, as LlavaForConditionalGeneration, or "
         "one that has features, as Dinov2Model. Wrap another in an nn.Module whose output a task can judge, your own "
@@ -248,7 +250,31 @@ def _with_names(make: Callable[[Any], nn.Module]) -> Callable[[Loaded], Source]:
     return lambda loaded: loaded.source(make(loaded.network), labels=names_of(loaded.network.config) or None)
 
 
+class _OfFrames:
+    """A processor of videos as one of pictures, each of which is a video of one frame."""
+
+    def __init__(self, processor: Any) -> None:
+        self.processor = processor
+
+    def __call__(self, images: Any, **more: Any) -> Mapping[str, Any]:
+        return {"pixel_values": self.processor([images], **more)["pixel_values"][0]}
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.processor, name)
+
+
+def _of_clips(loaded: Loaded) -> Source:
+    """The source of a network that takes (N, T, 3, H, W): T frames are the pictures of a rig."""
+    config, processor = loaded.network.config, loaded.processor and _OfFrames(loaded.processor)
+    module = AllAtOnce(_Classifier(loaded.network), int(config.num_frames))
+    loaded = replace(loaded, processor=processor)
+    side = config.image_size
+    size = {} if "input_size" in loaded.described else {"input_size": (side, side) if isinstance(side, int) else side}
+    return loaded.source(module, labels=names_of(config) or None, **size)
+
+
 NETWORKS = (
+    Family(_called("ForVideoClassification"), "AutoModelForVideoClassification", _of_clips),
     Family(
         _called("TimmWrapperForImageClassification"),
         "AutoModelForImageClassification",

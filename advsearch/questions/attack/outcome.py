@@ -84,13 +84,13 @@ def summarise(
         for name, data in space.files(u).items():
             write_bytes(run.path / "artifacts" / name, data)
         write_configuration(run.path, u.numpy())
-    summary = _summary(config, objective, problem, findings, clean, adversarial)
     drive = None if findings.interrupted else along_drive(problem, None if search is None else u, findings.spp, run)
-    kept = {"run": None if run is None else str(run.path), "warnings": warnings, "drive": drive}
-    shared = SharedWork.of_facts(journal.traced.facts, journal.machines.known)
-    summary = summary.model_copy(
-        update={**kept, "shared": shared, "seconds": {**stages.seconds, "total": stages.total}}
-    )
+    summary = _summary(
+        config, objective, problem, findings, clean, adversarial,
+        run=None if run is None else str(run.path), warnings=warnings, drive=drive,
+        shared=SharedWork.of_facts(journal.traced.facts, journal.machines.known),
+        seconds={**stages.seconds, "total": stages.total},
+    )  # fmt: skip
     if run is not None:
         run.write_summary(summary)
         write_text(run.path / REPORT, attack_page(run.path, summary), durable=False)
@@ -118,8 +118,9 @@ def _summary(
     findings: Findings,
     clean: KeptPicture,
     adversarial: KeptPicture,
+    **kept: Any,
 ) -> AttackSummary:
-    """All but where it is kept, how long it took and what there is to say."""
+    """The summary, of which some fields are `kept` as they are given."""
     task, search, baseline = problem.task, findings.search, findings.baseline
     controls = problem.searched_space.controls
     budgets = {bound.name: bound.budget for bound in controls}
@@ -135,7 +136,7 @@ def _summary(
     if distribution is not None and distribution.mean.numel() > MOST_NUMBERS:
         distribution = None
     return AttackSummary(
-        run=None,
+        **kept,
         object=config.object,
         judge=config.judge,
         model=problem.model.name,
@@ -201,8 +202,6 @@ def _summary(
             objectives=search.non_finite_objectives if search else 0,
             gradient_elements=search.non_finite_elements if search else 0,
         ),
-        warnings=[],
-        seconds={"total": 0.0},
         seed=problem.seed,
         command_line=config.command_line(),
     )

@@ -68,6 +68,7 @@ def attack_page(run: Path, result: AttackSummary) -> str:
     """See `page`."""
     given, thing = shown(result), read_object(run)
     frames, curves = _read_frames(run / directory.IMAGES / "search.gif"), _read_curves(run / store.NAME)
+    worked = [[name, text] for name, text in wording.method_facts(result).items() if text]
     sections = [
         *_pictures(run, result, animated=bool(frames)),
         object_part(thing),
@@ -77,7 +78,7 @@ def attack_page(run: Path, result: AttackSummary) -> str:
         _rates(result, given.sections[0]),
         *ambient_part(result),
         _curve(result, curves),
-        ResultPart("How the search worked", rows=_named(wording.method_facts(result)), folded=True),
+        ResultPart("How the search worked", rows=worked, folded=True),
         ResultPart(wording.plan_text(result), heads=wording.PLAN_HEADS, rows=wording.plan_rows(result), folded=True),
     ]
     seconds = result.seconds
@@ -98,10 +99,6 @@ def attack_page(run: Path, result: AttackSummary) -> str:
         data=[*data, *object_data(thing)],
         scripts=["make.js", "attack.js", *(["object.js"] if thing else [])],
     )
-
-
-def _named(facts: dict[str, str]) -> list[list[str]]:
-    return [[name, text] for name, text in facts.items() if text]
 
 
 def _pictures(run: Path, summary: AttackSummary, *, animated: bool) -> Iterator[ResultPart]:

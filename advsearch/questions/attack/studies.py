@@ -9,13 +9,12 @@ from __future__ import annotations
 
 import tempfile
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
 import torch
-from torch import Tensor
 
 from advsearch import seeds
 from advsearch.attacks import clopper_pearson
@@ -30,7 +29,7 @@ from advsearch.engine.problem import Problem
 from advsearch.engine.record import control_group, verified_rate
 from advsearch.engine.transport import CleanMatrix
 from advsearch.engine.verifier import RetrialCondition, Retrials
-from advsearch.errors import ClusterError
+from advsearch.errors import ClusterError, FileFormatError
 from advsearch.files import JsonObject
 from advsearch.progress import Progress
 from advsearch.question import Asked, carry_out
@@ -51,7 +50,6 @@ from advsearch.questions.attack.summary import (
     MatrixResult,
     MatrixRow,
     ObjectRow,
-    attack_of,
 )
 from advsearch.runs import files
 from advsearch.runs.directory import CONFIG, PARTS, default_name, is_run
@@ -64,14 +62,15 @@ from advsearch.settings import FILES, Config
 from advsearch.tasks import make_task
 
 
-def carry_out_part(path: Path, config: Config, progress: Progress) -> Result:
+def carry_out_part(path: Path, config: Config, progress: Progress, ask: Callable[..., Result] | None = None) -> Result:
     """Return the result of the part in the folder `path`; what is done of it is not done again. The configuration is
-    what it does, where it has not begun."""
+    what it does, where it has not begun; `ask` carries it out, None as every question is."""
+    ask = ask or carry_out
     if not is_run(path) or not (path / CONFIG).is_file():
-        return carry_out(config.model_copy(update={"run": str(path), "overwrite": True}), progress=progress)
+        return ask(config.model_copy(update={"run": str(path), "overwrite": True}), progress=progress)
     if finished(path):
         return read_result(path)
-    return carry_out(type(config).from_yaml(path / CONFIG, config.asked), progress=progress, resumed=path)
+    return ask(type(config).from_yaml(path / CONFIG, config.asked), progress=progress, resumed=path)
 
 
 LONGEST = 6 * 3600.0
@@ -253,16 +252,11 @@ class StudyRun:
         budget = f", epsilon {config.epsilon:.3g}" if isinstance(config.epsilon, float) else ""
         what = f"{config.object} against {config.model}, {' and '.join(config.controls)}{budget}"
         self.progress.message(f"attack {len(self.names)} of at most {sum(map(len, self.chains))}: {what}")
-        if is_run(path) and (path / CONFIG).is_file():
-            began = None if finished(path) else AttackConfig.from_yaml(path / CONFIG, config.asked)
-            summary = (
-                attack_once(began, progress=self.progress, resumed=path, clean=clean).summary
-                if began
-                else attack_of(path)
-            )
-        else:
-            config_there = config.model_copy(update={"run": str(path), "overwrite": True})
-            summary = attack_once(config_there, progress=self.progress, clean=clean).summary
+        summary = carry_out_part(
+            path, config, self.progress, lambda there, **more: attack_once(there, clean=clean, **more).summary
+        )
+        if not isinstance(summary, AttackSummary):
+            raise FileFormatError(f"{path}: expected the run of an attack, got one of {summary.command}")
         self.warnings += [text for text in summary.warnings if text not in self.warnings]
         if summary.ending == INTERRUPTED:
             self.asked.ending = INTERRUPTED
@@ -377,7 +371,11 @@ def matrix(asked: Asked[AttackConfig]) -> MatrixResult:
             attacked.append((one.of, summary))
     models: list[MatrixModel] = []
     cells: dict[str, list[MatrixCell]] = {}
-    found = {name: u for name, summary in attacked if (u := _configuration(summary)) is not None}
+    found = {  # of those in which something was searched
+        name: torch.from_numpy(read_configuration(Path(summary.run)))
+        for name, summary in attacked
+        if summary.adversarial is not None and summary.run is not None
+    }
     if found and not study.interrupted:
         spp = config.verify_spp or max([LEAST_SPP, *(s.sample_count.spp for _, s in attacked if s.sample_count)])
         with asked.until_interrupted():
@@ -390,7 +388,16 @@ def matrix(asked: Asked[AttackConfig]) -> MatrixResult:
                 each = trials * len(names)
                 hint = f"{each} predictions; `trials` or `verify_spp` shorten it"
                 study.progress.stage("trying the clean scene on every model", each, hint=hint)
-                models = [_model(condition, retrials) for condition in conditions]
+                models = [
+                    MatrixModel(
+                        model=condition.name,
+                        labels=list(condition.problem.task.truth_names(condition.problem.truth())),
+                        input_size=_size(condition.problem),
+                        spp=condition.spp,
+                        clean=control_group(retrials.clean(condition), condition.spp),
+                    )
+                    for condition in conditions
+                ]
                 for name, u in found.items():
                     study.progress.stage(f"trying the scene against {name} on every model", each, hint=hint)
                     checked = [(condition.name, retrials.adversarial(name, u, condition)) for condition in conditions]
@@ -422,23 +429,6 @@ def models_worker(settings: JsonObject) -> Call:
 def _alone(config: AttackConfig, name: str) -> AttackConfig:
     """What a scene is tried on one model with; nothing is searched."""
     return AttackConfig.of(config, model=name, ensemble=None)
-
-
-def _configuration(summary: AttackSummary) -> Tensor | None:
-    """The configuration that an attack found; None where nothing was searched."""
-    if summary.adversarial is None or summary.run is None:
-        return None
-    return torch.from_numpy(read_configuration(Path(summary.run)))
-
-
-def _model(condition: RetrialCondition, retrials: Retrials) -> MatrixModel:
-    return MatrixModel(
-        model=condition.name,
-        labels=list(condition.problem.task.truth_names(condition.problem.truth())),
-        input_size=_size(condition.problem),
-        spp=condition.spp,
-        clean=control_group(retrials.clean(condition), condition.spp),
-    )
 
 
 def _size(problem: Problem) -> tuple[int, int]:

@@ -32,7 +32,7 @@ class CompareConfig(SweepConfig):
     command: ClassVar[str] = "compare"
     without: ClassVar[tuple[str, ...]] = (
         *("model", "adversarial_of", "surface", "aov", "metrics", "log", "trials", "verify_spp", "path", "shutter"),
-        *("rolling", "fps"),
+        *("rolling", "fps", "must_change", "must_not_change"),
     )
 
     compared: str = setting(

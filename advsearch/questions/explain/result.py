@@ -148,7 +148,8 @@ class ExplainResult(RunResult, RightOf):
 
 CHOSEN = (
     "Chosen on one half of the rows and counted on the other, each beyond the rules before it; 95 % intervals. "
-    "Chance alone would tell any rule in one of a hundred cases at most."
+    "Chance alone would tell any rule in one of a hundred cases at most. The search of the sweep's page takes the "
+    "words of a rule and shows the pictures under it."
 )
 DECIDES = (
     "The share of the variance of the predictions, right or wrong, that is between parts of a parameter's values with "

@@ -14,6 +14,7 @@ import numpy as np
 import pandas as pd
 import torch
 from PIL import Image
+from pydantic import JsonValue
 
 from advsearch import seeds
 from advsearch.attacks import clopper_pearson
@@ -67,19 +68,14 @@ def photo_agreement(run: str | Path) -> PhotoAgreement:
             said = {"model": model, "correct": bool(row.correct), "said": row.label or ""}
             rows.append({**photo, "right": bool(photo["right"]), **said})
     table = pd.DataFrame(rows, columns=[*kept, "model", "correct", "said"])
-    counts = {
-        (a, b): int(((table["right"] == a) & (table["correct"] == b)).sum())
-        for a in (True, False)
-        for b in (True, False)
-    }
     table["agrees"] = table["right"] == table["correct"]
-    agreeing = int(table["agrees"].sum())
+    four, agreeing = table.groupby(["right", "correct"]).size(), int(table["agrees"].sum())
     return PhotoAgreement(
         photos=len(table),
-        right_right=counts[True, True],
-        right_wrong=counts[True, False],
-        wrong_right=counts[False, True],
-        wrong_wrong=counts[False, False],
+        right_right=int(four.get((True, True), 0)),
+        right_wrong=int(four.get((True, False), 0)),
+        wrong_right=int(four.get((False, True), 0)),
+        wrong_wrong=int(four.get((False, False), 0)),
         agreement=agreeing / len(table) if rows else None,
         interval=clopper_pearson(agreeing, len(table)) if rows else None,
         renderings=[
@@ -153,7 +149,7 @@ class Photographs:
     def _add(self, run: Path, rendering: str | None, data: bytes, source: str) -> None:
         """Judge and keep a photograph of the file `source`. Of one that was aligned with no rendering, only what the
         models say of it is kept."""
-        file, kind, sound, name = None, PHOTO if rendering else LOOSE_PHOTO, b"", ""
+        file, kind, sound, kept = None, PHOTO if rendering else LOOSE_PHOTO, b"", dict[str, JsonValue](source=source)
         if rendering is not None:
             file = result.rendering_file(run, rendering)
             with Image.open(file, formats=("PNG", "JPEG")) as image:
@@ -161,23 +157,29 @@ class Photographs:
         with RunDirectory.resume(run) as held:
             number, rows, judges = held.store.last_step(kind) + 1, [], self._judges(run)
             for place, judge in enumerate(judges):
-                kept: JsonObject = {"source": source}
                 values: dict[str, Value] = {}
                 if file is None or rendering is None:
                     sound = result.sound_photo(data, judge.size[::-1])
                 else:
                     step = int(rendering) * len(judges) + place if rendering.isdigit() else None
                     seen = None if step is None else held.store.row("sweep", step)
-                    values = {} if seen is None else dict(seen.values)
-                    right, label = _rendered(judge, rendering, file, seen)
-                    name = f"{rendering}-{number:04d}.jpg"
-                    kept |= {"rendering": rendering, "right": right, "label": label, "file": name}
+                    if seen is not None:  # a sweep's prediction as it was stored, others' by its file
+                        right, label, values = bool(seen.correct), seen.label or "", dict(seen.values)
+                    elif file.suffix == ".png":
+                        rendered = judge.judgement(rendering, None, file.read_bytes())
+                        right, label = rendered.right, rendered.prediction.label
+                    else:
+                        raise InputError(
+                            f"rendering: the results have no row for {file.stem}; it belongs to another run"
+                        )
+                    kept |= {"rendering": rendering, "right": right, "label": label}
+                    kept["file"] = f"{rendering}-{number:04d}.jpg"
                 shown = str(values["object"]["value"]) if "object" in values else None  # of a sweep over several
                 values["model"] = {"value": judge.model.name, "unit": ""}
                 row = judged(Row(kind, number, values=values), judge.judgement(rendering, shown, sound))
-                rows.append(replace(row, payload={"photo": kept, "answer": row.payload}))
+                rows.append(replace(row, payload={"photo": {**kept}, "answer": row.payload}))
             if file is not None:
-                write_bytes(run / IMAGES / result.FOLDER / name, sound)
+                write_bytes(run / IMAGES / result.FOLDER / str(kept["file"]), sound)
             held.record(*rows)
 
 
@@ -201,7 +203,7 @@ class _PhotoJudge:
             return judgements(self.task, self.model(pixels), pixels[None], [self.truth(rendering, name)])[0]
 
 
-def _judges_of(run: Path) -> Sequence[_PhotoJudge]:
+def _judges_of(run: Path) -> list[_PhotoJudge]:
     """Who judges the photographs of a run. What depends on where the object is seen is judged by where the rendering
     has it, with which the photograph was aligned."""
     command = read_yaml(run / CONFIG).get("command")
@@ -212,7 +214,7 @@ def _judges_of(run: Path) -> Sequence[_PhotoJudge]:
     raise InputError(f"{run.name}: photographs belong to renderings of attacks and sweeps, not of {command}")
 
 
-def _by_sweep(config: SweepConfig) -> Sequence[_PhotoJudge]:
+def _by_sweep(config: SweepConfig) -> list[_PhotoJudge]:
     scenes = scenes_of(config)
     job = scenes.job
 
@@ -231,12 +233,11 @@ def _by_sweep(config: SweepConfig) -> Sequence[_PhotoJudge]:
     return [_PhotoJudge(model, task, size, partial(truth, number)) for number, (model, task, size) in alone]
 
 
-def _by_attack(run: Path, config: AttackConfig) -> Sequence[_PhotoJudge]:
+def _by_attack(run: Path, config: AttackConfig) -> list[_PhotoJudge]:
     problem, _ = problem_from_config(judged_alone(config))
-    whole_task, size = problem.task, config.resolution
-    alone: list[tuple[Model, Task]] = [(problem.model, whole_task)]
-    if isinstance(whole_task, Together):
-        alone = list(zip(whole_task.models, whole_task.tasks, strict=True))
+    alone: list[tuple[Model, Task]] = [(problem.model, problem.task)]
+    if isinstance(problem.task, Together):
+        alone = list(zip(problem.task.models, problem.task.tasks, strict=True))
 
     def truth(task: Task, rendering: str | None, _: str | None) -> Truth:
         """Of the clean configuration, of the adversarial one, or of one of its trials."""
@@ -247,15 +248,5 @@ def _by_attack(run: Path, config: AttackConfig) -> Sequence[_PhotoJudge]:
         look = partial(problem.renderer.surfaces, whole)
         return task.truth(problem.facts(partial(problem.space.describe, whole), look))
 
+    size = config.resolution
     return [_PhotoJudge(model, task, size or model.input_size, partial(truth, task)) for model, task in alone]
-
-
-def _rendered(judge: _PhotoJudge, rendering: str, file: Path, row: Row | None) -> tuple[bool, str]:
-    """Whether the model is right on a rendering, and its prediction: a sweep's as it was stored, others' by its
-    file."""
-    if row is not None:
-        return bool(row.correct), row.label or ""
-    if file.suffix != ".png":
-        raise InputError(f"rendering: the results have no row for {file.stem}; it belongs to another run")
-    judgement = judge.judgement(rendering, None, file.read_bytes())
-    return judgement.right, judgement.prediction.label

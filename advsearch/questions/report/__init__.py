@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import csv
+import math
+import shutil
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +20,8 @@ EXAMPLES = (
     "report mug-texture-001 mug-sweep-001 --evidence --criterion 0.9 --out card --json",
 )
 NAME = "evidence"
+POSES, LARGEST_POSES = "poses.csv", 1 << 20
+"""The file that says where photographs were taken, and its most bytes."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -92,13 +98,51 @@ def _take_in(folder: str, name: str) -> None:
     from advsearch.settings import read_yaml
 
     run = find_run(name)
-    task: Any = read_yaml(run / CONFIG).get("task") or "classification"
-    files = photographs_in(Path(folder), task)
-    if loose := [one.name for one in files if not one.stem.startswith("rendering-")]:
-        raise InputError(
-            f"--photographs: {loose[0]}: expected the number of a rendering in its name, such as rendering-12.jpg; "
-            "advsearch dashboard aligns photographs by phone"
-        )
-    if not files:
-        raise InputError(f"--photographs: {folder}: expected a folder with photographs, got none in it")
-    Photographs().add_files(run, files)
+    with tempfile.TemporaryDirectory() as named:
+        place = Path(folder)
+        if (place / POSES).is_file():
+            place = _named_by_pose(place, run, Path(named))
+        task: Any = read_yaml(run / CONFIG).get("task") or "classification"
+        files = photographs_in(place, task)
+        if loose := [one.name for one in files if not one.stem.startswith("rendering-")]:
+            raise InputError(
+                f"photographs: {loose[0]}: expected the number of a rendering in its name, such as rendering-12.jpg, "
+                f"or {POSES} beside it; advsearch dashboard aligns photographs by phone"
+            )
+        if not files:
+            raise InputError(f"photographs: {folder}: expected a folder with photographs, got none in it")
+        Photographs().add_files(run, files)
+
+
+def _named_by_pose(folder: Path, run: Path, out: Path) -> Path:
+    """Copy the photographs that `POSES` lists, each under the name of the rendering that has its pose."""
+    # late, so that --help answers at once
+    from advsearch.files import read_text
+    from advsearch.runs.store import NAME as STORE
+    from advsearch.runs.store import Store
+
+    with Store(run / STORE, read_only=True) as store:
+        rows = [(row.step, {name: one["value"] for name, one in row.values.items()}) for row in store.rows("sweep")]
+    for line, said in enumerate(csv.DictReader(read_text(folder / POSES, "poses", LARGEST_POSES).splitlines()), 2):
+        where, file = f"photographs: {folder / POSES}, line {line}", folder / Path(str(said.pop("file", ""))).name
+        if not file.is_file():
+            raise InputError(f"{where}: expected the name of a photograph beside it under `file`, got {file.name!r}")
+        found = [step for step, values in rows if all(_is_at(values.get(name), text) for name, text in said.items())]
+        if len(found) != 1:
+            told = ", ".join(f"{name} {text}" for name, text in said.items())
+            raise InputError(
+                f"{where}: expected a pose that one rendering of {run.name} has, got {told}, which {len(found)} have; "
+                "sweep a grid of the poses"
+            )
+        shutil.copyfile(file, out / f"rendering-{found[0]}-{file.name}")
+    return out
+
+
+def _is_at(value: object, text: str | None) -> bool:
+    """Whether a rendering has what a file says, to a thousandth."""
+    if text is None or value is None or isinstance(value, str):
+        return text is not None and value == text.strip()
+    try:
+        return math.isclose(float(str(value)), float(text), rel_tol=1e-3, abs_tol=1e-3)
+    except ValueError:
+        return False

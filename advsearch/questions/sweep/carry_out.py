@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -53,6 +53,7 @@ from advsearch.questions.sweep.job import Job, NamedScene, Scenes, check_all, ch
 from advsearch.questions.sweep.loop import carry_out
 from advsearch.questions.sweep.result import SweepResult
 from advsearch.questions.sweep.settings import SweepConfig
+from advsearch.questions.sweep.tracks import Step
 from advsearch.runs.directory import CONFIG, RunDirectory, begun, check_free, find_run, is_run, run_path
 from advsearch.runs.listing import finished
 from advsearch.runs.summary import read_configuration
@@ -86,6 +87,7 @@ def sweep(
     controls: Controls = (),
     adversarial_of: str | Path | AttackResult | None = None,
     metrics: Mapping[str, str | Metric] | None = None,
+    tracker: Callable[[], Step] | None = None,
     run: str | Path | None = None,
     progress: Watched = None,
     **settings: Any,
@@ -109,6 +111,9 @@ def sweep(
             the attack was over varies.
         metrics: columns of the rows, by name: functions of (image (H, W, 3) sRGB in [0, 1], output of that picture,
             truth: the index of the right class) that return a number or a dict. `workers` need functions of a module.
+        tracker: makes, for each drive, what is called with boxes (n, 4) of a frame, x0, y0, x1, y1 in pixels, and their
+            scores (n,), and returns the tracks in it: a number and a box each (docs/drives.md). None takes
+            `advsearch.questions.sweep.tracks.ConstantVelocity`.
         run: folder to keep the run in; None keeps it in memory, which then grows with every configuration.
     """
     options = {name: value for name, value in settings.items() if value is not None}
@@ -154,6 +159,7 @@ def sweep(
     parts += ["the scene"] if any(place.scene.only_here for place in loaded) else []
     parts += [f"the task {task.name}"] if isinstance(task, Task) and not is_named(task, make_task) else []
     parts += [f"the metric {name}" for name in metrics_only_here(config.metrics)]
+    parts += ["the tracker"] if tracker is not None else []
     config = config.with_only_here([*parts, *(f"the control {name}" for name in only_here(controls))])
     if config.workers is not None or config.cluster is not None:
         check_shared(config.metrics)
@@ -173,7 +179,7 @@ def sweep(
     asked = task if isinstance(task, Task) else config.task
     with begun(config) if config.run is not None and resumed is None else nullcontext(resumed) as begun_in:
         job = _job(config, loaded or _places(config), several(networks), asked, controls)
-        job = replace(job, metrics=load_metrics(config.metrics, metrics))
+        job = replace(job, metrics=load_metrics(config.metrics, metrics), tracker=tracker or job.tracker)
         if config.run is not None:
             return _kept(config, job, progress, begun_in)
         with executor_for(config, WORKER, progress) as executor:

@@ -15,6 +15,7 @@ from typing import Any
 
 from advsearch.errors import InputError
 from advsearch.questions.sweep.figures import figure_size, sweep_axes
+from advsearch.questions.sweep.settings import BLIND, HARMLESS
 from advsearch.questions.sweep.summary import (
     AxisRow,
     CountedPredictions,
@@ -53,6 +54,14 @@ AXIS_COLUMNS: dict[str, Column] = {
     "accuracy": lambda row: percent(row.accuracy),
     "95 % interval": lambda row: wording.interval_text(row.interval),
 }
+CHANGED = "Shown again, changed:"
+CHANGE_COLUMNS: dict[str, Column] = {
+    "model": "{0.model}",
+    "what it says": lambda one: one.claim.replace("_", " "),
+    "when": lambda one: (BLIND | HARMLESS)[one.when],
+    "as claimed": "{0.correct} of {0.configurations}",
+    "95 % interval": lambda one: wording.interval_text(one.interval),
+}
 SURFACE_COLUMNS: dict[str, Column] = {
     "middle (u, v)": "{0.u:.3f}, {0.v:.3f}",
     "place (x, y, z)": lambda one: ", ".join(f"{x:.3g}" for x in one.place),
@@ -69,6 +78,7 @@ def shown(summary: SweepSummary) -> ShownResult:
     far = distance_of(summary)
     sections = [*_beside(summary), ResultPart(text=[distance_sentence(far)]) if far else ResultPart()]
     sections += [ResultPart(drive_title(one), heads=DRIVE_HEADS, rows=drive_rows(one)) for one in summary.drives or ()]
+    sections.append(ResultPart.table(summary.changes or [], CHANGE_COLUMNS, title=CHANGED))
     sections += _tables(summary)
     if summary.surface is not None:
         said = "\n".join(surface_sentences(summary.surface))
@@ -88,6 +98,7 @@ def _page_parts(summary: SweepSummary) -> Iterator[ResultPart]:
     for number, one in enumerate(summary.drives or ()):
         title, figure = ("Whole drives", "images/drive.png") if number == 0 else ("", "")
         yield ResultPart(title, [drive_title(one)], heads=DRIVE_HEADS, rows=drive_rows(one), figure=figure)
+    yield ResultPart.table(summary.changes or [], CHANGE_COLUMNS, title=CHANGED)
     if summary.surface is not None:
         text = [" ".join(surface_sentences(summary.surface))]
         yield ResultPart("The surface that was seen", text, figure="images/surface.png")
@@ -288,6 +299,12 @@ def drive_rows(one: DriveRates) -> list[tuple[str, str, str, str]]:
         ("longest gap", *_texts(one.longest_gap, 1.0, " s")),
         ("changes a second", *_texts(one.flicker, 1.0, "")),
     ]
+    if one.tracks is not None:
+        rows += [
+            ("frames without its track", *_texts(one.tracks.lost, 100.0, " %")),
+            ("identity switches", *_texts(one.tracks.switches, 1.0, "")),
+            ("longest gap of its track", *_texts(one.tracks.longest_gap, 1.0, " s")),
+        ]
     if one.first_seen is not None:
         never = f", never in {one.never_seen}" if one.never_seen else ""
         mean, interval, worst = _texts(one.first_seen, 1.0, f" {one.unit}")

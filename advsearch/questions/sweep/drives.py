@@ -18,10 +18,12 @@ from advsearch.questions.attack.result import evenly, write_drive
 from advsearch.questions.sweep.axes import Axis
 from advsearch.questions.sweep.job import Job, Scenes
 from advsearch.questions.sweep.settings import SweepConfig
-from advsearch.questions.sweep.summary import DriveRates, OneDrive, OverDrives
+from advsearch.questions.sweep.summary import DriveRates, OneDrive, OverDrives, TrackRates
+from advsearch.questions.sweep.tracks import Frame, frame_of, tracked
 from advsearch.report.marks import marked
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row
+from advsearch.tasks import Detection
 
 ANIMATED = 60
 MOST_LISTED = 1000
@@ -66,6 +68,9 @@ class Drives:
         right: Flags = np.full(shape, UNKNOWN, np.int8)
         away = np.full(shape[:-1], np.nan)
         self._ways: dict[int, str] = {}
+        self._frames: dict[int, Frame] = {}
+        names = [[job.right_names(place, model) for model in range(len(job.models))] for place in job.places]
+        rows_of_a_place = right.size // len(job.places)
         which = f"{axis.instance}.{WAY}"
         name, self._unit = f"{axis.instance}.distance", "object sizes"
         for row in rows:
@@ -74,6 +79,9 @@ class Drives:
                 distance = row.values[name]
                 away.flat[row.step // len(job.models)] = float(str(distance["value"]))
                 self._unit = distance["unit"]
+            if isinstance(job.tasks[row.step % len(job.models)], Detection) and isinstance(row.payload, dict):
+                right_names = names[row.step // rows_of_a_place][row.step % len(job.models)]
+                self._frames[row.step] = frame_of(row.payload, right_names)
             if which in row.values:
                 self._ways[row.step] = str(row.values[which]["value"])
         order = np.argsort([float(value) for value in axis.values])
@@ -92,8 +100,9 @@ class Drives:
                 whole = (right != UNKNOWN).all(axis=2) & (right != HIDDEN).any(axis=2)
                 away = self._away[mine].reshape(right.shape)[whole]
                 if whole.any():
-                    begins = self._numbers[mine][..., model, :].reshape(right.shape)[whole][:, 0]
-                    found.append(self._rates(network.name, beside_clean, right[whole], away, begins))
+                    numbers = self._numbers[mine][..., model, :].reshape(right.shape)[whole]
+                    rates = self._rates(network.name, beside_clean, right[whole], away, numbers[:, 0])
+                    found.append(rates.model_copy(update={"tracks": self._tracks(model, numbers)}))
         return found
 
     def _rates(
@@ -139,6 +148,22 @@ class Drives:
                 )
                 for k in range(min(len(right), MOST_LISTED))
             ],
+        )
+
+    def _tracks(self, model: int, numbers: npt.NDArray[np.int64]) -> TrackRates | None:
+        """What a tracker makes of drives, by the numbers (n, frames) of their rows; None without boxes in all."""
+        task = self._job.tasks[model]
+        if not isinstance(task, Detection) or not all(one in self._frames for one in numbers.flat):
+            return None
+        drives = [tracked([self._frames[one] for one in row], self._job.tracker, task.iou) for row in numbers.tolist()]
+        frames = len(self.times)
+        step = float(self.times[-1] - self.times[0]) / (frames - 1)
+        lost, switches, gaps = (np.array(one, dtype=float) for one in zip(*drives, strict=True))
+        return TrackRates(
+            tracker=str(getattr(self._job.tracker, "__name__", type(self._job.tracker).__name__)),
+            lost=over_drives(lost, max),
+            switches=over_drives(switches, max, (0.0, frames - 1.0)),
+            longest_gap=over_drives(gaps * step, max, (0.0, frames * step)),
         )
 
     def keep_worst(self, scenes: Scenes, run: RunDirectory) -> None:

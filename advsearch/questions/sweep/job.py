@@ -15,6 +15,7 @@ from advsearch.attacks import Evaluation, Query, Trials, run_trials
 from advsearch.attacks.draws import Seeds
 from advsearch.controls import Control, Space, make_control, make_space
 from advsearch.described import Value
+from advsearch.engine.changes import AWAY, as_claimed, changed
 from advsearch.engine.journal import Journal, Sent, Shared
 from advsearch.engine.judging import Looked, Metrics, check_truth, facts_of
 from advsearch.engine.loading import Scene, framed, make_renderer
@@ -29,11 +30,12 @@ from advsearch.questions.sweep.points import Drawn, Points
 from advsearch.questions.sweep.predicting import PredictedSweep, SweptPicture
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.questions.sweep.summary import WorstVerified
+from advsearch.questions.sweep.tracks import ConstantVelocity, Tracker
 from advsearch.runs.directory import RunDirectory
 from advsearch.scene.description import ENVIRONMENT, OBJECT
 from advsearch.scene.formation import next_count, to_8_bit
 from advsearch.scene.renderer import Renderer
-from advsearch.tasks import Facts, Judgement, Task
+from advsearch.tasks import Detection, Facts, Judgement, Task
 from advsearch.tasks.base import Truth
 from advsearch.viewer import thumbnails
 
@@ -80,6 +82,7 @@ class Job:
     aovs: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
     metrics: Metrics = field(default_factory=dict)
+    tracker: Tracker = ConstantVelocity
     _bound: dict[int, dict[tuple[int, int], Points]] = field(default_factory=dict, init=False, repr=False)
 
     @property
@@ -182,6 +185,11 @@ class Job:
     def _facts(self, place: NamedScene, values: Mapping[str, Value], look: Looked | None = None) -> Facts:
         return facts_of(place.scene, place.object, self.config, lambda: values, look)
 
+    def right_names(self, place: NamedScene, model: int) -> tuple[str, ...]:
+        """The names of the classes that are right for a detector; none for models of other tasks."""
+        task = self.tasks[model]
+        return task.names(task.right_classes(self._facts(place, {}))) if isinstance(task, Detection) else ()
+
     def check_truths(self, place: NamedScene) -> None:
         for task, model in zip(self.tasks, self.models, strict=True):
             check_truth(task, model, place.scene, self._facts(place, {}), self.config)
@@ -260,13 +268,11 @@ class SweptScene:
         place, config = job.places[number], job.config
         self.number, self.job = number, job
         self.points: dict[tuple[int, int], Points] = {}
+        self._without: dict[tuple[int, int], Renderer] = {}
         self.renderers: dict[tuple[int, int], Renderer] = {}
         spaces = job.spaces(place)
         for size, space in spaces.items():
-            description = framed(place.scene.description, size)
-            self.renderers[size] = make_renderer(
-                description, space, size, config.denoise, config.seed, sampler=config.pixel_sampler
-            )
+            self.renderers[size] = self._renderer(size)
             self.points[size] = job.points(space)
         facts, spp, seed = partial(facts_of, place.scene, place.object, config), job.spp, config.seed
         self.problems = tuple(
@@ -295,6 +301,7 @@ class SweptScene:
             if mine:
                 shown = torch.stack([made[size][query.number // models].picture for query in mine])
                 judged = problem.judge_several(shown, [query.u for query in mine], [query.values for query in mine])
+                judged = self._with_claims(problem, size, mine, shown, judged)
                 said |= {query.number: judgement for query, judgement in zip(mine, judged, strict=True)}
         wrong = {number // models for number, judgement in said.items() if not judgement.right}
         seconds, evaluations = (time.perf_counter() - begun) / len(queries), list[Evaluation]()
@@ -313,6 +320,38 @@ class SweptScene:
             evaluations.append(evaluation)
         so_far = [one.summary() for one in self.predicted.values()]
         return [*evaluations[:-1], replace(evaluations[-1], light=so_far, non_finite=max(0, self.not_finite - before))]
+
+    def _with_claims(
+        self, problem: Problem, size: tuple[int, int], mine: Sequence[Query], shown: Tensor, judged: list[Judgement]
+    ) -> list[Judgement]:
+        """Return judgements of pictures (n, H, W, 3) with a number for each claim about changed ones: 1 where it is as
+        claimed. What is true stays what it was before the change."""
+        wholes, listed = [query.u for query in mine], [query.values for query in mine]
+        for claim, when in self.job.config.claims:
+            if when == AWAY:
+                pictures = self._without_object(size, mine)
+            else:
+                pictures = torch.stack([changed(one, when, problem.model.cameras) for one in shown])
+            after = problem.judge_several(pictures, wholes, listed)
+            held = [as_claimed(claim, one.prediction, its.prediction) for one, its in zip(judged, after, strict=True)]
+            judged = [
+                replace(one, metrics={**(one.metrics or {}), f"{claim} {when}": float(right)})
+                for one, right in zip(judged, held, strict=True)
+            ]
+        return judged
+
+    def _without_object(self, size: tuple[int, int], queries: Sequence[Query]) -> Tensor:
+        """The pictures (n, H, W, 3) of queries in the scene without its object, rendered with the same noise."""
+        renderer = self._without[size] if size in self._without else self._renderer(size)
+        renderer.scene.assembly.away = True
+        self._without[size] = renderer  # one of its own: a scene in which something was far away has other last bits
+        with torch.no_grad():
+            return torch.stack([to_8_bit(renderer(one.u, one.seed, one.spp)) for one in queries])
+
+    def _renderer(self, size: tuple[int, int]) -> Renderer:
+        place, config = self.job.places[self.number], self.job.config
+        description, space = framed(place.scene.description, size), self.job.space(place, size)
+        return make_renderer(description, space, size, config.denoise, config.seed, sampler=config.pixel_sampler)
 
     def _made(self, size: tuple[int, int], queries: Sequence[Query]) -> dict[int, SweptPicture]:
         """The pictures of one size, rounded to 8 bits, by their numbers."""

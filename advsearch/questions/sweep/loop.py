@@ -38,6 +38,7 @@ from advsearch.questions.sweep.result import (
     counted_by_unit,
     map_over,
 )
+from advsearch.questions.sweep.settings import BLIND
 from advsearch.questions.sweep.summary import WorstConfiguration, WorstVerified
 from advsearch.questions.sweep.surface import map_surface
 from advsearch.report.wording import count
@@ -326,6 +327,7 @@ class Sweep:
         models, adversarial = [model.name for model in job.models], job.places[-1].beside_clean
         numbers = np.flatnonzero(predictions.seen & ~predictions.hidden)
         right, units, axes = predictions.right[numbers], self.units.of(numbers), self._axes(numbers)
+        changes = self._changes()
         if formation is not None and len(set(gains.values())) != 1:
             formation = formation.model_copy(update={"gain": None})
         summary = results.SweepSummary(
@@ -363,11 +365,12 @@ class Sweep:
             transport=combined([one for light in predicting for one in light]),
             surface=self._surface,
             drives=self._drives,
+            changes=changes,
             shared=SharedWork.of_facts(self._executor.facts, self.journal.machines.known),
             renders_per_second=self._rendered / swept if self._rendered and swept else None,
             seconds={**seconds, "total": self.stages.total},
             seed=job.config.seed,
-            warnings=[*job.warnings, *self._remarks(predictions, checked)],
+            warnings=[*job.warnings, *self._remarks(predictions, checked), *_blind_remarks(changes or ())],
             command_line=job.config.command_line(),
         )
         if self.run is not None:
@@ -376,6 +379,19 @@ class Sweep:
                 write_bytes(self.run.path / "images" / f"sweep.{suffix}", data)
             write_sweep_page(self.run.path, summary)
         return SweepResult(summary, None if self.run is None else self.run.path, tuple(self.journal.rows))
+
+    def _changes(self) -> list[results.ChangeRates] | None:
+        """How often changed pictures did what is claimed of them, for each model."""
+        found: list[results.ChangeRates] = []
+        for claim, when in self.job.config.claims:
+            held = {row.step: row.metrics[name] for row in self.rows() if (name := f"{claim} {when}") in row.metrics}
+            for model, network in enumerate(self.job.models):
+                numbers = np.array([one for one in held if one % self.models == model], dtype=np.int64)
+                right = np.array([held[one] == 1.0 for one in numbers.tolist()], dtype=bool)
+                counts = vars(counted_by_unit(right, self.units.of(numbers)))
+                row = int(numbers[~right][0]) if len(numbers) and not right.all() else None
+                found.append(results.ChangeRates(**counts, model=network.name, claim=claim, when=when, row=row))
+        return found or None
 
     def _gains(self) -> dict[str, float]:
         """The gain of each scene, by object and environment, where there are not too many to meter."""
@@ -413,6 +429,17 @@ class Sweep:
                 "that a check takes: noise may take part in it."
             )
         return remarks
+
+
+def _blind_remarks(changes: Sequence[results.ChangeRates]) -> list[str]:
+    """Return a sentence for each change with which nothing is left to see, and after which a model mostly says the
+    same: the interval of how often it says something else ends under one half."""
+    return [
+        f"{one.model} says the same in {one.configurations - one.correct} of {one.configurations} pictures when "
+        f"{BLIND[one.when]}: it may not be looking at the object."
+        for one in changes
+        if one.claim == "must_change" and one.interval is not None and one.interval[1] < 0.5
+    ]
 
 
 def _claim_of(seen: Judgement) -> results.WorstClaim:

@@ -11,7 +11,21 @@ from pydantic import field_validator
 from advsearch.config import ControlsByName, DerivativeConfig, RenderConfig, SceneConfig
 from advsearch.files import MESHES, either
 from advsearch.questions.attack.settings import FEWEST_TRIALS, AttackConfig
-from advsearch.settings import Clash, number_or_text, setting, setting_as_in, split_names
+from advsearch.settings import Clash, each_once, number_or_text, setting, setting_as_in, split_names
+
+BLIND = {
+    "black": "the picture is black",
+    "covered": "the camera is covered (one even colour, the picture's mean)",
+    "away": "the object is taken away",
+}
+"""Changes with which nothing is left to see of the object: a model that looks at it says something else."""
+
+HARMLESS = {
+    "exposure": "the exposure is a third of a stop higher",
+    "shift": "the picture moves by one pixel to the right",
+    "jpeg": "the picture is a JPEG file of quality 95",
+}
+"""Changes that mean nothing: it says the same."""
 
 Grid = dict[str, object]
 """Values, or numbers of them, by the parameters of the grid."""
@@ -96,6 +110,16 @@ class SweepConfig(SceneConfig):
         description="write ground truth of each pixel, names separated by commas, as layers of an EXR, for every "
         "configuration",
     )
+    must_change: str | None = setting(
+        None, "sweep", "show each picture also changed so that nothing is left to see, and count how often the model "
+        "says something else, as it must: black, covered (one even colour), away (rendered again without the object)",
+        f"names among {', '.join(BLIND)}, separated by commas", otherwise="none",
+    )
+    must_not_change: str | None = setting(
+        None, "sweep", "the same with what means nothing, where it must say the same: exposure (a third of a stop), "
+        "shift (one pixel), jpeg (quality 95)",
+        f"names among {', '.join(HARMLESS)}, separated by commas", otherwise="none",
+    )
     surface: bool = setting(
         False, "sweep", "map which parts of the object's surface, when visible, go with wrong predictions"
     )
@@ -116,6 +140,22 @@ class SweepConfig(SceneConfig):
     )
     # fmt: on
     cluster: str | None = setting_as_in(AttackConfig, "cluster")
+
+    _changes = each_once("must_change", "must_not_change")
+
+    @property
+    def claims(self) -> tuple[tuple[str, str], ...]:
+        """What is claimed of changed pictures: ``("must_change", "black")`` and so on."""
+        claimed = {"must_change": self.must_change, "must_not_change": self.must_not_change}
+        return tuple((claim, when) for claim, names in claimed.items() if names for when in split_names(names))
+
+    @field_validator("must_change", "must_not_change")
+    @classmethod
+    def _known_changes(cls, value: str | None, info: Any) -> str | None:
+        known = BLIND if info.field_name == "must_change" else HARMLESS
+        if value is not None and not set(split_names(value)) <= set(known):
+            raise ValueError("no such change")
+        return value
 
     @property
     def title(self) -> tuple[str, ...]:

@@ -172,6 +172,15 @@ class OneDrive(Fields):
     flicker: float = Field(description="changes between right and wrong a second")
 
 
+class TrackRates(Fields):
+    """What a tracker makes of a detector's boxes along whole drives."""
+
+    tracker: str = Field(description="its name")
+    lost: OverDrives = Field(description="share of the frames that see the object in which no track is on it")
+    switches: OverDrives = Field(description="how often the track on it has another number than before")
+    longest_gap: OverDrives = Field(description="seconds of the longest run of frames without its track")
+
+
 class DriveRates(Fields):
     """What a model says along whole drives; intervals are over drives, not over frames."""
 
@@ -188,7 +197,19 @@ class DriveRates(Fields):
     unit: str = Field(default="object sizes", description="of that distance")
     never_seen: int = Field(description="drives without a frame in which it is right")
     flicker: OverDrives = Field(description="changes between right and wrong a second")
+    tracks: TrackRates | None = Field(
+        default=None, description="what a [tracker](drives.md#tracks) makes of the boxes; absent without a detector"
+    )
     each: list[OneDrive] = Field(default=[], description="the numbers of each drive, the first 1,000")
+
+
+class ChangeRates(CountedPredictions):
+    """Pictures that were shown to a model a second time, changed; `correct` are those in which it is as claimed."""
+
+    model: str
+    claim: str = Field(description="`must_change`, or `must_not_change`: what the model says")
+    when: str = Field(description="what was changed")
+    row: int | None = Field(description="number of the first picture in which it is not as claimed; null without one")
 
 
 class SweepSummary(CountedPredictions, RunResult):
@@ -219,6 +240,10 @@ class SweepSummary(CountedPredictions, RunResult):
     worst: WorstConfiguration | None
     drives: list[DriveRates] | None = Field(
         default=None, description="of [whole drives](drives.md); absent where no frames of a path are swept"
+    )
+    changes: list[ChangeRates] | None = Field(
+        default=None,
+        description="of [pictures that are also shown changed](sweeps.md#is-it-looking); absent unless asked",
     )
     units: int | None = Field(
         default=None,

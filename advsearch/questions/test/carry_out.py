@@ -17,8 +17,7 @@ from advsearch.interrupts import interruptible
 from advsearch.progress import NullProgress, Progress
 from advsearch.questions.attack.carry_out import check_from_config
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.test.changes import OTHER_SCENE
-from advsearch.questions.test.claims import Trial, check_pictures, with_scene
+from advsearch.questions.test.claims import Trial, check_pictures
 from advsearch.questions.test.counterexamples import (
     Counterexample,
     add,
@@ -41,7 +40,6 @@ from advsearch.questions.test.result import (
 )
 from advsearch.questions.test.settings import (
     COUNTEREXAMPLES,
-    MustChangeClaim,
     NotBrokenClaim,
     NoWorseClaim,
     Suite,
@@ -274,8 +272,6 @@ def _check(planned: Sequence[PlannedClaim], suite: Suite) -> list[str]:
         wanted = [whole]
         if isinstance(claim, NoWorseClaim):
             wanted.append(whole.model_copy(update={"model": claim.than}))
-        if isinstance(claim, MustChangeClaim) and claim.when in OTHER_SCENE:
-            wanted.append(AttackConfig.of(with_scene(whole, claim)))
         for config in wanted:
             if config not in known:
                 try:

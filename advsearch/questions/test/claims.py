@@ -18,6 +18,7 @@ from advsearch.attacks.evaluation import Query
 from advsearch.attacks.trials import ConfidenceSequence, clopper_pearson, draws_needed
 from advsearch.config import SceneConfig
 from advsearch.described import OUT_OF_VIEW
+from advsearch.engine.changes import AWAY, as_claimed, changed
 from advsearch.engine.journal import Journal, Shared, worker_call
 from advsearch.engine.problem import Problem
 from advsearch.engine.verifier import ladder_of
@@ -28,7 +29,6 @@ from advsearch.questions.attack.carry_out import executor_for, parts_of, problem
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.studies import carry_out_part
 from advsearch.questions.attack.summary import AttackSummary
-from advsearch.questions.test.changes import ALIKE, CHANGED, OTHER_SCENE
 from advsearch.questions.test.counterexamples import TRIALS, Counterexample, is_over, same_scene
 from advsearch.questions.test.result import (
     FAILED,
@@ -136,7 +136,8 @@ class Trial:
         with executor_for(shared, "advsearch.questions.test.claims:claim_worker", self.progress) as executor:
             journal = Journal(self.run, Shared(problem, executor, "0"))
             beside = Journal(self.run, Shared(other, executor, "1"))
-            for query, own, its in self._pairs(asked, claim, config, journal, beside, Tensor.clone if same else None):
+            shown = (lambda _, picture: picture.clone()) if same else None
+            for query, own, its in self._pairs(asked, claim, config, journal, beside, shown):
                 ours += own.said.right and not its.said.right
                 theirs += its.said.right and not own.said.right
                 if first is None and its.said.right and not own.said.right:
@@ -156,22 +157,27 @@ class Trial:
     ) -> ClaimResult:
         """Whether a change of the picture changes what the model says, or not."""
         problem = self._problem(config)
-        other = self._problem(with_scene(config, claim)) if claim.when in OTHER_SCENE else problem
+        other = self._problem(config) if claim.when == AWAY else problem
+        other.renderer.scene.assembly.away = claim.when == AWAY
         sequence, held, example, verdict = ConfidenceSequence(self.confidence, sides=1), 0, "", UNDECIDED
         picture = None
         shared = self._shared(config)
         with executor_for(shared, "advsearch.questions.attack.carry_out:attack_worker", self.progress) as executor:
-            journal, beside = Journal(self.run, Shared(problem, executor)), Journal(self.run, Shared(other))
-            for query, own, its in self._pairs(asked, claim, config, journal, beside, CHANGED.get(claim.when)):
+            journal, beside = Journal(self.run, Shared(problem, executor)), Journal(self.run, Shared(problem))
+
+            def shown(query: Query, picture: Tensor) -> Tensor:  # judged by what was true before it was changed
+                if claim.when == AWAY:
+                    return other.picture(query.u, query.seed, query.spp)
+                return changed(picture, claim.when, problem.model.cameras)
+
+            for query, own, its in self._pairs(asked, claim, config, journal, beside, shown):
                 before, after = own.said.prediction, its.said.prediction
-                moved = abs((before.probability or 0.0) - (after.probability or 0.0))
-                another = before.label != after.label
-                as_claimed = another or moved > ALIKE if claim.claim == "must_change" else not another
-                held += as_claimed
-                if not as_claimed and picture is None:
+                right = as_claimed(claim.claim, before, after)
+                held += right
+                if not right and picture is None:
                     example = f"{before.label} before and {after.label} after: {self._described(problem, query)}"
                     picture = self._picture(asked.name, problem, query)
-                sequence.add(float(as_claimed))
+                sequence.add(float(right))
                 verdict = decided(sequence, least_mean(claim))
                 if verdict != UNDECIDED:
                     break
@@ -185,7 +191,7 @@ class Trial:
         config: SceneConfig,
         journal: Journal,
         beside: Journal,
-        shown: Callable[[Tensor], Tensor] | None,
+        shown: Callable[[Query, Tensor], Tensor] | None,
     ) -> Iterator[tuple[Query, Evaluation, Evaluation]]:
         """Yield a claim's pictures, what is said of each, and what the other side says of what is `shown` to it of this
         picture; without, of a picture of its own."""
@@ -203,7 +209,7 @@ class Trial:
         def there(queries: Sequence[Query]) -> Iterable[Evaluation]:
             if shown is None:
                 return beside.traced(queries)
-            return (_judged(other, query, shown(picture_of(query))) for query in queries)
+            return (_judged(other, query, shown(query, picture_of(query))) for query in queries)
 
         def picture_of(query: Query) -> Tensor:
             kept = pictures.get(query.number)  # what was asked before is read back, without its picture
@@ -350,11 +356,6 @@ def claim_worker(settings: JsonObject) -> Callable[[Any], Any]:
 
 def _judged(problem: Problem, query: Query, picture: Tensor) -> Evaluation:
     return Evaluation.of(problem.judge(picture, problem.whole(query.u)))
-
-
-def with_scene(config: SceneConfig, claim: MustChangeClaim | MustNotChangeClaim) -> SceneConfig:
-    """Return what the changed scene of a claim is made with."""
-    return config.model_copy(update={"set_": {**config.set_, **OTHER_SCENE.get(claim.when, {})}})
 
 
 def drawn(problem: Problem, kind: str, count: int, spp: int) -> Iterator[Query]:

@@ -16,9 +16,8 @@ from advsearch import __version__
 from advsearch.config import SceneConfig
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.summary import AttackSummary
+from advsearch.questions.sweep.settings import BLIND, HARMLESS
 from advsearch.questions.test.settings import (
-    BLIND,
-    HARMLESS,
     AnyClaim,
     MustChangeClaim,
     MustNotChangeClaim,

@@ -15,6 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from advsearch.config import SceneConfig
 from advsearch.errors import FileFormatError, InputError, resembling
 from advsearch.questions.attack.settings import AttackConfig
+from advsearch.questions.sweep.settings import BLIND, HARMLESS
 from advsearch.settings import (
     Clash,
     Config,
@@ -141,20 +142,6 @@ PICTURES, MOST = 400, 1_000_000
 
 COUNTEREXAMPLES = "counterexamples"
 """What stands for all of them, and no claim is called."""
-
-BLIND = {
-    "black": "the picture is black",
-    "covered": "the camera is covered (one even colour, the picture's mean)",
-    "away": "the object is taken away",
-}
-"""Changes with which nothing is left to see of the object: a model that looks at it says something else."""
-
-HARMLESS = {
-    "exposure": "the exposure is a third of a stop higher",
-    "shift": "the picture moves by one pixel to the right",
-    "jpeg": "the picture is a JPEG file of quality 95",
-}
-"""Changes that mean nothing: it says the same."""
 
 Settings = dict[str, object]
 

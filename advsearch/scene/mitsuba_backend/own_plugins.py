@@ -8,10 +8,12 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
 import torch
 
 from advsearch.scene.camera_model import NUMBERS, CameraModel
 from advsearch.scene.mitsuba_backend.variant import dr, mi
+from advsearch.scene.raindrops import APERTURE, DISTANCE, GRID, WATER, raindrops
 
 common: Any = mi.ad.integrators.common
 
@@ -203,12 +205,22 @@ CELLS = (128, 512)
 """Fewest and most cells along a side of the grid."""
 
 
+def _transmitted(before: Any, behind: Any, first: float, second: float) -> Any:
+    """Fresnel's share of unpolarised light that passes from a medium with the index of refraction `first` into one with
+    `second`, where the angles to the normal have these cosines."""
+    across = (first * before - second * behind) / (first * before + second * behind)
+    along = (second * before - first * behind) / (second * before + first * behind)
+    return 1.0 - 0.5 * (across * across + along * along)
+
+
 class ModelledCamera(mi.Sensor):  # type: ignore[misc]
     """The sensor `advsearch_camera`: a `CameraModel` at a place.
 
     The directions of rays are kept on a grid over the picture, from Newton's method, and in between are bilinear: the
     grid is so fine that this is off by less than a hundredth of a pixel, but for the last pixels before a fold. Every
     sample of a picture has a ray of its own, so that edges are as sharp as a pinhole's.
+
+    Drops of rain before it bend the rays: `advsearch.scene.raindrops`.
 
     Parameters: `to_world`; `lens`, its numbers in the order of `NUMBERS`.
     """
@@ -223,6 +235,15 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
         self.lens = mi.TensorXf(list(numbers), (len(NUMBERS),))
         self.rays = mi.Float()
         self._make_rays()
+        self._drops = None
+        if props["drops"] > 0.0:
+            asked = (int(props["drops"]), float(props["drop_size"]), int(props["drop_seed"]))
+            self._drops = raindrops(*asked, float(props["drop_tangent"]))
+            self._which = mi.UInt32(self._drops.grid.reshape(-1).astype("uint32"))
+            none = [[0.0, 0.0, -1.0, 1.0]]  # a drop without inside, where there is none
+            self._caps = mi.Float(np.concatenate([self._drops.drops, none]).astype("float32").reshape(-1))
+            dr.eval(self._which, self._caps)
+            self.m_needs_sample_3 = True
 
     def traverse(self, cb: Any) -> None:
         """See `mi.Object.traverse`."""
@@ -243,12 +264,52 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
     def sample_ray_differential(self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True) -> Any:
         """See `mi.Sensor.sample_ray_differential`; where the lens sees nothing, a ray of weight 0 that hits nothing."""
         ahead, inside = self._looked_up(sample2)
+        weight = mi.Float(1.0)
+        if self._drops is not None:
+            ahead, weight = self._through_drops(ahead, sample3)
+        return self._leaving(ahead, dr.select(inside, weight, 0.0), time)
+
+    def without_drops(self, time: Any, place: Any) -> tuple[Any, Any]:
+        """`sample_ray` where no drop is before the camera: what is true of a picture is so of the scene."""
+        ahead, inside = self._looked_up(place)
+        ray, weight = self._leaving(ahead, dr.select(inside, mi.Float(1.0), 0.0), time)
+        return mi.Ray3f(ray), weight
+
+    def _leaving(self, ahead: Any, weight: Any, time: Any) -> tuple[Any, Any]:
         ray = dr.zeros(mi.RayDifferential3f)  # all of it, or it would be ragged for derivatives
         ray.time = time
         ray.o = self.pose @ mi.Point3f(self._near * ahead)
         ray.d = self.pose @ mi.Vector3f(ahead)
-        ray.maxt = dr.select(inside, mi.Float(self._far), 0.0)
-        return ray, dr.select(inside, mi.Spectrum(1.0), 0.0)
+        ray.maxt = dr.select(weight > 0.0, mi.Float(self._far), 0.0)
+        return ray, mi.Spectrum(weight)
+
+    def _through_drops(self, ahead: Any, sample: Any) -> tuple[Any, Any]:
+        """Directions behind the sheet, and the light that passes: see `advsearch.scene.raindrops`."""
+        assert self._drops is not None
+        lens, half = APERTURE * mi.warp.square_to_uniform_disk_concentric(sample), self._drops.half
+        reach = DISTANCE / dr.maximum(ahead.z, 1e-3)
+        x, y = ahead.x * reach + lens.x, ahead.y * reach + lens.y
+        column, row = ((at + half) * (GRID / (2.0 * half)) for at in (x, y))
+        there = (ahead.z > 0.1) & (column >= 0.0) & (column < GRID) & (row >= 0.0) & (row < GRID)
+        cell = mi.UInt32(dr.clip(row, 0.0, GRID - 1.0)) * GRID + mi.UInt32(dr.clip(column, 0.0, GRID - 1.0))
+        cap = dr.gather(mi.Vector4f, self._caps, dr.gather(mi.UInt32, self._which, cell, there))
+        dx, dy = x - cap.x, y - cap.y
+        wet = there & (cap.z > 0.0) & (dx * dx + dy * dy < cap.z * cap.z)
+
+        inner = mi.Vector3f(ahead.x / WATER, ahead.y / WATER, 0.0)
+        inner.z = dr.safe_sqrt(1.0 - inner.x * inner.x - inner.y * inner.y)
+        start = mi.Vector3f(dx, dy, dr.safe_sqrt(cap.w * cap.w - cap.z * cap.z))  # from the middle of the curvature
+        along = dr.dot(start, inner)
+        out = start + inner * (dr.safe_sqrt(along * along - dr.squared_norm(start) + cap.w * cap.w) - along)
+        normal = out / cap.w
+        cosine = dr.dot(inner, normal)
+        beyond = 1.0 - WATER * WATER * (1.0 - cosine * cosine)
+        leaving = dr.safe_sqrt(beyond)
+        outer = WATER * inner + (leaving - WATER * cosine) * normal
+        passed = _transmitted(ahead.z, inner.z, 1.0, WATER) * _transmitted(cosine, leaving, WATER, 1.0)
+        lost = (beyond <= 0.0) | (outer.z <= 0.0)  # reflected inside
+        weight = dr.select(wet, dr.select(lost, 0.0, passed), 1.0)
+        return dr.select(wet & ~lost, dr.normalize(outer), ahead), weight
 
     def sample_ray(self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True) -> Any:
         """See `mi.Sensor.sample_ray`."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import singledispatch
@@ -420,12 +421,17 @@ def _lens(description: SceneDescription) -> Plugin:
     """The plugin of a camera, with what is before its place and its film."""
     model = description.camera_model
     if model is not None:
+        if description.backdrop and description.number("camera.drops") > 0.0:
+            raise InputError("background: raindrops have no plain background behind them; leave one of the two out")
         if description.backdrop and (model.black > 0.0 or not model.name):  # a searched lens may fold
             raise InputError(
                 "background: it would show where the camera's lens sees nothing as well; leave the plain background "
                 "out, or take a lens that fills the picture"
             )
-        return {"type": "advsearch_camera", "kind": model.kind, "reach": model.reach, **model.values}
+        drops = {name: description.number(f"camera.{name}") for name in ("drops", "drop_size", "drop_seed")}
+        tangent = max(model.tangents) if model.name else math.tan(math.radians(description.number("camera.fov")) / 2.0)
+        drops |= {"drop_tangent": tangent}
+        return {"type": "advsearch_camera", "kind": model.kind, "reach": model.reach, **model.values, **drops}
     pinhole: Plugin = {"type": "perspective", "fov": description.number("camera.fov"), "fov_axis": "larger"}
     if description.thin_lens:
         pinhole |= {"type": "thinlens", "aperture_radius": 1e-4, "focus_distance": 1.0}

@@ -357,7 +357,8 @@ def first_hits(scene: Any, sensor: Any, resolution: tuple[int, int]) -> Surfaces
     count = height * width
     pixel = dr.arange(mi.UInt32, count)
     place = mi.Point2f((pixel % width + 0.5) / width, (pixel // width + 0.5) / height)
-    ray, weight = sensor.sample_ray(0.0, 0.5, place, mi.Point2f(0.5))
+    clear = getattr(sensor, "without_drops", None)
+    ray, weight = sensor.sample_ray(0.0, 0.5, place, mi.Point2f(0.5)) if clear is None else clear(0.0, place)
     to_world = sensor.world_transform()
     eye = to_world @ mi.Point3f(0.0)  # rays begin at the near clipping plane
     ahead = dr.normalize(to_world @ mi.Vector3f(0.0, 0.0, 1.0))

@@ -1,13 +1,16 @@
-"""A street as geometry: 300 m of road between pavements and houses, with trees and lamps. Lengths are metres.
+"""Streets as geometry: road between pavements and houses, with trees and lamps. Lengths are metres.
 
-It runs along x. The object stands at the origin, in the lane of those who drive towards +x. At both ends it meets
-another street, whose houses close the view; beyond them lies a plain to the horizon.
+The avenue is 300 m long and runs along x. The object stands at the origin, in the lane of those who drive towards +x.
+At both ends it meets another street, whose houses close the view; beyond them lies a plain to the horizon. What stands
+where is a `Plan`; `crossing.py` and `car_park.py` are made of the same parts.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import lru_cache
+from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
@@ -46,32 +49,69 @@ LIT = {
 """Luminance by night, cd/m2: a lamp puts 15 lux on the road below it (7.5 m, 0.36 x 0.22 m)."""
 
 
+class Tree(NamedTuple):
+    """Where a tree stands; the two numbers choose its kind, turn and size."""
+
+    x: float
+    y: float
+    number: int
+    side: int = 0
+
+
+class Plan(NamedTuple):
+    """What stands where.
+
+    Attributes:
+        ground: makes road and pavements.
+        fronts: of houses: walls, from where to where along them, seeds.
+        trees: on the pavement.
+        posts: (x, y) of the foot of each lamp post, and y of its lamp.
+        more: makes further meshes, from the metres of one object size.
+    """
+
+    ground: Callable[[], Quads]
+    fronts: tuple[tuple[Frame, float, float, int], ...]
+    trees: tuple[Tree, ...]
+    posts: tuple[tuple[float, float, float], ...]
+    more: Callable[[float], tuple[MeshPart, ...]] = lambda metres: ()
+
+
+def avenue(metres: float, candelas: float | None, *, wet: bool, dark: bool) -> tuple[MeshPart, ...]:
+    """Return the meshes of the street; arguments as of `built`."""
+    return built(AVENUE, metres, candelas, wet=wet, dark=dark)
+
+
 @lru_cache(maxsize=4)
-def avenue(wet: bool, metres: float, candelas: float | None = None) -> tuple[MeshPart, ...]:
-    """Return the meshes of the street.
+def built(plan: Plan, metres: float, candelas: float | None, *, wet: bool, dark: bool) -> tuple[MeshPart, ...]:
+    """Return the meshes of a place.
 
     Args:
-        wet: whether the road is dark and reflects.
+        plan: what stands where.
         metres: of one object size, the scene's unit of length.
-        candelas: luminance of a radiance of 1, cd/m2, where lamps and windows shine; None where they don't.
+        candelas: luminance of a radiance of 1, cd/m2; None where the light has no unit.
+        wet: whether the road is dark and reflects.
+        dark: whether lamps and windows shine.
     """
-    rows, ground = _houses(), road.WET if wet else road.DRY
+    rows, ground = _houses(plan.fronts), road.WET if wet else road.DRY
     grey, white = np.full((2, 2, 3), 0.25, np.float32), np.full((2, 2, 3), 0.9, np.float32)
     made = (
-        (road.ROAD, _ground(), _display(paint.road, wet), ground),
+        (road.ROAD, plan.ground(), _display(paint.road, wet), ground),
         ("houses", rows.walls, _display(paint.walls), WET_WALL if wet else WALL),
         ("windows", rows.dark, _display(paint.panes), PANE),
         ("lit-windows", rows.lit, _display(paint.panes), PANE),
         ("shops", rows.shops, _display(paint.panes), PANE),
-        ("trees", _trees(), _leaves(), LEAF),
-        ("posts", _posts(), grey, IRON),
-        ("street-lamps", _lamps(), white, PANE),
+        ("trees", _trees(plan.trees), _leaves(), LEAF),
+        ("posts", _posts(plan.posts), grey, IRON),
+        ("street-lamps", _lamps(plan.posts), white, PANE),
         ("plain", _plain(), _grass(), WALL),
     )
-    shine = {} if candelas is None else {name: one[None, None] / np.float32(candelas) for name, one in LIT.items()}
-    return tuple(
-        MeshPart(name, quads.mesh(metres), base, finish, emission=shine.get(name), laid=True)
-        for name, quads, base, finish in made
+    shine = {name: one[None, None] / np.float32(candelas) for name, one in LIT.items()} if dark and candelas else {}
+    return (
+        *(
+            MeshPart(name, quads.mesh(metres), base, finish, emission=shine.get(name), laid=True)
+            for name, quads, base, finish in made
+        ),
+        *plan.more(metres),
     )
 
 
@@ -82,42 +122,75 @@ def _display(texture: object, *arguments: bool) -> Floats:
     return np.asarray(np.round(shown * np.float32(255.0)) / np.float32(255.0), np.float32)
 
 
-@lru_cache(maxsize=1)
-def _houses() -> Row:
-    """Both sides of the street, and the houses that close it at either end."""
-    row, (right, left) = Row(), paint.FRONTS
-    row.build(Frame((0.0, right, KERB), (0.0, 1.0, 0.0)), -END, END, 1)
-    row.build(Frame((0.0, left, KERB), (0.0, -1.0, 0.0)), -END, END, 2)
-    away = END + CROSSING + 4.0
-    row.build(Frame((away, 0.0, KERB), (-1.0, 0.0, 0.0)), -62.0, 62.0, 3)
-    row.build(Frame((-away, 0.0, KERB), (1.0, 0.0, 0.0)), -62.0, 62.0, 4)
+@lru_cache(maxsize=2)
+def _houses(fronts: tuple[tuple[Frame, float, float, int], ...]) -> Row:
+    row = Row()
+    for frame, begin, end, seed in fronts:
+        row.build(frame, begin, end, seed)
     return row
+
+
+def level(quads: Quads, x: Sequence[float], y: Sequence[float], z: float, v: tuple[float, float] | None = None) -> None:
+    """Add a level rectangle of ground; `v` are the y whose ground it shows, its own unless given."""
+    (x0, x1), (y0, y1), (low, high) = sorted(x), sorted(y), paint.FRONTS
+    shown = np.array(v or (y0, y1))
+    rows = (shown - low) / (high - low)
+    corners = np.array([[(x0, y0, z), (x1, y0, z), (x1, y1, z), (x0, y1, z)]])
+    u = np.array([x0, x1, x1, x0]) / paint.GROUND_PERIOD
+    quads.add(corners, np.stack([u, rows[[0, 0, 1, 1]]], axis=-1)[None])
+
+
+ASPHALT = (2.4, 5.2)
+"""y between which the ground has no markings."""
+
+
+def asphalt(quads: Quads, x: tuple[float, float], y: tuple[float, float]) -> None:
+    """Add a road without markings, in strips that show different parts of it."""
+    count = max(1, round((y[1] - y[0]) / (ASPHALT[1] - ASPHALT[0])))
+    edges = np.linspace(*y, count + 1)
+    for number, (y0, y1) in enumerate(pairwise(edges)):
+        rows = (np.array(ASPHALT)[:: -1 if number % 2 else 1] - paint.FRONTS[0]) / (paint.FRONTS[1] - paint.FRONTS[0])
+        u = (np.array([x[0], x[1], x[1], x[0]]) + 7.3 * number) / paint.GROUND_PERIOD
+        corners = np.array([[(x[0], y0, 0.0), (x[1], y0, 0.0), (x[1], y1, 0.0), (x[0], y1, 0.0)]])
+        quads.add(corners, np.stack([u, rows[[0, 0, 1, 1]]], axis=-1)[None])
+
+
+def painted(quads: Quads, x: tuple[float, float], y: tuple[float, float]) -> None:
+    """Add a rectangle of white paint on a road: it shows the line along the kerb."""
+    line = (road.KERBS[0] + 0.45 + np.array([-0.04, 0.04]) - paint.FRONTS[0]) / (paint.FRONTS[1] - paint.FRONTS[0])
+    corners = np.array([[(x[0], y[0]), (x[1], y[0]), (x[1], y[1]), (x[0], y[1])]])
+    along = (corners - corners[:, :1]).sum(axis=-1) / paint.GROUND_PERIOD + x[0] + y[0]
+    height = np.full((1, 4, 1), 0.004)
+    quads.add(np.concatenate([corners, height], axis=-1), np.stack([along, line[[0, 0, 1, 1]][None]], axis=-1))
+
+
+def street(quads: Quads, begin: float, end: float, *, marked: bool = True) -> None:
+    """Add a road along x with its pavements and kerbs."""
+    low, high = paint.FRONTS
+    right, left = road.KERBS
+    if marked:
+        level(quads, (begin, end), (right, left), 0.0)
+    else:
+        asphalt(quads, (begin, end), (right, left))
+    for edge, wall, out in ((right, low, 1.0), (left, high, -1.0)):
+        level(quads, (begin, end), (edge, wall), KERB)
+        corners = [(begin, edge, 0.0), (end, edge, 0.0), (end, edge, KERB), (begin, edge, KERB)]
+        v = (edge - out * np.array([0.02, 0.02, 0.1, 0.1]) - low) / (high - low)
+        uvs = np.stack([np.array([begin, end, end, begin]) / paint.GROUND_PERIOD, v], axis=-1)
+        quads.add(np.array([corners])[:, :: int(-out)], uvs[None, :: int(-out)])
+
+
+def closed(quads: Quads) -> None:
+    """Add the streets that a street along x meets at its ends."""
+    for sign in (-1.0, 1.0):
+        level(quads, (sign * END, sign * (END + CROSSING)), (-64.0, 64.0), 0.0, (2.4, 5.2))
+        level(quads, (sign * (END + CROSSING), sign * (END + CROSSING + 4.0)), (-64.0, 64.0), KERB, (-9.9, -6.0))
 
 
 def _ground() -> Quads:
     quads = Quads()
-    low, high = paint.FRONTS
-    right, left = road.KERBS
-
-    def level(x: Sequence[float], y: Sequence[float], z: float, v: tuple[float, float] | None = None) -> None:
-        """A level rectangle; `v` are the y whose ground it shows, its own unless given."""
-        (x0, x1), (y0, y1) = sorted(x), sorted(y)
-        shown = np.array(v or (y0, y1))
-        rows = (shown - low) / (high - low)
-        corners = np.array([[(x0, y0, z), (x1, y0, z), (x1, y1, z), (x0, y1, z)]])
-        u = np.array([x0, x1, x1, x0]) / paint.GROUND_PERIOD
-        quads.add(corners, np.stack([u, rows[[0, 0, 1, 1]]], axis=-1)[None])
-
-    level((-END, END), (right, left), 0.0)
-    for edge, wall, out in ((right, low, 1.0), (left, high, -1.0)):
-        level((-END, END), (edge, wall), KERB)
-        corners = [(-END, edge, 0.0), (END, edge, 0.0), (END, edge, KERB), (-END, edge, KERB)]
-        v = (edge - out * np.array([0.02, 0.02, 0.1, 0.1]) - low) / (high - low)
-        uvs = np.stack([np.array([-END, END, END, -END]) / paint.GROUND_PERIOD, v], axis=-1)
-        quads.add(np.array([corners])[:, :: int(-out)], uvs[None, :: int(-out)])
-    for sign in (-1.0, 1.0):
-        level((sign * END, sign * (END + CROSSING)), (-64.0, 64.0), 0.0, (2.4, 5.2))
-        level((sign * (END + CROSSING), sign * (END + CROSSING + 4.0)), (-64.0, 64.0), KERB, (-9.9, -6.0))
+    street(quads, -END, END)
+    closed(quads)
     return quads
 
 
@@ -136,19 +209,16 @@ def _grass() -> Floats:
 # ---- trees ----------------------------------------------------------------------------------------------------------
 
 
-@lru_cache(maxsize=1)
-def _trees() -> Quads:
+@lru_cache(maxsize=2)
+def _trees(places: tuple[Tree, ...]) -> Quads:
     quads = Quads()
     trees = [_tree(seed) for seed in range(3)]
-    for side, y in enumerate(TREE_AT):
-        for number, x in enumerate(TREES):
-            kind = trees[(number + side) % len(trees)]
-            turn, size = 2.4 * number + side, 0.9 + 0.2 * ((5 * number + 3 * side) % 7) / 7.0
-            matrix = size * np.array(
-                [[np.cos(turn), -np.sin(turn), 0.0], [np.sin(turn), np.cos(turn), 0.0], [0, 0, 1.0]]
-            )
-            for corners, uvs, normals in zip(kind.corners, kind.uvs, kind.normals, strict=True):
-                quads.add(corners @ matrix.T + [x + 9.0 * side, y, KERB], uvs, normals @ (matrix / size).T)
+    for x, y, number, side in places:
+        kind = trees[(number + side) % len(trees)]
+        turn, size = 2.4 * number + side, 0.9 + 0.2 * ((5 * number + 3 * side) % 7) / 7.0
+        matrix = size * np.array([[np.cos(turn), -np.sin(turn), 0.0], [np.sin(turn), np.cos(turn), 0.0], [0, 0, 1.0]])
+        for corners, uvs, normals in zip(kind.corners, kind.uvs, kind.normals, strict=True):
+            quads.add(corners @ matrix.T + [x, y, KERB], uvs, normals @ (matrix / size).T)
     return quads
 
 
@@ -158,12 +228,12 @@ LEAVES, CLUMPS = 3800, 40
 def _tree(seed: int) -> Quads:
     """A trunk, some boughs and leaves in clumps, which are shaded as the clump is round."""
     rng, quads = np.random.Generator(np.random.PCG64(500 + seed)), Quads()
-    _limb(quads, np.array([0.0, 0.0, 0.0]), np.array([0.05, 0.03, 3.0]), 0.17, 0.12)
+    limb(quads, np.array([0.0, 0.0, 0.0]), np.array([0.05, 0.03, 3.0]), 0.17, 0.12)
     way = rng.normal(size=(CLUMPS, 3))
     way *= rng.uniform(0.55, 1.0, (CLUMPS, 1)) / np.linalg.norm(way, axis=1, keepdims=True)
     middle = np.array([0.0, 0.0, 5.2]) + way * [1.75, 1.75, 2.3]
     for at in middle[:9]:
-        _limb(quads, np.array([0.05, 0.03, 2.8]), at, 0.08, 0.025)
+        limb(quads, np.array([0.05, 0.03, 2.8]), at, 0.08, 0.025)
     clump = rng.integers(CLUMPS, size=LEAVES)
     away = rng.normal(size=(LEAVES, 3))
     away *= rng.random((LEAVES, 1)) ** 0.4 / np.linalg.norm(away, axis=1, keepdims=True)
@@ -196,9 +266,7 @@ def _leaves() -> Floats:
     return linear_to_srgb(np.concatenate([bark, green], axis=1).repeat(2, axis=0))
 
 
-def _limb(
-    quads: Quads, start: Doubles, end: Doubles, thick: float, thin: float, sides: int = 7, u: float = 0.2
-) -> None:
+def limb(quads: Quads, start: Doubles, end: Doubles, thick: float, thin: float, sides: int = 7, u: float = 0.2) -> None:
     """A tapering round limb from one place to another."""
     ahead = (end - start) / np.linalg.norm(end - start)
     aside = np.cross(ahead, np.eye(3)[np.abs(ahead).argmin()])
@@ -216,22 +284,20 @@ def _limb(
 # ---- lamps ----------------------------------------------------------------------------------------------------------
 
 
-def lamp_places() -> Doubles:
+def lamp_places(posts: Sequence[tuple[float, float, float]]) -> Doubles:
     """Return where the middle of each shining area is, (N, 3) metres."""
-    sides = np.arange(len(POSTS)) % 2
-    y = np.where(sides == 0, POST_AT[0] + ARM, POST_AT[1] - ARM)
-    return np.column_stack([POSTS, y, np.full(len(POSTS), KERB + LAMP_HEIGHT - 0.07)])
+    return np.array([(x, lamp, KERB + LAMP_HEIGHT - 0.07) for x, _, lamp in posts])
 
 
-def _posts() -> Quads:
+def _posts(posts: Sequence[tuple[float, float, float]]) -> Quads:
     quads = Quads()
-    for x, y, z in lamp_places():
-        foot = np.array([x, POST_AT[0] if y < 1.75 else POST_AT[1], KERB])
+    for (x, y, z), (_, at, _) in zip(lamp_places(posts), posts, strict=True):
+        foot = np.array([x, at, KERB])
         top = foot + np.array([0.0, 0.0, LAMP_HEIGHT])
-        _limb(quads, foot, foot + np.array([0.0, 0.0, 1.1]), 0.11, 0.1, 10)
-        _limb(quads, foot + np.array([0.0, 0.0, 1.0]), top, 0.07, 0.045, 10)
-        _limb(quads, top - [0.0, 0.0, 0.06], np.array([x, y, top[2] + 0.02]), 0.04, 0.03, 8)
-        head = Frame((x, y, z), (0.0, -1.0 if y < 1.75 else 1.0, 0.0))
+        limb(quads, foot, foot + np.array([0.0, 0.0, 1.1]), 0.11, 0.1, 10)
+        limb(quads, foot + np.array([0.0, 0.0, 1.0]), top, 0.07, 0.045, 10)
+        limb(quads, top - [0.0, 0.0, 0.06], np.array([x, y, top[2] + 0.02]), 0.04, 0.03, 8)
+        head = Frame((x, y, z), (0.0, -1.0 if at < y else 1.0, 0.0))
         half, wide = LAMP_SIZE[0] / 2 + 0.06, LAMP_SIZE[1] / 2 + 0.05
         box = np.array([[-wide, wide, -half - 0.1, half, 0.004, 0.12]])
         quads.boxes(head, box, np.zeros((1, 4)), SHOWN)
@@ -240,11 +306,40 @@ def _posts() -> Quads:
     return quads
 
 
-def _lamps() -> Quads:
+def _lamps(posts: Sequence[tuple[float, float, float]]) -> Quads:
     """The areas that shine, facing down."""
-    quads, places = Quads(), lamp_places()
+    quads, places = Quads(), lamp_places(posts)
     half = np.array(LAMP_SIZE[::-1]) / 2.0
     signs = np.array([[-1, -1], [-1, 1], [1, 1], [1, -1]])
     corners = places[:, None] + np.concatenate([signs * half, np.zeros((4, 1))], axis=1)
     quads.add(corners, np.zeros((len(places), 4, 2)) + 0.5)
     return quads
+
+
+def trees_along(xs: Sequence[float] = TREES) -> tuple[Tree, ...]:
+    """Return the trees on both sides of a street, those on the left 9 m on."""
+    return tuple(Tree(x + 9.0 * side, y, number, side) for side, y in enumerate(TREE_AT) for number, x in enumerate(xs))
+
+
+def posts_along(xs: Sequence[float] = POSTS) -> tuple[tuple[float, float, float], ...]:
+    """Return the posts of a street, to the right and to the left in turn."""
+    reach = (ARM, -ARM)
+    return tuple((x, POST_AT[n % 2], POST_AT[n % 2] + reach[n % 2]) for n, x in enumerate(xs))
+
+
+def ends() -> tuple[tuple[Frame, float, float, int], ...]:
+    """Return the houses that close a street along x at either end."""
+    away = END + CROSSING + 4.0
+    return (
+        (Frame((away, 0.0, KERB), (-1.0, 0.0, 0.0)), -62.0, 62.0, 3),
+        (Frame((-away, 0.0, KERB), (1.0, 0.0, 0.0)), -62.0, 62.0, 4),
+    )
+
+
+RIGHT, LEFT = (
+    Frame((0.0, paint.FRONTS[0], KERB), (0.0, 1.0, 0.0)), Frame((0.0, paint.FRONTS[1], KERB), (0.0, -1.0, 0.0)),
+)  # fmt: skip
+"""Walls on either side of a street along x; along the right one x falls."""
+AVENUE = Plan(
+    _ground, ((RIGHT, -END, END, 1), (LEFT, -END, END, 2), *ends()), trees_along(), posts_along()
+)  # fmt: skip

@@ -16,6 +16,9 @@ from advsearch.scene.parts import MeshPart
 
 ROAD = "road"
 """Name of the mesh: asphalt with markings between two pavements, dry or wet."""
+FLOOR = "floor"
+"""Name of the mesh that things stand on in a room: its floor and the top of its table."""
+LAID = (ROAD, FLOOR)
 KERBS = (-2.3, 5.8)
 """Where the road ends on the right and on the left."""
 EDGES = (-10.0, 13.6)

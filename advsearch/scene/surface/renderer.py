@@ -237,6 +237,8 @@ def why_not_kept(renderer: Renderer) -> str | None:
         return "there is more in the scene than the object, its ground and an environment"
     if renderer.scene.volumetric or description.thin_lens or description.backdrop:
         return "there is haze, a lens with an aperture, or a plain background"
+    if description.number("camera.drops") > 0.0:
+        return "there are raindrops before the camera"
     return None if renderer.formation.denoiser == "oidn" else NOISE
 
 

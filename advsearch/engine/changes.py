@@ -1,4 +1,4 @@
-"""What claims change in a picture, to see whether the model says something else."""
+"""What is changed in a picture to see whether the model says something else, as it must or must not."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from PIL import Image
 from torch import Tensor
 
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
+from advsearch.tasks import Prediction
 
 
 def _brighter(picture: Tensor) -> Tensor:
@@ -33,9 +34,21 @@ CHANGED: dict[str, Callable[[Tensor], Tensor]] = {
 }
 """What makes the changed picture of one (H, W, 3), sRGB in [0, 1]."""
 
-OTHER_SCENE = {"away": {"pose.y": 1000.0}}
-"""Parameters of the scene that is rendered in its place. At 1,000 of its own sizes an object is under a pixel wide, and
-its shadow is out of the picture."""
+AWAY = "away"
+"""What is rendered again, see `Assembly.away`."""
 
 ALIKE = 0.1
 """How far the probability of one label may move, and nothing has changed for `must_change`."""
+
+
+def changed(picture: Tensor, when: str, cameras: int = 1) -> Tensor:
+    """Return a picture (H, W, 3) that is changed as a name of `CHANGED` says; of a rig those of all its cameras."""
+    return torch.cat([CHANGED[when](one) for one in picture.chunk(cameras, dim=1)], dim=1)
+
+
+def as_claimed(claim: str, before: Prediction, after: Prediction) -> bool:
+    """Return whether a change did what is claimed of it: that it `must_change` what the model says, or
+    `must_not_change` it."""
+    moved = abs((before.probability or 0.0) - (after.probability or 0.0))
+    another = before.label != after.label
+    return another or moved > ALIKE if claim == "must_change" else not another

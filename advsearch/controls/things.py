@@ -1,0 +1,203 @@
+"""The `things` control: where the things beside the object stand, how they are turned, and whether they are there.
+
+    place = where it was put + (x, y) + away * t,    t >= 0 the least at which it stands free
+
+`away` points from the object to the thing. Free is what overlaps with no other outline on the ground: the object's, the
+camera's, those of things that stay, and those of things before it in the list. Two convex outlines of which one moves
+straight on overlap over one stretch of its way, so that t is exact.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from advsearch.controls.base import Parameter, Value
+from advsearch.controls.numbers import NumberControl, Slot, Values
+from advsearch.controls.pose import euler
+from advsearch.errors import InputError, UnknownNameError
+from advsearch.scene.assets import Doubles
+from advsearch.scene.description import OBJECT, SceneDescription
+from advsearch.scene.geometry import affine, camera_to_world, middle, standing
+from advsearch.scene.parts import MeshPart
+from advsearch.scene.settings import ORBIT, moving
+from advsearch.scene.things import Footprint, blocked, footprint, ground_height
+
+GAP = 0.01
+"""Metres between a thing that was moved away and what it would have stood in."""
+CAMERA, NEAR = 0.3, 0.05
+"""Metres around the camera that stay free of what is as high; at most that share of its distance to the object."""
+EIGHTHS = np.arange(8) * np.pi / 4.0
+AWAY, SUNK = 1e-5, 0.01
+"""Size of a thing that is away, and how many metres it lies in the ground."""
+
+
+class Stand(NamedTuple):
+    """Where a thing stands, in the coordinates of the scene.
+
+    Attributes:
+        place: (2,) of its middle.
+        height: of the ground there.
+        pushed: how far it was moved away from the object.
+    """
+
+    place: Doubles
+    height: float
+    pushed: float
+
+
+class ThingsControl(NumberControl):
+    """Where the things beside the object stand, how they are turned, and whether they are there."""
+
+    kind = "things"
+    summary = "Where the things beside the object stand, how they are turned, and whether they are there."
+    parameters = (
+        moving(ORBIT, "x", "metres", -1000.0, 1000.0, 0.0, "Forwards from where it was put.", (-2.0, 2.0)),
+        moving(ORBIT, "y", "metres", -1000.0, 1000.0, 0.0, "To the left of where it was put.", (-2.0, 2.0)),
+        moving(
+            ORBIT, "heading", "degrees", -3600.0, 3600.0, 0.0, "Turn from how it was put, counter-clockwise.",
+            (-180.0, 180.0), periodic=True,
+        ),
+        Parameter(
+            "presence", (), "name", 0.0, 1.0, "there", "Whether it is there.", moves_silhouettes=True,
+            options=("there", "away"),
+        ),
+    )  # fmt: skip
+
+    @classmethod
+    def declared(cls, settings: Iterable[str]) -> tuple[Parameter, ...]:
+        """Return the parameters for all things, and those that are set for one, such as `person.x`."""
+        names = {one.name: one for one in cls.parameters}
+        split = [(one, one.rpartition(".")[2]) for one in settings if "." in one]
+        return (*cls.parameters, *(replace(names[last], name=one) for one, last in split if last in names))
+
+    def fit(self) -> None:
+        things = self.scene.things
+        if not things:
+            raise InputError(f"`controls` {self.name}: nothing stands beside the object; add `things`, such as car@6,3")
+        for name in (one.rpartition(".")[0] for one in self.specs):
+            if name and name not in things:
+                raise UnknownNameError(f"`controls` {self.name}: thing beside the object", name, things)
+        super().fit()
+        asked = {
+            slot.parameter.name.rpartition(".")[0]
+            for slot in self.slots
+            if slot.width
+            or not self.specs.keys().isdisjoint((slot.parameter.name, slot.parameter.name.rpartition(".")[2]))
+        }
+        self._moved = tuple(name for name in things if name in asked)  # the others stay, or another control moves them
+        as_put = {slot.parameter.name: torch.zeros(()) for slot in self.slots}
+        for name, stand in self._stands(as_put, {}).items():
+            if stand.pushed:
+                raise InputError(f"`controls` {self.name}: {name} stands in something else; put it elsewhere")
+
+    def laid_out(self) -> tuple[Slot, ...]:
+        slots: list[Slot] = []
+        for thing in self.scene.things:
+            for parameter in self.parameters:
+                asked = f"{thing}.{parameter.name}"
+                value = self.default(parameter)
+                spec = self.specs[asked] if asked in self.specs else self.spec(parameter, value)
+                begin = sum(slot.width for slot in slots)
+                slots.append(Slot(replace(parameter, name=asked), spec, 1, begin, value))
+        return tuple(slots)
+
+    @property
+    def refines(self) -> frozenset[str]:
+        """None is changed; but it comes after whatever moves what things may not stand in."""
+        stay = [name for name in self.scene.things if name not in self._moved]
+        poses = [f"{name}.to_world" for name in (OBJECT, "camera", *stay)]
+        return frozenset([*poses, *(f"{name}.offsets" for name in (OBJECT, *self.scene.things))])
+
+    def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        inputs = {}
+        for name, stand in self._stands(values, so_far).items():
+            part = self.scene.meshes[name]
+            base = torch.from_numpy(part.to_world).to(values[f"{name}.x"])
+            foot = torch.from_numpy(_foot(part)).to(base)
+            turn = euler(values[f"{name}.heading"], *base.new_zeros(2))
+            if values[f"{name}.presence"]:
+                turn = AWAY * turn
+            place = base.new_tensor([*stand.place, stand.height])
+            sunk = base.new_tensor([0.0, 0.0, SUNK / self.scene.metres]) * values[f"{name}.presence"]
+            inputs[f"{name}.to_world"] = affine(turn, place - sunk - turn @ foot) @ base
+        return inputs
+
+    def measured(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Value]:
+        """Where each thing stands in the end, as `with` says places."""
+        found: dict[str, Value] = {}
+        for name, stand in self._stands(values, so_far).items():
+            place = (stand.place - middle(self.scene)[:2]) * self.scene.metres
+            found |= {
+                f"{name}.at_{axis}": {"value": float(one), "unit": "metres"}
+                for axis, one in zip("xy", place, strict=True)
+            }
+        return found
+
+    def _stands(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Stand]:
+        """Where the things that move stand, by name; without derivatives."""
+        scene, metres = self.scene, self.scene.metres
+        thing = _footprint(scene, OBJECT, so_far)
+        camera = so_far.get("camera.to_world")
+        eye = (camera_to_world(scene) if camera is None else camera.detach().cpu().double().numpy())[:3, 3]
+        middle_of = (thing.outline.min(axis=0) + thing.outline.max(axis=0)) / 2.0
+        free = min(CAMERA / metres, NEAR * float(np.linalg.norm(eye[:2] - middle_of)))
+        around = eye[:2] + free * np.stack([np.cos(EIGHTHS), np.sin(EIGHTHS)], axis=1)
+        others = [thing, Footprint(around, eye[2], eye[2] + free)]
+        others += [_footprint(scene, name, so_far) for name in scene.things if name not in self._moved]
+        found = {}
+        for name in self._moved:
+            x, y, heading, away = (float(values[f"{name}.{one.name}"].detach()) for one in self.parameters)
+            foot, base = _foot(scene.meshes[name]), _footprint(scene, name, so_far)
+            angle = np.radians(heading)
+            turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+            asked = foot[:2] + np.array([x, y]) / metres
+            outline = (base.outline - foot[:2]) @ turn.T
+            lift = foot[2] - ground_height(scene, foot[:2])
+            here = Footprint(outline + asked, base.low, base.high)
+            way = asked - middle_of
+            way = way / np.linalg.norm(way) if way.any() else np.array([1.0, 0.0])
+            pushed = 0.0 if away else _free(here, others, way, GAP / metres)
+            place = asked + pushed * way
+            found[name] = Stand(place, lift + ground_height(scene, place), pushed)
+            if not away:
+                others.append(Footprint(outline + place, base.low, base.high))
+        return found
+
+
+def _foot(part: MeshPart) -> Doubles:
+    """Where a thing is put and turned about, (3,): the middle of its box, at the height of its lowest point."""
+    low, high = part.mesh.vertices.min(axis=0), part.mesh.vertices.max(axis=0)
+    foot = np.array([*(low[:2] + high[:2]) / 2.0, low[2]], np.float64)
+    return np.asarray(part.to_world[:3, :3] @ foot + part.to_world[:3, 3])
+
+
+def _footprint(scene: SceneDescription, name: str, so_far: Mapping[str, Tensor]) -> Footprint:
+    """What a mesh takes up where the controls before have it."""
+    part = scene.meshes[name]
+    pose, offsets = (so_far.get(f"{name}.{one}") for one in ("to_world", "offsets"))
+    if pose is None and offsets is None:
+        return _as_put(part)
+    vertices = part.mesh.vertices + (0.0 if offsets is None else offsets.detach().cpu().double().numpy())
+    matrix = part.to_world if pose is None else pose.detach().cpu().double().numpy()
+    return footprint(vertices @ matrix[:3, :3].T + matrix[:3, 3])
+
+
+@lru_cache(maxsize=256)
+def _as_put(part: MeshPart) -> Footprint:
+    return footprint(standing(part))
+
+
+def _free(one: Footprint, others: Sequence[Footprint], way: Doubles, gap: float) -> float:
+    """How far a thing has to be shifted along a way until it overlaps with no other."""
+    shift = 0.0
+    for begin, end in sorted(blocked(one, other, way) for other in others):
+        if begin < shift < end:
+            shift = end + gap
+    return shift

@@ -1,0 +1,122 @@
+"""Tracks: what a tracker makes of a detector's boxes along a drive, judged by the true box of each frame.
+
+A frame is lost where the object is seen and no track of that frame overlaps its true box; an identity switch is a frame
+whose track has another number than the one before that had the object (as in MOTA, Bernardin and Stiefelhagen 2008).
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+
+Doubles = NDArray[np.float64]
+Step = Callable[[Doubles, Doubles], Sequence[tuple[int, Any]]]
+"""From the boxes (n, 4) of a frame, x0, y0, x1, y1 in pixels, and their scores (n,) to the tracks that are in it: a
+number that stays the same, and a box."""
+Tracker = Callable[[], Step]
+"""Makes a new one for each drive; frames come in their order."""
+
+
+class Frame(NamedTuple):
+    """What a picture of a drive shows (its true box, None where nothing is seen), and what a detector says of it."""
+
+    true: Doubles | None
+    boxes: Doubles
+    scores: Doubles
+
+
+class Tracked(NamedTuple):
+    """Of one drive: the share of frames that are lost, identity switches, and the most lost frames in a row."""
+
+    lost: float
+    switches: int
+    gap: int
+
+
+@dataclass(frozen=True, eq=False)
+class _Track:
+    number: int
+    box: Doubles
+    speed: Doubles
+    missed: int = 0
+
+
+class ConstantVelocity:
+    """A tracker in which boxes go on as they went.
+
+    Boxes are given to the tracks whose predicted boxes they overlap most, all together (Kuhn 1955): first those with a
+    score of `sure`, then the others, which begin no track (Zhang et al. 2022, *ByteTrack*, section 3).
+
+    Args:
+        sure: score of a box that begins a track.
+        overlap: least intersection over union of a box with the predicted one.
+        patience: frames in which a track may be missed; after more it has ended.
+    """
+
+    def __init__(self, sure: float = 0.5, overlap: float = 0.3, patience: int = 3) -> None:
+        self.sure, self.overlap, self.patience = sure, overlap, patience
+        self._tracks: list[_Track] = []
+        self._numbers = itertools.count(1)
+
+    def __call__(self, boxes: Doubles, scores: Doubles) -> list[tuple[int, Doubles]]:
+        """Return the tracks that have a box in this frame."""
+        waiting = [replace(one, box=one.box + one.speed, missed=one.missed + 1) for one in self._tracks]
+        seen, new = list[_Track](), list[Doubles]()
+        for sure in (True, False):
+            left = list(boxes[(scores >= self.sure) == sure])
+            table = np.array([[overlap(one.box, box) for box in left] for one in waiting]).reshape(
+                len(waiting), len(left)
+            )
+            pairs = [(a, b) for a, b in zip(*linear_sum_assignment(-table), strict=True) if table[a, b] >= self.overlap]
+            for a, b in pairs:
+                before = waiting[a].box - waiting[a].speed * waiting[a].missed
+                seen.append(_Track(waiting[a].number, left[b], (left[b] - before) / waiting[a].missed))
+            taken, found = {a for a, _ in pairs}, {b for _, b in pairs}
+            waiting = [one for number, one in enumerate(waiting) if number not in taken]
+            new += [box for number, box in enumerate(left) if number not in found and sure]
+        seen += [_Track(next(self._numbers), box, np.zeros(4)) for box in new]
+        self._tracks = [*seen, *(one for one in waiting if one.missed <= self.patience)]
+        return [(one.number, one.box) for one in seen]
+
+
+def overlap(one: Sequence[float] | Doubles, other: Sequence[float] | Doubles) -> float:
+    """Return intersection over union of two boxes."""
+    one, other = np.asarray(one, dtype=float), np.asarray(other, dtype=float)
+    sides = np.minimum(one[2:], other[2:]) - np.maximum(one[:2], other[:2])
+    common = float(sides.clip(0.0).prod())
+    areas = sum(float((box[2:] - box[:2]).clip(0.0).prod()) for box in (one, other))
+    return common / max(areas - common, 1e-12)
+
+
+def frame_of(payload: Any, names: Collection[str]) -> Frame:
+    """Return what the payload of a detection's row says of boxes with some names."""
+    found = [one for one in payload["found"] if one["label"] in names]
+    boxes = np.array([one["box"] for one in found], dtype=float).reshape(-1, 4)
+    true = payload["box"]
+    return Frame(
+        None if true is None else np.array(true, dtype=float), boxes, np.array([one["score"] for one in found])
+    )
+
+
+def tracked(frames: Sequence[Frame], tracker: Tracker, iou: float) -> Tracked:
+    """Return what a tracker makes of a drive; a track is on the object where it overlaps the true box by `iou`."""
+    step, last = tracker(), None
+    lost, switches = list[bool](), 0
+    for true, boxes, scores in frames:
+        tracks = step(boxes, scores)
+        each = [] if true is None else [(overlap(true, box), number) for number, box in tracks]
+        on = [one for one in each if one[0] >= iou]
+        lost.append(true is not None and not on)
+        if on:
+            number = last if any(number == last for _, number in on) else max(on)[1]
+            switches += last is not None and number != last
+            last = number
+    gaps = [sum(run) for is_lost, run in itertools.groupby(lost) if is_lost]
+    seen = sum(true is not None for true, _, _ in frames)
+    return Tracked(sum(lost) / max(1, seen), switches, max(gaps, default=0))

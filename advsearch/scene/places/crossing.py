@@ -1,0 +1,121 @@
+"""A crossing: the avenue with another one across it, zebras and a stop sign. Lengths are metres.
+
+The object stands at the origin as at the stop line, and the other street is `AHEAD` of it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from advsearch.scene.geometry import rotation
+from advsearch.scene.library import load_object
+from advsearch.scene.parts import MeshPart, mesh_part
+from advsearch.scene.places import avenue, paint, road
+from advsearch.scene.places.avenue import END, KERB, Plan, Tree, asphalt, painted, street
+from advsearch.scene.places.houses import DEPTH
+from advsearch.scene.places.paint import BAY, FRONTS
+from advsearch.scene.places.quads import Frame, Quads
+
+AHEAD = 14.0
+"""x of the middle of the other street, which is as wide."""
+MIDDLE = sum(road.KERBS) / 2.0
+NEAR, FAR = AHEAD + MIDDLE - road.KERBS[1], AHEAD + MIDDLE - road.KERBS[0]
+"""x of its kerbs."""
+WEST, EAST = AHEAD + MIDDLE - FRONTS[1], AHEAD + MIDDLE - FRONTS[0]
+"""x of its fronts."""
+SIDE_END = 64.0
+STOP, ZEBRA = (3.6, 4.0), (4.9, 7.9)
+"""x of the stop line and of the zebra across the lane ahead."""
+STRIPE = 0.5
+SIGN = (4.4, -2.95)
+SIGN_LOW = 1.5
+"""Of the bundled stop sign's lower end over the pavement, on a post."""
+
+
+def crossing(metres: float, candelas: float | None, *, wet: bool, dark: bool) -> tuple[MeshPart, ...]:
+    """Return the meshes of the crossing; arguments as of `avenue.built`."""
+    return avenue.built(CROSSING, metres, candelas, wet=wet, dark=dark)
+
+
+def _ground() -> Quads:
+    quads, side = Quads(), Quads()
+    (right, left), (low, high) = road.KERBS, FRONTS
+    street(quads, -END, STOP[0] - 0.4)
+    street(quads, STOP[0] - 0.4, NEAR, marked=False)
+    street(quads, FAR, FAR + 5.0, marked=False)
+    street(quads, FAR + 5.0, END)
+    avenue.closed(quads)
+    asphalt(quads, (NEAR, FAR), (low, high))
+    for x, turn in ((NEAR, 1), (FAR, -1)):  # kerbs of the other street at the corners
+        for y0, y1 in ((low, right), (left, high)):
+            corners = np.array([[(x, y0, 0.0), (x, y1, 0.0), (x, y1, KERB), (x, y0, KERB)]])
+            v = (right - 0.1 - low) / (high - low) + np.zeros(4)
+            uvs = np.stack([np.array([y0, y1, y1, y0]) / paint.GROUND_PERIOD, v], axis=-1)[None]
+            quads.add(corners[:, ::turn], uvs[:, ::turn])
+    for begin, end in ((-SIDE_END, low), (high, SIDE_END)):  # the other street, as if it ran along x
+        street(side, begin, end)
+    for corners, uvs, normals in zip(side.corners, side.uvs, side.normals, strict=True):
+        x, y, z = np.moveaxis(corners, -1, 0)
+        quads.add(np.stack([AHEAD + MIDDLE - y, x, z], axis=-1), uvs, normals)
+    painted(quads, STOP, (right + 0.6, MIDDLE - 0.2))
+    painted(quads, (FAR + 4.0, FAR + 4.4), (MIDDLE + 0.2, left - 0.6))
+    for first in (ZEBRA[0], FAR + 0.9):
+        for y in np.arange(right + 0.55, left - STRIPE, 2.0 * STRIPE):
+            painted(quads, (first, first + ZEBRA[1] - ZEBRA[0]), (y, y + STRIPE))
+    for begin in (left + 0.9, right - 3.9):
+        for x in np.arange(NEAR + 0.55, FAR - STRIPE, 2.0 * STRIPE):
+            painted(quads, (x, x + STRIPE), (begin, begin + 3.0))
+    return quads
+
+
+def _sign(metres: float) -> tuple[MeshPart, ...]:
+    asset, post = load_object("stop-sign"), Quads()
+    assert asset.metres is not None
+    foot, low = np.array([*SIGN, KERB]), np.array([*SIGN, KERB + SIGN_LOW])
+    avenue.limb(post, foot, low + np.array([0.0, 0.0, 0.1]), 0.035, 0.035, 10)
+    place = np.eye(4)
+    place[:3, :3] = asset.metres / metres * rotation(180.0, 0.0, 0.0)
+    place[:3, 3] = low / metres
+    sign = mesh_part("sign", asset, place, asset.material)
+    grey = np.full((2, 2, 3), 0.45, np.float32)
+    return replace(sign, laid=True), MeshPart("sign-post", post.mesh(metres), grey, avenue.IRON, laid=True)
+
+
+def _fronts() -> tuple[tuple[Frame, float, float, int], ...]:
+    """Rows that begin and end with whole houses at the corners."""
+
+    def row(length: float) -> float:
+        return BAY * int(length / BAY) + 0.01
+
+    long, west, east = row(END - EAST), row(END + WEST), row(SIDE_END - FRONTS[1] - DEPTH)
+    (low, high), side = FRONTS, row(SIDE_END + FRONTS[0] - DEPTH)
+    right, left = Frame((0.0, low, KERB), (0.0, 1.0, 0.0)), Frame((0.0, high, KERB), (0.0, -1.0, 0.0))
+    facing_east, facing_west = Frame((WEST, 0.0, KERB), (1.0, 0.0, 0.0)), Frame((EAST, 0.0, KERB), (-1.0, 0.0, 0.0))
+    return (
+        (right, -WEST, -WEST + west, 1), (right, -EAST - long, -EAST, 6),
+        (left, WEST - west, WEST, 2), (left, EAST, EAST + long, 7),
+        (facing_east, high + DEPTH, high + DEPTH + east, 8), (facing_east, low - DEPTH - side, low - DEPTH, 9),
+        (facing_west, -high - DEPTH - east, -high - DEPTH, 10), (facing_west, DEPTH - low, DEPTH - low + side, 11),
+        (Frame((AHEAD, SIDE_END - 2.0, KERB), (0.0, -1.0, 0.0)), -20.0, 20.0, 12),
+        (Frame((AHEAD, 2.0 - SIDE_END, KERB), (0.0, 1.0, 0.0)), -20.0, 20.0, 13),
+        *avenue.ends(),
+    )  # fmt: skip
+
+
+def _clear(x: float) -> bool:
+    """Whether the place is beside the street, not in the crossing."""
+    return not WEST - 1.0 < x < EAST + 1.0
+
+
+CROSSING = Plan(
+    _ground,
+    _fronts(),
+    (
+        *(one for one in avenue.trees_along() if _clear(one.x)),
+        *(Tree((NEAR - 2.1, FAR + 2.1)[n % 2], y, n) for n, y in enumerate((24.0, 33.0, 42.0, -19.0, -28.0, -37.0))),
+    ),
+    (*(one for one in avenue.posts_along() if _clear(one[0])), *avenue.posts_along((30.0, -1.0))),
+    _sign,
+)

@@ -1,0 +1,222 @@
+"""A room for what stands on tables: a table, shelves with books, a window and a lamp. Lengths are metres.
+
+The object stands at the origin, on the table. The room is closed: by day light comes from the window, whose pane is
+painted with what is outside and shines, and in the evening from the lamp on the ceiling.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from itertools import pairwise
+
+import numpy as np
+
+from advsearch.scene.assets import Doubles, Floats, Material
+from advsearch.scene.color import linear_to_srgb
+from advsearch.scene.parts import MeshPart
+from advsearch.scene.places.paint import _clouds, _grain, tint
+from advsearch.scene.places.quads import FRONT, SHOWN, Frame, Quads
+from advsearch.scene.places.road import FLOOR
+
+LOW, HIGH = (-1.75, -2.0, -0.75), (2.6, 1.9, 1.85)
+"""Corners of the room."""
+TABLE, THICK = ((-0.45, 0.45), (-0.8, 0.8)), 0.035
+"""From and to in x and y of its top, which is at height 0."""
+CASE, BOARDS = ((-1.75, -1.46), (-1.5, 1.1)), (-0.69, -0.33, 0.03, 0.39, 0.75, 1.11)
+"""From and to in x and y of the shelves at the wall, and the heights of their boards."""
+WINDOW = ((-0.9, 1.5), (0.12, 1.5))
+"""From and to in x and z, in the wall at the largest y."""
+REVEAL, LAMP = 0.16, 0.24
+"""How far the pane stands back, and half a side of the lamp."""
+DAY, NIGHT, SHADE = 2600.0, 0.6, 4200.0
+"""Luminance of the sky in the window by day and by night, and of the lamp, cd/m2."""
+USUAL = 1000.0
+"""Luminance of a radiance of 1, cd/m2, where the light has no unit."""
+
+STRIP, TEXEL, COLUMNS = 0.5, 0.0125, 96
+"""How high each strip of the texture is, how large a texel, and how many there are along a strip of 1.2 m."""
+LONG = TEXEL * COLUMNS
+PLANKS, PLASTER, OAK, WHITE, SOCKET = range(5)
+COLORS = (
+    (0.20, 0.115, 0.062), (0.62, 0.58, 0.51), (0.34, 0.19, 0.095), (0.66, 0.65, 0.62), (0.09, 0.09, 0.09),
+    (0.32, 0.05, 0.04), (0.05, 0.11, 0.24), (0.07, 0.17, 0.10), (0.42, 0.30, 0.09), (0.50, 0.46, 0.38),
+    (0.10, 0.07, 0.05), (0.22, 0.26, 0.30), (0.36, 0.16, 0.07),
+)  # fmt: skip
+"""Linear reflectance; behind the first five, of books."""
+BOOKS = tuple(range(5, len(COLORS)))
+MATT, VARNISH = Material(roughness=0.8, specular=0.3), Material(roughness=0.35, specular=0.45)
+
+
+@lru_cache(maxsize=4)
+def room(metres: float, candelas: float | None, *, wet: bool, dark: bool) -> tuple[MeshPart, ...]:
+    """Return the meshes of the room; arguments as of `avenue.built`. It is never wet."""
+    unit, texture = np.float32(candelas or USUAL), _texture()
+    lamp = np.array((1.0, 0.82, 0.56), np.float32) * np.float32(SHADE if dark else 0.0) / unit
+    outside = _outside() * np.float32(NIGHT if dark else DAY) / unit
+    black, white = np.full((2, 2, 3), 0.02, np.float32), np.full((2, 2, 3), 0.8, np.float32)
+    made = (
+        (FLOOR, _ground(), texture, VARNISH, None),
+        ("walls", _walls(), texture, MATT, None),
+        ("furniture", _furniture(), texture, VARNISH, None),
+        ("books", _books(), texture, MATT, None),
+        ("window", _pane(), black, VARNISH, outside),
+        ("lamp", _lamp(), white, MATT, lamp[None, None] if dark else None),
+    )
+    return tuple(
+        MeshPart(name, quads.mesh(metres), base, finish, emission=shine, laid=True)
+        for name, quads, base, finish, shine in made
+    )
+
+
+def _texture() -> Floats:
+    """All strips, row 0 at v = 1: (h, w, 3) display-referred multiples of 1/255."""
+    rows = round(STRIP / TEXEL)
+    fine, cloud = _grain(rows * len(COLORS), COLUMNS, 700), _clouds(rows * len(COLORS), COLUMNS, 16, 701)
+    strips = []
+    for number, color in enumerate(COLORS):
+        part = slice(rows * number, rows * (number + 1))
+        tone = 1.0 + 0.05 * fine[part] + 0.04 * cloud[part]
+        if number in (PLANKS, OAK):  # grain along the strip
+            tone = tone + 0.10 * np.repeat(cloud[part][:, :1] + 0.6 * fine[part][:, :1], COLUMNS, axis=1)
+        if number == PLANKS:
+            board = np.arange(rows) // 10
+            shade = np.random.Generator(np.random.PCG64(702)).uniform(0.75, 1.2, (rows // 10, 2))
+            halves = (np.arange(COLUMNS)[None] + 37 * board[:, None]) % COLUMNS
+            tone = tone * shade[board[:, None], (halves >= COLUMNS // 2).astype(np.int64)]
+            joint = (np.arange(rows) % 10 == 0)[:, None] | np.isin(halves, (0, COLUMNS // 2))
+            tone = np.where(joint, 0.55 * tone, tone)
+        strips.append(tint(color) * tone[..., None])
+    shown = linear_to_srgb(np.clip(np.concatenate(strips), 0.004, 0.9).astype(np.float32)[::-1])
+    return np.asarray(np.round(shown * np.float32(255.0)) / np.float32(255.0), np.float32)
+
+
+def _outside() -> Floats:
+    """What is seen through the window, 1 for the sky, row 0 above: sky, trees and a lawn behind glazing bars."""
+    wide, high = 400, 240
+    u, v = np.meshgrid((np.arange(wide) + 0.5) / wide, 1.0 - (np.arange(high) + 0.5) / high)
+    cloud = _clouds(high, wide, 48, 704).astype(np.float64)
+    sky = np.array([0.80, 0.92, 1.0]) * (0.8 + 0.35 * v + 0.08 * cloud)[..., None]
+    trees = 0.34 + 0.09 * cloud[:1] + 0.04 * np.sin(9.0 * u)
+    green = np.array([0.09, 0.13, 0.055]) * (np.where(v < 0.16, 1.8, 0.75) * (1.0 + 0.4 * cloud))[..., None]
+    return np.asarray(np.where((v < trees)[..., None], green, sky), np.float32)
+
+
+def _rows(strip: int, low: Doubles | float, high: Doubles | float) -> tuple[Doubles, Doubles]:
+    """v of the lower and the upper edge of something that shows a strip, which is only so high."""
+    first = STRIP * strip + 0.02
+    reach = np.minimum(np.asarray(high) - np.asarray(low), STRIP - 0.04)
+    return first / (STRIP * len(COLORS)) + 0.0 * reach, (first + reach) / (STRIP * len(COLORS))
+
+
+def _block(quads: Quads, x: tuple[float, float], y: tuple[float, float], z: tuple[float, float], strip: int) -> None:
+    """Add a box with all its faces."""
+    low, high = _rows(strip, *z)
+    for out, rows in ((-1.0, (*x, -y[1], -y[0], *z)), (1.0, (-x[1], -x[0], y[0], y[1], *z))):
+        box = np.array([rows])
+        uvs = np.array([[rows[0] / LONG, rows[1] / LONG, float(low), float(high)]])
+        quads.boxes(Frame((0.0, 0.0, 0.0), (0.0, out, 0.0)), box, uvs, SHOWN if out < 0.0 else (FRONT,))
+
+
+def _flat(quads: Quads, x: tuple[float, float], y: tuple[float, float], z: float, strip: int, up: int = 1) -> None:
+    """Add a level rectangle that faces up or down, in stripes along y that show the strip over and over."""
+    edges = np.linspace(*x, max(1, round((x[1] - x[0]) / (STRIP - 0.1))) + 1)
+    for x0, x1 in pairwise(edges):
+        corners = np.array([[(x0, y[0], z), (x1, y[0], z), (x1, y[1], z), (x0, y[1], z)]])
+        low, high = _rows(strip, x0, x1)
+        along, across = np.array([y[0], y[0], y[1], y[1]]) / LONG + x0, np.array([low, high, high, low])
+        quads.add(corners[:, ::up], np.stack([along, across], axis=-1)[None, ::up])
+
+
+def _ground() -> Quads:
+    quads = Quads()
+    _flat(quads, (LOW[0], HIGH[0]), (LOW[1], HIGH[1]), LOW[2], PLANKS)
+    _flat(quads, *TABLE, 0.0, OAK)
+    return quads
+
+
+def _walls() -> Quads:
+    quads = Quads()
+    _flat(quads, (LOW[0], HIGH[0]), (LOW[1], HIGH[1]), HIGH[2], WHITE, -1)
+    (left, right), (sill, head) = WINDOW
+
+    def wall(
+        frame: Frame, rows: list[tuple[float, float, float, float]], strip: int = PLASTER, out: float = 0.0
+    ) -> None:
+        given = np.array(rows)
+        uvs = np.column_stack([given[:, 0] / LONG, given[:, 1] / LONG, *_rows(strip, given[:, 2], given[:, 3])])
+        quads.wall(frame, given, out, uvs)
+
+    heights = (LOW[2], HIGH[2])
+    sides = (
+        (Frame((LOW[0], 0.0, 0.0), (1.0, 0.0, 0.0)), LOW[1], HIGH[1]),
+        (Frame((HIGH[0], 0.0, 0.0), (-1.0, 0.0, 0.0)), -HIGH[1], -LOW[1]),
+        (Frame((0.0, LOW[1], 0.0), (0.0, 1.0, 0.0)), -HIGH[0], -LOW[0]),
+    )
+    for frame, begin, end in sides:
+        wall(frame, [(begin, end, *heights)])
+    lit = Frame((0.0, HIGH[1], 0.0), (0.0, -1.0, 0.0))
+    wall(
+        lit,
+        [
+            (LOW[0], left, *heights), (right, HIGH[0], *heights), (left, right, LOW[2], sill),
+            (left, right, head, HIGH[2]),
+        ],
+    )  # fmt: skip
+    for frame, begin, end in (*sides, (lit, LOW[0], HIGH[0])):  # skirting boards
+        uvs = np.array([[begin / LONG, end / LONG, *map(float, _rows(WHITE, 0.0, 0.09))]])
+        quads.boxes(frame, np.array([[begin, end, 0.0, 0.015, LOW[2], LOW[2] + 0.09]]), uvs)
+    back = HIGH[1] + REVEAL
+    _block(quads, (left - 0.05, right + 0.05), (HIGH[1] - 0.12, back), (sill - 0.03, sill), WHITE)
+    _block(quads, (left - 0.02, right + 0.02), (HIGH[1], back), (head, head + 0.03), WHITE)
+    for x in (left, right):
+        _block(quads, (x - 0.03, x) if x == left else (x, x + 0.03), (HIGH[1], back), (sill, head), WHITE)
+    for x in np.linspace(left, right, 4):
+        _block(quads, (x - 0.025, x + 0.025), (back - 0.05, back - 0.01), (sill, head), WHITE)
+    for z in (sill, head - 0.4, head):
+        _block(quads, (left, right), (back - 0.045, back - 0.015), (z - 0.025, z + 0.025), WHITE)
+    return quads
+
+
+def _furniture() -> Quads:
+    quads, ((x0, x1), (y0, y1)) = Quads(), TABLE
+    under = 0.001
+    _block(quads, (x0, x1), (y0, y1), (-THICK, -under), OAK)  # the top itself is what things stand on
+    for x in (x0 + 0.04, x1 - 0.1):
+        for y in (y0 + 0.04, y1 - 0.1):
+            _block(quads, (x, x + 0.06), (y, y + 0.06), (LOW[2], -THICK), OAK)
+    for y in (y0 + 0.05, y1 - 0.075):
+        _block(quads, (x0 + 0.1, x1 - 0.1), (y, y + 0.025), (-THICK - 0.09, -THICK), OAK)
+    (back, front), (begin, end) = CASE
+    for z in BOARDS:
+        _block(quads, (back, front), (begin, end), (z - 0.025, z), WHITE)
+    for y in (begin - 0.025, (begin + end) / 2.0 - 0.0125, end):
+        _block(quads, (back, front), (y, y + 0.025), (LOW[2], BOARDS[-1]), WHITE)
+    _block(quads, (back, back + 0.01), (begin, end), (LOW[2], BOARDS[-1]), WHITE)
+    return quads
+
+
+def _books() -> Quads:
+    quads, rng = Quads(), np.random.Generator(np.random.PCG64(703))
+    (_, front), (begin, end) = CASE
+    halves = ((begin + 0.02, (begin + end) / 2.0 - 0.03), ((begin + end) / 2.0 + 0.03, end - 0.02))
+    for z in BOARDS[:-1]:
+        for first, last in halves:
+            y, stop = first, last - rng.uniform(0.0, 0.45)
+            while y < stop - 0.05:
+                wide, high, deep = rng.uniform(0.018, 0.05), rng.uniform(0.19, 0.30), rng.uniform(0.15, 0.23)
+                _block(quads, (front - 0.03 - deep, front - 0.03), (y, y + wide), (z, z + high), int(rng.choice(BOOKS)))
+                y += wide + 0.002
+    return quads
+
+
+def _pane() -> Quads:
+    quads, ((left, right), (low, high)) = Quads(), WINDOW
+    frame = Frame((0.0, HIGH[1] + REVEAL, 0.0), (0.0, -1.0, 0.0))
+    quads.wall(frame, np.array([[left, right, low, high]]), 0.0, np.array([[0.0, 1.0, 0.0, 1.0]]))
+    return quads
+
+
+def _lamp() -> Quads:
+    quads, z = Quads(), HIGH[2] - 0.06
+    _flat(quads, (0.3 - LAMP, 0.3 + LAMP), (-LAMP, LAMP), z, WHITE, -1)
+    return quads

@@ -1,0 +1,190 @@
+"""The `things` control: what it moves, that nothing stands in anything else, and that what is away is not there."""
+
+from __future__ import annotations
+
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import advsearch
+from advsearch.controls import Space, compose, make_control, make_space
+from advsearch.errors import InputError, UnknownNameError
+from advsearch.questions.sweep.axes import on_grid, read_axes
+from advsearch.scene.assembly import Assembly
+from advsearch.scene.description import SceneDescription, describe
+from advsearch.scene.things import Footprint, footprint, overlapping
+
+pytestmark = pytest.mark.usefixtures("two_threads")
+
+THINGS = "chair@4,0,size=1; stop-sign@4.5,2; car@-6,0.5,heading=30"
+CLOSE = 2e-4
+"""Of float32 vertices some 5 object sizes away, in metres."""
+
+
+@pytest.fixture(scope="module")
+def scene() -> SceneDescription:
+    return describe("car", things=THINGS, given={"camera.distance": 9.0})
+
+
+def space_of(scene: SceneDescription, settings: dict[str, Any] | None = None, **others: Any) -> Space:
+    controls = [make_control("things", settings), *(make_control(name, given) for name, given in others.items())]
+    return make_space(controls, scene)
+
+
+def vertices(space: Space, u: torch.Tensor, name: str) -> np.ndarray:
+    """Where a mesh is, metres."""
+    assert space.scene is not None
+    assembly = Assembly(space.scene)
+    placed = assembly(space.inputs(u)).get(f"{name}.vertices")
+    placed = assembly.meshes[name].place(None, None)[0] if placed is None else placed
+    return np.asarray(placed.double().numpy()) * space.scene.metres
+
+
+def at(space: Space, **values: float) -> torch.Tensor:
+    """The configuration with some values (x of the chair is `chair_x`), and others at the start."""
+    u = space.start.clone()
+    for group in space.groups:
+        _, thing, parameter = group.name.split(".")
+        if (value := values.get(f"{thing.replace('-', '_')}_{parameter}")) is not None:
+            span = 360.0 if parameter == "heading" else 4.0
+            u[group.begin] = 0.5 + value / span
+    return u
+
+
+def test_at_its_start_all_stands_where_it_was_put(scene: SceneDescription) -> None:
+    space = space_of(scene)
+    assert [group.name.partition(".")[2] for group in space.groups] == [
+        f"{thing}.{parameter}" for thing in ("chair", "stop-sign", "car") for parameter in ("x", "y", "heading")
+    ]
+    for name in scene.things:
+        before = Assembly(scene).meshes[name].place(None, None)[0].double().numpy() * scene.metres
+        np.testing.assert_allclose(vertices(space, space.start, name), before, atol=CLOSE)
+
+
+def test_a_thing_is_moved_in_metres_and_turned_about_the_place_where_it_was_put(scene: SceneDescription) -> None:
+    space = space_of(scene)
+    put = vertices(space, space.start, "stop-sign")
+    moved = vertices(space, at(space, stop_sign_x=1.5, stop_sign_y=-0.5), "stop-sign")
+    np.testing.assert_allclose(moved - put, np.tile([1.5, -0.5, 0.0], (len(put), 1)), atol=CLOSE)
+    turned = vertices(space, at(space, stop_sign_heading=90.0), "stop-sign")
+    foot = np.array([*(put.min(axis=0) + put.max(axis=0))[:2] / 2.0, 0.0])
+    np.testing.assert_allclose(turned - foot, (put - foot) @ [[0, 1, 0], [-1, 0, 0], [0, 0, 1]], atol=CLOSE)
+
+
+def test_where_it_stands_is_said_as_things_are_asked_for(scene: SceneDescription) -> None:
+    space = space_of(scene)
+    u = at(space, chair_x=-2.0, chair_heading=40.0)  # into the car
+    said = space.describe(u)
+    x, y = (said[f"things.chair.at_{axis}"]["value"] for axis in "xy")
+    assert said["things.chair.x"]["value"] == -2.0 and float(x) > 2.3
+    again = describe("car", things=f"chair@{x},{y},size=1,heading=40", given={"camera.distance": 9.0})
+    placed = Assembly(again).meshes["chair"].place(None, None)[0].double().numpy() * again.metres
+    np.testing.assert_allclose(vertices(space, u, "chair"), placed, atol=5e-3)  # the car's middle is not its box's foot
+
+
+def test_nothing_stands_in_anything_else(scene: SceneDescription) -> None:
+    space = space_of(scene, {"x": [-7.0, 7.0], "y": [-3.0, 3.0], "heading": [-180.0, 180.0]})
+    pushed = 0
+    for seed in range(60):
+        u = torch.rand(len(space.start), generator=torch.Generator().manual_seed(seed))
+        prints = {name: footprint(vertices(space, u, name)) for name in ("object", *scene.things)}
+        assert not any(overlapping(prints[one], prints[other]) for one, other in combinations(prints, 2)), seed
+        assert torch.equal(space.inputs(u)["car.to_world"], space.inputs(u.clone())["car.to_world"])
+        said = {name: float(one["value"]) for name, one in space.describe(u).items()}
+        put = {"chair": 4.0, "stop-sign": 4.5, "car": -6.0}
+        pushed += any(abs(said[f"things.{one}.at_x"] - said[f"things.{one}.x"] - x) > 1e-3 for one, x in put.items())
+    assert 10 < pushed < 50
+
+
+def test_it_is_moved_no_farther_than_it_takes(scene: SceneDescription) -> None:
+    space = space_of(scene)
+    placed = footprint(vertices(space, at(space, chair_x=-2.0), "chair"))
+    car = footprint(vertices(space, space.start, "object"))
+    nearer = Footprint(placed.outline - [0.02, 0.0], placed.low, placed.high)
+    assert overlapping(nearer, car) and not overlapping(placed, car)
+
+
+def test_the_object_and_other_things_may_be_moved_by_other_controls(scene: SceneDescription) -> None:
+    object_moves = {"x": [0.3, 0.9]}
+    others: dict[str, Any] = {"pose": object_moves, "pose:chair": {"y": [-0.6, 0.6]}}
+    space = space_of(scene, {"stop-sign.x": [-2, 2], "stop-sign.y": [-2, 2]}, **others)
+    for seed in range(20):
+        u = torch.rand(len(space.start), generator=torch.Generator().manual_seed(seed))
+        prints = {name: footprint(vertices(space, u, name)) for name in ("object", "chair", "stop-sign")}
+        assert not any(overlapping(prints["stop-sign"], prints[other]) for other in ("object", "chair"))
+    with pytest.raises(InputError, match=r"two controls set chair.to_world, pose:chair and things"):
+        space_of(scene, **{"pose:chair": {"y": [0.0, 1.0]}}).inputs(torch.full((10,), 0.5))
+
+
+def test_nothing_stands_where_the_camera_is() -> None:
+    scene = describe(
+        "car", things="car@11,5", given={"camera.distance": 11.0, "camera.azimuth": 0.0, "camera.elevation": 3.0}
+    )
+    space = space_of(scene, {"y": [-5.0, 0.0]})
+    placed = footprint(vertices(space, torch.tensor([0.0]), "car"))
+    assert placed.outline[:, 0].min() > 11.0 and np.abs(placed.outline[:, 1].mean()) < 0.2
+
+
+def test_on_a_pavement_it_stands_as_high_as_that() -> None:
+    scene = describe("car", "avenue", things="person@6,-1")
+    space = space_of(scene, {"y": [-3.0, 0.0]})
+    low = [vertices(space, torch.tensor([share]), "person")[:, 2].min() for share in (1.0, 0.0)]
+    assert low == pytest.approx([0.0, 0.12], abs=CLOSE)
+
+
+def test_what_is_away_is_neither_seen_nor_in_the_way_and_throws_no_shadow() -> None:
+    settings = {"camera.distance": 6.0, "camera.azimuth": 20.0, "camera.elevation": 25.0}
+    pictures = []
+    for things, control in (("chair@2.6,1.2,size=1.4", {"presence": ["there", "away"]}), (None, None)):
+        loaded = advsearch.load_scene("car", "noon", things=things, settings=settings)
+        chosen = {"things": control} if control else {"camera": {"roll": [-1.0, 1.0]}}
+        render = loaded.renderer(chosen, resolution=48, denoise="none")
+        with torch.no_grad():
+            pictures += [render(torch.tensor([share]), 0, 64) for share in ((0.25, 0.75) if control else (0.5,))]
+            seen = [set(render.surfaces(torch.tensor([share])).names) for share in (0.25, 0.75)]
+    there, away, without = pictures
+    assert 8.0 * float((away - without).abs().mean()) < float((there - without).abs().mean())  # the rest is noise
+    assert "chair" not in seen[0]
+    scene = describe("car", things="chair@4,0,size=1; stop-sign@4,2")
+    space = make_space(
+        [make_control("things", {"chair.presence": ["there", "away"], "stop-sign.y": [-2, -1.99]})], scene
+    )
+    x = [float(space.describe(torch.tensor([share, 0.0]))["things.stop-sign.at_x"]["value"]) for share in (0.2, 0.8)]
+    assert x[0] > 4.2 and x[1] == 4.0
+
+
+def test_a_setting_is_for_all_things_or_for_one(scene: SceneDescription) -> None:
+    space = space_of(scene, {"x": [0.0, 1.0], "chair.x": [3.0, 4.0], "car.x": 0.5})
+    assert [group.name for group in space.groups] == ["things.chair.x", "things.stop-sign.x"]
+    said = space.describe(torch.tensor([0.5, 0.5]))
+    assert (said["things.chair.x"]["value"], said["things.stop-sign.x"]["value"]) == (3.5, 0.5)
+    assert said["things.car.at_x"]["value"] == pytest.approx(-5.5)
+    one = compose([make_control("things.chair.heading")], scene)
+    assert [group.name for group in one.groups] == ["things.chair.heading"]
+    assert one.inputs(one.start).keys() == {"chair.to_world"}
+
+
+def test_a_grid_may_be_of_one_thing(scene: SceneDescription) -> None:
+    axes = read_axes({"things.chair.heading": "0:315:8", "things.stop-sign.presence": ["there", "away"]}, ())
+    assert [(axis.name, len(axis.values)) for axis in axes] == [
+        ("things.chair.heading", 8),
+        ("things.stop-sign.presence", 2),
+    ]
+    space = make_space(on_grid((), axes, scene), scene)
+    assert [group.name for group in space.groups] == ["things.chair.heading", "things.stop-sign.presence"]
+    with pytest.raises(UnknownNameError, match=r"parameter of control things .chair.hight"):
+        read_axes({"things.chair.hight": "0:1:2"}, ())
+
+
+def test_what_cannot_be_is_refused(scene: SceneDescription) -> None:
+    with pytest.raises(InputError, match="nothing stands beside the object; add `things`"):
+        space_of(describe("car"))
+    with pytest.raises(UnknownNameError, match="chiar"):
+        space_of(scene, {"chiar.x": [0, 1]})
+    with pytest.raises(UnknownNameError, match="hight"):
+        make_control("things", {"chair.hight": [0, 1]})
+    with pytest.raises(InputError, match="chair stands in something else; put it elsewhere"):
+        space_of(describe("car", things="chair@1,0,size=1"))

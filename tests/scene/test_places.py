@@ -1,0 +1,149 @@
+"""The crossing, the car park and the room: places as geometry, made of the avenue's parts or as it is."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from advsearch.engine.loading import load_scene
+from advsearch.scene import library
+from advsearch.scene.description import SceneDescription, describe
+from advsearch.scene.geometry import standing
+from advsearch.scene.grounds import LUMINANCE, enclosed, paved
+from advsearch.scene.places import car_park, crossing, room
+from advsearch.scene.places.avenue import KERB, Plan, lamp_places
+from advsearch.scene.places.road import FLOOR, ROAD
+from advsearch.scene.things import footprint, overlapping
+
+pytestmark = pytest.mark.usefixtures("two_threads")
+
+PLACES = {"crossing": "car", "car-park": "car", "room": "mug"}
+"""Environments, and what stands in them."""
+
+
+def metres(scene: SceneDescription) -> dict[str, np.ndarray]:
+    return {name: standing(part) * scene.metres for name, part in scene.around.items()}
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_a_place_comes_with_its_environment_and_its_faces_look_outwards(place: str) -> None:
+    scene = describe(PLACES[place], place)
+    assert all(part.laid for part in scene.around.values()) and paved(scene) and enclosed(scene)
+    assert not describe(PLACES[place], place, given={"ground.size": 0.0}).around
+    for name, part in scene.around.items():
+        if name == "sign":  # a bundled object
+            continue
+        corners = part.mesh.vertices.astype(np.float64)[part.mesh.faces]
+        faces = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        agree = (faces * part.mesh.normals[part.mesh.faces].mean(axis=1)).sum(axis=1) >= 0.0
+        assert agree.mean() > 0.97, name
+        assert np.isfinite(part.mesh.uvs).all() and part.base_color.min() >= 0.0 and part.base_color.max() <= 1.0
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_nothing_stands_where_the_object_is(place: str) -> None:
+    scene = describe(PLACES[place], place)
+    thing, low = footprint(scene.base_vertices * scene.metres), -0.001
+    ground = (ROAD, FLOOR, "plain")
+    for name, part in scene.around.items():
+        if name in ground:
+            continue
+        corners = (standing(part) * scene.metres)[part.mesh.faces.astype(np.int64)]
+        near = (corners.min(axis=1)[:, :2] < thing.outline.max(axis=0)) & (
+            corners.max(axis=1)[:, :2] > thing.outline.min(axis=0)
+        )
+        upright = (corners[..., 2].max(axis=1) > 0.01) & (corners[..., 2].min(axis=1) < thing.high)
+        assert not (near.all(axis=1) & upright).any() or name in ("walls", "lamp", "trees"), name
+    assert low < thing.low < 0.01
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_below_the_horizon_there_is_ground_all_around(place: str) -> None:
+    given = {"camera.height": 0.3 if place == "room" else 1.6, "camera.distance": 0.5 if place == "room" else 8.0}
+    scene = load_scene(PLACES[place], place, settings=given, camera="equirectangular")
+    renderer = scene.renderer(["pose"], resolution=(32, 64), denoise="none")
+    seen = renderer.surfaces(renderer.start)
+    assert not bool((seen.id[17:] == 0).any()), "the environment is seen below the horizon"
+    if place == "room":
+        assert not bool((seen.id == 0).any()), "the room has a hole"
+        assert float(seen.depth.max()) < 5.0
+
+
+@pytest.mark.parametrize("plan", [crossing.CROSSING, car_park.CAR_PARK])
+def test_posts_and_trees_stand_on_pavements_or_between_bays(plan: Plan) -> None:
+    lamps = lamp_places(plan.posts)
+    assert (np.hypot(lamps[:, 0], lamps[:, 1]) > 4.0).all()
+    if plan is crossing.CROSSING:
+        places = [(one.x, one.y) for one in plan.trees] + [(x, y) for x, y, _ in plan.posts]
+        for x, y in places:
+            in_street = -2.3 < y < 5.8 or (crossing.NEAR < x < crossing.FAR and abs(y) < crossing.SIDE_END)
+            assert not in_street, (x, y)
+
+
+def test_the_crossing_has_a_stop_sign_that_faces_who_comes_and_a_zebra_ahead() -> None:
+    scene = describe("car", "crossing")
+    sign = metres(scene)["sign"]
+    assert sign[:, 2].min() == pytest.approx(KERB + crossing.SIGN_LOW, abs=1e-3)
+    assert np.ptp(sign[:, 2]) == pytest.approx(library.load_object("stop-sign").metres, rel=1e-3)
+    own = library.load_object("stop-sign").mesh.vertices
+    turned = scene.around["sign"].to_world[:3, :3] @ [1.0, 0.0, 0.0]
+    assert turned[0] < 0.0 and abs(own[:, 0]).max() < 0.3  # it faces where the object comes from
+    road = metres(scene)[ROAD]
+    paint = road[np.abs(road[:, 2] - 0.004) < 1e-4]
+    zebra = paint[(np.abs(paint[:, 0] - crossing.ZEBRA[0]) < 1e-3) & (paint[:, 1] > -2.0) & (paint[:, 1] < 5.6)]
+    widths = np.diff(np.unique(np.round(zebra[:, 1], 3)))
+    assert len(widths) > 10 and widths == pytest.approx(np.full(len(widths), crossing.STRIPE), abs=1e-3)
+    car = footprint(scene.base_vertices * scene.metres)
+    assert car.outline[:, 0].max() < crossing.STOP[0], "the car is beyond the stop line"
+
+
+def test_a_bay_is_as_large_as_bays_are_and_the_car_is_in_one() -> None:
+    scene = describe("car", "car-park")
+    car = footprint(scene.base_vertices * scene.metres)
+    assert np.abs(car.outline[:, 0]).max() < car_park.DEEP / 2.0 and np.abs(car.outline[:, 1]).max() < 1.2
+    row = min(car_park.ROWS, key=abs)
+    assert row == -car_park.DEEP / 2.0
+    neighbour = describe("car", "car-park", things="car@0,2.5")
+    beside = footprint(standing(neighbour.meshes["car"]) * neighbour.metres)
+    assert not overlapping(car, beside) and not any("stand in" in one for one in neighbour.notes)
+
+
+def test_things_stand_on_the_table_and_beyond_it_on_the_floor() -> None:
+    scene = describe("mug", "room", things="bottle@0.2,0.2; chair@0,1.2")
+    low = {name: float((standing(scene.meshes[name]) * scene.metres)[:, 2].min()) for name in scene.things}
+    assert low == pytest.approx({"bottle": 0.0, "chair": room.LOW[2]}, abs=1e-4)
+    assert describe("mug", "room").meshes["furniture"].laid
+
+
+@pytest.mark.parametrize(
+    ("environment", "shining", "luminance"), [("room", "window", None), ("room-evening", "lamp", room.SHADE)]
+)
+def test_by_day_the_window_lights_the_room_and_in_the_evening_the_lamp(
+    environment: str, shining: str, luminance: float | None
+) -> None:
+    scene = describe("mug", environment)
+    unit = scene.environment
+    assert unit is not None and unit.candelas is not None
+    means = {
+        name: float((part.emission.mean(axis=(0, 1)) @ np.array(LUMINANCE)) * unit.candelas)
+        for name, part in scene.around.items()
+        if part.emission is not None
+    }
+    assert max(means, key=lambda name: means[name]) == shining
+    if luminance is not None:
+        assert means["lamp"] == pytest.approx(0.845 * luminance, rel=0.02)  # of its colour
+    renderer = load_scene("mug", environment, settings={"camera.distance": 0.5}).renderer(["pose"], resolution=24)
+    with torch.no_grad():
+        picture = renderer(renderer.start, 0, 16)
+    assert 0.15 < float(picture.mean()) < 0.75 and float((picture > 0.99).float().mean()) < 0.1
+
+
+@pytest.mark.parametrize("place", ["crossing", "car-park"])
+def test_other_lights_of_a_place_have_the_maps_of_the_avenue(place: str) -> None:
+    for light in ("", "-dusk", "-night"):
+        one, other = library.load_environment(f"{place}{light}"), library.load_environment(f"avenue{light}")
+        assert np.array_equal(one.radiance, other.radiance) and one.candelas == other.candelas
+        assert one.name == f"{place}{light}" and one.ground == place
+    assert describe("car", f"{place}-night").around["street-lamps"].emission is not None
+    assert describe("car", place).around["street-lamps"].emission is None
