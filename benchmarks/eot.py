@@ -1,6 +1,6 @@
 """The protocol of table 2 of Athalye et al. (Synthesizing robust adversarial examples, ICML 2018), with other models.
 
-    python benchmarks/eot.py [--objects 10] [--targets 13] [--trials 100] [--steps 200] [--epsilon 0.3] [--model reference]
+    python benchmarks/eot.py [--objects 10] [--targets 13] [--trials 100] [--steps 200] [--epsilon 0.3] [--model NAME]
 
 For each mesh and each of several targets drawn at random, one texture is searched for that makes the model see the
 target from every camera: the expectation over transformations. It is tried on fresh renders from random cameras. As in
@@ -8,7 +8,7 @@ the paper, *adversariality* is the share of these that are classified as the tar
 classified as the object; means and standard deviations are over all (mesh, target).
 
 What differs: the paper's model is Inception v3 with 1,000 classes, its meshes are others, its budget is a penalty on
-the distance in LAB, and its renderer traces no paths. Here the budget is `--epsilon` (largest change of a colour), model
+the distance in LAB, and its renderer traces no paths. Here the budget is `--epsilon` (most change of a colour), model
 and meshes are the bundled ones, unless you name a model, and cameras are drawn from the ranges of the control `camera`.
 So the numbers stand beside those of the paper (accuracy 68.8 % of the plain meshes; 1.1 % of the adversarial ones, with
 an adversariality of 83.4 %) and do not repeat them.
