@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import torch
 from torch import Tensor, nn
@@ -148,7 +148,7 @@ class Scenes:
         self.labels, self.task, self.spp, self.seed = tuple(labels), task, spp, seed
         description = self.renderer.scene.made[0]
         self.right = find_label_set(label or description.object.label or description.object_name, self.labels)
-        self.space: Any = self.renderer.space
+        self.space = cast("Any", self.renderer.space)
         domain = domain_of(self.space.controls)
         self.us = domain.sample(torch.Generator().manual_seed(seed), count)
         index2label = dict(enumerate(self.labels))
