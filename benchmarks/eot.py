@@ -10,8 +10,8 @@ classified as the object; means and standard deviations are over all (mesh, targ
 What differs: the paper's model is Inception v3 with 1,000 classes, its meshes are others, its budget is a penalty on
 the distance in LAB, and its renderer traces no paths. Here the budget is `--epsilon` (most change of a colour), model
 and meshes are the bundled ones, unless you name a model, and cameras are drawn from the ranges of the control `camera`.
-So the numbers stand beside those of the paper (accuracy 68.8 % of the plain meshes; 1.1 % of the adversarial ones, with
-an adversariality of 83.4 %) and do not repeat them.
+So the numbers stand beside those of the paper (quoted from memory: accuracy 68.8 % of the plain meshes; 1.1 % of the
+adversarial ones, with an adversariality of 83.4 %) and do not repeat them.
 
 Ten meshes, thirteen targets and 200 steps take hours; `--objects 3 --targets 2 --steps 60 --trials 30` some minutes.
 """
@@ -58,7 +58,7 @@ def main() -> int:
             one, other = ("  ".join(f"{share:5.0%}" for share in pair) for pair in shares)
             print(f"{name:<13} {target:<13} {one:<23} {other}   {result.summary.ending}", flush=True)
     for what, shares in (("plain", plain), ("adversarial", adversarial)):
-        mean, spread = np.nanmean(shares, axis=0), np.nanstd(shares, axis=0)
+        mean, spread = np.nanmean(np.array(shares), axis=0), np.nanstd(np.array(shares), axis=0)
         print(f"{what}: accuracy {mean[0]:.1%} (sd {spread[0]:.1%}), adversariality {mean[1]:.1%} (sd {spread[1]:.1%})")
     print(f"{len(plain)} pairs, {args.trials} trials each, {args.steps} steps, epsilon {args.epsilon:g}, {model.name}")
     return 0

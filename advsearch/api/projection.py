@@ -48,7 +48,7 @@ def write_projection(run: str | Path, out: Path) -> list[str]:
         raise InputError(f"out: {out} is there already; choose another name")
     adversarial = adversarial_of(run)
     slices = adversarial.problem.space.slices(adversarial.u)
-    projectors = [(one, part) for one, part in slices if one.kind == ProjectorControl.kind]
+    projectors = [(one, part) for one, part in slices if isinstance(one, ProjectorControl)]
     if not projectors:
         raise InputError(f"{adversarial.folder}: it has no projector, so that there is nothing to project")
     notes: list[str] = []

@@ -16,7 +16,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 import torch
@@ -60,7 +60,7 @@ class ProjectorControl(NumberControl):
     _later = 0.0
     kind = "projector"
     summary = "A picture that a projector throws onto the object."
-    parameters = (
+    parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter(
             "pattern", (None, None, 3), "sRGB", 0.0, 1.0, "black, or grey",
             "Display-referred texels of the picture, rounded to 8 bits.", search=(0.0, 1.0), estimators=("adjoint",),
@@ -100,7 +100,7 @@ class ProjectorControl(NumberControl):
         Parameter("phase", (), "degrees", -3600.0, 3600.0, 0.0, "Where in its period a flashing light is at the time "
                   "of the picture; up to 180 it is on.", periodic=True),
     )  # fmt: skip
-    choices = (
+    choices: ClassVar[tuple[Choice, ...]] = (
         Choice("resolution", 64, "Rows of texels.", whole=(2, 512)),
         Choice("aspect", 1.0, "Width of the picture over its height.", most=4.0),
         Choice("fov", None, "Angle of the picture's width, degrees; by default it just covers the object.", most=150.0),

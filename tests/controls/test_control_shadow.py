@@ -101,7 +101,8 @@ class Sure(nn.Module):
 
 @pytest.mark.parametrize("control", ["projector", "shadow"])
 def test_light_is_searched_over_cameras_and_environments_and_along_a_path(control: str) -> None:
-    settings: dict[str, Any] = {"projector": {"resolution": 4}, "shadow": {"size": [0, 1]}}[control]
+    given: dict[str, Any] = {"projector": {"resolution": 4}, "shadow": {"size": [0, 1]}}
+    settings = given[control]
     few: dict[str, Any] = {"resolution": 16, "steps": 2, "draws": 2, "trials": 6, "verify_spp": 1, "measure": "no"}
     over = {"camera": {"azimuth": [30, 50]}, "environment": {"rotation": [0, 90]}}
     sure = advsearch.load_model(Sure(), labels=("mug", "glare"), input_size=16, name="sure")
