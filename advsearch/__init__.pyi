@@ -33,7 +33,7 @@ from advsearch.questions.replay.result import ReplayResult
 from advsearch.questions.stability.result import StabilityResult
 from advsearch.questions.sweep.carry_out import AnyScene
 from advsearch.questions.sweep.result import SweepResult as SweepResult
-from advsearch.questions.sweep.tracks import Tracker
+from advsearch.questions.sweep.tracks import Step
 from advsearch.registry import allow_code as allow_code
 from advsearch.tasks import AnyTask
 from advsearch.tasks.base import Task as Task
@@ -448,7 +448,7 @@ def sweep(
     controls: Controls = ...,
     adversarial_of: str | Path | AttackResult | None = ...,
     metrics: Mapping[str, str | Metric] | None = ...,
-    tracker: Tracker | None = ...,
+    tracker: Callable[[], Step] | None = ...,
     run: str | Path | None = ...,
     progress: Watched = ...,
     environment: Path | Names | None = ...,

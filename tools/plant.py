@@ -61,8 +61,8 @@ FAULTS = (
     Fault(
         "scene: the exposure is left out",
         "advsearch/scene/formation.py",
-        "return linear_to_srgb(radiance * self.gain)",
-        "return linear_to_srgb(radiance)",
+        "_Shown.apply(radiance, self.gain)",
+        "_Shown.apply(radiance, 1.0)",
         ("tests/scene/test_renderer.py",),
     ),
     Fault(

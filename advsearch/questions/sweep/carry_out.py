@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -53,7 +53,7 @@ from advsearch.questions.sweep.job import Job, NamedScene, Scenes, check_all, ch
 from advsearch.questions.sweep.loop import carry_out
 from advsearch.questions.sweep.result import SweepResult
 from advsearch.questions.sweep.settings import SweepConfig
-from advsearch.questions.sweep.tracks import Tracker
+from advsearch.questions.sweep.tracks import Step
 from advsearch.runs.directory import CONFIG, RunDirectory, begun, check_free, find_run, is_run, run_path
 from advsearch.runs.listing import finished
 from advsearch.runs.summary import read_configuration
@@ -87,7 +87,7 @@ def sweep(
     controls: Controls = (),
     adversarial_of: str | Path | AttackResult | None = None,
     metrics: Mapping[str, str | Metric] | None = None,
-    tracker: Tracker | None = None,
+    tracker: Callable[[], Step] | None = None,
     run: str | Path | None = None,
     progress: Watched = None,
     **settings: Any,
