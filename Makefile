@@ -19,7 +19,7 @@ SOURCES := advsearch scenes tests benchmarks docs tools
 export TORCH_INDEX
 
 .DEFAULT_GOAL := help
-.PHONY: help setup attack test test-quick test-slow test-zoo fuzz check lint format typecheck docs bench study reference wheel check-wheel clean
+.PHONY: help setup attack test test-quick test-slow test-zoo fuzz check lint format typecheck docs bench study reference wheel check-wheel check-channels docs-versions clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  %-14s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -70,7 +70,7 @@ docs: $(STAMP) ## run what the pages say and build them into build/site; fails o
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 # what compares results and not times, and takes long
-STUDIES := searches every_control rotation close_calls closed_form policies precision kill harden kill_cluster detached sequential verdict_flow over_seeds verdicts drives
+STUDIES := searches every_control rotation close_calls closed_form policies precision kill harden kill_cluster detached sequential verdict_flow over_seeds verdicts drives eot
 
 bench: $(STAMP) ## the benchmarks: ratios against a floor measured in the same run
 	@set -e; for file in $(filter-out $(STUDIES:%=benchmarks/%.py) benchmarks/golden.py benchmarks/matrix.py,$(wildcard benchmarks/[!_]*.py)); do \
@@ -90,6 +90,13 @@ wheel: $(STAMP) ## build the wheel into dist/, with a list of what it was built 
 
 check-wheel: $(STAMP) ## build the wheel, install it in a new environment and use it from another folder
 	@bash tools/check_wheel.sh "$(VENV)"
+
+check-channels: $(STAMP) ## check wheel, Dockerfile and conda recipe by twine, hadolint and rattler-build; says which are missing
+	@bash tools/check_channels.sh "$(VENV)"
+
+docs-versions: $(STAMP) ## build the pages of every tag and of this commit into build/versions
+	@$(BIN)/python -m pip install -qq --disable-pip-version-check --no-build-isolation -c constraints.txt -e '.[docs]'
+	@PATH="$(abspath $(BIN)):$$PATH" bash tools/docs_versions.sh
 
 clean: ## remove .venv, caches and what was built; runs/ stays
 	rm -rf $(VENV) build dist *.egg-info .cache .hypothesis .pytest_cache .mypy_cache .ruff_cache

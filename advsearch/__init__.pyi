@@ -1,6 +1,6 @@
 """Made by tools/stubs.py of the settings of each question."""
 
-from advsearch import controls as controls, losses as losses, testing as testing
+from advsearch import controls as controls, losses as losses, maite as maite, testing as testing
 from advsearch.api.chart import measured_palette as measured_palette
 from advsearch.api.keywords import Names
 from advsearch.api.render import load_model as load_model

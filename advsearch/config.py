@@ -201,7 +201,8 @@ class SceneConfig(Config):
     ask: dict[str, float] = setting(
         dict, "model",
         "a limit for a model behind an address, such as calls=500: calls (2000), tokens and money of a run, seconds of "
-        "an answer (120), and the prices per_call, per_million_in and per_million_out; may be repeated",
+        "an answer (120), requests at_once (4), and the prices per_call, per_million_in and per_million_out; may be "
+        "repeated",
         "LIMIT=NUMBER", metavar="LIMIT=NUMBER", form="assignments",
     )
     task: str | dict[str, JsonValue] = setting(

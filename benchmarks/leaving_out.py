@@ -53,6 +53,7 @@ PAIRS = (
     ("bottle", "noon", "environment"),
     ("mug", "studio", "light"),
     ("mug", "studio", "projector"),
+    ("mug", "low-sun", "shadow"),
     ("bowl", "noon", "camera"),
     ("bottle", "kitchen", "pose"),
 )

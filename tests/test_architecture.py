@@ -87,12 +87,15 @@ RULES = {
     "viewer": Rule({"runs", "report", "config", "settings", "questions"}, {"numpy", "pandas", "PIL"}, HEAVY),
     "rules": Rule({"attacks", "runs"}, {"numpy", "pandas"}, HEAVY),
     "losses": Rule({"attacks", "engine"}, {"torch"}),
+    "maite": Rule({"scene", "models", "tasks", "engine"}, {"torch"}),
     "question": Rule({"runs", "report", "viewer", "api", "settings"}, {"pydantic"}, HEAVY),
     "questions": Rule(None, None, frozenset(RENDERER)),
     "testing": Rule({"questions", "engine", "config"}, set()),
     "api": Rule(None),
     "cli": Rule(None),
-    "": Rule({"api", "attacks", "controls", "engine", "losses", "models", "questions", "tasks", "testing"}, set()),
+    "": Rule(
+        {"api", "attacks", "controls", "engine", "losses", "maite", "models", "questions", "tasks", "testing"}, set()
+    ),
 }
 """As in docs/design.md, "Packages and imports". The empty name is `advsearch/__init__.py`."""
 

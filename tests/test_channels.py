@@ -13,6 +13,8 @@ from pathlib import Path
 import pytest
 import yaml
 
+import advsearch
+
 ROOT = Path(__file__).parents[1]
 ACTION = yaml.safe_load((ROOT / "action.yml").read_text())
 DOCKERFILE = (ROOT / "Dockerfile").read_text()
@@ -69,3 +71,42 @@ def test_container_and_action_install_what_the_set_up_does() -> None:
 def test_the_list_for_programs_names_every_page() -> None:
     listed = re.findall(r"\((docs/[^)]+)\)", (ROOT / "llms.txt").read_text())
     assert sorted(listed) == sorted(str(page.relative_to(ROOT)) for page in (ROOT / "docs").glob("*.md"))
+
+
+ON_CONDA = {"matplotlib": "matplotlib-base", "openexr": "openexr-python", "torch": "pytorch"}
+"""What conda-forge calls a package otherwise."""
+
+
+def test_the_recipe_for_conda_needs_what_the_package_does() -> None:
+    recipe = yaml.safe_load((ROOT / "tools/conda/recipe.yaml").read_text())
+    config = ConfigParser()
+    config.read(ROOT / "setup.cfg")
+    needed = {"libllvm19", f"python {config['options']['python_requires']}"}
+    for line in config["options"]["install_requires"].split():
+        name, bounds = re.fullmatch(r"([\w.-]+)(.*)", line.lower()).groups()  # type: ignore[union-attr]
+        needed.add(f"{ON_CONDA.get(name, name)} {bounds}")
+    assert set(recipe["requirements"]["run"]) == needed
+    assert recipe["about"]["license"] == config["metadata"]["license"]
+    assert recipe["about"]["summary"] == config["metadata"]["description"]
+    assert str(recipe["context"]["version"]) == advsearch.__version__
+
+
+def test_a_tool_that_is_missing_is_named_with_what_installs_it(tmp_path: Path) -> None:
+    (tmp_path / ".venv/bin").mkdir(parents=True)
+    (tmp_path / ".venv/bin/hadolint").write_text("#!/bin/sh\n")
+    (tmp_path / ".venv/bin/hadolint").chmod(0o755)
+    (tmp_path / ".venv/bin/python").write_text("#!/bin/sh\nexit 1\n")
+    (tmp_path / ".venv/bin/python").chmod(0o755)
+
+    def checked() -> subprocess.CompletedProcess[str]:
+        words = ["bash", str(ROOT / "tools/check_channels.sh")]
+        env = {"PATH": "/usr/bin:/bin"}
+        return subprocess.run(words, cwd=tmp_path, env=env, capture_output=True, text=True, check=False)
+
+    done = checked()
+    assert done.returncode == 3 and "wheel: not checked, there is none in dist/: make wheel\n" in done.stdout
+    assert "Dockerfile: good\n" in done.stdout
+    assert "not checked, rattler_build is missing: pip install py-rattler-build\n" in done.stdout
+    (tmp_path / ".venv/bin/hadolint").write_text("#!/bin/sh\nexit 1\n")
+    done = checked()
+    assert done.returncode == 1 and "Dockerfile: hadolint has found faults\n" in done.stdout

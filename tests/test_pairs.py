@@ -124,7 +124,17 @@ def test_a_row_of_a_sweep_is_true_of_its_own_picture(pair: tuple[str, ...], mode
     grid = {} if {"camera", "path"} & set(pair) else GRID
     samples = ROWS // (2 if grid else 1)
     found = advsearch.sweep(
-        scene, model, grid, controls=controls, samples=samples, trials=0, spp=1, denoise="none", seed=3, resolution=SIZE
+        scene,
+        model,
+        grid,
+        controls=controls,
+        samples=samples,
+        trials=0,
+        spp=1,
+        denoise="none",
+        seed=3,
+        resolution=SIZE,
+        label="mug",  # of a person too: the model knows none
     )
     description = framed(scene.description, SIZE)
     drawn = tuple(make_control(kind, given) for kind, given in controls.items())

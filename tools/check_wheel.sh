@@ -5,6 +5,7 @@ set -euo pipefail
 
 builder=$PWD/${1:-.venv}/bin/python
 constraints=$PWD/constraints.txt
+notebook=$PWD/docs/notebook.ipynb
 work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT
 
@@ -13,9 +14,13 @@ rm -rf build
 ls -l "$work"/*.whl
 "$builder" -m venv "$work/venv"
 "$work/venv/bin/python" -m pip install -qq -c "$constraints" pip
-"$work/venv/bin/python" -m pip install -qq -c "$constraints" "$work"/*.whl
 
+# the first cell of the notebook, as somebody runs it who has nothing but the wheel
 cd "$work"
+PIP_CONSTRAINT=$constraints "$work/venv/bin/python" -c 'import json, sys
+cells = json.load(open(sys.argv[1]))["cells"]
+exec(next("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"))' "$notebook"
+
 "$work/venv/bin/advsearch" --help >/dev/null
 "$work/venv/bin/advsearch" doctor
 "$work/venv/bin/advsearch" attack --object mug --control light --steps 2 --trials 6 --resolution 32 --quiet

@@ -43,11 +43,9 @@ def home(name: str, known: dict[str, Any]) -> str:
 
 def text() -> str:
     """Return the file."""
-    imports, functions = (
-        {"import numpy as np", "from advsearch import controls as controls, losses as losses, testing as testing"},
-        [],
-    )
-    for name in sorted(set(advsearch.__all__) - {"controls", "losses", "testing"}):
+    modules = ", ".join(f"{name} as {name}" for name in advsearch._MODULES)  # type: ignore[attr-defined]
+    imports, functions = {"import numpy as np", f"from advsearch import {modules}"}, []
+    for name in sorted({*advsearch.__all__} - {*advsearch._MODULES}):  # type: ignore[attr-defined]
         made = getattr(advsearch, name)
         if not isinstance(getattr(made, "__signature__", None), keywords._Signature):
             imports.add(f"from {made.__module__} import {name} as {name}")

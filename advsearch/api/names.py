@@ -55,6 +55,8 @@ def check_names(config: Config) -> None:
     _check("environment", [one for one in environments if one != "none"], list_environments(), MAP_HINT)
     controls = {**(said.get("controls") or {}), **(said.get("over") or {})}
     kinds = [str((own or {}).get("kind") or name) for name, own in controls.items()]
+    texts = "".join(map(_text, (*_files("controls"), PACKAGE / "scene" / "settings.py")))
+    kinds = [kind for kind in kinds if f'"{kind}"' not in texts]  # of a parameter the registry says whose it is
     _check("control", [re.split(r"[:.]", kind)[0] for kind in kinds if not re.search(r":[A-Z]", kind)], "controls")
     for setting, group in (("policy", "policies"), ("task", "tasks")):
         given = said.get(setting)

@@ -6,7 +6,7 @@ A package outside adds its own (docs/controls/writing.md).
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from importlib import import_module
 from pkgutil import iter_modules
 from typing import Any
@@ -29,6 +29,7 @@ ORDER = (
         "material",
         "light",
         "projector",
+        "spot",
         "shadow",
         "environment",
         "sky",
@@ -88,7 +89,7 @@ def make_control(asked: str, settings: Mapping[str, object] | None = None) -> Co
     options: dict[str, Any] = {name: value for name, value in (settings or {}).items() if value is not None}
     kind, name, parameter = _read_name(asked, options)
     if kind not in CONTROLS:
-        raise UnknownNameError("control", kind, CONTROLS)
+        raise unknown_control(kind)
     control = CONTROLS[kind]
     if parameter is not None:
         options.setdefault(parameter, _default_range(control, parameter))
@@ -99,6 +100,13 @@ def make_control(asked: str, settings: Mapping[str, object] | None = None) -> Co
     if name != kind:
         options["name"] = name
     return control(**options)
+
+
+def unknown_control(kind: str, hint: str = "", instances: Iterable[str] = ()) -> UnknownNameError:
+    """Return the error for a control that there is not; it says of which it is a parameter, or else the hint."""
+    owners = [name for name in CONTROLS if any(one.name == kind for one in CONTROLS[name].parameters)]
+    of = f"It is a parameter: write {' or '.join(f'{name}.{kind}' for name in owners)}." if owners else hint
+    return UnknownNameError("control", kind, {*CONTROLS, *instances}, of)
 
 
 def names_of(asked: str, given: Mapping[str, object]) -> tuple[str, str]:

@@ -260,6 +260,9 @@ class Control(ABC):
     exposure: tuple[float, float] = (0.0, 0.0)
     """Seconds that the shutter is open, and that the rows of a picture are read in; see `advsearch.scene.moments`."""
 
+    flashes: float = 0.0
+    """How often a second it changes its light at most."""
+
     def later(self, seconds: float) -> Control:
         """Return the bound control as it is so many seconds later, where it knows a time; else itself."""
         return self

@@ -209,7 +209,7 @@ class PathControl(NumberControl):
         shortest = min((float(one.times[-1]) for one in self._files), default=self.seconds)
         if len(self._paths) > 1 and shortest < self.seconds:
             wide.append(
-                f"path: the shortest of the files takes {rounded(shortest)} of {rounded(self.seconds)} s; who has "
+                f"path: the shortest of the files takes {rounded(shortest)} s of {rounded(self.seconds)}; who has "
                 "arrived waits, and these frames count"
             )
         return replace(scene, remarks=tuple(dict.fromkeys((*scene.remarks, *wide)))) if wide else scene

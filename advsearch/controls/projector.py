@@ -16,11 +16,12 @@ from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from advsearch.controls.base import NOTHING, WHOLE_RANGE, Budget, Choice, Parameter, Value, change_in_colour
 from advsearch.controls.numbers import NumberControl, Values
@@ -48,15 +49,18 @@ AMBIENT = 100.0
 LUMENS, TIMES = 3000.0, 20.0
 """Of a projector that nobody has described: it is dimmed to so many times the light of the place."""
 GREY = 0.5
+LIT_SHARE = 0.5
+"""Of its period, in which a flashing light is on."""
 
 
 class ProjectorControl(NumberControl):
     """A picture thrown onto the object: its texels are searched, and numbers where they get a range."""
 
     part: ProjectorPart
+    _later = 0.0
     kind = "projector"
     summary = "A picture that a projector throws onto the object."
-    parameters = (
+    parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter(
             "pattern", (None, None, 3), "sRGB", 0.0, 1.0, "black, or grey",
             "Display-referred texels of the picture, rounded to 8 bits.", search=(0.0, 1.0), estimators=("adjoint",),
@@ -85,8 +89,18 @@ class ProjectorControl(NumberControl):
             "black", (), "1", 0.0, 1.0, 0.0, "Share of white that a black texel still throws: 0.001 at a contrast of "
             "1000.", estimators=LIT,
         ),
+        Parameter(
+            "blur", (), "texels", 0.0, 64.0, 0.0, "How far it is out of focus: standard deviation of the blur.",
+            estimators=LIT,
+        ),
+        Parameter(
+            "flicker", (), "Hz", 0.0, 1e5, 0.0, "How often a second it flashes: light in one half of each period; at 0 "
+            "it does not.",
+        ),
+        Parameter("phase", (), "degrees", -3600.0, 3600.0, 0.0, "Where in its period a flashing light is at the time "
+                  "of the picture; up to 180 it is on.", periodic=True),
     )  # fmt: skip
-    choices = (
+    choices: ClassVar[tuple[Choice, ...]] = (
         Choice("resolution", 64, "Rows of texels.", whole=(2, 512)),
         Choice("aspect", 1.0, "Width of the picture over its height.", most=4.0),
         Choice("fov", None, "Angle of the picture's width, degrees; by default it just covers the object.", most=150.0),
@@ -182,6 +196,8 @@ class ProjectorControl(NumberControl):
         (self.part,) = parts
         self._picture = self._read()
         super().fit()
+        rate = next(slot.spec for slot in self.slots if slot.parameter.name == "flicker")
+        self.flashes = rate.high if isinstance(rate, Range) else max(map(float, self.allowed("flicker", 0.0)))
 
     def _read(self) -> Tensor | None:
         if self.chosen["picture"] is None:
@@ -221,6 +237,11 @@ class ProjectorControl(NumberControl):
         there.fit()
         return there
 
+    def later(self, seconds: float) -> Self:
+        then = copy.copy(self)
+        then._later = self._later + seconds
+        return then
+
     # ---- at a configuration ------------------------------------------------------------------------------------------
 
     def values(self, u: Tensor) -> dict[str, Tensor]:
@@ -231,11 +252,19 @@ class ProjectorControl(NumberControl):
 
     def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
         place = (float(values[name].detach()) for name in ("azimuth", "elevation", "distance"))
-        pose = looking_from(self.scene, *place).to(values["pattern"])
-        light = srgb_to_linear(values["pattern"]) * (1.0 - values["black"]) + values["black"]
+        pose = looking_from(self.scene, *place).to(values["distance"])
+        light = self.thrown(values)
+        rate, phase = float(values["flicker"].detach()), float(values["phase"].detach()) / 360.0
+        if rate and (rate * self._later + phase) % 1.0 >= LIT_SHARE:
+            light = 0.0 * light
         at_one = self._beside(values) * (values["distance"].detach() / self.scene.metres) ** 2
         white = at_one * ambient_irradiance(self.scene) / math.pi
         return {f"{self.name}.pose": pose, f"{self.name}.pattern": light * white}
+
+    def thrown(self, values: Values) -> Tensor:
+        """Return the picture (h, w, 3) as it is thrown, of white, linear."""
+        light = srgb_to_linear(values["pattern"]) * (1.0 - values["black"]) + values["black"]
+        return out_of_focus(light, values["blur"])
 
     def _lux(self, values: Values) -> Tensor:
         """Illuminance () of a white picture where it meets the object's middle head-on."""
@@ -261,6 +290,20 @@ class ProjectorControl(NumberControl):
     def kept_pictures(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
         pattern = values["pattern"]
         return {self.name: pattern, f"{self.name}-large": enlarged(pattern, -(-PRINT_SIDE // len(pattern)))}
+
+
+def out_of_focus(light: Tensor, blur: Tensor) -> Tensor:
+    """Return a picture (h, w, 3) after a Gaussian blur of so many texels (); outside it there is no light."""
+    sigma = float(blur.detach())
+    if not sigma and not blur.requires_grad:
+        return light
+    reach = math.ceil(3.0 * sigma) + 1
+    kernel = torch.exp(-0.5 * (torch.arange(-reach, reach + 1).to(blur) / blur.clamp_min(0.1)) ** 2)
+    kernel = (kernel / kernel.sum()).expand(3, 1, 1, -1)
+    picture = light.permute(2, 0, 1)[None]
+    picture = functional.conv2d(picture, kernel, padding=(0, reach), groups=3)
+    picture = functional.conv2d(picture, kernel.transpose(2, 3), padding=(reach, 0), groups=3)
+    return picture[0].permute(1, 2, 0)
 
 
 @lru_cache(maxsize=64)

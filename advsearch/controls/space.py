@@ -237,7 +237,7 @@ class _Held(Control):
     def __init__(self, control: Control, at: Tensor) -> None:
         self._control, self._at = control, at
         self.name, self.moved, self.on_top = control.name, control.moved, control.on_top
-        self.exposure = control.exposure
+        self.exposure, self.flashes = control.exposure, control.flashes
         self.fit()
 
     def fit(self) -> None:

@@ -106,12 +106,16 @@ def inside(renderer: Renderer, share: float = 0.12) -> Tensor:
     """Return a point to measure at: the start, but continuous coordinates with a range at least `share` off its ends.
 
     Periodic ones are turned a little: starts are often symmetric. Groups with a norm ball stay at their start, and so
-    do discrete choices.
+    do discrete choices. But what starts at the end of its range as a whole, as a projector's black picture does, is
+    measured in the middle: at the end there is a bend, and no difference to either side.
     """
     u = renderer.start.clone()
     for group in renderer.plan.groups:
         if group.valid and group.size <= 64 and not group.periodic:
             u[group.coordinates] = u[group.coordinates].clamp(share, 1.0 - share)
+        part = u[group.coordinates]
+        if group.valid and group.size > 64 and bool(((part == 0.0) | (part == 1.0)).all()):
+            u[group.coordinates] = 0.5
         if group.periodic:
             u[group.coordinates] = (u[group.coordinates] + TURNED).remainder(1.0)
     return u

@@ -326,12 +326,15 @@ def make_renderer(
     return Renderer(scene, space, formation, seed, motion=measured, estimators=estimators, moments=moments)
 
 
+A_FLASH = 8
+"""Moments of each flash of a light."""
 LOOKS = 64
 """Configurations in which it is measured how far points move in the picture while it is taken."""
 
 
 def exposed_in(space: Space, motion: Motion, assembly: Assembly, height: int) -> tuple[Moment, ...]:
-    """Return the moments of an exposure, so many that no point goes far in the picture between two of them."""
+    """Return the moments of an exposure, so many that no point goes far in the picture between two of them, and that
+    light which flashes is seen on and off."""
     shutter, rolling = space.exposure
     moving = replace(space, controls=tuple(one for one in space.controls if any(one.exposure)))
     ends = [moving.later(side * (shutter + rolling) / 2.0) for side in (-1.0, 1.0)]
@@ -341,7 +344,8 @@ def exposed_in(space: Space, motion: Motion, assembly: Assembly, height: int) ->
         (before, seen), (after, still) = (motion.pixels(assembly(end.inputs(u))) for end in ends)
         moved = (after - before)[seen & still].norm(dim=1)
         travelled = max(travelled, float(moved.max()) if len(moved) else 0.0)
-    count = min(max(FEWEST, math.ceil(A_PIXEL * travelled)), MOST)
+    flashes = max(one.flashes for one in space.controls) * (shutter + rolling)
+    count = min(max(FEWEST, math.ceil(A_PIXEL * travelled), math.ceil(A_FLASH * flashes)), MOST)
     offsets, rows, samples = moments_of(shutter, rolling, height, count)
     return tuple(Moment(space.later(float(at)), own, samples) for at, own in zip(offsets, rows, strict=True))
 

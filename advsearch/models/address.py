@@ -19,10 +19,12 @@ import ssl
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from email.message import Message
 from functools import partial
+from itertools import islice
 from typing import Any, Protocol, TypeAlias
 from urllib.parse import SplitResult, parse_qsl, urlsplit, urlunsplit
 
@@ -47,11 +49,14 @@ CHAT = "/chat/completions"
 """How the path of an address ends that is asked as OpenAI's chat is."""
 
 LIMITS: dict[str, float] = {
-    "calls": 2000, "tokens": float("inf"), "money": float("inf"),
+    "calls": 2000, "at_once": 4, "tokens": float("inf"), "money": float("inf"),
     "per_call": 0.0, "per_million_in": 0.0, "per_million_out": 0.0, "seconds": 120.0,
 }  # fmt: skip
-"""What `ask` may say, with its defaults: the most calls, tokens and money of a run; the price of a call and of a
+"""What `ask` may say, with its defaults: the most calls of a run, and how many are under way
+at the same time; the most tokens and money; the price of a call and of a
 million tokens in and out, in the unit of `money`; how long an answer may take."""
+
+MOST_AT_ONCE = 64
 
 TRIES, FIRST_WAIT, LONGEST_WAIT = 5, 1.0, 60.0
 """How often a picture is sent to a server that is busy or fails, and the seconds between: twice as long each time."""
@@ -147,6 +152,8 @@ def limits_of(ask: Mapping[str, float]) -> dict[str, float]:
         if isinstance(value, bool) or not isinstance(value, (int, float)) or not value >= 0:
             raise InputError(f"`ask` {name}: expected a number of at least 0, got {value!r}")
     limits = {**LIMITS, **ask}
+    if not (1 <= limits["at_once"] <= MOST_AT_ONCE and limits["at_once"] == int(limits["at_once"])):
+        raise InputError(f"`ask` at_once: expected a whole number from 1 to {MOST_AT_ONCE}, got {limits['at_once']:g}")
     priced = any(limits[name] for name in ("per_call", "per_million_in", "per_million_out"))
     if "money" in ask and not priced:
         raise InputError(
@@ -240,35 +247,83 @@ class Line:
                     f"resume RUN ask.{name}={2 * limit or 1:.10g}` goes on with more, and asks nothing twice"
                 )
 
-    def send(self, body: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the JSON object that the server answers, asked again where it is busy. Raises ModelError: limits are
-        reached, nobody answers, or something else comes."""
-        wait = FIRST_WAIT
-        for tries_left in reversed(range(TRIES)):
+    @property
+    def at_once(self) -> int:
+        """Requests that are under way at the same time: one where only its answer tells whether another is allowed."""
+        by_token = self.limits["per_million_in"] or self.limits["per_million_out"]
+        waits = self.limits["tokens"] < LIMITS["tokens"] or (by_token and self.limits["money"] < LIMITS["money"])
+        return 1 if waits else int(self.limits["at_once"])
+
+    def send(self, bodies: Sequence[Mapping[str, Any]]) -> Iterator[tuple[int, dict[str, Any]]]:
+        """Yield the places of what is sent, each with the JSON object that the server answers; several are sent at
+        once, and again where it is busy. Raises ModelError: limits are reached, nobody answers, or something else
+        comes; what has been answered by then is yielded before."""
+        left = [(place, TRIES, FIRST_WAIT) for place in range(len(bodies))]
+        while left:
             INTERRUPTS.look()
-            self._check_limits()
-            self.spent.calls += 1
-            if self.store is not None:
-                self.store.set_note(self._note, json.dumps(vars(self.spent)))
+            wave = [left.pop(0) for _ in range(self._reserve(min(self.at_once, len(left))))]
+            sent = self._together([json.dumps(bodies[place]).encode() for place, _, _ in wave])
+            failed, again = list[str](), list[tuple[int, int, float]]()
+            for (place, tries, wait), answer in zip(wave, sent, strict=True):
+                if isinstance(answer, dict):
+                    yield place, answer
+                    continue
+                if isinstance(answer, ModelError):
+                    failed.append(str(answer))
+                    continue
+                why, later, asked_to = self._failure(answer, first=self.spent.calls <= len(wave))
+                if not later or tries == 1:
+                    failed.append(f"model {self.name}: {why} ({self.url})")
+                again.append((place, tries - 1, max(wait, asked_to)))
+            if failed:
+                raise ModelError(failed[0])
+            if again:
+                time.sleep(min(max(wait for _, _, wait in again), LONGEST_WAIT))
+                left = [(place, tries, 2 * wait) for place, tries, wait in again] + left
+
+    def _reserve(self, most: int) -> int:
+        """Count calls before they are made, as many as the limits allow, and return how many these are."""
+        for count in range(most):
             try:
-                return self._sent(json.dumps(body).encode())
-            except urllib.error.HTTPError as error:
-                with error:
-                    why = self._why(error)
-                later = error.code in BUSY
-                asked_to = error.headers.get("Retry-After", "")
-                if asked_to.isdigit():
-                    wait = max(wait, float(asked_to))
-            except (OSError, http.client.HTTPException) as error:  # URLError is an OSError
-                reason = getattr(error, "reason", error)
-                why = self._clean(f"{type(reason).__name__}: {reason}" if str(reason) else type(reason).__name__)
-                nobody_yet = self.spent.calls == 1 and isinstance(reason, ConnectionRefusedError)
-                later = not nobody_yet and not isinstance(reason, (ssl.SSLCertVerificationError, ValueError))
-            if not later or not tries_left:
-                raise ModelError(f"model {self.name}: {why} ({self.url})")
-            time.sleep(min(wait, LONGEST_WAIT))
-            wait *= 2
-        raise AssertionError
+                self._check_limits()
+            except ModelError:
+                if not count:
+                    raise
+                most = count
+                break
+            self.spent.calls += 1
+        if self.store is not None:
+            self.store.set_note(self._note, json.dumps(vars(self.spent)))
+        return most
+
+    def _together(self, bodies: Sequence[bytes]) -> list[dict[str, Any] | Exception]:
+        """What is answered to each, or why nothing is."""
+
+        def sent(body: bytes) -> dict[str, Any] | Exception:
+            try:
+                return self._sent(body)
+            except (OSError, http.client.HTTPException, ModelError) as error:  # URLError is an OSError
+                return error
+
+        if len(bodies) == 1:
+            return [sent(bodies[0])]
+        pool = ThreadPoolExecutor(len(bodies))
+        try:
+            return list(pool.map(sent, bodies))
+        finally:
+            pool.shutdown(wait=False)  # after Ctrl-C nobody waits for answers
+
+    def _failure(self, error: Exception, *, first: bool) -> tuple[str, bool, float]:
+        """Return why nothing was answered, whether it may be later, and after how many seconds."""
+        if isinstance(error, urllib.error.HTTPError):
+            with error:
+                why = self._why(error)
+            asked_to = error.headers.get("Retry-After", "")
+            return why, error.code in BUSY, float(asked_to) if asked_to.isdigit() else 0.0
+        reason = getattr(error, "reason", error)
+        why = self._clean(f"{type(reason).__name__}: {reason}" if str(reason) else type(reason).__name__)
+        nobody_yet = first and isinstance(reason, ConnectionRefusedError)
+        return why, not nobody_yet and not isinstance(reason, (ssl.SSLCertVerificationError, ValueError)), 0.0
 
     def _sent(self, body: bytes) -> dict[str, Any]:
         key = _key()
@@ -343,6 +398,13 @@ class _NoRedirect(urllib.request.HTTPRedirectHandler):
         return None
 
 
+def _text(answer: Mapping[str, Any]) -> str:
+    """What is said, the likeliest name where there are scores."""
+    if "scores" in answer:
+        return str(max(answer["scores"], key=answer["scores"].__getitem__))
+    return str(answer["text"])
+
+
 class Asked:
     """Answers pictures (N, 3, H, W) in [0, 1], rounded to 8 bits: logits (N, names), or without names what is said of
     each picture (`advsearch.tasks.answers.Texts`). The same picture is not sent twice in a run, also if it goes on.
@@ -368,20 +430,16 @@ class Asked:
         levels = (pictures.clamp(0.0, 1.0).nan_to_num() * 255.0).round().to(torch.uint8).permute(0, 2, 3, 1)
         images = list(levels.cpu().contiguous().numpy())
         if not self.names:
-            return [{"texts": [self.text(image, time) for time in range(self.times)]} for image in images]
-        rows = [self.scores(image) for image in images]
+            texts = iter(map(_text, self._answers([(image, turn) for image in images for turn in range(self.times)])))
+            return [{"texts": list(islice(texts, self.times))} for _ in images]
+        rows = [self._scores(answer) for answer in self._answers([(image, 0) for image in images])]
         return torch.tensor([[max(row.get(name, 0.0), LEAST) for name in self.names] for row in rows]).log()
-
-    def text(self, image: Levels, time: int) -> str:
-        """Return what is said of a picture, the likeliest name where there are scores."""
-        answer = self._answer(image, time)
-        if "scores" in answer:
-            return str(max(answer["scores"], key=answer["scores"].__getitem__))
-        return str(answer["text"])
 
     def scores(self, image: Levels) -> dict[str, float]:
         """Return the share of each name that an answer has, in its order."""
-        answer = self._answer(image, 0)
+        return self._scores(self._answers([(image, 0)])[0])
+
+    def _scores(self, answer: Mapping[str, Any]) -> dict[str, float]:
         if "scores" not in answer:
             raise ModelError(
                 f"model {self.line.name}: answers in words ({answer['text'][:60]!r}), which are no scores; use "
@@ -392,23 +450,26 @@ class Asked:
             raise ModelError(f"model {self.line.name}: says {min(other)!r}, which is none of the `labels`")
         return scores
 
-    def _answer(self, image: Levels, time: int) -> dict[str, Any]:
-        """An answer to a picture: one that the run has, or a new one. Trials differ in their noise, and so in their
-        pictures."""
-        body = self._body(image)
-        digest = hashlib.blake2b(json.dumps([body, time, self.line.spec]).encode(), digest_size=16).hexdigest()
-        key, store = f"answer {digest}", self.line.store
-        known = self._known.get(key) if store is None else store.noted(key)
-        if isinstance(known, dict):
-            return known
-        sent = self.line.send(body)
-        self.line.count_tokens(sent)
-        answer = self._read_chat(sent) if self.chat else self._read(sent)
-        if store is None:
-            self._known[key] = answer
-        else:
-            store.set_note(key, json.dumps(answer))
-        return answer
+    def _answers(self, asked: Sequence[tuple[Levels, int]]) -> list[dict[str, Any]]:
+        """The answer to each picture at each time: one that the run has, or a new one, kept as it comes. Trials differ
+        in their noise, and so in their pictures."""
+        store, keys, answers, new = self.line.store, list[str](), dict[str, Any](), dict[str, dict[str, Any]]()
+        for image, turn in asked:
+            body = self._body(image)
+            digest = hashlib.blake2b(json.dumps([body, turn, self.line.spec]).encode(), digest_size=16).hexdigest()
+            keys.append(key := f"answer {digest}")
+            answers[key] = self._known.get(key) if store is None else store.noted(key)
+            if not isinstance(answers[key], dict):
+                new[key] = body
+        for place, sent in self.line.send(list(new.values())):
+            self.line.count_tokens(sent)
+            key, answer = list(new)[place], self._read_chat(sent) if self.chat else self._read(sent)
+            answers[key] = answer
+            if store is None:
+                self._known[key] = answer
+            else:
+                store.set_note(key, json.dumps(answer))
+        return [answers[key] for key in keys]
 
     def _body(self, image: Levels) -> dict[str, Any]:
         picture = base64.b64encode(png_of(image)).decode()

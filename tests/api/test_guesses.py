@@ -201,6 +201,7 @@ def test_an_objective_that_takes_the_picture_first_is_told(scene: advsearch.Scen
         (["--policy", "fgsm"], "unknown policy 'fgsm'. Did you mean 'pgd'?"),
         (["--objective", "ce"], "unknown objective 'ce'. Did you mean 'cross_entropy'?"),
         (["--control", "color"], "unknown control 'color'. Did you mean 'material'?"),
+        (["--control", "yaw"], "It is a parameter: write pose.yaw."),
     ],
 )
 def test_words_of_other_tools_are_told_what_they_are_called_here(

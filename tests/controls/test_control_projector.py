@@ -18,6 +18,7 @@ from advsearch.api.projection import write_projection
 from advsearch.controls import make_control
 from advsearch.controls.projector import AMBIENT, ProjectorControl, ambient_irradiance
 from advsearch.controls.space import Space
+from advsearch.engine.gradients import inside
 from advsearch.errors import InputError
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.runs.images import read_png, write_png
@@ -111,6 +112,12 @@ def test_the_adjoint_is_the_difference() -> None:
     moved = {**inputs, "projector.pattern": inputs["projector.pattern"] + change}
     before, after = (float((scene.radiance(one, 3, 16) * weight).sum()) for one in (inputs, moved))
     assert float((gradient * change).sum()) == pytest.approx(after - before, rel=ROUNDING)
+
+
+def test_a_black_picture_is_checked_at_grey() -> None:
+    """At black there is a bend, of which differences to both sides see the half."""
+    renderer = renderer_of()
+    assert not bool(renderer.start.any()) and bool((inside(renderer) == 0.5).all())
 
 
 @pytest.mark.slow

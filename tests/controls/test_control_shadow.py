@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from torch import Tensor, nn
 
 import advsearch
 from advsearch.controls import make_control
@@ -87,3 +89,24 @@ def test_it_is_searched_with_a_projector_and_differentiated_by_differences() -> 
     u.requires_grad_()
     renderer(u, seed=0, spp=4).mean().backward()
     assert u.grad is not None and bool(torch.isfinite(u.grad).all()) and bool(u.grad.any())
+
+
+class Sure(nn.Module):
+    """Sees a mug in everything, and a little less of it where it is bright."""
+
+    def forward(self, images: Tensor) -> Tensor:
+        light = images.mean(dim=(1, 2, 3))
+        return torch.stack([5.0 - light, light], dim=1)
+
+
+@pytest.mark.parametrize("control", ["projector", "shadow"])
+def test_light_is_searched_over_cameras_and_environments_and_along_a_path(control: str) -> None:
+    given: dict[str, Any] = {"projector": {"resolution": 4}, "shadow": {"size": [0, 1]}}
+    settings = given[control]
+    few: dict[str, Any] = {"resolution": 16, "steps": 2, "draws": 2, "trials": 6, "verify_spp": 1, "measure": "no"}
+    over = {"camera": {"azimuth": [30, 50]}, "environment": {"rotation": [0, 90]}}
+    sure = advsearch.load_model(Sure(), labels=("mug", "glare"), input_size=16, name="sure")
+    for conditions in ({"over": over}, {"path": "approach", "over": "path"}):
+        found = advsearch.attack("mug", sure, controls={control: settings}, baseline=False, **conditions, **few).summary
+        assert found.claimed is not None and found.conditions, conditions
+        assert any(name.startswith(f"{control}.") for name in found.configuration or ()), conditions

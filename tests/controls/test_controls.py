@@ -137,7 +137,7 @@ def test_a_control_can_be_made_again_from_its_settings(kind: str) -> None:
     assert torch.equal(first.start, second.start) and first.groups == second.groups
 
 
-@pytest.mark.parametrize("kind", ["light", "projector", "shadow", "occlusion", "patch"])
+@pytest.mark.parametrize("kind", ["light", "projector", "spot", "shadow", "occlusion", "patch"])
 def test_two_of_a_kind_live_side_by_side(kind: str) -> None:
     space = make_space([make_control(f"{kind}:one"), make_control(f"{kind}:two")], describe("mug"))
     assert [control.name for control in space.controls] == ["one", "two"]

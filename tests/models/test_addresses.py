@@ -323,6 +323,66 @@ def test_a_limit_ends_it(server: Server, ask: dict[str, float], allowed: int, ex
     assert len(server.came) == allowed
 
 
+class Together:
+    """Says how light a picture is, after others have come or a while has gone by; counts those under way."""
+
+    def __init__(self, enough: int) -> None:
+        self.enough, self.now, self.most, self.lock = enough, 0, 0, threading.Condition()
+
+    def __call__(self, asked: dict[str, Any]) -> dict[str, Any]:
+        with self.lock:
+            self.now += 1
+            self.most = max(self.most, self.now)
+            self.lock.notify_all()
+            self.lock.wait_for(lambda: self.most >= self.enough, timeout=0.3)
+            self.now -= 1
+        usage = {"prompt_tokens": 100, "completion_tokens": 10}
+        return {**scores(asked), "usage": usage}
+
+
+GREYS = torch.linspace(0.1, 0.8, 8)[:, None, None, None].expand(8, 8, 8, 3).contiguous()
+
+
+@pytest.mark.parametrize(
+    ("ask", "most"),
+    [({}, 4), ({"at_once": 2}, 2), ({"at_once": 1}, 1), ({"tokens": 10_000}, 1), ({"per_million_in": 1.0}, 4)],
+)
+def test_pictures_are_sent_together_and_their_order_is_kept(server: Server, ask: dict[str, float], most: int) -> None:
+    server.say = say = Together(most)
+    model = advsearch.load_model(server.url, labels=["mug", "bowl"], ask=ask)
+    assert model(GREYS).softmax(dim=1)[:, 0].tolist() == pytest.approx(GREYS[:, 0, 0, 0].tolist(), abs=0.003)
+    assert say.most == most and len(server.came) == 8
+
+
+def test_no_call_too_many_goes_out_with_others(server: Server) -> None:
+    server.say = scores
+    model = advsearch.load_model(server.url, labels=["mug", "bowl"], ask={"calls": 6})
+    with pytest.raises(ModelError, match="6 calls are spent"):
+        model(GREYS)
+    assert len(server.came) == 6
+    with pytest.raises(ModelError, match="6 calls are spent"):
+        model(GREYS)
+    assert len(server.came) == 6 and model(GREYS[:6]).shape == (6, 2), "what was answered is kept"
+    with pytest.raises(InputError, match="`ask` at_once: expected a whole number from 1 to 64, got 0"):
+        advsearch.load_model(server.url, ask={"at_once": 0})
+
+
+def test_one_that_is_busy_among_others_is_asked_again(server: Server) -> None:
+    refused = [0.3, 0.6]
+
+    def say(asked: dict[str, Any]) -> Reply | dict[str, Any]:
+        level = next((one for one in refused if abs(shade(asked) - one) < 0.01), None)
+        if level is None:
+            return scores(asked)
+        refused.remove(level)
+        return 429, {}, b"later"
+
+    server.say = say
+    model = advsearch.load_model(server.url, labels=["mug", "bowl"])
+    assert model(GREYS).softmax(dim=1)[:, 0].tolist() == pytest.approx(GREYS[:, 0, 0, 0].tolist(), abs=0.003)
+    assert len(server.came) == 10 and not refused
+
+
 def test_tokens_that_are_not_told_cannot_be_limited(server: Server) -> None:
     server.say = chat("mug", usage=None)
     with pytest.raises(ModelError, match="`usage` with prompt_tokens"):

@@ -98,11 +98,11 @@ def _take_in(folder: str, name: str) -> None:
     from advsearch.settings import read_yaml
 
     run = find_run(name)
+    task: Any = read_yaml(run / CONFIG).get("task") or "classification"
     with tempfile.TemporaryDirectory() as named:
         place = Path(folder)
         if (place / POSES).is_file():
             place = _named_by_pose(place, run, Path(named))
-        task: Any = read_yaml(run / CONFIG).get("task") or "classification"
         files = photographs_in(place, task)
         if loose := [one.name for one in files if not one.stem.startswith("rendering-")]:
             raise InputError(

@@ -22,7 +22,7 @@ from advsearch.settings import read_yaml
 
 DOMAIN = {
     "place": ("environment", "background"),
-    "light": ("light", "sky", "exposure", "shadow", "projector"),
+    "light": ("light", "sky", "exposure", "shadow", "projector", "spot"),
     "weather": ("haze",),
     "road users and things": ("object", "answer", "things", "pose", "body", "occlusion", "contents"),
     "surfaces": ("texture", "material", "patch", "geometry"),

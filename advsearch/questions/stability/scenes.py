@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import tempfile
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -58,6 +59,7 @@ def exposed(control: str, low: float, high: float) -> dict[str, object]:
     return {"controls": controls, "u": {0: float(high > 0.0)}, "slow": control == "environment"}
 
 
+FINITE = "Picture and gradient are finite."
 RIGHT = "Picture and gradient are finite; the gradient of the linear picture is right."
 LAMP = {"light": {"type": "point", "power": [0.0, 20.0], "x": 1.0, "y": 1.0, "z": 2.0}}
 BRIGHT_TEXEL = {"environment": {"exposure": [-1.0, 1.0]}, "texture": {"resolution": 16}}
@@ -215,6 +217,48 @@ def texels_at_the_ends() -> Outcome:
     )
 
 
+# ---- light that is thrown --------------------------------------------------------------------------------------------
+
+SIDE = 8
+"""Texels along the picture of a projector."""
+WHOLE = [1.0] * (3 * SIDE**2)
+ONE_TEXEL = {3 * (SIDE**2 // 2 + SIDE // 2) + channel: 1.0 for channel in range(3)}
+
+
+def thrown(u: Sequence[float] | Mapping[int, float] = WHOLE, **projector: float) -> dict[str, object]:
+    """A white picture on the mug, or another one; its gradient is finite and not zero."""
+    controls = {"projector": {"resolution": SIDE, **projector}}
+    return {"controls": controls, "u": u, "compare": False, "gradient": (1e-12, None)}
+
+
+# fmt: off
+cases("light", seen, [
+    ("projector-black", "A black picture changes nothing, and texels have a gradient.",
+     {**thrown({}), "beside": {"controls": {"lens": {}}}, "apart": (None, 0.02)}),
+    ("projector-full", FINITE, thrown()),
+    ("projector-one-texel", FINITE, thrown(ONE_TEXEL)),
+    ("projector-grazing", FINITE, thrown(elevation=0.5)),
+    ("projector-behind-the-object", FINITE, thrown(azimuth=220.0)),
+    ("projector-inside-the-object", FINITE, thrown(distance=0.01, fov=30.0)),
+    ("projector-into-a-mirror", FINITE,
+     {**thrown(), "settings": {"material.metallic": 1.0, "material.roughness": 0.0}}),
+    ("projector-0-lumens", "Without light the gradient is zero.", {**thrown(lumens=0.0), "gradient": (0.0, 0.0)}),
+    ("projector-1e6-lumens", "The picture is white for the most part, and all is finite.",
+     {**thrown(lumens=1e6), "gradient": (None, None), "mean": (0.7, None)}),
+    ("spot-smallest", "Picture and gradient of a laser's spot are finite.",
+     {"controls": {"spot": {"width": [0.02, 0.1], "lumens": [0.0, 10.0]}}, "u": [0.0, 1.0], "compare": False,
+      "gradient": (1e-12, None)}),
+])
+# fmt: on
+
+
+@case("light", "projector-through-glass")
+def through_glass() -> Outcome:
+    """Light that meets glass on its way leaves picture and gradient finite."""
+    along = thrown(azimuth=describe("mug").number("camera.azimuth"))
+    return seen(**along, parts=[glass()])  # type: ignore[arg-type]
+
+
 # ---- meshes, places and views ---------------------------------------------------------------------------------------
 
 QUAD = [[0.0, -0.5, 0.0], [0.0, 0.5, 0.0], [0.0, 0.5, 1.0], [0.0, -0.5, 1.0]]
@@ -263,7 +307,6 @@ def outline(controls: ControlSettings) -> dict[str, object]:
     return {"controls": controls, "thing": dark, "settings": BARE, "u": [0.5]}
 
 
-FINITE = "Picture and gradient are finite."
 AWAY_FROM_IT = {"controls": {"pose": {"z": [-3.0, -2.0]}}, "settings": {"pose.x": 9e3}}
 # fmt: off
 cases("geometry", seen, [

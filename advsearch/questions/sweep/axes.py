@@ -13,7 +13,15 @@ from typing import Any
 
 import numpy as np
 
-from advsearch.controls import CONTROLS, Control, NumberControl, Parameter, check_instance, instance_of
+from advsearch.controls import (
+    CONTROLS,
+    Control,
+    NumberControl,
+    Parameter,
+    check_instance,
+    instance_of,
+    unknown_control,
+)
 from advsearch.controls.values import Number, OneOf, read
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.options import BY_KEY
@@ -84,7 +92,7 @@ def _read_axis(name: str, given: Any, instances: Mapping[str, Control]) -> Axis:
     control: Any = type(instances[instance]) if instance in instances else CONTROLS.get(kind)
     if control is None:
         hint = f"It stands in `grid` {name}; write `grid` CONTROL.PARAMETER=VALUES, such as pose.yaw=0:360:24."
-        raise UnknownNameError("control", kind, {*CONTROLS, *instances}, hint)
+        raise unknown_control(kind, hint, instances)
     if kind == BY_KEY:
         return _axis_by_key(control, name, given)
     there = instances[instance].own if instance in instances else ()

@@ -111,13 +111,13 @@ class SweepConfig(SceneConfig):
         "configuration",
     )
     must_change: str | None = setting(
-        None, "sweep", "show each picture also changed so that nothing is left to see, and count how often the model "
-        "says something else, as it must: black, covered (one even colour), away (rendered again without the object)",
+        None, "sweep", "show each picture also black, covered (one even colour) or with the object taken away, and "
+        "count how often the model says something else, as it must",
         f"names among {', '.join(BLIND)}, separated by commas", otherwise="none",
     )
     must_not_change: str | None = setting(
-        None, "sweep", "the same with what means nothing, where it must say the same: exposure (a third of a stop), "
-        "shift (one pixel), jpeg (quality 95)",
+        None, "sweep", "show each picture also with a third of a stop more exposure, a shift by one pixel or as a JPEG "
+        "file, and count how often the model says the same, as it must",
         f"names among {', '.join(HARMLESS)}, separated by commas", otherwise="none",
     )
     surface: bool = setting(

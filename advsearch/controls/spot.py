@@ -1,0 +1,91 @@
+"""The `spot` control: a torch or a laser from somewhere around the object. It only adds light.
+
+It is a projector whose picture is a round spot, so that no outline moves and its numbers have an adjoint:
+
+    picture = colour exp(-r^2 / (2 s^2)) picture's area / (2 pi s^2),        width = 2 s sqrt(2 ln 2)
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from advsearch.controls.base import Choice, Parameter, Value
+from advsearch.controls.numbers import NumberControl, Values
+from advsearch.controls.projector import LUMENS, TIMES, ProjectorControl
+from advsearch.controls.values import Number
+from advsearch.scene.color import srgb_to_linear
+from advsearch.scene.settings import CHANNELS, LIT, colors
+
+OF_THE_SOURCE = ("azimuth", "elevation", "distance", "ambient", "flicker", "phase")
+WIDTH = 0.3
+"""Object sizes."""
+WIDTH_OF_ONE = 2.0 * math.sqrt(2.0 * math.log(2.0))
+"""Diameter in which half of a round Gaussian of standard deviation 1 lies."""
+
+
+class SpotControl(ProjectorControl):
+    """A round spot of light on the object: where it falls, how wide, in which colour and how bright."""
+
+    kind = "spot"
+    amount = "lumens"
+    summary = "The spot of a torch or a laser on the object."
+    parameters = (
+        Parameter("x", (), "object sizes", -10.0, 10.0, 0.0, "Shift of its middle to the right, seen from the light.",
+                  search=(-0.5, 0.5), estimators=LIT),
+        Parameter("y", (), "object sizes", -10.0, 10.0, 0.0, "Shift of its middle upwards.", search=(-0.5, 0.5),
+                  estimators=LIT),
+        Parameter("width", (), "object sizes", 0.02, 10.0, WIDTH, "Diameter in which half of its light falls.",
+                  search=(0.05, 0.6), log=True, estimators=LIT),
+        *colors("of its light.", (0.0, 1.0)),
+        Parameter("lumens", (), "lumens", 0.0, 1e6, "0, or what is 20 times as bright as the place", "All of its "
+                  "light.", search=(0.0, LUMENS), estimators=LIT),
+        *(one for one in ProjectorControl.parameters if one.name in OF_THE_SOURCE),
+    )  # fmt: skip
+    choices = (
+        Choice("resolution", 64, "Rows of texels of the picture that it is made of.", whole=(2, 512)),
+        Choice("fov", None, "Angle in which it may fall, degrees; by default it just covers the object.", most=150.0),
+    )
+
+    # its numbers are a handful, and there is no picture among them
+    size, spec, budget_of = NumberControl.size, NumberControl.spec, NumberControl.budget_of
+    values, describe, kept_pictures = NumberControl.values, NumberControl.describe, NumberControl.kept_pictures
+
+    def check_choices(self) -> None:
+        self.chosen = {"aspect": 1.0, "picture": None, **self.chosen}
+
+    def default(self, parameter: Parameter) -> Number:
+        if parameter.name != "lumens":
+            return super().default(parameter)
+        return self._bright() if self.asked and not self.searches("lumens") else 0.0
+
+    def _bright(self) -> float:
+        """Lumens of a spot of the default width that is `TIMES` as bright as the place."""
+        ambient = next(one for one in self.own if one.name == "ambient")
+        area = 2.0 * math.pi * (WIDTH / WIDTH_OF_ONE * self.scene.metres) ** 2
+        return min(LUMENS, TIMES * float(super().default(ambient)) * area)
+
+    def unchanged(self, parameter: Parameter) -> Number:
+        return 0.0 if parameter.name == "lumens" else self.default(parameter)
+
+    def search_range(self, parameter: Parameter) -> tuple[float, float] | None:
+        return (0.0, self._bright()) if parameter.name == "lumens" else parameter.search
+
+    def thrown(self, values: Values) -> Tensor:
+        half = math.tan(math.radians(self.part.fov) / 2.0) * values["distance"].detach() / self.scene.metres
+        rows, columns = self.part.sides
+        across, up = (torch.linspace(-1.0, 1.0, 2 * count + 1)[1::2].to(half) * half for count in (columns, rows))
+        deviation = values["width"] / WIDTH_OF_ONE
+        away = (across[None] - values["x"]) ** 2 + (-up[:, None] - values["y"]) ** 2
+        spot = torch.exp(-0.5 * away / deviation**2) * (2.0 * half) ** 2 / (2.0 * math.pi * deviation**2)
+        return spot[..., None] * srgb_to_linear(torch.stack([values[name] for name in CHANNELS]))
+
+    def measured(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Value]:
+        brightest = float(self.thrown(values).detach().max())
+        return {
+            "lux": {"value": brightest * float(self._lux(values)), "unit": "lux, where it is brightest"},
+            "beside_ambient": {"value": brightest * float(self._beside(values)), "unit": "times the ambient light"},
+        }
