@@ -236,7 +236,7 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
         self.rays = mi.Float()
         self._make_rays()
         self._drops = None
-        if props.has_property("drops"):
+        if "drops" in props:
             asked = (int(props["drops"]), float(props["drop_size"]), int(props["drop_seed"]))
             self._drops = raindrops(*asked, float(props["drop_tangent"]))
             self._which = mi.UInt32(self._drops.grid.reshape(-1).astype("uint32"))
