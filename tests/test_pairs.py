@@ -211,8 +211,8 @@ def assert_close_pictures(one: Tensor, other: Tensor) -> None:
 @pytest.mark.parametrize("pair", pairs(QUICK[:1]))
 def test_a_row_of_an_attack_is_true_of_its_own_picture(pair: tuple[str, ...]) -> None:
     config = AttackConfig(
-        object="mug", controls={kind: FORMS[kind] for kind in pair}, resolution=SIZE, spp=1, denoise="none",
-        measure="no",
+        object=suited(pair), things=beside(pair), label=["mug"], controls={kind: FORMS[kind] for kind in pair},
+        resolution=SIZE, spp=1, denoise="none", measure="no",
     )  # fmt: skip
     problem, _ = problem_from_config(config)
     draws = [problem.domain.sample(torch.Generator().manual_seed(seed))[0] for seed in (1, 2)]
