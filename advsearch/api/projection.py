@@ -89,7 +89,7 @@ def settings_of(control: ProjectorControl, values: dict[str, Tensor]) -> list[st
         f"{number['lumens']:g} lumens for a white picture, {number['distance']:.3g} {unit} from the object's middle",
         f"a picture {part.fov:.3g} degrees wide (throw ratio {throw:.2f}), {part.aspect:.3g} times as wide as high",
         f"azimuth {number['azimuth'] % 360.0:.4g} and elevation {number['elevation']:.4g} degrees around the object",
-        f"ambient light of {number['ambient']:.3g} lux; white is {measured['white']['value']:.3g} lux on the object",
+        f"ambient light of {number['ambient']:.4g} lux; white is {measured['white']['value']:.4g} lux on the object",
     ]
 
 
