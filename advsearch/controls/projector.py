@@ -252,7 +252,7 @@ class ProjectorControl(NumberControl):
 
     def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
         place = (float(values[name].detach()) for name in ("azimuth", "elevation", "distance"))
-        pose = looking_from(self.scene, *place).to(values["distance"])
+        pose = looking_from(self.scene, *place).to(values["distance"], copy=True)
         light = self.thrown(values)
         rate, phase = float(values["flicker"].detach()), float(values["phase"].detach()) / 360.0
         if rate and (rate * self._later + phase) % 1.0 >= LIT_SHARE:

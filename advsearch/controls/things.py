@@ -108,6 +108,10 @@ class ThingsControl(NumberControl):
                 slots.append(Slot(replace(parameter, name=asked), spec, 1, begin, value))
         return tuple(slots)
 
+    def search_range(self, parameter: Parameter) -> tuple[float, float] | None:
+        reach = min(2.0, self.scene.metres)  # beside a small thing, two metres are off its table
+        return (-reach, reach) if parameter.name in ("x", "y") else parameter.search
+
     @property
     def refines(self) -> frozenset[str]:
         """None is changed; but it comes after whatever moves what things may not stand in."""

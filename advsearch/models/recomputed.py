@@ -24,14 +24,15 @@ class _Recomputed(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *slopes: Tensor | None) -> tuple[None, None, Tensor]:
+        (images,), again = ctx.saved_tensors, torch.is_grad_enabled()  # again: it is to be differentiated once more
         with torch.enable_grad():
-            images = ctx.saved_tensors[0].detach().requires_grad_()
+            images = images if again else images.detach().requires_grad_()
             tensors, _ = tree_flatten(ctx.ask(images))
         pairs = [pair for pair in zip(tensors, slopes, strict=True) if pair[0].requires_grad and pair[1] is not None]
         if not pairs:
             return None, None, torch.zeros_like(images)
         outputs, given = zip(*pairs, strict=True)
-        (slope,) = torch.autograd.grad(outputs, images, given, allow_unused=True)
+        (slope,) = torch.autograd.grad(outputs, images, given, create_graph=again, allow_unused=True)
         return None, None, torch.zeros_like(images) if slope is None else slope
 
 

@@ -49,6 +49,7 @@ def test_signatures_have_every_setting_as_it_is_declared(name: str) -> None:
         "optimiser",
         "loss",
         "beside",
+        "tracker",
     }
     assert set(parameters) - set(names) <= own
     inner = inspect.signature(function.__wrapped__).parameters

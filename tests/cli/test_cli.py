@@ -216,7 +216,8 @@ def test_a_bug_keeps_its_traceback_and_ends_with_1() -> None:
         "advsearch.question.carry_out = carry_out\n"
         "from advsearch.cli.main import main; sys.exit(main(['attack', '--object', 'mug', '--json']))"
     )
-    done = python(code, cwd=Path(__file__).parent, env={**os.environ, "PYTHONPATH": str(ROOT / "tests")})
+    path = os.pathsep.join(map(str, (ROOT, ROOT / "tests")))
+    done = python(code, cwd=Path(__file__).parent, env={**os.environ, "PYTHONPATH": path})
     assert done.returncode == 1 and done.stdout == ""
     assert "Traceback" in done.stderr and done.stderr.endswith("ValueError: a bug\n")
 

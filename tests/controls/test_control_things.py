@@ -188,3 +188,13 @@ def test_what_cannot_be_is_refused(scene: SceneDescription) -> None:
         make_control("things", {"chair.hight": [0, 1]})
     with pytest.raises(InputError, match="chair stands in something else; put it elsewhere"):
         space_of(describe("car", things="chair@1,0,size=1"))
+
+
+def test_beside_a_small_thing_the_search_stays_near() -> None:
+    for name, things, reach in (("mug", "bottle@0.3,0.1", 0.11), ("car", "chair@6,0,size=1", 2.0)):
+        scene = describe(name, things=things)
+        space = make_space([make_control("things")], scene)
+        u = space.start.clone()
+        u[0] = 1.0
+        there = space.describe(u)[f"things.{things.partition('@')[0]}.x"]["value"]
+        assert there == pytest.approx(min(2.0, scene.metres)) and there == pytest.approx(reach, rel=0.05)

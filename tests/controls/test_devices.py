@@ -49,9 +49,9 @@ CASES = [
 
 @pytest.mark.parametrize(("kind", "given"), CASES)
 def test_what_a_control_gives_lies_where_the_searchs_numbers_do(kind: str, given: dict[str, Any]) -> None:
-    space = compose(
-        (make_control(kind, given),), advsearch.load_scene("person" if kind == "body" else "mug").description
-    )
+    beside = "bottle@0.4,0.1" if kind == "things" else None
+    scene = advsearch.load_scene("person" if kind == "body" else "mug", things=beside).description
+    space = compose((make_control(kind, given),), scene)
     u = (0.25 * space.start + 0.5).clamp(0.0, 1.0)
     image = torch.full((8, 8, 3), 0.5)
     expected, seen = space.inputs(u), space.picture(u, image)

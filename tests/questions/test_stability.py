@@ -40,6 +40,8 @@ WANTED = {
     "gimbal full-turn",
     "stiff": "badly-scaled light-rotation-texel",
     "noise": "one-sample heavy-tails",
+    "light": "projector-black projector-full projector-one-texel projector-grazing projector-behind projector-inside "
+    "projector-into-a-mirror projector-through-glass projector-0-lumens projector-1e6-lumens spot",
 }
 """How the names of the extremes begin that the suite has to have."""
 

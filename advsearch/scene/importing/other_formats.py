@@ -34,7 +34,6 @@ SAID = {
     "a file of 3ds Max's": (ELSEWHERE, (".max",)),
     "a file of Cinema 4D's": (ELSEWHERE, (".c4d",)),
     "a file of SketchUp's": (ELSEWHERE, (".skp",)),
-    "binary glTF of an avatar": ("rename it to end in .glb", (".vrm",)),
     "NumPy's arrays": ("write the mesh, as in trimesh.Trimesh(vertices, faces).export('mesh.ply')", (".npz", ".npy")),
     "a picture": (
         "an object is a mesh; `environment` takes .hdr and .exr",
