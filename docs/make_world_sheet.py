@@ -100,14 +100,19 @@ def asked(own_car: Path, shirt: Any) -> Iterator[Asked]:
         {"object": "car", "environment": "avenue-night", "settings": wet, "things": "car@-8,3.5,heading=180,lamps=low"},
         {},
     )
-    for light in ("day", "night"):
+    for light in ("wet", "night"):
         environment, given = LIGHTS[light]
-        view = {"camera.distance": 12.0, "camera.fov": WIDE, **given, "camera.drops": 70.0}
+        view = {"camera.distance": 12.0, "camera.fov": WIDE, **given, "camera.drops": 70.0, "ground.kind": "wet-avenue"}
         yield Asked(
             f"rain-{light}",
             {"object": "car", "environment": environment, "settings": view, "camera": "dashcam"},
             {},
         )
+    snow = {"environment": "avenue-snow", "settings": {"camera.distance": 10.0, "camera.fov": WIDE, "camera.ev": 12.0}}
+    yield Asked("snow-ahead", {"object": "car", "camera": "dashcam", **snow}, {})
+    view = {"camera.distance": 17.0, "camera.azimuth": 14.0, "camera.elevation": 9.0, "camera.ev": 12.0}
+    things = "car@-8,3.5,heading=180,lamps=low; person@3,-2.8,heading=-20"
+    yield Asked("snow-two", {"object": "car", **snow, "settings": view, "things": things}, {})
     for name, pose in POSES.items():
         view = {"camera.distance": 3.4, "camera.azimuth": 20.0, "camera.elevation": 6.0, "camera.ev": 14.0}
         scene = {"object": "person", "environment": "avenue", "settings": view, "texture": shirt}

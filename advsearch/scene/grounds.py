@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -127,8 +127,8 @@ def enclosed(scene: SceneDescription) -> bool:
 
 
 PLACES: Mapping[str, Callable[..., tuple[MeshPart, ...]]] = {
-    settings.DRY_AVENUE: avenue, settings.WET_AVENUE: avenue, settings.CROSSING: crossing,
-    settings.CAR_PARK: car_park, settings.ROOM: room, settings.LIT_ROOM: room,
+    settings.DRY_AVENUE: avenue, settings.WET_AVENUE: avenue, settings.SNOW_AVENUE: partial(avenue, snow=True),
+    settings.CROSSING: crossing, settings.CAR_PARK: car_park, settings.ROOM: room, settings.LIT_ROOM: room,
 }  # fmt: skip
 """What makes the meshes of each kind of ground that is a place."""
 

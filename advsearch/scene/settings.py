@@ -200,10 +200,13 @@ ENVIRONMENT = (
         "exposure", (), "stops", -10.0, 10.0, 0.0, "Brightness, after metering.", search=(-1.0, 1.0), estimators=LIT
     ),
 )
-GROUND_KINDS = TABLE, PHOTOGRAPH, DRY_ROAD, WET_ROAD, DRY_AVENUE, WET_AVENUE, CROSSING, CAR_PARK, ROOM, LIT_ROOM = (
+GROUND_KINDS = (
+    TABLE, PHOTOGRAPH, DRY_ROAD, WET_ROAD, DRY_AVENUE, WET_AVENUE, CROSSING, CAR_PARK, ROOM, LIT_ROOM, SNOW_AVENUE,
+) = (
     "table", "photograph", "road", "wet-road", "avenue", "wet-avenue", "crossing", "car-park", "room", "lit-room",
+    "snow-avenue",
 )  # fmt: skip
-ROADS, PLACES = (DRY_ROAD, WET_ROAD), (DRY_AVENUE, WET_AVENUE, CROSSING, CAR_PARK, ROOM, LIT_ROOM)
+ROADS, PLACES = (DRY_ROAD, WET_ROAD), (DRY_AVENUE, WET_AVENUE, SNOW_AVENUE, CROSSING, CAR_PARK, ROOM, LIT_ROOM)
 PHOTOGRAPHED_FROM = 3.0
 """Height above the floor from which a photograph is taken of an object whose size is not known, object sizes."""
 TABLE_SETTINGS = ("ground.size", *(f"ground.{channel}" for channel in CHANNELS))

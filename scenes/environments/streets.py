@@ -264,6 +264,7 @@ STREETS: tuple[EnvironmentFamily, ...] = (
     EnvironmentFamily("street-dusk", "street", lambda rays: street(rays, DUSK), _SCRIPT, height=ROWS, ground="road"),
     EnvironmentFamily("avenue", "street", _open_day, _SCRIPT, height=ROWS, ground="avenue", lux=75000.0),
     EnvironmentFamily("avenue-wet", "street", _open_grey, _SCRIPT, ground="wet-avenue", lux=9000.0),
+    EnvironmentFamily("avenue-snow", "street", _open_grey, _SCRIPT, ground="snow-avenue", lux=9000.0, map="avenue-wet"),
     EnvironmentFamily("avenue-dusk", "street", _open_dusk, _SCRIPT, ground="avenue", lux=12.0),
     EnvironmentFamily("avenue-night", "street", _open_night, _SCRIPT, ground="avenue", lux=0.3),
 )

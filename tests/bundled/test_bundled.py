@@ -183,7 +183,7 @@ def test_things_of_the_street_have_their_size_and_several_materials() -> None:
 
 def test_half_of_the_environments_are_held_out() -> None:
     streets = {name for name, family in ENVIRONMENTS.items() if family.split == "street"}
-    avenues = {"avenue", "avenue-wet", "avenue-dusk", "avenue-night"}
+    avenues = {"avenue", "avenue-wet", "avenue-snow", "avenue-dusk", "avenue-night"}
     assert streets == {"street", "street-wet", "street-dusk", *avenues} == set(library.list_environments("street"))
     places = {f"{place}{light}" for place in ("crossing", "car-park") for light in ("", "-dusk", "-night")}
     assert {*places, "room", "room-evening"} == set(library.list_environments("place"))

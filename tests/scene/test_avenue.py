@@ -56,6 +56,21 @@ def test_what_stands_in_an_avenue_faces_outwards_and_rests_on_the_ground() -> No
         np.testing.assert_allclose(np.linalg.norm(part.mesh.normals, axis=1), 1.0, atol=1e-4)
 
 
+def test_snow_lies_on_what_faces_up_and_on_nothing_else() -> None:
+    dry, snow = (describe("car", name).around for name in ("avenue", "avenue-snow"))
+    assert set(snow) - set(dry) == {"snow"}
+    corners = snow["snow"].mesh.vertices.astype(np.float64)[snow["snow"].mesh.faces]
+    assert (snow["snow"].mesh.normals[snow["snow"].mesh.faces].mean(axis=1)[:, 2] > 0.0).all()
+    assert corners[..., 2].max() > 5.0, "roofs are white"
+    names = ("houses", "trees", "posts")
+    assert len(corners) == sum(len(dry[name].mesh.faces) - len(snow[name].mesh.faces) for name in names)
+    assert all(np.array_equal(dry[name].mesh.vertices, snow[name].mesh.vertices) for name in ("windows", "shops"))
+    base = snow[ROAD].base_color
+    rows = np.round((FRONTS[1] - np.array([-8.0, 1.75, 0.75])) / 0.03).astype(int)  # pavement, middle of road, wheels
+    pavement, middle, track = (float(base[row - 1 : row + 2].mean()) for row in rows)
+    assert pavement > 0.85 > middle > 0.6 > 0.45 > track
+
+
 def test_boxes_at_a_wall_face_outwards() -> None:
     frame, quads = Frame((1.0, 2.0, 0.0), (-1.0, 0.0, 0.0)), Quads()
     quads.boxes(frame, np.array([[0.0, 2.0, 0.0, 0.5, 1.0, 1.3]]), np.array([[0.0, 1.0, 0.0, 1.0]]), SHOWN)

@@ -338,8 +338,8 @@ ALL = "20 of 20 fresh renders (95 % interval 83-100 %)."
         ),
         (
             {"ending": "budget spent", "verified": rated(0, 0.0, 0.168)},
-            "No texture within 0.1 (linf) was found that makes the model miss this mug: it is wrong in 0 of 20 fresh"
-            " renders (95 % interval 0-17 %). The budget is spent.",
+            "No change of texture within 0.1 (linf) was found that makes the model miss this mug: it is wrong in 0 of"
+            " 20 fresh renders (95 % interval 0-17 %). The budget is spent.",
         ),
         (
             {"ending": "not verified", "verified": rated(3, 0.032, 0.379)},
@@ -371,8 +371,9 @@ ALL = "20 of 20 fresh renders (95 % interval 83-100 %)."
         ),
         (
             {**TARGET, "target": ["vase", "iron"], "ending": "budget spent", "verified": rated(2, 0.012, 0.317)},
-            "No texture within 0.1 (linf) was found that makes the model call this mug a vase or an iron: the model"
-            " calls this mug a vase or an iron in 2 of 20 fresh renders (95 % interval 1.2-32 %). The budget is spent.",
+            "No change of texture within 0.1 (linf) was found that makes the model call this mug a vase or an iron: the"
+            " model calls this mug a vase or an iron in 2 of 20 fresh renders (95 % interval 1.2-32 %). The budget is"
+            " spent.",
         ),
         (
             {**TARGET, "ending": "not verified", "verified": rated(3, 0.032, 0.379)},
@@ -385,9 +386,9 @@ ALL = "20 of 20 fresh renders (95 % interval 83-100 %)."
         ),
         (
             {**EASIER, "ending": "stalled", "verified": rated(3, 0.032, 0.379)},
-            "No texture within 0.1 (linf) was found that makes this mug easier to recognise: the model recognises this"
-            " mug, more surely than in the clean scene, in 3 of 20 fresh renders (95 % interval 3.2-38 %). The policy"
-            " had nothing more to propose.",
+            "No change of texture within 0.1 (linf) was found that makes this mug easier to recognise: the model"
+            " recognises this mug, more surely than in the clean scene, in 3 of 20 fresh renders (95 % interval"
+            " 3.2-38 %). The policy had nothing more to propose.",
         ),
         (
             {"over": ["camera"]},

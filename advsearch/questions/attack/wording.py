@@ -64,7 +64,7 @@ def attack_verdict(summary: AttackSummary) -> str:
     if ending == "not verified":
         return f"The search claims a wrong prediction that is not confirmed: {claim} in {rate}."
     why = _REASONS.get(ending, f"The search ended: {ending}.")
-    return f"No {budget_text(summary)} was found that {_wanted(summary, thing)}: {claim} in {rate}. {why}"
+    return f"No change of {budget_text(summary)} was found that {_wanted(summary, thing)}: {claim} in {rate}. {why}"
 
 
 def _as_random(summary: AttackSummary) -> str:

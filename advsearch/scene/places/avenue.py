@@ -76,13 +76,15 @@ class Plan(NamedTuple):
     more: Callable[[float], tuple[MeshPart, ...]] = lambda metres: ()
 
 
-def avenue(metres: float, candelas: float | None, *, wet: bool, dark: bool) -> tuple[MeshPart, ...]:
+def avenue(metres: float, candelas: float | None, *, wet: bool, dark: bool, snow: bool = False) -> tuple[MeshPart, ...]:
     """Return the meshes of the street; arguments as of `built`."""
-    return built(AVENUE, metres, candelas, wet=wet, dark=dark)
+    return built(AVENUE, metres, candelas, wet=wet, dark=dark, snow=snow)
 
 
 @lru_cache(maxsize=4)
-def built(plan: Plan, metres: float, candelas: float | None, *, wet: bool, dark: bool) -> tuple[MeshPart, ...]:
+def built(
+    plan: Plan, metres: float, candelas: float | None, *, wet: bool, dark: bool, snow: bool = False
+) -> tuple[MeshPart, ...]:
     """Return the meshes of a place.
 
     Args:
@@ -91,19 +93,25 @@ def built(plan: Plan, metres: float, candelas: float | None, *, wet: bool, dark:
         candelas: luminance of a radiance of 1, cd/m2; None where the light has no unit.
         wet: whether the road is dark and reflects.
         dark: whether lamps and windows shine.
+        snow: whether snow lies on all that faces up; on the road it is driven on.
     """
     rows, ground = _houses(plan.fronts), road.WET if wet else road.DRY
     grey, white = np.full((2, 2, 3), 0.25, np.float32), np.full((2, 2, 3), 0.9, np.float32)
+    fallen = Quads()
+    walls, trees, posts = (
+        quads.swept(fallen) if snow else quads for quads in (rows.walls, _trees(plan.trees), _posts(plan.posts))
+    )
     made = (
-        (road.ROAD, plan.ground(), _display(paint.road, wet), ground),
-        ("houses", rows.walls, _display(paint.walls), WET_WALL if wet else WALL),
+        (road.ROAD, plan.ground(), _display(paint.road, wet, snow), ground),
+        ("houses", walls, _display(paint.walls), WET_WALL if wet else WALL),
         ("windows", rows.dark, _display(paint.panes), PANE),
         ("lit-windows", rows.lit, _display(paint.panes), PANE),
         ("shops", rows.shops, _display(paint.panes), PANE),
-        ("trees", _trees(plan.trees), _leaves(), LEAF),
-        ("posts", _posts(plan.posts), grey, IRON),
+        ("trees", trees, _leaves(), LEAF),
+        ("posts", posts, grey, IRON),
         ("street-lamps", _lamps(plan.posts), white, PANE),
-        ("plain", _plain(), _grass(), WALL),
+        ("plain", _plain(), white if snow else _grass(), WALL),
+        *((("snow", fallen, white, WALL),) if snow else ()),
     )
     shine = {name: one[None, None] / np.float32(candelas) for name, one in LIT.items()} if dark and candelas else {}
     return (

@@ -78,6 +78,11 @@ def _sign(metres: float) -> tuple[MeshPart, ...]:
     place = np.eye(4)
     place[:3, :3] = asset.metres / metres * rotation(180.0, 0.0, 0.0)
     place[:3, 3] = low / metres
+    kept = np.ones(len(asset.mesh.faces), bool)
+    kept[asset.mesh.materials["rubber"]] = False  # the foot of a stand, which stands on the ground
+    number = np.cumsum(kept) - 1
+    materials = {name: number[faces] for name, faces in asset.mesh.materials.items() if name != "rubber"}
+    asset = replace(asset, mesh=replace(asset.mesh, faces=asset.mesh.faces[kept], materials=materials))
     sign = mesh_part("sign", asset, place, asset.material)
     grey = np.full((2, 2, 3), 0.45, np.float32)
     return replace(sign, laid=True), MeshPart("sign-post", post.mesh(metres), grey, avenue.IRON, laid=True)

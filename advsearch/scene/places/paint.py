@@ -159,8 +159,8 @@ FRONTS = (-12.0, 15.6)
 """y of the fronts of the houses on the right and on the left."""
 
 
-@lru_cache(maxsize=2)
-def road(wet: bool) -> Floats:
+@lru_cache(maxsize=3)
+def road(wet: bool, snow: bool = False) -> Floats:
     """Paint one period of the street's ground, (h, w, 3) linear reflectance, row 0 on the left."""
     columns, rows = round(GROUND_PERIOD / GROUND_TEXEL), round((FRONTS[1] - FRONTS[0]) / GROUND_TEXEL)
     x = (np.arange(columns) + 0.5) * GROUND_TEXEL
@@ -192,7 +192,20 @@ def road(wet: bool) -> Floats:
         far = np.hypot(wide - at, high - side)
         rings = np.where((far < 0.30) & ((wide * 18.0 % 1.0 < 0.4) != (high * 18.0 % 1.0 < 0.4)), 0.11, 0.045)
         color = np.where((far < 0.34)[..., None], np.where(far > 0.31, 0.025, rings)[..., None], color)
+    if snow:
+        color = _snowed(color * WETNESS, high, cloud, fine)
     return np.asarray(np.clip(color * (WETNESS if wet else 1.0), 0.004, 0.9), np.float32)
+
+
+def _snowed(color: Floats, y: Floats, cloud: Floats, fine: Floats) -> Floats:
+    """Snow on wet ground: wheels have left two tracks in each lane, grey slush lies between them."""
+    far = np.minimum(np.abs(np.abs(y) - 0.75), np.abs(np.abs(y - 3.5) - 0.75))
+    wheels = np.clip(1.6 - (far + 0.12 * cloud) / 0.2, 0.0, 1.0)
+    driven = np.clip((5.2 - np.abs(y - 1.75) * 2.0) / 1.2 + 1.0, 0.0, 1.0)[..., None]
+    clean = 0.8 * (1.0 + 0.05 * cloud + 0.04 * fine)[..., None] * tint((0.97, 0.985, 1.0))
+    slush = (0.5 + 0.16 * cloud + 0.08 * fine)[..., None] * tint((0.98, 0.98, 1.0))
+    snow = clean + driven * (slush - clean)
+    return np.asarray(snow + 0.85 * wheels[..., None] * (color - snow), np.float32)
 
 
 # ---- noise ----------------------------------------------------------------------------------------------------------

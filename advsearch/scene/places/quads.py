@@ -12,6 +12,8 @@ from advsearch.scene.assets import Doubles, Mesh
 FRONT, SIDES, TOP, BOTTOM = "front", "sides", "top", "bottom"
 SHOWN = (FRONT, SIDES, TOP, BOTTOM)
 """Faces of a box that stands at a wall: all but its back."""
+SLOPE = 0.35
+"""Cosine between a surface that snow stays on and the level, at the least: 70 degrees."""
 
 
 @dataclass(frozen=True)
@@ -87,6 +89,17 @@ class Quads:
                 placed = frame.world(at[:, None] + 0.0 * out, out, up)
                 narrow = shown * [0.15, 1.0] + shown[:, :1] * [0.85, 0.0]
                 self.add(placed[:, ::turn], narrow[:, ::turn])
+
+    def swept(self, fallen: Quads) -> Quads:
+        """Return those that do not face up, and add the others, which snow lies on, to `fallen`."""
+        bare = Quads()
+        for corners, uvs, normals in zip(self.corners, self.uvs, self.normals, strict=True):
+            across = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
+            faced = np.where(normals.any(axis=(1, 2))[:, None], normals.mean(axis=1), across)
+            lies = faced[:, 2] > SLOPE * np.linalg.norm(faced, axis=1)
+            bare.add(corners[~lies], uvs[~lies], normals[~lies])
+            fallen.add(corners[lies], 0.0 * uvs[lies] + 0.5, normals[lies])
+        return bare
 
     def mesh(self, metres: float) -> Mesh:
         """Return all of them as one mesh, in units of `metres`."""
