@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from advsearch.scene.assets import Doubles, Mesh
+from advsearch.scene.assets import Bools, Doubles, Mesh
 
 FRONT, SIDES, TOP, BOTTOM = "front", "sides", "top", "bottom"
 SHOWN = (FRONT, SIDES, TOP, BOTTOM)
@@ -96,7 +96,7 @@ class Quads:
         for corners, uvs, normals in zip(self.corners, self.uvs, self.normals, strict=True):
             across = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
             faced = np.where(normals.any(axis=(1, 2))[:, None], normals.mean(axis=1), across)
-            lies = np.asarray(faced[:, 2] > SLOPE * np.linalg.norm(faced, axis=1))
+            lies: Bools = np.asarray(faced[:, 2] > SLOPE * np.linalg.norm(faced, axis=1))
             bare.add(corners[~lies], uvs[~lies], normals[~lies])
             fallen.add(corners[lies], 0.0 * uvs[lies] + 0.5, normals[lies])
         return bare
