@@ -95,8 +95,9 @@ class Quads:
         bare = Quads()
         for corners, uvs, normals in zip(self.corners, self.uvs, self.normals, strict=True):
             across = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
-            faced = np.where(normals.any(axis=(1, 2))[:, None], normals.mean(axis=1), across)
-            lies: Bools = np.asarray(faced[:, 2] > SLOPE * np.linalg.norm(faced, axis=1))
+            told: Bools = np.asarray(normals.any(axis=(1, 2)))
+            faced = np.where(told[:, None], normals.mean(axis=1), across)
+            lies = faced[:, 2] > SLOPE * np.linalg.norm(faced, axis=1)
             bare.add(corners[~lies], uvs[~lies], normals[~lies])
             fallen.add(corners[lies], 0.0 * uvs[lies] + 0.5, normals[lies])
         return bare
