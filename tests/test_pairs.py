@@ -64,8 +64,8 @@ FORMS: dict[str, dict[str, Any]] = {
 }
 FORMS |= {kind: {} for kind in OWN if kind not in FORMS}  # another one varies as it declares itself
 EXCLUSIVE = {frozenset(("sky", "environment")), frozenset(("path", "camera")), frozenset(("geometry", "body"))}
-EXCLUSIVE |= {frozenset(("contents", "body"))}
-"""Pairs that set the same input and are refused; and nobody is a vessel."""
+EXCLUSIVE |= {frozenset(("contents", "body")), frozenset(("material", "body"))}
+"""Pairs that set the same input and are refused; nobody is a vessel, and no named material covers a person."""
 
 ALL = [(one,) for one in FORMS] + [
     pair for pair in itertools.combinations(FORMS, 2) if frozenset(pair) not in EXCLUSIVE
