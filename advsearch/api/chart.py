@@ -23,6 +23,7 @@ from advsearch.calls import helped
 from advsearch.errors import InputError
 from advsearch.pictures import upright
 from advsearch.report.sheets import MARGIN, blank
+from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 
 Floats = npt.NDArray[np.float64]
 
@@ -78,7 +79,7 @@ def measured_palette(photograph: str | Path) -> Tensor:
         FileFormatError: the file is no picture, or too large.
         InputError: it shows no such chart.
     """
-    light = _linear(upright(Path(photograph), LARGEST_SIDE).astype(np.float64))
+    light = srgb_to_linear(upright(Path(photograph), LARGEST_SIDE)).astype(np.float64)
     place = _homography(CORNERS, _found(light, photograph))
     offsets = np.array(list(itertools.product(np.linspace(-0.25, 0.25, 7) * PATCH, repeat=2)))
     crossings = np.array(list(itertools.product((-PITCH / 2.0, PITCH / 2.0), repeat=2)))
@@ -88,7 +89,7 @@ def measured_palette(photograph: str | Path) -> Tensor:
         ink = np.median(_at(light, place, middle + offsets), axis=0)
         paper = [np.median(_at(light, place, middle + one + close), axis=0) for one in crossings]
         measured.append(ink / np.maximum(np.mean(paper, axis=0), 1e-4))
-    return torch.from_numpy(_display(np.clip(np.array(measured), 0.0, 1.0))).float()
+    return torch.from_numpy(linear_to_srgb(np.array(measured, np.float32)))
 
 
 def _found(light: Floats, photograph: str | Path) -> Floats:
@@ -129,11 +130,3 @@ def _at(light: Floats, place: Floats, points: Floats) -> Floats:
     x, y, w = place @ np.concatenate([points, np.ones((len(points), 1))], axis=1).T
     at = [y / w, x / w]
     return np.stack([ndimage.map_coordinates(light[..., k], at, order=1, mode="nearest") for k in range(3)], axis=1)
-
-
-def _linear(display: Floats) -> Floats:
-    return np.where(display <= 0.04045, display / 12.92, ((display + 0.055) / 1.055) ** 2.4)
-
-
-def _display(linear: Floats) -> Floats:
-    return np.where(linear <= 0.0031308, linear * 12.92, 1.055 * linear ** (1.0 / 2.4) - 0.055)

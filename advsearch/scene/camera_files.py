@@ -101,10 +101,7 @@ def read_camera(spec: str) -> CameraModel:
         raise FileFormatError(f"{path}: expected a camera as text, got {CAMERAS[ending]}")
     if ending in MESHES:
         raise FileFormatError(f"{path}: expected a camera file, got a mesh; it is an object's, not a camera's")
-    try:
-        text = read_text(Path(path), "a camera file", LARGEST_JSON if ending == ".json" else LARGEST)
-    except OSError as error:
-        raise FileFormatError(f"{path}: expected a camera file, got {error.strerror}; check the path") from None
+    text = camera_text(path, LARGEST_JSON if ending == ".json" else LARGEST)
     lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
     if lines and re.fullmatch(r"\d+\s+[A-Za-z_]\w*\s.*", lines[0].strip()):
         return _of_colmap(spec, path, which, lines)
@@ -130,8 +127,21 @@ def _data(path: str, text: str) -> dict[str, Any]:
         return _xml(path, text)
     if not path.lower().endswith(".json"):
         return _yaml(path, text)
+    return _checked(path, read_json(path, text))
+
+
+def camera_text(path: str, most: int, what: str = "a camera file") -> str:
+    """Return the text of a file of at most so many bytes. Raises FileFormatError: it is missing, or no such text."""
     try:
-        return _checked(path, parse_json(text))
+        return read_text(Path(path), what, most)
+    except OSError as error:
+        raise FileFormatError(f"{path}: expected {what}, got {error.strerror}; check the path") from None
+
+
+def read_json(path: str, text: str) -> Any:
+    """Return what the text of a file says. Raises FileFormatError: it is not JSON."""
+    try:
+        return parse_json(text)
     except ValueError as error:
         raise FileFormatError(f"{path}: expected JSON, got {error}; correct the file") from None
 

@@ -18,10 +18,11 @@ import torch
 from torch import Tensor
 
 from advsearch.errors import FileFormatError
-from advsearch.files import parse_json, read_text
+from advsearch.files import read_text
 from advsearch.scene.assets import Doubles
-from advsearch.scene.camera_files import LARGEST_JSON, OF_A_FRAME, read_camera
+from advsearch.scene.camera_files import LARGEST_JSON, OF_A_FRAME, camera_text, read_camera, read_json
 from advsearch.scene.camera_model import CameraModel
+from advsearch.scene.skeleton import entries_of_turn
 from advsearch.yaml_text import LARGEST, parse_yaml
 
 MOST_CAMERAS = 32
@@ -177,12 +178,7 @@ def _of_camchain(spec: str, data: Mapping[str, Any]) -> tuple[Mount, ...]:
 
 def _of_transforms(path: str, which: str) -> tuple[Mount, ...]:
     """Frames of nerfstudio's transforms.json by their numbers; `transform_matrix` is from the camera to the world."""
-    try:
-        data = parse_json(read_text(Path(path), "a camera file", LARGEST_JSON))
-    except OSError as error:
-        raise FileFormatError(f"{path}: expected a camera file, got {error.strerror}; check the path") from None
-    except ValueError as error:
-        raise FileFormatError(f"{path}: expected JSON, got {error}; correct the file") from None
+    data = read_json(path, camera_text(path, LARGEST_JSON))
     frames = data.get("frames") if isinstance(data, dict) else None
     if not isinstance(frames, list) or not all(isinstance(one, dict) for one in frames):
         raise FileFormatError(f"{path}: expected `frames`, a list with a camera each, as nerfstudio writes it")
@@ -200,10 +196,7 @@ def _of_transforms(path: str, which: str) -> tuple[Mount, ...]:
 def _of_colmap(path: str, which: str) -> tuple[Mount, ...]:
     """COLMAP's images.txt: in every second line a rotation (quaternion, real part first) and a shift from the world to
     the camera, whose model is in the cameras.txt beside it."""
-    try:
-        text = read_text(Path(path), "COLMAP's images", MOST_BYTES)
-    except OSError as error:
-        raise FileFormatError(f"{path}: expected COLMAP's images, got {error.strerror}; check the path") from None
+    text = camera_text(path, MOST_BYTES, "COLMAP's images")
     lines = [line for line in text.splitlines() if not line.startswith("#")]
     rows = {words[0]: words for line in lines[::2] if (words := line.split(maxsplit=9))}
     if not rows:
@@ -228,11 +221,7 @@ def _of_colmap(path: str, which: str) -> tuple[Mount, ...]:
             raise FileFormatError(f"{where}: expected a quaternion of length 1, got one of {length:.3g}")
         w, x, y, z = (one / length for one in (w, x, y, z))
         seen = np.eye(4)
-        seen[:3, :3] = [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
+        seen[:3, :3] = np.reshape(entries_of_turn(x, y, z, w), (3, 3))
         seen[:3, 3] = shift
         poses.append(np.asarray(np.linalg.inv(seen), np.float64))
         cameras = Path(path).with_name("cameras.txt")

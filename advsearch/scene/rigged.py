@@ -22,7 +22,7 @@ from advsearch.errors import InputError
 from advsearch.scene.assets import Doubles, Ints
 from advsearch.scene.people import about
 from advsearch.scene.settings import GEOMETRIC, Parameter, moving
-from advsearch.scene.skeleton import Clip, Movable, Track
+from advsearch.scene.skeleton import Clip, Movable, Track, entries_of_turn
 
 AXES = ("x", "y", "z")
 WEIGHT = "weight"
@@ -285,10 +285,4 @@ def slerp(first: Tensor, second: Tensor, share: Tensor) -> Tensor:
 
 def rotation(quaternions: Tensor) -> Tensor:
     """Return the turns (N, 3, 3) of unit quaternions (N, 4), x, y, z, w."""
-    x, y, z, w = quaternions.unbind(dim=1)
-    rows = [
-        1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w),
-        2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w),
-        2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y),
-    ]  # fmt: skip
-    return torch.stack(rows, dim=1).reshape(-1, 3, 3)
+    return torch.stack(entries_of_turn(*quaternions.unbind(dim=1)), dim=1).reshape(-1, 3, 3)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -105,3 +106,13 @@ class Movable:
     weights: Doubles
     targets: tuple[Target, ...]
     rest: Doubles
+
+
+def entries_of_turn(x: Any, y: Any, z: Any, w: Any) -> list[Any]:
+    """Return the nine entries, row by row, of the rotation matrix of a unit quaternion with the real part `w`: numbers,
+    arrays or tensors."""
+    return [
+        1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w),
+        2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w),
+        2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip

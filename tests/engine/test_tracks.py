@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 import advsearch
 from advsearch.models import ModelWarning
-from advsearch.questions.sweep.tracks import ConstantVelocity, Frame, overlap, tracked
+from advsearch.questions.sweep.tracks import ConstantVelocity, Frame, overlaps, tracked
 
 Doubles = npt.NDArray[np.float64]
 NEAR: dict[str, Any] = {"path": "approach", "reach": 1.3}
@@ -56,7 +56,7 @@ def test_two_that_pass_each_other_keep_their_numbers() -> None:
         boxes = np.stack([moving(frame), moving(11 - frame) + np.array([0.0, 8.0, 0.0, 8.0])])
         order = [0, 1] if frame % 2 else [1, 0]
         seen = tracker(boxes[order], np.array([0.9, 0.8]))
-        numbers.append(tuple(max(seen, key=lambda one: overlap(one[1], box))[0] for box in boxes))
+        numbers.append(tuple(max(seen, key=lambda one: overlaps(one[1][None], box)[0])[0] for box in boxes))
     assert len(numbers) == 12 and len(set(numbers)) == 1
 
 

@@ -212,8 +212,8 @@ class Sweep:
         now = time.monotonic()
         if now - self._told >= TELL_SECONDS:
             facts, told = self._executor.facts, dict[str, float | str]()
-            if seen := int((predictions.seen & ~predictions.hidden).sum()):
-                told["accuracy"] = int((predictions.right & ~predictions.hidden).sum()) / seen
+            if seen := int(predictions.counted.sum()):
+                told["accuracy"] = int((predictions.right & predictions.counted).sum()) / seen
             if facts is not None:
                 told |= {**facts.told, "a second": self._rendered / max(1e-9, now - self._begun)}
             self.stages.progress.advance(self._untold, **told)
@@ -325,7 +325,7 @@ class Sweep:
         formation = Formation.of(next(iter(view.renderers.values())).formation) if view else None
         gains = self._gains() if formation else {}
         models, adversarial = [model.name for model in job.models], job.places[-1].beside_clean
-        numbers = np.flatnonzero(predictions.seen & ~predictions.hidden)
+        numbers = np.flatnonzero(predictions.counted)
         right, units, axes = predictions.right[numbers], self.units.of(numbers), self._axes(numbers)
         changes = self._changes()
         if formation is not None and len(set(gains.values())) != 1:

@@ -90,6 +90,11 @@ class Predictions:
         self._labels[number] = self._names.setdefault(said.prediction.label, len(self._names))
 
     @property
+    def counted(self) -> npt.NDArray[np.bool_]:
+        """(n,) which there is a prediction of and something to see in."""
+        return np.asarray(self.seen & ~self.hidden)
+
+    @property
     def worst(self) -> int | None:
         """The first configuration of the largest margin; None where none is a number."""
         margin = self.margin if self.hidden[self.seen].all() else np.where(self.hidden, np.nan, self.margin)
@@ -112,7 +117,7 @@ class Predictions:
         the second half of the configurations are the first with the adversarial scene."""
         halves = (2, -1, len(models))
         found = list[PairedRates]()
-        seen: npt.NDArray[np.bool_] = np.logical_and(*(self.seen & ~self.hidden).reshape(halves))
+        seen: npt.NDArray[np.bool_] = np.logical_and(*self.counted.reshape(halves))
         for model, name in enumerate(models):
             known = np.flatnonzero(seen[:, model])
             before, after = self.right.reshape(halves)[:, known, model]

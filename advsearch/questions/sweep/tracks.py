@@ -12,8 +12,11 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
+
+from advsearch.tasks.boxes import overlap
 
 Doubles = NDArray[np.float64]
 Step = Callable[[Doubles, Doubles], Sequence[tuple[int, Any]]]
@@ -69,10 +72,8 @@ class ConstantVelocity:
         waiting = [replace(one, box=one.box + one.speed, missed=one.missed + 1) for one in self._tracks]
         seen, new = list[_Track](), list[Doubles]()
         for sure in (True, False):
-            left = list(boxes[(scores >= self.sure) == sure])
-            table = np.array([[overlap(one.box, box) for box in left] for one in waiting]).reshape(
-                len(waiting), len(left)
-            )
+            left = boxes[(scores >= self.sure) == sure]
+            table = np.array([overlaps(left, one.box) for one in waiting]).reshape(len(waiting), len(left))
             pairs = [(a, b) for a, b in zip(*linear_sum_assignment(-table), strict=True) if table[a, b] >= self.overlap]
             for a, b in pairs:
                 before = waiting[a].box - waiting[a].speed * waiting[a].missed
@@ -85,13 +86,10 @@ class ConstantVelocity:
         return [(one.number, one.box) for one in seen]
 
 
-def overlap(one: Sequence[float] | Doubles, other: Sequence[float] | Doubles) -> float:
-    """Return intersection over union of two boxes."""
-    one, other = np.asarray(one, dtype=float), np.asarray(other, dtype=float)
-    sides = np.minimum(one[2:], other[2:]) - np.maximum(one[:2], other[:2])
-    common = float(sides.clip(0.0).prod())
-    areas = sum(float((box[2:] - box[:2]).clip(0.0).prod()) for box in (one, other))
-    return common / max(areas - common, 1e-12)
+def overlaps(boxes: Doubles, box: Doubles) -> Doubles:
+    """Return intersection over union of boxes (n, 4) with one box (4,), (n,)."""
+    found: Doubles = overlap(torch.from_numpy(boxes), torch.from_numpy(box)).numpy()
+    return found
 
 
 def frame_of(payload: Any, names: Collection[str]) -> Frame:
@@ -110,7 +108,9 @@ def tracked(frames: Sequence[Frame], tracker: Tracker, iou: float) -> Tracked:
     lost, switches = list[bool](), 0
     for true, boxes, scores in frames:
         tracks = step(boxes, scores)
-        each = [] if true is None else [(overlap(true, box), number) for number, box in tracks]
+        places = np.array([box for _, box in tracks], dtype=float).reshape(-1, 4)
+        numbers = [number for number, _ in tracks]
+        each = [] if true is None else list(zip(overlaps(places, true).tolist(), numbers, strict=True))
         on = [one for one in each if one[0] >= iou]
         lost.append(true is not None and not on)
         if on:

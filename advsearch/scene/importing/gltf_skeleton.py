@@ -14,7 +14,7 @@ from advsearch.scene.importing.files import Names, clean, damaged
 from advsearch.scene.importing.gltf import Buffers
 from advsearch.scene.importing.gltf_entries import Animation, Channel, Header, Node, Primitive, Skin
 from advsearch.scene.importing.parts import ImportedPart
-from advsearch.scene.skeleton import Clip, Movable, Skeleton, Target, Track
+from advsearch.scene.skeleton import Clip, Movable, Skeleton, Target, Track, entries_of_turn
 
 MOST_SETS = 8
 """Sets of four joints of a vertex."""
@@ -51,14 +51,7 @@ def matrix_of(node: Node) -> Doubles:
     x, y, z, w = np.array(node.rotation or [0.0, 0.0, 0.0, 1.0]) / max(
         float(np.linalg.norm(node.rotation or 1.0)), 1e-12
     )
-    turn = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-    matrix[:3, :3] = turn * np.array(node.scale or [1.0, 1.0, 1.0])
+    matrix[:3, :3] = np.reshape(entries_of_turn(x, y, z, w), (3, 3)) * np.array(node.scale or [1.0, 1.0, 1.0])
     matrix[:3, 3] = node.translation or [0.0, 0.0, 0.0]
     return matrix
 
