@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import numpy.typing as npt
 
-from advsearch.scene.assets import Material, ObjectAsset, Rig
+from advsearch.scene.assets import Material, MeshRig, ObjectAsset
 from advsearch.scene.library import BUNDLED_OBJECT, finished
 
 from .atlas import SIZE, joined, pack, painted
@@ -35,7 +35,7 @@ class Instance:
     material: Material
     detail: Mapping[str, float] = field(default_factory=dict)
     finishes: Mapping[str, Material] = field(default_factory=dict)
-    rig: Rig | None = None
+    rig: MeshRig | None = None
 
     def charts(self) -> list[tuple[float, float]]:
         """Return the width and height that every patch asks of the atlas."""
