@@ -1,7 +1,7 @@
 """One task, asked of the object and of every thing beside it: a prediction is right where it is right about all of
 them.
 
-A search is after a wrong prediction about any of them: margin and score are the largest of the things' own.
+A search is after a wrong prediction about any of them: loss and score are the largest of the things' own.
 """
 
 from __future__ import annotations
@@ -58,11 +58,11 @@ class EachThing(Task):
     def target_names(self) -> tuple[str, ...]:
         return self.part.target_names
 
-    def margin(self, output: Output, truth: Truths) -> Tensor:
-        return self._largest(self.part.margin, output, truth)
+    def loss(self, output: Output, truth: Truths) -> Tensor:
+        return self._largest(self.part.loss, output, truth)
 
     def score(self, output: Output, truth: Truths) -> Tensor:
-        return -self.margin(output, truth) if self.minimise else self._largest(self.part.score, output, truth)
+        return -self.loss(output, truth) if self.minimise else self._largest(self.part.score, output, truth)
 
     def pixel_margin(self, output: Output, truth: Truths) -> Tensor:
         """Return that of the thing where it is largest, (N,); of segmentation."""
@@ -79,7 +79,7 @@ class EachThing(Task):
         """See `Task.judge`: the prediction about the thing that is worst, and in the payload what is said of each."""
         each = zip(*(self.part.judge(output, one) for one in truth.values()), strict=True)
         with torch.no_grad():
-            scores, margins = self.score(output, truth).tolist(), self.margin(output, truth).tolist()
+            scores, margins = self.score(output, truth).tolist(), (0.0 - self.loss(output, truth)).tolist()
         return [
             self._judged(dict(zip(truth, said, strict=True)), *at)
             for said, at in zip(each, zip(scores, margins, strict=True), strict=True)
@@ -90,7 +90,7 @@ class EachThing(Task):
         if any(one.not_a_number for one in said.values()):
             return Judgement.of(score, math.nan, Prediction(""))
         seen = [name for name in said if said[name].prediction.label != OUT_OF_VIEW] or list(said)
-        worst = max(seen, key=lambda name: said[name].margin)
+        worst = min(seen, key=lambda name: said[name].margin)
         things = {
             name: {"right": one.right, "margin": one.margin, "answer": one.prediction.label}
             | ({"box": one.payload.get("box")} if isinstance(one.payload, dict) and "box" in one.payload else {})

@@ -18,7 +18,7 @@ from advsearch.tasks.base import Facts, Judgement, Mark, Prediction, Task, Truth
 from advsearch.tasks.command import Command
 
 RULES = ("any", "all", "mean", "vote")
-"""When the rig is right: in any picture, in all, on average of the margins, or in more than half."""
+"""When the rig is right: in any picture, in all, on average of the losses, or in more than half."""
 
 Outputs = tuple[Any, ...]
 """What the model returns for each picture of one configuration."""
@@ -28,8 +28,8 @@ Outputs = tuple[Any, ...]
 class Rig(Task):
     """Several cameras take pictures of one configuration, and one prediction is made of what a model says of each.
 
-    Each picture has a truth of its own, such as the box in it. The margin of the rig is the least, the largest or the
-    mean of its pictures' margins, or for `vote` the one that more than half of them are at or below.
+    Each picture has a truth of its own, such as the box in it. The loss of the rig is the least, the largest or the
+    mean of its pictures' losses, or for `vote` the one that more than half of them are at or below.
 
     Args:
         task: of each picture: a name, or a mapping with a `name` and options.
@@ -105,8 +105,8 @@ class Rig(Task):
     def target_names(self) -> tuple[str, ...]:
         return tuple(self.part.target_names)
 
-    def margin(self, output: Sequence[Outputs], truth: tuple[Truth, ...]) -> Tensor:
-        return self._ruled(self._each("margin", output, truth))
+    def loss(self, output: Sequence[Outputs], truth: tuple[Truth, ...]) -> Tensor:
+        return self._ruled(self._each("loss", output, truth))
 
     def score(self, output: Sequence[Outputs], truth: tuple[Truth, ...]) -> Tensor:
         """See `Task.score`: a target is reached, and a right prediction made, by the rule."""
@@ -131,7 +131,7 @@ class Rig(Task):
     def judge(self, output: Sequence[Outputs], truth: tuple[Truth, ...]) -> list[Judgement]:
         found = []
         with torch.no_grad():
-            margins, scores = self.margin(output, truth).tolist(), self.score(output, truth).tolist()
+            margins, scores = (0.0 - self.loss(output, truth)).tolist(), self.score(output, truth).tolist()
         for each, margin, score in zip(output, margins, scores, strict=True):
             said = [self.part.judge(one, true)[0] for one, true in zip(each, truth, strict=True)]
             lost = any(one.not_a_number for one in said)
