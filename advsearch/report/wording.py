@@ -19,7 +19,7 @@ DEPTH, SIMILARITY, COMMAND = "depth", "similarity", "command"
 """Tasks whose predictions have words of their own; others are quoted."""
 
 _MARGINS = {
-    CLASSIFICATION: "how far the right prediction leads the wrong one, in logits; below 0 where it is wrong",
+    CLASSIFICATION: "how far the right prediction leads the wrong one, in logits",
     DETECTION: "how far the best right box is over the score that counts, in log-odds; below 0 where none is found",
     SEGMENTATION: "the lead of right classes at the pixel that decides, in logits; below 0 where too few are right",
     DEPTH: "the logarithm of the tolerance, less that of the factor by which the object's distance is off",
