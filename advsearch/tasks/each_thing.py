@@ -19,7 +19,7 @@ from advsearch.errors import InputError
 from advsearch.tasks.base import Facts, Judgement, Mark, Output, Prediction, Task, Truth, mean
 from advsearch.tasks.together import Together
 
-Truths = Mapping[str, Truth]
+TruthOfEach = Mapping[str, Truth]
 """What is true of each thing, by name."""
 
 
@@ -40,7 +40,7 @@ class EachThing(Task):
     def calibrates(self) -> bool:
         return self.part.calibrates
 
-    def after_calibration(self, output: Output, truth: Truths | None) -> EachThing:
+    def after_calibration(self, output: Output, truth: TruthOfEach | None) -> EachThing:
         first = None if truth is None else next(iter(truth.values()))
         return replace(self, part=self.part.after_calibration(output, first))
 
@@ -48,34 +48,34 @@ class EachThing(Task):
         for one in facts.each.values():
             self.part.check(one)
 
-    def truth(self, facts: Facts) -> Truths:
+    def truth(self, facts: Facts) -> TruthOfEach:
         return {name: self.part.truth(one) for name, one in facts.each.items()}
 
-    def truth_names(self, truth: Truths) -> tuple[str, ...]:
+    def truth_names(self, truth: TruthOfEach) -> tuple[str, ...]:
         return tuple(dict.fromkeys(name for one in truth.values() for name in self.part.truth_names(one)))
 
     @property
     def target_names(self) -> tuple[str, ...]:
         return self.part.target_names
 
-    def loss(self, output: Output, truth: Truths) -> Tensor:
+    def loss(self, output: Output, truth: TruthOfEach) -> Tensor:
         return self._largest(self.part.loss, output, truth)
 
-    def score(self, output: Output, truth: Truths) -> Tensor:
+    def score(self, output: Output, truth: TruthOfEach) -> Tensor:
         return -self.loss(output, truth) if self.minimise else self._largest(self.part.score, output, truth)
 
-    def pixel_margin(self, output: Output, truth: Truths) -> Tensor:
+    def pixel_margin(self, output: Output, truth: TruthOfEach) -> Tensor:
         """Return that of the thing where it is largest, (N,); of segmentation."""
         return self._largest(self.part.pixel_margin, output, truth)  # type: ignore[attr-defined]
 
     @staticmethod
-    def _largest(value: Callable[[Output, Truth], Tensor], output: Output, truth: Truths) -> Tensor:
+    def _largest(value: Callable[[Output, Truth], Tensor], output: Output, truth: TruthOfEach) -> Tensor:
         return torch.stack([value(output, one) for one in truth.values()]).amax(dim=0)
 
     def predictions(self, output: Output, count: int = 1) -> list[tuple[Prediction, ...]]:
         return self.part.predictions(output, count)
 
-    def judge(self, output: Output, truth: Truths) -> list[Judgement]:
+    def judge(self, output: Output, truth: TruthOfEach) -> list[Judgement]:
         """See `Task.judge`: the prediction about the thing that is worst, and in the payload what is said of each."""
         each = zip(*(self.part.judge(output, one) for one in truth.values()), strict=True)
         with torch.no_grad():
@@ -101,7 +101,7 @@ class EachThing(Task):
         payload: Any = {**kept, "worst": worst, "mean_margin": average, "things": things}
         return Judgement.of(score, margin, said[worst].prediction, payload)
 
-    def marks(self, output: Output, truth: Truths) -> list[list[Mark]]:
+    def marks(self, output: Output, truth: TruthOfEach) -> list[list[Mark]]:
         """See `Task.marks`: what is true of each thing, and the prediction once."""
         found: list[list[Mark]] = []
         for marks in zip(*(self.part.marks(output, one) for one in truth.values()), strict=True):

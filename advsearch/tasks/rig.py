@@ -16,12 +16,10 @@ from advsearch.models.all_at_once import AllAtOnce
 from advsearch.options import FROM_RUN
 from advsearch.tasks.base import Facts, Judgement, Mark, Prediction, Task, Truth
 from advsearch.tasks.command import Command
+from advsearch.tasks.together import Outputs, all_said
 
 RULES = ("any", "all", "mean", "vote")
 """When the rig is right: in any picture, in all, on average of the losses, or in more than half."""
-
-Outputs = tuple[Any, ...]
-"""What the model returns for each picture of one configuration."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,7 +124,7 @@ class Rig(Task):
         return wrong.sort(dim=1).values[:, place]
 
     def predictions(self, output: Sequence[Outputs], count: int = 1) -> list[tuple[Prediction, ...]]:
-        return [(_joined([self.part.predictions(one)[0][0] for one in each]),) for each in output]
+        return [(all_said([self.part.predictions(one)[0][0] for one in each]),) for each in output]
 
     def judge(self, output: Sequence[Outputs], truth: tuple[Truth, ...]) -> list[Judgement]:
         found = []
@@ -140,7 +138,7 @@ class Rig(Task):
                     {"prediction": one.prediction.label, "right": one.right, "payload": one.payload} for one in said
                 ]
             }
-            prediction = _joined([one.prediction for one in said])
+            prediction = all_said([one.prediction for one in said])
             found.append(Judgement.of(score, math.nan if lost else margin, prediction, payload))
         return found
 
@@ -154,7 +152,3 @@ class Rig(Task):
 
     def _wide(self, mask: Tensor | None) -> Tensor | None:
         return None if mask is None else torch.cat([mask, *[torch.zeros_like(mask)] * (self.cameras - 1)], dim=-1)
-
-
-def _joined(predictions: Sequence[Prediction]) -> Prediction:
-    return Prediction("; ".join(one.label for one in predictions))
