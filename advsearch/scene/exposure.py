@@ -25,7 +25,7 @@ from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.geometry import camera_to_world, object_to_world, standing
 from advsearch.scene.grounds import paved
 from advsearch.scene.parts import MeshPart
-from advsearch.scene.raster import looked_up, pixels_in
+from advsearch.scene.raster import doubled_normals, looked_up, pixels_in
 from advsearch.scene.settings import ORBIT_CAMERA, resolve
 from advsearch.scene.silhouettes import NEAREST, Frame
 
@@ -107,7 +107,7 @@ def _emitted(part: MeshPart, emission: Floats, place: Doubles) -> tuple[Doubles,
     A face is taken for a disk of its mean radiance.
     """
     corners = standing(part)[part.mesh.faces]
-    area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2.0
+    area = doubled_normals(corners) / 2.0
     way = corners.mean(axis=1) - place
     far = (way * way).sum(axis=1)
     way = way / np.maximum(np.sqrt(far), 1e-12)[:, None]

@@ -16,6 +16,7 @@ from advsearch.scene.assets import Doubles, Floats, Mesh
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.mitsuba_backend.variant import Plugin, mi
 from advsearch.scene.parts import BASE_COLOR, MeshPart
+from advsearch.scene.raster import doubled_normals
 
 POSITIONS, NORMALS, TEXCOORDS, FACES = "vertex_positions", "vertex_normals", "vertex_texcoords", "faces"
 """Names of a mesh's parameters: flat arrays of 3, 3 and 2 numbers a vertex, and 3 indices a face."""
@@ -83,8 +84,7 @@ def sampling_weights(parts: Iterable[MeshPart]) -> dict[str, float]:
     for part in parts:
         if part.emission is not None:
             corners = (part.mesh.vertices.astype(np.float64) @ part.to_world[:3, :3].T)[part.mesh.faces]
-            doubled = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-            powers[part.name] = float(part.emission.mean() * np.linalg.norm(doubled, axis=1).sum())
+            powers[part.name] = float(part.emission.mean() * np.linalg.norm(doubled_normals(corners), axis=1).sum())
     total = max(sum(powers.values()), 1e-30)  # of faces without area it is 0
     return {name: (1.0 - LEAST) * power / total + LEAST / len(powers) for name, power in powers.items()}
 
@@ -105,18 +105,21 @@ def texture(linear: Floats) -> Plugin:
     return {"type": "bitmap", "bitmap": bitmap, "raw": True, "filter_type": "bilinear"}
 
 
+def with_inner(plugin: Mapping[str, object], change: Callable[[Mapping[str, object]], object]) -> Plugin:
+    """Return a plugin whose inner plugins are changed."""
+    return {key: change(entry) if isinstance(entry, Mapping) else entry for key, entry in plugin.items()}
+
+
 def own_surface(surface: Mapping[str, object], fill: Callable[[Mapping[str, object]], object]) -> Plugin:
     """Return a surface in Mitsuba's words, which has `BASE_COLOR` as a type, with its base colour in that place: what
     `fill` makes of how the texture is looked up."""
 
-    def filled(value: object) -> object:
-        if not isinstance(value, Mapping):
-            return value
-        if value.get("type") == BASE_COLOR:
-            return fill({key: entry for key, entry in value.items() if key != "type"})
-        return {key: filled(entry) for key, entry in value.items()}
+    def filled(plugin: Mapping[str, object]) -> object:
+        if plugin.get("type") == BASE_COLOR:
+            return fill({key: entry for key, entry in plugin.items() if key != "type"})
+        return with_inner(plugin, filled)
 
-    return loadable({key: filled(entry) for key, entry in surface.items()})
+    return loadable(with_inner(surface, filled))
 
 
 def base_texture(base_color: Floats, options: Mapping[str, object]) -> Plugin:

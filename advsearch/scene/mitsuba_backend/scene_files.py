@@ -14,15 +14,15 @@ from pathlib import Path
 import numpy as np
 
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.scene.assets import Doubles, Floats, Mesh, ObjectAsset, UpAxis, normalised
+from advsearch.scene.assets import Floats, Mesh, ObjectAsset, UpAxis, normalised
 from advsearch.scene.importing.files import clean, safe_name, shown
 from advsearch.scene.importing.geometry import assemble, join
 from advsearch.scene.importing.parts import BRIGHTEST, ImportedPart, ImportedSurface
 from advsearch.scene.importing.scenes import TAKEN, ImportedScene
 from advsearch.scene.importing.texture import textured
-from advsearch.scene.mitsuba_backend.meshes import plain
+from advsearch.scene.mitsuba_backend.meshes import plain, with_inner
 from advsearch.scene.mitsuba_backend.shape_surfaces import ShapeSurface, constant, surface_of
-from advsearch.scene.mitsuba_backend.shapes import MESHES, OF_A_SHAPE, ShapeMesh, haze_in, mesh_of
+from advsearch.scene.mitsuba_backend.shapes import MESHES, OF_A_SHAPE, ShapeMesh, haze_in, mesh_of, pose_of
 from advsearch.scene.mitsuba_backend.variant import Plugin
 from advsearch.scene.mitsuba_backend.xml_files import read_scene, trusted
 from advsearch.scene.parts import MediumPart, PlacedCamera, PluginPart, ScenePart, plugins_in
@@ -169,7 +169,7 @@ def import_plugins(scene: Path | Mapping[str, object], wanted: str) -> ImportedS
     shape = named[wanted]
     surface, triangles = surface_of(_bsdf(shape, named)), mesh_of(shape, wanted)
     placed = [plugin for plugin in named.values() if plugin["type"] in SENSORS and "to_world" in plugin]
-    upper = abs(_matrix(placed[0])[:3, 1]) if placed else np.array([0.0, 1.0, 0.0])  # of the first camera's side
+    upper = abs(pose_of(placed[0])[:3, 1]) if placed else np.array([0.0, 1.0, 0.0])  # of the first camera's side
     frame = _ObjectFrame(triangles.mesh, wanted, z_up=bool(upper[2] > upper[1]))
     haze, used = haze_in(named, frame.matrix) or (None, frozenset[str]())
     light = _light(shape)
@@ -227,7 +227,7 @@ def _plugins(tree: Mapping[str, object]) -> Iterator[tuple[str, Mapping[str, obj
 
 def _renamed(plugin: Mapping[str, object]) -> Plugin:
     """A plugin whose references have the names that the house left free."""
-    entries = {key: _renamed(value) if isinstance(value, Mapping) else value for key, value in plugin.items()}
+    entries = with_inner(plugin, _renamed)
     if entries["type"] == "ref" and entries["id"] in TAKEN:
         entries["id"] = f"{entries['id']}-2"
     return entries
@@ -248,7 +248,7 @@ def _bsdf(shape: Mapping[str, object], named: Mapping[str, Mapping[str, object]]
             if name not in named or depth > len(named):
                 raise UnknownNameError("material of the scene", name, list(named))
             return whole(named[name], depth + 1)
-        return {key: whole(entry, depth) if isinstance(entry, Mapping) else entry for key, entry in plugin.items()}
+        return with_inner(plugin, lambda inner: whole(inner, depth))
 
     for inner in shape.values():
         if isinstance(inner, Mapping) and inner["type"] not in LIGHTS | MEDIA:
@@ -334,25 +334,25 @@ class _ObjectFrame:
         """Return a plugin at the top of a scene in its place."""
         kind, entries = plugin["type"], dict(plugin)
         if kind == "merge":
-            return {key: self.moved(inner) if isinstance(inner, Mapping) else inner for key, inner in entries.items()}
+            return with_inner(entries, self.moved)
         if kind in SHAPES - {"shapegroup", "merge"}:
-            entries["to_world"] = self.matrix @ _matrix(plugin)
+            entries["to_world"] = self.matrix @ pose_of(plugin)
         elif kind in ("constant", "envmap", "sunsky", "timed_sunsky", "directional"):
             turn = np.eye(4)
             turn[:3, :3] = self.turn
             if "direction" in entries:
                 entries["direction"] = (self.turn @ np.asarray(entries["direction"], dtype=np.float64)).tolist()
             elif kind != "constant":
-                entries["to_world"] = turn @ _matrix(plugin)
+                entries["to_world"] = turn @ pose_of(plugin)
         elif kind in ("point", "spot", "projector"):
             if "position" in entries:
                 place = np.asarray(entries["position"], dtype=np.float64)
                 entries["position"] = (self.matrix[:3, :3] @ place + self.matrix[:3, 3]).tolist()
             else:
-                entries["to_world"] = self.matrix @ _matrix(plugin)
+                entries["to_world"] = self.matrix @ pose_of(plugin)
             power = "irradiance" if kind == "projector" else "intensity"
             entries[power] = _times(entries.get(power, 1.0), self.size**-2, str(kind))
-        return {key: self._inside(value) if isinstance(value, Mapping) else value for key, value in entries.items()}
+        return with_inner(entries, self._inside)
 
     def _inside(self, plugin: Mapping[str, object]) -> Plugin:
         """Return a plugin within another: media and volumes are scaled."""
@@ -360,12 +360,8 @@ class _ObjectFrame:
         if plugin["type"] in MEDIA:
             entries["scale"] = float(np.asarray(entries.get("scale", 1.0))) * self.size
         if plugin["type"] in ("gridvolume", "constvolume"):
-            entries["to_world"] = self.matrix @ _matrix(plugin)
-        return {key: self._inside(value) if isinstance(value, Mapping) else value for key, value in entries.items()}
-
-
-def _matrix(plugin: Mapping[str, object]) -> Doubles:
-    return np.asarray(plugin.get("to_world", np.eye(4)), dtype=np.float64)
+            entries["to_world"] = self.matrix @ pose_of(plugin)
+        return with_inner(entries, self._inside)
 
 
 def _times(value: object, factor: float, kind: str) -> object:
@@ -388,7 +384,7 @@ def _times(value: object, factor: float, kind: str) -> object:
 
 
 def _camera(sensor: Mapping[str, object], frame: _ObjectFrame) -> PlacedCamera:
-    matrix = frame.matrix @ _matrix(sensor)
+    matrix = frame.matrix @ pose_of(sensor)
     matrix[:3, :3] /= np.maximum(np.linalg.norm(matrix[:3, :3], axis=0), 1e-12)
     inner = [entry for entry in sensor.values() if isinstance(entry, Mapping)]
     film = next((plugin for plugin in inner if "film" in str(plugin["type"])), {})

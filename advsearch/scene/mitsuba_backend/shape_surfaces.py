@@ -9,6 +9,7 @@ import numpy as np
 
 from advsearch.scene.assets import Doubles, Floats
 from advsearch.scene.color import linear_to_srgb
+from advsearch.scene.mitsuba_backend.meshes import with_inner
 from advsearch.scene.mitsuba_backend.variant import Plugin, mi
 from advsearch.scene.parts import BASE_COLOR, plugins_in
 
@@ -82,7 +83,7 @@ def surface_of(bsdf: Mapping[str, object]) -> ShapeSurface:
         color = None if key is None or base is not None else _color(plugin.get(key, GREY))
         if key is not None and color is not None:
             base, plugin = color, {**plugin, key: {"type": BASE_COLOR, **color.options}}
-        return {name: without(value) if isinstance(value, Mapping) else value for name, value in plugin.items()}
+        return with_inner(plugin, without)
 
     surface = without(bsdf)
     color = base or _Color(np.full((PLAIN_SIZE, PLAIN_SIZE, 3), GREY, np.float32), {})
@@ -110,10 +111,7 @@ def surface_of(bsdf: Mapping[str, object]) -> ShapeSurface:
 
 def _with_transform(plugin: Mapping[str, object], before: Doubles, *kinds: str) -> Plugin:
     """Return a plugin whose textures of some kinds take texture coordinates after a transform (3, 3) as well."""
-    moved = {
-        key: _with_transform(entry, before, *kinds) if isinstance(entry, Mapping) else entry
-        for key, entry in plugin.items()
-    }
+    moved = with_inner(plugin, lambda inner: _with_transform(inner, before, *kinds))
     if moved["type"] in kinds:
         whole = np.eye(4)
         whole[np.ix_((0, 1, 3), (0, 1, 3))] = uv_matrix(plugin.get("to_uv", np.eye(3))) @ before

@@ -12,6 +12,7 @@ from advsearch.scene.assets import Doubles, Floats, Ints, Mesh
 from advsearch.scene.mitsuba_backend.meshes import FACES, NORMALS, POSITIONS, TEXCOORDS, loadable
 from advsearch.scene.mitsuba_backend.variant import fewer_warnings, mi
 from advsearch.scene.parts import HazePart
+from advsearch.scene.raster import doubled_normals
 
 Buffers = tuple[Doubles, Ints, Doubles | None, Doubles | None, dict[str, Floats]]
 """Vertices, faces, normals and texture coordinates of a mesh, and its attributes, (V or F, n) by their names."""
@@ -61,13 +62,14 @@ def mesh_of(shape: Mapping[str, object], name: str) -> ShapeMesh:
         corners = faces.reshape(-1)
         attributes = _of(corners, attributes)
         vertices, faces = vertices[corners], np.arange(len(corners)).reshape(-1, 3)
-        normals = _unit(_fronts(vertices, faces)).repeat(3, axis=0) if flat or normals is None else normals[corners]
+        faced = _unit(doubled_normals(vertices[faces])).repeat(3, axis=0)
+        normals = faced if flat or normals is None else normals[corners]
         uvs = np.tile(BARE, (len(faces), 1)) if uvs is None else uvs[corners]
     used, index = np.unique(faces, return_inverse=True)
     faces = index.reshape(-1, 3)
     vertices, uvs = vertices[used], uvs[used] * (1.0, -1.0) + (0.0, 1.0)
     normals = np.nan_to_num(normals)[used] * (-1.0 if shape.get("flip_normals") else 1.0)
-    if np.einsum("fk,fck->", _fronts(vertices, faces), normals[faces]) < 0.0:
+    if np.einsum("fk,fck->", doubled_normals(vertices[faces]), normals[faces]) < 0.0:
         faces = faces[:, ::-1]  # Mitsuba shades by the normals, whichever way faces are wound
     places, facing, texture = (values.astype(np.float32) for values in (vertices, normals, uvs))
     made = Mesh(places, np.ascontiguousarray(faces, np.uint32), facing, texture, _of(used, attributes))
@@ -77,12 +79,6 @@ def mesh_of(shape: Mapping[str, object], name: str) -> ShapeMesh:
 def _of(vertices: Ints, attributes: Mapping[str, Floats]) -> dict[str, Floats]:
     """The attributes of some of the vertices, in their order, and of all faces."""
     return {key: values[vertices] if key.startswith("vertex_") else values for key, values in attributes.items()}
-
-
-def _fronts(vertices: Doubles, faces: Ints) -> Doubles:
-    """Vectors (F, 3) along the sides from which faces are wound counter-clockwise, twice as long as their areas."""
-    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
-    return np.asarray(np.cross(b - a, c - a))
 
 
 def _loaded(shape: Mapping[str, object], name: str) -> Buffers:
@@ -137,8 +133,8 @@ def _solid(kind: str, shape: Mapping[str, object], name: str) -> Buffers:
         uvs, faces = _grid(np.array([0.0, 1.0]), np.array([0.0, 1.0]))
         vertices = np.column_stack([uvs * 2.0 - 1.0, np.zeros(4)])
     normals = np.tile((0.0, 0.0, 1.0), (len(vertices), 1)) if normals is None else normals
-    faces = faces[np.linalg.norm(_fronts(vertices, faces), axis=1) > 1e-9]
-    matrix = np.asarray(shape.get("to_world", np.eye(4)), dtype=np.float64) @ local
+    faces = faces[np.linalg.norm(doubled_normals(vertices[faces]), axis=1) > 1e-9]
+    matrix = pose_of(shape) @ local
     if not abs(np.linalg.det(matrix[:3, :3])) > 0.0:
         raise InputError(f"object {name}: expected a {kind} of some size, got one without extent; change its numbers")
     normals = _unit(normals @ np.linalg.inv(matrix[:3, :3]))
@@ -179,6 +175,11 @@ def _number(value: object) -> float:
     return float(np.asarray(value, dtype=np.float64))
 
 
+def pose_of(plugin: Mapping[str, object]) -> Doubles:
+    """Return the pose (4, 4) of a plugin."""
+    return np.asarray(plugin.get("to_world", np.eye(4)), dtype=np.float64)
+
+
 Plugins = Mapping[str, Mapping[str, object]]
 
 MOST, DARKEST = 2.0, 1e-3
@@ -211,7 +212,7 @@ def haze_in(named: Plugins, matrix: Doubles) -> tuple[HazePart, frozenset[str]] 
     across, middle = _numbers(ball.get("radius", 1.0)), _numbers(ball.get("center", np.zeros(3)))
     density, albedo = _numbers(medium.get("sigma_t", 1.0)), _numbers(medium.get("albedo", 0.75))
     scale = _numbers(medium.get("scale", 1.0))
-    pose = matrix @ np.asarray(ball.get("to_world", np.eye(4)), np.float64)
+    pose = matrix @ pose_of(ball)
     place = pose @ np.append(np.broadcast_to(middle, (3,)), 1.0)
     radius = float(across[0]) * float(np.cbrt(abs(np.linalg.det(pose[:3, :3]))))
     size = float(np.cbrt(abs(np.linalg.det(matrix[:3, :3]))))

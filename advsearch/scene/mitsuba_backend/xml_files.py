@@ -28,6 +28,7 @@ from advsearch.scene.environments import import_environment, read_light
 from advsearch.scene.importing.files import References, damaged, looks_like, read_bytes, shown
 from advsearch.scene.importing.objects import read_parts
 from advsearch.scene.importing.pictures import TEXTURE_LIMIT, banded_average, read_picture
+from advsearch.scene.mitsuba_backend.meshes import with_inner
 from advsearch.scene.mitsuba_backend.variant import VARIANT, Plugin, fewer_warnings, mi
 
 SUFFIX = ".xml"
@@ -318,7 +319,7 @@ def trusted(path: Path, scene: Mapping[str, object], notes: list[str]) -> Plugin
             )
         if not re.fullmatch(r"\w*", str(plugin.get("material", ""))):
             raise FileFormatError(f"{path}: {shown(str(plugin['material']))} is no name of a material")
-        entries = {key: checked(value) if isinstance(value, Mapping) else value for key, value in plugin.items()}
+        entries = with_inner(plugin, checked)
         if kind in readers and "filename" not in entries:  # without one Mitsuba's bitmap ends the process
             raise FileFormatError(f"{path}: expected a filename in each {kind}, got none; name the file")
         if "filename" in entries:
