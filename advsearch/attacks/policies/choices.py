@@ -65,9 +65,15 @@ class Race:
         race = self
         while True:
             batch, race = race._asking(n)
-            if batch or all(runner.over for runner in race.runners):
+            runners = race.runners
+            if batch or all(runner.over for runner in runners):
                 return batch, race
-            race = race._next_round()
+            ranked = sorted(race.field, key=lambda k: runners[k].best, reverse=True)
+            able = [k for k in ranked[: -(-len(ranked) // 2)] if not runners[k].over]
+            if race.round + 1 >= race.rounds or not able:  # nobody left who can go on: the renders are for whoever can
+                left = (k for k, runner in enumerate(runners) if not runner.over)
+                able = sorted(left, key=lambda k: -runners[k].best)[:1]
+            race = race.begun(able, min(race.round + 1, race.rounds - 1))
 
     def update(self, evaluated: Evaluated) -> Race:
         """Tell each search what came of its proposals, or of the first of them; every u and its evaluation are as its
@@ -77,9 +83,9 @@ class Race:
             by_runner[number].append((u, evaluation))
         runners = list(self.runners)
         for number, own in by_runner.items():
-            runner, reached = runners[number], max(evaluation.objective for _, evaluation in own)
+            runner, best = runners[number], max(evaluation.objective for _, evaluation in own)
             state = runner.policy.update(runner.state, own)
-            runners[number] = replace(runner, state=state, best=max(runner.best, reached))
+            runners[number] = replace(runner, state=state, best=max(runner.best, best))
         spent = self.spent + sum(evaluation.cost for _, evaluation in evaluated)
         return replace(self, runners=tuple(runners), spent=spent, asked=())
 
@@ -90,8 +96,8 @@ class Race:
 
     def failures(self) -> Failures | None:
         """Return the different failures of the search that has met the most; None where none looks for such."""
-        found = (runner.policy.failures(runner.state) for runner in self.runners)
-        return max((one for one in found if one is not None), key=lambda one: one.found, default=None)
+        known = [runner.policy.failures(runner.state) for runner in self.runners]
+        return max(filter(None, known), key=lambda failures: failures.found, default=None)
 
     def counts(self) -> Counts:
         """Return the sum over all searches."""
@@ -103,15 +109,6 @@ class Race:
         share = max(1, (self.steps - self.spent) // (self.rounds - number) // len(field))
         runners = [replace(runner, left=share if k in field else 0) for k, runner in enumerate(self.runners)]
         return replace(self, runners=tuple(runners), field=field, round=number)
-
-    def _next_round(self) -> Race:
-        runners = self.runners
-        ranked = sorted(self.field, key=lambda k: runners[k].best, reverse=True)
-        able = [k for k in ranked[: -(-len(ranked) // 2)] if not runners[k].over]
-        if self.round + 1 >= self.rounds or not able:  # nobody left who can go on: the renders are for whoever can
-            left = (k for k, runner in enumerate(runners) if not runner.over)
-            able = sorted(left, key=lambda k: -runners[k].best)[:1]
-        return self.begun(able, min(self.round + 1, self.rounds - 1))
 
     def _asking(self, n: int) -> tuple[tuple[Proposal, ...], Race]:
         """Return up to n proposals of this round that do not wait for each other; none where it is done."""
@@ -228,8 +225,7 @@ class Stay(Policy[Tensor]):
         return state
 
 
-MOST = 256
-"""No more combinations than this take part."""
+MOST = 256  # no more combinations than this take part
 
 MOST_NUMBERS = 2**24
 """And no more, but two, than have so many numbers together: each search keeps some vectors of that size."""
@@ -258,14 +254,9 @@ class ChoicesState:
 class Choices(Policy[ChoicesState]):
     """Searches combinations of options outside and, with another policy, the numbers inside.
 
-    Every combination of options has a search of its own over the numbers, and the combinations race. If
-    there are more combinations than can have a whole evaluation in every round, a random choice of them takes part, the
-    start's among them always.
-
-    `search` puts this around every policy whose `handles_choices` is false, a user's own included.
-
-    Attributes:
-        policy: what searches the numbers.
+    Every combination of options has a search of its own over the numbers, and the combinations race. If there are more
+    combinations than can have a whole evaluation in every round, a random choice of them takes part, the start's among
+    them always. `search` puts this around every policy whose `handles_choices` is false, a user's own included.
     """
 
     policy: Policy[Any]
@@ -281,18 +272,21 @@ class Choices(Policy[ChoicesState]):
         return self.policy.takes_differences(domain, steps)
 
     def start(self, domain: Domain, generator: torch.Generator, steps: int) -> ChoicesState:
-        seed = draw_seed(generator)
-        discrete = torch.cat([torch.full((block.size,), block.options > 0) for block in domain.blocks])
-        numbers, choices = (~discrete).nonzero().flatten(), discrete.nonzero().flatten()
-        inner = _without(domain, numbers)
-        policy: Policy[Any] = Stay() if inner is None else self.policy
+        seed, options = draw_seed(generator), domain.options
+        numbers, choices = (options == 0).nonzero().flatten(), options.nonzero().flatten()
+        policy, inner = self.policy, _EMPTY
+        if len(numbers):
+            first = None if domain.first is None else domain.first[numbers]
+            blocks = tuple(block for block in domain.blocks if not block.options)
+            inner = replace(domain, start=domain.start[numbers], blocks=blocks, first=first)
+        else:
+            policy = Stay()
+        counts = options[choices].tolist()
         each = 1 + (domain.gradient_cost if policy.uses_gradient else 0)
-        counts = [block.options for block in domain.blocks if block.options]
         limit = min(MOST, math.prod(counts), max(2, MOST_NUMBERS // domain.dim))
         most = most_runners(steps, each, limit)
         combinations = _combinations(counts, domain.begin[choices], most, seeded(seed, 0))
-        search = (policy, _EMPTY if inner is None else inner)
-        race = line_up([search] * len(combinations), steps, seed)
+        race = line_up([(policy, inner)] * len(combinations), steps, seed)
         return ChoicesState(domain, numbers, choices, combinations, race)
 
     def propose(self, state: ChoicesState, n: int) -> tuple[tuple[Proposal, ...], ChoicesState]:
@@ -303,9 +297,9 @@ class Choices(Policy[ChoicesState]):
 
     def update(self, state: ChoicesState, evaluated: Evaluated) -> ChoicesState:
         inner, numbers = [], state.numbers
-        for u, one in evaluated:
-            gradient = None if one.gradient is None else one.gradient[numbers]
-            inner.append((u[numbers], replace(one, gradient=gradient)))
+        for u, evaluation in evaluated:
+            gradient = None if evaluation.gradient is None else evaluation.gradient[numbers]
+            inner.append((u[numbers], replace(evaluation, gradient=gradient)))
         return replace(state, race=state.race.update(inner))
 
     def counts(self, state: ChoicesState) -> Counts:
@@ -326,33 +320,23 @@ def with_choices(policy: Policy[Any], domain: Domain) -> Policy[Any]:
     return Choices(policy) if discrete and not policy.handles_choices else policy
 
 
-_EMPTY = Domain(torch.zeros(1), (Block(1),))
-"""Stands in where nothing but choices may vary; its one number is dropped."""
-
-
-def _without(domain: Domain, numbers: Tensor) -> Domain | None:
-    """Return the domain of the numbers alone; None if there are none."""
-    blocks = tuple(block for block in domain.blocks if not block.options)
-    if not blocks:
-        return None
-    first = None if domain.first is None else domain.first[numbers]
-    return replace(domain, start=domain.start[numbers], blocks=blocks, first=first)
+_EMPTY = Domain(torch.zeros(1), (Block(1),))  # stands in where nothing but choices may vary; its one number is dropped
 
 
 def _combinations(counts: list[int], begin: Tensor, most: int, generator: torch.Generator) -> Tensor:
     """Return (n, c) elements of u, n at most `most`, that of the start first and unchanged: all combinations in a
     random order, or so many distinct ones."""
-    sizes = torch.tensor(counts)
-    total = math.prod(counts)
+    sizes, total = torch.tensor(counts), math.prod(counts)
     start = torch.floor(begin * sizes).long().clamp(max=sizes - 1)
     if total <= max(1024, 4 * most):
         every = torch.cartesian_prod(*(torch.arange(count) for count in counts)).reshape(total, len(counts))
         every = every[torch.randperm(total, generator=generator)]
         picked = every[~(every == start).all(dim=1)][: most - 1]
     else:
-        seen = {tuple(start.tolist())}
+        first = tuple(start.tolist())
+        seen = {first}
         while len(seen) < most:
             seen.add(tuple(int(torch.randint(count, (1,), generator=generator)) for count in counts))
-        picked = torch.tensor(sorted(seen - {tuple(start.tolist())})).reshape(-1, len(counts))
+        picked = torch.tensor(sorted(seen - {first})).reshape(-1, len(counts))
     middles = centre_of_option((picked + 0.5) / sizes, sizes)
     return torch.cat([begin[None], middles.to(begin.dtype)])
