@@ -21,8 +21,7 @@ SAME = 1e-4  # configurations that differ by less than this in every element are
 @dataclass(frozen=True, eq=False)
 class Candidate:
     """A configuration (d,) worth a second look: the objective (biased upwards) and success of the render that admitted
-    it, the objectives of its renders since then, -inf for one that was not finite, and how many of these were a
-    success."""
+    it, the objectives of its renders since then, -inf where not finite, and how many were a success."""
 
     u: Tensor
     objective: float
@@ -92,8 +91,7 @@ def contenders(pool: tuple[Candidate, ...], shared: int) -> tuple[Candidate, ...
 
 
 def best(pool: tuple[Candidate, ...]) -> Candidate:
-    """Return the winner: by success rate, then by objective, of the new renders where every candidate has had its
-    own."""
+    """Return the winner: by success rate, then by objective, of new renders where all have had some."""
     if all(candidate.again for candidate in pool):
         return max(pool, key=lambda candidate: (candidate.rate, candidate.believed))
     return pool[0]
@@ -227,8 +225,7 @@ Likely = Callable[[Tensor], bool]
 @dataclass(frozen=True, eq=False)
 class Bracket:
     """Where the smallest scale lies: a search found nothing at `low` (0 where none has failed), and `u` (d,) passes at
-    `high`, infinity where nothing did; it is of the search `found_by`, and has passed again, with new seeds, if
-    `confirmed`."""
+    `high`, infinity where nothing did; of the search `found_by`; if `confirmed` it has passed again with new seeds."""
 
     low: float
     high: float
@@ -268,8 +265,7 @@ def smallest(search: Search, passes: Passes, domain: Domain, likely: Likely | No
     2. The configuration is moved towards the start, by bisection in the logarithm of its length, to the shortest that
        passes: a handful of trials, no search.
     3. A search at half the scale reached, then at the geometric mean of the bracket's ends; each configuration that
-       passes is shortened as in 2, each that fails raises the lower end; until it is closed or `ROUNDS` searches are
-       done.
+       passes is shortened as in 2, each that fails raises the lower end; until it is closed, or after `ROUNDS`.
 
     For a linear model and a gradient policy the first search points the right way and 2 ends within its own step of the
     optimum, so that the result is within `RATIO` of the closed form.

@@ -103,12 +103,10 @@ class Domain:
         blocks: consecutive slices of u that add up to d.
         gradient_cost: pictures that one whole gradient costs on top of the one it belongs to: 0 for an adjoint, two
             for each number with central differences.
-        partial_gradients: whether `evaluate` understands `gradient="free"`, the part of the gradient that costs
-            nothing.
+        partial_gradients: whether `evaluate` understands `gradient="free"`, the part that costs nothing.
         exact: whether evaluations are free of noise: equal configurations have equal objectives and gradients, as where
             a matrix predicts the pictures (docs/transport.md).
-        drawn: whether evaluations are free of noise but for the conditions that each draws anew, from a bank
-            (docs/transport.md).
+        drawn: whether they are but for the conditions that each draws anew from a bank (docs/transport.md).
         first: (d,) where a policy should begin, if not at the start; it moves no ball. For wrappers that begin
             several times.
         lower, upper: (d,) float32 bounds; those of an l-infinity ball are cut into them already.

@@ -36,8 +36,7 @@ Doubles = NDArray[np.float64]
 
 
 class Draws:
-    """Points of [0, 1)^dimensions by number, by a sampler of `SAMPLERS`; their streams are called `name`. 0 dimensions
-    are fine."""
+    """Points of [0, 1)^dimensions by number, by a sampler of `SAMPLERS`; their streams are called `name`."""
 
     def __init__(self, dimensions: int, sampler: str, seed: int, name: str = "draws") -> None:
         if sampler not in SAMPLERS:

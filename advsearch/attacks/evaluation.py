@@ -172,8 +172,7 @@ class Proposal:
     Attributes:
         u: (d,) float32 inside the domain; the caller must not write to it.
         gradient: whether the policy wants the derivative there: not, all of it (`Domain.gradient_cost` more pictures),
-            or what is "free" (only where the domain has `partial_gradients`). A wish: the last evaluations of a budget
-            get none, and `update` sees None.
+            or what is "free" (only where the domain has `partial_gradients`). A wish: the end of a budget gets none.
         step_size: the step that led here in units of each block's radius, for the log; NaN where there is none.
         samples: render with so many times the search's samples per pixel, at least 1, for as many times the renders.
             A wish too: the end of a budget gets what is left.
@@ -302,8 +301,7 @@ def draw_seed(generator: torch.Generator) -> int:
 
 
 def seeded(seed: int, number: int) -> torch.Generator:
-    """Return the generator for draw `number` of a policy: it depends on nothing else, so that a state can be
-    replayed."""
+    """Return the generator for draw `number` of a policy: it depends on nothing else."""
     return torch.Generator().manual_seed(stream(seed, "policy", number))
 
 

@@ -212,9 +212,8 @@ def cosine_distance(features: ReadFeatures, clean: Tensor) -> Callable[[Tensor, 
         features: of the clean picture; called once, here.
         clean: as for `feature_distance`.
 
-    Returns:
-        An objective (features (N, F), images, labels) -> (N,), at least 0 but for `h`^2, that looks at the features
-        only, whatever their length.
+    Returns: An objective (features (N, F), images, labels) -> (N,), at least 0 but for `h`^2, that looks at the
+        features only.
     """
     reference = functional.normalize(_reference(features, clean), dim=0)
     away = _away(reference)

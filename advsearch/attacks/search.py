@@ -157,21 +157,18 @@ def search(
     A policy that does not handle discrete choices is wrapped in `Choices` where the domain has some.
 
     A non-finite objective is counted, is never best, and reaches the policy as -inf; `NON_FINITE_LIMIT` in a row end
-    the search. KeyboardInterrupt, wherever it strikes, ends it with what there is. Every other exception passes
-    through.
+    the search. KeyboardInterrupt, wherever it strikes, ends it with what there is.
 
     Args:
         evaluate: renders and judges configurations.
         steps: renders of the search, at least 1; as many evaluations where no gradient costs any. By default all are
             spent: the worst case is wanted, not the first.
         seed, noise: root seeds of the search's own randomness, and of the renders; at least 0.
-        candidates, repeats, close: see above; together they cost at most `candidates * (repeats + close)` renders on
-            top of `steps`.
+        candidates, repeats, close: see above; they cost at most `candidates * (repeats + close)` renders more.
         on_step: called after every evaluation.
         seconds: end step 1 after the first evaluation that is done later than this, over 0; None for no limit. There
             is always one evaluation, and step 2 comes on top. Policies still plan for `steps`.
-        late: says, after so many evaluations, whether the time is over; in place of `seconds`, for a run that goes on
-            after it was stopped.
+        late: says, after so many evaluations, whether the time is over; in place of `seconds`, for a run that goes on.
         kind: of the queries.
 
     Raises:
@@ -366,8 +363,7 @@ def _check_inside(proposal: Proposal, domain: Domain, name: str) -> None:
 
 
 def _check_evaluation(evaluation: Evaluation, proposal: Proposal, domain: Domain) -> None:
-    """Raise RuntimeError unless a gradient came as it was asked for, at the cost that the domain said: the budget rests
-    on that."""
+    """Raise RuntimeError unless a gradient came as it was asked for, at the cost that the domain said."""
     gradient, u, least, most = evaluation.gradient, proposal.u, proposal.samples, proposal.cost(domain)
     if proposal.gradient and gradient is None:
         raise RuntimeError("evaluate returned no gradient although one was asked for")

@@ -319,8 +319,7 @@ def choose_spp(
 def _climbed(
     margins: MarginsOf, seed: int, ladder: Sequence[int], looks: Sequence[int], trials: int
 ) -> list[list[float]]:
-    """Return the margins of one configuration at each rung, up to that at which it settles or beyond which none can
-    settle it."""
+    """Return the margins of one configuration at each rung, up to that at which it settles or none above can."""
     values: list[list[float]] = [[] for _ in ladder]
     places = list(product(range(1, len(ladder)), looks))
     for number, (level, count) in enumerate(places):

@@ -158,8 +158,7 @@ class Verification:
         clean_trials, adversarial_trials: every single trial, in the order of their seeds; of curtailed ones the second
             group is the shorter.
         renders: renders spent here.
-        stopped: why there are no more trials: "asked for" (as many as were), "decided" (the verdict is certain, or
-            stands).
+        stopped: why there are no more trials: "asked for" (as many as were), "decided" (the verdict stands).
         outcomes: of each trial of the second group, whether it is a success; None where it does not count, as under
             its conditions the clean configuration is wrong.
         begin: the number of the first trial.

@@ -44,8 +44,7 @@ def changed(picture: Tensor, when: str, cameras: int = 1) -> Tensor:
 
 
 def as_claimed(claim: str, before: Prediction, after: Prediction) -> bool:
-    """Return whether a change did what is claimed of it: that it `must_change` what the model says, or
-    `must_not_change` it."""
+    """Return whether a change did what is claimed: that it `must_change` what the model says, or `must_not_change`."""
     moved = abs((before.probability or 0.0) - (after.probability or 0.0))
     another = before.label != after.label
     return another or moved > ALIKE if claim == "must_change" else not another

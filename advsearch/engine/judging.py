@@ -184,8 +184,7 @@ Looked = Callable[[], Surfaces]
 
 
 def facts_of(scene: Scene, name: str, config: SceneConfig, describe: Described, look: Looked | None = None) -> Facts:
-    """Return what a scene gives a task to judge by, with what is right and what is judged by the settings; see
-    `facts_about`."""
+    """Return what a scene gives a task to judge by, with what the settings say; see `facts_about`."""
     return facts_about(scene.description, name, config.label, describe, look, config.judge)
 
 

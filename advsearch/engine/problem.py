@@ -33,8 +33,7 @@ from advsearch.tasks.base import Output, Truth, mean, typical
 
 
 class Prepared(NamedTuple):
-    """What is measured before a search, and holds for its queries; the longest light path is in segments, None for the
-    scene's."""
+    """What is measured before a search; the longest light path is in segments, None for the scene's."""
 
     spp: int
     search_depth: int | None
@@ -197,8 +196,7 @@ class Problem:
         return self.seen(picture, whole)[1]
 
     def seen(self, picture: Tensor, whole: Tensor) -> tuple[bool, list[Mark]]:
-        """Return whether the model's prediction of a picture (H, W, 3) of the whole space at `whole` is right, and what
-        shows it."""
+        """Return whether the model's prediction of a picture (H, W, 3) at `whole` is right, and what shows it."""
         with torch.no_grad():
             output, truth = self.model(picture), self.truth(whole)
             return self.task.judge(output, truth)[0].right, self.task.marks(output, truth)[0]

@@ -257,8 +257,7 @@ def kept_rows(
 ) -> Ending:
     """Take rows until they end, the time is up or there is an interrupt, and keep what they come to after each.
 
-    The summary never has fewer rows than an earlier sitting left in it: those are read back before anything is
-    measured.
+    The summary never has fewer rows than an earlier sitting left in it: those are read back first.
     """
     taken: list[Kept] = []
     ending = INTERRUPTED

@@ -67,8 +67,7 @@ def remark(reason: str) -> str:
 
 @dataclass
 class PredictedSearch(ABC):
-    """What predicts the pictures of a run's searches. All of it follows from the seed, so that a run that goes on makes
-    the same again.
+    """What predicts the pictures of a run's searches. All of it follows from the seed, so that it can be made again.
 
     Attributes:
         way: how, in words.

@@ -1,5 +1,4 @@
-"""Trials of configurations, kept as rows: of what was found, of different failures, of it on other models or
-pictures."""
+"""Trials of configurations, kept as rows: of what was found, of different failures, also on other models."""
 
 from __future__ import annotations
 
@@ -13,20 +12,11 @@ import torch
 from torch import Tensor
 
 from advsearch import seeds
-from advsearch.attacks import (
-    Ending,
-    Evaluation,
-    SampleCount,
-    SearchResult,
-    Verification,
-    choose_spp,
-    run_trials,
-    verify,
-)
+from advsearch.attacks import Ending, Evaluation, SearchResult, Verification, choose_spp, run_trials, verify
 from advsearch.attacks.draws import batches
 from advsearch.attacks.evaluation import Query, most_at_once
 from advsearch.attacks.rate_samples import CONDITIONS, OVER_LADDER, affordable, choose_rate_spp
-from advsearch.attacks.trials import LADDER, margins_of, most_samples
+from advsearch.attacks.trials import LADDER, SampleCount, margins_of, most_samples
 from advsearch.cluster import Executor
 from advsearch.config import SceneConfig
 from advsearch.engine.journal import Journal, Shared
@@ -45,8 +35,7 @@ MANY = 64  # of a configuration with more numbers than this, a trial's row does 
 
 
 def ladder_of(config: SceneConfig) -> Sequence[int]:
-    """Return the samples a pixel that a verification climbs, as the sampler has them; the only count, if one was asked
-    for."""
+    """Return the samples a pixel that a verification climbs, as the sampler has them; one, if that was asked for."""
     asked = getattr(config, "verify_spp", None)
     return LADDER if asked is None else (next_count(config.pixel_sampler, asked),)
 
@@ -292,8 +281,7 @@ class Retrials:
             yield evaluation
 
     def _changed(self, kind: str, condition: RetrialCondition, queries: Sequence[Query]) -> Iterator[Evaluation]:
-        """Judge pictures as the condition changes them; those of the configuration that is tried now are kept for other
-        conditions."""
+        """Judge pictures as the condition changes them; those of the present configuration are kept for others."""
         if kind != self._pictured:
             self._pictures.clear()
             self._lights.clear()

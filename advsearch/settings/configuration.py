@@ -198,8 +198,7 @@ FILES = (
 
 
 class SettingsError(InputError):
-    """One or more settings have values that are not allowed: `problems` are pairs of a setting's name and what is wrong
-    with it."""
+    """One or more settings have values that are not allowed: `problems` are pairs of a name and what is wrong."""
 
     def __init__(self, problems: tuple[tuple[str, str], ...], file: str | Path = "") -> None:
         where = f"{file}: " if file else ""

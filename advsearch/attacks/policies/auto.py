@@ -242,7 +242,7 @@ class WithoutAscent(Auto):
 
 
 @dataclass(frozen=True)
-class Restarts(Raced):
+class Restarts(Raced[Race]):
     """Lets a policy search `times` times, each with an equal share of the renders; they take turns, step by step.
 
     The first begins where the policy would begin by itself, the others at samples of the domain (`Domain.sample`); the
@@ -279,13 +279,12 @@ class Restarts(Raced):
 
 
 @dataclass(frozen=True)
-class Portfolio(Raced):
+class Portfolio(Raced[Race]):
     """Lets several policies search side by side and goes on with those that reached more.
 
     With n policies there are 1 + ceil(log2 n) rounds of equally many renders, see `choices`. Within a round every
-    policy that is still in has an equal share; after it the better half goes on, by the largest objective so far. So
-    of two policies each has a quarter of the renders, and the better one the other half. Each plans for what it gets
-    if it stays in.
+    policy that is still in has an equal share; after it the better half goes on, by the largest objective so far. So of
+    two policies each has a quarter of the renders, and the better one the other half.
 
     A policy that cannot search the domain (it says so with an InputError: a grid over a texture) is left out; if none
     can, the first one's error is passed on.

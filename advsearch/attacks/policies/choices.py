@@ -10,23 +10,14 @@ from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from heapq import heapify, heappop, heappush
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import torch
 from torch import Tensor
 
 from advsearch.attacks.candidates import Failures
 from advsearch.attacks.domain import Block, Distribution, Domain, centre_of_option
-from advsearch.attacks.evaluation import (
-    NO_COUNTS,
-    Counts,
-    Evaluated,
-    Policy,
-    Proposal,
-    affordable,
-    draw_seed,
-    seeded,
-)
+from advsearch.attacks.evaluation import NO_COUNTS, Counts, Evaluated, Policy, Proposal, affordable, draw_seed, seeded
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +31,9 @@ class Runner:
     left: int = 0
     best: float = -math.inf
     over: bool = False
+
+
+Racing = TypeVar("Racing", bound="Race")
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,57 +54,14 @@ class Race:
         """The number of the search that has met the largest objective so far, the first of equals."""
         return max(range(len(self.runners)), key=lambda k: self.runners[k].best)
 
-    def propose(self, n: int) -> tuple[tuple[Proposal, ...], Race]:
-        """Return the next proposals of this round, up to n; of the next round where this one is done."""
-        race = self
-        while True:
-            batch, race = race._asking(n)
-            runners = race.runners
-            if batch or all(runner.over for runner in runners):
-                return batch, race
-            ranked = sorted(race.field, key=lambda k: runners[k].best, reverse=True)
-            able = [k for k in ranked[: -(-len(ranked) // 2)] if not runners[k].over]
-            if race.round + 1 >= race.rounds or not able:  # nobody left who can go on: the renders are for whoever can
-                left = (k for k, runner in enumerate(runners) if not runner.over)
-                able = sorted(left, key=lambda k: -runners[k].best)[:1]
-            race = race.begun(able, min(race.round + 1, race.rounds - 1))
-
-    def update(self, evaluated: Evaluated) -> Race:
-        """Tell each search what came of its proposals, or of the first of them; every u and its evaluation are as its
-        own domain has them."""
-        by_runner = defaultdict[int, list[Any]](list)
-        for number, (u, evaluation) in zip(self.asked, evaluated, strict=False):
-            by_runner[number].append((u, evaluation))
-        runners = list(self.runners)
-        for number, own in by_runner.items():
-            runner, best = runners[number], max(evaluation.objective for _, evaluation in own)
-            state = runner.policy.update(runner.state, own)
-            runners[number] = replace(runner, state=state, best=max(runner.best, best))
-        spent = self.spent + sum(evaluation.cost for _, evaluation in evaluated)
-        return replace(self, runners=tuple(runners), spent=spent, asked=())
-
-    def distribution(self) -> Distribution | None:
-        """Return the leader's distribution, if it has one."""
-        runner = self.runners[self.leader]
-        return runner.policy.distribution(runner.state)
-
-    def failures(self) -> Failures | None:
-        """Return the different failures of the search that has met the most; None where none looks for such."""
-        known = [runner.policy.failures(runner.state) for runner in self.runners]
-        return max(filter(None, known), key=lambda failures: failures.found, default=None)
-
-    def counts(self) -> Counts:
-        """Return the sum over all searches."""
-        return sum((runner.policy.counts(runner.state) for runner in self.runners), NO_COUNTS)
-
-    def begun(self, field: Iterable[int], number: int) -> Race:
+    def begun(self: Racing, field: Iterable[int], number: int) -> Racing:
         """Return the race at the beginning of a round, with equal shares for those that are in it."""
         field = tuple(field)
         share = max(1, (self.steps - self.spent) // (self.rounds - number) // len(field))
         runners = [replace(runner, left=share if k in field else 0) for k, runner in enumerate(self.runners)]
         return replace(self, runners=tuple(runners), field=field, round=number)
 
-    def _asking(self, n: int) -> tuple[tuple[Proposal, ...], Race]:
+    def asking(self: Racing, n: int) -> tuple[tuple[Proposal, ...], Racing]:
         """Return up to n proposals of this round that do not wait for each other; none where it is done."""
         runners, field = list(self.runners), self.field
         queue = _queue(runners, field)
@@ -188,23 +139,48 @@ def line_up(
     return Race(runners, steps, rounds).begun(range(len(runners)), 0)
 
 
-class Raced(Policy[Race]):
+class Raced(Policy[Racing]):
     """A policy that is a race; its `start` lines it up."""
 
-    def propose(self, state: Race, n: int) -> tuple[tuple[Proposal, ...], Race]:
-        return state.propose(n)
+    def propose(self, state: Racing, n: int) -> tuple[tuple[Proposal, ...], Racing]:
+        """Return the next proposals of this round, up to n; of the next round where this one is done."""
+        while True:
+            batch, state = state.asking(n)
+            runners = state.runners
+            if batch or all(runner.over for runner in runners):
+                return batch, state
+            ranked = sorted(state.field, key=lambda k: runners[k].best, reverse=True)
+            able = [k for k in ranked[: -(-len(ranked) // 2)] if not runners[k].over]
+            if state.round + 1 >= state.rounds or not able:  # nobody left who can go on: the rest is for whoever can
+                left = (k for k, runner in enumerate(runners) if not runner.over)
+                able = sorted(left, key=lambda k: -runners[k].best)[:1]
+            state = state.begun(able, min(state.round + 1, state.rounds - 1))
 
-    def update(self, state: Race, evaluated: Evaluated) -> Race:
-        return state.update(evaluated)
+    def update(self, state: Racing, evaluated: Evaluated) -> Racing:
+        """Tell each search what came of its proposals, or of the first of them; both as its own domain has them."""
+        by_runner = defaultdict[int, list[Any]](list)
+        for number, (u, evaluation) in zip(state.asked, evaluated, strict=False):
+            by_runner[number].append((u, evaluation))
+        runners = list(state.runners)
+        for number, own in by_runner.items():
+            runner, best = runners[number], max(evaluation.objective for _, evaluation in own)
+            told = runner.policy.update(runner.state, own)
+            runners[number] = replace(runner, state=told, best=max(runner.best, best))
+        spent = state.spent + sum(evaluation.cost for _, evaluation in evaluated)
+        return replace(state, runners=tuple(runners), spent=spent, asked=())
 
-    def distribution(self, state: Race) -> Distribution | None:
-        return state.distribution()
+    def distribution(self, state: Racing) -> Distribution | None:
+        """Return the leader's distribution, if it has one."""
+        runner = state.runners[state.leader]
+        return runner.policy.distribution(runner.state)
 
-    def failures(self, state: Race) -> Failures | None:
-        return state.failures()
+    def failures(self, state: Racing) -> Failures | None:
+        """Return the different failures of the search that has met the most; None where none looks for such."""
+        known = [runner.policy.failures(runner.state) for runner in state.runners]
+        return max(filter(None, known), key=lambda failures: failures.found, default=None)
 
-    def counts(self, state: Race) -> Counts:
-        return state.counts()
+    def counts(self, state: Racing) -> Counts:
+        return sum((runner.policy.counts(runner.state) for runner in state.runners), NO_COUNTS)
 
 
 @dataclass(frozen=True)
@@ -231,16 +207,15 @@ MOST_NUMBERS = 2**24
 """And no more, but two, than have so many numbers together: each search keeps some vectors of that size."""
 
 
-@dataclass(frozen=True, eq=False)
-class ChoicesState:
-    """Where the search stands: positions in u of numbers (k,) and choices (c,), the choices' elements (n, c) of each
-    search in the race, which goes over the numbers alone."""
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ChoicesState(Race):
+    """Where the search stands: a race over the numbers alone, positions in u of numbers (k,) and choices (c,), and the
+    choices' elements (n, c) of each search in it."""
 
     domain: Domain
     numbers: Tensor
     choices: Tensor
     combinations: Tensor
-    race: Race
 
     def whole(self, numbers: Tensor, combination: int) -> Tensor:
         """Return the configuration (d,) of these numbers, beside a combination of options."""
@@ -251,7 +226,7 @@ class ChoicesState:
 
 
 @dataclass(frozen=True)
-class Choices(Policy[ChoicesState]):
+class Choices(Raced[ChoicesState]):
     """Searches combinations of options outside and, with another policy, the numbers inside.
 
     Every combination of options has a search of its own over the numbers, and the combinations race. If there are more
@@ -287,31 +262,30 @@ class Choices(Policy[ChoicesState]):
         most = most_runners(steps, each, limit)
         combinations = _combinations(counts, domain.begin[choices], most, seeded(seed, 0))
         race = line_up([(policy, inner)] * len(combinations), steps, seed)
-        return ChoicesState(domain, numbers, choices, combinations, race)
+        return ChoicesState(**vars(race), domain=domain, numbers=numbers, choices=choices, combinations=combinations)
 
     def propose(self, state: ChoicesState, n: int) -> tuple[tuple[Proposal, ...], ChoicesState]:
-        proposals, race = state.race.propose(n)
-        asked = zip(proposals, race.asked, strict=True)
-        us = tuple(replace(proposal, u=state.whole(proposal.u, number)) for proposal, number in asked)
-        return us, replace(state, race=race)
+        proposals, state = super().propose(state, n)
+        asked = zip(proposals, state.asked, strict=True)
+        return tuple(replace(proposal, u=state.whole(proposal.u, number)) for proposal, number in asked), state
 
     def update(self, state: ChoicesState, evaluated: Evaluated) -> ChoicesState:
         inner, numbers = [], state.numbers
         for u, evaluation in evaluated:
             gradient = None if evaluation.gradient is None else evaluation.gradient[numbers]
             inner.append((u[numbers], replace(evaluation, gradient=gradient)))
-        return replace(state, race=state.race.update(inner))
-
-    def counts(self, state: ChoicesState) -> Counts:
-        return state.race.counts()
+        return super().update(state, inner)
 
     def distribution(self, state: ChoicesState) -> Distribution | None:
-        inner = state.race.distribution()
+        inner = super().distribution(state)
         if inner is None:
             return None
         deviation = torch.zeros_like(state.domain.start)
         deviation[state.numbers] = inner.deviation
-        return Distribution(state.whole(inner.mean, state.race.leader), deviation)
+        return Distribution(state.whole(inner.mean, state.leader), deviation)
+
+    def failures(self, state: ChoicesState) -> None:
+        """None: those of a search are without their choices."""
 
 
 def with_choices(policy: Policy[Any], domain: Domain) -> Policy[Any]:

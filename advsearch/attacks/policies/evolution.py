@@ -26,8 +26,7 @@ FULL = 80
 size from which the linear algebra would use several threads, whose last bits may differ."""
 
 MOST = 10_000
-"""More numbers are refused: a generation would take longer than renders, and the ascent along a gradient is far ahead
-long before."""
+"""More numbers are refused: a generation would take longer than renders, and an ascent is far ahead long before."""
 
 WIDEST, NARROWEST = 10.0, 1e-3
 """In half ranges: the step size grows no further (it does where all objectives are equal), and a run is over when its
@@ -137,8 +136,7 @@ class NES(Policy[NESState]):
 
 
 def _normal(*shape: int) -> Doubles:
-    """Standard normal numbers from numpy's global generator. A copy of pycma's default, a method of that generator,
-    would carry a generator of its own along."""
+    """Standard normal numbers from numpy's global generator. (A copy of pycma's default carries its own along.)"""
     return np.random.standard_normal(shape)  # noqa: NPY002
 
 
@@ -230,8 +228,7 @@ class CMAES(Policy[CMAESState]):
 
         spread * ||x - P(x)||^2 / (d sigma^2),
 
-    spread the distance between the quartiles of the generation, so that the mean does not drift away outside. Angles
-    wrap and cost nothing.
+    spread the distance between the quartiles of the generation, so that the mean does not drift outside. Angles wrap.
 
     A run whose largest deviation has fallen under a thousandth of half a range has nothing more to find. The next one
     begins at a sample of the domain with twice the population (Auger and Hansen 2005, "A restart CMA evolution strategy

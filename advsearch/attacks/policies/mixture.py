@@ -159,9 +159,8 @@ class Mixture(Policy[MixtureState]):
     maximisation to the draws that failed (as long as these are few, to those with the largest objectives), weighed by
     the even density over the mean density that they came from (the balance heuristic of Veach and Guibas 1995).
 
-    Its result is a failure for each component, and with the share of all configurations that fail: see
-    `failure_share`. That share is of single renders with the search's samples. In an l2 ball the draws are projected,
-    and no share is told.
+    Its result is a failure for each component, and with the share of all configurations that fail: see `failure_share`.
+    That share is of single renders with the search's samples. In an l2 ball no share is told.
 
     Attributes:
         components: of the mixture, 1 to 20.

@@ -26,8 +26,7 @@ FEWEST_NUMBERS = 8  # fewer numbers than this have no median to speak of
 
 
 def clipped(domain: Domain, gradient: Tensor, lengths: tuple[float, ...]) -> tuple[Tensor, tuple[float, ...], Counts]:
-    """Return a gradient (d,), finite, without outliers, the lengths of the latest ones in their order, and what was an
-    outlier.
+    """Return a gradient (d,), finite, without outliers, the lengths of the latest ones, and what was an outlier.
 
     - In a ball of at least `FEWEST_NUMBERS`, each is cut to so many medians of those that are not zero: `CLIP` in an
       l-infinity ball, where the step follows the signs, so that this changes how gradients are averaged and no single
@@ -52,8 +51,7 @@ def clipped(domain: Domain, gradient: Tensor, lengths: tuple[float, ...]) -> tup
 
 
 FIRST_WINDOW, SHORTEN, SHORTEST = 0.22, 0.03, 0.06
-"""Length of the first window, how much each next one is shorter, and the shortest, as fractions of the steps (Auto-
-PGD)."""
+"""Length of the first window, how much each next one is shorter, and the shortest, as fractions of the steps."""
 
 FEWEST = 3  # no window is shorter than this: two noisy values say nothing about a trend
 
