@@ -27,9 +27,7 @@ SUREST = -15.0
 """Log-odds below which cross-entropy is continued by its tangent. In float32 its own slope, exp(log-odds), would be
 lost at -103 and count for nothing beside other numbers long before."""
 
-RELIEF = 1e-4
-"""What is added to a denominator of `dlr`, as a fraction of the distance from the largest to the smallest logit."""
-
+RELIEF = 1e-4  # added to a denominator of `dlr`, as a fraction of the distance from the largest to the smallest logit
 SAME = 1e-12  # logits that lie closer together than this are all the same to `dlr`
 
 
@@ -151,8 +149,7 @@ def _safe(denominator: Tensor, spread: Tensor) -> Tensor:
     return torch.where(spread > SAME, denominator + RELIEF * spread, torch.ones_like(spread))
 
 
-NEARBY = 1e-3
-"""Distances under this fraction of the clean features' length count as none: the distance is rounded off there."""
+NEARBY = 1e-3  # distances under this fraction of the clean features' length count as none: it is rounded off there
 
 ReadFeatures = Callable[[Tensor], Tensor]
 """From images (N, H, W, 3), display-referred sRGB in [0, 1], to features (N, F): what

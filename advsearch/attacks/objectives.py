@@ -37,8 +37,7 @@ from advsearch.tasks.depth import GOALS as DEPTH_GOALS
 from advsearch.tasks.detection import GOALS, Detection
 from advsearch.tasks.together import Together
 
-ASKED = ("u", "texture", "textures", "inputs", "configuration")
-"""What a function may ask for by the names of further parameters."""
+ASKED = ("u", "texture", "textures", "inputs", "configuration")  # what a function may ask for by further parameters
 
 TRUTHS = ("target", "targets", "labels", "label", "truth")
 """What the second of two parameters is called in a loss of outputs and right labels alone."""

@@ -47,11 +47,8 @@ _EXPLANATIONS = {
 }
 
 
-PASS_PERCENT = 95
-"""What a claim must hold in, in per cent of the trials, and what the clean control must pass: 14 of 14, 19 of 20."""
-
-PASS_PERCENT_OVER = 90
-"""What a claim over many conditions must hold in, in per cent of those in which the clean configuration is right."""
+PASS_PERCENT = 95  # of trials in which a claim must hold, and the clean control be right: 14 of 14, 19 of 20
+PASS_PERCENT_OVER = 90  # of conditions in which a claim must hold, of those in which the clean configuration is right
 
 TRIAL_LOOKS = 14, 23
 """Trials after which a verdict may stand, where nobody asked for a number: `found` takes 14 of 14, or 22 of 23.

@@ -19,9 +19,7 @@ from advsearch.errors import ClusterError
 from advsearch.interrupts import INTERRUPTS
 
 DEATHS = 3  # workers that may die of a batch before it is cut in halves or given up
-
-LOADS = 5
-"""Times that as many workers as there are may die while they get ready, and none gets ready, before all is given up."""
+LOADS = 5  # times that as many workers as there are may die while they get ready, and none does, before all is given up
 
 SLOW, LEAST_DEADLINE, FIRST_DEADLINE = 10.0, 60.0, 900.0
 """Times the median that a batch may take, least seconds of that, and seconds before there is a median."""

@@ -43,8 +43,7 @@ CONFIG = {
     "distributed.admin.system-monitor.gil.enabled": False,
 }
 
-NO_WORKER = ("NoValidWorkerError", "NoWorkerError")
-"""Errors by which a scheduler ends a call whose worker has not been there for long."""
+NO_WORKER = ("NoValidWorkerError", "NoWorkerError")  # that end a call whose worker is not there
 
 
 class Site(NamedTuple):

@@ -23,11 +23,9 @@ MARGIN = 0.3  # mean difference of the margin over the views, with its sign, tha
 OF_MOVED = 0.05
 """The same as a share of what the search has moved the margin, where that is more: so much is the length of a step that
 is predicted, and not its direction."""
-BOUND = 2.0
-"""Levels of 255, root mean square over the object, that are good enough where a rendered picture has less noise."""
+BOUND = 2.0  # levels of 255, root mean square over the object, that will do where a rendered picture has less noise
 CLEARLY_GOOD, CLEARLY_BAD = 0.7, 1.4  # shares of what is allowed up to which, and from which on, the first views decide
-ACCEPTED = 0.9
-"""Share of the levels that is accepted in the end, so that a prediction beyond the limit seldom is by chance."""
+ACCEPTED = 0.9  # share of the levels that is accepted in the end, so that one beyond the limit seldom is by chance
 CHECK_SPP = 16  # samples a pixel of each of the two traced pictures of a view
 
 MarginOf = Callable[[Tensor, Tensor], float]

@@ -120,9 +120,7 @@ def lost(query: Query, why: str) -> Evaluation:
 
 MADE_OF = "made of"  # the note of functions and weights
 LONGEST = 10_000  # characters of a function's source that are noted
-
-NEAR, LEAST = 1e-3, 1e-4
-"""Values of one picture are the same within this part of the larger, and this: other versions round differently."""
+NEAR, LEAST = 1e-3, 1e-4  # values of one picture are the same within this part of the larger, and this
 
 
 def check_made_of(

@@ -236,8 +236,7 @@ def tuned(plan: GradientPlan, table: Sequence[Measured]) -> tuple[GradientPlan, 
     return plan, max(counts) if counts else None
 
 
-SHORTEST = 2
-"""Segments of the shortest path tried: light that reaches the camera from a surface that it falls on directly."""
+SHORTEST = 2  # segments of the shortest path tried: light that reaches the camera from a surface that it falls on
 BOUND = 0.5  # root-mean-square change of the displayed picture, in 8-bit levels, that a search accepts
 LEVELS = 255.0
 

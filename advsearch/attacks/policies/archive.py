@@ -21,10 +21,7 @@ from advsearch.seeds import stream
 
 MOST = 10_000  # more numbers are refused: every cell keeps a whole configuration
 MOST_CELLS = 1_000_000  # an archive has no more
-
-MOST_SPANNED = 4
-"""Parameters that an archive is spanned by at most; with more, nearly every configuration has a cell of its own."""
-
+MOST_SPANNED = 4  # parameters that span it; with more, nearly every configuration has a cell of its own
 ANEW = 0.1  # share of the configurations, and of the discrete choices, that are drawn anew
 TOURNAMENT = 4  # so many kept configurations are drawn, and the one with the largest objective is changed
 

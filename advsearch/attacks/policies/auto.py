@@ -39,8 +39,7 @@ PAYS = 4
 """Beside no norm ball, a gradient is worth its renders if it brings so many numbers for each, and so many gradients fit
 into the ascent. One by differences never is: half a number for each, and the surrogate was better on average."""
 
-REACH = 0.1
-"""Length of the ascent's whole step in a box, as a share of half the diagonal: the screen has been everywhere else."""
+REACH = 0.1  # the ascent's whole step in a box, as a share of half the diagonal: the screen has been everywhere else
 
 MOMENTUM, MOMENTUM_DRAWN = 0.75, 0.95
 """Weight of past gradients where none has noise and all point the same way, and where each sees other conditions; with

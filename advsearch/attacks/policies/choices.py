@@ -202,9 +202,7 @@ class Stay(Policy[Tensor]):
 
 
 MOST = 256  # no more combinations than this take part
-
-MOST_NUMBERS = 2**24
-"""And no more, but two, than have so many numbers together: each search keeps some vectors of that size."""
+MOST_NUMBERS = 2**24  # nor more, but two, that have so many numbers together: each search keeps some such vectors
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -25,8 +25,7 @@ FULL = 80
 """Up to so many numbers have a full covariance matrix; more have its diagonal (Ros and Hansen 2008). Also about the
 size from which the linear algebra would use several threads, whose last bits may differ."""
 
-MOST = 10_000
-"""More numbers are refused: a generation would take longer than renders, and an ascent is far ahead long before."""
+MOST = 10_000  # more numbers are refused: a generation would take longer than renders, and an ascent is far ahead
 
 WIDEST, NARROWEST = 10.0, 1e-3
 """In half ranges: the step size grows no further (it does where all objectives are equal), and a run is over when its

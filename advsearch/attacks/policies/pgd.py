@@ -18,10 +18,7 @@ from advsearch.errors import InputError
 
 CLIP = 3.0  # what exceeds the median so many times is out of the usual
 MEMORY = 15  # latest gradients whose lengths say what is usual
-
-CLIP_L2 = 10.0
-"""The same of single numbers in an l2 block, whose true gradient may well be uneven: its direction is at stake."""
-
+CLIP_L2 = 10.0  # the same of numbers in an l2 block, whose true gradient may be uneven: its direction is at stake
 FEWEST_NUMBERS = 8  # fewer numbers than this have no median to speak of
 
 
@@ -54,16 +51,10 @@ FIRST_WINDOW, SHORTEN, SHORTEST = 0.22, 0.03, 0.06
 """Length of the first window, how much each next one is shorter, and the shortest, as fractions of the steps."""
 
 FEWEST = 3  # no window is shorter than this: two noisy values say nothing about a trend
-
-IMPROVING = 0.75
-"""Fraction of a window's steps that must improve the objective for the step size to be kept (Auto-PGD's rho)."""
-
+IMPROVING = 0.75  # fraction of a window's steps that must improve the objective to keep the step size (Auto-PGD's rho)
 SLOWEST = 0.05  # what is left of the step size at the end of a search without noise, as a fraction of the first
 FEWEST_EXACT = 5  # the same as `FEWEST` without noise, where all windows have the shortest length
-
-GAIN = 1e-3
-"""Without noise, what a window must add to the best of the one before, as a fraction of what the search has gained."""
-
+GAIN = 1e-3  # without noise, what a window must add to the best of the one before, as a fraction of all that was gained
 ENOUGH = 3  # windows in a row that add less, after which there is nothing to gain
 PATIENCE = 5  # evaluations in a row without any gradient after which there is nothing to follow
 

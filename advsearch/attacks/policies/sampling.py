@@ -16,9 +16,7 @@ from advsearch.attacks.evaluation import Evaluated, Policy, Proposal, draw_seed,
 from advsearch.errors import InputError
 
 MOST = 21_201  # Scipy has direction numbers for so many dimensions (Joe and Kuo 2008)
-
-CHUNK = 2**20
-"""So many numbers at most of a Sobol sequence are drawn and kept at once, as long as that is one point at least."""
+CHUNK = 2**20  # numbers of a Sobol sequence that are drawn and kept at once, at most, and one point at least
 
 
 NONE = torch.empty(0, 0)

@@ -16,9 +16,7 @@ from advsearch.attacks.evaluation import Evaluated, seeded
 MOST_SOBOL = 1000  # more coordinates than this are screened with independent points; Sobol's advantage is long gone
 MOVED = 4  # about so many coordinates change in one local move; all, where there are no more
 ANOTHER = 0.3  # share of moved choices that are drawn anew
-
-NEAREST, FARTHEST = 0.01, 0.3
-"""Standard deviations of local moves, in units of a coordinate's whole range; between them log-uniform."""
+NEAREST, FARTHEST = 0.01, 0.3  # deviations of local moves, in a coordinate's whole range; between them log-uniform
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,10 +108,7 @@ LENGTHS = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6)
 
 NOISES = (1e-4, 1e-2, 0.1, 0.5, 2.0)  # candidate variances of the noise, as shares of the signal's
 STRETCHES = (0.5, 2.0, 4.0)  # by how much one coordinate's length is changed on trial
-
-LONGEST = 8.0
-"""No length is more than this many times the square root of the number of coordinates: it no longer matters then."""
-
+LONGEST = 8.0  # no length is more than this many times the root of the number of coordinates: it no longer matters then
 EVIDENCE = 1.0  # gain in log-likelihood that a coordinate's own length must bring; less would fit the noise
 REFIT = 5  # lengths and noise are fitted again after so many new points, or a tenth of all if that is more
 MEMORY = 100  # so many of the best points and so many of the latest count, unless more are asked for
