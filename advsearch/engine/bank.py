@@ -16,7 +16,7 @@ from advsearch import seeds
 from advsearch.attacks import Evaluate, Evaluation
 from advsearch.attacks.domain import Domain, centre_of_option
 from advsearch.attacks.draws import Draws
-from advsearch.attacks.evaluation import Query
+from advsearch.attacks.evaluation import Query, WhichGradient
 from advsearch.engine.acceptance import ComparedView
 from advsearch.engine.transport import PredictedSearch
 from advsearch.files import scaled
@@ -109,13 +109,13 @@ class Bank(PredictedSearch):
 
     def evaluate(self, query: Query) -> Evaluation:
         self.passed(query)
-        u, chosen = query.u, self._drawn(query.kind, query.number)
+        evaluation = self._evaluated(self._drawn(query.kind, query.number), query.u, query.gradient)
+        return replace(evaluation, picture=to_8_bit(self._picture(query.u))) if query.keep else evaluation
+
+    def _evaluated(self, chosen: Sequence[Condition], u: Tensor, gradient: WhichGradient) -> Evaluation:
         wholes = [torch.cat([u, condition.numbers]) for condition in chosen]
-        evaluation = self.problem.mean_under(
-            lambda some, at: self._pictures(chosen[some], at), wholes, u, query.gradient, TOGETHER
-        )
-        picture = to_8_bit(self._picture(u)) if query.keep else None
-        return replace(evaluation, predicted=1, picture=picture)
+        evaluation = self.problem.mean_under(lambda s, at: self._pictures(chosen[s], at), wholes, u, gradient, TOGETHER)
+        return replace(evaluation, predicted=1)
 
     def _drawn(self, kind: str, index: int) -> list[Condition]:
         """The conditions that an evaluation looks at: what is new, and a random choice of the rest."""
