@@ -180,7 +180,7 @@ def rate_of(rate: Trials, trials: Sequence[Judgement], successes: Sequence[Judge
         successes=rate.successes,
         spp=rate.spp,
         labels=dict(labels.most_common()),
-        margin=mean_number(trial.score for trial in trials),
+        margin=0.0 - mean_number(trial.score for trial in trials),
         **_counted(rate, trials),
     )
 
