@@ -170,7 +170,16 @@ def given_to(config: SceneConfig, controls: Controls) -> tuple[Control, ...]:
                     f"{choice.run_setting}: control {instance.name} was given as an instance; set it there, as in "
                     f"{type(instance).__name__}({choice.name}=...)"
                 )
-        ready[name] = given if isinstance(given, Control) else {**_taken(config, name, given), **given}
+        ready[name] = given
+        if not isinstance(given, Control):
+            _, own_name = names_of(name, given)
+            taken = {}
+            for choice in _choices(name, given) or ():
+                value = getattr(config, choice.run_setting, None)
+                value = value.get(own_name) if isinstance(value, Mapping) else value
+                if value is not None and not isinstance(value, tuple):  # each run of a curve has its own epsilon
+                    taken[choice.name] = value
+            ready[name] = {**taken, **given}
     return as_controls(ready)
 
 
@@ -207,29 +216,17 @@ def check_run_settings(config: SceneConfig) -> None:
             raise _not_taken(setting, without[0], names_of(without[0], asked[without[0]])[0])
 
 
-def _taken(config: SceneConfig, asked: str, given: Mapping[str, object]) -> dict[str, object]:
-    """What one control takes, by the names of its own settings."""
-    _, name = names_of(asked, given)
-    taken = {}
-    for choice in _choices(asked, given):
-        value = getattr(config, choice.run_setting, None)
-        value = value.get(name) if isinstance(value, Mapping) else value
-        if value is not None and not isinstance(value, tuple):  # the several epsilons of a curve: each run has its own
-            taken[choice.name] = value
-    return taken
-
-
 def takes(asked: str, given: Mapping[str, object], setting: str) -> bool:
     """Whether a control takes one of the run's settings; one that is not known counts as one that does."""
-    kind, _ = names_of(asked, given)
-    return kind not in CONTROLS or setting in {choice.run_setting for choice in _choices(asked, given)}
+    choices = _choices(asked, given)
+    return choices is None or setting in {choice.run_setting for choice in choices}
 
 
-def _choices(asked: str, given: Mapping[str, object]) -> list[Choice]:
-    """The choices of a control, as it is asked for, that count."""
+def _choices(asked: str, given: Mapping[str, object]) -> list[Choice] | None:
+    """The choices of a control, as it is asked for, that count; None of one that is not known."""
     ((name, settings),) = gathered({asked: given}).items()
     kind, _ = names_of(name, settings)
-    return _counting(CONTROLS[kind], settings) if kind in CONTROLS else []
+    return _counting(CONTROLS[kind], settings) if kind in CONTROLS else None
 
 
 def _counting(kind: type[Control], given: Mapping[str, object]) -> list[Choice]:
