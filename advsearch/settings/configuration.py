@@ -124,7 +124,8 @@ def settings(config: type[Config]) -> tuple[Setting, ...]:
     for field, info in config.model_fields.items():
         if field in config.without:
             continue
-        notes: Any = {name: note for name, note in (info.json_schema_extra or {}).items() if name != "declared"}
+        extra: Any = info.json_schema_extra
+        notes: Any = {name: note for name, note in extra.items() if name != "declared"}
         notes["flag"] = notes["flag"] or "--" + field.replace("_", "-")
         notes["expects"] = notes["expects"] or _expected(info)
         notes["metavar"] = notes["metavar"] or field.rpartition("_")[2].upper()
