@@ -355,7 +355,7 @@ def claim_worker(settings: JsonObject) -> Callable[[Any], Any]:
 
 
 def _judged(problem: Problem, query: Query, picture: Tensor) -> Evaluation:
-    return Evaluation.of(problem.judge(picture, problem.whole(query.u)))
+    return problem.trial(picture, problem.whole(query.u))
 
 
 def drawn(problem: Problem, kind: str, count: int, spp: int) -> Iterator[Query]:
