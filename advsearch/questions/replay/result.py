@@ -78,8 +78,7 @@ class ReplayConfig(Config):
         return Path(self.attack).name, self.command
 
 
-NOT_DONE = "not done"
-"""How a condition ends that could not be had."""
+NOT_DONE = "not done"  # How a condition ends that could not be had
 
 
 class ReplayRow(Fields):
