@@ -241,7 +241,7 @@ def _printability(problem: Problem, findings: Findings) -> Printability:
             steps=len(findings.unprinted.history),
             margin_with=rate.margin,
             margin_without=unprinted.margin,
-            cost=unprinted.margin - rate.margin,
+            cost=rate.margin - unprinted.margin,
             verified=unprinted,
             terms=terms["without"],
         )
@@ -341,8 +341,8 @@ def _average(findings: Findings) -> AverageCase:
         correct=counted.successes,
         accuracy=counted.rate,
         interval=counted.interval,
-        margin=mean_number(scores),
-        worst_margin=max((score for score in scores if score == score), default=math.nan),
+        margin=0.0 - mean_number(scores),
+        worst_margin=0.0 - max((score for score in scores if score == score), default=math.nan),
     )
 
 

@@ -16,6 +16,7 @@ from advsearch.report.wording import (
     count,
     margin_text,
     number_text,
+    objective_name,
     rate_text,
     seconds_text,
     wanted,
@@ -200,7 +201,7 @@ def renders_text(summary: AttackSummary) -> str:
 
 
 def print_cost_text(summary: AttackSummary) -> str:
-    """Return ``margin 4.1 with the print terms, 6.3 without (200 steps): they cost 2.2 logits``; empty: not known."""
+    """Return ``margin -4.1 with the print terms, -6.3 without (200 steps): they cost 2.2 logits``; empty: not known."""
     cost = None if summary.printability is None else summary.printability.cost
     if cost is None:
         return ""
@@ -262,7 +263,7 @@ def method_facts(summary: AttackSummary) -> dict[str, str]:
     segments, nothing, terms = summary.light_path_segments, summary.non_finite, summary.printability
     claim = samples = gradients = cut = not_finite = printed = ""
     if claimed is not None:
-        claim = f"{summary.objective} {_short(claimed.objective)} in the render that won"
+        claim = f"{objective_name(summary.objective)} {_short(claimed.objective)} in the render that won"
         if math.isfinite(claimed.re_evaluated):
             claim += f", {_short(claimed.re_evaluated)} when rendered again"
     if chosen is not None:

@@ -262,7 +262,7 @@ class PairPictures:
         """Yield what one side alone gets right, at most so many of each, where the margins are farthest apart first,
         with pictures as far as they are to be had."""
         most, folder = self.asked.config.pictures, self.asked.run.path
-        apart = (second.rows["margin"] - first.rows["margin"]).fillna(0.0)
+        apart = (first.rows["margin"] - second.rows["margin"]).fillna(0.0)
         worse, better = -apart[first.right & ~second.right], apart[~first.right & second.right]
         places = [
             place for alone in (worse, better) for place in alone.sort_values(kind="stable").index[:most].tolist()

@@ -225,17 +225,17 @@ def _map(
     hint = f"{side * side} pictures of {verifier.findings.spp} samples a pixel; `map` or `verify_spp` shorten it"
     verifier.stages.begin("map", "drawing the map", side * side, hint=hint)
     steps = torch.linspace(0.0, 1.0, side) if side > 1 else torch.tensor([0.5])
-    scores = list[float]()
+    margins = list[float]()
     for numbers in batches(0, side * side, most_at_once(verifier.problem.domain.dim)):
         places = {number: varied.at(torch.stack([steps[number % side], steps[number // side]])) for number in numbers}
-        scores += [trial.score for trial in verifier.trials("map", places, sought=False, predictor=light)]
-    margins = [scores[begin : begin + side] for begin in range(0, len(scores), side)]
+        margins += [-trial.score for trial in verifier.trials("map", places, sought=False, predictor=light)]
+    rows = [margins[begin : begin + side] for begin in range(0, len(margins), side)]
     ends = [verifier.problem.describe(varied.at(torch.full((2,), end))) for end in (0.0, 1.0)]
     axes = []
     for grown in box:
         low, high = (_number(end[grown.name], "") for end in ends) if grown.name in ends[0] else (0.0, 1.0)
         axes.append(AxisRange(name=grown.name, unit=grown.unit, low=low, high=high))
-    drawn = MarginMap(axes=(axes[0], axes[1]), margins=margins)
+    drawn = MarginMap(axes=(axes[0], axes[1]), margins=rows)
     for suffix, data in map_figure(drawn, box).items():
         write_bytes(run.path / "images" / f"map.{suffix}", data)
     return drawn
