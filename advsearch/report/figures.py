@@ -114,7 +114,6 @@ def search_axes(
 
 MARGIN, ACCURACY = "margin [logits]; below 0: wrong", "accuracy"
 """What the colours of a map may mean: red is wrong in both."""
-
 MOST_POINTS = 400  # Values of an axis that are drawn
 
 

@@ -13,15 +13,12 @@ from PIL import Image, ImageDraw, ImageFont
 from advsearch.runs.images import to_8bit
 
 Floats = npt.NDArray[np.float32]
-
 TRUE, SAID = (0, 190, 255), (255, 110, 0)
 """Colours of what is true and of what the model says; told apart in any kind of colour vision."""
 SMALLEST = 512  # Pixels of the longest side at least; smaller pictures are magnified, so that text can be read
 TINT, LETTERS = 0.45, 28  # How much of a tint covers a picture; how many letters are as high as its longest side
 
 Box = tuple[float, float, float, float]
-
-
 Shape = Any  # What is drawn, a box or the pixels of a mask: `advsearch.tasks.Mark`
 
 

@@ -152,7 +152,6 @@ WIDE, NARROW = 720, 350
 """Height and widths of a chart in CSS pixels: for a screen, and for a phone, which would shrink the letters of the wide
 one until nobody can read them. The style sheet shows one of them.
 """
-
 COLORS = {"search": "#010101", "baseline": "#020202", "soft": "#030303", "line": "#040404"}
 """Variables of the style sheet, and what stands for them while matplotlib draws."""
 OF_FIGURES = {"search": BLUE, "baseline": RED, "soft": GREY}  # The same of the colours that figures have

@@ -26,13 +26,11 @@ from advsearch.report.wording import percent
 from advsearch.runs.results import INTERRUPTED, RUNNING, AverageCase, Fields, Formation, Interval, Result, VerifiedRate
 
 LONG = 24  # Rows of a table of fields above which it is folded
-
 _ELSEWHERE = (
     *("run", "object", "objects", "controls", "environment", "ending", "warnings", "seconds", "command_line"),
     *("figures", "model", "renders", "seed"),
 )
 """Fields that stand in the heading or below, or nowhere."""
-
 Column = str | Callable[[Any], str]
 """How a cell is made of a row, which is called `0`: ``{0.seconds:.2f}``, or a function."""
 
@@ -229,7 +227,6 @@ class Claim(Fields):
 
 
 NOTHING, NO_PROOF = "Nothing is claimed", "This does not show that there is none."
-
 ENDED = ("budget spent", "stalled")  # Endings of a search that ran to its end without finding anything
 
 

@@ -209,10 +209,10 @@ def test_intervals_of_what_decides_hold(accuracy: tuple[float, ...], rows: int) 
 
 def test_the_envelope_leaves_out_what_fails_and_little_else() -> None:
     box = find_envelope(*halves(planted("red"), 0), accuracy=0.9)
-    assert box is not None and box.held and interval_of(box.inside)[0] >= 0.9
-    assert [one.row.text for one in box.conditions] == ["colour blue or green"]
+    assert box is not None and box.held and box.interval[0] >= 0.9
+    assert [one.text for one in box.conditions] == ["colour blue or green"]
     whole = find_envelope(*halves(planted("none"), 0), accuracy=0.9)
-    assert whole is not None and whole.held and whole.conditions == ()
+    assert whole is not None and whole.held and whole.conditions == []
     assert find_envelope(*halves(planted("red"), 0), accuracy=0.99) is None
 
 

@@ -64,7 +64,6 @@ from advsearch.tasks.together import Together, together
 
 LOADING, PREPARING = "loading the scene and the model", "preparing the scene for rendering"
 """What a person who waits is told before the first picture."""
-
 SEARCHED_WITH = ("the objective", "the policy", "the metric")
 """How the parts of a run begin that say nothing of whether its result is right."""
 

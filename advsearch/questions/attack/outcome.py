@@ -47,7 +47,6 @@ from advsearch.tasks.base import mean
 from advsearch.viewer.pages import keep_result
 
 T = TypeVar("T")
-
 MOST_NUMBERS = 4096  # Numbers of a distribution that a summary names, at most
 
 

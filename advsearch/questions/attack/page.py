@@ -44,7 +44,6 @@ from advsearch.viewer.pages import object_data, object_part, read_object, shown_
 FRAME_QUALITY = 85  # Of the JPEG frames of the search, from 1 to 95
 MOST_TRIALS = 24  # Pictures of the verification that the page shows
 AT_THE_END = 1e-6  # Of a range: as near as that to one of its ends a value was stopped by it
-
 MARKED, FORMERLY_MARKED = "-prediction.png", "-answer.png"
 """How files with marks end, and how those of runs that were made before do."""
 

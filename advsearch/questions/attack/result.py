@@ -334,7 +334,6 @@ def write_object(run: RunDirectory, problem: Problem, u: Tensor) -> None:
 
 
 FRAMES = 24
-
 STRIP, SIDE = 8, 160  # Pictures of a strip at most, and the height of each in pixels
 FASTEST = 40  # Milliseconds that a frame of an animation is shown at least
 

@@ -47,14 +47,10 @@ from advsearch.scene.transport.matrix import TransportTooLargeError
 from advsearch.tasks import Judgement
 
 MOST_FRAMES = 60
-
 UNPRINTED = "search without print terms"
 """The kind of the search beside one with print terms: what these cost is told by its result."""
-
-
 LOOK, LOOKED_AT = "first look", ("score", "margin", "objective")
 """The note of what the model and the objective said of the first look, and of what it consists for each picture."""
-
 FIRST_LOOK = 4
 """Renders of the clean configuration before the search; wrong in all of them, it goes through the full trials first."""
 

@@ -25,7 +25,6 @@ from advsearch.report.wording import (
 from advsearch.runs.results import PrintTerms, VerifiedRate
 
 PATH = "path"  # The control whose conditions are moments
-
 NORMS = {"linf": "the largest change of any value", "l2": "the root of the sum of all squared changes"}
 """What these words mean, said where they are first used."""
 

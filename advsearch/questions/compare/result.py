@@ -136,7 +136,6 @@ NOTE_OF_UNITS = (
 )
 
 LEVEL = 0.05  # A p-value up to this is called a difference
-
 MOST_TABLES, MOST_PICTURES = 4, 3
 """Parameters, and pictures of what one side alone gets right, that a terminal shows; the page has all."""
 

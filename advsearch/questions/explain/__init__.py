@@ -8,7 +8,7 @@ from typing import ClassVar
 from advsearch.config import SceneConfig
 from advsearch.errors import InputError
 from advsearch.question import Asked, question
-from advsearch.questions.explain.result import EnvelopeRow, ExplainResult, RuleRow
+from advsearch.questions.explain.result import ExplainResult, RuleRow
 from advsearch.questions.explain.result import claims as claims
 from advsearch.questions.explain.result import shown as shown
 from advsearch.runs.directory import PARTS, find_run
@@ -123,13 +123,7 @@ def explain(asked: Asked[ExplainConfig]) -> ExplainResult:
         rules=rules,
         not_told=not_told(found.next, len(table)),
         importance=importance,
-        envelope=box
-        and EnvelopeRow(
-            conditions=[condition.row for condition in box.conditions],
-            **vars(right_of(box.inside)),
-            accuracy=config.accuracy,
-            held=box.held,
-        ),
+        envelope=box,
         pairs=pairs,
         pairs_sought=min(config.pairs, counted.total - counted.right),
         clusters=clusters,

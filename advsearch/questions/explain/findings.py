@@ -34,7 +34,7 @@ from scipy.stats import chi2, ncf, ncx2
 from scipy.stats import f as fisher
 
 from advsearch.attacks.trials import CONFIDENCE
-from advsearch.questions.explain.result import ParameterWeight, RightOf, RuleNotTold
+from advsearch.questions.explain.result import EnvelopeRow, ParameterWeight, RightOf, RuleNotTold
 from advsearch.rules import CHANCE as RULES_CHANCE
 from advsearch.rules import (
     FEWEST_ROWS,
@@ -51,7 +51,6 @@ MOST_PARTS = 20
 ROWS_IN_A_CELL = 25  # Rows that a cell of two factors' parts has on average, at least
 CHANCE = 0.01
 """Probability that any pair is told to decide together where none does; each is tested at its part (Bonferroni)."""
-
 LEAST_SPREAD = 0.1
 """What chance adds for units, at least, of what it adds to independent predictions, though units deviate in nothing."""
 
@@ -172,16 +171,7 @@ LEAST_INSIDE = 60  # Fewer rows, or drives, than this cannot show an accuracy of
 RESERVE = 0.01  # By how much more the choosing rows have to show, since they were chosen by
 
 
-@dataclass(frozen=True, eq=False)
-class Envelope:
-    """A box, the rows inside it that did not choose it, and whether they show the accuracy that was asked for."""
-
-    conditions: RuleConditions
-    inside: pd.DataFrame
-    held: bool
-
-
-def find_envelope(choosing: pd.DataFrame, counting: pd.DataFrame, accuracy: float) -> Envelope | None:
+def find_envelope(choosing: pd.DataFrame, counting: pd.DataFrame, accuracy: float) -> EnvelopeRow | None:
     """Return the largest box that promises an accuracy in (0, 1), the lower end of a 95 % interval; None where no box
     of enough rows does. Some rows choose the box, and others try it, once."""
     conditions: RuleConditions = ()
@@ -197,8 +187,9 @@ def find_envelope(choosing: pd.DataFrame, counting: pd.DataFrame, accuracy: floa
         if best is None:
             return None
         conditions, inside = best, kept
-    tried = counting[covered(conditions, counting)]
-    return Envelope(conditions, tried, interval_of(tried)[0] >= accuracy)
+    tried = right_of(counting[covered(conditions, counting)])
+    rows = [condition.row for condition in conditions]
+    return EnvelopeRow(conditions=rows, **vars(tried), accuracy=accuracy, held=tried.interval[0] >= accuracy)
 
 
 def _peeled(conditions: RuleConditions, inside: pd.DataFrame) -> Iterator[RuleConditions]:
@@ -263,10 +254,8 @@ def not_told(rule: CountedRule | None, rows: int) -> RuleNotTold | None:
 
 
 MOST, FEWEST = 6, 8  # Clusters at most, and failures of which clusters are sought at least
-
 REFERENCES = 19
 """Draws of as many points from one normal distribution like them: groups in none of these may be as far apart."""
-
 DIMENSIONS = 8  # Principal components that distances are measured in
 
 

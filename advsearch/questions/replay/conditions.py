@@ -48,7 +48,6 @@ SENSORS: dict[str, dict[str, float]] = {
 
 CURVES = {"gamma": "a power of 1/2.2 in place of sRGB", "reinhard": "highlights rolled off, x / (1 + x)"}
 """Other tone curves, by `ImageFormation.transfer`."""
-
 SHORT, LONG = 2, 16  # Longest light paths in segments: direct light alone, and far more than a run renders
 
 
@@ -261,7 +260,6 @@ def _changed(folder: Path, parts: AttackParts) -> list[str]:
 
 Again = Callable[..., tuple[Problem, list[str]]]
 """The problem of the run with some settings changed, and warnings; see `problem_of_parts`."""
-
 OWN_MODEL = "the run's own"  # What no other model is called
 
 

@@ -18,7 +18,6 @@ from advsearch.settings import Clash, Config, each_once, setting, setting_as_in,
 
 WAYS = ("samples", "resolution", "depth", "integrator", "sampler", "denoiser", "curve", "jpeg", "sensor", "blender")
 """What a replay may change beside the model."""
-
 REPLAY_TRIALS = 10
 """Half of an attack's: there are many rows, to be compared. The 95 % interval of 10 of 10 begins at 69 %."""
 
