@@ -147,6 +147,11 @@ def split_names(text: str) -> tuple[str, ...]:
     return tuple(part.strip() for part in text.split(",") if part.strip())
 
 
+def names_together(texts: Iterable[str]) -> str:
+    """Return the parts of several such texts as one, each once."""
+    return ",".join(dict.fromkeys(name for text in texts for name in split_names(text)))
+
+
 def is_file(name: str) -> bool:
     try:
         return Path(name).is_file()
