@@ -213,8 +213,19 @@ def output_kept_clean() -> Iterator[None]:
     """Send whatever is printed inside the block to standard error, be it by Python or by a native library. So one JSON
     value, printed afterwards, is all that standard output holds."""
     sys.stdout.flush()
-    with redirect_stdout(sys.stderr), _descriptor_redirected(1, 2):
-        yield
+    kept: int | None = None
+    with suppress(OSError):  # where one of them is closed
+        kept = os.dup(1)
+        os.dup2(2, 1)
+    try:
+        with redirect_stdout(sys.stderr):
+            yield
+    finally:
+        if kept is not None:
+            with suppress(OSError, AttributeError):  # what the C library holds back, before its descriptor changes
+                ctypes.CDLL(None).fflush(None)
+            os.dup2(kept, 1)
+            os.close(kept)
 
 
 def shown_text(result: Result) -> str:
@@ -244,25 +255,6 @@ def aligned(rows: Sequence[Sequence[str]]) -> str:
     return "\n".join(
         ("  " + "   ".join(cell.ljust(width) for cell, width in zip(row, wide, strict=False))).rstrip() for row in rows
     )
-
-
-@contextmanager
-def _descriptor_redirected(source: int, target: int) -> Iterator[None]:
-    """Let file descriptor `source` stand for `target` inside the block; do nothing where one of them is closed."""
-    try:
-        kept = os.dup(source)
-        os.dup2(target, source)
-    except OSError:
-        yield
-        return
-    try:
-        yield
-    finally:
-        # write out what the C library holds back, before its descriptor changes
-        with suppress(OSError, AttributeError):
-            ctypes.CDLL(None).fflush(None)
-        os.dup2(kept, source)
-        os.close(kept)
 
 
 @contextmanager
