@@ -332,10 +332,7 @@ class SceneConfig(Config):
             raise ValueError("a name that would be two; a file can have it")
         return as_text(value, several=info.field_name in SEVERAL)
 
-    @field_validator("things", mode="before")
-    @classmethod
-    def _things_as_text(cls, value: Any) -> Any:
-        return things_as_text(value)
+    _things_as_text = field_validator("things", mode="before")(things_as_text)
 
     @field_validator("prompt", mode="before")
     @classmethod
@@ -351,13 +348,6 @@ class SceneConfig(Config):
     def _task_with_options(cls, value: Any) -> Any:
         """Accept ``{name: yaw, tolerance: 5}``, ``yaw={tolerance: 5}`` and a name, and several with + between them."""
         return read_joined(value, "task", cls.model_fields["task"].default)
-
-    @field_validator("spp")
-    @classmethod
-    def _spp_in_range(cls, value: Any) -> Any:
-        if isinstance(value, int) and not 1 <= value <= 65536:
-            raise ValueError("out of range")
-        return value
 
     @field_validator("controls", "over", mode="before", check_fields=False)
     @classmethod
@@ -385,10 +375,12 @@ class SceneConfig(Config):
             parts = [parts]
         return [*parts, *parts] if isinstance(parts, (list, tuple)) and len(parts) == 1 else parts
 
-    @field_validator("resolution")
+    @field_validator("spp", "resolution")
     @classmethod
-    def _resolution_in_range(cls, value: tuple[int, int] | None) -> tuple[int, int] | None:
-        if value is not None and not all(8 <= side <= 4096 for side in value):
+    def _in_range(cls, value: Any, info: Any) -> Any:
+        low, most = (1, 65536) if info.field_name == "spp" else (8, 4096)
+        numbers = value if isinstance(value, tuple) else (value,)
+        if any(isinstance(number, int) and not low <= number <= most for number in numbers):
             raise ValueError("out of range")
         return value
 

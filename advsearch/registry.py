@@ -12,6 +12,7 @@ import re
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from functools import cached_property, wraps
 from importlib import import_module
 from importlib.machinery import PathFinder
@@ -25,6 +26,7 @@ Entry = TypeVar("Entry")
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
+@dataclass(eq=False, repr=False)
 class Registry(Mapping[str, Entry], Generic[Entry]):
     """Entries by name: our own first, in the order given, then those of installed packages; ours win a name.
 
@@ -37,29 +39,23 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
             with a capital letter, from the Python path or the current directory.
     """
 
-    def __init__(
-        self,
-        group: str,
-        own: Mapping[str, Entry | str],
-        expected: str,
-        fits: Callable[[str, Any], bool],
-        *,
-        imports: bool = False,
-    ) -> None:
-        self.group = group
-        self._own, self._expected, self._fits, self._imports = own, expected, fits, imports
+    group: str
+    own: Mapping[str, Entry | str]
+    expected: str
+    fits: Callable[[str, Any], bool]
+    imports: bool = False
 
     def __getitem__(self, name: str) -> Entry:
         if self.names_class(name):
             return self._class(name)
-        entry: Any = self._own[name] if name in self._own else self._installed[name]
+        entry: Any = self.own[name] if name in self.own else self._installed[name]
         if isinstance(entry, str):
             module, _, attribute = entry.partition(":")
             entry = getattr(import_module(module), attribute)
         return entry  # type: ignore[no-any-return]
 
     def __iter__(self) -> Iterator[str]:
-        return iter([*self._own, *(name for name in self._installed if name not in self._own)])
+        return iter([*self.own, *(name for name in self._installed if name not in self.own)])
 
     def __len__(self) -> int:
         return sum(1 for _ in self)
@@ -67,10 +63,10 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
     def names_class(self, name: str) -> bool:
         """Whether a name is that of a class to import, and not of an instance of a registered entry ("light:Key")."""
         module, colon, attribute = name.partition(":")
-        if not (self._imports and colon and attribute[:1].isupper() and attribute.isidentifier()):
+        if not (self.imports and colon and attribute[:1].isupper() and attribute.isidentifier()):
             return False
         parts = module.split(".")
-        return all(part.isidentifier() for part in parts) and not (parts[0] in self._own or parts[0] in self._installed)
+        return all(part.isidentifier() for part in parts) and not (parts[0] in self.own or parts[0] in self._installed)
 
     def _class(self, name: str) -> Entry:
         """Import "package.module:Class". Raises InputError where it cannot be imported, is something else, or must not
@@ -83,8 +79,8 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
         except Exception as error:  # the user's code may raise anything
             mend = f"a module is looked for on the Python path and in {os.getcwd()}"
             raise InputError(f"{name}: cannot be imported ({type(error).__name__}: {error}); {mend}") from error
-        if not self._fits(getattr(entry, "kind", ""), entry):
-            raise InputError(f"{name}: expected {self._expected}, got {entry!r}")
+        if not self.fits(getattr(entry, "kind", ""), entry):
+            raise InputError(f"{name}: expected {self.expected}, got {entry!r}")
         return entry
 
     @cached_property
@@ -99,8 +95,8 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
                 entry = point.load()
             except (ImportError, AttributeError) as error:
                 raise InputError(f"{where}: cannot be imported ({error}); {mend}") from None
-            if not self._fits(point.name, entry):
-                raise InputError(f"{where}: expected {self._expected}; {mend}")
+            if not self.fits(point.name, entry):
+                raise InputError(f"{where}: expected {self.expected}; {mend}")
             entries[point.name] = entry
         return entries
 

@@ -107,47 +107,47 @@ def load_model(
     if names is not None and task and task.names_from:
         raise InputError(f"labels: the names of task {task.name} are those of {task.names_from}; leave `labels` out")
     prompts = read_prompts(prompt)  # first, because loading a model takes seconds
-    found = _find(spec)
+    source = _find(spec)
     switches = turned_by_code()
-    if prompts is not None and not (isinstance(found, Source) and found.reads_text):
-        raise InputError(f"prompt: model {found.name} has classes of its own and reads no text; leave `prompt` out")
-    if isinstance(found, Source) and found.finish is not None:
+    if prompts is not None and not (isinstance(source, Source) and source.reads_text):
+        raise InputError(f"prompt: model {source.name} has classes of its own and reads no text; leave `prompt` out")
+    if isinstance(source, Source) and source.finish is not None:
         wanted = task.name if task else "classification"
         lengths = getattr(task, "tokens", 16), getattr(task, "times", 1)
-        found = found.finish(Purpose(wanted, names, prompts, *lengths, ask or {}))
-    if isinstance(found, Source) and isinstance(found.module, nn.Module):
-        called_under(found.module, switches)
+        source = source.finish(Purpose(wanted, names, prompts, *lengths, ask or {}))
+    if isinstance(source, Source) and isinstance(source.module, nn.Module):
+        called_under(source.module, switches)
     if task:
-        found = replace(found, module=task.wrapped(found.module))
-    if isinstance(found, Source) and found.takes_more and not isinstance(found.module, WithState):
-        raise ModelError(f"model {found.name}: takes more than pictures; give task command the `state` that it takes")
-    if isinstance(found, Model):
-        found = replace(found, read=read or found.read)
-        found = found if names is None and name is None else replace(found, asked=None)
-        loaded = _relabelled(found, names, origin, name, given)
+        source = replace(source, module=task.wrapped(source.module))
+    if isinstance(source, Source) and source.takes_more and not isinstance(source.module, WithState):
+        raise ModelError(f"model {source.name}: takes more than pictures; give task command the `state` that it takes")
+    if isinstance(source, Model):
+        source = replace(source, read=read or source.read)
+        source = source if names is None and name is None else replace(source, asked=None)
+        model = _relabelled(source, names, origin, name, given)
     else:
-        if read is not None and isinstance(found.module, nn.Module):  # YOLO's have names, and `args` from training
-            args = getattr(found.module, "args", None)
+        if read is not None and isinstance(source.module, nn.Module):  # YOLO's have names, and `args` from training
+            args = getattr(source.module, "args", None)
             side = args.get("imgsz") if isinstance(args, Mapping) else None
             size = (side, side) if isinstance(side, int) and side > 1 else None
-            its_names = names_in(getattr(found.module, "names", None))
-            found = replace(found, labels=found.labels or its_names, input_size=found.input_size or size)
+            its_names = names_in(getattr(source.module, "names", None))
+            source = replace(source, labels=source.labels or its_names, input_size=source.input_size or size)
         if max_batch is not None and (isinstance(max_batch, bool) or not isinstance(max_batch, int) or max_batch < 1):
             raise InputError(f"max_batch: expected a whole number of at least 1, got {max_batch!r}")
-        low, high = found.batch_limits
+        low, high = source.batch_limits
         bare = Model(
-            module=found.module,
-            name=name or found.name,
+            module=source.module,
+            name=name or source.name,
             labels=(),
-            preprocessing=_preprocessing(found, given),
+            preprocessing=_preprocessing(source, given),
             batch_limits=(low, max(low, min(high, max_batch or high))),
-            dtype=found.dtype,
-            device=found.device,
+            dtype=source.dtype,
+            device=source.device,
             read=read,
         )
-        loaded = probe(bare, found.labels if names is None else names, origin)
+        model = probe(bare, source.labels if names is None else names, origin)
     alone = isinstance(spec, (str, os.PathLike)) and not given and labels is None and name is None
-    return replace(loaded, asked=os.fspath(spec)) if alone else loaded  # type: ignore[arg-type]
+    return replace(model, asked=os.fspath(spec)) if alone else model  # type: ignore[arg-type]
 
 
 def named_code(spec: str) -> str | None:

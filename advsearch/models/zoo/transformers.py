@@ -48,18 +48,14 @@ ADVICE = "Give a folder that save_pretrained(..., safe_serialization=True) has m
 def load(spec: str) -> Source:
     """Return ``hf:REPOSITORY[@REVISION]`` or ``hf:FOLDER``: a network of one of `NETWORKS`.
 
-    One that reads texts gets its classes from its user (`zero_shot`, `open_vocabulary`, `language`).
-
-    Its labels are those that it was published with; size, order of channels and normalisation are measured on its
-    image processor (`library.measured`). Code in a repository is never run, and weights are read from safetensors
-    alone. A repository that timm has saved goes to timm.
+    One that reads texts gets its classes from its user (`zero_shot`, `language`). Labels of others are those that they
+    were published with; size, order of channels and normalisation are measured on the image processor
+    (`library.measured`), and where there is none a ModelWarning says so. Code in a repository is never run, and weights
+    are read from safetensors alone. A repository that timm has saved goes to timm.
 
     Raises:
         ModelError: transformers is missing, the repository cannot be had or lacks weights, its network is of another
             kind or larger than the memory, or its processor does what `Preprocessing` can't.
-
-    Warns:
-        ModelWarning: it has no image processor.
     """
     name, _, revision = spec.partition(":")[2].strip().partition("@")
     transformers = library("transformers", spec, "hf")
@@ -92,13 +88,9 @@ def load(spec: str) -> Source:
 
 
 def of_network(network: nn.Module) -> Source | None:
-    """Return the source of a network of transformers that is there already; None of any other.
-
-    Names come from its ``config``, and what is done to pictures from the repository or folder that it was loaded from.
-
-    Warns:
-        ModelWarning: that has no image processor, or can't be read any more.
-    """
+    """Return the source of a network of transformers that is there already; None of any other. Names come from its
+    ``config``, and what is done to pictures from the repository or folder that it was loaded from; a ModelWarning says
+    where that has no image processor, or can't be read any more."""
     transformers: Any = sys.modules.get("transformers")
     if transformers is None or not isinstance(network, transformers.PreTrainedModel):
         return None
@@ -125,20 +117,18 @@ def _kind(architecture: str, network: Any, spec: str) -> Family:
             return kind
     raise ModelError(
         f"model {spec}: is a {architecture}; expected one whose name has ForImageClassification, "
-        "ForVideoClassification, "
-        "ForSemanticSegmentation, ForUniversalSegmentation, ForObjectDetection or ForDepthEstimation in it, one that "
-        "compares pictures with texts, as CLIPModel, one that goes on in words, as LlavaForConditionalGeneration, or "
-        "one that has features, as Dinov2Model. Wrap another in an nn.Module whose output a task can judge, your own "
-        "too, and give that from Python"
+        "ForVideoClassification, ForSemanticSegmentation, ForUniversalSegmentation, ForObjectDetection or "
+        "ForDepthEstimation in it, one that compares pictures with texts, as CLIPModel, one that goes on in words, as "
+        "LlavaForConditionalGeneration, or one that has features, as Dinov2Model. Wrap another in an nn.Module whose "
+        "output a task can judge, your own too, and give that from Python"
     )
 
 
 def _config(transformers: Any, name: str, spec: str, where: Mapping[str, Any]) -> Mapping[str, Any]:
     """Return what is in the config.json of a repository or a folder."""
+    has = partial(cached_file, transformers, name, where=where)
     try:
-        if cached_file(transformers, name, "config.json", where) is None and cached_file(
-            transformers, name, "open_clip_config.json", where
-        ):
+        if not has("config.json") and has("open_clip_config.json"):
             raise ModelError(
                 f"model {spec}: is a repository of open_clip, which transformers can't read; give the network as "
                 "transformers has it, such as hf:openai/clip-vit-base-patch32 or hf:google/siglip-base-patch16-224"
