@@ -122,9 +122,17 @@ def load_model(
     if isinstance(source, Source) and source.takes_more and not isinstance(source.module, WithState):
         raise ModelError(f"model {source.name}: takes more than pictures; give task command the `state` that it takes")
     if isinstance(source, Model):
-        source = replace(source, read=read or source.read)
-        source = source if names is None and name is None else replace(source, asked=None)
-        model = _relabelled(source, names, origin, name, given)
+        if given:
+            raise InputError(
+                f"model {source.name} brings its own preprocessing: leave out {', '.join(given)}, or load its network "
+                "anew"
+            )
+        asked = source.asked if names is None and name is None else None
+        model = replace(source, name=name or source.name, read=read or source.read, asked=asked)
+        if names is not None:
+            if model.read is None:  # the classes of others are counted by their task
+                names = fitting_labels(model.classes, names, origin, model.name)
+            model = replace(model, labels=names, named=True)
     else:
         if read is not None and isinstance(source.module, nn.Module):  # YOLO's have names, and `args` from training
             args = getattr(source.module, "args", None)
@@ -198,22 +206,6 @@ def _preprocessing(source: Source, given: Mapping[str, object]) -> Preprocessing
     fields |= parse_normalisation(given.get("mean"), given.get("std"))
     fields |= {key: parse(given[key]) for key, parse in READERS.items() if key in given}
     return Preprocessing(**{key: value for key, value in fields.items() if value})
-
-
-def _relabelled(
-    model: Model, labels: tuple[str, ...] | None, origin: str, name: str | None, given: Mapping[str, object]
-) -> Model:
-    """Return a model that was complete already, with other labels or another name at most."""
-    if given:
-        raise InputError(
-            f"model {model.name} brings its own preprocessing: leave out {', '.join(given)}, or load its network anew"
-        )
-    name = name or model.name
-    if labels is None:
-        return replace(model, name=name)
-    if model.read is None:  # the classes of others are counted by their task
-        labels = fitting_labels(model.classes, labels, origin, name)
-    return replace(model, name=name, labels=labels, named=True)
 
 
 # ---- what a user writes of preprocessing: Python values, or strings from a command line ------------------------------
