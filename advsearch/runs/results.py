@@ -515,5 +515,7 @@ def kind_of(values: JsonObject) -> type[Result] | None:
     room = rooms.room(str(values.get("command")))
     if room is None:
         return None
-    kind: type[Result] | None = next((kind for name, kind in room.others.items() if name in values), room.result)
+    kind: type[Result] | None = next(
+        (kind for name, kind in (room.others or {}).items() if name in values), room.result
+    )
     return kind
