@@ -71,7 +71,7 @@ class Example(NamedTuple):
         """Whether the model is right about it."""
         assert self.task is not None
         with torch.no_grad():
-            return bool(self.task.margin(model(self.levels[None] / 255.0), self.truth)[0] <= 0.0)
+            return bool(self.task.loss(model(self.levels[None] / 255.0), self.truth)[0] <= 0.0)
 
 
 def read_coco(folder: Path, model: Model) -> list[Example]:

@@ -121,7 +121,7 @@ class Looking:
             truth = problem.truth(problem.whole(problem.domain.start, seed))
             for place, model in enumerate((work.model, work.with_weights(self.weights))):
                 with torch.no_grad():
-                    right[place] += bool(problem.task.margin(model(picture), truth)[0] <= 0.0)
+                    right[place] += bool(problem.task.loss(model(picture), truth)[0] <= 0.0)
         return right[0], right[1]
 
 
