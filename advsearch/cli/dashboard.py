@@ -17,7 +17,7 @@ from advsearch.errors import InputError
 from advsearch.questions.sweep.page import write_bundle
 from advsearch.runs.directory import find_run
 from advsearch.viewer.clients import NO_QR, qr_text
-from advsearch.viewer.pages import renewed
+from advsearch.viewer.pages import write_page
 from advsearch.viewer.server import Dashboard
 
 if TYPE_CHECKING:
@@ -99,7 +99,7 @@ def _view(args: argparse.Namespace) -> int:
     folders = [find_run(name) for name in args.runs]
     if args.bundle is None and len(folders) > 1:
         raise InputError("--bundle: pages of several runs go into a folder; name one, or give one run")
-    out = renewed(folders[0]) if args.bundle is None else write_bundle(folders, Path(args.bundle))
+    out = write_page(folders[0]) if args.bundle is None else write_bundle(folders, Path(args.bundle))
     return output.say(args.json, {"command": "view", "runs": list(map(str, folders)), "out": str(out)}, str(out))
 
 
