@@ -239,7 +239,7 @@ class Hardening:
             clean_after=_share(self.clean.get("after")), table=table, split=split, rounds=rounds,
             search=f"{config.policy_name}, {config.steps} steps",
             stronger_search=f"portfolio of pgd with restarts, cmaes and random, {scenes.TIMES * config.steps} steps",
-            # code makes what has no name
+            # a name with a colon is of code that makes it
             hardened=f"{name}@{artifacts / WEIGHTS}" if done and (name == "reference" or ":" in name) else None,
             weights=str(artifacts / WEIGHTS) if done else None,
             pictures=str(artifacts / PICTURES) if done else None,

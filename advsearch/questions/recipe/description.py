@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from importlib import resources
 from itertools import product
@@ -164,8 +164,31 @@ class PlannedRun:
 def planned(recipe: Recipe, config: RecipeConfig) -> list[PlannedRun]:
     """Return the runs of a recipe in the order in which they are carried out; an InputError names a part with a setting
     that its command has not. A run is about one object; a search, about one environment and one model, too."""
-    chosen = made_of(recipe, config)
-    runs = [run for name in chosen.parts for run in _runs(chosen, name, config)]
+    chosen, runs = made_of(recipe, config), list[PlannedRun]()
+    for name, part in chosen.parts.items():
+        where, kind = f"{config.recipe}: parts: {name}", CONFIGS[part.command]
+        settings = {**chosen.settings, **part.settings}
+        usual = {"environment": DEFAULT_ENVIRONMENT, "model": "reference"} if part.command == "attack" else {}
+        axes = {axis: names_listed(settings.get(axis) or names) for axis, names in {"object": "", **usual}.items()}
+        for number, values in enumerate(product(*axes.values())):
+            own: Settings = dict(zip(axes, values, strict=True))
+            words = [word for axis, word in zip(axes, values, strict=True) if axis == "object" or len(axes[axis]) > 1]
+            # a seed of its own, so that no two runs draw the same
+            own["seed"] = seeds.stream(config.seed, f"recipe {part.drawn_as or name} {number}")
+            own |= {"deterministic": True} if config.deterministic else {"threads": config.threads}
+            if (label := config.label_of(str(own["object"]))) is not None:
+                own["label"] = label
+            try:
+                made = kind(**{**settings, **own})
+            except SettingsError as error:
+                raise SettingsError(error.problems, where) from None
+            except UnknownNameError:
+                raise
+            except InputError as error:
+                raise InputError(f"{where}: {error}") from None
+            assert isinstance(made, SceneConfig)
+            folder = f"{number:02d}-{default_name(words[0], [default_name(word, []) for word in words[1:]])}"
+            runs.append(PlannedRun(f"{name}-{folder}", name, made, part.around and f"{part.around}-{folder}"))
     if len(runs) > MOST_RUNS:
         raise InputError(f"{config.recipe}: expected at most {MOST_RUNS} runs, got {len(runs)}; name fewer objects")
     return runs
@@ -193,29 +216,3 @@ def made_of(recipe: Recipe, config: RecipeConfig) -> Recipe:
 def names_listed(value: object) -> list[str]:
     """Return names that stand in a list, or in a text with commas between them."""
     return [str(name) for name in value] if isinstance(value, (list, tuple)) else list(split_names(str(value)))
-
-
-def _runs(recipe: Recipe, name: str, config: RecipeConfig) -> Iterator[PlannedRun]:
-    part, where = recipe.parts[name], f"{config.recipe}: parts: {name}"
-    kind, settings = CONFIGS[part.command], {**recipe.settings, **part.settings}
-    usual = {"environment": DEFAULT_ENVIRONMENT, "model": "reference"} if part.command == "attack" else {}
-    axes = {axis: names_listed(settings.get(axis) or names) for axis, names in {"object": "", **usual}.items()}
-    for number, values in enumerate(product(*axes.values())):
-        own: Settings = dict(zip(axes, values, strict=True))
-        words = [value for axis, value in zip(axes, values, strict=True) if axis == "object" or len(axes[axis]) > 1]
-        # a seed of its own, so that no two runs draw the same
-        own["seed"] = seeds.stream(config.seed, f"recipe {part.drawn_as or name} {number}")
-        own |= {"deterministic": True} if config.deterministic else {"threads": config.threads}
-        if (label := config.label_of(str(own["object"]))) is not None:
-            own["label"] = label
-        try:
-            made = kind(**{**settings, **own})
-        except SettingsError as error:
-            raise SettingsError(error.problems, where) from None
-        except UnknownNameError:
-            raise
-        except InputError as error:
-            raise InputError(f"{where}: {error}") from None
-        assert isinstance(made, SceneConfig)
-        folder = f"{number:02d}-{default_name(words[0], [default_name(word, []) for word in words[1:]])}"
-        yield PlannedRun(f"{name}-{folder}", name, made, part.around and f"{part.around}-{folder}")
