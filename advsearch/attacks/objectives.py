@@ -281,10 +281,10 @@ _OWN = {
         *(
             ObjectiveKind(name, summary, unit, getattr(functions, name), getattr(functions, f"targeted_{name}"))
             for name, summary, unit in (
-                ("margin", "the largest wrong logit minus the largest right one", "logits (log-odds)"),
+                ("margin", "the margin loss: the largest wrong logit minus the largest right one", "logits (log-odds)"),
                 ("log_odds", "the log-odds of a wrong prediction, over all classes", "logits (log-odds)"),
                 ("cross_entropy", "minus the logarithm of the probability of the right labels", "nats"),
-                ("dlr", "the margin over a distance between logits: independent of their scale", "none (a ratio)"),
+                ("dlr", "the margin loss over a distance between logits: independent of their scale", "none (a ratio)"),
             )
         ),
         ObjectiveKind(
@@ -296,7 +296,7 @@ _OWN = {
             task=Similarity.name, of_features=functions.cosine_distance,
         ),
         ObjectiveKind(
-            "score", "the task's own score, over 0 where a prediction is a success; in classification the margin",
+            "score", "the task's own score, over 0 where a prediction is a success; in classification the margin loss",
             "that of the task", task=None, of_task=_score_of,
         ),
         *(

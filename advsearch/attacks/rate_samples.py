@@ -39,8 +39,8 @@ def affordable(ladder: Sequence[int], pictures: int, searched: int) -> Sequence[
 
 
 def choose_rate_spp(margins: Mapping[str, MarginsOf], *, seed: int, ladder: Sequence[int] = OVER_LADDER) -> SampleCount:
-    """Climb a ladder of sample counts until more of them would leave the share of conditions with a margin over zero
-    where it is, of each configuration; return the highest rung that one of them needed.
+    """Climb a ladder of sample counts until more of them would leave the share of conditions with a margin below
+    zero where it is, of each configuration; return the highest rung that one of them needed.
 
     Each is rendered under the same `CONDITIONS` at a rung and at the one below. It has settled where the mean change of
     the margin, taken once more and at either end of its 95 % interval (Student's t), would carry at most `MOVED` of the

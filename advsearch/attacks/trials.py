@@ -237,8 +237,9 @@ MarginsOf = Callable[[int, Sequence[int]], Sequence[float]]
 
 
 def margins_of(evaluate: Evaluate, kind: str, u: Tensor, *, keep: int = 0, drawn: bool = False) -> MarginsOf:
-    """Return the margins of one configuration under the conditions that the scene comes with, or under those `drawn` by
-    the seeds; the rows of all sample counts are numbered together, and the first `keep` pictures of each are wanted."""
+    """Return the margins of one configuration, its scores with their sign turned, under the conditions that the scene
+    comes with, or under those `drawn` by the seeds; the rows of all sample counts are numbered together, and the first
+    `keep` pictures of each are wanted."""
     made = Counter[int]()
 
     def margins(spp: int, seeds: Sequence[int]) -> list[float]:
@@ -246,7 +247,7 @@ def margins_of(evaluate: Evaluate, kind: str, u: Tensor, *, keep: int = 0, drawn
         asked = enumerate(zip(seeds, numbers, strict=True), made.total())
         made[spp] += len(seeds)
         queries = [Query(u, seed, kind, row, spp=spp, drawn=drawn, keep=number < keep) for row, (seed, number) in asked]
-        return [evaluation.said.score for evaluation in evaluate(queries)]
+        return [-evaluation.said.score for evaluation in evaluate(queries)]
 
     return margins
 

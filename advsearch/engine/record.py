@@ -199,7 +199,7 @@ def rate_of(rate: Trials, trials: Sequence[Judgement], successes: Sequence[Judge
         interval=rate.interval,
         spp=rate.spp,
         labels=dict(labels.most_common()),
-        margin=mean_number(trial.score for trial in trials),
+        margin=0.0 - mean_number(trial.score for trial in trials),
         not_a_number=sum(trial.not_a_number for trial in trials),
     )
 

@@ -132,7 +132,7 @@ def search_axes(
 
 # ---- parts ----------------------------------------------------------------------------------------------------------
 
-MARGIN, ACCURACY = "margin [logits]; above 0: wrong", "accuracy"
+MARGIN, ACCURACY = "margin [logits]; below 0: wrong", "accuracy"
 """What the colours of a map may mean: red is wrong in both."""
 
 MOST_POINTS = 400
@@ -148,7 +148,7 @@ def heat(
         colours: dict[str, str | float] = {"cmap": "RdBu", "vmin": 0.0, "vmax": 1.0}
     else:
         largest = max([*finite, 1e-6])
-        colours = {"cmap": "RdBu_r", "vmin": -largest, "vmax": largest}
+        colours = {"cmap": "RdBu", "vmin": -largest, "vmax": largest}
     shown = axes.imshow(values, origin="lower", extent=extent, aspect="auto", **colours)
     axes.set(xlabel=across, ylabel=up)
     axes.figure.colorbar(shown, ax=axes, label=meaning)

@@ -19,12 +19,12 @@ DEPTH, SIMILARITY, COMMAND = "depth", "similarity", "command"
 """Tasks whose predictions have words of their own; others are quoted."""
 
 _MARGINS = {
-    CLASSIFICATION: "how far the wrong prediction leads the right one, in logits",
-    DETECTION: "how far the best right box is under the score that counts, in log-odds; over 0 where none is found",
-    SEGMENTATION: "the lead of wrong classes at the pixel that decides, in logits; over 0 where too few are right",
-    DEPTH: "the logarithm of the factor by which the object's distance is off, less that of the tolerance",
-    SIMILARITY: "how far the nearest wrong name leads the right one, in logits",
-    COMMAND: "how many envelopes the action is from the clean one, less 1; over 0 outside of it",
+    CLASSIFICATION: "how far the right prediction leads the wrong one, in logits",
+    DETECTION: "how far the best right box is over the score that counts, in log-odds; below 0 where none is found",
+    SEGMENTATION: "the lead of right classes at the pixel that decides, in logits; below 0 where too few are right",
+    DEPTH: "the logarithm of the tolerance, less that of the factor by which the object's distance is off",
+    SIMILARITY: "how far the right name leads the nearest wrong one, in logits",
+    COMMAND: "1 less how many envelopes the action is from the clean one; below 0 outside of it",
 }
 _MARKS = {
     DETECTION: "Blue is the true box, orange what the model finds with a score that counts.",
@@ -126,7 +126,7 @@ def beside_text(run: str, pair: Any) -> str:
 
 def margin_text(task: str) -> str:
     """Return what the margin of a task is, as a clause."""
-    return _MARGINS.get(task, "over 0 where the prediction is wrong")
+    return _MARGINS.get(task, "below 0 where the prediction is wrong")
 
 
 def is_command(text: str) -> bool:
@@ -135,8 +135,14 @@ def is_command(text: str) -> bool:
 
 
 def objective_label(objective: str) -> str:
-    """Return an objective with its unit, for an axis: ``margin [logits]``."""
-    return next((f"{objective} [{unit}]" for unit, names in _UNITS.items() if objective in names), objective)
+    """Return an objective with its unit, for an axis: ``margin loss [logits]``."""
+    named = objective_name(objective)
+    return next((f"{named} [{unit}]" for unit, names in _UNITS.items() if objective in names), named)
+
+
+def objective_name(objective: str) -> str:
+    """Return what an objective is called beside its value: that of a margin has the margin's sign turned."""
+    return {"margin": "margin loss", "pixel_margin": "margin loss of the pixels"}.get(objective, objective)
 
 
 def marks_text(task: str) -> str:

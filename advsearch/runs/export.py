@@ -160,7 +160,7 @@ _PLACED = ("environment", "object")
 
 def write_threedb(rows: Callable[[], Iterable[Row]], out: Path, picture: Callable[[int], bytes | None]) -> int:
     """Write the rows of a sweep as such a folder, made or empty, with the PNG of each, where one was kept, and return
-    how many there were. ``loss`` holds the margin: how wrong a prediction is, over 0 where it is not right. The
+    how many there were. ``loss`` is the margin with its sign turned: over 0 where a prediction is not right. The
     parameter ``network`` tells what several networks predict apart."""
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"out: {out} is there already and not empty; name another folder")
@@ -198,7 +198,7 @@ def _line(row: Row, names: Iterable[str], prediction: int) -> JsonObject:
         "environment": environment,
         "model": model,
         "is_correct": str(bool(row.correct)),
-        "loss": row.margin,
+        "loss": None if row.margin is None else 0.0 - row.margin,
         "prediction": [prediction],
         "output_type": "classes",
         "render_args": parameters,  # type: ignore[dict-item]
@@ -267,7 +267,7 @@ def _imported(folder: Path, number: int, line: bytes, classes: Sequence[str]) ->
             kind="sweep",
             step=number,
             correct=str(told.get("is_correct")) == "True",
-            margin=float(loss) if isinstance(loss, (int, float)) else None,
+            margin=0.0 - loss if isinstance(loss, (int, float)) else None,
             label=label,
             label_index=index,
             values=values,

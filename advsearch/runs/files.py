@@ -210,7 +210,7 @@ LARGEST = 64 << 30
 APPLICATION_ID = 0x41445653
 """In the header of every results.sqlite that is ours: "ADVS"."""
 
-VERSION = 8
+VERSION = 9
 """Of the tables; in the header of the file. Files of another version are read by the advsearch that wrote them."""
 
 SCHEMA = f"""
@@ -232,7 +232,7 @@ SCHEMA = f"""
         score        REAL,                -- what the task says of the prediction, over 0 where it is what is sought
         success      INTEGER,             -- 1 when the prediction is what is sought, 0 when not, NULL in a sweep
         correct      INTEGER,             -- 1 when the prediction was a right one, else 0
-        margin       REAL,                -- largest logit of a wrong class minus largest of a right one
+        margin       REAL,                -- largest logit of a right class minus largest of a wrong one
         label        TEXT,                -- the class that the model predicted
         label_index  INTEGER,             -- its number
         probability  REAL,                -- the model's probability for it, in [0, 1]

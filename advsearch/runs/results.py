@@ -423,7 +423,9 @@ class VerifiedRate(Fields):
     interval: Interval
     spp: int = Field(description="samples a pixel")
     labels: dict[str, int] = Field(description="predictions of the successes, and how often each was given")
-    margin: JsonFloat = Field(description="mean over these trials, in logits; of a detector in log-odds")
+    margin: JsonFloat = Field(
+        description="mean over these trials, below 0 in a success, in logits; of a detector in log-odds"
+    )
     not_a_number: int = Field(default=0, description="trials whose output is NaN or infinity; absent without")
     stopped: str | None = Field(
         default=None,
@@ -440,7 +442,7 @@ class AverageCase(Fields):
     accuracy: float
     interval: Interval
     margin: JsonFloat = Field(description="the mean, in logits")
-    worst_margin: JsonFloat = Field(description="the largest, in logits")
+    worst_margin: JsonFloat = Field(description="the smallest, in logits")
 
 
 class PredictionError(Fields):

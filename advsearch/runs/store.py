@@ -55,8 +55,8 @@ class Row:
             not a number.
         success: whether the prediction is what the attack is after; None where nothing is sought, as in a sweep.
         correct: whether the prediction is right.
-        margin: how wrong it is, by the run's task, over 0 where it is not right; in classification the largest logit of
-            a wrong class minus the largest of a right one; stored as None when it is not a number.
+        margin: how right it is, by the run's task, below 0 where it is not; in classification the largest logit of a
+            right class minus the largest of a wrong one; stored as None when it is not a number.
         label: what the model predicted, in words.
         label_index: the number of that class; None where there are no classes.
         probability: the model's probability for it, in [0, 1]; None where it gives none.

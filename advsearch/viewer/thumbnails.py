@@ -130,7 +130,7 @@ class Kept:
     def embedded(self, rows: pd.DataFrame, most: int) -> Iterator[tuple[str, str]]:
         """Yield number and data address of thumbnails, of the worst margins first, up to `most` bytes."""
         steps, margins = rows["step"].to_numpy(), rows["margin"].to_numpy()
-        order = np.argsort(-np.nan_to_num(margins, nan=-np.inf), kind="stable")
+        order = np.argsort(np.nan_to_num(margins, nan=np.inf), kind="stable")
         there, spent = set(self.numbers), 0
         for step in steps[order]:
             number = int(step) // self.models

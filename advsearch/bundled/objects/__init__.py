@@ -2,38 +2,23 @@
 
 from __future__ import annotations
 
-from .cars import CAR
+from .cars import car
 from .family import Instance, ObjectFamily
-from .furniture import CHAIR, LAMP
-from .kitchen import FRYING_PAN, TEAPOT
-from .people import PERSON
-from .signs import STOP_SIGN
-from .things import BALL, BANANA, BOOK
-from .tools import DUMBBELL, HAMMER
-from .vessels import BOTTLE, BOWL, MUG, VASE, WINE_GLASS
+from .furniture import chair, lamp
+from .kitchen import frying_pan, teapot
+from .people import person
+from .signs import stop_sign
+from .things import ball, banana, book
+from .tools import dumbbell, hammer
+from .vessels import bottle, bowl, mug, vase, wine_glass
 
-HOUSEHOLD: dict[str, ObjectFamily] = {
-    family.name: family
-    for family in (
-        MUG,
-        BOWL,
-        BOTTLE,
-        VASE,
-        TEAPOT,
-        WINE_GLASS,
-        FRYING_PAN,
-        HAMMER,
-        BANANA,
-        BALL,
-        CHAIR,
-        LAMP,
-        BOOK,
-        DUMBBELL,
-    )
-}
+_HOUSEHOLD = (
+    mug, bowl, bottle, vase, teapot, wine_glass, frying_pan, hammer, banana, ball, chair, lamp, book, dumbbell,
+)  # fmt: skip
+HOUSEHOLD: dict[str, ObjectFamily] = {family.name: family for family in _HOUSEHOLD}
 """What the reference model is trained on."""
 
-STREET: dict[str, ObjectFamily] = {family.name: family for family in (CAR, STOP_SIGN, PERSON)}
+STREET: dict[str, ObjectFamily] = {family.name: family for family in (car, stop_sign, person)}
 
 OBJECTS: dict[str, ObjectFamily] = HOUSEHOLD | STREET
 

@@ -7,7 +7,7 @@ with `GUTTER` texels of their own colour around them, so that filtering and halv
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -24,7 +24,7 @@ DECIMALS = 6  # coordinates are rounded to this: machines differ in the last bit
 
 
 @dataclass(frozen=True)
-class Slot:
+class Place:
     """Where a chart lies: left, bottom, width and height in texels (gutters included); turned by 90 degrees or not."""
 
     x: int
@@ -34,11 +34,11 @@ class Slot:
     turned: bool
 
 
-def _shelves(sizes: Sequence[tuple[float, float]], scale: float, side: int) -> list[Slot] | None:
+def _shelves(sizes: Sequence[tuple[float, float]], scale: float, side: int) -> list[Place] | None:
     """Pack rectangles (w, h), w >= h, on shelves of a square, tallest first; None where they do not fit."""
     cells = [(int(np.ceil(w * scale)) + 2 * GUTTER, int(np.ceil(h * scale)) + 2 * GUTTER) for w, h in sizes]
     order = sorted(range(len(cells)), key=lambda i: (-cells[i][1], -cells[i][0], i))
-    slots: list[Slot | None] = [None] * len(cells)
+    places: dict[int, Place] = {}
     shelves: list[list[int]] = []  # bottom, height, filled width
     top = 0
     for i in order:
@@ -52,56 +52,56 @@ def _shelves(sizes: Sequence[tuple[float, float]], scale: float, side: int) -> l
             shelf = [top, height, 0]
             shelves.append(shelf)
             top += height
-        slots[i] = Slot(shelf[2], shelf[0], width, height, False)
+        places[i] = Place(shelf[2], shelf[0], width, height, False)
         shelf[2] += width
-    return [slot for slot in slots if slot is not None]
+    return [places[i] for i in range(len(cells))]
 
 
-def pack(sizes: Sequence[tuple[float, float]], side: int = SIZE) -> list[Slot]:
-    """Return a slot for every chart of size (width, height), at the largest common scale that was found to fit."""
+def pack(sizes: Sequence[tuple[float, float]], side: int = SIZE) -> list[Place]:
+    """Return a place for every chart of size (width, height), at the largest common scale that was found to fit."""
     exact = [(round(w, DECIMALS), round(h, DECIMALS)) for w, h in sizes]
     wide = [(max(s), min(s)) for s in exact]
     low, high = 0.0, side / max(w for w, _ in wide)
     best = _shelves(wide, low, side)
     for _ in range(12):
         middle = (low + high) / 2
-        slots = _shelves(wide, middle, side)
-        if slots is None:
+        places = _shelves(wide, middle, side)
+        if places is None:
             high = middle
         else:
-            low, best = middle, slots
+            low, best = middle, places
     if best is None:
         raise ValueError(f"{len(sizes)} charts do not fit an atlas of {side} texels; use fewer patches")
-    return [Slot(slot.x, slot.y, slot.width, slot.height, h > w) for slot, (w, h) in zip(best, exact, strict=True)]
+    return [replace(place, turned=h > w) for place, (w, h) in zip(best, exact, strict=True)]
 
 
-def _chart(slot: Slot) -> tuple[Array, Array]:
-    """Chart coordinates (u, v) of every texel of a slot, row by row from the bottom, clamped in the gutter."""
-    a = np.clip((np.arange(slot.width) + 0.5 - GUTTER) / (slot.width - 2 * GUTTER), 0.0, 1.0)
-    b = np.clip((np.arange(slot.height) + 0.5 - GUTTER) / (slot.height - 2 * GUTTER), 0.0, 1.0)
-    a, b = np.broadcast_to(a, (slot.height, slot.width)).ravel(), np.repeat(b, slot.width)
-    return (b, 1.0 - a) if slot.turned else (a, b)
+def _chart(place: Place) -> tuple[Array, Array]:
+    """Chart coordinates (u, v) of every texel of a place, row by row from the bottom, clamped in the gutter."""
+    a = np.clip((np.arange(place.width) + 0.5 - GUTTER) / (place.width - 2 * GUTTER), 0.0, 1.0)
+    b = np.clip((np.arange(place.height) + 0.5 - GUTTER) / (place.height - 2 * GUTTER), 0.0, 1.0)
+    a, b = np.broadcast_to(a, (place.height, place.width)).ravel(), np.repeat(b, place.width)
+    return (b, 1.0 - a) if place.turned else (a, b)
 
 
-def _in_atlas(slot: Slot, uvs: Array, side: int) -> Array:
+def _in_atlas(place: Place, uvs: Array, side: int) -> Array:
     """Atlas coordinates in [0, 1] of chart coordinates (V, 2)."""
-    local = np.stack([1.0 - uvs[:, 1], uvs[:, 0]], axis=1) if slot.turned else uvs
-    inner = np.array([slot.width - 2 * GUTTER, slot.height - 2 * GUTTER])
-    places: Array = (np.array([slot.x, slot.y]) + GUTTER + local * inner) / side
+    local = np.stack([1.0 - uvs[:, 1], uvs[:, 0]], axis=1) if place.turned else uvs
+    inner = np.array([place.width - 2 * GUTTER, place.height - 2 * GUTTER])
+    places: Array = (np.array([place.x, place.y]) + GUTTER + local * inner) / side
     return places
 
 
 def painted(
-    patches: Sequence[Patch], slots: Sequence[Slot], paints: Mapping[str, Paint], side: int = SIZE
+    patches: Sequence[Patch], places: Sequence[Place], paints: Mapping[str, Paint], side: int = SIZE
 ) -> npt.NDArray[np.float32]:
     """Return the (side, side, 3) texture, display-referred sRGB, multiples of 1/255, row 0 at the top."""
     image = np.zeros((side, side, 3))
     used = np.zeros((side, side), dtype=bool)
-    for patch, slot in zip(patches, slots, strict=True):
-        u, v = _chart(slot)
-        colour = paints[patch.tag](Texels(patch.rest(u, v), u, v, patch.size))
-        area = np.s_[slot.y : slot.y + slot.height, slot.x : slot.x + slot.width]
-        image[area] = np.broadcast_to(colour, (len(u), 3)).reshape(slot.height, slot.width, 3)
+    for patch, place in zip(patches, places, strict=True):
+        u, v = _chart(place)
+        color = paints[patch.tag](Texels(patch.rest(u, v), u, v, patch.size))
+        area = np.s_[place.y : place.y + place.height, place.x : place.x + place.width]
+        image[area] = color.reshape(place.height, place.width, 3)
         used[area] = True
     image[~used] = np.round(image[used].mean(axis=0), 2)
     levels = np.clip(np.round(image[::-1] * 255.0, 4) + 0.5, 0.5, 255.5).astype(np.uint8)
@@ -109,7 +109,7 @@ def painted(
     return stored
 
 
-def joined(patches: Sequence[Patch], slots: Sequence[Slot], side: int = SIZE) -> Mesh:
+def joined(patches: Sequence[Patch], places: Sequence[Place], side: int = SIZE) -> Mesh:
     """Return one mesh, largest extent 1, standing on z = 0 and centred, every number rounded to `DECIMALS`."""
     starts = np.cumsum([0] + [len(p.vertices) for p in patches[:-1]])
     vertices = np.concatenate([p.vertices for p in patches])
@@ -117,7 +117,7 @@ def joined(patches: Sequence[Patch], slots: Sequence[Slot], side: int = SIZE) ->
     origin = np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]])
     vertices = (vertices - origin) / float((high - low).max())
     normals = np.concatenate([p.normals for p in patches])
-    uvs = np.concatenate([_in_atlas(slot, p.uvs, side) for p, slot in zip(patches, slots, strict=True)])
+    uvs = np.concatenate([_in_atlas(place, p.uvs, side) for p, place in zip(patches, places, strict=True)])
     faces = np.concatenate([p.faces + start for p, start in zip(patches, starts, strict=True)])
     used = np.unique(faces)  # poles leave vertices behind that no triangle needs
     renumbered = np.searchsorted(used, faces).astype(np.uint32)

@@ -7,36 +7,29 @@ that follow the lines of hood, waist and roof. Windows, lights, grilles and whee
 from __future__ import annotations
 
 from collections.abc import Callable
-from itertools import pairwise
+from itertools import pairwise, product
 
 import numpy as np
 
 from advsearch.scene.assets import Material
 
 from .carving import Field, carved
-from .curves import Array, rectangle, rotation, rounded, spline, unit
-from .draw import Draw
-from .family import Instance, ObjectFamily
-from .shapes import Patch, box, cap, grid, lathe, placed, stretched, sweep
-from .textures import Paint, Texels, colour, hexed, mix, solid, step
+from .curves import Array, away_from, rectangle, rotation, rounded, spline, unit
+from .draw import Draw, hexed
+from .family import Instance, family
+from .shapes import Patch, box, cap, grid, lathe, mean_lengths, placed, stretched, sweep
+from .textures import Paint, Texels, mix, painter, solid, step
 
 AXLES = (1.29, -1.33)
 WHEEL, TYRE = 0.33, 0.215  # radius and width
 ARCH = 0.385
+WHEELS = tuple(product(AXLES, (1.0, -1.0)))  # x of the axle, and the side
 MIDDLE = -0.5  # of the cabin
 COLUMNS = 92
+Height = Callable[[Array, Array, Array], Array]
 
 
 # ------------------------------------------------------------------------------------------------------- outlines
-
-
-def _angles(front: float, rear: float, half: float, power: float) -> Array:
-    """(COLUMNS + 1,) angles around an outline, equally far apart along it; symmetrical, from the rear's middle."""
-    fine = np.linspace(-np.pi, np.pi, 8001)
-    x, y = _outline(fine, front, rear, half, power, 0.0)
-    at = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
-    angles: Array = np.interp(np.linspace(0.0, at[-1], COLUMNS + 1), at, fine)
-    return angles
 
 
 def _outline(angle: Array, front: float, rear: float, half: float, power: float, middle: float) -> tuple[Array, Array]:
@@ -46,47 +39,42 @@ def _outline(angle: Array, front: float, rear: float, half: float, power: float,
     return middle + reach * np.sign(c) * np.abs(c) ** (2 / power), half * np.sign(s) * np.abs(s) ** (2 / power)
 
 
-def _stack(rows: Array, power: float, middle: float, height: Callable[[Array, Array, Array], Array]) -> Array:
-    """Points (R, COLUMNS + 1, 3) of outlines.
+def _shell(rows: Array, power: float, middle: float, height: Height, corner: float) -> list[Patch]:
+    """Painted patches of a stack of outlines.
 
     Args:
         rows: (R, 4) share of the height, half the width, front and rear end of each.
         power: of the superellipses.
         middle: x about which they are drawn.
         height: from share, x and y to z.
+        corner: share of the columns from the middles of front and rear at which it is cut.
     """
-    widest = rows[np.argmax(rows[:, 1])]
-    angle = _angles(widest[2] - middle, widest[3] - middle, widest[1], power)
-    points = np.empty((len(rows), len(angle), 3))
+    # angles are equally far apart along the widest outline, symmetrical, from the rear's middle
+    _, half, front, rear = rows[np.argmax(rows[:, 1])]
+    fine = np.linspace(-np.pi, np.pi, 8001)
+    x, y = _outline(fine, front - middle, rear - middle, half, power, 0.0)
+    at = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
+    angle = np.interp(np.linspace(0.0, at[-1], COLUMNS + 1), at, fine)
+    points = np.empty((len(rows), COLUMNS + 1, 3))
     for row, (share, half, front, rear) in zip(points, rows, strict=True):
         x, y = _outline(angle, front, rear, half, power, middle)
         row[:, 0], row[:, 1], row[:, 2] = x, y, height(np.full_like(x, share), x, y)
-    return points
-
-
-def _pieces(tag: str, points: Array, cuts: tuple[int, ...]) -> list[Patch]:
-    """Patches of a closed stack of outlines, cut in columns."""
     around = np.concatenate([points[:, -2:-1], points, points[:, 1:2]], axis=1)
     across = np.gradient(around, axis=1)[:, 1:-1]
     normals = unit(np.cross(across, np.gradient(points, axis=0)))
-    found = []
-    for first, last in pairwise(cuts):
+    opposite, cut = COLUMNS // 2, int(COLUMNS * corner)
+    patches = []
+    for first, last in pairwise((0, cut, opposite - cut, opposite + cut, COLUMNS - cut, COLUMNS)):
         part = points[:, first : last + 1]
-        u, v = (_lengths(part, axis) for axis in (1, 0))
+        u, v = (mean_lengths(part, axis) for axis in (1, 0))
         size = (float(u[-1]), float(v[-1]))
-        found.append(grid(tag, part, normals[:, first : last + 1], size, v / v[-1], u / u[-1]))
-    return found
-
-
-def _lengths(points: Array, axis: int) -> Array:
-    """Mean lengths along an axis of a grid of points, from 0."""
-    steps = np.linalg.norm(np.diff(points, axis=axis), axis=-1).mean(axis=1 - axis)
-    return np.concatenate([[0.0], np.cumsum(steps)])
+        patches.append(grid("paint", part, normals[:, first : last + 1], size, v / v[-1], u / u[-1]))
+    return patches
 
 
 def _line(knots: list[tuple[float, float]]) -> Callable[[Array], Array]:
     """A smooth function through knots (x, value) in order of x."""
-    curve = spline(np.array(knots), 200)
+    curve = spline(knots, 200)
     return lambda x: np.interp(x, curve[:, 0], curve[:, 1])
 
 
@@ -135,16 +123,13 @@ _BODY_POWER, _CABIN_POWER = 4.2, 4.6
 
 
 def _body_height(share: Array, x: Array, y: Array) -> Array:
-    top = _WAIST(x) + 0.045 * (1.0 - (y / 0.8) ** 2)
-    low = _BOTTOM(x)
-    height: Array = low + share * (top - low)
-    return height
+    top, low = _WAIST(x) + 0.045 * (1.0 - (y / 0.8) ** 2), _BOTTOM(x)
+    return np.asarray(low + share * (top - low))
 
 
 def _cabin_height(share: Array, x: Array, y: Array) -> Array:
     low = _WAIST(x) + 0.045 * (1.0 - (y / 0.8) ** 2) - 0.03
-    height: Array = low + share * (_ROOF(x) + 0.035 * (1.0 - (y / 0.6) ** 2) - low)
-    return height
+    return np.asarray(low + share * (_ROOF(x) + 0.035 * (1.0 - (y / 0.6) ** 2) - low))
 
 
 def _within(front: float, rear: float, half: float, power: float, middle: float) -> Field:
@@ -153,18 +138,13 @@ def _within(front: float, rear: float, half: float, power: float, middle: float)
     def inside(p: Array) -> Array:
         reach = np.where(p[:, 0] >= middle, front - middle, middle - rear)
         size = (np.abs((p[:, 0] - middle) / reach) ** power + np.abs(p[:, 1] / half) ** power) ** (1 / power)
-        value: Array = half * (1.0 - size)
-        return value
+        return np.asarray(half * (1.0 - size))
 
     return inside
 
 
-def _front(p: Array, at: float = 1.2) -> Array:
-    return np.where(p[:, 0] > at, 1.0, -1.0)
-
-
-def _arch(axle: float, radius: float) -> Field:
-    return lambda p: np.where(np.abs(p[:, 1]) > 0.4, radius - np.hypot(p[:, 0] - axle, p[:, 2] - WHEEL), -1.0)
+def _arch(axle: float) -> Field:
+    return lambda p: np.where(np.abs(p[:, 1]) > 0.4, ARCH - np.hypot(p[:, 0] - axle, p[:, 2] - WHEEL), -1.0)
 
 
 def _headlight(p: Array) -> Array:
@@ -181,9 +161,8 @@ def _taillight(p: Array) -> Array:
 def _grille(half: float, low: float, high: float, lean: float = 0.0) -> Field:
     def inside(p: Array) -> Array:
         out = np.abs(p[:, 1])
-        return np.where(
-            p[:, 0] > 1.5, _softest(half - out, p[:, 2] - low - lean * out, high + lean * out - p[:, 2]), -1.0
-        )
+        hole = _softest(half - out, p[:, 2] - low - lean * out, high + lean * out - p[:, 2])
+        return np.where(p[:, 0] > 1.5, hole, -1.0)
 
     return inside
 
@@ -217,32 +196,28 @@ def _side_windows(p: Array) -> Array:
     return np.where(np.abs(p[:, 1]) > 0.45, _softest(pillar, rear, z - low, high - z), -1.0)
 
 
-def _body(tag: str) -> list[Patch]:
-    rows = spline(np.array(_BODY), 23)
-    deck = np.array([(1.0, s * 0.78, s * 1.79, s * -1.965) for s in (0.92, 0.81, 0.69, 0.56, 0.43)])
-    points = _stack(np.concatenate([rows, deck]), _BODY_POWER, 0.0, _body_height)
-    cut = int(COLUMNS * 0.085)
-    half = COLUMNS // 2
-    shell = _pieces(tag, points, (0, cut, half - cut, half + cut, COLUMNS - cut, COLUMNS))
-    shell = carved(shell, _within(0.9, -1.86, 0.72, _CABIN_POWER, MIDDLE), None)
-    for axle in AXLES:
-        shell = carved(shell, _arch(axle, ARCH), None)
-    shell = carved(shell, _headlight, "headlight")
-    shell = carved(shell, _taillight, "taillight")
-    shell = carved(shell, _grille(0.62, 0.24, 0.37, -0.02), "trim")
-    shell = carved(shell, _grille(0.41, 0.5, 0.64, 0.04), "trim")
-    return carved(shell, _valance, "trim")
+CARVED: tuple[tuple[Field, str | None], ...] = (
+    (_within(0.9, -1.86, 0.72, _CABIN_POWER, MIDDLE), None),
+    *((_arch(axle), None) for axle in AXLES),
+    (_headlight, "headlight"),
+    (_taillight, "taillight"),
+    (_grille(0.62, 0.24, 0.37, -0.02), "trim"),
+    (_grille(0.41, 0.5, 0.64, 0.04), "trim"),
+    (_valance, "trim"),
+)
+"""What is carved out of the body, and what it becomes."""
 
 
-def _cabin(tag: str) -> list[Patch]:
-    rows = spline(np.array(_CABIN), 16)
-    roof = np.array([(1.0, s * 0.5, MIDDLE + s * 0.28, MIDDLE - s * 0.8) for s in (0.75, 0.45, 0.15, 0.002)])
-    points = _stack(np.concatenate([rows, roof]), _CABIN_POWER, MIDDLE, _cabin_height)
-    half, cut = COLUMNS // 2, int(COLUMNS * 0.1)
-    shell = _pieces(tag, points, (0, cut, half - cut, half + cut, COLUMNS - cut, COLUMNS))
-    shell = carved(shell, _windscreen, "glass")
-    shell = carved(shell, _rear_window, "glass")
-    return carved(shell, _side_windows, "glass")
+def _body_and_cabin() -> list[Patch]:
+    deck = [(1.0, s * 0.78, s * 1.79, s * -1.965) for s in (0.92, 0.81, 0.69, 0.56, 0.43)]
+    body = _shell(np.array([*spline(_BODY, 23), *deck]), _BODY_POWER, 0.0, _body_height, 0.085)
+    for inside, tag in CARVED:
+        body = carved(body, inside, tag)
+    roof = [(1.0, s * 0.5, MIDDLE + s * 0.28, MIDDLE - s * 0.8) for s in (0.75, 0.45, 0.15, 0.002)]
+    cabin = _shell(np.array([*spline(_CABIN, 16), *roof]), _CABIN_POWER, MIDDLE, _cabin_height, 0.1)
+    for window in (_windscreen, _rear_window, _side_windows):
+        cabin = carved(cabin, window, "glass")
+    return body + cabin
 
 
 # --------------------------------------------------------------------------------------------------------- wheels
@@ -255,85 +230,70 @@ def _wheel() -> list[Patch]:
     tread = [(WHEEL, half - 0.05), (WHEEL, 0.0), (WHEEL, 0.05 - half)]
     tyre = [*((r, -z) for r, z in outside), *tread[::-1], *outside[::-1]]
     deep = half - 0.06
-    patches = lathe([("rubber", np.array(tyre))], 28)
-    patches += lathe([("rim", np.array([(rim, half - 0.008), (rim - 0.014, half - 0.012), (rim - 0.02, deep)]))], 28)
-    patches += lathe([("well", np.array([(rim - 0.02, deep), (0.0, deep)]))], 24)
+    patches = lathe([("rubber", tyre)], 28)
+    patches += lathe([("rim", [(rim, half - 0.008), (rim - 0.014, half - 0.012), (rim - 0.02, deep)])], 28)
+    patches += lathe([("well", [(rim - 0.02, deep), (0.0, deep)])], 24)
     spoke = np.array([(0.03, 0.0, half - 0.035), (0.11, 0.0, half - 0.022), (rim - 0.012, 0.0, half - 0.018)])
     section = rectangle(0.03, 0.03, 0.008, 1)
-    for number in range(5):
-        for side in (-1.0, 1.0):
-            arm = spoke.copy()
-            arm[:, 1] = side * np.array([0.012, 0.018, 0.04])
-            patches += placed(sweep("rim", arm, section, np.array([1.0, 1.0, 1.15])), rotation("z", 72.0 * number))
+    for number, side in product(range(5), (-1.0, 1.0)):
+        spoke[:, 1] = side * np.array([0.012, 0.018, 0.04])
+        patches += placed(sweep("rim", spoke, section, (1.0, 1.0, 1.15)), rotation("z", 72.0 * number))
     hub = [(0.052, deep), (0.05, half - 0.02), (0.03, half - 0.01), (0.0, half - 0.008)]
     return patches + lathe([("rim", rounded(hub, 0.008, 2))], 20)
 
 
 def _wheels() -> list[Patch]:
-    found = []
-    for axle in AXLES:
-        for side in (1.0, -1.0):
-            turn = rotation("y", 17.0 * axle) @ rotation("x", -90.0 * side)
-            found += placed(_wheel(), turn, (axle, side * (0.852 - TYRE / 2), WHEEL))
-    return found
+    patches = []
+    for axle, side in WHEELS:
+        turn = rotation("y", 17.0 * axle) @ rotation("x", -90.0 * side)
+        patches += placed(_wheel(), turn, (axle, side * (0.852 - TYRE / 2), WHEEL))
+    return patches
 
 
 def _wells() -> list[Patch]:
     """The insides of the wheel arches, and the floor."""
-    found = []
-    for axle in AXLES:
-        for side in (1.0, -1.0):
-            angle = np.radians(np.linspace(-30.0, 210.0, 17))
-            inner = np.stack([axle + ARCH * np.cos(angle), 0 * angle, WHEEL + ARCH * np.sin(angle)], axis=1)
-            rows = np.stack([inner + np.array([0.0, side * y, 0.0]) for y in (0.79, 0.56)])
-            if side > 0:
-                rows = rows[::-1]
-            normals = np.broadcast_to(np.stack([-np.cos(angle), 0 * angle, -np.sin(angle)], axis=1)[None], rows.shape)
-            down, across = np.array([0.0, 1.0]), np.linspace(0.0, 1.0, len(angle))
-            found.append(grid("well", rows, normals, (ARCH * 4.2, 0.32), down, across))
-            ring = inner + np.array([0.0, side * 0.56, 0.0])
-            found.append(cap("well", ring[::-1] if side > 0 else ring, np.array([0.0, side, 0.0])))
+    angle = np.radians(np.linspace(-30.0, 210.0, 17))
+    outwards = np.stack([np.cos(angle), 0 * angle, np.sin(angle)], axis=1)
+    patches = []
+    for axle, side in WHEELS:
+        inner = np.array([axle, 0.0, WHEEL]) + ARCH * outwards
+        rows = np.stack([inner + np.array([0.0, side * y, 0.0]) for y in (0.79, 0.56)])
+        ring = rows[1]
+        if side > 0:
+            rows, ring = rows[::-1], ring[::-1]
+        normals = np.broadcast_to(-outwards, rows.shape)
+        across = np.linspace(0.0, 1.0, len(angle))
+        patches.append(grid("well", rows, normals, (ARCH * 4.2, 0.32), np.array([0.0, 1.0]), across))
+        patches.append(cap("well", ring, np.array([0.0, side, 0.0])))
     x, y = _outline(np.linspace(np.pi, -np.pi, 41)[:-1], 1.97, -1.99, 0.79, _BODY_POWER, 0.0)
-    return [*found, cap("well", np.stack([x, y, np.full_like(x, 0.2)], axis=1), np.array([0.0, 0.0, -1.0]))]
+    return [*patches, cap("well", np.stack([x, y, np.full_like(x, 0.2)], axis=1), np.array([0.0, 0.0, -1.0]))]
 
 
 # ------------------------------------------------------------------------------------------------------- fittings
 
 
-def _mirrors() -> list[Patch]:
-    found = []
-    for side in (1.0, -1.0):
-        shell = box("paint", (0.0, 0.0, 0.0), (0.12, 0.2, 0.125), 0.055, 3)
-        found += placed(shell, rotation("z", -14.0 * side), (0.57, side * 0.93, 1.005))
-        found += box("trim", (0.58, side * 0.83, 0.955), (0.06, 0.14, 0.035), 0.012, 1)
-    return found
-
-
 def _fittings() -> list[Patch]:
-    found = _mirrors()
-    found += placed(box("plate", (0, 0, 0), (0.014, 0.52, 0.112), 0.004, 1), rotation("y", -4.0), (2.146, 0.0, 0.428))
-    found += placed(box("plate", (0, 0, 0), (0.014, 0.52, 0.112), 0.004, 1), rotation("y", 3.0), (-2.138, 0.0, 0.705))
-    badge = lathe([("rim", np.array([(0.058, -0.02), (0.058, 0.006), (0.05, 0.012), (0.0, 0.014)]))], 24)
-    found += placed(badge, rotation("y", 78.0), (2.118, 0.0, 0.575))
-    found += placed(badge, rotation("y", -80.0), (-2.075, 0.0, 0.86))
-    for side in (1.0, -1.0):
-        for x in (0.05, -0.92):
-            found += box("paint", (x, side * 0.889, 0.775), (0.2, 0.032, 0.028), 0.011, 1)
-    found += placed(box("paint", (0, 0, 0), (0.2, 1.04, 0.035), 0.015, 2, 2), rotation("y", 9.0), (-1.60, 0.0, 1.364))
-    return found
+    patches = []
+    for side in (1.0, -1.0):  # mirrors
+        shell = box("paint", (0.0, 0.0, 0.0), (0.12, 0.2, 0.125), 0.055, 3)
+        patches += placed(shell, rotation("z", -14.0 * side), (0.57, side * 0.93, 1.005))
+        patches += box("trim", (0.58, side * 0.83, 0.955), (0.06, 0.14, 0.035), 0.012, 1)
+    plate = box("plate", (0, 0, 0), (0.014, 0.52, 0.112), 0.004, 1)
+    badge = lathe([("rim", [(0.058, -0.02), (0.058, 0.006), (0.05, 0.012), (0.0, 0.014)])], 24)
+    for thing, lean, place in (
+        (plate, -4.0, (2.146, 0.0, 0.428)),
+        (plate, 3.0, (-2.138, 0.0, 0.705)),
+        (badge, 78.0, (2.118, 0.0, 0.575)),
+        (badge, -80.0, (-2.075, 0.0, 0.86)),
+    ):
+        patches += placed(thing, rotation("y", lean), place)
+    for side, x in product((1.0, -1.0), (0.05, -0.92)):  # handles of the doors
+        patches += box("paint", (x, side * 0.889, 0.775), (0.2, 0.032, 0.028), 0.011, 1)
+    spoiler = box("paint", (0, 0, 0), (0.2, 1.04, 0.035), 0.015, 2, 2)
+    return [*patches, *placed(spoiler, rotation("y", 9.0), (-1.60, 0.0, 1.364))]
 
 
 # --------------------------------------------------------------------------------------------------------- paints
-
-
-def _near(a: Array, b: Array, path: list[tuple[float, float]]) -> Array:
-    """Distance of points (a, b) to a polyline."""
-    best = np.full(len(a), 9.0)
-    for (x0, y0), (x1, y1) in pairwise(path):
-        dx, dy = x1 - x0, y1 - y0
-        t = np.clip(((a - x0) * dx + (b - y0) * dy) / (dx * dx + dy * dy), 0.0, 1.0)
-        best = np.minimum(best, np.hypot(a - x0 - t * dx, b - y0 - t * dy))
-    return best
 
 
 _DOORS = (
@@ -343,31 +303,28 @@ _DOORS = (
 )
 
 
-def _lacquer(color: Array) -> Paint:
+@painter
+def _lacquer(t: Texels, color: Array) -> Array:
     """Paint with the gaps of doors, hood and tailgate."""
-
-    def paint(t: Texels) -> Array:
-        x, y, z = t.xyz.T
-        side = np.min([_near(x, z, path) for path in _DOORS], axis=0)
-        side = np.where((np.abs(y) > 0.6) & (z < 1.02), side, 9.0)
-        hood = _near(x, np.abs(y), [(0.9, 0.74), (1.5, 0.70), (1.84, 0.58), (1.95, 0.3), (1.97, 0.0)])
-        hood = np.where((x > 0.8) & (z > 0.6), hood, 9.0)
-        gate = _near(np.abs(y), z, [(0.66, 1.2), (0.70, 0.98), (0.62, 0.66), (0.55, 0.58), (0.0, 0.57)])
-        gate = np.where(x < -1.7, gate, 9.0)
-        cap_ = np.where((y < -0.6) & (x < -1.0), np.abs(np.hypot(x + 1.52, z - 0.80) - 0.075), 9.0)
-        fold = _near(x, np.abs(y), [(0.95, 0.5), (1.9, 0.36)])
-        gap = np.min([side, hood, gate, cap_], axis=0)
-        fold = np.where((x > 0.8) & (z > 0.7), np.clip(1.0 - fold / 0.05, 0.0, 1.0), 0.0)
-        shaded = mix(np.broadcast_to(color, (len(x), 3)), 0.75 * color, 0.4 * fold)
-        return mix(shaded, 0.12 * color, 0.9 * step(0.005 - gap, 0.0, 0.011))
-
-    return paint
+    x, y, z = t.xyz.T
+    out = np.abs(y)
+    hood = away_from(x, out, [(0.9, 0.74), (1.5, 0.70), (1.84, 0.58), (1.95, 0.3), (1.97, 0.0)])
+    gate = away_from(out, z, [(0.66, 1.2), (0.70, 0.98), (0.62, 0.66), (0.55, 0.58), (0.0, 0.57)])
+    gaps = [
+        np.where((out > 0.6) & (z < 1.02), away_from(x, z, *_DOORS), 9.0),
+        np.where((x > 0.8) & (z > 0.6), hood, 9.0),
+        np.where(x < -1.7, gate, 9.0),
+        np.where((y < -0.6) & (x < -1.0), np.abs(np.hypot(x + 1.52, z - 0.80) - 0.075), 9.0),  # the tank's lid
+    ]
+    fold = np.clip(1.0 - away_from(x, out, [(0.95, 0.5), (1.9, 0.36)]) / 0.05, 0.0, 1.0)
+    shaded = mix(color, 0.75 * color, 0.4 * np.where((x > 0.8) & (z > 0.7), fold, 0.0))
+    return mix(shaded, 0.12 * color, 0.9 * step(0.005 - np.min(gaps, axis=0), 0.0, 0.011))
 
 
 def _panes(t: Texels) -> Array:
     """Dark glass, with the pillar between the doors, and behind the windscreen what one sees of two seats."""
     x, y, z = t.xyz.T
-    color = mix(np.broadcast_to(hexed("20272b"), (len(x), 3)), hexed("414d55"), np.clip((z - 0.95) / 0.5, 0.0, 1.0))
+    color = mix(hexed("20272b"), hexed("414d55"), np.clip((z - 0.95) / 0.5, 0.0, 1.0))
     out = np.abs(y)
     seat = np.minimum(np.hypot((out - 0.36) / 0.24, (z - 1.0) / 0.2), np.hypot((out - 0.36) / 0.11, (z - 1.23) / 0.055))
     ahead = np.where(x > 0.0, step(1.0 - seat, 0.0, 0.15), 0.0)
@@ -380,37 +337,31 @@ def _lamps(t: Texels) -> Array:
     x, y, z = t.xyz.T
     out = np.abs(y)
     lamp = np.minimum(np.hypot(out - 0.58, z - 0.62), np.hypot(out - 0.71, z - 0.64))
-    base = mix(np.broadcast_to(hexed("9aa4ab"), (len(x), 3)), hexed("f4f7f8"), step(0.032 - lamp, 0.0, 0.01))
+    base = mix(hexed("9aa4ab"), hexed("f4f7f8"), step(0.032 - lamp, 0.0, 0.01))
     return mix(base, hexed("3a4045"), step(0.01 - np.abs(lamp - 0.039), 0.0, 0.008))
 
 
 def _tail(t: Texels) -> Array:
     z = t.xyz[:, 2]
-    return mix(
-        np.broadcast_to(hexed("8e0d12"), (len(z), 3)), hexed("d8392f"), step(0.018 - np.abs(z - 0.87), 0.0, 0.01)
-    )
+    return mix(hexed("8e0d12"), hexed("d8392f"), step(0.018 - np.abs(z - 0.87), 0.0, 0.01))
 
 
 def _slats(t: Texels) -> Array:
     """Dark plastic; the grilles have bright slats."""
     x, _, z = t.xyz.T
     slat = np.where((x > 1.9) & (z > 0.48), step(0.006 - np.abs((z % 0.034) - 0.017), 0.0, 0.006), 0.0)
-    return mix(np.broadcast_to(hexed("17181a"), (len(x), 3)), hexed("8b9095"), slat)
+    return mix(hexed("17181a"), hexed("8b9095"), slat)
 
 
-def _plate(ground: Array) -> Paint:
+@painter
+def _plate(t: Texels, ground: Array) -> Array:
     """A licence plate: dark strokes on a light ground; nobody's number."""
-
-    def paint(t: Texels) -> Array:
-        y, z = t.xyz[:, 1] / 0.26, t.xyz[:, 2] / 0.056
-        cell = (y + 0.86) / 0.215
-        within = (np.abs(y) < 0.86) & (np.abs(z) < 0.62) & (np.floor(cell) != 3) & (t.xyz[:, 0] > -1.0)
-        place = np.abs(cell % 1.0 - 0.5)
-        strokes = (np.abs(place - 0.27) < 0.09) | ((place < 0.3) & (np.abs(np.abs(z) - 0.5) < 0.13))
-        ink = within & strokes
-        return mix(np.broadcast_to(ground, (len(y), 3)), hexed("16181c"), ink.astype(np.float64))
-
-    return paint
+    y, z = t.xyz[:, 1] / 0.26, t.xyz[:, 2] / 0.056
+    cell = (y + 0.86) / 0.215
+    field = (np.abs(y) < 0.86) & (np.abs(z) < 0.62) & (np.floor(cell) != 3) & (t.xyz[:, 0] > -1.0)
+    place = np.abs(cell % 1.0 - 0.5)
+    strokes = (np.abs(place - 0.27) < 0.09) | ((place < 0.3) & (np.abs(np.abs(z) - 0.5) < 0.13))
+    return mix(ground, hexed("16181c"), (field & strokes).astype(np.float64))
 
 
 GLASS = Material(roughness=0.04, specular=0.6)
@@ -427,24 +378,22 @@ FINISHES = {
 }
 
 
-def _car(draw: Draw) -> Instance:
-    color = colour(draw, "2a5fa8", "b3202a", "d9dadb", "2f6f4f", "e0a02c", "3a3f45", wild=0.2)
+@family(metres=1.0, texels=384)
+def car(draw: Draw) -> Instance:
+    color = draw.colour("2a5fa8", "b3202a", "d9dadb", "2f6f4f", "e0a02c", "3a3f45", wild=0.2)
     stretch = np.array([draw(1.0, 0.94, 1.07), draw(1.0, 0.96, 1.05), draw(1.0, 0.95, 1.1)])
-    patches = [*_body("paint"), *_cabin("paint"), *_wheels(), *_wells(), *_fittings()]
-    metal = colour(draw, "c4c7ca", "8d9094", "2d2f31", wild=0.0)
+    patches = [*_body_and_cabin(), *_wheels(), *_wells(), *_fittings()]
+    metal = draw.colour("c4c7ca", "8d9094", "2d2f31", wild=0.0)
     paints: dict[str, Paint] = {
         "paint": _lacquer(color),
         "glass": _panes,
         "headlight": _lamps,
         "taillight": _tail,
-        "rubber": solid(hexed("1c1c1d")),
+        "rubber": solid("1c1c1d"),
         "rim": solid(metal),
         "trim": _slats,
-        "plate": _plate(colour(draw, "f2f2ec", "f0d264", wild=0.0)),
-        "well": solid(hexed("0a0a0b")),
+        "plate": _plate(draw.colour("f2f2ec", "f0d264", wild=0.0)),
+        "well": solid("0a0a0b"),
     }
     detail = {"rubber": 0.3, "well": 0.15, "rim": 0.35, "trim": 0.7, "plate": 3.0}
     return Instance(stretched(patches, stretch), paints, FINISHES["paint"], detail, FINISHES)
-
-
-CAR = ObjectFamily("car", _car, metres=1.0, texels=384)

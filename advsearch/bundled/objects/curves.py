@@ -3,18 +3,45 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import pairwise
+from itertools import chain, pairwise
+from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
+Array: TypeAlias = npt.NDArray[np.float64]
+Points: TypeAlias = Array | Sequence[Sequence[float] | Array]
 
 
 def unit(vectors: Array) -> Array:
     """Return vectors (..., 3) or (..., 2) scaled to length one; zero vectors stay zero."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return vectors / np.where(length > 0.0, length, 1.0)
+
+
+def at_height(profile: Array, height: float) -> float:
+    """Return how far from the axis a profile (K, 2) of points (r, z) with rising z is at a height."""
+    return float(np.interp(height, profile[:, 1], profile[:, 0]))
+
+
+def lengths(curve: Array) -> Array:
+    """Return how far along a polyline (K, D) its points are: (K,), from 0."""
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))])
+
+
+def away_from(x: Array, y: Array, *paths: Points) -> Array:
+    """Return how far points (N,) are from the nearest of some polylines (K, 2)."""
+    away = np.full(len(x), np.inf)
+    for (x0, y0), (x1, y1) in chain.from_iterable(map(pairwise, paths)):
+        dx, dy = x1 - x0, y1 - y0
+        t = np.clip(((x - x0) * dx + (y - y0) * dy) / (dx * dx + dy * dy), 0.0, 1.0)
+        away = np.minimum(away, np.hypot(x - x0 - t * dx, y - y0 - t * dy))
+    return away
+
+
+def upright(curve: Array) -> Array:
+    """Return a plane curve (K, 2) as one (K, 3) in the plane of x and z."""
+    return np.insert(curve, 1, 0.0, axis=1)
 
 
 def rotation(axis: str, degrees: float) -> Array:
@@ -27,10 +54,10 @@ def rotation(axis: str, degrees: float) -> Array:
     return turn
 
 
-def spline(points: Sequence[Sequence[float]] | Array, count: int) -> Array:
+def spline(points: Points, count: int) -> Array:
     """Return `count` points of the Catmull-Rom curve (chord-length knots) through (K, D) points, ends included."""
     knots = np.asarray(points, dtype=np.float64)
-    at = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(knots, axis=0), axis=1))])
+    at = lengths(knots)
     slope = np.gradient(knots, at, axis=0)
     t = np.linspace(0.0, at[-1], count)
     i = np.clip(np.searchsorted(at, t, side="right") - 1, 0, len(knots) - 2)
@@ -43,7 +70,7 @@ def spline(points: Sequence[Sequence[float]] | Array, count: int) -> Array:
     return curve
 
 
-def rounded(corners: Sequence[Sequence[float]] | Array, radius: float | Sequence[float], steps: int = 5) -> Array:
+def rounded(corners: Points, radius: float | Sequence[float], steps: int = 5) -> Array:
     """Return the open polyline (K, D) with its inner corners rounded off.
 
     Args:
@@ -67,8 +94,9 @@ def rounded(corners: Sequence[Sequence[float]] | Array, radius: float | Sequence
     return np.array(out)
 
 
-def dense(curve: Array, longest: float) -> Array:
+def dense(points: Points, longest: float) -> Array:
     """Return the polyline with edges longer than `longest` cut into equal pieces."""
+    curve = np.asarray(points, dtype=np.float64)
     out = [curve[:1]]
     for a, b in pairwise(curve):
         pieces = max(1, int(np.ceil(round(float(np.linalg.norm(b - a)) / longest, 6))))

@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from advsearch.scene.assets import Material, ObjectAsset, Rig
 from advsearch.scene.library import BUNDLED_OBJECT, finished
@@ -37,13 +36,6 @@ class Instance:
     finishes: Mapping[str, Material] = field(default_factory=dict)
     rig: Rig | None = None
 
-    def charts(self) -> list[tuple[float, float]]:
-        """Return the width and height that every patch asks of the atlas."""
-        return [
-            (patch.size[0] * self.detail.get(patch.tag, 1.0), patch.size[1] * self.detail.get(patch.tag, 1.0))
-            for patch in self.patches
-        ]
-
 
 @dataclass(frozen=True)
 class ObjectFamily:
@@ -73,17 +65,21 @@ class ObjectFamily:
         """
         instance = self.make(Draw(rng))
         if instance.finishes:  # the faces of a material in one row
-            tags = list(dict.fromkeys(one.tag for one in instance.patches))
-            instance = replace(instance, patches=sorted(instance.patches, key=lambda one: tags.index(one.tag)))
-        slots = pack(instance.charts(), self.texels)
-        mesh = joined(instance.patches, slots, self.texels)
+            tags = list(dict.fromkeys(patch.tag for patch in instance.patches))
+            instance = replace(instance, patches=sorted(instance.patches, key=lambda patch: tags.index(patch.tag)))
+        patches, details = instance.patches, [instance.detail.get(patch.tag, 1.0) for patch in instance.patches]
+        sizes = [(patch.size[0] * share, patch.size[1] * share) for patch, share in zip(patches, details, strict=True)]
+        charts = pack(sizes, self.texels)
+        mesh = joined(patches, charts, self.texels)
         if instance.finishes:
-            mesh = replace(mesh, materials=_by_tag(instance.patches), rig=instance.rig)
-        extent = np.ptp(np.concatenate([one.vertices for one in instance.patches]), axis=0).max()
+            tags_of = np.repeat([patch.tag for patch in patches], [len(patch.faces) for patch in patches])
+            materials = {str(tag): np.nonzero(tags_of == tag)[0] for tag in dict.fromkeys(tags_of)}
+            mesh = replace(mesh, materials=materials, rig=instance.rig)
+        extent = np.ptp(np.concatenate([patch.vertices for patch in patches]), axis=0).max()
         return ObjectAsset(
             name=self.name,
             mesh=mesh,
-            base_color=painted(instance.patches, slots, instance.paints, self.texels),
+            base_color=painted(patches, charts, instance.paints, self.texels),
             material=instance.material,
             label=self.label,
             source=BUNDLED_OBJECT,
@@ -93,10 +89,9 @@ class ObjectFamily:
         )
 
 
-def _by_tag(patches: Sequence[Patch]) -> dict[str, npt.NDArray[np.int64]]:
-    """The faces of each tag, as `joined` numbers them."""
-    tags = np.repeat([one.tag for one in patches], [len(one.faces) for one in patches])
-    return {str(tag): np.nonzero(tags == tag)[0] for tag in dict.fromkeys(tags)}
+def family(metres: float, texels: int = SIZE) -> Callable[[Callable[[Draw], Instance]], ObjectFamily]:
+    """Make a family of the function below, with its name; see `ObjectFamily`."""
+    return lambda make: ObjectFamily(make.__name__.replace("_", "-"), make, metres, texels)
 
 
 def finish(

@@ -2,40 +2,23 @@
 
 from __future__ import annotations
 
+from itertools import product
+
 import numpy as np
 
 from .curves import Array, dense, ellipse, rectangle, rotation, rounded, spline
-from .draw import Draw
-from .family import Instance, ObjectFamily, finish
-from .shapes import Patch, ball, box, lathe, placed, sweep
-from .textures import (
-    Paint,
-    between,
-    checks,
-    colour,
-    dots,
-    gradient,
-    hexed,
-    mottled,
-    natural,
-    over,
-    rings,
-    shade,
-    solid,
-    stripes,
-    wood,
-)
+from .draw import Draw, hexed
+from .family import Instance, family, finish
+from .shapes import Patch, box, lathe, placed, sphere, sweep
+from .textures import Paint, between, checks, clouded, dots, gradient, natural, over, rings, shade, solid, stripes, wood
 
 # ------------------------------------------------------------------------------------------------------- chair
 
 
-def _post(
-    tag: str,
-    low: tuple[float, float, float],
-    high: tuple[float, float, float],
-    section: Array,
-    ends: tuple[float, float],
-) -> list[Patch]:
+Place = tuple[float, float, float]
+
+
+def _post(tag: str, low: Place, high: Place, section: Array, ends: tuple[float, float]) -> list[Patch]:
     """A straight post between two points, scaled from the first to the second end value."""
     t = np.array([0.0, 0.02, 0.5, 0.98, 1.0])
     path = np.array(low) + t[:, None] * (np.array(high) - np.array(low))
@@ -44,7 +27,8 @@ def _post(
     return sweep(tag, path, section, scale, first=(0.0, 0.0, 1.0) if lying else (1.0, 0.0, 0.0), caps=True)
 
 
-def _chair(draw: Draw) -> Instance:
+@family(metres=0.01)
+def chair(draw: Draw) -> Instance:
     """Faces +x; the back stands at -x."""
     wide, deep = draw(43.0, 36.0, 50.0), draw(42.0, 36.0, 48.0)
     seat, total = draw(45.0, 40.0, 50.0), draw(92.0, 78.0, 108.0)
@@ -57,45 +41,34 @@ def _chair(draw: Draw) -> Instance:
     taper = (leg * draw(0.75, 0.55, 1.0), leg)
     x, y = deep / 2 - leg - 0.4, wide / 2 - leg - 0.4
     patches: list[Patch] = []
-    for sx in (-1.0, 1.0):
-        for sy in (-1.0, 1.0):
-            patches += _post(
-                "up", (sx * (x + splay), sy * (y + splay), 0.0), (sx * x, sy * y, seat - thick + 0.5), section, taper
-            )
+    for sx, sy in product((-1.0, 1.0), repeat=2):
+        foot = (sx * (x + splay), sy * (y + splay), 0.0)
+        patches += _post("up", foot, (sx * x, sy * y, seat - thick + 0.5), section, taper)
     patches += box("seat", (0.0, 0.0, seat - thick / 2), (deep, wide, thick), 0.45 * thick, steps=3, cells=2)
-    cushion = draw.chance(0.35)
-    if cushion:
+    if draw.chance(0.35):
         patches += box("cushion", (0.5, 0.0, seat + 1.4), (deep - 4.0, wide - 4.0, 4.4), 2.1, steps=3, cells=2)
     if draw.chance(0.55, True):
         low = seat * draw(0.36, 0.25, 0.6)
-        spread = 1.0 - low / seat
+        ahead, aside = (one + splay * (1.0 - low / seat) for one in (x, y))
+        thin, thinner = (0.55 * leg, 0.55 * leg), (0.5 * leg, 0.5 * leg)
         for sy in (-1.0, 1.0):
-            patches += _post(
-                "along",
-                (-x - splay * spread, sy * (y + splay * spread), low),
-                (x + splay * spread, sy * (y + splay * spread), low),
-                section,
-                (0.55 * leg, 0.55 * leg),
-            )
-        patches += _post(
-            "cross", (0.0, -y - splay * spread, low), (0.0, y + splay * spread, low), section, (0.5 * leg, 0.5 * leg)
-        )
+            patches += _post("along", (-ahead, sy * aside, low), (ahead, sy * aside, low), section, thin)
+        patches += _post("cross", (0.0, -aside, low), (0.0, aside, low), section, thinner)
     patches += _chair_back(draw, x, y, seat, total, lean, leg, section)
     turned = placed(patches, rotation("z", draw(8.0, -25.0, 25.0)))
 
     offset = draw.offset()
-    timber = colour(draw, "a86f3d", "c79a63", "6b4226", "3a2418", "d8bc92", wild=0.0)
-    paint_color = colour(draw, "f0ede4", "2f5d7c", "b5442e", "3d6b4a", "22262b", "e0b040")
+    timber = draw.colour("a86f3d", "c79a63", "6b4226", "3a2418", "d8bc92", wild=0.0)
+    paint_color = draw.colour("f0ede4", "2f5d7c", "b5442e", "3d6b4a", "22262b", "e0b040")
     painted = draw.chance(0.4)
-    size = total
-    wild = natural(draw, size, solid(paint_color), 0.5)
+    wild = natural(draw, total, solid(paint_color), 0.5)
 
     def grain(axis: int) -> Paint:
         return wild if painted else wood(timber, 3.2, offset, axis=axis, contrast=0.36)
 
-    fabric = colour(draw, "8a2f2a", "2f4f6f", "566b3f", "c9b48a", "4a4a4f")
+    fabric = draw.colour("8a2f2a", "2f4f6f", "566b3f", "c9b48a", "4a4a4f")
     cover = draw.pick(
-        mottled(fabric, shade(fabric, 0.8), 1.5, offset),
+        clouded(fabric, 0.8, 1.5, offset),
         stripes(fabric, shade(fabric, 1.5), 6.0),
         checks(fabric, hexed("efe6d4"), 4.0),
         dots(solid(fabric), hexed("f4efe4"), 6.0),
@@ -139,9 +112,8 @@ def _chair_back(
     elif style == "ladder":
         count = int(draw.pick(3, 2, 4))
         for i in range(count):
-            patches += slat(
-                "cross", seat + high * (0.28 + 0.66 * i / max(1, count - 1)), inner, high * draw(0.15, 0.1, 0.2)
-            )
+            z = seat + high * (0.28 + 0.66 * i / max(1, count - 1))
+            patches += slat("cross", z, inner, high * draw(0.15, 0.1, 0.2))
     else:
         tall = draw(0.6, 0.35, 0.75) * high
         patches += slat("cushion" if draw.chance(0.3) else "up", total - tall / 2 - 0.04 * high, inner, tall)
@@ -155,95 +127,62 @@ def _shade(draw: Draw, low: float, high: float, wide: float, narrow: float) -> l
     """An open lampshade with a thin wall, standing free from `low` to `high`."""
     wall = 0.25
     belly = draw(0.0, -0.1, 0.12) * wide
-    outer = spline(np.array([(wide, low), ((wide + narrow) / 2 + belly, (low + high) / 2), (narrow, high)]), 14)
+    outer = spline([(wide, low), ((wide + narrow) / 2 + belly, (low + high) / 2), (narrow, high)], 14)
     inner = (outer - np.array([wall, 0.0]))[::-1]
-    return lathe(
-        [
-            ("shade", dense(outer, 2.0)),
-            ("rim", np.array([outer[-1], inner[0]])),
-            ("lining", inner),
-            ("rim", np.array([inner[-1], outer[0]])),
-        ],
-        56,
-    )
+    pieces = [
+        ("shade", dense(outer, 2.0)), ("rim", [outer[-1], inner[0]]), ("lining", inner), ("rim", [inner[-1], outer[0]]),
+    ]  # fmt: skip
+    return lathe(pieces, 56)
 
 
 def _lamp_base(draw: Draw, style: str, low: float, radius: float, stem: float) -> list[Patch]:
     """The foot and the stem, up to the height `low`."""
-    under = np.array([[0.0, 0.0], [radius - 0.4, 0.0]])
+    under, top = [(0.0, 0.0), (radius - 0.4, 0.0)], [(stem, low), (0.0, low)]
     if style == "disc":
-        top = draw(2.0, 1.2, 3.2)
-        side = rounded(
-            [
-                (radius - 0.4, 0.0),
-                (radius, 0.4),
-                (radius * 0.96, top),
-                (stem * 2.0, top * 1.4),
-                (stem, top * 2.2),
-                (stem, low),
-            ],
-            [0.3, 0.5, 1.0, 1.2],
-            5,
-        )
-        return lathe([("base", under), ("base", dense(side, 1.6)), ("base", np.array([[stem, low], [0.0, low]]))], 44)
+        thick = draw(2.0, 1.2, 3.2)
+        corners = [
+            under[-1], (radius, 0.4), (radius * 0.96, thick), (stem * 2.0, thick * 1.4), (stem, thick * 2.2), top[0],
+        ]  # fmt: skip
+        side = dense(rounded(corners, [0.3, 0.5, 1.0, 1.2], 5), 1.6)
+        return lathe([("base", under), ("base", side), ("base", top)], 44)
     belly = radius * draw(1.12, 0.95, 1.4)
     at = draw(0.38, 0.28, 0.6) * low
-    knots = [
-        (radius * 0.96, 1.2),
-        (radius * 0.8, 2.4),
-        (belly, at),
-        (0.45 * belly, 0.72 * low),
-        (stem * 1.5, 0.86 * low),
-        (stem, 0.93 * low),
-    ]
+    waist = [(0.45 * belly, 0.72 * low)]
     if style == "gourd":
-        knots[3:4] = [(0.55 * belly, 0.6 * low), (0.72 * belly, 0.73 * low)]
-    body = spline(np.array(knots), 34)
-    ring = rounded([(radius - 0.4, 0.0), (radius, 0.2), (radius, 1.2), (radius * 0.96, 1.2)], [0.15, 0.3], 3)
-    return lathe(
-        [
-            ("base", under),
-            ("foot", ring),
-            ("body", body),
-            ("base", np.array([[stem, 0.93 * low], [stem, low]])),
-            ("base", np.array([[stem, low], [0.0, low]])),
-        ],
-        44,
-    )
+        waist = [(0.55 * belly, 0.6 * low), (0.72 * belly, 0.73 * low)]
+    knots = [
+        (radius * 0.96, 1.2), (radius * 0.8, 2.4), (belly, at), *waist, (stem * 1.5, 0.86 * low), (stem, 0.93 * low),
+    ]  # fmt: skip
+    body = spline(knots, 34)
+    ring = rounded([under[-1], (radius, 0.2), (radius, 1.2), knots[0]], [0.15, 0.3], 3)
+    neck = [knots[-1], top[0]]
+    return lathe([("base", under), ("foot", ring), ("body", body), ("base", neck), ("base", top)], 44)
 
 
-def _lamp(draw: Draw) -> Instance:
-    total = draw(48.0, 42.0, 58.0)
-    tall = draw(20.0, 14.0, 24.0)
-    wide = draw(16.5, 12.0, 19.0)
+@family(metres=0.01)
+def lamp(draw: Draw) -> Instance:
+    total, tall, wide = draw(48.0, 42.0, 58.0), draw(20.0, 14.0, 24.0), draw(16.5, 12.0, 19.0)
     narrow = wide * draw(0.6, 0.35, 1.0)
     low = total - tall
     radius, stem = draw(7.4, 6.0, 9.5), draw(0.8, 0.6, 1.3)
     style = draw.pick("body", "disc", "gourd")
     base = _lamp_base(draw, style, low + 0.25 * tall, radius, stem)
     patches = base + _shade(draw, low, total, wide, narrow)
-    patches += ball("bulb", min(3.0, 0.4 * narrow), (0.0, 0.0, low + 0.42 * tall), 12, 20)
-    ring_z = total - 0.12 * tall
-    inside = narrow + (wide - narrow) * 0.12
+    patches += sphere("bulb", min(3.0, 0.4 * narrow), (0.0, 0.0, low + 0.42 * tall), 12, 20)
+    ring_z, inside = total - 0.12 * tall, narrow + (wide - narrow) * 0.12
     for angle in (20.0, 140.0, 260.0):
-        spoke = sweep("base", np.array([[0.0, 0.0, ring_z], [inside, 0.0, ring_z]]), ellipse(0.22, 0.22, 8))
+        spoke = sweep("base", [(0.0, 0.0, ring_z), (inside, 0.0, ring_z)], ellipse(0.22, 0.22, 8))
         patches += placed(spoke, rotation("z", angle))
-    patches += sweep(
-        "base",
-        np.array([[0, 0, low + 0.2 * tall], [0, 0, ring_z], [0, 0, ring_z + 0.8], [0, 0, ring_z + 1.0]], dtype=float),
-        ellipse(0.35, 0.35, 10),
-        np.array([1.0, 1.0, 1.6, 0.0]),
-        first=(1.0, 0.0, 0.0),
-    )
+    rod = [(0, 0, z) for z in (low + 0.2 * tall, ring_z, ring_z + 0.8, ring_z + 1.0)]
+    patches += sweep("base", rod, ellipse(0.35, 0.35, 10), (1.0, 1.0, 1.6, 0.0), first=(1.0, 0.0, 0.0))
     offset = draw.offset()
-    linen = colour(draw, "f1e3c4", "f4f1e8", "c9b48a", "b5442e", "2f5d7c", "3d6b4a", "20242a", wild=0.25)
-    weave = mottled(linen, shade(linen, 0.93), 1.2, offset)
+    linen = draw.colour("f1e3c4", "f4f1e8", "c9b48a", "b5442e", "2f5d7c", "3d6b4a", "20242a", wild=0.25)
+    weave = clouded(linen, 0.93, 1.2, offset)
     kind = draw.pick("plain", "band", "stripes", "dots", "rings", "gradient")
-    accent = colour(draw, "b08d3c", "7a1f2b", "23395d", "efe6cf")
+    accent = draw.colour("b08d3c", "7a1f2b", "23395d", "efe6cf")
     if kind == "band":
-        weave = over(
-            over(weave, between(0.0, low + 1.4), solid(accent)), between(total - 1.4, 2 * total), solid(accent)
-        )
+        for band in (between(0.0, low + 1.4), between(total - 1.4, 2 * total)):
+            weave = over(weave, band, solid(accent))
     elif kind == "stripes":
         weave = stripes(linen, accent, draw(5.0, 3.0, 9.0), draw(0.4, 0.2, 0.6))
     elif kind == "dots":
@@ -253,24 +192,19 @@ def _lamp(draw: Draw) -> Instance:
     elif kind == "gradient":
         weave = gradient(linen, shade(linen, 0.6), low, total)
     else:
-        weave = over(
-            weave, lambda t: between(0.0, low + 0.5)(t) + between(total - 0.5, 2 * total)(t), solid(shade(linen, 0.75))
-        )
+        for hem in (between(0.0, low + 0.5), between(total - 0.5, 2 * total)):
+            weave = over(weave, hem, solid(shade(linen, 0.75)))
     cloth = natural(draw, total, weave, 0.3)
-    clay = colour(draw, "2f6f6a", "23408f", "b5442e", "f2f1ea", "22262b", "8a5a32", "c9a24b")
-    body = natural(draw, total, mottled(clay, shade(clay, 1.3), 4.0, offset), 0.35)
-    metal = colour(draw, "b08d3c", "2b2d30", "b4b8bd", "8a5a32", wild=0.15)
+    clay = draw.colour("2f6f6a", "23408f", "b5442e", "f2f1ea", "22262b", "8a5a32", "c9a24b")
+    body = natural(draw, total, clouded(clay, 1.3, 4.0, offset), 0.35)
+    metal = draw.colour("b08d3c", "2b2d30", "b4b8bd", "8a5a32", wild=0.15)
     paints = {
         "shade": cloth,
         "rim": solid(shade(linen, 0.8)),
-        "lining": solid(hexed("f4f0e4")),
-        "bulb": solid(hexed("fbf6e6")),
+        "lining": solid("f4f0e4"),
+        "bulb": solid("fbf6e6"),
         "body": body,
         "foot": solid(metal),
         "base": body if style == "disc" and draw.chance(0.5) else solid(metal),
     }
     return Instance(patches, paints, finish(draw, 0.4, 0.3), {"lining": 0.6})
-
-
-CHAIR = ObjectFamily("chair", _chair, metres=0.01)
-LAMP = ObjectFamily("lamp", _lamp, metres=0.01)

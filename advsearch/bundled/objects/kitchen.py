@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import numpy as np
 
-from .curves import Array, ellipse, rectangle, rotation, spline
+from .curves import Array, Points, at_height, ellipse, rectangle, rotation, spline, upright
 from .draw import Draw
-from .family import Instance, ObjectFamily, finish
-from .shapes import Patch, ball, frames, lathe, placed, sweep, vessel
+from .family import Instance, family, finish
+from .shapes import Patch, frames, lathe, placed, sphere, sweep, vessel
 from .textures import (
     Paint,
+    Texels,
     between,
-    colour,
+    clouded,
     dots,
-    hexed,
-    mottled,
     natural,
     over,
+    painter,
     rings,
     shade,
     solid,
@@ -37,7 +37,7 @@ def _spout(draw: Draw, radius: float, height: float) -> list[Patch]:
     bend = 0.22 if style == "curved" else 0.04
     middle = (start + tip) / 2 + np.array([bend, 0.0, -0.6 * bend]) * radius * 0.5
     above = start + (tip - start) * 0.8 + np.array([-bend * 0.1, 0.0, -0.1 * bend]) * radius
-    path = spline(np.array([start, middle, above, tip]), 18)
+    path = spline([start, middle, above, tip], 18)
     root, end = draw(1.75, 1.3, 2.2), draw(0.72, 0.55, 0.95)
     scale = end + (root - end) * (1.0 - np.linspace(0.0, 1.0, 18)) ** 1.3
     tangent, first, second = frames(path, (0.0, 1.0, 0.0))
@@ -47,106 +47,58 @@ def _spout(draw: Draw, radius: float, height: float) -> list[Patch]:
     push = np.zeros(len(order))
     push[18:21] = (0.1, 0.12, 0.06)
     frame = (tangent[order], first[order], second[order])
-    patches = sweep("spout", path[order] + push[:, None] * tangent[order], ellipse(1.0, 1.0, 20), radii, frame=frame)
-    return patches
+    return sweep("spout", path[order] + push[:, None] * tangent[order], ellipse(1.0, 1.0, 20), radii, frame=frame)
 
 
-def _teapot(draw: Draw) -> Instance:
+@family(metres=0.01)
+def teapot(draw: Draw) -> Instance:
     radius, height = draw(7.2, 6.4, 8.0), draw(10.2, 8.0, 12.5)
     foot, mouth = radius * draw(0.58, 0.5, 0.75), radius * draw(0.48, 0.42, 0.6)
     at = draw(0.45, 0.35, 0.58)
     full = draw(0.9, 0.82, 0.97)
-    side = spline(
-        np.array(
-            [
-                (foot, 0.5),
-                (radius * full, 0.5 * at * height),
-                (radius, at * height),
-                (radius * (0.97 * full), (0.42 * at + 0.58) * height),
-                (mouth, height),
-            ]
-        ),
-        26,
-    )
-    dome = draw(1.5, 0.7, 2.4)
-    lid = spline(
-        np.array(
-            [
-                (mouth * 0.97, height + 0.05),
-                (mouth * 0.9, height + 0.35),
-                (mouth * 0.55, height + 0.75 * dome + 0.2),
-                (0.35, height + dome + 0.2),
-            ]
-        ),
-        10,
-    )
-    knob_r = draw(1.0, 0.7, 1.4)
-    knob_low = height + dome + 0.2
+    knots = [
+        (foot, 0.5), (radius * full, 0.5 * at * height), (radius, at * height),
+        (radius * (0.97 * full), (0.42 * at + 0.58) * height), (mouth, height),
+    ]  # fmt: skip
+    side = spline(knots, 26)
+    dome, r = draw(1.5, 0.7, 2.4), draw(1.0, 0.7, 1.4)
+    top = height + dome + 0.2
+    rim = [
+        (mouth, height), (mouth * 0.97, height + 0.02), (mouth * 0.94, height - 0.12), (mouth * 0.94, height + 0.05),
+        (mouth * 0.97, height + 0.05),
+    ]  # fmt: skip
+    lid = spline([rim[-1], (mouth * 0.9, height + 0.35), (mouth * 0.55, height + 0.75 * dome + 0.2), (0.35, top)], 10)
     knob = spline(
-        np.array(
-            [
-                (0.45, knob_low),
-                (0.5, knob_low + 0.3),
-                (knob_r, knob_low + 0.45 + knob_r * 0.6),
-                (0.7 * knob_r, knob_low + 0.45 + 1.35 * knob_r),
-                (0.0, knob_low + 0.45 + 1.6 * knob_r),
-            ]
-        ),
-        12,
-    )
-    body = lathe(
-        [
-            ("base", np.array([[0.0, 0.2], [foot * 0.8, 0.2], [foot * 0.86, 0.0], [foot * 0.97, 0.0]])),
-            ("body", np.concatenate([[(foot * 0.97, 0.0)], side])),
-            (
-                "body",
-                np.array(
-                    [
-                        [mouth, height],
-                        [mouth * 0.97, height + 0.02],
-                        [mouth * 0.94, height - 0.12],
-                        [mouth * 0.94, height + 0.05],
-                        [mouth * 0.97, height + 0.05],
-                    ]
-                ),
-            ),
-            ("lid", lid),
-            ("knob", np.concatenate([[lid[-1]], knob])),
-        ],
-        56,
-    )
+        [(0.45, top), (0.5, top + 0.3), (r, top + 0.45 + r * 0.6), (0.7 * r, top + 0.45 + 1.35 * r),
+         (0.0, top + 0.45 + 1.6 * r)], 12,
+    )  # fmt: skip
+    profile: list[tuple[str, Points]] = [
+        ("base", [(0.0, 0.2), (foot * 0.8, 0.2), (foot * 0.86, 0.0), (foot * 0.97, 0.0)]),
+        ("body", [(foot * 0.97, 0.0), *side]),
+        ("body", rim),
+        ("lid", lid),
+        ("knob", [lid[-1], *knob]),
+    ]
+    body = lathe(profile, 56)
     span = draw(0.9, 0.75, 1.0)
     high, low = height * 0.84, height * (0.84 - 0.62 * span)
-    top_root, low_root = (float(np.interp(z, side[:, 1], side[:, 0])) - 0.25 for z in (high, low))
+    top_root, low_root = (at_height(side, z) - 0.25 for z in (high, low))
     reach = radius * draw(0.72, 0.5, 0.9)
-    edge = radius
     lift = draw(0.05, -0.02, 0.2) * height
-    curve = spline(
-        np.array(
-            [
-                (top_root, high),
-                (edge + 0.35 * reach, high + lift),
-                (edge + 0.9 * reach, high - 0.1 * (high - low)),
-                (edge + draw(0.95, 0.7, 1.0) * reach, 0.5 * (high + low)),
-                (edge + 0.4 * reach, low + 0.08 * (high - low)),
-                (low_root, low),
-            ]
-        ),
-        26,
-    )
-    path = np.stack([curve[:, 0], np.zeros(26), curve[:, 1]], axis=1)
-    thick = draw(0.5, 0.4, 0.7)
-    grip = sweep(
-        "handle", path, ellipse(thick, draw(0.62, 0.45, 0.85), 16), 1.0 + 0.2 * np.abs(np.linspace(-1, 1, 26)) ** 3
-    )
+    knots = [
+        (top_root, high), (radius + 0.35 * reach, high + lift), (radius + 0.9 * reach, high - 0.1 * (high - low)),
+        (radius + draw(0.95, 0.7, 1.0) * reach, 0.5 * (high + low)), (radius + 0.4 * reach, low + 0.08 * (high - low)),
+        (low_root, low),
+    ]  # fmt: skip
+    section = ellipse(draw(0.5, 0.4, 0.7), draw(0.62, 0.45, 0.85), 16)
+    grip = sweep("handle", upright(spline(knots, 26)), section, 1.0 + 0.2 * np.abs(np.linspace(-1, 1, 26)) ** 3)
     patches = placed([*body, *_spout(draw, radius, height), *placed(grip, rotation("z", 180.0))], rotation("z", 118.0))
 
     offset = draw.offset()
-    clay = colour(draw, "7b2d26", "f2eee4", "2f5d7c", "3d5c47", "22262b", "c98a3a", "e7b9b0")
-    glaze = mottled(clay, shade(clay, 1.25), 3.5, offset, 1.6)
-    second = colour(draw, "e8cfa0", "23408f", "c9a24b", "f4efe4", "b5442e")
+    clay = draw.colour("7b2d26", "f2eee4", "2f5d7c", "3d5c47", "22262b", "c98a3a", "e7b9b0")
+    glaze = clouded(clay, 1.25, 3.5, offset, 1.6)
+    second = draw.colour("e8cfa0", "23408f", "c9a24b", "f4efe4", "b5442e")
     kind = draw.pick("bands", "plain", "dots", "stripes", "rings", "speckle")
-    size = height + 4.0
     if kind == "bands":
         paint = over(glaze, between(0.7 * height, 0.74 * height, soft=0.1), solid(second))
         paint = over(paint, between(0.77 * height, 0.785 * height, soft=0.1), solid(second))
@@ -160,10 +112,10 @@ def _teapot(draw: Draw) -> Instance:
         paint = speckled(glaze, second, 0.5, offset)
     else:
         paint = glaze
-    paint = natural(draw, size, paint)
+    paint = natural(draw, height + 4.0, paint)
     trim = draw.pick(glaze, solid(second), paint)
     paints = {
-        "base": solid(hexed("a98663")),
+        "base": solid("a98663"),
         "body": paint,
         "lid": draw.pick(paint, trim),
         "spout": draw.pick(glaze, paint),
@@ -176,89 +128,64 @@ def _teapot(draw: Draw) -> Instance:
 # ---------------------------------------------------------------------------------------------------- frying pan
 
 
-def _frying_pan(draw: Draw) -> Instance:
+@family(metres=0.01)
+def frying_pan(draw: Draw) -> Instance:
     base, rim = draw(10.5, 9.0, 11.5), draw(13.0, 12.2, 14.5)
     depth = draw(4.2, 2.8, 5.5)
     wall = draw(0.38, 0.3, 0.55)
-    side = spline(
-        np.array([(base - 0.8, 0.0), (base, 0.25), (base + 0.55 * (rim - base), 0.5 * depth), (rim, depth)]), 14
-    )
+    side = spline([(base - 0.8, 0.0), (base, 0.25), (base + 0.55 * (rim - base), 0.5 * depth), (rim, depth)], 14)
     body = vessel(side, wall, 0.5, columns=64, step=1.6)
 
     length = draw(18.0, 14.0, 21.0)
     root = np.array([rim - 0.6, 0.0, 0.78 * depth])
     rise = draw(2.6, 0.6, 4.5)
-    knots = [
-        root,
-        root + np.array([0.22 * length, 0.0, 0.55 * rise]),
-        root + np.array([0.6 * length, 0.0, rise]),
-        root + np.array([length, 0.0, rise * draw(1.05, 0.8, 1.2)]),
-    ]
-    count = 26
-    path = spline(np.array(knots), count)
-    t = np.linspace(0.0, 1.0, count)
-    width = draw(1.15, 0.85, 1.5)
-    thick = draw(0.62, 0.45, 0.9)
+    along = [(0.0, 0.0), (0.22 * length, 0.55 * rise), (0.6 * length, rise), (length, rise * draw(1.05, 0.8, 1.2))]
+    path = spline(root + upright(np.array(along)), 26)
+    t = np.linspace(0.0, 1.0, 26)
+    width, thick = draw(1.15, 0.85, 1.5), draw(0.62, 0.45, 0.9)
     shape = (0.62 + 0.38 * np.clip(t / 0.35, 0.0, 1.0) ** 1.5) * (1.0 + draw(0.12, 0.0, 0.25) * np.sin(np.pi * t))
     end = np.sqrt(np.clip(1.0 - ((t - 0.94) / 0.06).clip(0.0, 1.0) ** 2, 0.0, 1.0))
     scale = np.stack([thick * (0.7 + 0.3 * np.clip(t / 0.3, 0.0, 1.0)), width * shape], axis=1) * end[:, None]
     section = ellipse(1.0, 1.0, 20) if draw.chance(0.5, True) else rectangle(2.0, 2.0, 0.7)
     grip = sweep("handle", path, section, scale)
-    rivets: list[Patch] = []
-    inner = float(np.interp(0.72 * depth, side[:, 1], side[:, 0])) - wall
-    for y in (-1.1, 1.1):
-        rivets += ball("rivet", 0.38, (inner + 0.02, y, 0.72 * depth), rows=8, columns=12)
-    bracket = sweep(
-        "bracket",
-        np.array(
-            [
-                [rim - 1.4, 0.0, 0.72 * depth],
-                [rim - 0.3, 0.0, 0.75 * depth],
-                [rim + 0.2 * length, 0.0, 0.78 * depth + 0.5 * rise],
-            ]
-        ),
-        rectangle(0.7, 3.0, 0.25),
-        np.array([1.0, 1.0, 0.62]),
-        caps=True,
-    )
+    inner = at_height(side, 0.72 * depth) - wall
+    rivets = [
+        patch
+        for y in (-1.1, 1.1)
+        for patch in sphere("rivet", 0.38, (inner + 0.02, y, 0.72 * depth), rows=8, columns=12)
+    ]
+    spine = [(rim - 1.4, 0.72 * depth), (rim - 0.3, 0.75 * depth), (rim + 0.2 * length, 0.78 * depth + 0.5 * rise)]
+    bracket = sweep("bracket", upright(np.array(spine)), rectangle(0.7, 3.0, 0.25), (1.0, 1.0, 0.62), caps=True)
     patches = placed([*body, *grip, *rivets, *bracket], rotation("z", 118.0))
 
     offset = draw.offset()
-    coat = colour(draw, "2b2c2e", "3a3a3c", "1c1d1f", "8c8f94", "5c4033", wild=0.2)
-    inside = speckled(mottled(coat, shade(coat, 1.2), 5.0, offset), shade(coat, 1.7), 0.5, offset, 0.06)
+    coat = draw.colour("2b2c2e", "3a3a3c", "1c1d1f", "8c8f94", "5c4033", wild=0.2)
+    inside = speckled(clouded(coat, 1.2, 5.0, offset), shade(coat, 1.7), 0.5, offset, 0.06)
     if draw.chance(0.4, True):
-        inside = over(
-            inside,
-            lambda t: step(np.sin(2 * np.pi * np.hypot(t.xyz[:, 0], t.xyz[:, 1]) / 0.9), 0.6, 0.8) * 0.35,
-            solid(shade(coat, 1.6)),
-        )
-    outer = colour(draw, "a9231f", "2b2c2e", "9a9da1", "2f5d7c", "3d6b4a", "d9822b")
+        inside = over(inside, _turned(), solid(shade(coat, 1.6)))
+    outer = draw.colour("a9231f", "2b2c2e", "9a9da1", "2f5d7c", "3d6b4a", "d9822b")
     outside = natural(draw, 2 * rim, _enamel(outer, depth, offset), 0.3)
     inside = natural(draw, 2 * rim, inside, 0.2)
     style = draw.pick("black", "wood", "wild")
-    hold = {
-        "black": solid(colour(draw, "1b1b1d", "2a2a2c", wild=0.1)),
-        "wood": wood(colour(draw, "8a5a32", "b98550", wild=0.0), 1.4, offset, axis=0),
-        "wild": solid(colour(draw, "a9231f")),
-    }[style]
-    steel = solid(colour(draw, "b9bcc0", "8c8f94", wild=0.1))
-    paints = {
-        "base": solid(colour(draw, "77797c", "2b2c2e")),
-        "outside": outside,
-        "inside": inside,
-        "handle": hold,
-        "rivet": steel,
-        "bracket": steel,
+    holds = {
+        "black": solid(draw.colour("1b1b1d", "2a2a2c", wild=0.1)),
+        "wood": wood(draw.colour("8a5a32", "b98550", wild=0.0), 1.4, offset, axis=0),
+        "wild": solid(draw.colour("a9231f")),
     }
+    steel = solid(draw.colour("b9bcc0", "8c8f94", wild=0.1))
+    paints = {"outside": outside, "inside": inside, "handle": holds[style], "rivet": steel, "bracket": steel}
+    paints["base"] = solid(draw.colour("77797c", "2b2c2e"))
     return Instance(patches, paints, finish(draw, 0.38, 0.3), {"base": 0.5})
+
+
+@painter
+def _turned(t: Texels) -> Array:
+    """Faint rings, as turning leaves."""
+    return step(np.sin(2 * np.pi * np.hypot(t.xyz[:, 0], t.xyz[:, 1]) / 0.9), 0.6, 0.8) * 0.35
 
 
 def _enamel(color: Array, height: float, offset: Array) -> Paint:
     """Enamel that darkens towards the bottom, with a dark line at the rim."""
-    paint = mottled(color, shade(color, 0.85), 5.0, offset)
+    paint = clouded(color, 0.85, 5.0, offset)
     paint = over(paint, between(-1.0, 0.25 * height, soft=0.6 * height), solid(shade(color, 0.6)))
-    return over(paint, between(height - 0.1, 2 * height, soft=0.15), solid(hexed("2b2c2e")))
-
-
-TEAPOT = ObjectFamily("teapot", _teapot, metres=0.01)
-FRYING_PAN = ObjectFamily("frying-pan", _frying_pan, metres=0.01)
+    return over(paint, between(height - 0.1, 2 * height, soft=0.15), solid("2b2c2e"))

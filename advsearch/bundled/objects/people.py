@@ -9,10 +9,10 @@ from advsearch.scene.assets import Ints, Material
 from advsearch.scene.people import Person, body_data
 
 from .curves import Array
-from .draw import Draw
-from .family import Instance, ObjectFamily
+from .draw import Draw, hexed
+from .family import Instance, family
 from .shapes import Patch, Rest
-from .textures import Paint, Texels, colour, hexed, mix, noise, step
+from .textures import Texels, mix, noise, painter, step
 
 FINISHES = {
     "shirt": Material(roughness=0.85, specular=0.2),
@@ -29,8 +29,8 @@ def _rest(charts: Array, points: Array) -> Rest:
     inside, beside = LinearNDInterpolator(charts, points), NearestNDInterpolator(charts, points)
 
     def places(u: Array, v: Array) -> Array:
-        found: Array = inside(u, v)
-        return np.where(np.isnan(found), beside(u, v), found)
+        at: Array = inside(u, v)
+        return np.where(np.isnan(at), beside(u, v), at)
 
     return places
 
@@ -47,125 +47,98 @@ def _patches(person: Person) -> list[Patch]:
     faces = data["faces"].astype(np.int64)
     whole = np.concatenate([faces[a:b] + start for a, b, start in zip(ends, ends[1:], starts, strict=False)])
     normals = _normals(vertices, whole, index)
-    found = []
+    patches = []
     for number, tag in enumerate(data["tags"]):
         mine, own = slice(starts[number], starts[number + 1]), faces[ends[number] : ends[number + 1]]
-        width, height = data["sizes"][number]
+        width, height = map(float, data["sizes"][number])
         rest = _rest(charts[mine], reference[mine])
-        size = float(width), float(height)
-        found.append(Patch(str(tag), vertices[mine], normals[mine], charts[mine], own, size, rest))
-    return found
+        patches.append(Patch(str(tag), vertices[mine], normals[mine], charts[mine], own, (width, height), rest))
+    return patches
 
 
 def _normals(vertices: Array, faces: Ints, index: Ints) -> Array:
     """Unit normals (V, 3), smooth across the seams of charts."""
-    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
+    a, b, c = vertices[faces].swapaxes(0, 1)
     summed = np.zeros((int(index.max()) + 1, 3))
     np.add.at(summed, index[faces].reshape(-1), np.repeat(np.cross(b - a, c - a), 3, axis=0))
-    normals: Array = summed[index]
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    return normals
+    normals = summed[index]
+    return np.asarray(normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12))
 
 
-def _woven(color: Array, depth: float) -> Paint:
+@painter
+def _woven(t: Texels, color: Array, depth: float) -> Array:
     """Cloth: fine threads, and folds as faint clouds that are longer than wide."""
-
-    def paint(t: Texels) -> Array:
-        folds = noise(t.xyz * np.array([9.0, 9.0, 4.0])) - 0.5
-        thread = noise(t.xyz * 180.0) - 0.5
-        return np.clip(color * (1.0 + depth * (1.2 * folds + 0.6 * thread))[:, None], 0.0, 1.0)
-
-    return paint
+    folds = noise(t.xyz * np.array([9.0, 9.0, 4.0])) - 0.5
+    thread = noise(t.xyz * 180.0) - 0.5
+    return np.clip(color * (1.0 + depth * (1.2 * folds + 0.6 * thread))[:, None], 0.0, 1.0)
 
 
-def _jeans(color: Array) -> Paint:
-    """Woven cloth with seams at the sides, a belt line and a fly."""
-    cloth = _woven(color, 0.25)
-
-    def paint(t: Texels) -> Array:
-        x, _, z = t.xyz.T
-        seam = np.where((z < 0.88) & (z > 0.08), np.minimum(np.abs(x - 0.005), 9.0), 9.0)
-        hem = np.abs(z - 0.085)
-        return mix(cloth(t), 0.6 * color, 0.8 * step(0.004 - np.minimum(seam, hem), 0.0, 0.003))
-
-    return paint
+@painter
+def _jeans(t: Texels, color: Array) -> Array:
+    """Woven cloth with seams at the sides and the hems."""
+    x, _, z = t.xyz.T
+    seam = np.where((z < 0.88) & (z > 0.08), np.minimum(np.abs(x - 0.005), 9.0), 9.0)
+    hem = np.abs(z - 0.085)
+    return mix(_woven(color, 0.25)(t), 0.6 * color, 0.8 * step(0.004 - np.minimum(seam, hem), 0.0, 0.003))
 
 
-def _face(color: Array, hair: Array) -> Paint:
+@painter
+def _face(t: Texels, color: Array, hair: Array) -> Array:
     """Skin, redder lips and cheeks, and eyebrows."""
-
-    def paint(t: Texels) -> Array:
-        x, y, z = t.xyz.T
-        ahead = x > 0.1
-        skin = np.clip(color * (1.0 + 0.1 * (noise(t.xyz * 14.0) - 0.5))[:, None], 0.0, 1.0)
-        lips = np.where(ahead, 1.0 - np.hypot(y / 0.025, (z - 1.563) / 0.011), -1.0)
-        skin = mix(skin, color * np.array([0.86, 0.62, 0.6]), 0.75 * step(lips, 0.0, 0.25))
-        cheeks = np.where(ahead, 1.0 - np.hypot((np.abs(y) - 0.042) / 0.022, (z - 1.605) / 0.02), -1.0)
-        skin = mix(skin, color * np.array([1.0, 0.84, 0.8]), 0.5 * step(cheeks, 0.0, 0.6))
-        arch = 1.659 - 14.0 * (np.abs(y) - 0.034) ** 2
-        brow = np.where(ahead & (np.abs(np.abs(y) - 0.034) < 0.021), 0.0038 - np.abs(z - arch), -1.0)
-        return mix(skin, hair, 0.8 * step(brow, 0.0, 0.0015))
-
-    return paint
+    x, y, z = t.xyz.T
+    aside, ahead = np.abs(y), x > 0.1
+    skin = np.clip(color * (1.0 + 0.1 * (noise(t.xyz * 14.0) - 0.5))[:, None], 0.0, 1.0)
+    lips = np.where(ahead, 1.0 - np.hypot(y / 0.025, (z - 1.563) / 0.011), -1.0)
+    skin = mix(skin, color * np.array([0.86, 0.62, 0.6]), 0.75 * step(lips, 0.0, 0.25))
+    cheeks = np.where(ahead, 1.0 - np.hypot((aside - 0.042) / 0.022, (z - 1.605) / 0.02), -1.0)
+    skin = mix(skin, color * np.array([1.0, 0.84, 0.8]), 0.5 * step(cheeks, 0.0, 0.6))
+    arch = 1.659 - 14.0 * (aside - 0.034) ** 2
+    brow = np.where(ahead & (np.abs(aside - 0.034) < 0.021), 0.0038 - np.abs(z - arch), -1.0)
+    return mix(skin, hair, 0.8 * step(brow, 0.0, 0.0015))
 
 
-def _strands(color: Array) -> Paint:
-    def paint(t: Texels) -> Array:
-        strand = noise(t.xyz * np.array([60.0, 160.0, 40.0])) - 0.5
-        return np.clip(color * (1.0 + 0.7 * strand)[:, None] + 0.02, 0.0, 1.0)
-
-    return paint
+@painter
+def _strands(t: Texels, color: Array) -> Array:
+    strand = noise(t.xyz * np.array([60.0, 160.0, 40.0])) - 0.5
+    return np.clip(color * (1.0 + 0.7 * strand)[:, None] + 0.02, 0.0, 1.0)
 
 
-def _leather(color: Array) -> Paint:
+@painter
+def _leather(t: Texels, color: Array) -> Array:
     """Shoes with a pale sole."""
-
-    def paint(t: Texels) -> Array:
-        return mix(np.broadcast_to(color, (len(t.u), 3)), hexed("cfcac0"), step(0.012 - t.xyz[:, 2], 0.0, 0.004))
-
-    return paint
+    return mix(color, hexed("cfcac0"), step(0.012 - t.xyz[:, 2], 0.0, 0.004))
 
 
-def _irises(color: Array) -> Paint:
+@painter
+def _irises(t: Texels, color: Array) -> Array:
     """Eyes that look ahead: white, iris and pupil."""
-
-    def paint(t: Texels) -> Array:
-        x, y, z = t.xyz.T
-        middle = 0.031, float(0.5 * (z.min() + z.max()))
-        out = np.where(x > 0.128, np.hypot(np.abs(y) - middle[0], z - middle[1]), 1.0)
-        white = np.broadcast_to(hexed("e6e2dc"), (len(x), 3))
-        return mix(mix(white, color, step(0.0065 - out, 0.0, 0.001)), hexed("101010"), step(0.003 - out, 0.0, 0.001))
-
-    return paint
+    x, y, z = t.xyz.T
+    out = np.where(x > 0.128, np.hypot(np.abs(y) - 0.031, z - float(0.5 * (z.min() + z.max()))), 1.0)
+    iris = mix(hexed("e6e2dc"), color, step(0.0065 - out, 0.0, 0.001))
+    return mix(iris, hexed("101010"), step(0.003 - out, 0.0, 0.001))
 
 
-def _person(draw: Draw) -> Instance:
+@family(metres=1.0, texels=512)
+def person(draw: Draw) -> Instance:
     woman = draw.chance(0.5)
-    person = Person(
-        body_data(),
-        {
-            "gender": 0.0 if woman else 1.0,
-            "height": draw(1.7, 1.52, 1.9) - (0.08 if woman else 0.0),
-            "weight": draw(0.5, 0.25, 0.8),
-            "age": draw(35.0, 16.0, 75.0),
-            "stride": draw(0.0, 0.0, 1.2),
-            "walk": draw(0.0, 0.0, 360.0),
-        },
-    )
+    about = {
+        "gender": 0.0 if woman else 1.0,
+        "height": draw(1.7, 1.52, 1.9) - (0.08 if woman else 0.0),
+        "weight": draw(0.5, 0.25, 0.8),
+        "age": draw(35.0, 16.0, 75.0),
+        "stride": draw(0.0, 0.0, 1.2),
+        "walk": draw(0.0, 0.0, 360.0),
+    }
+    body = Person(body_data(), about)
     skin = hexed(draw.pick("d9a98a", "e8c3a8", "c68863", "8d5a3a", "5c3a28", "f0cfb4"))
     hair = hexed(draw.pick("2e2019", "120d0a", "5a3a20", "8a6a3c", "9a948c"))
-    paints: dict[str, Paint] = {
-        "shirt": _woven(colour(draw, "5b86b8", "c8c4ba", "b04038", "3f6b4a", "d0a83e", "2f3338"), 0.16),
-        "trousers": _jeans(colour(draw, "31374a", "4a4640", "1f2226", "6b6152", "5a6270", wild=0.15)),
+    paints = {
+        "shirt": _woven(draw.colour("5b86b8", "c8c4ba", "b04038", "3f6b4a", "d0a83e", "2f3338"), 0.16),
+        "trousers": _jeans(draw.colour("31374a", "4a4640", "1f2226", "6b6152", "5a6270", wild=0.15)),
         "skin": _face(skin, hair),
         "hair": _strands(hair),
-        "shoes": _leather(colour(draw, "4a3324", "1d1d1f", "8a8680", "5b2f24", wild=0.15)),
+        "shoes": _leather(draw.colour("4a3324", "1d1d1f", "8a8680", "5b2f24", wild=0.15)),
         "eyes": _irises(hexed(draw.pick("4a3424", "5a7a94", "5f6f4a"))),
     }
     detail = {"skin": 0.8, "shoes": 0.8, "shirt": 1.15}
-    return Instance(_patches(person), paints, FINISHES["shirt"], detail, FINISHES, rig=person)
-
-
-PERSON = ObjectFamily("person", _person, metres=1.0, texels=512)
-
-__all__ = ["PERSON"]
+    return Instance(_patches(body), paints, FINISHES["shirt"], detail, FINISHES, rig=body)

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from .curves import Array, dense, unit
+from .curves import Array, Points, at_height, dense, lengths, unit
 
 Indices = npt.NDArray[np.int64]
 Rest = Callable[[Array, Array], Array]
@@ -65,20 +65,16 @@ def stretched(patches: Iterable[Patch], factors: Sequence[float] | Array) -> lis
 # ------------------------------------------------------------------------------------------------ grid patches
 
 
-def _grid_faces(rows: int, columns: int) -> Indices:
-    """Two triangles for every cell of a (rows, columns) grid of vertices in row-major order."""
-    corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)[None]).reshape(-1)
-    lower = np.stack([corner, corner + 1, corner + columns + 1], axis=1)
-    upper = np.stack([corner, corner + columns + 1, corner + columns], axis=1)
-    return np.stack([lower, upper], axis=1).reshape(-1, 3).astype(np.int64)
-
-
-def _without_slivers(vertices: Array, faces: Indices) -> Indices:
-    """Drop triangles whose area is nothing beside the patch's (they arise where a row shrinks to a point)."""
-    a, b, c = vertices[faces[:, 0]], vertices[faces[:, 1]], vertices[faces[:, 2]]
+def _grid_faces(points: Array) -> Indices:
+    """Two triangles for every cell of a grid (R, C, 3), but for those whose area is nothing beside the others', as
+    where a row shrinks to a point."""
+    rows, columns = points.shape[:2]
+    corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).reshape(-1)
+    beside = corner[:, None] + [[0, 1, columns + 1, 0, columns + 1, columns]]
+    faces = beside.reshape(-1, 3).astype(np.int64)
+    a, b, c = points.reshape(-1, 3)[faces].swapaxes(0, 1)
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    kept: Indices = faces[area > 1e-6 * float(np.median(area[area > 0.0]))]
-    return kept
+    return np.asarray(faces[area > 1e-6 * float(np.median(area[area > 0.0]))])
 
 
 def grid(tag: str, points: Array, normals: Array, size: tuple[float, float], down: Array, across: Array) -> Patch:
@@ -104,16 +100,20 @@ def grid(tag: str, points: Array, normals: Array, size: tuple[float, float], dow
         high = points[i + 1, j] * (1 - t) + points[i + 1, j + 1] * t
         return low * (1 - s) + high * s
 
-    flat = points.reshape(-1, 3)
-    faces = _without_slivers(flat, _grid_faces(rows, columns))
     uvs = np.stack([u, v], axis=-1).reshape(-1, 2)
-    return Patch(tag, flat, normals.reshape(-1, 3), uvs, faces, size, rest)
+    return Patch(tag, points.reshape(-1, 3), normals.reshape(-1, 3), uvs, _grid_faces(points), size, rest)
 
 
 def _along(curve: Array) -> tuple[Array, float]:
     """Return (K,) normalised arc lengths of a polyline, and its length."""
-    at = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))])
+    at = lengths(curve)
     return at / at[-1], float(at[-1])
+
+
+def _fan(count: int) -> Indices:
+    """The faces (count, 3) between a middle, which is vertex 0, and a ring of `count` vertices after it."""
+    j = np.arange(count)
+    return np.stack([np.zeros_like(j), 1 + j, 1 + (j + 1) % count], axis=1).astype(np.int64)
 
 
 # ----------------------------------------------------------------------------------------- surfaces of revolution
@@ -136,38 +136,32 @@ def _profile_normals(parts: Sequence[Array]) -> list[Array]:
     return [np.stack([d[:, 1], -d[:, 0]], axis=1) for d in directions]
 
 
+def _around(curve: Array, theta: Array) -> Array:
+    """Points (K, M, 3) of a curve (K, 2) of points (r, z) at angles (M,) about the z axis."""
+    up = np.broadcast_to(curve[:, 1:], (len(curve), len(theta)))
+    return np.stack([curve[:, :1] * np.cos(theta), curve[:, :1] * np.sin(theta), up], axis=-1)
+
+
 def _disc(tag: str, profile: Array, normals: Array, columns: int) -> Patch:
     """A piece of a surface of revolution that starts or ends on the axis, charted by its distance from the pole."""
     inwards = profile[-1, 0] < 1e-9
     curve, normal = (profile[::-1], normals[::-1]) if inwards else (profile, normals)
     at, length = _along(curve)
     theta = 2 * np.pi * np.arange(columns) / columns
-    c, s = np.cos(theta), np.sin(theta)
-    side = (
-        1.0 if inwards else -1.0
-    )  # a profile that ends on the axis faces up: seen from above the chart is not mirrored
-
-    def around(radial: Array, axial: Array) -> Array:
-        return np.stack(
-            [radial[:, None] * c, radial[:, None] * s, np.broadcast_to(axial[:, None], (len(axial), columns))], -1
-        )
-
-    ring = around(curve[1:, 0], curve[1:, 1]).reshape(-1, 3)
-    ring_normal = around(normal[1:, 0], normal[1:, 1]).reshape(-1, 3)
-    ring_uv = np.stack([0.5 + 0.5 * side * at[1:, None] * c, 0.5 + 0.5 * at[1:, None] * s], axis=-1).reshape(-1, 2)
-    vertices = np.concatenate([[[0.0, 0.0, curve[0, 1]]], ring])
-    vertex_normals = np.concatenate([[[0.0, 0.0, normal[0, 1]]], ring_normal])
-    uvs = np.concatenate([[[0.5, 0.5]], ring_uv])
+    side = 1.0 if inwards else -1.0  # a profile that ends on the axis faces up: seen from above it is not mirrored
+    vertices, vertex_normals = (
+        np.concatenate([[[0.0, 0.0, rows[0, 1]]], _around(rows[1:], theta).reshape(-1, 3)]) for rows in (curve, normal)
+    )
+    around = [0.5 + 0.5 * side * at[1:, None] * np.cos(theta), 0.5 + 0.5 * at[1:, None] * np.sin(theta)]
+    uvs = np.concatenate([[[0.5, 0.5]], np.stack(around, axis=-1).reshape(-1, 2)])
 
     j = np.arange(columns)
     k = (j + 1) % columns
-    faces = [np.stack([np.zeros_like(j), 1 + j, 1 + k], axis=1)]
+    faces = [_fan(columns)]
     for row in range(len(curve) - 2):
         a, b = 1 + row * columns, 1 + (row + 1) * columns
         faces += [np.stack([a + j, b + j, b + k], axis=1), np.stack([a + j, b + k, a + k], axis=1)]
-    triangles = np.concatenate(faces).astype(np.int64)
-    if not inwards:
-        triangles = triangles[:, ::-1]
+    triangles = np.concatenate(faces)
 
     def rest(u: Array, v: Array) -> Array:
         x, y = (2 * u - 1) * side, 2 * v - 1
@@ -175,35 +169,25 @@ def _disc(tag: str, profile: Array, normals: Array, columns: int) -> Patch:
         radius, angle = np.interp(rho, at, curve[:, 0]), np.arctan2(y, x)
         return np.stack([radius * np.cos(angle), radius * np.sin(angle), np.interp(rho, at, curve[:, 1])], axis=-1)
 
-    return Patch(tag, vertices, vertex_normals, uvs, triangles, (2 * length, 2 * length), rest)
+    size = (2 * length, 2 * length)
+    return Patch(tag, vertices, vertex_normals, uvs, triangles if inwards else triangles[:, ::-1], size, rest)
 
 
 def _wall(tag: str, profile: Array, normals: Array, columns: int) -> list[Patch]:
     """A piece of a surface of revolution charted as an unrolled band, cut in 2 or 4 where it would be a long strip."""
     theta = 2 * np.pi * np.arange(columns + 1) / columns
     theta[-1] = 0.0  # the seam's two columns are the same points, to the bit
-    c, s = np.cos(theta), np.sin(theta)
-    shape = (len(profile), columns + 1)
-    points = np.stack([profile[:, :1] * c, profile[:, :1] * s, np.broadcast_to(profile[:, 1:], shape)], axis=-1)
-    normal = np.stack([normals[:, :1] * c, normals[:, :1] * s, np.broadcast_to(normals[:, 1:], shape)], axis=-1)
+    points, normal = _around(profile, theta), _around(normals, theta)
     down, length = _along(profile)
     width = 2 * np.pi * float(np.quantile(profile[:, 0], 0.75))
     pieces = 1 if width <= 3 * length else 2 if width <= 6 * length or columns % 4 else 4
     each = columns // pieces
-    return [
-        grid(
-            tag,
-            points[:, at : at + each + 1],
-            normal[:, at : at + each + 1],
-            (width / pieces, length),
-            down,
-            np.arange(each + 1) / each,
-        )
-        for at in range(0, each * pieces, each)
-    ]
+    columns_of = (np.s_[:, at : at + each + 1] for at in range(0, each * pieces, each))
+    across, size = np.arange(each + 1) / each, (width / pieces, length)
+    return [grid(tag, points[piece], normal[piece], size, down, across) for piece in columns_of]
 
 
-def lathe(profile: Sequence[tuple[str, Array]], columns: int = 56) -> list[Patch]:
+def lathe(profile: Sequence[tuple[str, Points]], columns: int = 56) -> list[Patch]:
     """Turn a profile about the z axis.
 
     Args:
@@ -232,22 +216,14 @@ def _unlooped(curve: Array, offset: Array) -> Array:
     return offset[keep]
 
 
-def vessel(
-    outside: Array,
-    wall: float,
-    floor: float,
-    *,
-    tags: tuple[str, str, str] = ("base", "outside", "inside"),
-    columns: int = 56,
-    step: float = 0.7,
-) -> list[Patch]:
-    """An open container: an outside profile, a rounded lip, an inside at constant wall thickness, a floor, a base.
+def vessel(outside: Array, wall: float, floor: float, *, columns: int = 56, step: float = 0.7) -> list[Patch]:
+    """An open container: an "outside" profile with a rounded lip, an "inside" at constant wall thickness with a floor,
+    and a "base".
 
     Args:
         outside: (K, 2) profile (r, z) from the foot (z about 0, r > 0) up to the lip.
         wall: thickness of the wall.
         floor: height of the inside's floor.
-        tags: names of the base, the outside with the lip, and the inside.
         columns: faces around.
         step: longest edge along the profile.
     """
@@ -258,26 +234,23 @@ def vessel(
     up = np.array([-across[1], across[0]])
     lip = top + np.cos(half)[:, None] * across + np.sin(half)[:, None] * up
     fillet = min(1.5 * wall, 0.3 * float(outside[:, 0].max()))
-    edge = float(np.interp(floor, inner[::-1, 1], inner[::-1, 0]))
+    edge = at_height(inner[::-1], floor)
     inner = inner[(inner[:, 1] > floor + fillet) & (inner[:, 0] > 0.05 * float(outside[:, 0].max()))]
     t = np.linspace(0.0, 1.0, 5)[1:, None]
     turn = np.array([max(edge - fillet, 0.4 * edge), floor])
     inside = np.concatenate([inner, (1 - t) ** 2 * inner[-1] + 2 * t * (1 - t) * np.array([edge, floor]) + t**2 * turn])
     foot = outside[0]
     inset = min(0.35 * wall, 0.3 * floor)
-    base = np.array([[0.0, inset], [0.86 * foot[0], inset], [0.9 * foot[0], foot[1]], foot])
-    return lathe(
-        [
-            (tags[0], dense(base, 3 * step)),
-            (tags[1], dense(np.concatenate([outside, lip, inner[:1]]), step)),
-            (tags[2], dense(inside, step)),
-            (tags[2], dense(np.array([turn, [0.0, floor]]), 3 * step)),
-        ],
-        columns,
-    )
+    pieces = [
+        ("base", dense([(0.0, inset), (0.86 * foot[0], inset), (0.9 * foot[0], foot[1]), foot], 3 * step)),
+        ("outside", dense(np.concatenate([outside, lip, inner[:1]]), step)),
+        ("inside", dense(inside, step)),
+        ("inside", dense([turn, (0.0, floor)], 3 * step)),
+    ]
+    return lathe(pieces, columns)
 
 
-def ball(
+def sphere(
     tag: str, radius: float, centre: Sequence[float] = (0.0, 0.0, 0.0), rows: int = 24, columns: int = 40
 ) -> list[Patch]:
     """A sphere in three charts: two polar caps and a band."""
@@ -323,9 +296,9 @@ def _sweep_normals(points: Array, tangent: Array) -> Array:
 
 def sweep(
     tag: str,
-    path: Array,
+    path: Points,
     section: Array,
-    scale: Array | float = 1.0,
+    scale: Array | Sequence[float] | float = 1.0,
     *,
     first: Sequence[float] = (0.0, 0.0, 1.0),
     caps: bool = False,
@@ -342,23 +315,28 @@ def sweep(
         caps: close both ends with flat faces and a hard edge.
         frame: tangents and normals to use in place of `frames(path, first)`.
     """
-    tangent, a, b = frames(path, first) if frame is None else frame
-    scales = np.broadcast_to(
-        np.asarray(scale, dtype=np.float64).reshape(-1, 1) if np.ndim(scale) < 2 else np.asarray(scale), (len(path), 2)
-    )
+    centres = np.asarray(path, dtype=np.float64)
+    tangent, a, b = frames(centres, first) if frame is None else frame
+    scales = np.asarray(scale, dtype=np.float64)
+    scales = np.broadcast_to(scales.reshape(-1, 1) if scales.ndim < 2 else scales, (len(centres), 2))
     flat = section[None] * scales[:, None]
-    points = path[:, None] + flat[..., :1] * a[:, None] + flat[..., 1:] * b[:, None]
+    points = centres[:, None] + flat[..., :1] * a[:, None] + flat[..., 1:] * b[:, None]
     normals = _sweep_normals(points, tangent)
     ring, around = _along(np.concatenate([section, section[:1]]))
     closed = np.concatenate([points, points[:, :1]], axis=1)
     closed_normals = np.concatenate([normals, normals[:, :1]], axis=1)
-    middle = np.linalg.norm(np.diff(points, axis=0), axis=-1).mean(axis=1)
-    down = np.concatenate([[0.0], np.cumsum(middle)])
+    down = mean_lengths(points)
     width = around * float(np.quantile(scales.mean(axis=1), 0.75))
     patches = [grid(tag, closed, closed_normals, (width, float(down[-1])), down / down[-1], ring)]
     if caps:
         patches += [cap(tag, points[0][::-1], -tangent[0]), cap(tag, points[-1], tangent[-1])]
     return patches
+
+
+def mean_lengths(points: Array, axis: int = 0) -> Array:
+    """Return mean lengths along an axis of a grid of points (R, C, 3), from 0."""
+    steps = np.linalg.norm(np.diff(points, axis=axis), axis=-1).mean(axis=1 - axis)
+    return np.concatenate([[0.0], np.cumsum(steps)])
 
 
 def cap(tag: str, ring: Array, normal: Array) -> Patch:
@@ -370,15 +348,14 @@ def cap(tag: str, ring: Array, normal: Array) -> Patch:
     flat = np.stack([(ring - centre) @ x, (ring - centre) @ y], axis=1)
     low, span = flat.min(axis=0), flat.max(axis=0) - flat.min(axis=0)
     uvs = (np.concatenate([[[0.0, 0.0]], flat]) - low) / span
-    j = np.arange(len(ring))
-    faces = np.stack([np.zeros_like(j), 1 + j, 1 + (j + 1) % len(ring)], axis=1).astype(np.int64)
     vertices = np.concatenate([centre[None], ring])
 
     def rest(u: Array, v: Array) -> Array:
         places: Array = centre + (u * span[0] + low[0])[:, None] * x + (v * span[1] + low[1])[:, None] * y
         return places
 
-    return Patch(tag, vertices, np.tile(normal, (len(vertices), 1)), uvs, faces, (float(span[0]), float(span[1])), rest)
+    size = (float(span[0]), float(span[1]))
+    return Patch(tag, vertices, np.tile(normal, (len(vertices), 1)), uvs, _fan(len(ring)), size, rest)
 
 
 def box(

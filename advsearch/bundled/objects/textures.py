@@ -7,18 +7,18 @@ part. Lengths are in the object's units.
 
 from __future__ import annotations
 
-import colorsys
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TypeAlias
+from functools import wraps
+from typing import Concatenate, ParamSpec
 
 import numpy as np
 
 from .curves import Array
-from .draw import Draw
+from .draw import Color, Draw, hexed
 from .shapes import Indices
 
-Color: TypeAlias = Array  # (3,) display-referred sRGB
+Options = ParamSpec("Options")
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,26 +35,20 @@ Paint = Callable[[Texels], Array]
 Mask = Callable[[Texels], Array]  # (N,) weights in [0, 1]
 
 
-def hexed(code: str) -> Color:
-    """Return the colour written as six hexadecimal digits, with or without '#'."""
-    code = code.lstrip("#")
-    return np.array([int(code[i : i + 2], 16) / 255.0 for i in (0, 2, 4)])
+def painter(paint: Callable[Concatenate[Texels, Options], Array]) -> Callable[Options, Paint]:
+    """Make of a function of texels and of what it paints there one of the latter alone, which returns the paint (or the
+    mask)."""
+
+    @wraps(paint)
+    def with_options(*args: Options.args, **kwargs: Options.kwargs) -> Paint:
+        return lambda t: paint(t, *args, **kwargs)
+
+    return with_options
 
 
 def shade(color: Color, factor: float) -> Color:
     """Return the colour made darker (factor below 1) or lighter (above 1), clipped to [0, 1]."""
     return np.clip(color * factor, 0.0, 1.0)
-
-
-def colour(draw: Draw, canonical: str, *others: str, wild: float = 0.4) -> Color:
-    """Return the canonical colour; when drawing, one of those given, jittered, or with chance `wild` any colour."""
-    if draw.rng is None:
-        return hexed(canonical)
-    if draw.rng.random() < wild:
-        hue, saturation, value = draw.rng.random(), draw.rng.random() ** 0.7, draw.rng.uniform(0.15, 0.97)
-        return np.array(colorsys.hsv_to_rgb(hue, saturation, value))
-    base = hexed(str(draw.pick(canonical, *others)))
-    return np.clip(base * draw.rng.uniform(0.85, 1.12) + draw.rng.uniform(-0.05, 0.05, 3), 0.02, 0.98)
 
 
 # ------------------------------------------------------------------------------------------------------ noise
@@ -113,18 +107,21 @@ def step(value: Array, edge: float, soft: float) -> Array:
 # ------------------------------------------------------------------------------------------------------ paints
 
 
-def solid(color: Color) -> Paint:
+@painter
+def solid(t: Texels, color: Color | str) -> Array:
     """One colour."""
-    return lambda t: np.broadcast_to(color, (len(t.u), 3))
+    return np.broadcast_to(hexed(color) if isinstance(color, str) else color, (len(t.u), 3))
 
 
-def mottled(a: Color, b: Color, scale: float, offset: Array, contrast: float = 2.0) -> Paint:
+@painter
+def mottled(t: Texels, a: Color, b: Color, scale: float, offset: Array, contrast: float = 2.0) -> Array:
     """Clouds of two colours, `scale` wide."""
+    return mix(a, b, np.clip((fbm(t.xyz / scale + offset) - 0.5) * contrast + 0.5, 0.0, 1.0))
 
-    def paint(t: Texels) -> Array:
-        return mix(a, b, np.clip((fbm(t.xyz / scale + offset) - 0.5) * contrast + 0.5, 0.0, 1.0))
 
-    return paint
+def clouded(color: Color, factor: float, scale: float, offset: Array, contrast: float = 2.0) -> Paint:
+    """Clouds of a colour and a shade of it, `scale` wide."""
+    return mottled(color, shade(color, factor), scale, offset, contrast)
 
 
 def speckled(base: Paint, color: Color, scale: float, offset: Array, amount: float = 0.16) -> Paint:
@@ -132,36 +129,30 @@ def speckled(base: Paint, color: Color, scale: float, offset: Array, amount: flo
     return over(base, lambda t: step(noise(t.xyz / scale + offset), 1.0 - 1.1 * amount, 0.12), solid(color))
 
 
-def gradient(a: Color, b: Color, low: float, high: float, axis: int = 2) -> Paint:
+@painter
+def gradient(t: Texels, a: Color, b: Color, low: float, high: float, axis: int = 2) -> Array:
     """From colour a at `low` to colour b at `high` along an axis."""
-    return lambda t: mix(a, b, np.clip((t.xyz[:, axis] - low) / (high - low), 0.0, 1.0))
+    return mix(a, b, np.clip((t.xyz[:, axis] - low) / (high - low), 0.0, 1.0))
 
 
-def wood(color: Color, scale: float, offset: Array, axis: int = 2, contrast: float = 0.45) -> Paint:
+@painter
+def wood(t: Texels, color: Color, scale: float, offset: Array, axis: int = 2, contrast: float = 0.45) -> Array:
     """Wood with its grain along an axis: wobbling growth rings and fine fibres; rings are about `scale` apart."""
-
-    def paint(t: Texels) -> Array:
-        stretch = np.full(3, 1.0 / scale)
-        stretch[axis] = 0.12 / scale
-        p = t.xyz * stretch + offset
-        across = [i for i in range(3) if i != axis]
-        ring = p[:, across[0]] + 0.6 * p[:, across[1]] + 1.6 * noise(p * 0.45)
-        rings = 0.5 + 0.5 * np.sin(2 * np.pi * ring * 0.8)
-        fibre = noise(p * np.where(np.arange(3) == axis, 1.0, 4.0))
-        grain: Array = np.clip(color * (1.0 - contrast * (0.55 * rings**2 + 0.45 * fibre))[:, None] * 1.12, 0.0, 1.0)
-        return grain
-
-    return paint
+    stretch = np.full(3, 1.0 / scale)
+    stretch[axis] = 0.12 / scale
+    p = t.xyz * stretch + offset
+    across = [i for i in range(3) if i != axis]
+    ring = p[:, across[0]] + 0.6 * p[:, across[1]] + 1.6 * noise(p * 0.45)
+    rings = 0.5 + 0.5 * np.sin(2 * np.pi * ring * 0.8)
+    fibre = noise(p * np.where(np.arange(3) == axis, 1.0, 4.0))
+    grain = contrast * (0.55 * rings**2 + 0.45 * fibre)
+    return np.asarray(np.clip(color * (1.0 - grain)[:, None] * 1.12, 0.0, 1.0))
 
 
-def rings(a: Color, b: Color, period: float, share: float = 0.5, axis: int = 2, phase: float = 0.0) -> Paint:
+@painter
+def rings(t: Texels, a: Color, b: Color, period: float, share: float = 0.5, axis: int = 2) -> Array:
     """Stripes across an axis; colour b takes `share` of every period."""
-
-    def paint(t: Texels) -> Array:
-        wave = (t.xyz[:, axis] / period + phase) % 1.0
-        return mix(a, b, step(share / 2 - np.abs(wave - 0.5), 0.0, 0.06))
-
-    return paint
+    return mix(a, b, step(share / 2 - np.abs(t.xyz[:, axis] / period % 1.0 - 0.5), 0.0, 0.06))
 
 
 def _cells(t: Texels, cell: float) -> tuple[Array, Array]:
@@ -169,83 +160,66 @@ def _cells(t: Texels, cell: float) -> tuple[Array, Array]:
     return t.u * max(1, round(t.size[0] / cell)), t.v * max(1, round(t.size[1] / cell))
 
 
-def stripes(a: Color, b: Color, cell: float, share: float = 0.5, slant: int = 0) -> Paint:
+@painter
+def stripes(t: Texels, a: Color, b: Color, cell: float, share: float = 0.5, slant: int = 0) -> Array:
     """Stripes up the chart, `cell` apart; `slant` cells of shift from bottom to top."""
-
-    def paint(t: Texels) -> Array:
-        across, _ = _cells(t, cell)
-        wave = (across + slant * t.v) % 1.0
-        return mix(a, b, step(share / 2 - np.abs(wave - 0.5), 0.0, 0.08))
-
-    return paint
+    across, _ = _cells(t, cell)
+    return mix(a, b, step(share / 2 - np.abs((across + slant * t.v) % 1.0 - 0.5), 0.0, 0.08))
 
 
-def checks(a: Color, b: Color, cell: float) -> Paint:
+@painter
+def checks(t: Texels, a: Color, b: Color, cell: float) -> Array:
     """A chequer board with squares `cell` wide."""
+    across, up = _cells(t, 2 * cell)
+    return mix(a, b, (np.floor(2 * across) + np.floor(2 * up)) % 2.0)
 
-    def paint(t: Texels) -> Array:
-        across, up = _cells(t, 2 * cell)
-        return mix(a, b, ((np.floor(2 * across) + np.floor(2 * up)) % 2.0))
 
-    return paint
+@painter
+def _staggered(t: Texels, cell: float, radius: float) -> Array:
+    across, up = _cells(t, cell)
+    across = across + 0.5 * (np.floor(up) % 2.0)
+    return step(radius - np.hypot(across % 1.0 - 0.5, up % 1.0 - 0.5), 0.0, 0.1)
 
 
 def dots(base: Paint, color: Color, cell: float, radius: float = 0.3) -> Paint:
     """Round dots in staggered rows on another paint; radius in cells."""
-
-    def mask(t: Texels) -> Array:
-        across, up = _cells(t, cell)
-        across = across + 0.5 * (np.floor(up) % 2.0)
-        return step(radius - np.hypot(across % 1.0 - 0.5, up % 1.0 - 0.5), 0.0, 0.1)
-
-    return over(base, mask, solid(color))
+    return over(base, _staggered(cell, radius), solid(color))
 
 
-def zigzag(a: Color, b: Color, cell: float) -> Paint:
+@painter
+def zigzag(t: Texels, a: Color, b: Color, cell: float) -> Array:
     """Chevrons running around the chart, `cell` high."""
-
-    def paint(t: Texels) -> Array:
-        across, up = _cells(t, cell)
-        wave = (up + np.abs(across % 1.0 - 0.5)) % 1.0
-        return mix(a, b, step(0.25 - np.abs(wave - 0.5), 0.0, 0.1))
-
-    return paint
+    across, up = _cells(t, cell)
+    return mix(a, b, step(0.25 - np.abs((up + np.abs(across % 1.0 - 0.5)) % 1.0 - 0.5), 0.0, 0.1))
 
 
-def over(base: Paint, mask: Mask, top: Paint) -> Paint:
+@painter
+def over(t: Texels, base: Paint, mask: Mask, top: Paint) -> Array:
     """One paint over another, where the mask is above 0."""
-
-    def paint(t: Texels) -> Array:
-        weight = mask(t)
-        near = np.nonzero(weight)[0]
-        color = np.array(np.broadcast_to(base(t), (len(weight), 3)))
-        if len(near):
-            part = Texels(t.xyz[near], t.u[near], t.v[near], t.size)
-            color[near] = mix(color[near], top(part), weight[near])
-        return color
-
-    return paint
+    weight = mask(t)
+    near = np.nonzero(weight)[0]
+    color = np.array(base(t))
+    if len(near):
+        part = Texels(t.xyz[near], t.u[near], t.v[near], t.size)
+        color[near] = mix(color[near], top(part), weight[near])
+    return color
 
 
-def between(low: float, high: float, axis: int = 2, soft: float = 0.02) -> Mask:
+@painter
+def between(t: Texels, low: float, high: float, axis: int = 2, soft: float = 0.02) -> Array:
     """1 where a coordinate lies between two values; the edges are `soft` wide, in object units."""
+    return within(t.xyz[:, axis], low, high, soft)
 
-    return lambda t: within(t.xyz[:, axis], low, high, soft)
 
-
-def facing(degrees: float, half_width: float, low: float, high: float, soft: float = 0.02) -> Mask:
+@painter
+def facing(t: Texels, degrees: float, half_width: float, low: float, high: float, soft: float = 0.02) -> Array:
     """1 on a label: within `half_width` degrees of the azimuth `degrees` about z, and between two heights."""
-    rows = between(low, high, soft=soft)
-
-    def mask(t: Texels) -> Array:
-        weight = rows(t)
-        near = np.nonzero(weight)[0]
-        angle = np.degrees(np.arctan2(t.xyz[near, 1], t.xyz[near, 0]))
-        away = np.abs((angle - degrees + 180.0) % 360.0 - 180.0)
-        weight[near] *= step(half_width - away, 0.0, 2.0)
-        return weight
-
-    return mask
+    weight = within(t.xyz[:, 2], low, high, soft)
+    near = np.nonzero(weight)[0]
+    angle = np.degrees(np.arctan2(t.xyz[near, 1], t.xyz[near, 0]))
+    away = np.abs((angle - degrees + 180.0) % 360.0 - 180.0)
+    weight[near] *= step(half_width - away, 0.0, 2.0)
+    return weight
 
 
 def anything(draw: Draw, size: float) -> Paint:
@@ -255,7 +229,7 @@ def anything(draw: Draw, size: float) -> Paint:
         draw: must hold a generator.
         size: about the size of the object, in its units.
     """
-    a, b = colour(draw, "808080", wild=1.0), colour(draw, "808080", wild=1.0)
+    a, b = draw.colour("808080", wild=1.0), draw.colour("808080", wild=1.0)
     cell = size * draw(0.1, 0.05, 0.2)
     at = draw.offset()
     kind = draw.pick("solid", "rings", "stripes", "checks", "dots", "zigzag", "mottled", "speckled", "gradient", "wood")
@@ -276,7 +250,7 @@ def anything(draw: Draw, size: float) -> Paint:
     if kind == "gradient":
         return gradient(a, b, 0.0, size, axis=int(draw.pick(0, 1, 2)))
     if kind == "wood":
-        return wood(colour(draw, "9a6a3c", "c89b62", "5b3a22"), 0.5 * cell, at, axis=int(draw.pick(0, 1, 2)))
+        return wood(draw.colour("9a6a3c", "c89b62", "5b3a22"), 0.5 * cell, at, axis=int(draw.pick(0, 1, 2)))
     return solid(a)
 
 

@@ -4,61 +4,32 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 
 from .curves import Array, rotation, unit
-from .draw import Draw
-from .family import Instance, ObjectFamily, finish
-from .shapes import Patch, ball, box, grid, placed, sweep
-from .textures import (
-    Paint,
-    Texels,
-    anything,
-    colour,
-    hexed,
-    mix,
-    mottled,
-    natural,
-    noise,
-    over,
-    shade,
-    solid,
-    step,
-)
+from .draw import Draw, hexed
+from .family import Instance, family, finish
+from .shapes import Patch, box, grid, placed, sphere, sweep
+from .textures import Paint, Texels, anything, clouded, mix, natural, noise, over, painter, shade, solid, step
 
 # -------------------------------------------------------------------------------------------------------- ball
 
 _GOLDEN = (1.0 + 5.0**0.5) / 2.0
-
-
-def _icosahedron() -> Array:
-    """The 12 unit directions of an icosahedron's corners: the middles of a football's dark panels."""
-    corners = []
-    for a in (-1.0, 1.0):
-        for b in (-_GOLDEN, _GOLDEN):
-            corners += [(0.0, a, b), (a, b, 0.0), (b, 0.0, a)]
-    return unit(np.array(corners))
-
-
-def _hexagons() -> Array:
-    """The 20 unit directions of an icosahedron's face middles: the middles of a football's light panels."""
-    corners = _icosahedron()
-    near = corners @ corners.T > 0.4
-    middles = [
-        corners[[i, j, k]].sum(axis=0)
-        for i in range(12)
-        for j in range(i + 1, 12)
-        for k in range(j + 1, 12)
-        if near[i, j] and near[j, k] and near[i, k]
-    ]
-    return unit(np.array(middles))
+_SIGNS = ((a, b) for a in (-1.0, 1.0) for b in (-_GOLDEN, _GOLDEN))
+PENTAGONS = unit(np.array([corner for a, b in _SIGNS for corner in ((0.0, a, b), (a, b, 0.0), (b, 0.0, a))]))
+"""The 12 unit directions of an icosahedron's corners: the middles of a football's dark panels."""
+_NEAR = PENTAGONS @ PENTAGONS.T > 0.4
+_FACES = [face for face in combinations(range(12), 3) if all(_NEAR[pair] for pair in combinations(face, 2))]
+HEXAGONS = unit(np.array([PENTAGONS[list(face)].sum(axis=0) for face in _FACES]))
+"""The 20 unit directions of its face middles: the middles of the light panels."""
 
 
 def football_seams(direction: Array) -> tuple[Array, Array]:
     """Return (N,) distance to the nearest seam and (N,) whether the panel is a pentagon, on a truncated icosahedron."""
-    pentagon = direction @ _icosahedron().T / 0.9393  # offsets of the two kinds of faces from the centre
-    hexagon = direction @ _hexagons().T / 0.9149
+    pentagon = direction @ PENTAGONS.T / 0.9393  # offsets of the two kinds of faces from the centre
+    hexagon = direction @ HEXAGONS.T / 0.9149
     both = np.sort(np.concatenate([pentagon, hexagon], axis=1), axis=1)
     return both[:, -1] - both[:, -2], pentagon.max(axis=1) > hexagon.max(axis=1)
 
@@ -66,7 +37,7 @@ def football_seams(direction: Array) -> tuple[Array, Array]:
 def basketball_seams(d: Array) -> Array:
     """Return (N,) a distance to the nearest groove of a basketball."""
     curve = np.abs(np.abs(d[:, 1]) - (0.42 + 0.38 * d[:, 2] ** 2))
-    return np.minimum(np.minimum(np.abs(d[:, 0]), np.abs(d[:, 2])), np.where(np.abs(d[:, 1]) > 0.0, curve, 1.0))
+    return np.asarray(np.min([np.abs(d[:, 0]), np.abs(d[:, 2]), np.where(d[:, 1] != 0.0, curve, 1.0)], axis=0))
 
 
 def tennis_seam(d: Array) -> Array:
@@ -76,71 +47,65 @@ def tennis_seam(d: Array) -> Array:
 
 def _grooved(patches: list[Patch], radius: float, depth: float, seam: Callable[[Array], Array]) -> list[Patch]:
     """Press the seams into the sphere; normals stay those of the sphere, the groove is a shade, not an edge."""
-    out = []
-    for p in patches:
-        away = seam(p.vertices / radius)
-        out.append(replace(p, vertices=p.vertices * (1.0 - depth * np.exp(-((away / 0.03) ** 2)))[:, None]))
-    return out
+    depths = (depth * np.exp(-((seam(patch.vertices / radius) / 0.03) ** 2)) for patch in patches)
+    return [replace(p, vertices=p.vertices * (1.0 - by)[:, None]) for p, by in zip(patches, depths, strict=True)]
 
 
-def _ball(draw: Draw) -> Instance:
+@painter
+def _football(t: Texels, light: Array, dark: Array, offset: Array) -> Array:
+    away, pentagon = football_seams(unit(t.xyz))
+    base = mix(light, dark, pentagon.astype(np.float64)) * (1.0 - 0.06 * noise(t.xyz / 2.0 + offset))[:, None]
+    return mix(hexed("3a3a3a"), base, step(away, 0.012, 0.016))
+
+
+@painter
+def _beach(t: Texels, colors: list[Array], light: Array, radius: float) -> Array:
+    """Panels between the poles, which are light."""
+    angle = np.arctan2(t.xyz[:, 1], t.xyz[:, 0]) / (2 * np.pi) % 1.0
+    pole = np.abs(t.xyz[:, 2]) > 0.955 * radius
+    return np.where(pole[:, None], light, np.array(colors)[np.minimum((angle * 6).astype(np.int64), 5)])
+
+
+@painter
+def _near_to(t: Texels, seam: Callable[[Array], Array], reach: float) -> Array:
+    """1 within so far of a seam."""
+    return step(-seam(unit(t.xyz)), -reach, 0.02)
+
+
+@painter
+def _star(t: Texels, radius: float) -> Array:
+    x, y = t.xyz[:, 0], t.xyz[:, 1]
+    return step(np.cos(5 * np.arctan2(y, x)) * 0.25 - np.hypot(x, y) / radius, -0.55, 0.04)
+
+
+@family(metres=0.01)
+def ball(draw: Draw) -> Instance:
     radius = 11.0
     style = draw.pick("football", "beach", "basket", "tennis", "star", "plain", "wild", "wild")
     squash = draw(1.0, 0.95, 1.03)
-    patches = ball("ball", radius, rows=28, columns=48)
+    patches = sphere("ball", radius, rows=28, columns=48)
     turn = rotation("z", draw(12.0, 0.0, 360.0)) @ rotation("x", draw(24.0, 0.0, 180.0))
     offset = draw.offset()
-    light, dark = (
-        colour(draw, "f1f0ea", "f4f4f2", "e8d34a", wild=0.3),
-        colour(draw, "1d1f22", "23395d", "b5442e", wild=0.3),
-    )
-
-    def football(t: Texels) -> Array:
-        away, pentagon = football_seams(unit(t.xyz))
-        base = mix(light, dark, pentagon.astype(np.float64)) * (1.0 - 0.06 * noise(t.xyz / 2.0 + offset))[:, None]
-        return mix(hexed("3a3a3a"), base, step(away, 0.012, 0.016))
-
-    def beach(t: Texels) -> Array:
-        panels = np.array([colours[i] for i in range(6)])
-        angle = np.arctan2(t.xyz[:, 1], t.xyz[:, 0]) / (2 * np.pi) % 1.0
-        pole = np.abs(t.xyz[:, 2]) > 0.955 * radius
-        return np.where(pole[:, None], light, panels[np.minimum((angle * 6).astype(np.int64), 5)])
-
+    light = draw.colour("f1f0ea", "f4f4f2", "e8d34a", wild=0.3)
+    dark = draw.colour("1d1f22", "23395d", "b5442e", wild=0.3)
     if style == "beach":
-        bright = [colour(draw, c, wild=0.5) for c in ("d8342c", "f4f4f2", "2f6fb5", "f4f4f2", "eeb52d", "f4f4f2")]
-        colours = [bright[i] if draw.chance(0.7) else light for i in range(6)]
-        paint: Paint = beach
+        bright = [draw.colour(code, wild=0.5) for code in "d8342c f4f4f2 2f6fb5 f4f4f2 eeb52d f4f4f2".split()]
+        paint = _beach([color if draw.chance(0.7) else light for color in bright], light, radius)
     elif style == "basket":
-        skin = colour(draw, "c8642b", "b5532a", "7a3b22", wild=0.2)
-        paint = over(
-            mottled(skin, shade(skin, 0.85), 0.7, offset),
-            lambda t: step(-basketball_seams(unit(t.xyz)), -0.03, 0.02),
-            solid(hexed("1b1715")),
-        )
+        skin = draw.colour("c8642b", "b5532a", "7a3b22", wild=0.2)
+        paint = over(clouded(skin, 0.85, 0.7, offset), _near_to(basketball_seams, 0.03), solid("1b1715"))
         patches = _grooved(patches, radius, 0.015, basketball_seams)
     elif style == "tennis":
-        felt = colour(draw, "c9d63c", "d5dc4a", "e08a2e", wild=0.25)
-        paint = over(
-            mottled(felt, shade(felt, 0.85), 0.6, offset),
-            lambda t: step(-tennis_seam(unit(t.xyz)), -0.045, 0.02),
-            solid(hexed("eeeee6")),
-        )
+        felt = draw.colour("c9d63c", "d5dc4a", "e08a2e", wild=0.25)
+        paint = over(clouded(felt, 0.85, 0.6, offset), _near_to(tennis_seam, 0.045), solid("eeeee6"))
     elif style == "star":
-        paint = over(
-            solid(dark),
-            lambda t: step(
-                np.cos(5 * np.arctan2(t.xyz[:, 1], t.xyz[:, 0])) * 0.25 - np.hypot(t.xyz[:, 0], t.xyz[:, 1]) / radius,
-                -0.55,
-                0.04,
-            ),
-            solid(light),
-        )
+        paint = over(solid(dark), _star(radius), solid(light))
     elif style == "plain":
-        paint = mottled(dark, shade(dark, 1.2), 3.0, offset)
+        paint = clouded(dark, 1.2, 3.0, offset)
     elif style == "wild":
         paint = anything(draw, 2 * radius)
     else:
-        paint = football
+        paint = _football(light, dark, offset)
         patches = _grooved(patches, radius, 0.008, lambda d: football_seams(unit(d))[0] * 1.5)
     shaped = [replace(p, vertices=p.vertices * np.array([1.0, 1.0, squash])) for p in placed(patches, turn)]
     return Instance(shaped, {"ball": paint}, finish(draw, 0.4, 0.3))
@@ -149,18 +114,19 @@ def _ball(draw: Draw) -> Instance:
 # ------------------------------------------------------------------------------------------------------ banana
 
 
-def _banana(draw: Draw) -> Instance:
-    length, bend = draw(19.0, 15.0, 22.0), draw(105.0, 65.0, 130.0)
-    thick = draw(1.65, 1.45, 2.1)
-    stem = draw(2.4, 1.6, 3.6)
+@family(metres=0.01)
+def banana(draw: Draw) -> Instance:
+    length, bend, thick, stem = (
+        draw(19.0, 15.0, 22.0),
+        draw(105.0, 65.0, 130.0),
+        draw(1.65, 1.45, 2.1),
+        draw(2.4, 1.6, 3.6),
+    )
     count = 44
     t = np.linspace(0.0, 1.0, count)
-    curl = bend * (t + 0.05 * np.sin(2 * np.pi * t)) - bend / 2
-    angle = np.radians(curl)
-    step_length = length / (count - 1)
+    angle = np.radians(bend * (t + 0.05 * np.sin(2 * np.pi * t)) - bend / 2)[:-1]
     path = np.zeros((count, 3))
-    path[1:, 0] = np.cumsum(np.sin(angle[:-1])) * step_length
-    path[1:, 1] = np.cumsum(np.cos(angle[:-1])) * step_length
+    path[1:, 0], path[1:, 1] = (np.cumsum(turn(angle)) * (length / (count - 1)) for turn in (np.sin, np.cos))
     at = t * length
     body = np.clip((at - stem) / (0.26 * length), 0.0, 1.0) ** 0.75
     taper = np.clip((length - at) / (0.24 * length), 0.0, 1.0) ** 0.62
@@ -179,16 +145,14 @@ def _banana(draw: Draw) -> Instance:
     patches = placed(patches, rotation("z", draw(78.0, 45.0, 120.0)))
 
     offset = draw.offset()
-    skin = colour(draw, "f0c930", "f3d64a", "e3b62a", "b7c04a", wild=0.0)
-    tip, brown = hexed("3a2a18"), hexed("6b4520")
-    green = hexed("a9b13c")
+    skin = draw.colour("f0c930", "f3d64a", "e3b62a", "b7c04a", wild=0.0)
+    tip, brown, green = map(hexed, ("3a2a18", "6b4520", "a9b13c"))
     amount = draw(0.1, 0.0, 0.22)
     heads = path[[0, -1]]
 
     def paint(t: Texels) -> Array:
         xyz = t.xyz
-        start = np.linalg.norm(xyz - heads[0], axis=1)
-        end = np.linalg.norm(xyz - heads[1], axis=1)
+        start, end = (np.linalg.norm(xyz - head, axis=1) for head in heads)
         base = mix(skin, shade(skin, 0.86), noise(xyz / 2.2 + offset))
         base = mix(base, green, np.clip(1.0 - (start - 0.9 * stem) / 2.6, 0.0, 1.0) * 0.75)
         base = mix(base, green, np.clip(1.0 - end / 2.2, 0.0, 1.0) * 0.5)
@@ -207,7 +171,8 @@ def _banana(draw: Draw) -> Instance:
 # -------------------------------------------------------------------------------------------------------- book
 
 
-def _book(draw: Draw) -> Instance:
+@family(metres=0.01)
+def book(draw: Draw) -> Instance:
     """A closed hardback on its back cover; the spine runs along y at -x, the pages show at the other three sides."""
     width, height, thick = draw(15.5, 12.0, 18.0), 22.5, draw(4.2, 2.2, 6.0)
     board, lip = draw(0.34, 0.2, 0.45), draw(0.4, 0.2, 0.6)
@@ -215,27 +180,20 @@ def _book(draw: Draw) -> Instance:
     patches: list[Patch] = []
     for z in (board / 2, thick - board / 2):
         patches += box("cover", (0.25, 0.0, z), (width, height, board), 0.12)
-    pages = box(
-        "pages",
-        (0.3 - lip / 2, 0.0, thick / 2),
-        (width - lip - 0.5, height - 2 * lip, thick - 2 * board + 0.04),
-        0.05,
-        steps=1,
-    )
-    patches += pages
+    size = (width - lip - 0.5, height - 2 * lip, thick - 2 * board + 0.04)
+    patches += box("pages", (0.3 - lip / 2, 0.0, thick / 2), size, 0.05, steps=1)
     half = thick / 2
     angle = np.linspace(-np.pi / 2, np.pi / 2, 9)
-    outer = np.stack([-width / 2 + 0.25 - bulge * np.cos(angle) - 0.1, half + half * np.sin(angle)], axis=1)
-    inner = np.stack(
-        [-width / 2 + 0.25 - bulge * np.cos(angle[::-1]) + board, half + (half - board) * np.sin(angle[::-1])], axis=1
-    )
+    cosine, sine = np.cos(angle), np.sin(angle)
+    outer = np.stack([-width / 2 + 0.25 - bulge * cosine - 0.1, half + half * sine], axis=1)
+    inner = np.stack([-width / 2 + 0.25 - bulge * cosine + board, half + (half - board) * sine], axis=1)[::-1]
     patches += _spine(outer, inner, height)
     turned = placed(patches, rotation("z", draw(-122.0, -150.0, -100.0)))
 
     offset = draw.offset()
-    cloth = colour(draw, "7a1f2b", "1f3f5f", "2f5b46", "20242a", "c98a3a", "5b3a6b", "d8d0bd")
-    gold = colour(draw, "d8b45a", "efe6cf", "1d1f22", wild=0.25)
-    base = natural(draw, height, mottled(cloth, shade(cloth, 0.85), 0.6, offset, 1.2), 0.3)
+    cloth = draw.colour("7a1f2b", "1f3f5f", "2f5b46", "20242a", "c98a3a", "5b3a6b", "d8d0bd")
+    gold = draw.colour("d8b45a", "efe6cf", "1d1f22", wild=0.25)
+    base = natural(draw, height, clouded(cloth, 0.85, 0.6, offset, 1.2), 0.3)
     title = draw.pick("frame", "blocks", "picture", "plain")
     front = _front(draw, base, gold, title, width, height, thick)
     paper = hexed("ece2c8") if draw.chance(0.7, True) else hexed("f4f2ea")
@@ -258,22 +216,20 @@ def _book(draw: Draw) -> Instance:
 def _spine(outer: Array, inner: Array, height: float) -> list[Patch]:
     """Extrude the spine's section along y: its outer curve (K, 2) upwards in (x, z), its inner one downwards."""
     loop = np.concatenate([outer, inner])[::-1]
-    path = np.stack([np.zeros(2), np.array([height / 2, -height / 2]), np.zeros(2)], axis=1)
     frame = (np.tile([0.0, -1.0, 0.0], (2, 1)), np.tile([1.0, 0.0, 0.0], (2, 1)), np.tile([0.0, 0.0, 1.0], (2, 1)))
-    patches = sweep("spine", path, loop, frame=frame)
-    breadth = float(np.ptp(outer[:, 0])) + float(np.linalg.norm(outer[0] - inner[-1]))
+    patches = sweep("spine", [(0.0, height / 2, 0.0), (0.0, -height / 2, 0.0)], loop, frame=frame)
+    size = (float(np.ptp(outer[:, 1])), float(np.ptp(outer[:, 0])) + float(np.linalg.norm(outer[0] - inner[-1])))
     for side in (1.0, -1.0):
         rows = [np.insert(curve, 1, side * height / 2, axis=1) for curve in (outer, inner[::-1])]
         ends = np.stack(rows if side > 0 else rows[::-1])
         normal = np.broadcast_to([0.0, side, 0.0], ends.shape)
-        size = (float(np.ptp(outer[:, 1])), breadth)
         patches.append(grid("spine", ends, normal, size, np.array([0.0, 1.0]), np.linspace(0.0, 1.0, len(outer))))
     return patches
 
 
 def _front(draw: Draw, base: Paint, gold: Array, title: str, width: float, height: float, thick: float) -> Paint:
     """What is stamped or printed on the front cover."""
-    accent = colour(draw, "c9a24b", "2f6f8f", "b5442e", "3d6b4a")
+    accent = draw.colour("c9a24b", "2f6f8f", "b5442e", "3d6b4a")
 
     def inside(x: Array, y: Array, w: float, h: float) -> Array:
         return step(w - np.abs(x), 0.0, 0.12) * step(h - np.abs(y), 0.0, 0.12)
@@ -292,22 +248,13 @@ def _front(draw: Draw, base: Paint, gold: Array, title: str, width: float, heigh
             frame = inside(x, y, 0.43 * width, 0.45 * height) - inside(x, y, 0.43 * width - 0.28, 0.45 * height - 0.28)
             color = mix(color, gold, frame * top)
         words = step(noise(np.stack([x * 1.5, 0 * x, np.floor(y / 2.0)], axis=1) + 7.0), 0.3, 0.08)
-        lines = (
-            inside(x, y - 0.24 * height, 0.32 * width, 0.09 * height)
-            * step(np.abs((y / 2.0) % 1.0 - 0.5), 0.22, 0.1)
-            * words
-        )
+        rows = step(np.abs((y / 2.0) % 1.0 - 0.5), 0.22, 0.1) * words
+        lines = inside(x, y - 0.24 * height, 0.32 * width, 0.09 * height) * rows
         color = mix(color, gold, np.clip(lines, 0.0, 1.0) * top)
         if title != "picture":
-            seal = step(0.14 * width - np.hypot(x, y + 0.16 * height), 0.0, 0.12) - step(
-                0.1 * width - np.hypot(x, y + 0.16 * height), 0.0, 0.12
-            )
+            away = np.hypot(x, y + 0.16 * height)
+            seal = step(0.14 * width - away, 0.0, 0.12) - step(0.1 * width - away, 0.0, 0.12)
             color = mix(color, gold, seal * top)
         return color
 
     return paint
-
-
-BALL = ObjectFamily("ball", _ball, metres=0.01)
-BANANA = ObjectFamily("banana", _banana, metres=0.01)
-BOOK = ObjectFamily("book", _book, metres=0.01)

@@ -6,15 +6,16 @@ import numpy as np
 
 from .curves import Array, dense, ellipse, polygon, rectangle, rotation, rounded
 from .draw import Draw
-from .family import Instance, ObjectFamily, finish
-from .shapes import Patch, ball, lathe, placed, sweep
+from .family import Instance, family, finish
+from .shapes import Patch, lathe, placed, sphere, sweep
 from .textures import (
-    Paint,
+    Texels,
     between,
-    colour,
+    clouded,
     mottled,
     natural,
     over,
+    painter,
     rings,
     shade,
     solid,
@@ -31,47 +32,35 @@ def _claw(draw: Draw, half: float, start: float, length: float, drop: float) -> 
     """Two tapering prongs that curve downwards (towards -x) from the head, along +y."""
     spread = draw(0.34, 0.2, 0.5)
     t = np.linspace(0.0, 1.0, 14)
+    thick, broad = half * (0.72 * (1 - t) + 0.1), half * 0.47 * (1.0 - 0.25 * t)
+    scale, section = np.stack([thick, broad], axis=1), rectangle(2.0, 2.0, 0.5, 2)
     patches = []
     for side in (-1.0, 1.0):
-        curve = np.stack(
-            [0.25 * half - drop * t**1.8, start + length * (t - 0.1 * t**2), side * half * (0.5 + spread * t)], axis=1
-        )
-        thick = half * (0.72 * (1 - t) + 0.1)
-        broad = half * 0.47 * (1.0 - 0.25 * t)
-        patches += sweep(
-            "head",
-            curve,
-            rectangle(2.0, 2.0, 0.5, 2),
-            np.stack([thick, broad], axis=1),
-            first=(1.0, 0.0, 0.0),
-            caps=True,
-        )
+        down, along = 0.25 * half - drop * t**1.8, start + length * (t - 0.1 * t**2)
+        curve = np.stack([down, along, side * half * (0.5 + spread * t)], axis=1)
+        patches += sweep("head", curve, section, scale, first=(1.0, 0.0, 0.0), caps=True)
     return patches
+
+
+def _along_y(*places: float) -> Array:
+    """A path along y."""
+    return np.array([(0.0, place, 0.0) for place in places])
 
 
 def _peen(draw: Draw, half: float, start: float, length: float) -> list[Patch]:
     """A wedge (cross peen) or a ball at the back of the head, along +y."""
     if draw.chance(0.5):
-        neck = sweep(
-            "head",
-            np.array([[0, start - 0.3, 0], [0, start + 0.5 * length, 0.0]]),
-            ellipse(1, 1, 20),
-            np.array([0.75, 0.6]) * half,
-        )
-        return neck + ball("head", 0.95 * half, (0.0, start + 0.75 * length, 0.0), 16, 24)
-    path = np.array(
-        [
-            [0.0, start, 0.0],
-            [0.0, start + 0.3 * length, 0.0],
-            [0.0, start + 0.9 * length, 0.0],
-            [0.0, start + length, 0.0],
-        ]
-    )
+        neck = _along_y(start - 0.3, start + 0.5 * length)
+        middle = (0.0, start + 0.75 * length, 0.0)
+        stem = sweep("head", neck, ellipse(1, 1, 20), np.array([0.75, 0.6]) * half)
+        return stem + sphere("head", 0.95 * half, middle, 16, 24)
+    path = _along_y(start, start + 0.3 * length, start + 0.9 * length, start + length)
     scale = np.array([[0.95, 0.95], [0.85, 0.95], [0.22, 0.9], [0.12, 0.85]]) * half
     return sweep("head", path, rectangle(2.0, 2.0, 0.4), scale, first=(1.0, 0.0, 0.0), caps=True)
 
 
-def _hammer(draw: Draw) -> Instance:
+@family(metres=0.01)
+def hammer(draw: Draw) -> Instance:
     """The handle runs along -x from the head at the origin; the head lies along y, its striking face at -y."""
     half = draw(1.35, 1.15, 1.7)
     length = draw(27.0, 20.0, 31.0)
@@ -81,31 +70,22 @@ def _hammer(draw: Draw) -> Instance:
     eye = half * draw(1.25, 1.1, 1.5)
     front = max(front, 2.2 * eye)
 
-    cheek = sweep(
-        "head",
-        np.array([[0, -eye * 1.1, 0], [0, -eye * 0.9, 0], [0, eye * 0.9, 0], [0, eye * 1.15, 0]], dtype=float),
-        rectangle(2.0, 2.0, 0.45),
-        np.array([[0.82, 0.82], [1, 1], [1, 1], [0.86, 0.86]]) * half * 1.05,
-        first=(1.0, 0.0, 0.0),
-        caps=True,
-    )
+    scale = np.array([[0.82, 0.82], [1, 1], [1, 1], [0.86, 0.86]]) * half * 1.05
+    path = _along_y(-eye * 1.1, -eye * 0.9, eye * 0.9, eye * 1.15)
+    head = sweep("head", path, rectangle(2.0, 2.0, 0.45), scale, first=(1.0, 0.0, 0.0), caps=True)
     if style == "sledge":
-        path = np.array([[0, -front, 0], [0, -front + 0.3, 0], [0, front - 0.3, 0], [0, front, 0]], dtype=float)
+        path = _along_y(-front, -front + 0.3, front - 0.3, front)
         section = polygon(8, 0.1) if draw.chance(0.5) else rectangle(1.8, 1.8, 0.4)
-        head = sweep(
-            "head", path, section, np.array([0.85, 1.0, 1.0, 0.85]) * face * 1.25, first=(1.0, 0.0, 0.0), caps=True
-        )
+        scale = np.array([0.85, 1.0, 1.0, 0.85]) * face * 1.25
+        head = sweep("head", path, section, scale, first=(1.0, 0.0, 0.0), caps=True)
     else:
-        neck = np.array([-eye * 0.9, -eye * 1.2, -0.62 * front, -0.7 * front, -0.74 * front, -front + 0.25, -front])
-        size = np.array([0.85, 0.75, 0.72, 0.85, 1.0, 1.0, 0.88]) * np.array([half] * 3 + [face] * 4)
-        path = np.stack([np.zeros(7), neck, np.zeros(7)], axis=1)
-        poll = sweep("head", path, ellipse(1.0, 1.0, 28), size, first=(1.0, 0.0, 0.0), caps=True)
-        back = (
-            _claw(draw, half, eye * 0.95, draw(6.4, 5.0, 7.5), draw(2.6, 1.2, 3.6))
-            if style == "claw"
-            else _peen(draw, half, eye, draw(4.0, 3.0, 5.0))
-        )
-        head = cheek + poll + back
+        path = _along_y(-eye * 0.9, -eye * 1.2, -0.62 * front, -0.7 * front, -0.74 * front, -front + 0.25, -front)
+        scale = np.array([0.85, 0.75, 0.72, 0.85, 1.0, 1.0, 0.88]) * np.array([half] * 3 + [face] * 4)
+        head += sweep("head", path, ellipse(1.0, 1.0, 28), scale, first=(1.0, 0.0, 0.0), caps=True)
+        if style == "claw":
+            head += _claw(draw, half, eye * 0.95, draw(6.4, 5.0, 7.5), draw(2.6, 1.2, 3.6))
+        else:
+            head += _peen(draw, half, eye, draw(4.0, 3.0, 5.0))
 
     t = np.linspace(0.0, 1.0, 30)
     belly = draw(0.16, 0.0, 0.3)
@@ -114,7 +94,7 @@ def _hammer(draw: Draw) -> Instance:
     ends[-1] = 0.0
     thick, broad = half * draw(0.72, 0.6, 0.9), half * draw(0.92, 0.75, 1.1)
     reach = half * 1.18
-    path = np.stack([reach - (length + reach) * t, np.zeros(30), np.zeros(30)], axis=1)
+    path = np.stack([reach - (length + reach) * t, 0 * t, 0 * t], axis=1)
     scale = np.stack([broad * grip * ends, thick * grip * ends], axis=1)
     scale[0] *= 0.9
     section = ellipse(1.0, 1.0, 24) if draw.chance(0.6, True) else rectangle(2.0, 2.0, 0.7)
@@ -125,25 +105,21 @@ def _hammer(draw: Draw) -> Instance:
     patches = placed(placed([*head, *stick], rotation("y", -float(tilt))), rotation("z", draw(58.0, 20.0, 90.0)))
 
     offset = draw.offset()
-    steel = colour(draw, "4b4f55", "8d9298", "2b2d30", "6b7078", wild=0.15)
+    steel = draw.colour("4b4f55", "8d9298", "2b2d30", "6b7078", wild=0.15)
     metal = over(
         mottled(steel, shade(steel, 0.8), 1.6, offset, 2.4),
         lambda t: step(-t.xyz[:, 1], 0.86 * front, 0.3),
         solid(shade(steel, 1.7)),
     )
-    timber = wood(colour(draw, "c48f55", "a8743f", "d9b27c", "7a4f2a", wild=0.05), 0.9, offset, axis=0)
-    stain = colour(draw, "8f2e22", "1f4e79", "d9a02b", "2d2d33", "3d6b4a")
+    timber = wood(draw.colour("c48f55", "a8743f", "d9b27c", "7a4f2a", wild=0.05), 0.9, offset, axis=0)
+    stain = draw.colour("8f2e22", "1f4e79", "d9a02b", "2d2d33", "3d6b4a")
     kind = draw.pick("wood", "dipped", "rubber")
-    if kind == "wood":
-        hold: Paint = timber
-    elif kind == "dipped":
+    hold = timber
+    if kind == "dipped":
         hold = over(timber, between(-2 * length, -draw(0.5, 0.4, 0.7) * length, axis=0, soft=0.05), solid(stain))
-    else:
-        hold = over(
-            solid(shade(stain, 0.5)),
-            between(-2 * length, -0.45 * length, axis=0, soft=0.05),
-            rings(stain, shade(stain, 0.7), 1.1, 0.2, axis=0),
-        )
+    elif kind == "rubber":
+        ribs = rings(stain, shade(stain, 0.7), 1.1, 0.2, axis=0)
+        hold = over(solid(shade(stain, 0.5)), between(-2 * length, -0.45 * length, axis=0, soft=0.05), ribs)
     paints = {"head": natural(draw, length, metal, 0.3), "handle": natural(draw, length, hold, 0.3)}
     return Instance(patches, paints, finish(draw, 0.38, 0.2))
 
@@ -154,42 +130,29 @@ def _hammer(draw: Draw) -> Instance:
 def _weights(draw: Draw, style: str, at: float, length: float, radius: float) -> list[Patch]:
     """One weight on the +x end of the bar, from x = at outwards, built along z and laid down afterwards."""
     if style == "hex":
-        path = np.array(
-            [[0, 0, at], [0, 0, at + 0.12 * length], [0, 0, at + 0.85 * length], [0, 0, at + length]], dtype=float
-        )
-        return sweep(
-            "weight",
-            path,
-            polygon(6, 0.14, 3),
-            np.array([0.86, 1.0, 1.0, 0.8]) * radius,
-            first=(0.0, 1.0, 0.0),
-            caps=True,
-        )
+        path = [(0, 0, at), (0, 0, at + 0.12 * length), (0, 0, at + 0.85 * length), (0, 0, at + length)]
+        scale = np.array([0.86, 1.0, 1.0, 0.8]) * radius
+        return sweep("weight", path, polygon(6, 0.14, 3), scale, first=(0.0, 1.0, 0.0), caps=True)
     if style == "globe":
-        return ball("weight", radius * 0.95, (0.0, 0.0, at + 0.8 * radius))
+        return sphere("weight", radius * 0.95, (0.0, 0.0, at + 0.8 * radius))
     plates = 3 if style == "plates" else 1
     patches, z = [], at
     for i in range(plates):
         thick, size = length / plates * 0.94, radius * (1.0 - 0.17 * i)
         bevel = min(0.25 * thick, 0.6)
         side = rounded([(0.55 * size, z), (size, z), (size, z + thick), (0.55 * size, z + thick)], bevel, 4)
-        patches += lathe(
-            [
-                ("weight", np.array([[0.0, z], [0.55 * size, z]])),
-                ("weight", dense(side, 1.2)),
-                ("weight", np.array([[0.55 * size, z + thick], [0.0, z + thick]])),
-            ],
-            44,
-        )
+        under, top = [(0.0, z), (0.55 * size, z)], [(0.55 * size, z + thick), (0.0, z + thick)]
+        patches += lathe([("weight", under), ("weight", dense(side, 1.2)), ("weight", top)], 44)
         z += length / plates
     if style == "plates":
         nut = polygon(6, 0.1) if draw.chance(0.5) else ellipse(1.0, 1.0, 24)
-        path = np.array([[0, 0, z - 0.1], [0, 0, z + 0.6], [0, 0, z + 0.75]], dtype=float)
-        patches += sweep("bar", path, nut, np.array([1.0, 1.0, 0.85]) * 0.42 * radius, first=(0.0, 1.0, 0.0), caps=True)
+        path, scale = [(0, 0, z - 0.1), (0, 0, z + 0.6), (0, 0, z + 0.75)], np.array([1.0, 1.0, 0.85]) * 0.42 * radius
+        patches += sweep("bar", path, nut, scale, first=(0.0, 1.0, 0.0), caps=True)
     return patches
 
 
-def _dumbbell(draw: Draw) -> Instance:
+@family(metres=0.01)
+def dumbbell(draw: Draw) -> Instance:
     style = draw.pick("hex", "plates", "hex", "round", "globe")
     radius = draw(4.6, 3.6, 6.2)
     grip, length = draw(5.6, 5.0, 7.0), draw(5.6, 3.8, 7.0)
@@ -197,19 +160,17 @@ def _dumbbell(draw: Draw) -> Instance:
     swell = draw(0.16, 0.0, 0.3)
     z = np.linspace(-grip - 0.6, grip + 0.6, 25)
     profile = np.stack([bar * (1.0 + swell * np.cos(np.pi * z / (2 * grip + 1.2)) ** 2), z], axis=1)
-    one = _weights(draw, style, grip, length, radius)
-    patches = lathe([("bar", profile)], 28) + one + placed(one, rotation("y", 180.0))
+    weights = _weights(draw, style, grip, length, radius)
+    patches = lathe([("bar", profile)], 28) + weights + placed(weights, rotation("y", 180.0))
     laid = placed(placed(patches, rotation("y", 90.0)), rotation("z", draw(118.0, 90.0, 150.0)))
     offset = draw.offset()
-    iron = colour(draw, "26282b", "3a3d42", "8a8d92", "7a2f8f", "2f6f8f", "c23b4a", wild=0.25)
-    weight = speckled(
-        mottled(iron, shade(iron, 1.25), 2.5, offset), shade(iron, 1.9), 0.35, offset, draw(0.08, 0.0, 0.2)
-    )
+    iron = draw.colour("26282b", "3a3d42", "8a8d92", "7a2f8f", "2f6f8f", "c23b4a", wild=0.25)
+    weight = speckled(clouded(iron, 1.25, 2.5, offset), shade(iron, 1.9), 0.35, offset, draw(0.08, 0.0, 0.2))
     tip = grip + (length if style != "globe" else 1.75 * radius)
-    accent = colour(draw, "c9ccd0", "f2f2f0", "d9a02b", "c23b4a")
+    accent = draw.colour("c9ccd0", "f2f2f0", "d9a02b", "c23b4a")
     if draw.chance(0.5, True):
-        weight = _disc_mark(weight, accent, tip - 0.6, 0.34 * radius, 0.44 * radius)
-    steel = colour(draw, "b4b8bd", "8d9298", "2b2d30", wild=0.2)
+        weight = over(weight, _on_both_ends(tip - 0.6, 0.34 * radius, 0.44 * radius), solid(accent))
+    steel = draw.colour("b4b8bd", "8d9298", "2b2d30", wild=0.2)
     knurl = over(
         solid(steel),
         lambda t: (step(np.sin(90 * t.u + 60 * t.v), 0.3, 0.6) * between(-0.75 * grip, 0.75 * grip)(t)) * 0.6,
@@ -219,16 +180,8 @@ def _dumbbell(draw: Draw) -> Instance:
     return Instance(laid, paints, finish(draw, 0.42, 0.2))
 
 
-def _disc_mark(base: Paint, color: Array, beyond: float, inner: float, outer: float) -> Paint:
-    """A ring painted on both end faces."""
-    return over(
-        base,
-        lambda t: (
-            step(np.abs(t.xyz[:, 2]), beyond, 0.05) * within(np.hypot(t.xyz[:, 0], t.xyz[:, 1]), inner, outer, 0.12)
-        ),
-        solid(color),
-    )
-
-
-HAMMER = ObjectFamily("hammer", _hammer, metres=0.01)
-DUMBBELL = ObjectFamily("dumbbell", _dumbbell, metres=0.01)
+@painter
+def _on_both_ends(t: Texels, beyond: float, inner: float, outer: float) -> Array:
+    """1 on a ring on both end faces."""
+    away = np.hypot(t.xyz[:, 0], t.xyz[:, 1])
+    return step(np.abs(t.xyz[:, 2]), beyond, 0.05) * within(away, inner, outer, 0.12)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from .curves import Array, dense, ellipse, rectangle, rotation, rounded, spline
-from .draw import Draw
-from .family import Instance, ObjectFamily, finish
+from .curves import Array, at_height, dense, ellipse, rectangle, rotation, rounded, spline, upright
+from .draw import Draw, hexed
+from .family import Instance, family, finish
 from .shapes import Patch, lathe, placed, sweep, vessel
 from .textures import (
     Paint,
@@ -14,11 +14,10 @@ from .textures import (
     anything,
     between,
     checks,
-    colour,
+    clouded,
     dots,
     facing,
     gradient,
-    hexed,
     mottled,
     natural,
     over,
@@ -46,63 +45,56 @@ def handle(draw: Draw, style: str, low: float, high: float, reach: float, at_low
         at_low: distance of the lower root from the axis.
         at_high: distance of the upper root from the axis.
     """
-    mid = (low + high) / 2
     edge = max(at_low, at_high)
     if style == "square":
         corners = [(at_high, high), (edge + reach, high), (edge + reach, low), (at_low, low)]
-        curve = rounded(corners, 0.45 * reach, 6)
-        curve = spline(dense(curve, 0.8), 26)
+        curve = spline(dense(rounded(corners, 0.45 * reach, 6), 0.8), 26)
     else:
         tops = {"round": (0.82, 0.98, 0.82), "ear": (0.98, 0.9, 0.5), "loop": (0.85, 1.0, 0.85)}[style]
         span = high - low
         knots = [
-            (at_high, high),
-            (edge + 0.45 * reach, high + 0.04 * span),
-            (edge + tops[0] * reach, high - 0.16 * span),
-            (edge + tops[1] * reach, mid),
-            (edge + tops[2] * reach, low + 0.18 * span),
-            (edge + 0.3 * reach, low + 0.03 * span),
-            (at_low, low),
-        ]
+            (at_high, high), (edge + 0.45 * reach, high + 0.04 * span), (edge + tops[0] * reach, high - 0.16 * span),
+            (edge + tops[1] * reach, (low + high) / 2), (edge + tops[2] * reach, low + 0.18 * span),
+            (edge + 0.3 * reach, low + 0.03 * span), (at_low, low),
+        ]  # fmt: skip
         curve = spline(knots, 26)
-    path = np.stack([curve[:, 0], np.zeros(len(curve)), curve[:, 1]], axis=1)
     thick, broad = draw(0.42, 0.32, 0.6), draw(0.62, 0.4, 0.95)
-    flare = 1.0 + 0.25 * np.abs(np.linspace(-1.0, 1.0, len(path))) ** 4
+    flare = 1.0 + 0.25 * np.abs(np.linspace(-1.0, 1.0, len(curve))) ** 4
     section = ellipse(thick, broad, 16) if draw.chance(0.7, True) else rectangle(2 * thick, 2 * broad, 0.6 * thick)
-    return sweep("handle", path, section, flare)
+    return sweep("handle", upright(curve), section, flare)
 
 
 def _ceramic(draw: Draw, height: float, glaze: Paint, accent: Paint) -> Paint:
     """Decorations a potter or a printer might put around a vessel of that height."""
     kind = draw.pick("band", "plain", "bands", "dots", "stripes", "dip", "checks", "zigzag", "rings")
-    second = colour(draw, "2f5d7c", "b5442e", "356b4f", "e0b040", "22262b", "f2efe6")
+    second = draw.colour("2f5d7c", "b5442e", "356b4f", "e0b040", "22262b", "f2efe6")
+    pale = "f4efe4"
     if kind == "band":
         return over(glaze, between(draw(0.36, 0.1, 0.5) * height, draw(0.72, 0.55, 0.9) * height, soft=0.12), accent)
     if kind == "bands":
-        return over(glaze, between(0.62 * height, 0.9 * height), rings(hexed("f4efe4"), second, 0.13 * height))
+        return over(glaze, between(0.62 * height, 0.9 * height), rings(hexed(pale), second, 0.13 * height))
     if kind == "dots":
         return dots(glaze, second, draw(2.0, 1.2, 3.2), draw(0.3, 0.2, 0.4))
     if kind == "stripes":
-        return stripes(
-            colour(draw, "f4efe4", "f4f4f2"), second, draw(1.8, 1.0, 4.0), draw(0.5, 0.25, 0.6), int(draw.pick(0, 2))
-        )
+        ground = draw.colour(pale, "f4f4f2")
+        return stripes(ground, second, draw(1.8, 1.0, 4.0), draw(0.5, 0.25, 0.6), int(draw.pick(0, 2)))
     if kind == "checks":
-        return over(
-            glaze, between(0.25 * height, 0.75 * height), checks(colour(draw, "f4efe4"), second, draw(1.4, 0.9, 2.2))
-        )
+        board = checks(draw.colour(pale), second, draw(1.4, 0.9, 2.2))
+        return over(glaze, between(0.25 * height, 0.75 * height), board)
     if kind == "zigzag":
-        return over(glaze, between(0.3 * height, 0.7 * height), zigzag(colour(draw, "f4efe4"), second, 2.5))
+        return over(glaze, between(0.3 * height, 0.7 * height), zigzag(draw.colour(pale), second, 2.5))
     if kind == "dip":
         return over(glaze, between(draw(0.5, 0.3, 0.7) * height, 2 * height, soft=0.1), accent)
     if kind == "rings":
-        return rings(colour(draw, "f4efe4"), second, height * draw(0.12, 0.06, 0.25), draw(0.5, 0.2, 0.7))
+        return rings(draw.colour(pale), second, height * draw(0.12, 0.06, 0.25), draw(0.5, 0.2, 0.7))
     return glaze
 
 
 # ------------------------------------------------------------------------------------------------------- mug
 
 
-def _mug(draw: Draw) -> Instance:
+@family(metres=0.01)
+def mug(draw: Draw) -> Instance:
     height = draw(9.4, 7.6, 12.0)
     top = draw(4.15, 3.6, 5.0)
     foot = top * draw(0.93, 0.72, 1.02)
@@ -117,27 +109,21 @@ def _mug(draw: Draw) -> Instance:
     style = draw.pick("ear", "round", "square", "loop")
     grip_high = height * draw(0.85, 0.76, 0.88)
     grip_low = height * (draw(0.3, 0.34, 0.42) if style == "loop" else draw(0.2, 0.16, 0.3))
-    roots = [float(np.interp(z, side[:, 1], side[:, 0])) - 0.55 * wall for z in (grip_low, grip_high)]
+    roots = [at_height(side, z) - 0.55 * wall for z in (grip_low, grip_high)]
     grip = handle(draw, style, grip_low, grip_high, draw(2.9, 2.3, 3.4), roots[0], roots[1])
 
     offset = draw.offset()
-    clay = colour(draw, "e9dfca", "f3f1ec", "d9c7a5", "3a3f45", "8fa7a0", "b5442e", "6f8fb0")
+    clay = draw.colour("e9dfca", "f3f1ec", "d9c7a5", "3a3f45", "8fa7a0", "b5442e", "6f8fb0")
     glaze = speckled(
-        mottled(clay, shade(clay, 0.93), 3.0, offset),
-        colour(draw, "7d6247", wild=0.2),
-        0.28,
-        offset,
-        draw(0.06, 0.0, 0.14),
+        clouded(clay, 0.93, 3.0, offset), draw.colour("7d6247", wild=0.2), 0.28, offset, draw(0.06, 0.0, 0.14)
     )
-    deep = colour(draw, "1f4e79", "2c6e63", "a63c2a", "d79b2b", "2d2d33")
-    accent = mottled(deep, shade(deep, 1.35), 2.2, offset)
+    deep = draw.colour("1f4e79", "2c6e63", "a63c2a", "d79b2b", "2d2d33")
+    accent = clouded(deep, 1.35, 2.2, offset)
     outer = natural(draw, height, _ceramic(draw, height, glaze, accent))
-    inner = (
-        outer
-        if draw.chance(0.15)
-        else (solid(colour(draw, "efe6d4", "f3f1ec", wild=0.3)) if draw.chance(0.5, True) else glaze)
-    )
-    raw = solid(hexed("a98663"))
+    inner = outer
+    if not draw.chance(0.15):
+        inner = solid(draw.colour("efe6d4", "f3f1ec", wild=0.3)) if draw.chance(0.5, True) else glaze
+    raw = solid("a98663")
     paints = {
         "outside": over(outer, between(-1.0, 0.35, soft=0.1), raw) if draw.chance(0.4, True) else outer,
         "inside": inner,
@@ -151,34 +137,26 @@ def _mug(draw: Draw) -> Instance:
 # ------------------------------------------------------------------------------------------------------- bowl
 
 
-def _bowl(draw: Draw) -> Instance:
+@family(metres=0.01)
+def bowl(draw: Draw) -> Instance:
     radius = 8.0
     height = radius * draw(0.86, 0.6, 1.0)
     foot = radius * draw(0.42, 0.34, 0.55)
     ring = draw(0.7, 0.15, 1.1)
     full = draw(0.86, 0.72, 0.97)  # how far out the wall already is at half height
     flare = draw(0.0, -0.03, 0.1) * radius
-    side = spline(
-        np.array(
-            [
-                (foot * 1.04, ring),
-                (radius * 0.5 * (0.72 + full) * 0.92, ring + 0.22 * (height - ring)),
-                (radius * full, 0.55 * height),
-                (radius * (0.5 + 0.5 * full), 0.8 * height),
-                (radius + flare, height),
-            ]
-        ),
-        22,
-    )
-    outside = np.concatenate([[(foot, 0.0)], side])
-    body = vessel(outside, draw(0.45, 0.32, 0.65), ring + 0.55, step=0.9)
+    knots = [
+        (foot * 1.04, ring), (radius * 0.5 * (0.72 + full) * 0.92, ring + 0.22 * (height - ring)),
+        (radius * full, 0.55 * height), (radius * (0.5 + 0.5 * full), 0.8 * height), (radius + flare, height),
+    ]  # fmt: skip
+    body = vessel(np.array([(foot, 0.0), *spline(knots, 22)]), draw(0.45, 0.32, 0.65), ring + 0.55, step=0.9)
     offset = draw.offset()
-    clay = colour(draw, "3f7f86", "e9dfca", "2f5d7c", "b5442e", "f3f1ec", "566b3f")
-    glaze = mottled(clay, shade(clay, 0.72), 2.6, offset)
+    clay = draw.colour("3f7f86", "e9dfca", "2f5d7c", "b5442e", "f3f1ec", "566b3f")
+    glaze = clouded(clay, 0.72, 2.6, offset)
     accent = mottled(hexed("e8dcc0"), hexed("d6c39a"), 2.0, offset)
     outer = natural(draw, 2 * radius, _bowl_paint(draw, height, glaze, accent))
-    inner = draw.pick(accent, glaze, outer, solid(colour(draw, "f3f1ec")), rings(clay, shade(clay, 1.3), height * 0.2))
-    raw = solid(hexed("9b7352"))
+    inner = draw.pick(accent, glaze, outer, solid(draw.colour("f3f1ec")), rings(clay, shade(clay, 1.3), height * 0.2))
+    raw = solid("9b7352")
     return Instance(
         placed(body, BACK), {"outside": outer, "inside": inner, "base": raw}, finish(draw, 0.28, 0.5), {"base": 0.6}
     )
@@ -188,13 +166,14 @@ def _bowl_paint(draw: Draw, height: float, glaze: Paint, accent: Paint) -> Paint
     if draw.rng is not None:
         return _ceramic(draw, height, glaze, accent)
     rim = over(glaze, between(0.93 * height, 2 * height, soft=0.25), accent)
-    return over(rim, between(-1.0, 0.55, soft=0.1), solid(hexed("9b7352")))
+    return over(rim, between(-1.0, 0.55, soft=0.1), solid("9b7352"))
 
 
 # ------------------------------------------------------------------------------------------------------ bottle
 
 
-def _bottle(draw: Draw) -> Instance:
+@family(metres=0.01)
+def bottle(draw: Draw) -> Instance:
     height = draw(30.0, 24.0, 32.0)
     radius = draw(3.75, 3.0, 4.8)
     neck = draw(1.35, 1.0, 1.7)
@@ -202,47 +181,34 @@ def _bottle(draw: Draw) -> Instance:
     rise = height * draw(0.15, 0.08, 0.22)
     slope = draw(0.35, 0.1, 0.8)  # 0: square shoulder, 1: sloping
     taper = draw(1.0, 0.93, 1.03)
-    curve = rounded(
-        [
-            (radius * 0.82, 0.0),
-            (radius * taper, 0.02 * height),
-            (radius, shoulder),
-            (neck + (radius - neck) * (0.55 - 0.35 * slope), shoulder + rise * (0.6 - 0.25 * slope)),
-            (neck * 1.03, shoulder + rise),
-            (neck * 0.95, height - 1.6),
-        ],
-        [0.8, 0.45 * rise + 0.4, 0.6 * rise, 0.5 * rise],
-        7,
-    )
-    bead = draw(0.28, 0.1, 0.4)
-    finish_ring = [
-        (neck * 0.95 + bead, height - 1.5),
-        (neck * 0.95 + bead, height - 0.6),
-        (neck * 0.97, height - 0.5),
-        (neck * 0.93, height),
-    ]
+    corners = [
+        (radius * 0.82, 0.0), (radius * taper, 0.02 * height), (radius, shoulder),
+        (neck + (radius - neck) * (0.55 - 0.35 * slope), shoulder + rise * (0.6 - 0.25 * slope)),
+        (neck * 1.03, shoulder + rise), (neck * 0.95, height - 1.6),
+    ]  # fmt: skip
+    curve = rounded(corners, [0.8, 0.45 * rise + 0.4, 0.6 * rise, 0.5 * rise], 7)
+    wide = neck * 0.95 + draw(0.28, 0.1, 0.4)
+    ring = [(wide, height - 1.5), (wide, height - 0.6), (neck * 0.97, height - 0.5), (neck * 0.93, height)]
     capped = draw.chance(0.4)
-    cap_at = len(curve)
-    outside = np.concatenate([curve, finish_ring])
-    outside = np.concatenate([dense(outside[:cap_at], 1.6), outside[cap_at:]])
+    outside = np.concatenate([dense(curve, 1.6), ring])
     patches = vessel(outside, draw(0.35, 0.3, 0.45), 0.8, step=1.6, columns=48)
     if capped:
-        patches += _cap(draw, neck * 0.95 + bead + 0.12, height)
+        patches += _cap(draw, wide + 0.12, height)
     offset = draw.offset()
-    glass = colour(draw, "17351f", "4a2c14", "1d3f2a", "cfdde0", "2a4d69", "ece7dd", "111416")
-    surface = natural(draw, height, mottled(glass, shade(glass, 1.25), 9.0, offset), 0.25)
-    paper = colour(draw, "efe6cf", "f5f2ea", "20242a", "c9a24b", wild=0.3)
-    ink = colour(draw, "7a1f2b", "23395d", "2e2a25", "b08d3c", wild=0.3)
+    glass = draw.colour("17351f", "4a2c14", "1d3f2a", "cfdde0", "2a4d69", "ece7dd", "111416")
+    surface = natural(draw, height, clouded(glass, 1.25, 9.0, offset), 0.25)
+    paper = draw.colour("efe6cf", "f5f2ea", "20242a", "c9a24b", wild=0.3)
+    ink = draw.colour("7a1f2b", "23395d", "2e2a25", "b08d3c", wild=0.3)
     low, high = 0.14 * height, min(draw(0.44, 0.3, 0.5) * height, shoulder - 1.5)
     outer = surface if draw.chance(0.2) else _labelled(draw, surface, paper, ink, low, high)
-    foil = colour(draw, "6d1a26", "b08d3c", "1c1f24", "23395d", "d5d5d5")
+    foil = draw.colour("6d1a26", "b08d3c", "1c1f24", "23395d", "d5d5d5")
     if draw.chance(0.5, True):
         outer = over(outer, between(height * 0.8, 2 * height), speckled(solid(foil), shade(foil, 1.3), 0.5, offset))
     paints = {
         "outside": outer,
         "inside": solid(shade(glass, 0.6)),
         "base": solid(glass),
-        "cap": solid(colour(draw, "c9a24b", "d0d0d0", "b5442e", "22262b")),
+        "cap": solid(draw.colour("c9a24b", "d0d0d0", "b5442e", "22262b")),
     }
     return Instance(placed(patches, BACK), paints, finish(draw, 0.2, 0.6), {"inside": 0.25, "base": 0.5})
 
@@ -252,7 +218,7 @@ def _cap(draw: Draw, radius: float, height: float) -> list[Patch]:
     low, top = height - draw(1.5, 0.9, 2.2), height + 0.35
     under = np.array([[0.6 * radius, low], [radius, low]])
     side = rounded([(radius, low), (radius, top), (0.6 * radius, top)], 0.3, 4)
-    return lathe([("cap", under), ("cap", dense(side, 0.8)), ("cap", np.array([[0.6 * radius, top], [0.0, top]]))], 40)
+    return lathe([("cap", under), ("cap", dense(side, 0.8)), ("cap", [[0.6 * radius, top], [0.0, top]])], 40)
 
 
 def _labelled(draw: Draw, surface: Paint, paper: Array, ink: Array, low: float, high: float) -> Paint:
@@ -262,9 +228,8 @@ def _labelled(draw: Draw, surface: Paint, paper: Array, ink: Array, low: float, 
     label = over(surface, facing(at, half, low, high, 0.08), solid(paper))
     label = over(label, facing(at, half - 6.0, high - 0.12 * span, high - 0.07 * span, 0.05), solid(ink))
     label = over(label, facing(at, half - 6.0, low + 0.06 * span, low + 0.1 * span, 0.05), solid(ink))
-    label = over(
-        label, facing(at, 0.42 * min(half, 95.0), low + 0.6 * span, low + 0.76 * span, 0.05), solid(shade(ink, 0.8))
-    )
+    title = facing(at, 0.42 * min(half, 95.0), low + 0.6 * span, low + 0.76 * span, 0.05)
+    label = over(label, title, solid(shade(ink, 0.8)))
     for i, share in enumerate((0.5, 0.36, 0.44)):
         z = low + (0.5 - 0.1 * i) * span
         label = over(label, facing(at, share * min(half, 95.0), z, z + 0.035 * span, 0.05), solid(ink))
@@ -276,148 +241,111 @@ def _labelled(draw: Draw, surface: Paint, paper: Array, ink: Array, low: float, 
         away = np.hypot(angle * radius, xyz[:, 2] - (low + 0.2 * span))
         return step(0.09 * span - away, 0.0, 0.08)
 
-    return over(label, seal, solid(hexed("b08d3c")))
+    return over(label, seal, solid("b08d3c"))
 
 
 # ------------------------------------------------------------------------------------------------------- vase
 
 
-def _vase(draw: Draw) -> Instance:
+@family(metres=0.01)
+def vase(draw: Draw) -> Instance:
     height = 24.0
     foot = draw(3.6, 2.6, 4.4)
     belly, belly_at = draw(7.2, 5.2, 8.6), height * draw(0.52, 0.3, 0.68)
     neck, neck_at = draw(2.6, 2.2, 3.8), height * draw(0.84, 0.78, 0.88)
     lip = neck + draw(1.5, 0.5, 2.6)
     knots = [
-        (foot, 0.0),
-        (foot * 0.97, 0.5),
-        (0.45 * foot + 0.55 * belly, 0.48 * belly_at),
-        (belly, belly_at),
-        (0.45 * belly + 0.55 * neck, 0.45 * belly_at + 0.55 * neck_at),
-        (neck, neck_at),
-        (lip, height),
-    ]
-    body = vessel(spline(np.array(knots), 34), draw(0.4, 0.35, 0.6), 0.8, step=1.2)
-    patches = list(body)
+        (foot, 0.0), (foot * 0.97, 0.5), (0.45 * foot + 0.55 * belly, 0.48 * belly_at), (belly, belly_at),
+        (0.45 * belly + 0.55 * neck, 0.45 * belly_at + 0.55 * neck_at), (neck, neck_at), (lip, height),
+    ]  # fmt: skip
+    profile = spline(knots, 34)
+    patches = vessel(profile, draw(0.4, 0.35, 0.6), 0.8, step=1.2)
     if draw.chance(0.25):
         low, high = belly_at + 0.15 * (neck_at - belly_at), neck_at - 0.2
-        profile = spline(np.array(knots), 34)
-        at = [float(np.interp(z, profile[:, 1], profile[:, 0])) - 0.2 for z in (low, high)]
+        at = [at_height(profile, z) - 0.2 for z in (low, high)]
         ear = handle(draw, "ear", low, high, draw(1.6, 1.2, 2.4), at[0], at[1])
         patches += [*placed(ear, rotation("z", 130.0)), *placed(ear, rotation("z", -50.0))]
     offset = draw.offset()
-    clay = colour(draw, "f2f1ea", "b7562f", "2f6f6a", "26303c", "d9c7a5", "8a2f2a")
-    glaze = mottled(clay, shade(clay, 0.95), 4.0, offset)
+    clay = draw.colour("f2f1ea", "b7562f", "2f6f6a", "26303c", "d9c7a5", "8a2f2a")
+    glaze = clouded(clay, 0.95, 4.0, offset)
     outer = natural(draw, height, _vase_paint(draw, glaze, height, offset))
-    paints = {"outside": outer, "inside": solid(shade(clay, 0.8)), "base": solid(hexed("b79b7c")), "handle": glaze}
+    paints = {"outside": outer, "inside": solid(shade(clay, 0.8)), "base": solid("b79b7c"), "handle": glaze}
     return Instance(placed(patches, BACK), paints, finish(draw, 0.25, 0.6), {"inside": 0.35, "base": 0.5})
 
 
 def _vase_paint(draw: Draw, glaze: Paint, height: float, offset: Array) -> Paint:
     """Blue brushwork on white for the canonical vase; glazes, bands and drips for the others."""
-    ink = colour(draw, "23408f", "1f2a33", "b5442e", "d79b2b", "e9dfca")
+    ink = draw.colour("23408f", "1f2a33", "b5442e", "d79b2b", "e9dfca")
     if draw.rng is not None and draw.chance(0.6):
-        return _ceramic(draw, height, glaze, mottled(ink, shade(ink, 1.3), 3.0, offset))
+        return _ceramic(draw, height, glaze, clouded(ink, 1.3, 3.0, offset))
 
     def scroll(texels: Texels) -> Array:
-        xyz = texels.xyz
-        angle = np.arctan2(xyz[:, 1], xyz[:, 0])
-        z = xyz[:, 2] / height
-        petal = np.abs(np.sin(3.0 * angle + 9.0 * np.sin(5.0 * z))) * (
-            0.5 + 0.5 * np.sin(30.0 * z + 2.0 * np.sin(6.0 * angle))
-        )
+        angle, z = np.arctan2(texels.xyz[:, 1], texels.xyz[:, 0]), texels.xyz[:, 2] / height
+        curl = np.abs(np.sin(3.0 * angle + 9.0 * np.sin(5.0 * z)))
+        petal = curl * (0.5 + 0.5 * np.sin(30.0 * z + 2.0 * np.sin(6.0 * angle)))
         return step(petal, 0.55, 0.16) * between(0.24 * height, 0.74 * height, soft=0.1)(texels)
+
+    def frieze(texels: Texels) -> Array:
+        teeth = step(np.sin(16 * np.arctan2(texels.xyz[:, 1], texels.xyz[:, 0])), 0.0, 0.5)
+        return between(0.09 * height, 0.17 * height, soft=0.1)(texels) * teeth
 
     paint = over(glaze, scroll, solid(ink))
     for low, high in ((0.05, 0.08), (0.18, 0.2), (0.215, 0.225), (0.76, 0.77), (0.785, 0.805), (0.96, 2.0)):
         paint = over(paint, between(low * height, high * height, soft=0.12), solid(ink))
-    return over(
-        paint,
-        lambda t: (
-            between(0.09 * height, 0.17 * height, soft=0.1)(t)
-            * step(np.sin(16 * np.arctan2(t.xyz[:, 1], t.xyz[:, 0])), 0.0, 0.5)
-        ),
-        solid(ink),
-    )
+    return over(paint, frieze, solid(ink))
 
 
 # --------------------------------------------------------------------------------------------------- wine glass
 
 
-def _wine_glass(draw: Draw) -> Instance:
+@family(metres=0.01)
+def wine_glass(draw: Draw) -> Instance:
     foot = draw(3.5, 2.9, 4.2)
     stem, stem_top = draw(0.42, 0.32, 0.6), draw(9.5, 6.0, 12.0)
     bowl, deep = draw(4.1, 3.2, 5.0), draw(9.8, 6.5, 11.5)
     mouth = bowl * draw(0.8, 0.7, 1.12)
     wide_at = draw(0.42, 0.3, 0.55)
     wall = draw(0.24, 0.2, 0.3)
-    under = np.array([[0.0, 0.12], [foot * 0.8, 0.12], [foot * 0.9, 0.0], [foot - 0.15, 0.0]])
-    rise = spline(
-        np.array([(foot, 0.28), (0.55 * foot, 0.6), (0.22 * foot, 1.25), (stem * 1.15, 2.4), (stem, 0.6 * stem_top)]),
-        14,
-    )
+    under = [(0.0, 0.12), (foot * 0.8, 0.12), (foot * 0.9, 0.0), (foot - 0.15, 0.0)]
+    rising = [(foot, 0.28), (0.55 * foot, 0.6), (0.22 * foot, 1.25), (stem * 1.15, 2.4), (stem, 0.6 * stem_top)]
     knob = draw.chance(0.25)
     neck = [(stem * (2.2 if knob else 1.0), 0.78 * stem_top), (stem * 1.1, 0.92 * stem_top)]
     cup = [
-        (0.5 * bowl, stem_top + 0.07 * deep),
-        (0.86 * bowl, stem_top + 0.2 * deep),
-        (bowl, stem_top + wide_at * deep),
-        (0.45 * bowl + 0.55 * mouth, stem_top + 0.76 * deep),
-        (mouth, stem_top + deep),
-    ]
-    outer = spline(np.array([(stem, 0.6 * stem_top), *neck, *cup]), 36)
+        (0.5 * bowl, stem_top + 0.07 * deep), (0.86 * bowl, stem_top + 0.2 * deep), (bowl, stem_top + wide_at * deep),
+        (0.45 * bowl + 0.55 * mouth, stem_top + 0.76 * deep), (mouth, stem_top + deep),
+    ]  # fmt: skip
+    outer = spline([(stem, 0.6 * stem_top), *neck, *cup], 36)
     normal = np.gradient(outer, axis=0)
     normal = np.stack([normal[:, 1], -normal[:, 0]], axis=1) / np.linalg.norm(normal, axis=1, keepdims=True)
     inner = (outer - wall * normal)[::-1]
     inner = inner[inner[:, 1] > stem_top + 0.11 * deep]
     angle = np.pi * np.arange(1, 4) / 4
     side = np.array([-normal[-1, 1], normal[-1, 0]])
-    lip = (
-        outer[-1]
-        - wall / 2 * normal[-1]
-        + wall / 2 * (np.cos(angle)[:, None] * normal[-1] + np.sin(angle)[:, None] * side)
-    )
+    curl = np.cos(angle)[:, None] * normal[-1] + np.sin(angle)[:, None] * side
+    lip = outer[-1] - wall / 2 * normal[-1] + wall / 2 * curl
     floor = stem_top + 0.08 * deep
-    edge = [(inner[-1, 0] * 0.6, floor + 0.25 * (inner[-1, 1] - floor))]
-    body = lathe(
-        [
-            ("foot", dense(under, 1.5)),
-            ("foot", np.concatenate([[(foot - 0.15, 0.0), (foot, 0.08)], rise])),
-            ("bowl", np.concatenate([outer, lip, inner[:1]])),
-            ("inside", inner),
-            ("inside", np.concatenate([inner[-1:], edge, [(0.0, floor)]])),
-        ],
-        52,
-    )
+    edge = (inner[-1, 0] * 0.6, floor + 0.25 * (inner[-1, 1] - floor))
+    profile = [
+        ("foot", dense(under, 1.5)),
+        ("foot", np.array([under[-1], (foot, 0.08), *spline(rising, 14)])),
+        ("bowl", np.concatenate([outer, lip, inner[:1]])),
+        ("inside", inner),
+        ("inside", np.array([inner[-1], edge, (0.0, floor)])),
+    ]
+    body = lathe(profile, 52)
     height = stem_top + deep
-    tint = colour(draw, "c4dbe2", "d9e4e6", "e8d9c8", "8fb8a8", "c58a94", "7c9cc4", "f0f0ee", wild=0.3)
-    drink = colour(draw, "6d1526", "d8b45a", "c46a6a", "3f1420", wild=0.15)
+    tint = draw.colour("c4dbe2", "d9e4e6", "e8d9c8", "8fb8a8", "c58a94", "7c9cc4", "f0f0ee", wild=0.3)
+    drink = draw.colour("6d1526", "d8b45a", "c46a6a", "3f1420", wild=0.15)
     level = stem_top + deep * draw(0.48, 0.3, 0.62)
     plain = gradient(shade(tint, 0.86), shade(tint, 1.08), 0.0, height)
-    filled = draw.chance(0.5, True)
-    outside = (
-        over(
-            plain,
-            between(stem_top + 0.06 * deep, level, soft=0.1),
-            mottled(drink, shade(drink, 0.8), 3.0, draw.offset()),
-        )
-        if filled
-        else plain
-    )
+    outside = inside = plain
+    if draw.chance(0.5, True):
+        wine = clouded(drink, 0.8, 3.0, draw.offset())
+        outside = over(plain, between(stem_top + 0.06 * deep, level, soft=0.1), wine)
+        inside = over(plain, between(0.0, level, soft=0.1), solid(drink))
     outside = natural(draw, height, outside, 0.3)
     if draw.chance(0.2, True):
-        outside = over(outside, between(height - 0.35, 2 * height, soft=0.1), solid(hexed("c9a24b")))
-    inside = over(plain, between(0.0, level, soft=0.1), solid(drink)) if filled else plain
+        outside = over(outside, between(height - 0.35, 2 * height, soft=0.1), solid("c9a24b"))
     foot_paint = draw.pick(plain, outside, plain) if draw.chance(0.7, True) else anything(draw, height)
-    return Instance(
-        placed(body, BACK),
-        {"foot": foot_paint, "bowl": outside, "inside": inside},
-        finish(draw, 0.18, 0.8, spread=0.12),
-    )
-
-
-MUG = ObjectFamily("mug", _mug, metres=0.01)
-BOWL = ObjectFamily("bowl", _bowl, metres=0.01)
-BOTTLE = ObjectFamily("bottle", _bottle, metres=0.01)
-VASE = ObjectFamily("vase", _vase, metres=0.01)
-WINE_GLASS = ObjectFamily("wine-glass", _wine_glass, metres=0.01)
+    paints = {"foot": foot_paint, "bowl": outside, "inside": inside}
+    return Instance(placed(body, BACK), paints, finish(draw, 0.18, 0.8, spread=0.12))

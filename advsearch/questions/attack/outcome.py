@@ -247,7 +247,7 @@ def _printability(problem: Problem, findings: Findings) -> results.Printability:
             steps=len(unprinted.history),
             margin_with=ours.margin,
             margin_without=theirs.margin,
-            cost=theirs.margin - ours.margin,
+            cost=ours.margin - theirs.margin,
             verified=theirs,
             terms=terms(unprinted),
         )
@@ -364,8 +364,8 @@ def _average(findings: Findings) -> AverageCase:
         correct=counted.successes,
         accuracy=counted.rate,
         interval=counted.interval,
-        margin=mean_number(scores),
-        worst_margin=max((score for score in scores if score == score), default=math.nan),
+        margin=0.0 - mean_number(scores),
+        worst_margin=0.0 - max((score for score in scores if score == score), default=math.nan),
     )
 
 

@@ -17,6 +17,7 @@ from advsearch.report.wording import (
     count,
     margin_text,
     number_text,
+    objective_name,
     rate_text,
     seconds_text,
     wanted,
@@ -220,7 +221,7 @@ def renders_text(summary: AttackSummary) -> str:
 
 
 def print_cost_text(summary: AttackSummary) -> str:
-    """Return ``margin 4.1 with the print terms, 6.3 without (200 steps): they cost 2.2 logits``; empty: not known."""
+    """Return ``margin -4.1 with the print terms, -6.3 without (200 steps): they cost 2.2 logits``; empty: not known."""
     cost = None if summary.printability is None else summary.printability.cost
     if cost is None or cost.cost is None or cost.margin_with is None or cost.margin_without is None:
         return ""
@@ -368,7 +369,9 @@ def _search_claim(summary: AttackSummary) -> str:
     if claim is None:
         return ""
     again = f"{_short(claim.re_evaluated)} when rendered again" if math.isfinite(claim.re_evaluated) else ""
-    return ", ".join(filter(None, (f"{summary.objective} {_short(claim.objective)} in the render that won", again)))
+    return ", ".join(
+        filter(None, (f"{objective_name(summary.objective)} {_short(claim.objective)} in the render that won", again))
+    )
 
 
 def _sample_count(summary: AttackSummary) -> str:

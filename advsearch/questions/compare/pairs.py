@@ -264,7 +264,7 @@ def far_apart(first: Side, second: Side, most: int) -> list[int]:
     """Return places of pairs that one side alone gets right, at most so many of each: first those of the first side,
     where the margins are farthest apart first."""
     right, other = first.right, second.right
-    apart = (second.rows["margin"] - first.rows["margin"]).fillna(0.0)
+    apart = (first.rows["margin"] - second.rows["margin"]).fillna(0.0)
     worse = (-apart[right & ~other]).sort_values(kind="stable").index[:most]
     better = apart[~right & other].sort_values(kind="stable").index[:most]
     return [*worse.tolist(), *better.tolist()]

@@ -69,7 +69,7 @@ class Example(NamedTuple):
     def right(self, model: Model) -> bool:
         assert self.task is not None
         with torch.no_grad():
-            return bool(self.task.margin(model(self.levels[None] / 255.0), self.truth)[0] <= 0.0)
+            return bool(self.task.loss(model(self.levels[None] / 255.0), self.truth)[0] <= 0.0)
 
 
 def read_coco(folder: Path, model: Model) -> list[Example]:

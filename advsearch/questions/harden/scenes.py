@@ -118,7 +118,7 @@ class SceneWork:
             truth = problem.truth(problem.whole(problem.domain.start, seed))
             for when, model in (("before", self.model), ("after", self.with_weights(weights))):
                 with torch.no_grad():
-                    right[when].append(bool(problem.task.margin(model(picture), truth)[0] <= 0.0))
+                    right[when].append(bool(problem.task.loss(model(picture), truth)[0] <= 0.0))
         return right
 
     def with_weights(self, weights: bytes) -> Model:

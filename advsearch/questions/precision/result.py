@@ -177,8 +177,8 @@ may record them again, and so may the first one after other scenes were rendered
 FAMILIES = {"none": " without denoiser", "oidn": " with denoiser"}
 READING = (
     "Each row is a setting: its error beside a reference of far more samples, with the 95 % interval of that "
-    "error, and the processor time, in seconds, that one picture or gradient takes. A margin is how far the wrong "
-    "prediction leads the right one, in logits; a cosine of 1 means that a gradient points the right way."
+    "error, and the processor time, in seconds, that one picture or gradient takes. A margin is how far the right "
+    "prediction leads the wrong one, in logits; a cosine of 1 means that a gradient points the right way."
 )
 
 

@@ -173,7 +173,7 @@ Shares = tuple[float, float, float]
 Triangle = tuple[int, int, bool]  # how far along the first and the second share it is, and whether it points down
 MEANINGLESS = (
     "The prediction is {} in every picture, so that shares of predictions tell nothing. Colours are how far the right "
-    "prediction leads the best wrong one: the margin with its sign turned, in logits for a classifier."
+    "prediction leads the best wrong one: the margin, in logits for a classifier."
 )
 
 
@@ -196,7 +196,7 @@ def ternary(rows: Rows, options: TernaryOptions) -> MadeFigure:
     corners = all_triangles(options.side)
     places = pd.Series([triangle_of(mixture, options.side) for mixture in mixtures])
     inside = [(places == triangle).to_numpy() for triangle in corners]
-    given, lead = frame.most_frequent(rows[frame.PREDICTION]), -rows["margin"].astype(float).to_numpy()
+    given, lead = frame.most_frequent(rows[frame.PREDICTION]), rows["margin"].astype(float).to_numpy()
     leads = {name: lead[(most == number) & ~np.isnan(lead)] for number, name in enumerate(names)}
     by_lead = len(given) == 1 and min(map(len, leads.values())) >= 2
     text, table, panels = list[str](), list[list[frame.Cell]](), dict[str, list[float | None]]()

@@ -239,18 +239,18 @@ def _map(
     verifier.stages.begin("map", "drawing the map", side * side, hint=hint)
     steps = torch.linspace(0.0, 1.0, side) if side > 1 else torch.tensor([0.5])
 
-    scores = list[float]()
+    margins = list[float]()
     for numbers in batches(0, side * side, most_at_once(verifier.problem.domain.dim)):
         places = {one: at(torch.stack([steps[one % side], steps[one // side]])) for one in numbers}
-        scores += [trial.score for trial in verifier.trials("map", places, sought=False, predictor=light)]
-    margins = [scores[begin : begin + side] for begin in range(0, len(scores), side)]
+        margins += [-trial.score for trial in verifier.trials("map", places, sought=False, predictor=light)]
+    rows = [margins[begin : begin + side] for begin in range(0, len(margins), side)]
     ends = [verifier.problem.describe(at(torch.full((2,), end))) for end in (0.0, 1.0)]
     axes = []
     for side_of in box:
         known = side_of.name in ends[0]
         low, high = (_number(end[side_of.name], "") for end in ends) if known else (0.0, 1.0)
         axes.append(AxisRange(name=side_of.name, unit=side_of.unit, low=low, high=high))
-    drawn = MarginMap(axes=(axes[0], axes[1]), margins=margins)
+    drawn = MarginMap(axes=(axes[0], axes[1]), margins=rows)
     for suffix, data in map_figure(drawn, box).items():
         write_bytes(run.path / "images" / f"map.{suffix}", data)
     return drawn

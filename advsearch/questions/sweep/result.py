@@ -96,9 +96,9 @@ class Predictions:
 
     @property
     def worst(self) -> int | None:
-        """The first configuration of the largest margin; None where none is a number."""
+        """The first configuration of the smallest margin; None where none is a number."""
         margin = self.margin if self.hidden[self.seen].all() else np.where(self.hidden, np.nan, self.margin)
-        return None if np.isnan(margin).all() else int(np.nanargmax(margin))
+        return None if np.isnan(margin).all() else int(np.nanargmin(margin))
 
     @property
     def not_finite(self) -> int:

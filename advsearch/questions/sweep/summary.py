@@ -79,7 +79,7 @@ class WorstVerified(VerifiedRate):
 
 
 class WorstConfiguration(Fields):
-    """The configuration with the largest margin."""
+    """The configuration with the smallest margin."""
 
     configuration: int = Field(description="its number")
     values: Annotated[dict[str, DescribedValue], having("object", "model")]
