@@ -58,9 +58,8 @@ class BodyControl(NumberControl):
         known = [one.name for one in self.rig.parameters]
         for name in self.specs:
             if name not in known:
-                raise UnknownNameError(
-                    f"parameter of {self.mesh}", name, known, f"It stands in `controls` {self.name}."
-                )
+                where = f"It stands in `controls` {self.name}."
+                raise UnknownNameError(f"parameter of {self.mesh}", name, known, where)
         if not self._given and not any(map(self.search_range, self.parameters)):
             example = next((name for name in known if name.endswith(".x")), known[0])
             raise InputError(
