@@ -178,9 +178,9 @@ class Cycles:
         shift = [float(values.get(f"camera.shift_{axis}", torch.zeros(1))[0]) for axis in "xy"]
         lamps: list[dict[str, object]] = []
         for lamp in scene.lamps.values():
-            ball, place, shape = np.eye(4), np.eye(4), None
+            place, shape = np.eye(4), list[list[float]]()
             if isinstance(lamp, BallLamp):
-                ball[:3, :3] *= lamp.radius
+                ball = np.diag([lamp.radius] * 3 + [1.0])
                 ball[:3, 3] = lamp.place
                 shape = values.get(f"{lamp.name}.ball", torch.from_numpy(ball)).double().tolist()
                 color = values.get(f"{lamp.name}.radiance", torch.tensor(lamp.radiance))
@@ -189,7 +189,7 @@ class Cycles:
                 place[:3, 3] = values.get(f"{lamp.name}.position", torch.tensor(lamp.position)).numpy()
                 color = values.get(f"{lamp.name}.intensity", torch.tensor(lamp.intensity))
             if bool((color > 0.0).any()):
-                lamps.append({"ball": shape, "place": place.tolist(), "color": color.tolist()})
+                lamps.append({"ball": shape or None, "place": place.tolist(), "color": color.tolist()})
         radiance = None if scene.environment is None else np.asarray(scene.environment.radiance, np.float32)
         if "environment.padded" in values:
             radiance = values["environment.padded"][:, 1:-1].numpy()

@@ -22,12 +22,12 @@ import numpy as np
 
 from advsearch.scene.assets import Doubles, EnvironmentAsset, Floats, Ints
 from advsearch.scene.color import srgb_to_linear
-from advsearch.scene.geometry import camera_to_world, object_to_world, standing
+from advsearch.scene.geometry import NEAREST, camera_to_world, object_to_world, standing
 from advsearch.scene.grounds import paved
 from advsearch.scene.parts import MeshPart
 from advsearch.scene.raster import doubled_normals, looked_up, pixels_in
 from advsearch.scene.settings import ORBIT_CAMERA, resolve
-from advsearch.scene.silhouettes import NEAREST, Frame
+from advsearch.scene.silhouettes import Frame
 
 if TYPE_CHECKING:
     from advsearch.scene.description import SceneDescription

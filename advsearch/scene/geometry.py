@@ -144,11 +144,10 @@ def object_to_world(description: SceneDescription) -> Doubles:
 def moved_part(part: MeshPart, values: Mapping[str, float | None]) -> MeshPart:
     """Return a mesh around the object, as it came, as the settings have it: posed about its own middle, where it
     stands, by those that are called `pose:NAME.yaw` and so on."""
-    asked = {parameter.name: values.get(f"pose:{part.name}.{parameter.name}") for parameter in POSE}
-    asked = {name: value for name, value in asked.items() if value is not None}
-    if asked:
+    pose = {own.name: value for own in POSE if (value := values.get(f"pose:{part.name}.{own.name}")) is not None}
+    if pose:
         places = standing(part)
-        pose = {**{parameter.name: float(parameter.default) for parameter in POSE}, **asked}
+        pose = {**{own.name: float(own.default) for own in POSE}, **pose}
         part = replace(part, to_world=_posed(places, float(places[:, 2].min()), pose) @ part.to_world)
     return replace(part, material=part.material.with_values(values, f"material:{part.name}."))
 

@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from advsearch.scene.assets import Bools, Doubles
+from advsearch.scene.geometry import NEAREST
 from advsearch.scene.raster import pixels_in
 
 RASTER = 128
@@ -27,8 +28,6 @@ HALVINGS = 12
 """Steps that narrow it down."""
 GRID = 24
 """Rows and columns of the directions that stand for the whole frame."""
-NEAREST = 1e-3
-"""Points nearer to the camera plane than this, or behind it, are left out of silhouettes."""
 
 
 @dataclass(frozen=True)

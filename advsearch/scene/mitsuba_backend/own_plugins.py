@@ -280,7 +280,7 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
         ray, weight = self.sample_ray_differential(time, sample1, sample2, sample3, active)
         return mi.Ray3f(ray), weight
 
-    def without_drops(self, time: Any, place: Any) -> tuple[Any, Any]:
+    def without_drops(self, time: Any, place: Any) -> Any:
         """`sample_ray` where no drop is before the camera: what is true of a picture is so of the scene."""
         drops, self._drops = self._drops, None
         try:

@@ -345,9 +345,11 @@ class MitsubaScene:
             emitters = {emitter.id(): emitter for emitter in self._scene.emitters()}
             projector = emitters.get(part) if name.endswith(PATTERN) else None
             paths = collect(self._scene, self.parameters, key, noise, self.resolution, self._depth, spp, projector)
-            size, surface = self.parameters[key].shape[:2], None if projector else self.made[0].meshes[part].surface
-            if projector is None and surface is None:
-                return paths
+            size, surface = self.parameters[key].shape[:2], None
+            if projector is None:
+                surface = self.made[0].meshes[part].surface
+                if surface is None:
+                    return paths
 
             def looked_up(uv: Tensor) -> Tensor:
                 """Where lookups of a matrix, which repeat at the border, find what is shown at texture coordinates."""

@@ -148,9 +148,9 @@ def collect(
     means = [dr.block_sum(channel, spp) / spp for channel in channels]
     dr.eval(means)
     picture = torch.stack([mean.torch() for mean in means], dim=1).reshape(*size, -1)
-    pictures = (part.contiguous() for part in torch.split(picture, [3, 1, 3, 3, 3], dim=-1))
+    parts = [part.contiguous() for part in torch.split(picture, [3, 1, 3, 3, 3], dim=-1)]
     kept = [_kept(*vertex, taken, spp) for vertex, taken in zip(vertices, taking_part, strict=True)]
-    return Paths(*pictures, vertices=kept)
+    return Paths(parts[0], parts[1], parts[2], parts[3], parts[4], kept)
 
 
 def _kept(uv: Any, weight: Any, sharp: Any, taking_part: Any, spp: int) -> Vertices:

@@ -145,7 +145,7 @@ def _part(part: parts.ScenePart, left: Plugin) -> Plugin:
         plugin: Plugin = {"type": "ply", "bsdf": surface, **({"emitter": light} if light else {})}
     elif isinstance(part, (parts.PointLamp, parts.SpotLamp, parts.BallLamp)):
         ball = inputs.pop("ball", None)
-        triples = {name: tuple(map(float, inputs.pop(name))) for name in list(inputs)}
+        triples: Plugin = {name: tuple(map(float, inputs.pop(name))) for name in list(inputs)}
         plugin = translation(replace(part, **triples)).plugins[part.name]
         if ball is not None:
             plugin["to_world"] = mi.ScalarTransform4f(ball)

@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -351,7 +352,7 @@ def seen_of(columns: npt.NDArray[np.int32], of_cell: Ints, texels: int) -> tuple
     row, flat = np.repeat(np.arange(count), rays), columns.ravel()
     of_sky, of_texel = flat >= len(of_cell), (flat >= 0) & (flat < len(of_cell))
 
-    def matrix(taken: Bools, column: Ints, width: int) -> Tensor:
+    def matrix(taken: Bools, column: npt.NDArray[np.integer[Any]], width: int) -> Tensor:
         values = np.full(len(column), math.pi / rays, dtype=np.float32)
         return by_rows(scipy.sparse.coo_matrix((values, (row[taken], column)), (count, width)).tocsr())
 

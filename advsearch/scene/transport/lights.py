@@ -73,7 +73,7 @@ class Lighting:
     @property
     def moved(self) -> frozenset[str]:
         """The inputs that are light and move."""
-        return frozenset().union(*self.groups.values()) - ON_PICTURE
+        return frozenset[str]().union(*self.groups.values()) - ON_PICTURE
 
     def at_its_brightest(self, u: Tensor) -> Tensor:
         """Return a configuration with as much light of the environment as there can be."""
@@ -197,7 +197,8 @@ class Span:
         sine = torch.sin((torch.arange(height) + 0.5) * torch.pi / height)[:, None].expand(height, width).reshape(-1)
         columns = self.maps.permute(3, 0, 1, 2).reshape(3, count, -1).double()
         weighted = columns * sine
-        return (torch.linalg.pinv(weighted @ columns.transpose(1, 2)) @ weighted).float()
+        inverse: Tensor = torch.linalg.pinv(weighted @ columns.transpose(1, 2)) @ weighted
+        return inverse.float()
 
 
 # ---- pictures -------------------------------------------------------------------------------------------------------
