@@ -24,7 +24,7 @@ from advsearch.errors import FileFormatError, InputError, ModelError
 from advsearch.question import Asked
 from advsearch.questions.compare.result import ComparedPair, CountOf, PairPart, PairPicture, PairRule
 from advsearch.questions.sweep.carry_out import scenes_of
-from advsearch.questions.sweep.job import Scenes
+from advsearch.questions.sweep.job import OpenScenes
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.questions.sweep.summary import SweepSummary
 from advsearch.report.wording import short_names
@@ -254,7 +254,7 @@ class PairPictures:
     asked: Asked[Any]
     rendered: int = 0
     warnings: list[str] = field(default_factory=list)
-    scenes: dict[str, Scenes | None] = field(default_factory=dict)
+    scenes: dict[str, OpenScenes | None] = field(default_factory=dict)
 
     def of(self, first: Side, second: Side, pair: int) -> Iterator[PairPicture]:
         """Yield what one side alone gets right, at most so many of each, where the margins are farthest apart first,
