@@ -294,12 +294,7 @@ class Split(NamedTuple):
 
 def _candidates(table: pd.DataFrame, least: int, seed: int) -> Iterator[RuleConditions]:
     """The nodes of one tree of all rows and of a random forest."""
-    try:
-        trees_of, forests = (importlib.import_module(f"sklearn.{part}") for part in ("tree", "ensemble"))
-    except ImportError as error:
-        raise InputError(
-            "explain needs scikit-learn, which cannot be imported: pip install 'advsearch[explain]'"
-        ) from error
+    trees_of, forests = (import_library(f"sklearn.{part}") for part in ("tree", "ensemble"))
     one_tree, forest = trees_of.DecisionTreeClassifier, forests.RandomForestClassifier
     columns: list[npt.NDArray[np.float64]] = []
     splits: list[Split] = []
@@ -355,3 +350,13 @@ def _nodes(tree: Any, splits: list[Split]) -> Iterator[dict[Split, RuleCondition
             names = before.options
             below, above = (replace(before, options=one) for one in (names - {split.name}, names & {split.name}))
         open_nodes += [(left, {**conditions, key: below}), (right, {**conditions, key: above})]
+
+
+def import_library(name: str) -> Any:
+    """Return a module of scikit-learn, such as ``sklearn.tree``."""
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise InputError(
+            "explain needs scikit-learn, which cannot be imported: pip install 'advsearch[explain]'"
+        ) from error
