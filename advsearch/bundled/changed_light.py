@@ -11,10 +11,8 @@ from advsearch.scene.assets import EnvironmentAsset, Floats
 
 WARM = (1.06, 0.18, -1.25)
 """Logarithms of what light of 2,700 K has of red, green and blue, beside light of 6,500 K; their mean is about zero."""
-OF_WARM = (-0.24, 1.0)
-"""Ends of the uniform factor of `WARM`: about 10,000 and 2,700 K."""
-WHITE_LIGHT_CHANGES = 0.5
-"""How often the colour of light is changed."""
+OF_WARM = (-0.24, 1.0)  # ends of the uniform factor of `WARM`: about 10,000 and 2,700 K
+WHITE_LIGHT_CHANGES = 0.5  # how often the colour of light is changed
 
 
 def varied(environment: EnvironmentAsset, rng: np.random.Generator) -> EnvironmentAsset:

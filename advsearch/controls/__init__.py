@@ -21,43 +21,18 @@ from advsearch.registry import Registry
 from advsearch.scene.description import ENVIRONMENT, OBJECT, SceneDescription
 
 ORDER = (
-    *(
-        "pose",
-        "camera",
-        "path",
-        "texture",
-        "material",
-        "light",
-        "projector",
-        "spot",
-        "shadow",
-        "environment",
-        "sky",
-        "geometry",
-    ),
-    *(
-        "things",
-        "body",
-        "patch",
-        "occlusion",
-        "contents",
-        "background",
-        "haze",
-        "lens",
-        "sensor",
-        "corruption",
-        "mitsuba",
-    ),
-)
+    "pose camera path texture material light projector spot shadow environment sky geometry things body patch "
+    "occlusion contents background haze lens sensor corruption mitsuba"
+).split()
 """In which lists have controls; one that is not named comes last."""
 SHARED = ("base", "ranges", "numbers", "space", "values", "corruption_filters", "material_patterns")
 """Modules of this folder that are no control."""
 
 
-_modules = (one.name for one in iter_modules(__path__) if one.name not in SHARED)
+_kinds = {module.name for module in iter_modules(__path__)} - {*SHARED}
 OWN = {
     kind: "".join(map(str.capitalize, kind.split("_"))) + "Control"
-    for kind in sorted(_modules, key=lambda kind: (ORDER.index(kind) if kind in ORDER else len(ORDER), kind))
+    for kind in sorted(_kinds, key=lambda kind: (ORDER.index(kind) if kind in ORDER else len(ORDER), kind))
 }
 """The package's own controls, one for each other module: the word on the command line is the module's name, and this is
 its class."""
@@ -119,9 +94,9 @@ def _read_name(asked: str, given: dict[str, object]) -> tuple[str, str, str | No
     """Return kind, instance name and single parameter; takes "kind" out of the settings."""
     kind, colon, name = asked.partition(":")
     kind, dot, parameter = kind.partition(".")
-    said = given.pop("kind", None)
-    if said is not None:
-        return str(said), asked, None
+    kind_given = given.pop("kind", None)
+    if kind_given is not None:
+        return str(kind_given), asked, None
     if CONTROLS.names_class(asked):
         return asked, CONTROLS[asked].kind, None
     check_instance(f"`controls` {asked}", name, colon)
@@ -145,18 +120,15 @@ def check_instance(where: str, name: str, colon: str = ":") -> None:
 
 
 def _default_range(control: type[Control], parameter: str) -> object:
-    for declared in control.declared((parameter,)) if control.parameters else ():
-        if declared.name == parameter:
-            if declared.options:
-                return {"choices": list(declared.options)}
-            return list(declared.search or (declared.low, declared.high))
     if not control.parameters:
         raise InputError(
             f"`controls` {control.kind}.{parameter}: expected a range, as in {control.kind}:{parameter}=[0.2, 0.8]"
         )
-    raise UnknownNameError(
-        f"parameter of control {control.kind}", parameter, [declared.name for declared in control.parameters]
-    )
+    declared = {one.name: one for one in control.declared((parameter,))}
+    if parameter not in declared:
+        raise UnknownNameError(f"parameter of control {control.kind}", parameter, declared)
+    named = declared[parameter]
+    return {"choices": list(named.options)} if named.options else list(named.search or (named.low, named.high))
 
 
 def settings_by_name(asked: Mapping[str, object]) -> dict[str, Mapping[str, object]]:
@@ -235,11 +207,12 @@ def compose(controls: Sequence[Control], scene: SceneDescription) -> Space:
         if control.mesh != OBJECT:
             control.mesh_in(scene)
     bound = tuple(control.bind(scene) for control in controls)
-    moved += [one for control in bound for one in control.moved]
+    moved = sorted(
+        [*moved, *(one for control in bound for one in control.moved)], key=lambda one: names.index(one.control)
+    )
     lit_by = [str(one.used) for one in moved if one.parameter == ENVIRONMENT]
     lit_by += [scene.environment_spec] if scene.environment_spec != described.environment_spec else []
-    ordered = tuple(sorted(moved, key=lambda one: names.index(one.control)))
-    return Space(bound, scene, ordered, lit_by[0] if lit_by else None)
+    return Space(bound, scene, tuple(moved), lit_by[0] if lit_by else None)
 
 
 def check_about(controls: Sequence[Control], scene: SceneDescription) -> None:

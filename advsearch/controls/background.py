@@ -10,11 +10,12 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
+from functools import partial
 
 import torch
 from torch import Tensor
 
-from advsearch.controls.base import Choice, Parameter, Value
+from advsearch.controls.base import Choice, Parameter, Value, measure, number
 from advsearch.controls.numbers import NumberControl, Values
 from advsearch.controls.values import Fixed, Number, OneOf
 from advsearch.errors import InputError
@@ -23,10 +24,12 @@ from advsearch.scene.description import SceneDescription
 from advsearch.scene.grounds import on_its_ground
 from advsearch.scene.settings import CHANNELS
 
-COLOR = "backdrop.color"
-"""The scene input: (3,) display-linear values in [0, 1]."""
+COLOR = "backdrop.color"  # the scene input: (3,) display-linear values in [0, 1]
 WHAT = ("colour", "environment")
 NUMBERS = ("hue", "saturation", "value")
+
+
+_image = partial(number, ("image",))
 
 
 class BackgroundControl(NumberControl):
@@ -40,17 +43,9 @@ class BackgroundControl(NumberControl):
             "what", (), "name", 0, len(WHAT) - 1, "colour",
             "What is behind the object: the colour, or the environment as ever.", options=WHAT, estimators=(),
         ),
-        Parameter(
-            "hue", (), "degrees", 0.0, 360.0, 0.0, "Hue: 0 is red, 120 green, 240 blue.", periodic=True,
-            search=(0.0, 360.0), estimators=("image",),
-        ),
-        Parameter(
-            "saturation", (), "1", 0.0, 1.0, 0.0, "Saturation: 0 is grey.", search=(0.0, 1.0), estimators=("image",)
-        ),
-        Parameter(
-            "value", (), "sRGB", 0.0, 1.0, 0.5, "The largest of red, green and blue: 0 is black.", search=(0.0, 1.0),
-            estimators=("image",),
-        ),
+        _image("hue", "degrees", 0.0, 360.0, 0.0, "Hue: 0 is red, 120 green, 240 blue.", (0.0, 360.0), periodic=True),
+        _image("saturation", "1", 0.0, 1.0, 0.0, "Saturation: 0 is grey.", (0.0, 1.0)),
+        _image("value", "sRGB", 0.0, 1.0, 0.5, "The largest of red, green and blue: 0 is black.", (0.0, 1.0)),
     )  # fmt: skip
     choices = (
         Choice(
@@ -87,7 +82,7 @@ class BackgroundControl(NumberControl):
 
     def measured(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Value]:
         color = hsv_to_rgb(values["hue"], values["saturation"], values["value"])
-        return {name: {"value": float(one), "unit": "sRGB"} for name, one in zip(CHANNELS, color, strict=True)}
+        return {name: measure(value, "sRGB") for name, value in zip(CHANNELS, color, strict=True)}
 
 
 def hsv_to_rgb(hue: Tensor, saturation: Tensor, value: Tensor) -> Tensor:

@@ -131,21 +131,20 @@ class Control(ABC):
         self.name = name or self.kind
         settings = {setting: as_setting(value) for setting, value in settings.items()}
         self.own = self.declared(settings)
-        known = [one.name for one in self.own] + [one.name for one in self.choices]
+        known = [parameter.name for parameter in self.own] + [choice.name for choice in self.choices]
         for setting in settings:
             if setting not in known:
                 raise UnknownNameError(f"setting of control {self.kind}", setting, known)
-        self._given: dict[str, Any] = {
-            setting: plain(value) for setting, value in settings.items() if value is not None
-        }
-        self.chosen: dict[str, Any] = {one.name: self._given.get(one.name, one.default) for one in self.choices}
+        given = {setting: plain(value) for setting, value in settings.items() if value is not None}
+        self._given: dict[str, Any] = given
+        self.chosen: dict[str, Any] = {choice.name: given.get(choice.name, choice.default) for choice in self.choices}
         for choice in self.choices:
             choice.check(self.name, self.chosen[choice.name])
         self.check_choices()
         self.specs = {
-            one.name: read(f"{self.name}.{one.name}", one, self._given[one.name])
-            for one in self.own
-            if one.name in self._given
+            parameter.name: read(f"{self.name}.{parameter.name}", parameter, given[parameter.name])
+            for parameter in self.own
+            if parameter.name in given
         }
         self.asked = any(not isinstance(spec, Fixed) for spec in self.specs.values())
 
@@ -317,9 +316,20 @@ class Control(ABC):
         return {}
 
 
+def number(
+    estimators: tuple[str, ...], name: str, unit: str, low: float, high: float, default: float | str, text: str,
+    search: tuple[float, float] | None = None, *, periodic: bool = False, log: bool = False,
+) -> Parameter:  # fmt: skip
+    """Return a number that moves no outlines; see `advsearch.scene.settings.moving` for one that does."""
+    return Parameter(name, (), unit, low, high, default, text, periodic, False, search, log, estimators=estimators)
+
+
+def measure(value: Tensor | float, unit: str) -> Value:
+    """Return a number and its unit, as configurations are described."""
+    return {"value": float(value), "unit": unit}
+
+
 def change_in_colour(name: str, change: Tensor) -> dict[str, Value]:
     """Say a change of searched colours, display-referred: the largest, and the root of the mean square."""
-    return {
-        f"{name}.linf": {"value": float(change.abs().max()), "unit": "sRGB"},
-        f"{name}.rms": {"value": float(change.square().mean().sqrt()), "unit": "sRGB"},
-    }
+    root_mean_square = change.square().mean().sqrt()
+    return {f"{name}.linf": measure(change.abs().max(), "sRGB"), f"{name}.rms": measure(root_mean_square, "sRGB")}

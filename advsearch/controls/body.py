@@ -11,7 +11,7 @@ from advsearch.controls.numbers import NumberControl, Values
 from advsearch.controls.ranges import is_number
 from advsearch.controls.values import Number
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.scene.assets import Rig
+from advsearch.scene.assets import MeshRig
 from advsearch.scene.people import PARAMETERS
 from advsearch.scene.rigged import TIME, part_of_a_rig
 
@@ -32,7 +32,7 @@ class BodyControl(NumberControl):
         return (*cls.parameters, *(one for one in named if one is not None))
 
     @property
-    def rig(self) -> Rig:
+    def rig(self) -> MeshRig:
         """What moves the mesh."""
         mesh = self.mesh_in(self.scene)
         if mesh.mesh.rig is None:
@@ -58,9 +58,8 @@ class BodyControl(NumberControl):
         known = [one.name for one in self.rig.parameters]
         for name in self.specs:
             if name not in known:
-                raise UnknownNameError(
-                    f"parameter of {self.mesh}", name, known, f"It stands in `controls` {self.name}."
-                )
+                where = f"It stands in `controls` {self.name}."
+                raise UnknownNameError(f"parameter of {self.mesh}", name, known, where)
         if not self._given and not any(map(self.search_range, self.parameters)):
             example = next((name for name in known if name.endswith(".x")), known[0])
             raise InputError(

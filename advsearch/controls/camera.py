@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from advsearch.controls.base import Parameter
+from advsearch.controls.base import Parameter, number
 from advsearch.controls.numbers import NumberControl, Values
 from advsearch.controls.values import Fixed
 from advsearch.errors import InputError
@@ -27,21 +27,17 @@ from advsearch.scene.geometry import STEEPEST, affine, camera_to_world, framing_
 from advsearch.scene.settings import CAMERA, ORBIT, ORBIT_CAMERA, moving
 from advsearch.scene.sizes import on_roads
 
-ROAD_USERS = (0.5, 4.0)
-"""Metres above the road from which vehicles are seen: from a bumper to the roof of a lorry."""
-SENSOR_WIDTH = 36.0
-"""Width in millimetres of the full-frame sensor that a focal length refers to."""
-
-
-def _lens(
-    name: str, unit: str, low: float, high: float, default: float | str, text: str, log: bool = False
-) -> Parameter:
-    return Parameter(name, (), unit, low, high, default, text, log=log, estimators=ORBIT)
+ROAD_USERS = (0.5, 4.0)  # metres above the road from which vehicles are seen: from a bumper to the roof of a lorry
+SENSOR_WIDTH = 36.0  # width in millimetres of the full-frame sensor that a focal length refers to
 
 
 def _coefficient(name: str) -> Parameter:
     what = {"k": "Radial", "p": "Tangential", "s": "Thin-prism"}[name[0]]
     return moving(ORBIT, name, "1", -100.0, 100.0, 0.0, f"{what} distortion, as OpenCV has it.")
+
+
+SAME = (("fov", "focal_length"), ("elevation", "height"), ("distance", "sizes"))
+"""Pairs of parameters that say the same thing."""
 
 
 class CameraControl(NumberControl):
@@ -55,8 +51,8 @@ class CameraControl(NumberControl):
         moving(ORBIT, "sizes", "object sizes", 1e-4, 1e5, "as distance", "The same as `distance`.", log=True),
         moving(ORBIT, "shift_x", "picture widths", -2.0, 2.0, 0.0, "Shift of the picture to the right."),
         moving(ORBIT, "shift_y", "picture heights", -2.0, 2.0, 0.0, "Shift of the picture downwards."),
-        _lens("aperture", "object sizes", 0.0, 10.0, 0.0, "Radius of the lens; 0 is a pinhole."),
-        _lens("focus", "metres", 1e-4, 1e5, "the object's middle", "Distance in focus.", log=True),
+        number(ORBIT, "aperture", "object sizes", 0.0, 10.0, 0.0, "Radius of the lens; 0 is a pinhole."),
+        number(ORBIT, "focus", "metres", 1e-4, 1e5, "the object's middle", "Distance in focus.", log=True),
         *map(_coefficient, COEFFICIENTS),
         CAMERA[-1],
     )
@@ -67,14 +63,13 @@ class CameraControl(NumberControl):
                 f"`controls` {self.name}: moves along an orbit around the object, and the scene is seen by its camera "
                 f"{scene.camera!r}; leave the control out, or have it seen by {ORBIT_CAMERA!r}"
             )
-        if "fov" in self.specs and "focal_length" in self.specs:
-            raise InputError(f"`controls` {self.name}: fov and focal_length say the same thing; leave one of them out")
-        if "elevation" in self.specs and "height" in self.specs:
-            raise InputError(f"`controls` {self.name}: elevation and height say the same thing; leave one of them out")
-        if "distance" in self.specs and "sizes" in self.specs:
-            raise InputError(f"`controls` {self.name}: distance and sizes say the same thing; leave one of them out")
+        for first, second in SAME:
+            if first in self.specs and second in self.specs:
+                raise InputError(
+                    f"`controls` {self.name}: {first} and {second} say the same thing; leave one of them out"
+                )
         wanted = "aperture" in self.specs or "focus" in self.specs
-        if wanted and ("shift_x" in self.specs or "shift_y" in self.specs):
+        if wanted and self._shifted:
             raise InputError(
                 f"`controls` {self.name}: a shifted picture together with an aperture is not supported; leave one out"
             )
@@ -85,6 +80,10 @@ class CameraControl(NumberControl):
             return replace(scene, thin_lens=True) if wanted else scene
         self._check_model(scene.camera_model, bent)
         return scene
+
+    @property
+    def _shifted(self) -> bool:
+        return "shift_x" in self.specs or "shift_y" in self.specs
 
     def _check_model(self, model: CameraModel, bent: list[str]) -> None:
         """Refuse what the camera's model has not. Raises InputError where it was asked for."""
@@ -108,10 +107,8 @@ class CameraControl(NumberControl):
         model = self.scene.camera_model
         if parameter.name in COEFFICIENTS and model is not None:
             return model.values[parameter.name]
-        if parameter.name == "distance" or parameter.name == "focus":
-            return fitted_distance(self._described()) * self.scene.metres
-        if parameter.name == "sizes":
-            return fitted_distance(self._described())
+        if parameter.name in ("distance", "focus", "sizes"):
+            return fitted_distance(self._described()) * (1.0 if parameter.name == "sizes" else self.scene.metres)
         if parameter.name == "height":
             return float(camera_to_world(self._described())[2, 3]) * self.scene.metres
         if parameter.name == "focal_length":
@@ -119,9 +116,8 @@ class CameraControl(NumberControl):
         return super().default(parameter)
 
     def setting(self, parameter: Parameter) -> str:
-        return {"focal_length": "camera.fov", "sizes": "camera.distance"}.get(
-            parameter.name, super().setting(parameter)
-        )
+        same = {"focal_length": "camera.fov", "sizes": "camera.distance"}
+        return same.get(parameter.name, super().setting(parameter))
 
     def search_range(self, parameter: Parameter) -> tuple[float, float] | None:
         preset = PRESETS.get(self.scene.preset)
@@ -156,7 +152,7 @@ class CameraControl(NumberControl):
             inputs["camera.aperture"] = values["aperture"].clamp_min(1e-5).reshape(1)
             focus = values["focus"] / scene.metres if "focus" in self.specs else distance
             inputs["camera.focus"] = focus.reshape(1)
-        if scene.camera_model is None and ("shift_x" in self.specs or "shift_y" in self.specs):
+        if scene.camera_model is None and self._shifted:
             inputs["camera.shift"] = torch.stack([values["shift_x"], values["shift_y"]])
         if "exposure" in self.specs:
             inputs["camera.exposure"] = values["exposure"] - scene.number("camera.exposure")
@@ -174,22 +170,20 @@ class CameraControl(NumberControl):
 
     def _described(self) -> SceneDescription:
         """The scene with a fixed lens, for which the distance is worked out as for the same setting."""
-        scene, fov, focal_length = self.scene, self.specs.get("fov"), self.specs.get("focal_length")
+        fov, focal_length = self.specs.get("fov"), self.specs.get("focal_length")
         if isinstance(fov, Fixed):
-            return scene.with_values(camera__fov=float(fov.value))
+            return self.scene.with_values(camera__fov=float(fov.value))
         if isinstance(focal_length, Fixed):
-            return scene.with_values(camera__fov=_fov_of(torch.tensor(float(focal_length.value))).item())
-        return scene
+            return self.scene.with_values(camera__fov=_fov_of(torch.tensor(float(focal_length.value))).item())
+        return self.scene
 
     @property
     def _keeps_height(self) -> bool:
         """Whether the height above the ground says how high the camera is, and not the elevation."""
         if {"elevation", "height"} & self.specs.keys():
             return "height" in self.specs
-        heights = next(one for one in self.own if one.name == "height")
-        return self.scene.values.get("camera.height") is not None or not (
-            self.asked or self.search_range(heights) is None
-        )
+        searched = not self.asked and self.search_range(self.named("height")) is not None
+        return self.scene.values.get("camera.height") is not None or searched
 
     def _orbit(self, values: Values, distance: Tensor) -> Tensor:
         azimuth, elevation, roll = (torch.deg2rad(values[name]) for name in ("azimuth", "elevation", "roll"))

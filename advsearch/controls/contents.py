@@ -11,46 +11,36 @@ Proportions add up to one: the two that are free are cut off a stick of length o
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from scipy import ndimage
 from torch import Tensor
 
-from advsearch.controls.base import NOTHING, Parameter, Value
+from advsearch.controls.base import NOTHING, Parameter, Value, measure, number
 from advsearch.controls.numbers import NumberControl, Values
 from advsearch.controls.ranges import Range
+from advsearch.controls.shadow import polygon
 from advsearch.controls.values import Fixed, Number, OneOf, Spec
 from advsearch.errors import InputError
-from advsearch.scene.assets import Floats, Material, Mesh, ObjectAsset
+from advsearch.scene.assets import Doubles, Ints, Material, Mesh, ObjectAsset
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.geometry import object_to_world
 from advsearch.scene.parts import MeshPart
 from advsearch.scene.raster import pixels_in
-from advsearch.scene.settings import ORBIT, moving
+from advsearch.scene.settings import LIT, ORBIT, moving
 
-Doubles = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
-
-GRID = 128
-"""Cells of the height map along the longer side of the mesh."""
-ROWS = 40
-"""Heights at which the wall is looked for."""
-COLUMNS = 96
-"""Directions in which it is looked for."""
-SHALLOWEST = 0.03
-"""Smallest depth of a vessel in object sizes."""
-NARROWEST = 5e-4
-"""Smallest opening of a vessel in squared object sizes."""
-CLOSED = 0.97
-"""Share of the rays that have to meet the wall."""
-BRIM = 0.985
-"""A full vessel is filled to this share of its depth."""
+GRID = 128  # cells of the height map along the longer side of the mesh
+ROWS = 40  # heights at which the wall is looked for
+COLUMNS = 96  # directions in which it is looked for
+SHALLOWEST = 0.03  # smallest depth of a vessel in object sizes
+NARROWEST = 5e-4  # smallest opening of a vessel in squared object sizes
+CLOSED = 0.97  # share of the rays that have to meet the wall
+BRIM = 0.985  # a full vessel is filled to this share of its depth
 
 INGREDIENTS = ("water", "milk", "coffee")
 """In the order in which they are cut off the stick; what the first two leave is coffee."""
@@ -58,14 +48,10 @@ REFLECTANCE = {"milk": (0.84, 0.80, 0.70), "coffee": (0.040, 0.016, 0.007)}
 """Linear reflectance of a deep cup of each."""
 SCATTERING = {"milk": 1.0, "coffee": 0.10}
 """How strongly each scatters, relative to milk."""
-WATER = (0.86, 0.94, 0.95)
-"""What a cup of water leaves of the light that has been to the bottom and back."""
-DENSITY = 7.0
-"""How fast coffee and milk make water opaque: a tenth of them hides half of the vessel's floor."""
-TOTAL = 1e-6
-"""How far proportions may miss one."""
-RADIUS = 0.995
-"""The disc ends this close to the wall, as a share of its distance."""
+WATER = (0.86, 0.94, 0.95)  # what a cup of water leaves of the light that has been to the bottom and back
+DENSITY = 7.0  # how fast coffee and milk make water opaque: a tenth of them hides half of the vessel's floor
+TOTAL = 1e-6  # how far proportions may miss one
+RADIUS = 0.995  # the disc ends this close to the wall, as a share of its distance
 FIRST = 0.02
 """Below this level the disc is drawn together and sunk into the floor, so that an empty vessel shows none of it."""
 SURFACE = Material(roughness=0.08, specular=0.5)
@@ -86,6 +72,16 @@ class Vessel:
     heights: Doubles
     radii: Doubles
     color: Doubles
+
+
+def _vessel(control: str, scene: SceneDescription) -> Vessel:
+    vessel = interior(scene.object)
+    if vessel is None:
+        raise InputError(
+            f"`controls` {control}: expected a vessel, open at the top and closed around and below (a mug, a "
+            f"bowl, a glass), got {scene.object.name!r}; choose another object or leave the control out"
+        )
+    return vessel
 
 
 @lru_cache(maxsize=8)
@@ -126,10 +122,8 @@ def _basin(mesh: Mesh) -> tuple[Doubles, float, float] | None:
 
 
 def _height_map(mesh: Mesh) -> tuple[Doubles, float, Doubles]:
-    """Highest surface over a grid with an empty margin: place of cell (0, 0), side of a cell, (h, w) heights.
-
-    Edges are drawn as well as faces, so that a thin upright wall is not missed between two cells.
-    """
+    """Highest surface over a grid with an empty margin: place of cell (0, 0), side of a cell, (h, w) heights. Edges are
+    drawn as well as faces, so that a thin upright wall is not missed between two cells."""
     vertices = mesh.vertices.astype(np.float64)
     low, high = vertices[:, :2].min(axis=0), vertices[:, :2].max(axis=0)
     cell = float((high - low).max()) / GRID
@@ -149,17 +143,13 @@ def _height_map(mesh: Mesh) -> tuple[Doubles, float, Doubles]:
 
 
 def _filled(ground: Doubles) -> Doubles:
-    """The level of water on a height map (h, w) from whose edges it runs off.
-
-    Every cell stands as high as its ground or its lowest neighbour's water, whichever is higher; repeated until
-    nothing changes.
-    """
+    """The level of water on a height map (h, w) from whose edges it runs off. Every cell stands as high as its ground
+    or its lowest neighbour's water, whichever is higher; repeated until nothing changes."""
     water = np.full_like(ground, np.inf)
     water[[0, -1]], water[:, [0, -1]] = ground[[0, -1]], ground[:, [0, -1]]
     while True:
-        lowest = np.minimum(
-            np.minimum(water[:-2, 1:-1], water[2:, 1:-1]), np.minimum(water[1:-1, :-2], water[1:-1, 2:])
-        )
+        beside = (water[:-2, 1:-1], water[2:, 1:-1], water[1:-1, :-2], water[1:-1, 2:])
+        lowest = np.minimum.reduce(beside)
         level = np.maximum(ground[1:-1, 1:-1], np.minimum(lowest, water[1:-1, 1:-1]))
         if np.array_equal(level, water[1:-1, 1:-1]):
             return water
@@ -167,11 +157,8 @@ def _filled(ground: Doubles) -> Doubles:
 
 
 def _wall(mesh: Mesh, axis: Doubles, height: float) -> tuple[Doubles, Ints]:
-    """Cast level rays from the axis at one height.
-
-    Returns:
-        (COLUMNS,) distance of the first surface in each direction, infinite where there is none, and its face or -1.
-    """
+    """Cast level rays from the axis at one height. Returns the (COLUMNS,) distance of the first surface in each
+    direction, infinite where there is none, and its face or -1."""
     face, begin, end = _section(mesh, height)
     begin, end = begin - axis, end - axis
     angle = np.arange(COLUMNS) * 2.0 * np.pi / COLUMNS
@@ -216,10 +203,6 @@ def _color(asset: ObjectAsset, faces: Ints) -> Doubles:
     return np.asarray(srgb_to_linear(asset.base_color[row, column]).mean(axis=0), dtype=np.float64)
 
 
-def _ingredient(name: str, default: float, text: str) -> Parameter:
-    return Parameter(name, (), "1", 0.0, 1.0, default, text, search=(0.0, 1.0), estimators=("adjoint", "differences"))
-
-
 class ContentsControl(NumberControl):
     """What a vessel is filled with, and how high.
 
@@ -235,9 +218,10 @@ class ContentsControl(NumberControl):
         moving(
             ORBIT, "level", "1", 0.0, 1.0, 0.0, "Height of the liquid: 0 is empty, 1 is full to the brim.", (0.0, 0.95)
         ),
-        _ingredient("water", 0.0, "Share of water."),
-        _ingredient("milk", 0.0, "Share of milk."),
-        _ingredient("coffee", 1.0, "Share of coffee."),
+        *(
+            number(LIT, name, "1", 0.0, 1.0, float(name == "coffee"), f"Share of {name}.", (0.0, 1.0))
+            for name in INGREDIENTS
+        ),
     )
 
     def __init__(self, name: str | None = None, **settings: object) -> None:
@@ -245,8 +229,11 @@ class ContentsControl(NumberControl):
         self.bounds = self._feasible()
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
-        vessel = self._vessel(scene)
-        mesh = _disc(_surface(vessel, torch.tensor(0.5)).numpy())
+        vessel = _vessel(self.name, scene)
+        angle = np.arange(COLUMNS) * 2.0 * np.pi / COLUMNS
+        uvs = np.concatenate([[(0.5, 0.5)], 0.5 + 0.45 * np.stack([np.cos(angle), np.sin(angle)], axis=1)])
+        vertices = _surface(vessel, torch.tensor(0.5)).numpy()
+        mesh = replace(polygon(COLUMNS), vertices=vertices, uvs=uvs.astype(np.float32))
         color = np.zeros((4, 4, 3), dtype=np.float32)
         return scene.with_part(MeshPart(self.name, mesh, color, SURFACE, to_world=object_to_world(scene)))
 
@@ -262,11 +249,11 @@ class ContentsControl(NumberControl):
         return {**values, **self.proportions(values)}
 
     def describe(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Value]:
-        said, values = super().describe(u, so_far), self.values(u.detach())
-        return said | {f"{self.name}.{name}": {"value": float(values[name]), "unit": "1"} for name in INGREDIENTS}
+        values = self.values(u.detach())
+        return super().describe(u, so_far) | {f"{self.name}.{name}": measure(values[name], "1") for name in INGREDIENTS}
 
     def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        vessel = self._vessel(self.scene)
+        vessel = _vessel(self.name, self.scene)
         base = _surface(vessel, torch.full_like(values["level"], 0.5))
         inputs = {f"{self.name}.offsets": _surface(vessel, values["level"]) - base}
         if "object.to_world" in so_far:
@@ -295,9 +282,12 @@ class ContentsControl(NumberControl):
                 bounds[name] = (spec.low, spec.high)
         least, most = sum(low for low, _ in bounds.values()), sum(high for _, high in bounds.values())
         if least > 1.0 + TOTAL or (len(bounds) == len(INGREDIENTS) and most < 1.0 - TOTAL):
-            said = ", ".join(f"{name} {_said(*bounds[name])}" for name in INGREDIENTS if name in bounds)
+            got = ", ".join(
+                f"{name} {low:g}" + (f" to {high:g}" if low < high else "")
+                for name, (low, high) in sorted(bounds.items(), key=lambda item: INGREDIENTS.index(item[0]))
+            )
             raise InputError(
-                f"`controls` {self.name}: expected proportions of water, milk and coffee that add up to 1, got {said}; "
+                f"`controls` {self.name}: expected proportions of water, milk and coffee that add up to 1, got {got}; "
                 "change one of them or leave one out"
             )
         searched = not self.asked or any(isinstance(self.specs.get(name), Range) for name in INGREDIENTS)
@@ -317,53 +307,33 @@ class ContentsControl(NumberControl):
 
     def proportions(self, cuts: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Cut the stick: coordinates in [0, 1] by ingredient to shares that add up to one; differentiable."""
-        bounds = self._bounds(cuts[INGREDIENTS[0]].device)
-        left, shares = torch.ones_like(bounds[0][0]), []
-        for number, name in enumerate(INGREDIENTS):
-            low, high = self._range(bounds, number, left)
-            shares.append(low + (high - low).clamp_min(0.0) * cuts[name])
-            left = left - shares[-1]
-        return dict(zip(INGREDIENTS, shares, strict=True))
+        return self._in_turn(
+            cuts[INGREDIENTS[0]].device, lambda name, low, high: low + (high - low).clamp_min(0.0) * cuts[name]
+        )
 
     def cuts(self, shares: Mapping[str, float]) -> dict[str, float]:
         """Return the coordinates whose shares are nearest to some, one ingredient after the other."""
-        bounds = self._bounds(torch.device("cpu"))
-        left, cuts = torch.ones_like(bounds[0][0]), {}
-        for number, name in enumerate(INGREDIENTS):
-            low, high = (float(one) for one in self._range(bounds, number, left))
-            share = min(max(shares[name], low), max(low, high))
-            cuts[name] = (share - low) / (high - low) if high > low else 0.0
-            left = left - share
+        cuts = {}
+
+        def nearest(name: str, low: Tensor, high: Tensor) -> Tensor:
+            least, most = float(low), float(high)
+            share = min(max(shares[name], least), max(least, most))
+            cuts[name] = (share - least) / (most - least) if most > least else 0.0
+            return low.new_tensor(share)
+
+        self._in_turn(torch.device("cpu"), nearest)
         return cuts
 
-    def _bounds(self, device: torch.device) -> list[tuple[Tensor, Tensor]]:
-        """The least and the most of every ingredient, each ()."""
+    def _in_turn(self, device: torch.device, share: Callable[[str, Tensor, Tensor], Tensor]) -> dict[str, Tensor]:
+        """Give each ingredient in turn a share () of what is left, between the least and the most that it may have, so
+        that those after it can make up one."""
         limits = torch.tensor([self.bounds[name] for name in INGREDIENTS]).to(device)
-        return [(low, high) for low, high in limits]
-
-    @staticmethod
-    def _range(bounds: list[tuple[Tensor, Tensor]], number: int, left: Tensor) -> tuple[Tensor, Tensor]:
-        """What one ingredient may have of what is left, so that those after it can make up one."""
-        low, high = bounds[number]
-        after = bounds[number + 1 :]
-        least = sum((one for one, _ in after), torch.zeros_like(left))
-        most = sum((one for _, one in after), torch.zeros_like(left))
-        return torch.maximum(low, left - most), torch.minimum(high, left - least)
-
-    # ---- the vessel -------------------------------------------------------------------------------------------------
-
-    def _vessel(self, scene: SceneDescription) -> Vessel:
-        vessel = interior(scene.object)
-        if vessel is None:
-            raise InputError(
-                f"`controls` {self.name}: expected a vessel, open at the top and closed around and below (a mug, a "
-                f"bowl, a glass), got {scene.object.name!r}; choose another object or leave the control out"
-            )
-        return vessel
-
-
-def _said(low: float, high: float) -> str:
-    return f"{low:g}" if low == high else f"{low:g} to {high:g}"
+        left, shares = torch.ones_like(limits[0, 0]), {}
+        for place, name in enumerate(INGREDIENTS):
+            (low, high), (least, most) = limits[place], limits[place + 1 :].sum(dim=0)
+            shares[name] = share(name, torch.maximum(low, left - most), torch.minimum(high, left - least))
+            left = left - shares[name]
+        return shares
 
 
 # ---- how it looks ---------------------------------------------------------------------------------------------------
@@ -385,11 +355,9 @@ def liquid(shares: Tensor, vessel: Tensor) -> Tensor:
 
 
 def _surface(vessel: Vessel, level: Tensor) -> Tensor:
-    """Vertices (1 + COLUMNS, 3) of the liquid's surface in mesh coordinates, the middle first.
-
-    The wall's distance is interpolated between the heights at which it is known, so the vertices are differentiable in
-    the level, with kinks at those heights.
-    """
+    """Vertices (1 + COLUMNS, 3) of the liquid's surface in mesh coordinates, the middle first. The wall's distance is
+    interpolated between the heights at which it is known, so the vertices are differentiable in the level, with kinks
+    at those heights."""
     heights, radii = torch.from_numpy(vessel.heights).to(level), torch.from_numpy(vessel.radii).to(level)
     place = level * (len(heights) - 1)
     row = int(place.detach().clamp(0, len(heights) - 2))
@@ -401,14 +369,3 @@ def _surface(vessel: Vessel, level: Tensor) -> Tensor:
     around = torch.stack([torch.cos(angle), torch.sin(angle)], dim=1) * (radius * there)[:, None]
     flat = torch.cat([around.new_zeros(1, 2), around]) + torch.from_numpy(vessel.axis).to(level)
     return torch.cat([flat, height.expand(len(flat), 1)], dim=1)
-
-
-def _disc(vertices: Floats) -> Mesh:
-    """The surface as a mesh: a fan around its middle, facing upwards."""
-    ring = np.arange(COLUMNS)
-    faces = np.stack([np.zeros_like(ring), 1 + ring, 1 + (ring + 1) % COLUMNS], axis=1)
-    angle = ring * 2.0 * np.pi / COLUMNS
-    around = 0.5 + 0.45 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    uvs = np.concatenate([[(0.5, 0.5)], around])
-    normals = np.tile(np.array([0.0, 0.0, 1.0], dtype=np.float32), (len(vertices), 1))
-    return Mesh(vertices.astype(np.float32), faces.astype(np.uint32), normals, uvs.astype(np.float32))

@@ -19,22 +19,17 @@ from PIL import Image
 from torch import Tensor
 
 from advsearch.controls import corruption_filters as filters
-from advsearch.controls.base import Choice, Parameter, Value
+from advsearch.controls.base import Choice, Parameter, Value, measure, number
 from advsearch.controls.numbers import NumberControl, Values
 from advsearch.scene.formation import levels_of
 
-BRIGHTNESS = ((0.1,), (0.2,), (0.3,), (0.4,), (0.5,))
-"""Added to the value of hue, saturation and value."""
-CONTRAST = ((0.4,), (0.3,), (0.2,), (0.1,), (0.05,))
-"""Factor on the distance from the mean."""
+BRIGHTNESS = ((0.1,), (0.2,), (0.3,), (0.4,), (0.5,))  # added to the value of hue, saturation and value
+CONTRAST = ((0.4,), (0.3,), (0.2,), (0.1,), (0.05,))  # factor on the distance from the mean
 SATURATE = ((0.3, 0.0), (0.1, 0.0), (2.0, 0.0), (5.0, 0.1), (20.0, 0.2))
 """Factor on the saturation, and what is added to it."""
-PIXELATE = (0.6, 0.5, 0.4, 0.3, 0.25)
-"""Pixels left along a side, as a share."""
-JPEG = (25, 18, 15, 10, 7)
-"""Quality."""
-_GREY = 1.0 / 512.0
-"""Values and saturations this small have no hue to speak of; keeps quotients finite."""
+PIXELATE = (0.6, 0.5, 0.4, 0.3, 0.25)  # pixels left along a side, as a share
+JPEG = (25, 18, 15, 10, 7)  # quality
+_GREY = 1.0 / 512.0  # values and saturations this small have no hue to speak of; keeps quotients finite
 
 
 def brightness(image: Tensor, level: Tensor, seed: int) -> Tensor:
@@ -68,9 +63,8 @@ def pixelate(image: Tensor, whole: int) -> Tensor:
     height, width = image.shape[:2]
     share = PIXELATE[whole - 1] / max(1.0, min(height, width) / filters.REFERENCE)
     cells = (max(1, int(height * share)), max(1, int(width * share)))
-    return filters.picture(
-        F.interpolate(F.interpolate(filters.planes(image), cells, mode="area"), (height, width), mode="nearest-exact")
-    )
+    averaged = F.interpolate(filters.planes(image), cells, mode="area")
+    return filters.picture(F.interpolate(averaged, (height, width), mode="nearest-exact"))
 
 
 def jpeg(image: Tensor, whole: int) -> Tensor:
@@ -97,25 +91,13 @@ def coded(image: Tensor, quality: int) -> Tensor:
 
 
 SMOOTH: Mapping[str, Callable[[Tensor, Tensor, int], Tensor]] = {
-    one.__name__: one
-    for one in (
-        filters.gaussian_noise,
-        filters.shot_noise,
-        filters.impulse_noise,
-        filters.speckle_noise,
-        filters.defocus_blur,
-        filters.glass_blur,
-        filters.motion_blur,
-        filters.zoom_blur,
-        filters.gaussian_blur,
-        filters.snow,
-        filters.frost,
-        filters.fog,
-        brightness,
-        contrast,
-        saturate,
+    corruption.__name__: corruption
+    for corruption in (
+        filters.gaussian_noise, filters.shot_noise, filters.impulse_noise, filters.speckle_noise,
+        filters.defocus_blur, filters.glass_blur, filters.motion_blur, filters.zoom_blur, filters.gaussian_blur,
+        filters.snow, filters.frost, filters.fog, brightness, contrast, saturate,
     )
-}
+}  # fmt: skip
 """Corruptions of every severity in [1, 5], mixed in below: of the picture, the severity and the seed."""
 FROM_NOTHING: Mapping[str, Callable[[Tensor, Tensor, int], Tensor]] = {"elastic": filters.elastic}
 """Corruptions of every severity in [0, 5]: a mix of a warped and an unwarped picture would show the object twice."""
@@ -135,10 +117,9 @@ class CorruptionControl(NumberControl):
             "which", (), "name", 0, len(NAMES) - 1, NAMES[0], "Which corruption.", search=(0, len(NAMES) - 1),
             options=NAMES, estimators=(),
         ),
-        Parameter(
-            "severity", (), "1", 0.0, float(filters.LEVELS), 0.0,
-            "How strong it is: 0 is none, 1 to 5 are the published severities.", search=(0.0, float(filters.LEVELS)),
-            estimators=("image",),
+        number(
+            ("image",), "severity", "1", 0.0, float(filters.LEVELS), 0.0,
+            "How strong it is: 0 is none, 1 to 5 are the published severities.", (0.0, float(filters.LEVELS)),
         ),
     )  # fmt: skip
     choices = (
@@ -162,7 +143,7 @@ class CorruptionControl(NumberControl):
     def measured(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Value]:
         severity = values["severity"]
         applied = nearest(severity) if NAMES[int(values["which"])] in STEPPED else float(severity)
-        return {"applied": {"value": float(applied), "unit": "1"}}
+        return {"applied": measure(applied, "1")}
 
 
 def corrupted(image: Tensor, which: str, severity: Tensor, seed: int = 0) -> Tensor:
@@ -178,7 +159,13 @@ def corrupted(image: Tensor, which: str, severity: Tensor, seed: int = 0) -> Ten
         (H, W, 3) sRGB in [0, 1]; differentiable in the picture and the severity, as `docs/controls/corruption.md` says.
     """
     if which in STEPPED:
-        return _stepped(image, STEPPED[which], severity).clamp(0.0, 1.0)
+        at, whole = STEPPED[which], nearest(severity)
+        out = at(image, whole) if whole else image
+        if severity.requires_grad:  # by the straight lines between the steps: a staircase has no slope
+            below = min(int(severity.detach()), filters.LEVELS - 1)
+            low, high = at(image, below).detach() if below else image.detach(), at(image, below + 1).detach()
+            out = out + (severity - severity.detach()) * (high - low)
+        return out.clamp(0.0, 1.0)
     if which in FROM_NOTHING:
         return FROM_NOTHING[which](image, severity, seed).clamp(0.0, 1.0)
     if float(severity.detach()) >= 1.0:
@@ -190,18 +177,3 @@ def corrupted(image: Tensor, which: str, severity: Tensor, seed: int = 0) -> Ten
 def nearest(severity: Tensor) -> int:
     """Return the whole severity nearest to one, halves upwards."""
     return int(float(severity.detach()) + 0.5)
-
-
-def _stepped(image: Tensor, at: Callable[[Tensor, int], Tensor], severity: Tensor) -> Tensor:
-    """Corrupt by the nearest whole severity.
-
-    A staircase has no slope. The derivative by the severity is that of the straight lines between the steps, which is
-    the staircase's own when averaged over half a severity to either side.
-    """
-    whole = nearest(severity)
-    out = at(image, whole) if whole else image
-    if not severity.requires_grad:
-        return out
-    below = min(int(severity.detach()), filters.LEVELS - 1)
-    low, high = at(image, below).detach() if below else image.detach(), at(image, below + 1).detach()
-    return out + (severity - severity.detach()) * (high - low)

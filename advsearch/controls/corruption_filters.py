@@ -21,10 +21,8 @@ from torch import Tensor
 
 from advsearch import seeds
 
-REFERENCE = 224
-"""Smaller side in pixels of the pictures that the published tables were made for."""
-LEVELS = 5
-"""Severities run from 1 to this."""
+REFERENCE = 224  # smaller side in pixels of the pictures that the published tables were made for
+LEVELS = 5  # severities run from 1 to this
 
 
 def scale(image: Tensor) -> float:
@@ -112,46 +110,43 @@ def warped(image: Tensor, shift: Tensor) -> Tensor:
     return picture(F.grid_sample(planes(image), grid[None], padding_mode="reflection", align_corners=False))
 
 
-def resized(field: Tensor, height: int, width: int) -> Tensor:
-    """Resize an (h, w, C) field to (height, width, C), smoothly."""
+def resized(field: Tensor, height: int, width: int, *, antialias: bool = True) -> Tensor:
+    """Resize an (h, w, C) field to (height, width, C), bilinearly; differentiable."""
     if field.shape[:2] == (height, width):
         return field
-    stack = F.interpolate(planes(field), (height, width), mode="bilinear", antialias=True, align_corners=False)
+    size = (height, width)
+    stack = F.interpolate(planes(field), size, mode="bilinear", antialias=antialias, align_corners=False)
     return picture(stack).contiguous()
 
 
-GAUSSIAN = ((0.08,), (0.12,), (0.18,), (0.26,), (0.38,))
-"""Standard deviation, sRGB."""
-SHOT = ((60.0,), (25.0,), (12.0,), (5.0,), (3.0,))
-"""Photons in a white pixel."""
-IMPULSE = ((0.03,), (0.06,), (0.09,), (0.17,), (0.27,))
-"""Share of the values that are lost."""
-SPECKLE = ((0.15,), (0.2,), (0.35,), (0.45,), (0.6,))
-"""Standard deviation relative to the value."""
-_DARK = 1e-3
-"""Keeps the slope of a square root finite in black."""
+GAUSSIAN = ((0.08,), (0.12,), (0.18,), (0.26,), (0.38,))  # standard deviation, sRGB
+SHOT = ((60.0,), (25.0,), (12.0,), (5.0,), (3.0,))  # photons in a white pixel
+IMPULSE = ((0.03,), (0.06,), (0.09,), (0.17,), (0.27,))  # share of the values that are lost
+SPECKLE = ((0.15,), (0.2,), (0.35,), (0.45,), (0.6,))  # standard deviation relative to the value
+_DARK = 1e-3  # keeps the slope of a square root finite in black
 
 
 @lru_cache(maxsize=8)
-def _normal(height: int, width: int, seed: int, name: str) -> Tensor:
-    return torch.randn(height, width, 3, generator=generator(seed, name))
+def drawn(height: int, width: int, seed: int, stream: str, *, normal: bool = True) -> Tensor:
+    """Return the noise (height, width, 3) of a stream of random numbers: standard normal, or uniform in [0, 1)."""
+    source = torch.Generator().manual_seed(seeds.stream(seed, stream))
+    return (torch.randn if normal else torch.rand)(height, width, 3, generator=source)
 
 
-@lru_cache(maxsize=8)
-def _uniform(height: int, width: int, seed: int, name: str) -> Tensor:
-    return torch.rand(height, width, 3, generator=generator(seed, name))
+def _noise(image: Tensor, seed: int, name: str, *, normal: bool = True) -> Tensor:
+    return drawn(image.shape[0], image.shape[1], seed, f"corruption {name}", normal=normal).to(image.device)
 
 
 def gaussian_noise(image: Tensor, level: Tensor, seed: int) -> Tensor:
     """Add normal noise, as of a sensor in the dark."""
     (sigma,) = at_level(GAUSSIAN, level)
-    return image + sigma * _normal(image.shape[0], image.shape[1], seed, "gaussian noise").to(image.device)
+    return image + sigma * _noise(image, seed, "gaussian noise")
 
 
 def speckle_noise(image: Tensor, level: Tensor, seed: int) -> Tensor:
     """Add normal noise in proportion to the value."""
     (sigma,) = at_level(SPECKLE, level)
-    return image + image * sigma * _normal(image.shape[0], image.shape[1], seed, "speckle noise").to(image.device)
+    return image + image * sigma * _noise(image, seed, "speckle noise")
 
 
 def shot_noise(image: Tensor, level: Tensor, seed: int) -> Tensor:
@@ -161,7 +156,7 @@ def shot_noise(image: Tensor, level: Tensor, seed: int) -> Tensor:
     of standard deviations from the mean, when the mean or the spread changes a little.
     """
     (photons,) = at_level(SHOT, level)
-    share = _uniform(image.shape[0], image.shape[1], seed, "shot noise").to(image.device)
+    share = _noise(image, seed, "shot noise", normal=False)
     with torch.no_grad():
         counted = poisson(image * photons, share) / photons
         away = (counted - image) / torch.sqrt(image / photons + _DARK)
@@ -190,25 +185,20 @@ def impulse_noise(image: Tensor, level: Tensor, seed: int) -> Tensor:
     over all draws of which ones are lost.
     """
     (lost,) = at_level(IMPULSE, level)
-    height, width = image.shape[:2]
-    turn = _uniform(height, width, seed, "impulse noise").to(image.device)
-    extreme = (_uniform(height, width, seed, "impulse value") < 0.5).float().to(image.device)
+    turn = _noise(image, seed, "impulse noise", normal=False)
+    extreme = (_noise(image, seed, "impulse value", normal=False) < 0.5).float()
     kept = torch.where(turn < lost.detach(), extreme, image)
     return kept + (lost - lost.detach()) * (extreme - image.detach())
 
 
-GAUSSIAN_BLUR = ((1.0,), (2.0,), (3.0,), (4.0,), (6.0,))
-"""Standard deviation, reference pixels."""
-DEFOCUS = ((3.0,), (4.0,), (6.0,), (8.0,), (10.0,))
-"""Radius of the disc, reference pixels."""
+GAUSSIAN_BLUR = ((1.0,), (2.0,), (3.0,), (4.0,), (6.0,))  # standard deviation, reference pixels
+DEFOCUS = ((3.0,), (4.0,), (6.0,), (8.0,), (10.0,))  # radius of the disc, reference pixels
 GLASS = ((0.7, 1, 2), (0.9, 2, 1), (1.0, 2, 3), (1.1, 3, 2), (1.5, 4, 2))
 """Standard deviation and farthest neighbour, reference pixels; number of passes."""
 MOTION = ((10.0, 3.0), (15.0, 5.0), (15.0, 8.0), (15.0, 12.0), (20.0, 15.0))
 """Radius and standard deviation, reference pixels."""
-ZOOM = ((1.11,), (1.15,), (1.2,), (1.24,), (1.3,))
-"""Largest magnification."""
-ZOOM_STEPS = 16
-"""Magnified pictures that are averaged; the published ones take 11 to 16."""
+ZOOM = ((1.11,), (1.15,), (1.2,), (1.24,), (1.3,))  # largest magnification
+ZOOM_STEPS = 16  # magnified pictures that are averaged; the published ones take 11 to 16
 ELASTIC = ((488.0, 170.8, 24.4), (488.0, 19.52, 48.8), (12.2, 2.44, 4.88), (17.08, 2.44, 4.88), (29.28, 2.44, 4.88))
 """Height of the wrinkles, their width, and how far a corner of the middle third moves; reference pixels."""
 
@@ -227,15 +217,10 @@ def defocus_blur(image: Tensor, level: Tensor, seed: int) -> Tensor:
     offsets = torch.arange(-reach, reach + 1, dtype=torch.float32, device=image.device)
     distance = torch.sqrt(offsets[:, None] ** 2 + offsets[None, :] ** 2)
     disc = (radius + 0.5 - distance).clamp(0.0, 1.0)
-    return _convolved(image, disc / disc.sum())
-
-
-def _convolved(image: Tensor, kernel: Tensor) -> Tensor:
-    """Convolve an (H, W, 3) picture with a symmetric (2 r + 1, 2 r + 1) kernel; edges are continued."""
-    height, width, reach = image.shape[0], image.shape[1], kernel.shape[0] // 2
+    height, width = image.shape[:2]
     padded = F.pad(planes(image), (reach,) * 4, mode="replicate")
     size = (padded.shape[2] + 2 * reach, padded.shape[3] + 2 * reach)
-    product = torch.fft.rfft2(padded, s=size) * torch.fft.rfft2(kernel, s=size)
+    product = torch.fft.rfft2(padded, s=size) * torch.fft.rfft2(disc / disc.sum(), s=size)
     whole = torch.fft.irfft2(product, s=size)
     return picture(whole[:, :, 2 * reach : 2 * reach + height, 2 * reach : 2 * reach + width])
 
@@ -269,11 +254,9 @@ def glass_blur(image: Tensor, level: Tensor, seed: int) -> Tensor:
 
 @lru_cache(maxsize=8)
 def _glass_shift(height: int, width: int, seed: int, whole: int) -> Tensor:
-    """(H, W, 2) how far each pixel looks at a whole severity, in reference pixels.
-
-    One pixel after another, from the bottom right, takes over what a random neighbour shows by then; so what is shown
-    may come from further away than one step.
-    """
+    """(H, W, 2) how far each pixel looks at a whole severity, in reference pixels. One pixel after another, from the
+    bottom right, takes over what a random neighbour shows by then; so what is shown may come from further away than one
+    step."""
     tall, wide = reference_size(height, width)
     _, reach, passes = (int(value) for value in GLASS[whole - 1])
     source = generator(seed, "glass blur")
@@ -319,16 +302,11 @@ def _elastic_shift(height: int, width: int, seed: int, whole: int) -> Tensor:
     return resized(shift, height, width)
 
 
-FOG = ((1.5,), (2.0,), (2.5,), (2.5,), (3.0,))
-"""How dense the fog is."""
-FOG_DECAY = (2.0, 2.0, 1.7, 1.5, 1.4)
-"""How fast its details lose height: less is rougher."""
-FROST = ((1.0, 0.4), (0.8, 0.6), (0.7, 0.7), (0.65, 0.7), (0.6, 0.75))
-"""Weight of the picture and of the frost."""
-FEATHER_AREA = 260
-"""Square half-pixels of the reference picture for each feather of ice."""
-ICE = (0.86, 0.95, 1.0)
-"""Colour of the ice, sRGB."""
+FOG = ((1.5,), (2.0,), (2.5,), (2.5,), (3.0,))  # how dense the fog is
+FOG_DECAY = (2.0, 2.0, 1.7, 1.5, 1.4)  # how fast its details lose height: less is rougher
+FROST = ((1.0, 0.4), (0.8, 0.6), (0.7, 0.7), (0.65, 0.7), (0.6, 0.75))  # weight of the picture and of the frost
+FEATHER_AREA = 260  # square half-pixels of the reference picture for each feather of ice
+ICE = (0.86, 0.95, 1.0)  # colour of the ice, sRGB
 SNOW = (
     (0.1, 0.3, 3.0, 0.5, 10.0, 4.0),
     (0.2, 0.3, 2.0, 0.5, 12.0, 4.0),
@@ -337,10 +315,8 @@ SNOW = (
     (0.55, 0.3, 2.5, 0.85, 12.0, 12.0),
 )
 """Mean and spread of the noise, size of a flake, noise over which there is one, radius and spread of its streak."""
-SNOW_KEEP = ((0.8,), (0.7,), (0.7,), (0.65,), (0.55,))
-"""Weight of the picture; the rest is a paler one."""
-LUMA = (0.299, 0.587, 0.114)
-"""Weights of red, green and blue in a grey."""
+SNOW_KEEP = ((0.8,), (0.7,), (0.7,), (0.65,), (0.55,))  # weight of the picture; the rest is a paler one
+LUMA = (0.299, 0.587, 0.114)  # weights of red, green and blue in a grey
 
 
 def fog(image: Tensor, level: Tensor, seed: int) -> Tensor:

@@ -19,7 +19,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from advsearch.controls.base import WHOLE_RANGE, Budget, Choice, Parameter
+from advsearch.controls.base import WHOLE_RANGE, Budget, Choice, Parameter, number
 from advsearch.controls.numbers import NumberControl, Values
 from advsearch.controls.values import Fixed, Number
 from advsearch.errors import InputError
@@ -31,10 +31,7 @@ from advsearch.scene.exposure import metered_gain
 from advsearch.scene.geometry import real_harmonics
 from advsearch.scene.settings import CHANNELS, LIT
 
-COEFFICIENTS = 27
-"""Degrees 0 to 2 of three colour channels."""
-
-
+COEFFICIENTS = 27  # degrees 0 to 2 of three colour channels
 MAPS = tuple(sorted({*library.list_environments()} - {*library.list_environments("place")}))
 """The bundled environments that are a map; the others are a place around the object."""
 
@@ -51,10 +48,7 @@ class EnvironmentControl(NumberControl):
             options=(OWN_MAP, *MAPS), estimators=(),
         ),
         *settings.ENVIRONMENT,
-        *(
-            Parameter(f"tint_{color}", (), "1", 0.0, 10.0, 1.0, f"Factor on the map's {color}.", estimators=LIT)
-            for color in CHANNELS
-        ),
+        *(number(LIT, f"tint_{color}", "1", 0.0, 10.0, 1.0, f"Factor on the map's {color}.") for color in CHANNELS),
         Parameter(
             "harmonics", (COEFFICIENTS,), "mean radiances", -1.0, 1.0, 0.0,
             "Low-order light that is added: spherical-harmonic coefficients, 9 for each channel, inside the ball.",
@@ -90,10 +84,9 @@ class EnvironmentControl(NumberControl):
         """An environment that is fixed is the scene's; so is the first of several where these are files, and the
         scene's own is none of them."""
         spec, allowed = self.specs.get("which"), self.allowed("which", OWN_MAP)
-        files = [str(one) for one in allowed if _is_file(one)]
-        maps = {name: _loaded(name) for name in files}
-        notes = [note for one in maps.values() for note in one.warnings]
-        if OWN_MAP in allowed or self._own_name(scene) is not None or not (isinstance(spec, Fixed) or files):
+        maps = {str(name): _loaded(str(name)) for name in allowed if _is_file(name)}
+        notes = [note for asset in maps.values() for note in asset.warnings]
+        if OWN_MAP in allowed or self._own_name(scene) is not None or not (isinstance(spec, Fixed) or maps):
             lit = scene.environment_for(f"`controls` {self.name}")
             if maps and scene.photograph is None and not lit.photographed and scene.number("ground.size") > 0.0:
                 names = ", ".join(Path(name).name for name in maps)

@@ -19,7 +19,6 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from scipy import linalg, sparse
 from scipy.sparse import linalg as sparse_linalg
@@ -27,38 +26,26 @@ from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 from torch import Tensor
 
-from advsearch.controls.base import NOTHING, Choice, Control, Group, Parameter, Value
+from advsearch.controls.base import NOTHING, Choice, Control, Group, Parameter, Value, measure
 from advsearch.scene.assembly import MovingMesh
-from advsearch.scene.assets import Mesh
+from advsearch.scene.assets import Doubles, Ints, Mesh
 from advsearch.scene.raster import welded
-
-Doubles = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
 
 CELL = 0.035
 """Side of the cubes that the surface is thinned to one point in, in extents of the mesh; larger if that is too many."""
-LANDMARKS = 900
-"""Largest number of such points."""
+LANDMARKS = 900  # largest number of such points
 SAMPLES = 20000
 """Points spread over the surface before they are thinned, so that large triangles count as what they cover."""
-BANDWIDTH = 1.8
-"""Standard deviation of the kernel, in cells."""
-FACE_STRAIN = 0.7
-"""Largest displacement gradient along a face; below 1 no face can turn over."""
-WALL_STRAIN = 0.5
-"""Largest change of the distance between two walls, as a share of it."""
-WALL_REACH = 0.3
-"""Walls further apart than this, in extents, are not held together."""
-OPPOSITE = -0.3
-"""Largest cosine between the normals of the two sides of a wall."""
+BANDWIDTH = 1.8  # standard deviation of the kernel, in cells
+FACE_STRAIN = 0.7  # largest displacement gradient along a face; below 1 no face can turn over
+WALL_STRAIN = 0.5  # largest change of the distance between two walls, as a share of it
+WALL_REACH = 0.3  # walls further apart than this, in extents, are not held together
+OPPOSITE = -0.3  # largest cosine between the normals of the two sides of a wall
 THIN_FACE = 2e-3
 """Faces whose height is less than this share of their longest edge are slivers: their strain is not looked at."""
-SHARPNESS = 32
-"""Exponent p of the norm that stands in for a maximum."""
-SMOOTHING_LENGTH = 0.1
-"""Distance over which a push on one vertex spreads, in extents (form large-steps)."""
-WALL_WEIGHT = 4.0
-"""Weight of a link through a wall, in edges of the mesh."""
+SHARPNESS = 32  # exponent p of the norm that stands in for a maximum
+SMOOTHING_LENGTH = 0.1  # distance over which a push on one vertex spreads, in extents (form large-steps)
+WALL_WEIGHT = 4.0  # weight of a link through a wall, in edges of the mesh
 
 
 class Body:
@@ -91,17 +78,14 @@ class Body:
         self.walls = self._walls()
 
     def _walls(self) -> Ints:
-        """The nearest place with an opposite normal for each place, where there is one.
-
-        Nearest in `|x - y|^2 + b^2 |n + m|^2`: a search in six dimensions.
-        """
+        """The nearest place with an opposite normal for each place, where there is one: nearest in
+        `|x - y|^2 + b^2 |n + m|^2`, a search in six dimensions."""
         turn = 0.1 * self.extent * self.normals
-        tree = cKDTree(np.hstack([self.places, turn]))
-        partner = tree.query(np.hstack([self.places, -turn]))[1]
+        partner = cKDTree(np.hstack([self.places, turn])).query(np.hstack([self.places, -turn]))[1]
         distance = np.linalg.norm(self.places - self.places[partner], axis=1)
         opposite = (self.normals * self.normals[partner]).sum(axis=1) < OPPOSITE
-        found = np.flatnonzero(opposite & (distance > 1e-5 * self.extent) & (distance < WALL_REACH * self.extent))
-        return np.stack([found, partner[found]], axis=1)
+        place = np.flatnonzero(opposite & (distance > 1e-5 * self.extent) & (distance < WALL_REACH * self.extent))
+        return np.stack([place, partner[place]], axis=1)
 
 
 # ---- modes over space ------------------------------------------------------------------------------------------------
@@ -140,10 +124,8 @@ def shape_modes(mesh: Mesh, count: int) -> Doubles:
 
 def _largest(symmetric: Doubles, count: int) -> tuple[Doubles, Doubles]:
     """The largest eigenvalues of a symmetric matrix, falling, and their vectors with the largest entry positive.
-
     Entries too small to matter are dropped and the rest goes through Lanczos: dense solvers wait for all threads, which
-    takes ten times as long on a machine with other work.
-    """
+    takes ten times as long on a machine with other work."""
     sparse_matrix = sparse.csr_matrix(np.where(symmetric > 1e-7 * symmetric.max(), symmetric, 0.0))
     begin = np.cos(np.arange(len(symmetric)))
     values, vectors = sparse_linalg.eigsh(
@@ -286,9 +268,8 @@ class Limits:
         # index_select, for its derivative is ten times faster than that of an index
         corners = [field.index_select(0, corner) for corner in faces_of.T]
         first, second = corners[1] - corners[0], corners[2] - corners[0]
-        one = first * across[:, :1]
-        other = (second - first * across[:, 1:2]) * across[:, 2:]
-        faces = (one.square() + other.square()).sum(dim=1) * (self.epsilon / FACE_STRAIN) ** 2
+        along, beside = first * across[:, :1], (second - first * across[:, 1:2]) * across[:, 2:]
+        faces = (along.square() + beside.square()).sum(dim=1) * (self.epsilon / FACE_STRAIN) ** 2
         apart = field.index_select(0, walls_of[:, 0]) - field.index_select(0, walls_of[:, 1])
         walls = apart.square().sum(dim=1) * (self.epsilon / WALL_STRAIN / gaps).square()
         return torch.cat([field.square().sum(dim=1), faces, walls])
@@ -374,9 +355,9 @@ class GeometryControl(Control):
         offsets = self.offsets(u.detach())
         lengths = offsets.norm(dim=1)
         return {
-            f"{self.name}.largest": {"value": float(lengths.max()), "unit": "object sizes"},
-            f"{self.name}.rms": {"value": float(lengths.square().mean().sqrt()), "unit": "object sizes"},
-            f"{self.name}.thinnest": {"value": self._limits.thinnest(offsets), "unit": "1"},
+            f"{self.name}.largest": measure(lengths.max(), "object sizes"),
+            f"{self.name}.rms": measure(lengths.square().mean().sqrt(), "object sizes"),
+            f"{self.name}.thinnest": measure(self._limits.thinnest(offsets), "1"),
         }
 
     def files(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, bytes]:
@@ -386,7 +367,6 @@ class GeometryControl(Control):
         lines += [f"v {x:.7g} {y:.7g} {z:.7g}" for x, y, z in vertices.tolist()]
         lines += [f"vt {u:.7g} {v:.7g}" for u, v in self._mesh.uvs.tolist()]
         lines += [f"vn {x:.5f} {y:.5f} {z:.5f}" for x, y, z in normals.tolist()]
-        lines += [
-            f"f {a}/{a}/{a} {b}/{b}/{b} {c}/{c}/{c}" for a, b, c in (self._mesh.faces.astype(np.int64) + 1).tolist()
-        ]
+        faces = (self._mesh.faces.astype(np.int64) + 1).tolist()
+        lines += [f"f {a}/{a}/{a} {b}/{b}/{b} {c}/{c}/{c}" for a, b, c in faces]
         return {f"{self.name}.obj": ("\n".join(lines) + "\n").encode("ascii")}

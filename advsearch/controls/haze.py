@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from advsearch.controls.base import Parameter
+from advsearch.controls.base import Parameter, number
 from advsearch.controls.numbers import NumberControl, Values
 from advsearch.controls.ranges import Range
 from advsearch.controls.values import Number
@@ -24,12 +24,9 @@ from advsearch.scene.geometry import camera_to_world
 from advsearch.scene.parts import HazePart
 from advsearch.scene.settings import CHANNELS, LIT, colors
 
-LEAST_RADIUS = 4.0
-"""The haze reaches at least this far from the scene's middle, object sizes."""
-BEHIND_CAMERA = 1.5
-"""It reaches at least so many times as far as the camera is away."""
-THIN_HAZE = 0.1
-"""Density where it is not searched and was not given."""
+LEAST_RADIUS = 4.0  # the haze reaches at least this far from the scene's middle, object sizes
+BEHIND_CAMERA = 1.5  # it reaches at least so many times as far as the camera is away
+THIN_HAZE = 0.1  # density where it is not searched and was not given
 
 
 class HazeControl(NumberControl):
@@ -39,24 +36,23 @@ class HazeControl(NumberControl):
     amount = "density"
     summary = "A uniform haze around camera and object: how dense it is, and its colour."
     parameters = (
-        Parameter(
-            "density", (), "per object size", 0.0, 2.0, 0.0,
-            "Extinction: over 1 / density the haze takes 63 % of the light out of a ray.", search=(0.0, 0.3),
-            estimators=LIT,
+        number(
+            LIT, "density", "per object size", 0.0, 2.0, 0.0,
+            "Extinction: over 1 / density the haze takes 63 % of the light out of a ray.", (0.0, 0.3),
         ),
         *colors("of the haze: what it scatters and does not absorb.", (0.6, 1.0), low=0.02),
     )  # fmt: skip
 
     def default(self, parameter: Parameter) -> Number:
-        if (own := _haze_of(self.scene)) is not None and own.density:
-            return own.density if parameter.name == "density" else _display(own)[CHANNELS.index(parameter.name)]
+        if (own := _haze_of(self.scene)) is not None:
+            color = dict(zip(CHANNELS, linear_to_srgb(np.asarray(own.albedo, np.float32)).tolist(), strict=True))
+            return own.density if parameter.name == "density" else color[parameter.name]
         if parameter.name == "density" and self.asked and not self.searches("density"):
             return THIN_HAZE
         return parameter.default
 
     def unchanged(self, parameter: Parameter) -> Number:
-        own = _haze_of(self.scene)
-        return parameter.default if own is None or not own.density else self.default(parameter)
+        return parameter.default if _haze_of(self.scene) is None else self.default(parameter)
 
     def estimators(self, parameter: Parameter) -> tuple[str, ...]:
         if parameter.name != "density":
@@ -65,9 +61,9 @@ class HazeControl(NumberControl):
         return parameter.estimators if isinstance(spec, Range) and spec.low > 0.0 else ("differences",)
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
-        if (own := _haze_of(scene)) is not None and own.density:  # of a scene that comes with haze
+        if (own := _haze_of(scene)) is not None:
             named = replace(own, name=self.name)
-            return replace(scene, parts=tuple(named if one is own else one for one in scene.parts))
+            return replace(scene, parts=tuple(named if part is own else part for part in scene.parts))
         away = float(np.linalg.norm(camera_to_world(scene)[:3, 3]))
         return scene.with_part(HazePart(self.name, max(LEAST_RADIUS, BEHIND_CAMERA * away)))
 
@@ -77,9 +73,5 @@ class HazeControl(NumberControl):
 
 
 def _haze_of(scene: SceneDescription) -> HazePart | None:
-    return next((one for one in scene.parts if isinstance(one, HazePart)), None)
-
-
-def _display(haze: HazePart) -> list[float]:
-    """The colour of a haze, display-referred."""
-    return [float(value) for value in linear_to_srgb(np.asarray(haze.albedo, np.float32))]
+    """The haze that a scene comes with."""
+    return next((part for part in scene.parts if isinstance(part, HazePart) and part.density), None)

@@ -14,32 +14,24 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from advsearch.controls.base import Choice, Parameter
+from advsearch.controls.base import Choice, Parameter, number
 from advsearch.controls.numbers import NumberControl, Values
 from advsearch.controls.values import OneOf
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
+from advsearch.scene.settings import CHANNELS
 
-DOTS = 4
-"""How many dots there are when nothing is said."""
+DOTS = 4  # how many dots there are when nothing is said
 MOST_DOTS = 64
 PLACES = ("x", "y")
-STICKER_SIDE = 256
-"""Side in pixels of the picture of the sticker that is kept with a run."""
-_FAR = 40.0
-"""Past this exponent a dot counts as invisible: exp(-40) is 4e-18, and no power overflows."""
+STICKER_SIDE = 256  # side in pixels of the picture of the sticker that is kept with a run
+_FAR = 40.0  # past this exponent a dot counts as invisible: exp(-40) is 4e-18, and no power overflows
 
 
-def _per_dot(name: str, unit: str, default: float, description: str, **more: object) -> Parameter:
-    """A parameter in [0, 1] with one number a dot, searched over its whole range unless `more` says otherwise."""
-    return Parameter(
-        name,
-        (None,),
-        unit,
-        **{"low": 0.0, "high": 1.0, "search": (0.0, 1.0), **more},  # type: ignore[arg-type]
-        default=default,
-        description=description,
-        estimators=("image",),
-    )
+def _per_dot(
+    name: str, unit: str, default: float, text: str, search: tuple[float, float] = (0.0, 1.0), low: float = 0.0,
+    *, log: bool = False,
+) -> Parameter:  # fmt: skip
+    return Parameter(name, (None,), unit, low, 1.0, default, text, search=search, log=log, estimators=("image",))
 
 
 class LensControl(NumberControl):
@@ -53,16 +45,13 @@ class LensControl(NumberControl):
         _per_dot("y", "picture heights", 0.5, "Centre of each dot, from the top edge."),
         _per_dot(
             "radius", "picture sizes", 0.12,
-            "Distance at which a dot has lost 63 % of its opacity, as a share of the picture's smaller side.", low=0.01,
-            search=(0.03, 0.25), log=True,
+            "Distance at which a dot has lost 63 % of its opacity, as a share of the picture's smaller side.",
+            (0.03, 0.25), 0.01, log=True,
         ),
-        _per_dot("red", "sRGB", 0.5, "Red of each dot."),
-        _per_dot("green", "sRGB", 0.5, "Green of each dot."),
-        _per_dot("blue", "sRGB", 0.5, "Blue of each dot."),
-        _per_dot("opacity", "1", 0.0, "Opacity in the middle of each dot; 0 is no dot.", search=(0.0, 0.5)),
-        Parameter(
-            "falloff", (), "1", 1.0, 8.0, 1.0, "How sharp the edges are: 1 is a Gaussian blob, 8 nearly a disc.",
-            estimators=("image",),
+        *(_per_dot(color, "sRGB", 0.5, f"{color.capitalize()} of each dot.") for color in CHANNELS),
+        _per_dot("opacity", "1", 0.0, "Opacity in the middle of each dot; 0 is no dot.", (0.0, 0.5)),
+        number(
+            ("image",), "falloff", "1", 1.0, 8.0, 1.0, "How sharp the edges are: 1 is a Gaussian blob, 8 nearly a disc."
         ),
     )  # fmt: skip
     choices = (Choice("dots", DOTS, f"How many dots there are, 1 to {MOST_DOTS}.", whole=(1, MOST_DOTS)),)
@@ -125,11 +114,9 @@ def with_dots(image: Tensor, values: Mapping[str, Tensor]) -> Tensor:
     Returns:
         (H, W, 3) sRGB in [0, 1]; differentiable in the picture and in every value.
     """
-    shades = srgb_to_linear(torch.stack([values["red"], values["green"], values["blue"]], dim=-1))
-    light = srgb_to_linear(image)
-    for cover, shade in zip(
-        _covers(image.shape[0], image.shape[1], values).to(image.device), shades.to(image.device), strict=True
-    ):
+    shades = srgb_to_linear(torch.stack([values[color] for color in CHANNELS], dim=-1)).to(image.device)
+    covers, light = _covers(image.shape[0], image.shape[1], values).to(image.device), srgb_to_linear(image)
+    for cover, shade in zip(covers, shades, strict=True):
         light = light + cover[..., None] * (shade - light)
     return linear_to_srgb(light)
 

@@ -17,7 +17,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from advsearch.controls.base import Choice, Parameter
+from advsearch.controls.base import Choice, Parameter, number
 from advsearch.controls.numbers import NumberControl, Values
 from advsearch.controls.values import Fixed, Number
 from advsearch.errors import InputError
@@ -28,8 +28,7 @@ from advsearch.scene.geometry import affine
 from advsearch.scene.parts import BallLamp, PointLamp
 from advsearch.scene.settings import CHANNELS, LIT, colors, moving
 
-LIT_WHITE = 0.9
-"""Linear display value of a white surface that faces a lamp of power 1 at distance 1."""
+LIT_WHITE = 0.9  # linear display value of a white surface that faces a lamp of power 1 at distance 1
 LIT_POWER = 6.0
 """Power of a lamp whose power is not searched and was not given: at its default place about as bright as the
 environment."""
@@ -55,10 +54,10 @@ class LightControl(NumberControl):
         _place("y", -2.0, 2.0, -1.0, "Where the lamp's middle is, along y."),
         _place("z", 2.0, 3.5, 2.0, "Height of the lamp's middle above the ground plane."),
         *colors("of the lamp's colour.", (0.6, 1.0)),
-        Parameter(
-            "power", (), "1", 0.0, 1000.0, 0.0,
+        number(
+            LIT, "power", "1", 0.0, 1000.0, 0.0,
             "Irradiance at distance 1, in multiples of the one that shows a white surface just below white.",
-            search=(0.0, 12.0), estimators=LIT,
+            (0.0, 12.0),
         ),
         moving(
             ("differences",), "size", "object sizes", 0.001, 10.0, 0.2, "Diameter of an area light; a point has none.",

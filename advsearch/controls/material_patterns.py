@@ -7,7 +7,7 @@ of periodic gradient noise (Perlin 1985), cells (Worley 1996), and iterated band
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, lru_cache
 
@@ -15,37 +15,41 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from advsearch.scene.assets import Floats, Material, Mesh
+from advsearch.scene.assets import Doubles, Floats, Material, Mesh
 from advsearch.scene.raster import looked_up, texel_positions
 
-Doubles = npt.NDArray[np.float64]
 Grid = tuple[Doubles, Doubles]
+"""Coordinates x (to the right) and y (down) of texel centres, each (SIDE, SIDE) in (0, 1)."""
 
-SIDE = 512
-"""Side of a tile in texels."""
-BLEND = 20.0
-"""Power of the normal's components that weighs the three projections of a tile: how sharply they meet."""
+SIDE = 512  # side of a tile in texels
+BLEND = 20.0  # power of the normal's components that weighs the three projections of a tile: how sharply they meet
 
 
 @dataclass(frozen=True)
 class Pattern:
-    """A named material: the side of a tile in object sizes, the surface beside its colour, and what draws the tile:
-    (SIDE, SIDE, 3) display-referred sRGB, any overshoot clipped later."""
+    """A named material: the side of a tile in object sizes, the surface beside its colour, and what draws the tile at
+    texels (`Grid`): (SIDE, SIDE, 3) display-referred sRGB, any overshoot clipped later."""
 
     name: str
     size: float
     material: Material
-    paint: Callable[[], Doubles]
+    paint: Callable[[Grid], Doubles]
+
+
+PATTERNS: dict[str, Pattern] = {}
+"""Every named material by its name."""
+
+
+def pattern(size: float, **surface: float) -> Callable[[Callable[[Grid], Doubles]], None]:
+    """Make a named material of the function below; see `Pattern`."""
+
+    def register(paint: Callable[[Grid], Doubles]) -> None:
+        PATTERNS[paint.__name__] = Pattern(paint.__name__, size, Material(**surface), paint)
+
+    return register
 
 
 # ---- ingredients: everything repeats after 1 in x and y --------------------------------------------------------------
-
-
-def _grid() -> Grid:
-    """Coordinates x (to the right) and y (down) of the texel centres, each (SIDE, SIDE) in (0, 1)."""
-    line = (np.arange(SIDE) + 0.5) / SIDE
-    x, y = np.meshgrid(line, line)
-    return x, y
 
 
 def _noise(at: Grid, cells: tuple[int, int], seed: int) -> Doubles:
@@ -83,10 +87,8 @@ def _warped(at: Grid, cells: int, amount: float, seed: int) -> Grid:
 
 
 def _scattered(count: int, seed: int) -> Doubles:
-    """Points of a torus about as far from each other as they can be, irregular: (count, 2) in [0, 1).
-
-    Best candidate sampling (Mitchell 1991): each point is the farthest from those before it of a few random ones.
-    """
+    """Points of a torus about as far from each other as they can be, irregular: (count, 2) in [0, 1). Best candidate
+    sampling (Mitchell 1991): each point is the farthest from those before it of a few random ones."""
     generator = np.random.Generator(np.random.PCG64(seed))
     points = generator.random((1, 2))
     while len(points) < count:
@@ -106,11 +108,8 @@ def _cells(at: Grid, points: Doubles, count: int = 2) -> tuple[Doubles, npt.NDAr
 
 def _turing(wavelength: tuple[float, float], bias: float, seed: int, rounds: int = 12) -> Doubles:
     """Animal stripes or spots in [-1, 1]: noise, band-passed and saturated again and again; after about ten rounds the
-    pattern has settled.
-
-    Wavelengths are in tiles, along x and along y; unequal ones make stripes across the shorter. The bias is added
-    before saturation: stripes break up into spots away from 0.
-    """
+    pattern has settled. Wavelengths are in tiles, along x and along y; unequal ones make stripes across the shorter.
+    The bias is added before saturation: stripes break up into spots away from 0."""
     frequency = np.fft.fftfreq(SIDE, 1.0 / SIDE)
     radius = np.hypot(frequency[None, :] * wavelength[0], frequency[:, None] * wavelength[1])
     band = np.exp(-(((radius - 1.0) / 0.22) ** 2))
@@ -146,12 +145,13 @@ def _ramp(value: Doubles, *codes: str) -> Doubles:
 # ---- the patterns ----------------------------------------------------------------------------------------------------
 
 
-def _plain() -> Doubles:
+@pattern(1.0, roughness=0.5)
+def plain(at: Grid) -> Doubles:
     return np.ones((SIDE, SIDE, 3))
 
 
-def _wood() -> Doubles:
-    at = _grid()
+@pattern(0.6, roughness=0.45)
+def wood(at: Grid) -> Doubles:
     x, y = at
     bend = 0.16 * _clouds(at, (2, 1), 2, 11) + 0.012 * _noise(at, (8, 3), 12)
     rings = 9.0 * (x + bend) + 0.25 * _noise(at, (5, 2), 17)
@@ -163,8 +163,8 @@ def _wood() -> Doubles:
     return _mix(_ramp(tone, "dcb27a", "c8955a", "a06c38", "784824"), _color("5a3519"), 0.4 * pores)
 
 
-def _marble() -> Doubles:
-    at = _grid()
+@pattern(0.9, roughness=0.15)
+def marble(at: Grid) -> Doubles:
     near = _warped(at, 2, 0.22, 21)
     far = _warped(near, 6, 0.03, 22)
     x, y = far
@@ -178,8 +178,8 @@ def _marble() -> Doubles:
     return _mix(base, _color("4c5159"), np.clip(veins, 0.0, 0.9))
 
 
-def _brick() -> Doubles:
-    at = _grid()
+@pattern(0.6, roughness=0.9, specular=0.2)
+def brick(at: Grid) -> Doubles:
     x, y = _warped(at, 12, 0.0035, 31)
     rows, columns = 8, 4
     row = np.floor(y * rows)
@@ -198,8 +198,8 @@ def _brick() -> Doubles:
     return _mix(mortar, brick, solid)
 
 
-def _fabric() -> Doubles:
-    at = _grid()
+@pattern(0.45, roughness=0.95, specular=0.1)
+def fabric(at: Grid) -> Doubles:
     x, y = _warped(at, 6, 0.004, 41)
     count = 16
     across, down = x * count, y * count
@@ -217,8 +217,8 @@ def _fabric() -> Doubles:
     return thread * (0.25 + 0.75 * height**0.7 + 0.14 * fibres)[..., None]
 
 
-def _leopard() -> Doubles:
-    at = _grid()
+@pattern(0.7, roughness=0.8, specular=0.2)
+def leopard(at: Grid) -> Doubles:
     place = _warped(_warped(at, 4, 0.03, 51), 12, 0.012, 52)
     points = _scattered(42, 53)
     distance, index = _cells(place, points)
@@ -242,22 +242,23 @@ def _leopard() -> Doubles:
     return _mix(coat * (1.0 + 0.10 * fur)[..., None], _color("221710"), spots)
 
 
-def _zebra() -> Doubles:
-    at = _grid()
+@pattern(0.8, roughness=0.8, specular=0.2)
+def zebra(at: Grid) -> Doubles:
     stripes = _turing((0.42, 0.125), 0.0, 61)
     black = _step(stripes + 0.12 * _noise(at, (10, 40), 62), 0.0, 0.7)
     fur = 1.0 + 0.06 * _clouds(at, (30, 110), 2, 63)
     return _mix(_color("efeae0"), _color("17140f"), black) * fur[..., None]
 
 
-def _checker() -> Doubles:
-    x, y = _grid()
+@pattern(0.5, roughness=0.4)
+def checker(at: Grid) -> Doubles:
+    x, y = at
     odd = (np.floor(4.0 * x) + np.floor(4.0 * y)) % 2.0
     return _mix(_color("f2f2f0"), _color("191919"), odd)
 
 
-def _rust() -> Doubles:
-    at = _grid()
+@pattern(0.7, roughness=0.85, metallic=0.1, specular=0.3)
+def rust(at: Grid) -> Doubles:
     place = _warped(at, 4, 0.06, 71)
     broad = 0.5 + 0.5 * _clouds(place, (3, 3), 5, 72)
     grain = _clouds(at, (48, 48), 3, 73)
@@ -271,7 +272,8 @@ def _rust() -> Doubles:
     return _mix(surface, _color("1b0d09"), 0.6 * pits)
 
 
-def _grass() -> Doubles:
+@pattern(0.5, roughness=0.9, specular=0.1)
+def grass(at: Grid) -> Doubles:
     """Blades drawn one over the other, bent and lighter towards the tip; later ones lie on top."""
     generator = np.random.Generator(np.random.PCG64(81))
     count, samples, broad = 2600, 64, 5
@@ -299,8 +301,8 @@ def _grass() -> Doubles:
     return np.asarray(texels.reshape(SIDE, SIDE, 3))
 
 
-def _elephant() -> Doubles:
-    at = _grid()
+@pattern(0.5, roughness=0.85, specular=0.2)
+def elephant(at: Grid) -> Doubles:
     place = _warped(_warped(at, 3, 0.05, 91), 14, 0.012, 92)
     folds = np.zeros((SIDE, SIDE))
     for count, width, depth, seed in ((45, 0.013, 0.75, 93), (320, 0.006, 0.42, 94)):
@@ -314,36 +316,19 @@ def _elephant() -> Doubles:
     return _mix(hide, _color("342f2b"), np.clip(folds, 0.0, 0.9))
 
 
-def _steel() -> Doubles:
-    at = _grid()
+@pattern(0.5, roughness=0.32, metallic=1.0)
+def steel(at: Grid) -> Doubles:
     scratches = _noise(at, (3, 240), 101) + 0.6 * _noise(at, (7, 120), 102) + 0.4 * _noise(at, (2, 256), 103)
     tone = 0.72 + 0.09 * scratches + 0.03 * _noise(at, (2, 2), 104)
     return np.asarray(tone[..., None] * _color("fbfdff"))
 
 
-_ALL = (
-    Pattern("plain", 1.0, Material(roughness=0.5), _plain),
-    Pattern("wood", 0.6, Material(roughness=0.45), _wood),
-    Pattern("marble", 0.9, Material(roughness=0.15), _marble),
-    Pattern("brick", 0.6, Material(roughness=0.9, specular=0.2), _brick),
-    Pattern("fabric", 0.45, Material(roughness=0.95, specular=0.1), _fabric),
-    Pattern("leopard", 0.7, Material(roughness=0.8, specular=0.2), _leopard),
-    Pattern("zebra", 0.8, Material(roughness=0.8, specular=0.2), _zebra),
-    Pattern("checker", 0.5, Material(roughness=0.4), _checker),
-    Pattern("rust", 0.7, Material(roughness=0.85, metallic=0.1, specular=0.3), _rust),
-    Pattern("grass", 0.5, Material(roughness=0.9, specular=0.1), _grass),
-    Pattern("elephant", 0.5, Material(roughness=0.85, specular=0.2), _elephant),
-    Pattern("steel", 0.5, Material(roughness=0.32, metallic=1.0), _steel),
-)
-
-PATTERNS: Mapping[str, Pattern] = {pattern.name: pattern for pattern in _ALL}
-"""Every named material by its name."""
-
-
 @cache
 def tile(name: str) -> Floats:
     """Return one tile of a pattern: (SIDE, SIDE, 3) float32 display-referred sRGB in [0, 1]; do not change it."""
-    painted = np.clip(PATTERNS[name].paint(), 0.0, 1.0).astype(np.float32)
+    line = (np.arange(SIDE) + 0.5) / SIDE
+    across, down = np.meshgrid(line, line)
+    painted = np.clip(PATTERNS[name].paint((across, down)), 0.0, 1.0).astype(np.float32)
     painted.setflags(write=False)
     return painted
 

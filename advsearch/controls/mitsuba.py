@@ -42,8 +42,7 @@ class MitsubaControl(NumberControl):
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         return scene.with_part(PluginNumbers(self.name, plugin_numbers(scene, self.name, tuple(self._given))))
 
-    def laid_out(self) -> tuple[Slot, ...]:
-        slots: list[Slot] = []
+    def laid_out(self) -> Iterator[Slot]:
         for number in self._numbers():
             whole = self.specs.get(number.key)
             if isinstance(whole, OneOf) and len(number.values) > 1:
@@ -53,12 +52,12 @@ class MitsubaControl(NumberControl):
                 )
             for parameter, value in zip(_channels(number), number.values, strict=True):
                 spec = self.specs.get(parameter.name, whole or Fixed(value))
-                slots.append(Slot(replace(parameter, default=value), spec, 1, sum(slot.width for slot in slots), value))
-        return tuple(slots)
+                yield Slot(replace(parameter, default=value), spec, 1, value)
 
     def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
         return {
-            one.input: torch.stack([values[parameter.name] for parameter in _channels(one)]) for one in self._numbers()
+            number.input: torch.stack([values[channel.name] for channel in _channels(number)])
+            for number in self._numbers()
         }
 
     def left_out(self, slots: Sequence[Slot]) -> Iterator[Moved]:

@@ -15,13 +15,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import accumulate
 from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
-from advsearch.controls.base import NOTHING, WHOLE_RANGE, Budget, Control, Group, Parameter, Value
+from advsearch.controls.base import NOTHING, WHOLE_RANGE, Budget, Control, Group, Parameter, Value, measure
 from advsearch.controls.ranges import Range
 from advsearch.controls.values import (
     Fixed,
@@ -48,13 +49,13 @@ Values = Mapping[str, Tensor]
 
 @dataclass(frozen=True)
 class Slot:
-    """One parameter in a bound control: what it is set to and where its coordinates begin."""
+    """One parameter in a bound control: what it is set to, its numbers and where its coordinates begin."""
 
     parameter: Parameter
     spec: Spec
     size: int
-    begin: int
     default: Number
+    begin: int = 0
 
     @property
     def width(self) -> int:
@@ -119,6 +120,10 @@ class NumberControl(Control):
         spec = self.specs.get(parameter)
         return spec.values if isinstance(spec, OneOf) else (spec.value,) if isinstance(spec, Fixed) else otherwise
 
+    def named(self, parameter: str) -> Parameter:
+        """Return its parameter of a name."""
+        return next(declared for declared in self.own if declared.name == parameter)
+
     def searches(self, parameter: str) -> bool:
         """Return whether a parameter with a range of its own is among what is searched."""
         return not isinstance(self.specs[parameter], Fixed) if parameter in self.specs else not self.asked
@@ -177,25 +182,21 @@ class NumberControl(Control):
     # ---- what it makes of it ----------------------------------------------------------------------------------------
 
     def fit(self) -> None:
-        self.slots = self.laid_out()
+        slots = [*self.laid_out()]
+        begins = accumulate((slot.width for slot in slots), initial=0)
+        self.slots = tuple(replace(slot, begin=begin) for slot, begin in zip(slots, begins, strict=False))
         self.moved = tuple(self.left_out(self.slots))
         self.start = torch.tensor([share for slot in self.slots for share in slot.start()], dtype=torch.float32)
         self.groups = tuple(self._group(slot) for slot in self.slots if slot.width)
-        ranges = [one.spec if isinstance(one.spec, Range) else Range(0.0, 1.0) for one in self.slots]
-        widths = torch.tensor([one.width for one in self.slots])
-        self._low = torch.tensor([one.low for one in ranges], dtype=torch.float64).repeat_interleave(widths)
-        self._span = torch.tensor([one.high - one.low for one in ranges], dtype=torch.float64).repeat_interleave(widths)
+        ranges = [slot.spec if isinstance(slot.spec, Range) else Range(0.0, 1.0) for slot in slots]
+        ends = torch.tensor([(spec.low, spec.high - spec.low) for spec in ranges], dtype=torch.float64).reshape(-1, 2)
+        self._low, self._span = ends.T.repeat_interleave(torch.tensor([slot.width for slot in slots]), dim=1)
 
-    def laid_out(self) -> tuple[Slot, ...]:
-        """Return the parameters in the order of their coordinates."""
-        slots: list[Slot] = []
-        begin = 0
+    def laid_out(self) -> Iterator[Slot]:
+        """Yield the parameters in the order of their coordinates."""
         for parameter in self.own:
             value = self.default(parameter)
-            spec, size = self.spec(parameter, value), self.size(parameter)
-            slots.append(Slot(self.in_scene(parameter), spec, size, begin, value))
-            begin += slots[-1].width
-        return tuple(slots)
+            yield Slot(self.in_scene(parameter), self.spec(parameter, value), self.size(parameter), value)
 
     def spec(self, parameter: Parameter, value: Number) -> Spec:
         """Return what a parameter is set to where its value in the unchanged scene is `value`."""
@@ -231,14 +232,9 @@ class NumberControl(Control):
         budget = WHOLE_RANGE if options else self.budget_of(parameter)
         if type(spec) not in (OneOf, Range) and budget != WHOLE_RANGE:
             raise InputError(f"{self.name}.{parameter.name}: it has a ball and no distribution; give it a range")
+        valid, setting = () if options else self.estimators(parameter), self.setting(parameter)
         return Group(
-            parameter.name,
-            slot.width,
-            () if options else self.estimators(parameter),
-            budget,
-            periodic=slot.periodic,
-            options=options,
-            setting=self.setting(parameter),
+            parameter.name, slot.width, valid, budget, periodic=slot.periodic, options=options, setting=setting
         )
 
     def values(self, u: Tensor) -> dict[str, Tensor]:
@@ -283,12 +279,10 @@ class NumberControl(Control):
             if parameter.options:
                 described[name] = {"value": parameter.options[int(value)], "unit": "name"}
             elif value.ndim == 0:
-                described[name] = {"value": float(value), "unit": parameter.unit}
+                described[name] = measure(value, parameter.unit)
             else:
-                described |= {
-                    f"{name}.{k}": {"value": float(one), "unit": parameter.unit} for k, one in enumerate(value)
-                }
-        return described | {f"{self.name}.{name}": one for name, one in self.measured(values, so_far).items()}
+                described |= {f"{name}.{k}": measure(number, parameter.unit) for k, number in enumerate(value)}
+        return described | {f"{self.name}.{name}": value for name, value in self.measured(values, so_far).items()}
 
     def artifacts(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Tensor]:
         return self.kept_pictures(self.values(u.detach()), so_far)

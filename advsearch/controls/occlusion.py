@@ -21,20 +21,19 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from advsearch.controls.base import Choice, Parameter, Value
+from advsearch.controls.base import Choice, Parameter, Value, measure
 from advsearch.controls.numbers import NumberControl, Values
 from advsearch.errors import InputError
 from advsearch.files import reading
 from advsearch.scene import library, silhouettes
-from advsearch.scene.assets import Material, Mesh, ObjectAsset, normalised
+from advsearch.scene.assets import Doubles, Material, Mesh, ObjectAsset, normalised
 from advsearch.scene.camera_model import CameraModel
 from advsearch.scene.description import SceneDescription
-from advsearch.scene.geometry import affine, camera_to_world, object_to_world
+from advsearch.scene.geometry import affine, camera_to_world, object_to_world, rotation
 from advsearch.scene.importing.objects import import_object
 from advsearch.scene.parts import MeshPart
 from advsearch.scene.settings import ORBIT, moving
 
-Doubles = npt.NDArray[np.float64]
 _moving = partial(moving, ORBIT)
 
 MADE = ("card", "sphere")
@@ -42,10 +41,8 @@ BUNDLED = ("book", "bottle", "vase", "chair", "banana", "hammer")
 OPTIONS = (*MADE, *BUNDLED)
 EASE = 0.02
 """Below this coverage the occluder slides in from outside the frame, so that the picture changes without a jump."""
-CLEARANCE = 0.05
-"""Smallest distance in object sizes between the camera and the occluder."""
-PARKED = 1e-3
-"""Size of an occluder that is put away, behind the camera."""
+CLEARANCE = 0.05  # smallest distance in object sizes between the camera and the occluder
+PARKED = 1e-3  # size of an occluder that is put away, behind the camera
 SURROUNDINGS = ("camera.to_world", "camera.fov", "camera.shift", "camera.lens", "object.to_world", "object.offsets")
 """Inputs of other controls that an occluder goes by."""
 
@@ -62,8 +59,12 @@ def loaded(spec: str) -> ObjectAsset:
 def centred(asset: ObjectAsset) -> ObjectAsset:
     """Return an object with its largest extent 1 and the middle of its bounding box at the origin."""
     mesh = normalised(asset.mesh)
-    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
-    return replace(asset, mesh=replace(mesh, vertices=(mesh.vertices - (low + high) / 2.0).astype(np.float32)))
+    middle = (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2.0
+    return replace(asset, mesh=replace(mesh, vertices=(mesh.vertices - middle).astype(np.float32)))
+
+
+def _asset(option: str) -> ObjectAsset:
+    return made(option) if option in MADE else loaded(option)
 
 
 @cache
@@ -93,12 +94,8 @@ def sphere(rows: int, columns: int) -> Mesh:
     above = corner + columns + 1
     lower, upper = np.stack([corner, corner + 1, above + 1], 1), np.stack([corner, above + 1, above], 1)
     faces = np.concatenate([lower[columns:], upper[:-columns]])  # without those that are points at the poles
-    return Mesh(
-        (0.5 * normals).astype(np.float32),
-        faces.astype(np.uint32),
-        normals.astype(np.float32),
-        np.stack([u, v], axis=1).astype(np.float32),
-    )
+    vertices, outwards, uvs = (one.astype(np.float32) for one in (0.5 * normals, normals, np.stack([u, v], axis=1)))
+    return Mesh(vertices, faces.astype(np.uint32), outwards, uvs)
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,17 +168,17 @@ class OcclusionControl(NumberControl):
         self._given["object"] = self.chosen["object"] = str(occluder)
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
-        away = _put_away(torch.from_numpy(camera_to_world(scene))).numpy()
+        away = put_away(torch.from_numpy(camera_to_world(scene))).numpy()
         for option in self._candidates():
-            asset = self._asset(option)
+            asset = _asset(option)
             looks = asset.base_color, asset.material, asset.label
             scene = scene.with_part(MeshPart(self._part(option), asset.mesh, *looks, to_world=away))
         return scene
 
     def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
         chosen = self._option(values)
-        camera = so_far.get("camera.to_world", torch.from_numpy(camera_to_world(self.scene)).to(values["turn"]))
-        inputs = {f"{self._part(one)}.to_world": _put_away(camera) for one in self._candidates()}
+        camera = camera_in(self.scene, so_far).to(values["turn"])
+        inputs = {f"{self._part(one)}.to_world": put_away(camera) for one in self._candidates()}
         placed = self.placement(values, so_far)
         if not placed.away:
             inputs[f"{self._part(chosen)}.to_world"] = _matrix(camera, placed, values)
@@ -190,14 +187,11 @@ class OcclusionControl(NumberControl):
     def measured(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Value]:
         """What is hidden of the object, and what became of the size and the distance that were asked for."""
         placed = self.placement(values, so_far)
-        hidden: dict[str, Value] = {"hidden": {"value": placed.hidden, "unit": "1"}}
+        hidden = {"hidden": measure(placed.hidden, "1")}
         if placed.away:
             return hidden
-        return {
-            **hidden,
-            "true_size": {"value": placed.size, "unit": "object sizes"},
-            "true_distance": {"value": placed.distance, "unit": "object sizes"},
-        }
+        sizes = {"true_size": placed.size, "true_distance": placed.distance}
+        return hidden | {name: measure(value, "object sizes") for name, value in sizes.items()}
 
     # ---- inside -----------------------------------------------------------------------------------------------------
 
@@ -214,24 +208,27 @@ class OcclusionControl(NumberControl):
         """The name of an occluder's part: the instance's, with the option where there are several."""
         return self.name if len(self._candidates()) == 1 else f"{self.name}-{option}"
 
-    def _asset(self, option: str) -> ObjectAsset:
-        return made(option) if option in MADE else loaded(option)
-
     def placement(self, values: Values, so_far: Mapping[str, Tensor]) -> Placement:
         """Work out where the occluder goes, with camera and object where other controls put them; without
         derivatives."""
         asked = {name: float(value.detach()) for name, value in values.items()}
         seen = _Seen.of(self.scene, so_far)
-        mesh = self._asset(self._option(values)).mesh
+        mesh = _asset(self._option(values)).mesh
         if seen.directions is None or asked["coverage"] <= 0.0:
             return Placement(np.eye(3), 0.0, asked["size"], asked["distance"] * seen.far, 0.0, True)
-        points = mesh.vertices.astype(np.float64) @ _about_upright(asked["turn"]).T
+        points = mesh.vertices.astype(np.float64) @ rotation(asked["turn"], 0.0, 0.0).T
         size, distance = _fitting(points, asked["size"], asked["distance"] * seen.far, seen.near)
         ahead = np.stack([points[:, 1] * size, points[:, 2] * size, distance - points[:, 0] * size], axis=1)
         cover = silhouettes.silhouette(ahead, mesh.faces)
         if cover is None:
             return Placement(np.eye(3), 0.0, size, distance, 0.0, True)
-        return _solved(seen, cover, asked, size, distance)
+        axes = silhouettes.middle_axes(seen.directions)
+        sweep = silhouettes.Passage(seen.directions, cover, axes, asked["direction"])
+        outside = silhouettes.angle_outside(seen.shown, seen.rim, cover, axes, asked["direction"])
+        angle = sweep.solve(max(asked["coverage"], EASE), outside)
+        if asked["coverage"] < EASE:
+            angle = outside + (angle - outside) * asked["coverage"] / EASE
+        return Placement(axes, angle, size, distance, float(sweep.coverage(np.array([angle]))[0]), False)
 
 
 # ---- what the camera sees -------------------------------------------------------------------------------------------
@@ -257,11 +254,13 @@ class _Seen:
 
     @staticmethod
     def of(scene: SceneDescription, so_far: Mapping[str, Tensor]) -> _Seen:
-        camera = _numpy(so_far, "camera.to_world", camera_to_world(scene))
+        camera = camera_in(scene, so_far).detach().double().cpu().numpy()
         pose = _numpy(so_far, "object.to_world", object_to_world(scene))
         mesh = scene.object.mesh
         vertices = mesh.vertices.astype(np.float64) + _numpy(so_far, "object.offsets", np.zeros(3))
-        points = _from_camera(vertices @ pose[:3, :3].T + pose[:3, 3], camera)
+        world = vertices @ pose[:3, :3].T + pose[:3, 3]
+        # right, up, forward: a sensor's own x axis points to the left
+        points = (world - camera[:3, 3]) @ camera[:3, :3] * (-1.0, 1.0, 1.0)
         if (model := scene.camera_model) is not None:
             model = model.with_numbers(so_far["camera.lens"].detach().cpu()) if "camera.lens" in so_far else model
             shown = rim = _looked(model, (0.0, 1.0), (0.0, 1.0), silhouettes.GRID)
@@ -313,36 +312,14 @@ def _numpy(inputs: Mapping[str, Tensor], name: str, otherwise: Doubles) -> Doubl
     return inputs[name].detach().double().cpu().numpy() if name in inputs else otherwise
 
 
-def _from_camera(world: Doubles, camera: Doubles) -> Doubles:
-    """World points (N, 3) in camera coordinates: right, up, forward. A sensor's own x axis points to the left."""
-    return np.asarray((world - camera[:3, 3]) @ camera[:3, :3] * (-1.0, 1.0, 1.0))
-
-
 # ---- where the occluder goes ----------------------------------------------------------------------------------------
-
-
-def _solved(
-    seen: _Seen, cover: silhouettes.Silhouette, asked: Mapping[str, float], size: float, distance: float
-) -> Placement:
-    """Find the angle at which the wanted share is hidden."""
-    assert seen.directions is not None
-    axes = silhouettes.middle_axes(seen.directions)
-    sweep = silhouettes.Passage(seen.directions, cover, axes, asked["direction"])
-    outside = silhouettes.angle_outside(seen.shown, seen.rim, cover, axes, asked["direction"])
-    angle = sweep.solve(max(asked["coverage"], EASE), outside)
-    if asked["coverage"] < EASE:
-        angle = outside + (angle - outside) * asked["coverage"] / EASE
-    hidden = float(sweep.coverage(np.array([angle]))[0])
-    return Placement(axes, angle, size, distance, hidden, False)
 
 
 def _fitting(points: Doubles, size: float, distance: float, near: float) -> tuple[float, float]:
     """Return a size and a distance close to those asked for with which an occluder with points (V, 3), one object size
-    large around the origin, is between the camera and the object, whose nearest vertex is at `near`.
-
-    It keeps `CLEARANCE` from the camera, and no vertex is farther from the camera than the object's nearest one. Where
-    its size leaves no such place, it is made smaller.
-    """
+    large around the origin, is between the camera and the object, whose nearest vertex is at `near`. It keeps
+    `CLEARANCE` from the camera, and no vertex is farther from the camera than the object's nearest one. Where its size
+    leaves no such place, it is made smaller."""
     front, back = float(points[:, 0].max()), float(-points[:, 0].min())
     aside = float(np.hypot(points[:, 1], points[:, 2]).max())
     near = max(near, 3.0 * CLEARANCE)
@@ -356,17 +333,9 @@ def _fitting(points: Doubles, size: float, distance: float, near: float) -> tupl
     return size, min(max(distance, nearest), farthest)
 
 
-def _about_upright(degrees: float) -> Doubles:
-    sine, cosine = math.sin(math.radians(degrees)), math.cos(math.radians(degrees))
-    return np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
-
-
 def _matrix(camera: Tensor, placed: Placement, values: Values) -> Tensor:
-    """The occluder's pose (4, 4).
-
-    Differentiable in the camera, the direction and the turn at the angle that was found; nothing else has a derivative
-    here, which is why the control is differentiated by differences.
-    """
+    """The occluder's pose (4, 4). Differentiable in the camera, the direction and the turn at the angle that was found;
+    nothing else has a derivative here, which is why the control is differentiated by differences."""
     right, up, forward = torch.from_numpy(placed.axes).to(camera)
     direction = torch.deg2rad(values["direction"])
     along = torch.cos(direction) * right + torch.sin(direction) * up
@@ -385,5 +354,11 @@ def _matrix(camera: Tensor, placed: Placement, values: Values) -> Tensor:
     return affine(linear, place)
 
 
-def _put_away(camera: Tensor) -> Tensor:
+def camera_in(scene: SceneDescription, so_far: Mapping[str, Tensor]) -> Tensor:
+    """Return the pose (4, 4) of the camera where the controls before have it."""
+    return so_far.get("camera.to_world", torch.from_numpy(camera_to_world(scene)))
+
+
+def put_away(camera: Tensor) -> Tensor:
+    """Return the pose (4, 4) of what is out of sight: tiny, behind the camera of a pose (4, 4)."""
     return affine(PARKED * torch.eye(3).to(camera), camera[:3, 3] - camera[:3, 2])

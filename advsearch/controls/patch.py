@@ -14,10 +14,12 @@ plane, unrolled along the direction in which the surface bends (exact for cylind
 from __future__ import annotations
 
 import math
+from abc import abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -25,7 +27,8 @@ import torch.nn.functional as F
 from scipy import spatial
 from torch import Tensor
 
-from advsearch.controls.base import NOTHING, WHOLE_RANGE, Budget, Choice, Parameter, Value, change_in_colour
+from advsearch.controls.base import NOTHING, WHOLE_RANGE, Budget, Choice, Parameter, Value, change_in_colour, number
+from advsearch.controls.corruption_filters import picture, planes, resized
 from advsearch.controls.numbers import NumberControl, Slot, Values
 from advsearch.controls.ranges import Range
 from advsearch.controls.texture import radius, resampled
@@ -37,26 +40,72 @@ from advsearch.scene.description import SceneDescription
 from advsearch.scene.geometry import camera_to_world, object_to_world
 from advsearch.scene.importing.pictures import read_picture
 from advsearch.scene.raster import Charts, MeshSurface, rasterised
+from advsearch.scene.settings import LIT
 
 BASE_COLOR = "object.base_color"
 NORMS = ("box", "linf", "l2")
-PRINT_SIDE = 512
-"""Least side of the picture that is kept for printing, in pixels."""
-BASE_SIDES = (512, 1024)
-"""Smallest and largest side of the base-colour map that is painted into, in texels."""
+PRINT_SIDE = 512  # least side of the picture that is kept for printing, in pixels
+BASE_SIDES = (512, 1024)  # smallest and largest side of the base-colour map that is painted into, in texels
 REACH = 0.75
 """Radius around the middle, in sides of the square, within which the surface is painted: its corners are at 0.7071."""
-FACING = (0.1, 0.3)
-"""Cosines between the surface and the square's normal between which it fades in."""
-EDGE_TEXELS = 2.0
-"""Width of the soft edge in texels."""
+FACING = (0.1, 0.3)  # cosines between the surface and the square's normal between which it fades in
+EDGE_TEXELS = 2.0  # width of the soft edge in texels
 
 
-class PatchControl(NumberControl):
+class PictureControl(NumberControl):
+    """A control of a picture, searched or from a file, and of numbers, which are fixed where they are not given.
+
+    Attributes:
+        shown: the parameter that is the picture.
+    """
+
+    shown: ClassVar[str]
+
+    @property
+    @abstractmethod
+    def sides(self) -> tuple[int, int]:
+        """Rows and columns of the picture."""
+
+    @property
+    def free(self) -> bool:
+        """Whether the picture is searched."""
+        return self.chosen["picture"] is None and not isinstance(self.specs.get(self.shown), Fixed)
+
+    def size(self, parameter: Parameter) -> int:
+        return 3 * math.prod(self.sides) if parameter.shape else 1
+
+    def spec(self, parameter: Parameter, value: Number) -> Spec:
+        if parameter.name == self.shown:
+            return self.specs.get(self.shown, Range(0.0, 1.0) if self.free else Fixed(0.0))
+        return self.specs.get(parameter.name, Fixed(value))
+
+    def read_picture(self) -> Tensor | None:
+        """Return the picture (h, w, 3) sRGB that was chosen; None where none was.
+
+        Raises:
+            FileFormatError: it cannot be read.
+        """
+        if self.chosen["picture"] is None:
+            return None
+        try:
+            return torch.from_numpy(read_picture(Path(self.chosen["picture"])))
+        except FileFormatError as error:
+            raise FileFormatError(f"{self.name}.picture: {error}") from error
+
+    def describe(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Value]:
+        described = super().describe(u, so_far)
+        if not self.free:
+            return described
+        here, start = (self.values(at)[self.shown] for at in (u.detach(), self.start.to(u.device)))
+        return {**change_in_colour(self.name, here - start), **described}
+
+
+class PatchControl(PictureControl):
     """A printed square stuck onto the object: numbers that are not given are fixed, and pixels are searched unless they
     are a grey or a picture."""
 
     kind = "patch"
+    shown = "pixels"
     summary = "A printed square stuck onto the object: its pixels, place, size and turn."
     parameters = (
         Parameter(
@@ -64,23 +113,18 @@ class PatchControl(NumberControl):
             "Display-referred colours of the patch; a narrower range is a printer's gamut.", search=(0.0, 1.0),
             estimators=("adjoint",),
         ),
-        Parameter(
-            "azimuth", (), "degrees", 0.0, 360.0, "towards the camera", "Side of the object that the patch is on.",
-            periodic=True, estimators=("differences",),
+        number(
+            ("differences",), "azimuth", "degrees", 0.0, 360.0, "towards the camera",
+            "Side of the object that the patch is on.", periodic=True,
         ),
-        Parameter(
-            "height", (), "1", 0.0, 1.0, "towards the camera",
+        number(
+            ("differences",), "height", "1", 0.0, 1.0, "towards the camera",
             "Where it is from the middle of the underside (0) over the sides (0.5) to the middle of the top (1).",
-            estimators=("differences",),
         ),
-        Parameter(
-            "size", (), "object sizes", 0.05, 0.6, 0.3, "Side of the patch.", log=True,
-            estimators=("adjoint", "differences"),
-        ),
-        Parameter(
-            "rotation", (), "degrees", -180.0, 180.0, 0.0,
+        number(LIT, "size", "object sizes", 0.05, 0.6, 0.3, "Side of the patch.", log=True),
+        number(
+            LIT, "rotation", "degrees", -180.0, 180.0, 0.0,
             "Turn of the patch on the surface, counter-clockwise; upright at 0.", periodic=True,
-            estimators=("adjoint", "differences"),
         ),
     )  # fmt: skip
     choices = (
@@ -109,9 +153,8 @@ class PatchControl(NumberControl):
         if pixels is not None and not isinstance(pixels, Fixed) and type(pixels) is not Range:
             got = f"a list of {len(pixels.values)}" if isinstance(pixels, OneOf) else "a distribution"
             raise InputError(f"{self.name}.pixels: expected [low, high] or one number, got {got}")
-        self._free = picture is None and not isinstance(pixels, Fixed)
         ball = next((one for one in ("epsilon", "norm") if self.chosen[one] not in (None, "box")), None)
-        if ball and not self._free:
+        if ball and not self.free:
             raise InputError(
                 f"{self.name}.{ball}: is of the ball that searched pixels stay in, and these are fixed; leave it out, "
                 f"or leave out {self.name}.{'picture' if picture is not None else 'pixels'}"
@@ -128,18 +171,14 @@ class PatchControl(NumberControl):
 
     # ---- in a scene -------------------------------------------------------------------------------------------------
 
-    def size(self, parameter: Parameter) -> int:
-        return 3 * int(self.chosen["resolution"]) ** 2 if parameter.shape else 1
+    @property
+    def sides(self) -> tuple[int, int]:
+        return (int(self.chosen["resolution"]),) * 2
 
     def default(self, parameter: Parameter) -> Number:
         if parameter.name in ("azimuth", "height"):
             return towards_camera(self.scene)[parameter.name == "height"]
         return 0.0 if parameter.name == "pixels" else parameter.default  # what is underneath takes their place
-
-    def spec(self, parameter: Parameter, value: Number) -> Spec:
-        if parameter.name == "pixels" and "pixels" not in self.specs:
-            return Range(0.0, 1.0) if self._free else Fixed(0.0)
-        return self.specs.get(parameter.name, Fixed(value))
 
     def budget_of(self, parameter: Parameter) -> Budget:
         norm = self.chosen["norm"]
@@ -156,8 +195,8 @@ class PatchControl(NumberControl):
                 f"`controls` {self.name}: the pixels are fixed, so there is nothing to search; give another parameter "
                 f"a range, such as {self.name}={{azimuth: [0, 360]}}"
             )
-        side, pixels = int(self.chosen["resolution"]), self.slots[0]
-        self._picture = None if self.chosen["picture"] is None else resampled(self._read(), side)
+        side, pixels, picture = self.sides[0], self.slots[0], self.read_picture()
+        self._picture = None if picture is None else resampled(picture, side)
         resting = {name: float(value) for name, value in self.values(self.start).items() if name != "pixels"}
         self._sticker = Sticker(self.scene, resting, side)
         if isinstance(pixels.spec, Range):
@@ -169,32 +208,19 @@ class PatchControl(NumberControl):
             self.moved = (Moved(self.name, f"{self.name}.pixels", "sRGB", "the texture underneath", nearest),) * moved
 
     def left_out(self, slots: Sequence[Slot]) -> Iterator[Moved]:
-        return super().left_out(() if self._free else slots[1:])  # at the start searched pixels show no patch
-
-    def _read(self) -> Tensor:
-        try:
-            return torch.from_numpy(read_picture(Path(self.chosen["picture"])))
-        except FileFormatError as error:
-            raise FileFormatError(f"{self.name}.picture: {error}") from error
+        return super().left_out(() if self.free else slots[1:])  # at the start searched pixels show no patch
 
     def values(self, u: Tensor) -> dict[str, Tensor]:
-        values, side = super().values(u), int(self.chosen["resolution"])
+        values = super().values(u)
         if self._picture is not None:
             return values | {"pixels": self._picture.to(u.device, copy=True)}
-        return values | {"pixels": values["pixels"].reshape(side, side, 3)}
+        return values | {"pixels": values["pixels"].reshape(*self.sides, 3)}
 
     def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
         return {BASE_COLOR: self._sticker.paint(so_far.get(BASE_COLOR), values["pixels"], values)}
 
-    def describe(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Value]:
-        described = super().describe(u, so_far)
-        if not self._free:
-            return described
-        here, start = (self.values(at)["pixels"] for at in (u.detach(), self.start.to(u.device)))
-        return {**change_in_colour(self.name, here - start), **described}
-
     def printed(self, u: Tensor) -> Tensor | None:
-        return self.values(u)["pixels"] if self._free else None
+        return self.values(u)["pixels"] if self.free else None
 
     def kept_pictures(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
         pixels = values["pixels"]
@@ -203,9 +229,8 @@ class PatchControl(NumberControl):
 
 def enlarged(pixels: Tensor, factor: int) -> Tensor:
     """Return a picture (h, w, 3) sRGB at a whole multiple of its size, interpolated as the renderer does it."""
-    linear = srgb_to_linear(pixels).permute(2, 0, 1)[None]
-    larger = F.interpolate(linear, scale_factor=factor, mode="bilinear", align_corners=False)
-    return linear_to_srgb(larger[0].permute(1, 2, 0))
+    larger = F.interpolate(planes(srgb_to_linear(pixels)), scale_factor=factor, mode="bilinear", align_corners=False)
+    return linear_to_srgb(picture(larger))
 
 
 # ---- on the surface --------------------------------------------------------------------------------------------------
@@ -280,7 +305,7 @@ class Sticker:
         edge = (0.5 - across.abs().amax(dim=1)) * size / (EDGE_TEXELS * spot.spacing) + 0.5
         cover = (spot.cover.to(device) * _smooth(edge))[:, None]
         grid = (across * across.new_tensor([2.0, -2.0]))[None, None]
-        linear = srgb_to_linear(pixels).permute(2, 0, 1)[None]
+        linear = planes(srgb_to_linear(pixels))
         color = F.grid_sample(linear, grid, mode="bilinear", padding_mode="border", align_corners=False)[0, :, 0].T
         flat = base.reshape(-1, 3)
         under = flat.index_select(0, texels)
@@ -314,20 +339,16 @@ class Sticker:
         outwards /= np.linalg.norm(outwards)
         face, point = self._surface.hit(middle + 4.0 * (radius + half) * outwards, -outwards)
         side = 1.0 if float(self._surface.normals[face] @ outwards) >= 0.0 else -1.0
-        normal = self._mean_normal(face, point, side)
+        # the mean normal over half of the patch's side at the start
+        normal, near_by = self._surface.normals[face], 0.5 * self._resting["size"]
+        near = self._surface.region(face, point, normal, near_by)[self._faces]
+        fall = np.maximum(1.0 - ((self._positions[near] - point) ** 2).sum(axis=1) / near_by**2, 0.0) ** 2
+        total = (self._normals[near] * (fall * self._areas[near])[:, None]).sum(axis=0)
+        length = float(np.linalg.norm(total))
+        normal = total / length if length > 1e-12 else normal
         level = math.hypot(outwards[0], outwards[1])
         upwards = np.array([-outwards[2] * math.cos(angle), -outwards[2] * math.sin(angle), level])
         return self._around(face, point, _frame(side * normal, upwards), side, REACH * size)
-
-    def _mean_normal(self, face: int, point: Doubles, side: float) -> Doubles:
-        """Unit normal (3,) of the surface around a point: the mean over half of the patch's side at the start."""
-        radius = 0.5 * self._resting["size"]
-        normal = self._surface.normals[face]
-        near = self._surface.region(face, point, normal, radius)[self._faces]
-        fall = np.maximum(1.0 - ((self._positions[near] - point) ** 2).sum(axis=1) / radius**2, 0.0) ** 2
-        total = (self._normals[near] * (fall * self._areas[near])[:, None]).sum(axis=0)
-        length = float(np.linalg.norm(total))
-        return np.asarray(total / length) if length > 1e-12 else normal
 
     def _around(self, face: int, point: Doubles, frame: Doubles, side: float, radius: float) -> Spot:
         chosen = np.flatnonzero(self._surface.region(face, point, side * frame[2], radius)[self._faces])
@@ -401,8 +422,4 @@ def _smooth(share: Tensor) -> Tensor:
 
 def _fitted(base: Tensor, side: int) -> Tensor:
     """Resize a base colour (h, w, 3) to (side, side, 3); differentiable."""
-    if base.shape[:2] == (side, side):
-        return base
-    planes, smaller = base.permute(2, 0, 1)[None], max(base.shape[:2]) > side
-    resized = F.interpolate(planes, size=(side, side), mode="bilinear", antialias=smaller, align_corners=False)
-    return resized[0].permute(1, 2, 0)
+    return resized(base, side, side, antialias=max(base.shape[:2]) > side)

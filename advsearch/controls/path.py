@@ -21,8 +21,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from advsearch.controls.base import Choice, Parameter, Value
+from advsearch.controls.base import Choice, Parameter, Value, measure
 from advsearch.controls.numbers import NumberControl, Values
+from advsearch.controls.pose import euler
 from advsearch.controls.values import Number, OneOf, Spec
 from advsearch.described import rounded
 from advsearch.errors import FileFormatError, InputError
@@ -35,29 +36,22 @@ from advsearch.scene.settings import GEOMETRIC, ORBIT, ORBIT_CAMERA, moving
 APPROACH, PASS, TURN = "approach", "pass", "orbit"
 PATHS = (APPROACH, PASS, TURN)
 CAMERA, THING = MOVERS = "camera", "object"
-BOTH = "+"
-"""Between the camera's path and the object's."""
-SEVERAL, WAY = ",", "way"
-"""Between paths of which one is drawn, and the parameter that says which."""
+BOTH = "+"  # between the camera's path and the object's
+SEVERAL, WAY = ",", "way"  # between paths of which one is drawn, and the parameter that says which
 MOST_PATHS = 64
 CLEAN_AT = {APPROACH: 1.0, PASS: 0.5, TURN: 0.0}
 """Share of the time at which the scene is as it is described."""
 
 REACH, SECONDS = 4.0, 10.0
-SHORTEST, LONGEST = 1e-3, 3600.0
-"""Seconds between waypoints at least, and of a path at most."""
-ROUNDED = 1e-3
-"""Share of the least time between waypoints that may be lost where times are written in decimals."""
-NEAREST = 1e-3
-"""Object sizes from the camera to what it looks at, at least: nearer, it looks nowhere."""
-LOOKS = 2048
-"""Times at which curved paths are looked at; a file's waypoints are in addition."""
+SHORTEST, LONGEST = 1e-3, 3600.0  # seconds between waypoints at least, and of a path at most
+ROUNDED = 1e-3  # share of the least time between waypoints that may be lost where times are written in decimals
+NEAREST = 1e-3  # object sizes from the camera to what it looks at, at least: nearer, it looks nowhere
+LOOKS = 2048  # times at which curved paths are looked at; a file's waypoints are in addition
 TIME, PLACE, LOOKING, HEADING = "time", ("x", "y", "z"), ("look_x", "look_y", "look_z"), "heading"
 SHIFT, TURNING = ("object_x", "object_y", "object_z"), "object_heading"
 """Columns of the object in a file that is about both."""
 MOST_WAYPOINTS, MOST_BYTES = 100_000, 16 * 2**20
-FARTHEST = 1e5
-"""Metres, or object sizes, that a waypoint may be away."""
+FARTHEST = 1e5  # metres, or object sizes, that a waypoint may be away
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,24 +106,21 @@ class PathControl(NumberControl):
     )
     choices = (
         Choice(
-            "path",
-            APPROACH,
+            "path", APPROACH,
             "approach (straight up to where it stands), pass (straight past it), orbit (once around), or a .csv file "
             "with columns time, x, y, z. Two of them with a + between: the camera's and the object's. Several with "
-            "commas between: each configuration has one of them, `way`.",
-            "path",
+            "commas between: each configuration has one of them, `way`.", "path",
         ),
         Choice("moves", CAMERA, "What travels along a single path: camera or object.", options=MOVERS),
         Choice("seconds", SECONDS, "How long it takes; a file says so itself.", most=LONGEST),
         Choice(
-            "reach",
-            REACH,
+            "reach", REACH,
             "How far it goes, in distances of the scene's own camera: where approach begins, half of what pass takes.",
             most=1000.0,
         ),
         Choice("shutter", None, "Seconds that each row is exposed: motion blur.", "shutter", most=60.0),
         Choice("rolling", None, "Seconds in which the rows are read, one after the other.", "rolling", most=60.0),
-    )
+    )  # fmt: skip
 
     @classmethod
     def declared(cls, settings: Iterable[str]) -> tuple[Parameter, ...]:
@@ -205,21 +196,17 @@ class PathControl(NumberControl):
         for name, ways in zip(_names(self.chosen["path"]), self._paths, strict=True):
             if CAMERA in ways:
                 there._check_looks(name, ways)
-        wide = [note for way in self._files for note in way.notes]
+        notes = [note for way in self._files for note in way.notes]
         shortest = min((float(one.times[-1]) for one in self._files), default=self.seconds)
         if len(self._paths) > 1 and shortest < self.seconds:
-            wide.append(
+            notes.append(
                 f"path: the shortest of the files takes {rounded(shortest)} s of {rounded(self.seconds)}; who has "
                 "arrived waits, and these frames count"
             )
-        return replace(scene, remarks=tuple(dict.fromkeys((*scene.remarks, *wide)))) if wide else scene
+        return replace(scene, remarks=tuple(dict.fromkeys((*scene.remarks, *notes)))) if notes else scene
 
     def _check_looks(self, name: str, ways: Ways) -> None:
-        """Refuse a path on which the camera is at what it looks at, at a waypoint or between two.
-
-        Raises:
-            InputError: it is, somewhere.
-        """
+        """Refuse a path on which the camera is at what it looks at, at a waypoint or between two."""
         files = [way.times for way in ways.values() if isinstance(way, Waypoints)]
         time = torch.cat([torch.linspace(0.0, self.seconds, LOOKS), *files]).unique()
         begin = self._start(time)
@@ -267,7 +254,7 @@ class PathControl(NumberControl):
         shift, _ = self._object(ways, start, time)
         away = self._camera(ways, start, time, shift)[0] - start.middle - shift
         unit = "object sizes" if self.scene.object.metres is None else "metres"
-        return {"distance": {"value": float(away.norm()) * self.scene.metres, "unit": unit}}
+        return {"distance": measure(float(away.norm()) * self.scene.metres, unit)}
 
     def _ways(self, values: Values) -> Ways:
         return self._paths[int(values[WAY])] if WAY in values else self._paths[0]
@@ -275,9 +262,6 @@ class PathControl(NumberControl):
     def _start(self, time: Tensor) -> Start:
         """How the scene stands, on the device of a time."""
         return Start(*(one.to(time.device) for one in _start_of(self.scene)))
-
-    def _share(self, time: Tensor) -> Tensor:
-        return (time / self.seconds).clamp(0.0, 1.0)
 
     def _camera(self, ways: Ways, begin: Start, time: Tensor, shift: Tensor) -> tuple[Tensor, Tensor]:
         """Where the camera is, and what it looks at: an object that is shifted, unless a file says something else."""
@@ -288,19 +272,16 @@ class PathControl(NumberControl):
         if isinstance(way, Waypoints):
             target = center + (shift if way.targets is None else way.at(time, way.targets) / self.scene.metres)
             return center + way.at(time, way.places) / self.scene.metres, target
-        along, away, reach = pose[:3, 2], (start - center).norm(), float(self.chosen["reach"])
-        ahead = torch.stack([along[0], along[1], pose.new_zeros(())])  # the camera keeps its height, as a car's does
-        ahead = ahead / ahead.norm().clamp_min(1e-6)
-        share = self._share(time)
+        away, reach = (start - center).norm(), float(self.chosen["reach"])
+        share = (time / self.seconds).clamp(0.0, 1.0)
         if way == APPROACH:
-            return start - ahead * away * (reach - 1.0) * (1.0 - share)[..., None], center + shift
+            return start - _level(pose[:3, 2]) * away * (reach - 1.0) * (1.0 - share)[..., None], center + shift
         if way == PASS:
             return start + pose[:3, 0] * away * reach * (1.0 - 2.0 * share)[..., None], center + shift
         angle = 2.0 * math.pi * share
-        x, y, z = start - center
-        cos, sin = angle.cos(), angle.sin()
-        turned = torch.stack([cos * x - sin * y, sin * x + cos * y, z.expand(angle.shape)], dim=-1)
-        return center + turned, center + shift
+        (x, y, z), cos, sin = start - center, angle.cos(), angle.sin()
+        around = torch.stack([cos * x - sin * y, sin * x + cos * y, z.expand(angle.shape)], dim=-1)
+        return center + around, center + shift
 
     def _object(self, ways: Ways, begin: Start, time: Tensor) -> tuple[Tensor, Tensor]:
         """How far the object is shifted, and how many degrees it is turned by."""
@@ -311,21 +292,25 @@ class PathControl(NumberControl):
         if isinstance(way, Waypoints):
             shift = way.at(time, way.places) / self.scene.metres
             return shift, still if way.headings is None else way.at(time, way.headings)
-        share, reach = self._share(time), float(self.chosen["reach"])
+        share, reach = (time / self.seconds).clamp(0.0, 1.0), float(self.chosen["reach"])
         if way == TURN:
             return own.new_zeros(3), 360.0 * share
         away = (own[:3, 3] - begin.middle).norm()
-        along = own[:3, 2] if way == APPROACH else -own[:3, 0]
-        ahead = torch.stack([along[0], along[1], still])
-        ahead = ahead / ahead.norm().clamp_min(1e-6)
-        far = away * (reach - 1.0) * (1.0 - share) if way == APPROACH else away * reach * (1.0 - 2.0 * share)
-        return ahead * far[..., None], still
+        if way == APPROACH:
+            return _level(own[:3, 2]) * (away * (reach - 1.0) * (1.0 - share))[..., None], still
+        return _level(-own[:3, 0]) * (away * reach * (1.0 - 2.0 * share))[..., None], still
 
 
 @lru_cache(maxsize=4)
 def _start_of(scene: SceneDescription) -> Start:  # which takes a look at every vertex
     poses = camera_to_world(scene), middle(scene), object_to_world(scene)
     return Start(*(torch.from_numpy(one).float() for one in poses))
+
+
+def _level(along: Tensor) -> Tensor:
+    """The level direction (3,) of one: what travels keeps its height, as a car does."""
+    ahead = torch.stack([along[0], along[1], along.new_zeros(())])
+    return torch.as_tensor(ahead / ahead.norm().clamp_min(1e-6))
 
 
 def looking(place: Tensor, target: Tensor, roll: float) -> Tensor:
@@ -340,11 +325,9 @@ def looking(place: Tensor, target: Tensor, roll: float) -> Tensor:
 
 def turned(start: Start, shift: Tensor, heading: Tensor) -> Tensor:
     """Return what turns the object about the vertical through its middle, in degrees, and shifts it: (4, 4)."""
-    angle, center = torch.deg2rad(heading), start.middle
-    zero, one = torch.zeros_like(angle), torch.ones_like(angle)
-    about = torch.stack([angle.cos(), -angle.sin(), zero, angle.sin(), angle.cos(), zero, zero, zero, one])
-    about = about.reshape(3, 3)
-    return affine(about, center - about @ center + shift) @ start.object
+    about, center = euler(heading, *heading.new_zeros(2)), start.middle
+    posed: Tensor = affine(about, center - about @ center + shift) @ start.object
+    return posed
 
 
 def the_shorter_way(degrees: Doubles) -> tuple[Doubles, str | None]:
@@ -355,11 +338,8 @@ def the_shorter_way(degrees: Doubles) -> tuple[Doubles, str | None]:
     """
     low, high = float(degrees.min()), float(degrees.max())
     places = np.nonzero(np.abs(np.diff(degrees)) > 180.0)[0]
-    if (
-        not len(places)
-        or high - low >= 360.0
-        or not ((0.0 <= low and high <= 360.0) or (-180.0 <= low and high <= 180.0))
-    ):
+    within = (0.0 <= low and high <= 360.0) or (-180.0 <= low and high <= 180.0)
+    if not len(places) or high - low >= 360.0 or not within:
         return degrees, None
     first, last = (f"{one:g}" for one in degrees[places[0] : places[0] + 2])
     note = f"it turns the shorter way from {first} to {last} degrees; for the longer one, add a waypoint between them"

@@ -14,7 +14,7 @@ import copy
 import math
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
@@ -23,82 +23,78 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from advsearch.controls.base import NOTHING, WHOLE_RANGE, Budget, Choice, Parameter, Value, change_in_colour
-from advsearch.controls.numbers import NumberControl, Values
-from advsearch.controls.patch import PRINT_SIDE, enlarged
+from advsearch.controls.base import WHOLE_RANGE, Budget, Choice, Parameter, Value, measure, number
+from advsearch.controls.corruption_filters import picture, planes
+from advsearch.controls.numbers import Values
+from advsearch.controls.patch import PRINT_SIDE, PictureControl, enlarged
 from advsearch.controls.ranges import Range
 from advsearch.controls.texture import NORMS, radius
-from advsearch.controls.values import LARGEST_EPSILON, Fixed, Number, Spec
-from advsearch.errors import FileFormatError, InputError
+from advsearch.controls.values import LARGEST_EPSILON, Fixed, Number
+from advsearch.errors import InputError
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.exposure import METERED_WHITE, WHITE, metered_gain
 from advsearch.scene.formation import to_8_bit
-from advsearch.scene.geometry import camera_axes, camera_to_world, middle
-from advsearch.scene.importing.pictures import read_picture
+from advsearch.scene.geometry import affine, camera_axes, camera_to_world, middle
 from advsearch.scene.parts import ProjectorPart
 from advsearch.scene.settings import LIT, moving
 
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-BESIDE = 15.0
-"""Degrees around the object between the camera and a projector that nobody has placed."""
-AMBIENT = 100.0
-"""Lux of a place whose brightness has no unit: a lit hall, a street at late dusk."""
+BESIDE = 15.0  # degrees around the object between the camera and a projector that nobody has placed
+AMBIENT = 100.0  # lux of a place whose brightness has no unit: a lit hall, a street at late dusk
 LUMENS, TIMES = 3000.0, 20.0
 """Of a projector that nobody has described: it is dimmed to so many times the light of the place."""
 GREY = 0.5
-LIT_SHARE = 0.5
-"""Of its period, in which a flashing light is on."""
+LIT_SHARE = 0.5  # of its period, in which a flashing light is on
 
 
-class ProjectorControl(NumberControl):
+_lit, _moving = partial(number, LIT), partial(moving, ("differences",))
+
+
+class ProjectorControl(PictureControl):
     """A picture thrown onto the object: its texels are searched, and numbers where they get a range."""
 
     part: ProjectorPart
     _later = 0.0
     kind = "projector"
+    shown = "pattern"
     summary = "A picture that a projector throws onto the object."
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter(
             "pattern", (None, None, 3), "sRGB", 0.0, 1.0, "black, or grey",
             "Display-referred texels of the picture, rounded to 8 bits.", search=(0.0, 1.0), estimators=("adjoint",),
         ),
-        moving(
-            ("differences",), "azimuth", "degrees", -3600.0, 3600.0, f"{BESIDE:g} from the camera",
+        _moving(
+            "azimuth", "degrees", -3600.0, 3600.0, f"{BESIDE:g} from the camera",
             "Direction of the projector around the object.", periodic=True,
         ),
-        moving(
-            ("differences",), "elevation", "degrees", -89.0, 89.0, "the camera's",
-            "Height of the projector above the ground plane.",
-        ),
-        moving(
-            ("differences",), "distance", "object sizes", 0.01, 1e4, "the camera's",
+        _moving("elevation", "degrees", -89.0, 89.0, "the camera's", "Height of the projector above the ground plane."),
+        _moving(
+            "distance", "object sizes", 0.01, 1e4, "the camera's",
             "Distance to the object's middle; in metres where the object's size is known.", log=True,
         ),
-        Parameter(
-            "lumens", (), "lumens", 0.0, 1e6, f"{LUMENS:g}, or what is {TIMES:g} times as bright as the place",
-            "Light of a white picture.", estimators=LIT,
+        _lit(
+            "lumens", "lumens", 0.0, 1e6, f"{LUMENS:g}, or what is {TIMES:g} times as bright as the place",
+            "Light of a white picture.",
         ),
-        Parameter(
-            "ambient", (), "lux", 1e-3, 2e5, f"the place's, or {AMBIENT:g}",
-            "Light on the object without the projector.", log=True, estimators=LIT,
+        _lit(
+            "ambient", "lux", 1e-3, 2e5, f"the place's, or {AMBIENT:g}",
+            "Light on the object without the projector.", log=True,
         ),
-        Parameter(
-            "black", (), "1", 0.0, 1.0, 0.0, "Share of white that a black texel still throws: 0.001 at a contrast of "
-            "1000.", estimators=LIT,
+        _lit(
+            "black", "1", 0.0, 1.0, 0.0, "Share of white that a black texel still throws: 0.001 at a contrast of 1000."
         ),
-        Parameter(
-            "blur", (), "texels", 0.0, 64.0, 0.0, "How far it is out of focus: standard deviation of the blur.",
-            estimators=LIT,
+        _lit("blur", "texels", 0.0, 64.0, 0.0, "How far it is out of focus: standard deviation of the blur."),
+        number(
+            ("differences",), "flicker", "Hz", 0.0, 1e5, 0.0,
+            "How often a second it flashes: light in one half of each period; at 0 it does not.",
         ),
-        Parameter(
-            "flicker", (), "Hz", 0.0, 1e5, 0.0, "How often a second it flashes: light in one half of each period; at 0 "
-            "it does not.",
+        number(
+            ("differences",), "phase", "degrees", -3600.0, 3600.0, 0.0,
+            "Where in its period a flashing light is at the time of the picture; up to 180 it is on.", periodic=True,
         ),
-        Parameter("phase", (), "degrees", -3600.0, 3600.0, 0.0, "Where in its period a flashing light is at the time "
-                  "of the picture; up to 180 it is on.", periodic=True),
     )  # fmt: skip
     choices: ClassVar[tuple[Choice, ...]] = (
         Choice("resolution", 64, "Rows of texels.", whole=(2, 512)),
@@ -138,26 +134,26 @@ class ProjectorControl(NumberControl):
     # ---- in a scene -------------------------------------------------------------------------------------------------
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
-        picture = self._read()
+        picture = self.read_picture()
         rows = int(self.chosen["resolution"]) if picture is None else len(picture)
         columns = max(2, round(rows * self.chosen["aspect"])) if picture is None else picture.shape[1]
         there = self.within(scene)
         part = ProjectorPart(self.name, there._fov(columns / rows), (rows, columns))
         if scene.environment is None or scene.environment.candelas is None:
-            told = self.specs.get("ambient")
             note = (
                 f"The place's brightness has no unit: its light is taken for {AMBIENT:g} lux; "
                 f"{self.name}.ambient says otherwise."
             )
-            scene = scene if told is not None else replace(scene, remarks=(*scene.remarks, note))
+            scene = scene if "ambient" in self.specs else replace(scene, remarks=(*scene.remarks, note))
         return scene.with_part(part)
 
     def in_scene(self, parameter: Parameter) -> Parameter:
         metres = parameter.name == "distance" and self.scene.object.metres is not None
         return replace(parameter, unit="metres") if metres else parameter
 
-    def size(self, parameter: Parameter) -> int:
-        return 3 * math.prod(self.part.sides) if parameter.shape else 1
+    @property
+    def sides(self) -> tuple[int, int]:
+        return self.part.sides
 
     def default(self, parameter: Parameter) -> Number:
         if parameter.name == "pattern":
@@ -167,10 +163,7 @@ class ProjectorControl(NumberControl):
             unit = None if place is None else place.candelas
             return AMBIENT if unit is None else min(max(unit * ambient_irradiance(self.scene), 1e-3), 2e5)
         if parameter.name == "lumens":
-            ambient, distance = (next(one for one in self.own if one.name == name) for name in ("ambient", "distance"))
-            spec = self.specs.get("distance")
-            at = float(spec.value) if isinstance(spec, Fixed) else float(self.default(distance))
-            return min(LUMENS, TIMES * float(self.default(ambient)) * self.part.area * at**2)
+            return min(LUMENS, TIMES * float(self.default(self.named("ambient"))) * self.part.area * self._far() ** 2)
         away = camera_to_world(self.scene)[:3, 3] - middle(self.scene)
         far = float(np.linalg.norm(away))
         if parameter.name == "azimuth":
@@ -179,10 +172,10 @@ class ProjectorControl(NumberControl):
             return min(max(math.degrees(math.asin(away[2] / far)), -89.0), 89.0)
         return far * self.scene.metres if parameter.name == "distance" else parameter.default
 
-    def spec(self, parameter: Parameter, value: Number) -> Spec:
-        if parameter.name == "pattern":
-            return Range(0.0, 1.0) if self.chosen["picture"] is None else Fixed(0.0)
-        return self.specs.get(parameter.name, Fixed(value))
+    def _far(self) -> float:
+        """How far away it stands at the start."""
+        spec = self.specs.get("distance")
+        return float(spec.value if isinstance(spec, Fixed) else self.default(self.named("distance")))
 
     def budget_of(self, parameter: Parameter) -> Budget:
         if parameter.name != "pattern":
@@ -192,21 +185,15 @@ class ProjectorControl(NumberControl):
         return Budget(norm, whole if epsilon is None else radius(norm, epsilon, self.size(parameter)))
 
     def fit(self) -> None:
-        parts = [one for one in self.scene.parts if isinstance(one, ProjectorPart) and one.name == self.name]
-        (self.part,) = parts
-        self._picture = self._read()
+        (self.part,) = (part for part in self.scene.parts if isinstance(part, ProjectorPart) and part.name == self.name)
+        self._picture = self.read_picture()
         super().fit()
         rate = next(slot.spec for slot in self.slots if slot.parameter.name == "flicker")
         self.flashes = rate.high if isinstance(rate, Range) else max(map(float, self.allowed("flicker", 0.0)))
 
-    def _read(self) -> Tensor | None:
-        if self.chosen["picture"] is None:
-            return None
-        try:
-            picture = torch.from_numpy(read_picture(Path(self.chosen["picture"])))
-        except FileFormatError as error:
-            raise FileFormatError(f"{self.name}.picture: {error}") from error
-        if min(picture.shape[:2]) < 2:
+    def read_picture(self) -> Tensor | None:
+        picture = super().read_picture()
+        if picture is not None and min(picture.shape[:2]) < 2:
             got = f"{picture.shape[1]} x {picture.shape[0]}"
             raise InputError(f"{self.name}.picture: expected at least 2 texels a side, got {got}")
         return picture
@@ -215,12 +202,9 @@ class ProjectorControl(NumberControl):
         """Degrees: what was chosen, or with which the picture covers the object from where it stands at the start."""
         if self.chosen["fov"] is not None:
             return float(self.chosen["fov"])
-        distances = next(one for one in self.own if one.name == "distance")
-        spec, far = self.specs.get("distance"), float(self.default(distances))
-        far = float(spec.value) if isinstance(spec, Fixed) else far
         vertices = self.scene.base_vertices - middle(self.scene)
         reach = float(np.linalg.norm(vertices, axis=1).max()) * max(1.0, aspect) * self.scene.metres
-        return min(math.degrees(2.0 * math.atan(reach / far)), 150.0)
+        return min(math.degrees(2.0 * math.atan(reach / self._far())), 150.0)
 
     @property
     def ambient(self) -> float | None:
@@ -275,17 +259,10 @@ class ProjectorControl(NumberControl):
 
     def measured(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Value]:
         return {
-            "white": {"value": float(self._lux(values)), "unit": "lux"},
-            "beside_ambient": {"value": float(self._beside(values)), "unit": "times the ambient light"},
-            "mean": {"value": float(srgb_to_linear(values["pattern"]).mean()), "unit": "of white"},
+            "white": measure(self._lux(values), "lux"),
+            "beside_ambient": measure(self._beside(values), "times the ambient light"),
+            "mean": measure(srgb_to_linear(values["pattern"]).mean(), "of white"),
         }
-
-    def describe(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Value]:
-        described = super().describe(u, so_far)
-        if self._picture is not None:
-            return described
-        here, start = (self.values(at)["pattern"] for at in (u.detach(), self.start.to(u.device)))
-        return {**change_in_colour(self.name, here - start), **described}
 
     def kept_pictures(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
         pattern = values["pattern"]
@@ -300,10 +277,8 @@ def out_of_focus(light: Tensor, blur: Tensor) -> Tensor:
     reach = math.ceil(3.0 * sigma) + 1
     kernel = torch.exp(-0.5 * (torch.arange(-reach, reach + 1).to(blur) / blur.clamp_min(0.1)) ** 2)
     kernel = (kernel / kernel.sum()).expand(3, 1, 1, -1)
-    picture = light.permute(2, 0, 1)[None]
-    picture = functional.conv2d(picture, kernel, padding=(0, reach), groups=3)
-    picture = functional.conv2d(picture, kernel.transpose(2, 3), padding=(reach, 0), groups=3)
-    return picture[0].permute(1, 2, 0)
+    rows = functional.conv2d(planes(light), kernel, padding=(0, reach), groups=3)
+    return picture(functional.conv2d(rows, kernel.transpose(2, 3), padding=(reach, 0), groups=3))
 
 
 @lru_cache(maxsize=64)
@@ -311,10 +286,8 @@ def looking_from(scene: SceneDescription, azimuth: float, elevation: float, dist
     """The pose (4, 4) of what looks at the object's middle along its own +z from somewhere around it; degrees, and the
     distance as `ProjectorControl` has it. It is not to be written into."""
     left, up, outwards = torch.from_numpy(camera_axes(azimuth, elevation, 0.0)).float()
-    pose = torch.eye(4)
-    pose[:3, 0], pose[:3, 1], pose[:3, 2] = left, up, -outwards
-    pose[:3, 3] = torch.from_numpy(middle(scene)).float() + distance / scene.metres * outwards
-    return pose
+    place = torch.from_numpy(middle(scene)).float() + distance / scene.metres * outwards
+    return affine(torch.stack([left, up, -outwards], dim=1), place)
 
 
 def ambient_irradiance(scene: SceneDescription) -> float:

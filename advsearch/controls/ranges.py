@@ -16,25 +16,20 @@ from advsearch.distributions import DISTRIBUTION, FROM_PYTHON, OwnQuantiles
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.settings import Parameter
 
-LARGEST = 1e30
-"""No quantity of a scene is larger; the square of one that is has no float32."""
+LARGEST = 1e30  # no quantity of a scene is larger; the square of one that is has no float32
 
 Quantiles = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 COMMON = ("norm", "truncnorm", "uniform", "triang", "beta", "lognorm", "expon", "gamma", "vonmises")
 """Names that a message tells."""
 
-TAIL = 1e-6
-"""Probability of an endless tail that is left out."""
+TAIL = 1e-6  # probability of an endless tail that is left out
 
-MOST_OUTSIDE = 0.01
-"""Probability outside of a parameter's bounds, where a distribution is cut off, at most."""
+MOST_OUTSIDE = 0.01  # probability outside of a parameter's bounds, where a distribution is cut off, at most
 
-CHECKED = 257
-"""Shares at which a function from Python is looked at."""
+CHECKED = 257  # shares at which a function from Python is looked at
 
-NEAR = 1e-4
-"""Half of the step over which the slope of a quantile is taken."""
+NEAR = 1e-4  # half of the step over which the slope of a quantile is taken
 
 
 def is_number(given: object) -> TypeGuard[float]:

@@ -16,34 +16,22 @@ image of a flat, textureless Lambertian surface, section 2.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import lru_cache
+from functools import partial
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from advsearch import seeds
-from advsearch.controls.base import Choice, Parameter
+from advsearch.controls.base import Choice, number
 from advsearch.controls.corruption import coded
-from advsearch.controls.corruption_filters import picture, planes, warped
+from advsearch.controls.corruption_filters import drawn, picture, planes, warped
 from advsearch.controls.numbers import NumberControl, Values
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 
-_DARK = 1e-6
-"""Keeps the slope of a square root finite in black."""
+_DARK = 1e-6  # keeps the slope of a square root finite in black
 
 
-def _number(name: str, unit: str, low: float, high: float, description: str, **more: object) -> Parameter:
-    return Parameter(
-        name,
-        (),
-        unit,
-        low,
-        high,
-        0.0,
-        description,
-        **{"search": (low, high), "estimators": ("image",), **more},  # type: ignore[arg-type]
-    )
+_image = partial(number, ("image",))
 
 
 class SensorControl(NumberControl):
@@ -52,26 +40,25 @@ class SensorControl(NumberControl):
     kind = "sensor"
     summary = "What a camera adds: noise, mosaic, white balance, chromatic aberration, vignetting, JPEG."
     parameters = (
-        _number(
-            "vignetting", "1", 0.0, 0.95, "Share of the light that is missing in the corners.", search=None,
+        _image("vignetting", "1", 0.0, 0.95, 0.0, "Share of the light that is missing in the corners."),
+        _image(
+            "aberration", "1", -0.02, 0.02, 0.0, "How much larger the red picture is than the green one; blue smaller.",
+            (-0.005, 0.005),
         ),
-        _number(
-            "aberration", "1", -0.02, 0.02, "How much larger the red picture is than the green one; blue smaller.",
-            search=(-0.005, 0.005),
+        _image(
+            "shot", "1", 0.0, 0.5, 0.0, "Standard deviation of the noise in white that grows with the root of light.",
+            (0.0, 0.1),
         ),
-        _number(
-            "shot", "1", 0.0, 0.5, "Standard deviation of the noise in white that grows with the root of light.",
-            search=(0.0, 0.1),
+        _image("read", "1", 0.0, 0.2, 0.0, "Standard deviation of the noise that is there in the dark.", (0.0, 0.02)),
+        _image(
+            "mosaic", "1", 0.0, 1.0, 0.0, "Share of the picture that goes through a Bayer mosaic; 1 is a real camera.",
+            (0.0, 1.0),
         ),
-        _number(
-            "read", "1", 0.0, 0.2, "Standard deviation of the noise that is there in the dark.", search=(0.0, 0.02)
-        ),
-        _number("mosaic", "1", 0.0, 1.0, "Share of the picture that goes through a Bayer mosaic; 1 is a real camera."),
-        _number("red", "stops", -1.0, 1.0, "White balance: red is this much brighter.", search=(-0.5, 0.5)),
-        _number("blue", "stops", -1.0, 1.0, "White balance: blue is this much brighter.", search=(-0.5, 0.5)),
-        _number(
-            "compression", "1", 0.0, 95.0, "0 is no file; above, a JPEG file of quality 100 less this.",
-            search=(0.0, 60.0), estimators=(),
+        _image("red", "stops", -1.0, 1.0, 0.0, "White balance: red is this much brighter.", (-0.5, 0.5)),
+        _image("blue", "stops", -1.0, 1.0, 0.0, "White balance: blue is this much brighter.", (-0.5, 0.5)),
+        number(
+            (), "compression", "1", 0.0, 95.0, 0.0, "0 is no file; above, a JPEG file of quality 100 less this.",
+            (0.0, 60.0),
         ),
     )  # fmt: skip
     choices = (Choice("seed", 0, "Which draw of the noise: a whole number from 0.", whole=(0, 2**32 - 1)),)
@@ -97,7 +84,7 @@ def through_sensor(image: Tensor, values: Mapping[str, Tensor], seed: int = 0) -
     light = aberrated(light, values["aberration"])
     variance = values["shot"] ** 2 * light + values["read"] ** 2
     spread = torch.sqrt(variance + _DARK**2) - _DARK
-    light = light + spread * _normal(height, width, seed).to(light)
+    light = light + spread * drawn(height, width, seed, "sensor").to(light)
     light = light + values["mosaic"] * (demosaiced(light) - light)
     gains = torch.stack([2.0 ** values["red"], torch.ones_like(values["red"]), 2.0 ** values["blue"]])
     seen = linear_to_srgb((light * gains.to(light.device)).clamp(0.0, 1.0))
@@ -129,21 +116,10 @@ def aberrated(image: Tensor, amount: Tensor) -> Tensor:
 def demosaiced(light: Tensor) -> Tensor:
     """Return (H, W, 3) of which each pixel keeps one channel (RGGB) and gets the others from neighbours, bilinearly."""
     height, width = light.shape[:2]
-    kept = _pattern(height, width).to(light)
+    rows, columns = torch.arange(height)[:, None] % 2, torch.arange(width)[None, :] % 2
+    red, blue = (1 - rows) * (1 - columns), rows * columns
+    kept = torch.stack([red, 1 - red - blue, blue], dim=-1).to(light)
     kernel = light.new_tensor([[1.0, 2.0, 1.0], [2.0, 4.0, 2.0], [1.0, 2.0, 1.0]]).expand(3, 1, 3, 3)
     total = F.conv2d(planes(light * kept), kernel, padding=1, groups=3)
     weight = F.conv2d(planes(kept), kernel, padding=1, groups=3)
     return torch.where(kept > 0.0, light, picture(total / weight.clamp_min(1e-6)))
-
-
-@lru_cache(maxsize=8)
-def _pattern(height: int, width: int) -> Tensor:
-    """(H, W, 3): 1 where Bayer's pattern keeps the channel."""
-    rows, columns = torch.arange(height)[:, None] % 2, torch.arange(width)[None, :] % 2
-    red, blue = (1 - rows) * (1 - columns), rows * columns
-    return torch.stack([red, 1 - red - blue, blue], dim=-1).float()
-
-
-@lru_cache(maxsize=8)
-def _normal(height: int, width: int, seed: int) -> Tensor:
-    return torch.randn(height, width, 3, generator=torch.Generator().manual_seed(seeds.stream(seed, "sensor")))

@@ -12,15 +12,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from advsearch.controls.base import Choice, Parameter, Value
+from advsearch.controls.base import Choice, Parameter, Value, measure
 from advsearch.controls.numbers import NumberControl, Values
-from advsearch.controls.occlusion import SURROUNDINGS
+from advsearch.controls.occlusion import SURROUNDINGS, camera_in, put_away
 from advsearch.controls.values import Number
 from advsearch.scene.assets import Doubles, Material, Mesh
 from advsearch.scene.description import SceneDescription
@@ -29,14 +29,14 @@ from advsearch.scene.geometry import affine, camera_axes, camera_to_world, middl
 from advsearch.scene.parts import MeshPart
 from advsearch.scene.settings import moving
 
-SMALLEST = 0.01
-"""A smaller card is put away."""
+SMALLEST = 0.01  # a smaller card is put away
 FARTHEST, STEPS = 8.0, 12
 """How many times as far it may be so that the camera does not see it, and in how many steps that is looked for."""
-BELOW_LAMP = 0.7
-"""Where it is at most on the way to a lamp."""
-LOW = 5.0
-"""Degrees above the ground that light counts from: lower, the card would stand on it."""
+BELOW_LAMP = 0.7  # where it is at most on the way to a lamp
+LOW = 5.0  # degrees above the ground that light counts from: lower, the card would stand on it
+
+
+_moving = partial(moving, ("differences",))
 
 
 class ShadowControl(NumberControl):
@@ -47,27 +47,36 @@ class ShadowControl(NumberControl):
     refines = frozenset(SURROUNDINGS)  # none is changed; but it comes after whatever moves the camera
     summary = "A dark card that throws a shadow onto the object, out of the camera's sight."
     parameters = (
-        moving(("differences",), "x", "object sizes", -10.0, 10.0, 0.0, "Shift of the shadow to the right, seen from "
-               "the light.", (-0.5, 0.5)),
-        moving(("differences",), "y", "object sizes", -10.0, 10.0, 0.0, "Shift of the shadow upwards.", (-0.5, 0.5)),
-        moving(("differences",), "size", "object sizes", 0.0, 10.0, 0.0, "Radius of the card; at 0 there is none.",
-               (0.0, 0.6)),
-        moving(("differences",), "turn", "degrees", -3600.0, 3600.0, 0.0, "Turn of the card, counter-clockwise.",
-               (0.0, 360.0), periodic=True),
-        Parameter("radii", (None,), "1", 0.05, 1.0, 1.0, "Radius at each corner, as a share of the size.",
-                  moves_silhouettes=True, search=(0.2, 1.0)),
-        moving(("differences",), "azimuth", "degrees", -3600.0, 3600.0, "the strongest light's",
-               "Direction from the object to the card.", periodic=True),
-        moving(("differences",), "elevation", "degrees", LOW, 90.0, "the strongest light's",
-               "Height of that direction above the ground plane."),
-        moving(("differences",), "distance", "object sizes", 0.1, 1000.0, 2.0, "From the object's middle to the card; "
-               "farther where the camera would see it.", log=True),
+        _moving(
+            "x", "object sizes", -10.0, 10.0, 0.0, "Shift of the shadow to the right, seen from the light.", (-0.5, 0.5)
+        ),
+        _moving("y", "object sizes", -10.0, 10.0, 0.0, "Shift of the shadow upwards.", (-0.5, 0.5)),
+        _moving("size", "object sizes", 0.0, 10.0, 0.0, "Radius of the card; at 0 there is none.", (0.0, 0.6)),
+        _moving(
+            "turn", "degrees", -3600.0, 3600.0, 0.0, "Turn of the card, counter-clockwise.", (0.0, 360.0), periodic=True
+        ),
+        Parameter(
+            "radii", (None,), "1", 0.05, 1.0, 1.0, "Radius at each corner, as a share of the size.",
+            moves_silhouettes=True, search=(0.2, 1.0),
+        ),
+        _moving(
+            "azimuth", "degrees", -3600.0, 3600.0, "the strongest light's", "Direction from the object to the card.",
+            periodic=True,
+        ),
+        _moving(
+            "elevation", "degrees", LOW, 90.0, "the strongest light's",
+            "Height of that direction above the ground plane.",
+        ),
+        _moving(
+            "distance", "object sizes", 0.1, 1000.0, 2.0,
+            "From the object's middle to the card; farther where the camera would see it.", log=True,
+        ),
     )  # fmt: skip
     choices = (Choice("corners", 6, "Corners of the card.", whole=(3, 64)),)
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         texel = np.full((2, 2, 3), 0.1, dtype=np.float32)
-        away = _put_away(torch.from_numpy(camera_to_world(scene))).numpy()
+        away = put_away(torch.from_numpy(camera_to_world(scene))).numpy()
         card = polygon(int(self.chosen["corners"]))
         return scene.with_part(MeshPart(self.name, card, texel, Material(roughness=1.0), to_world=away))
 
@@ -82,21 +91,17 @@ class ShadowControl(NumberControl):
             return math.degrees(math.atan2(towards[1], towards[0]))
         return max(math.degrees(math.asin(min(towards[2], 1.0))), LOW)
 
-    def unchanged(self, parameter: Parameter) -> Number:
-        return self.default(parameter)
-
     def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
         radii = values["radii"]
         rim = torch.from_numpy(polygon(len(radii)).vertices[1:].copy()).to(radii)
         offsets = torch.cat([torch.zeros(1, 3).to(radii), rim * (radii[:, None] - 1.0)])
-        camera = so_far.get("camera.to_world", torch.from_numpy(camera_to_world(self.scene))).to(radii)
         far = self._distance(values, so_far)
-        pose = _put_away(camera) if far is None else self._pose(values, far)
+        pose = put_away(camera_in(self.scene, so_far).to(radii)) if far is None else self._pose(values, far)
         return {f"{self.name}.to_world": pose, f"{self.name}.offsets": offsets}
 
     def measured(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Value]:
         far = self._distance(values, so_far)
-        return {"true_distance": {"value": 0.0 if far is None else far, "unit": "object sizes, 0 where it is put away"}}
+        return {"true_distance": measure(0.0 if far is None else far, "object sizes, 0 where it is put away")}
 
     # ---- inside -----------------------------------------------------------------------------------------------------
 
@@ -130,19 +135,19 @@ class ShadowControl(NumberControl):
 
     def _seen(self, place: Doubles, size: float, so_far: Mapping[str, Tensor]) -> bool:
         """Whether a ball around the card is in the camera's picture: within the cone around its corners."""
-        camera = so_far.get("camera.to_world", torch.from_numpy(camera_to_world(self.scene))).detach().double().numpy()
+        camera = camera_in(self.scene, so_far).detach().double().cpu().numpy()
         way = (place - camera[:3, 3]) @ camera[:3, :3]
         far = float(np.linalg.norm(way))
         if far <= size:
             return True
         model, fov = self.scene.camera_model, so_far.get("camera.fov")
-        widest = (
-            2.0 * math.atan(math.hypot(*model.tangents))
-            if model is not None
-            else math.radians(self.scene.number("camera.fov") if fov is None else float(fov.detach()))
+        if model is not None:
+            widest = 2.0 * math.atan(math.hypot(*model.tangents))
+        else:
+            widest = math.radians(self.scene.number("camera.fov") if fov is None else float(fov.detach()))
+        corner = math.atan(
+            math.tan(min(widest, 3.0) / 2.0) * math.hypot(1.0, min(self.scene.aspect, 1.0 / self.scene.aspect))
         )
-        larger = math.tan(min(widest, 3.0) / 2.0)
-        corner = math.atan(larger * math.hypot(1.0, min(self.scene.aspect, 1.0 / self.scene.aspect)))
         shift = so_far.get("camera.shift")
         if shift is not None:
             corner += 2.0 * float(shift.detach().abs().max())
@@ -177,7 +182,3 @@ def strongest_light(scene: SceneDescription) -> tuple[Doubles, float]:
             far = float(np.linalg.norm(way))
             found, most = way / far, float(lit.mean())
     return found, far
-
-
-def _put_away(camera: Tensor) -> Tensor:
-    return affine(1e-3 * torch.eye(3).to(camera), camera[:3, 3] - camera[:3, 2])

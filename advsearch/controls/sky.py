@@ -21,23 +21,20 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from advsearch.controls.base import Choice, Parameter
+from advsearch.controls.base import Choice, number
 from advsearch.controls.numbers import NumberControl, Values
 from advsearch.scene.assets import EnvironmentAsset
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.mitsuba_backend.parts import sunsky_tables
+from advsearch.scene.settings import LIT
 
-ROWS, COLUMNS = 256, 512
-"""Size of the map."""
-SUN_RADIUS = math.radians(1.5)
-"""Radius of the sun in the map, radians; half of its light comes from within 0.7 degrees."""
-SUN_APERTURE = math.radians(0.5358 / 2.0)
-"""Radius of the real sun, radians: the one that the coefficients are made for."""
+ROWS, COLUMNS = 256, 512  # size of the map
+SUN_RADIUS = math.radians(1.5)  # radius of the sun in the map, radians; half of its light comes from within 0.7 degrees
+SUN_APERTURE = math.radians(0.5358 / 2.0)  # radius of the real sun, radians: the one that the coefficients are made for
 SUN_OVER_SKY = 467.069280386
 """Factor from the unit of the sun's coefficients to that of the sky's, as in Mitsuba's plugin."""
-TURBIDITIES = (1.0, 10.0)
-"""What the coefficients cover."""
+TURBIDITIES = (1.0, 10.0)  # what the coefficients cover
 NEARLY_NOTHING = 1e-12
 
 
@@ -55,20 +52,16 @@ def direction(azimuth: Tensor, elevation: Tensor) -> Tensor:
 
 
 def _at_turbidity(table: Tensor, turbidity: Tensor) -> Tensor:
-    """Interpolate a table (10, ...) between whole turbidities by cubics with a continuous derivative.
-
-    The slope at a whole turbidity is that between its neighbours (Catmull and Rom 1974), one-sided at the ends. The
-    authors interpolate linearly, so that the derivative jumps at whole turbidities, the default of 3 among them.
-    """
+    """Interpolate a table (10, ...) between whole turbidities by cubics with a continuous derivative. The slope at a
+    whole turbidity is that between its neighbours (Catmull and Rom 1974), one-sided at the ends. The authors
+    interpolate linearly, so that the derivative jumps at whole turbidities, the default of 3 among them."""
     below = min(8, max(0, int(turbidity.detach()) - 1))
     t = turbidity - 1.0 - below
     first, second = table[below], table[below + 1]
-    slopes = [
-        (table[min(9, k + 1)] - table[max(0, k - 1)]) / (min(9, k + 1) - max(0, k - 1)) for k in (below, below + 1)
-    ]
-    straight = torch.lerp(first, second, t)
+    around = ((max(0, k - 1), min(9, k + 1)) for k in (below, below + 1))
+    slopes = [(table[after] - table[before]) / (after - before) for before, after in around]
     rise = second - first
-    return straight + t * (1.0 - t) * ((1.0 - t) * (slopes[0] - rise) - t * (slopes[1] - rise))
+    return torch.lerp(first, second, t) + t * (1.0 - t) * ((1.0 - t) * (slopes[0] - rise) - t * (slopes[1] - rise))
 
 
 def sun_irradiance(elevation: Tensor, turbidity: Tensor) -> Tensor:
@@ -161,18 +154,17 @@ class SkyControl(NumberControl):
     kind = "sky"
     summary = "A clear sky instead of the environment: where the sun stands, and how hazy the air is."
     parameters = (
-        Parameter(
-            "azimuth", (), "degrees", -3600.0, 3600.0, 90.0, "Direction of the sun about the vertical; 0 is +x.",
-            periodic=True, search=(0.0, 360.0), estimators=("differences",),
+        number(
+            ("differences",), "azimuth", "degrees", -3600.0, 3600.0, 90.0,
+            "Direction of the sun about the vertical; 0 is +x.", (0.0, 360.0), periodic=True,
         ),
-        Parameter(
-            "elevation", (), "degrees", 2.0, 90.0, 45.0, "Height of the sun above the horizon.", search=(5.0, 85.0),
-            estimators=("differences",),
+        number(
+            ("differences",), "elevation", "degrees", 2.0, 90.0, 45.0, "Height of the sun above the horizon.",
+            (5.0, 85.0),
         ),
-        Parameter(
-            "turbidity", (), "1", *TURBIDITIES, 3.0,
-            "How much the air scatters: 2 is very clear, 3 clear, 6 warm and moist, 10 hazy.", search=(2.0, 8.0),
-            estimators=("adjoint", "differences"),
+        number(
+            LIT, "turbidity", "1", *TURBIDITIES, 3.0,
+            "How much the air scatters: 2 is very clear, 3 clear, 6 warm and moist, 10 hazy.", (2.0, 8.0),
         ),
     )  # fmt: skip
     choices = (

@@ -17,10 +17,9 @@ from advsearch.controls.values import Moved
 from advsearch.copies import is_ours
 from advsearch.errors import InputError
 from advsearch.scene.description import ENVIRONMENT, OWN_MAP, SceneDescription
-from advsearch.scene.validity import View, past, surroundings_of, view_of
+from advsearch.scene.validity import CameraView, past, surroundings_of, view_of
 
-VIEWS = 256
-"""Configurations of a camera, a power of two, by which is found how far it goes."""
+VIEWS = 256  # configurations of a camera, a power of two, by which is found how far it goes
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,18 +62,13 @@ class Space:
         """
         scene = self.scene
         unknown = scene is not None and (
-            scene.backdrop
-            or scene.thin_lens
-            or scene.camera_model is not None
-            or scene.cut_out
-            or scene.normal_mapped
-            or scene.emits
+            any((scene.backdrop, scene.thin_lens, scene.camera_model, scene.cut_out, scene.normal_mapped, scene.emits))
             or any(part.volumetric for part in scene.parts)
         )
         groups, begin = [], 0
         for control in self.controls:
             for group in control.groups:
-                valid = tuple(one for one in group.valid if not (unknown and one == "material"))
+                valid = tuple(name for name in group.valid if not (unknown and name == "material"))
                 groups.append(replace(group, control=control.name, begin=begin, valid=valid))
                 begin += group.size
         return tuple(groups)
@@ -91,7 +85,7 @@ class Space:
     @cached_property
     def _turns(self) -> tuple[int, ...]:
         """The numbers of the controls: those later that refine what others set, and last those that lie on top."""
-        kinds = [(bool(one.refines), one.on_top) for one in self.controls]
+        kinds = [(bool(control.refines), control.on_top) for control in self.controls]
         return tuple(sorted(range(len(kinds)), key=kinds.__getitem__))
 
     def inputs(self, u: Tensor) -> dict[str, Tensor]:
@@ -137,30 +131,34 @@ class Space:
 
     def describe(self, u: Tensor, controls: Sequence[Control] | None = None) -> dict[str, Value]:
         """Say a configuration in a few named values with units: what some of the controls say of it, or else all."""
-        values: dict[str, Value] = {}
-        for control, part, so_far in self._among_others(u):
-            if controls is None or control in controls:
-                values.update(control.describe(part, so_far))
-        return values
+        return {
+            name: value
+            for control, part, so_far in self._among_others(u)
+            if controls is None or control in controls
+            for name, value in control.describe(part, so_far).items()
+        }
 
     def printed(self, u: Tensor) -> dict[str, Tensor]:
         """Return the searched colours that a printer would print, by control; see `Control.printed`."""
-        found = {control.name: control.printed(part) for control, part in self.slices(u)}
-        return {name: colors for name, colors in found.items() if colors is not None}
+        printed = ((control.name, control.printed(part)) for control, part in self.slices(u))
+        return {name: colors for name, colors in printed if colors is not None}
 
     def numbers(self, u: Tensor) -> dict[str, Tensor]:
         """Return the numbers of a configuration by parameter ("pose.yaw"); see `Control.numbers`."""
-        each = ((control.name, control.numbers(part)) for control, part in self.slices(u))
-        return {f"{name}.{one}": value for name, numbers in each for one, value in numbers.items()}
+        return {
+            f"{control.name}.{parameter}": value
+            for control, part in self.slices(u)
+            for parameter, value in control.numbers(part).items()
+        }
 
     @property
     def exposure(self) -> tuple[float, float]:
         """Seconds that the shutter is open, and that rows are read in."""
-        return max((one.exposure for one in self.controls), default=(0.0, 0.0))
+        return max((control.exposure for control in self.controls), default=(0.0, 0.0))
 
     def later(self, seconds: float) -> Space:
         """Return the space so many seconds later, where a control knows a time."""
-        return replace(self, controls=tuple(one.later(seconds) for one in self.controls))
+        return replace(self, controls=tuple(control.later(seconds) for control in self.controls))
 
     def holding(self, u: Tensor) -> Space:
         """Return the space whose first controls stay where a configuration of them has them, so that the others vary.
@@ -199,7 +197,7 @@ class Space:
         turns = any(group.setting == "environment.rotation" for group in self.groups)
         return (*scene.notes, *past(scene, self._views(scene), turns=turns))
 
-    def _views(self, scene: SceneDescription) -> list[View]:
+    def _views(self, scene: SceneDescription) -> list[CameraView]:
         """How the camera looks in some configurations, evenly spread, and where a coordinate is at an end."""
         if surroundings_of(scene) is None:
             return []
@@ -209,26 +207,23 @@ class Space:
             size = len(start)
             spread = SobolEngine(size).draw(VIEWS) if size else torch.zeros(1, 0)
             ends = [torch.where(torch.eye(size) > 0.0, end, 0.5) for end in (0.0, 1.0)]
-            posed = [control.inputs(one) for one in torch.cat([spread, *ends])]
-            return [
-                view_of(
-                    scene,
-                    one["camera.to_world"].detach().double().numpy(),
-                    float(one["camera.fov"]) if "camera.fov" in one else None,
-                )
-                for one in posed
-            ]
+            views = []
+            for u in torch.cat([spread, *ends]):
+                inputs = control.inputs(u)
+                fov = float(inputs["camera.fov"]) if "camera.fov" in inputs else None
+                views.append(view_of(scene, inputs["camera.to_world"].detach().double().numpy(), fov))
+            return views
         return [view_of(scene)]
 
     def artifacts(self, u: Tensor) -> dict[str, Tensor]:
         """Return the pictures worth keeping of a configuration, by file stem."""
-        named = (control.artifacts(part, so_far) for control, part, so_far in self._among_others(u))
-        return {file_name(name): image for one in named for name, image in one.items()}
+        kept = (control.artifacts(part, so_far) for control, part, so_far in self._among_others(u))
+        return {file_name(name): image for pictures in kept for name, image in pictures.items()}
 
     def files(self, u: Tensor) -> dict[str, bytes]:
         """Return the other files worth keeping of a configuration, by name."""
-        named = (control.files(part, so_far) for control, part, so_far in self._among_others(u))
-        return {file_name(name): data for one in named for name, data in one.items()}
+        kept = (control.files(part, so_far) for control, part, so_far in self._among_others(u))
+        return {file_name(name): data for files in kept for name, data in files.items()}
 
 
 class _Held(Control):
@@ -273,8 +268,7 @@ EXPECTED: Mapping[str, tuple[tuple[int | None, ...] | None, float, float]] = {
 """Shape and range of the inputs that a control of another package may set, by the last part of their names; None for
 any number or any shape."""
 
-SLACK = 1e-4
-"""How far past its range rounding may put a colour."""
+SLACK = 1e-4  # how far past its range rounding may put a colour
 
 
 def _check_inputs(control: str, inputs: object) -> None:

@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from functools import partial
 
 import torch
 from torch import Tensor
 
-from advsearch.controls.base import Choice, Parameter, Value
+from advsearch.controls.base import Choice, Parameter, Value, measure, number
 from advsearch.controls.numbers import NumberControl, Values
 from advsearch.controls.projector import LUMENS, TIMES, ProjectorControl
 from advsearch.controls.values import Number
@@ -21,10 +22,12 @@ from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.settings import CHANNELS, LIT, colors
 
 OF_THE_SOURCE = ("azimuth", "elevation", "distance", "ambient", "flicker", "phase")
-WIDTH = 0.3
-"""Object sizes."""
+WIDTH = 0.3  # object sizes
 WIDTH_OF_ONE = 2.0 * math.sqrt(2.0 * math.log(2.0))
 """Diameter in which half of a round Gaussian of standard deviation 1 lies."""
+
+
+_lit = partial(number, LIT)
 
 
 class SpotControl(ProjectorControl):
@@ -34,16 +37,20 @@ class SpotControl(ProjectorControl):
     amount = "lumens"
     summary = "The spot of a torch or a laser on the object."
     parameters = (
-        Parameter("x", (), "object sizes", -10.0, 10.0, 0.0, "Shift of its middle to the right, seen from the light.",
-                  search=(-0.5, 0.5), estimators=LIT),
-        Parameter("y", (), "object sizes", -10.0, 10.0, 0.0, "Shift of its middle upwards.", search=(-0.5, 0.5),
-                  estimators=LIT),
-        Parameter("width", (), "object sizes", 0.02, 10.0, WIDTH, "Diameter in which half of its light falls.",
-                  search=(0.05, 0.6), log=True, estimators=LIT),
+        _lit(
+            "x", "object sizes", -10.0, 10.0, 0.0, "Shift of its middle to the right, seen from the light.", (-0.5, 0.5)
+        ),
+        _lit("y", "object sizes", -10.0, 10.0, 0.0, "Shift of its middle upwards.", (-0.5, 0.5)),
+        _lit(
+            "width", "object sizes", 0.02, 10.0, WIDTH, "Diameter in which half of its light falls.", (0.05, 0.6),
+            log=True,
+        ),
         *colors("of its light.", (0.0, 1.0)),
-        Parameter("lumens", (), "lumens", 0.0, 1e6, "0, or what is 20 times as bright as the place", "All of its "
-                  "light.", search=(0.0, LUMENS), estimators=LIT),
-        *(one for one in ProjectorControl.parameters if one.name in OF_THE_SOURCE),
+        _lit(
+            "lumens", "lumens", 0.0, 1e6, "0, or what is 20 times as bright as the place", "All of its light.",
+            (0.0, LUMENS),
+        ),
+        *(parameter for parameter in ProjectorControl.parameters if parameter.name in OF_THE_SOURCE),
     )  # fmt: skip
     choices = (
         Choice("resolution", 64, "Rows of texels of the picture that it is made of.", whole=(2, 512)),
@@ -64,9 +71,8 @@ class SpotControl(ProjectorControl):
 
     def _bright(self) -> float:
         """Lumens of a spot of the default width that is `TIMES` as bright as the place."""
-        ambient = next(one for one in self.own if one.name == "ambient")
         area = 2.0 * math.pi * (WIDTH / WIDTH_OF_ONE * self.scene.metres) ** 2
-        return min(LUMENS, TIMES * float(super().default(ambient)) * area)
+        return min(LUMENS, TIMES * float(super().default(self.named("ambient"))) * area)
 
     def unchanged(self, parameter: Parameter) -> Number:
         return 0.0 if parameter.name == "lumens" else self.default(parameter)
@@ -86,6 +92,6 @@ class SpotControl(ProjectorControl):
     def measured(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Value]:
         brightest = float(self.thrown(values).detach().max())
         return {
-            "lux": {"value": brightest * float(self._lux(values)), "unit": "lux, where it is brightest"},
-            "beside_ambient": {"value": brightest * float(self._beside(values)), "unit": "times the ambient light"},
+            "lux": measure(brightest * float(self._lux(values)), "lux, where it is brightest"),
+            "beside_ambient": measure(brightest * float(self._beside(values)), "times the ambient light"),
         }

@@ -18,10 +18,10 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from advsearch.controls.base import NOTHING, Budget, Choice, Control, Group, Parameter, Value, change_in_colour
+from advsearch.controls.corruption_filters import resized
 from advsearch.controls.values import LARGEST_EPSILON
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.assets import Bools, Floats, Mesh
@@ -30,8 +30,7 @@ from advsearch.scene.description import OBJECT, SceneDescription
 from advsearch.scene.parts import MeshPart
 from advsearch.scene.raster import texel_area, texels_of_faces
 
-RESOLUTIONS = (256, 512)
-"""Smallest and largest side that is taken from the object's own texture when none is asked for."""
+RESOLUTIONS = (256, 512)  # smallest and largest side that is taken from the object's own texture when none is asked for
 DEFAULT_EPSILON = 0.1
 """Default radius of the L-infinity ball; the default L2 ball has the same root-mean-square change at its edge."""
 NORMS = ("linf", "l2")
@@ -39,8 +38,7 @@ FORMS = ("texels", "palette", "waves")
 LARGEST_WAVES = 64
 LARGEST_PALETTE = 64
 LLOYD_STEPS = 30
-LEAST_ALONE = 0.5
-"""Share of the texels of materials that must be theirs alone for them to be painted."""
+LEAST_ALONE = 0.5  # share of the texels of materials that must be theirs alone for them to be painted
 WAVE_REACH = 3.0
 """Argument of the tanh that the slowest wave alone reaches at its largest amplitude: 0.995 of the ball's radius."""
 
@@ -260,11 +258,7 @@ def waved(original: Tensor, where: Tensor, count: int, radius: float) -> Painter
 
 def resampled(image: Tensor, side: int) -> Tensor:
     """Resize an (h, w, 3) image to (side, side, 3) with an antialiased bilinear filter; values stay in [0, 1]."""
-    if image.shape[:2] == (side, side):
-        return image.contiguous()
-    channels_first = image.permute(2, 0, 1)[None]
-    resized = F.interpolate(channels_first, size=(side, side), mode="bilinear", antialias=True, align_corners=False)
-    return resized[0].permute(1, 2, 0).clamp(0.0, 1.0).contiguous()
+    return resized(image, side, side).contiguous().clamp(0.0, 1.0)
 
 
 def palette(image: Tensor, weight: Floats, count: int) -> Tensor:

@@ -9,33 +9,33 @@ straight on overlap over one stretch of its way, so that t is exact.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from advsearch.controls.base import Parameter, Value
+from advsearch.controls.base import Parameter, Value, measure
 from advsearch.controls.numbers import NumberControl, Slot, Values
+from advsearch.controls.occlusion import camera_in
 from advsearch.controls.pose import euler
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.assets import Doubles
 from advsearch.scene.description import OBJECT, SceneDescription
-from advsearch.scene.geometry import affine, camera_to_world, middle, standing
+from advsearch.scene.geometry import affine, middle, standing
 from advsearch.scene.parts import MeshPart
 from advsearch.scene.settings import ORBIT, moving
 from advsearch.scene.things import Footprint, blocked, footprint, ground_height
 
-GAP = 0.01
-"""Metres between a thing that was moved away and what it would have stood in."""
+GAP = 0.01  # metres between a thing that was moved away and what it would have stood in
 CAMERA, NEAR = 0.3, 0.05
 """Metres around the camera that stay free of what is as high; at most that share of its distance to the object."""
 EIGHTHS = np.arange(8) * np.pi / 4.0
-AWAY, SUNK = 1e-5, 0.01
-"""Size of a thing that is away, and how many metres it lies in the ground."""
+AWAY, SUNK = 1e-5, 0.01  # size of a thing that is away, and how many metres it lies in the ground
 
 
 class Stand(NamedTuple):
@@ -85,28 +85,22 @@ class ThingsControl(NumberControl):
             if name and name not in things:
                 raise UnknownNameError(f"`controls` {self.name}: thing beside the object", name, things)
         super().fit()
-        asked = {
-            slot.parameter.name.rpartition(".")[0]
-            for slot in self.slots
-            if slot.width
-            or not self.specs.keys().isdisjoint((slot.parameter.name, slot.parameter.name.rpartition(".")[2]))
-        }
+        asked = set()
+        for slot in self.slots:
+            thing, _, short = slot.parameter.name.rpartition(".")
+            if slot.width or slot.parameter.name in self.specs or short in self.specs:
+                asked.add(thing)
         self._moved = tuple(name for name in things if name in asked)  # the others stay, or another control moves them
         as_put = {slot.parameter.name: torch.zeros(()) for slot in self.slots}
         for name, stand in self._stands(as_put, {}).items():
             if stand.pushed:
                 raise InputError(f"`controls` {self.name}: {name} stands in something else; put it elsewhere")
 
-    def laid_out(self) -> tuple[Slot, ...]:
-        slots: list[Slot] = []
-        for thing in self.scene.things:
-            for parameter in self.parameters:
-                asked = f"{thing}.{parameter.name}"
-                value = self.default(parameter)
-                spec = self.specs[asked] if asked in self.specs else self.spec(parameter, value)
-                begin = sum(slot.width for slot in slots)
-                slots.append(Slot(replace(parameter, name=asked), spec, 1, begin, value))
-        return tuple(slots)
+    def laid_out(self) -> Iterator[Slot]:
+        for thing, parameter in product(self.scene.things, self.parameters):
+            asked, value = f"{thing}.{parameter.name}", self.default(parameter)
+            spec = self.specs[asked] if asked in self.specs else self.spec(parameter, value)
+            yield Slot(replace(parameter, name=asked), spec, 1, value)
 
     def search_range(self, parameter: Parameter) -> tuple[float, float] | None:
         reach = min(2.0, self.scene.metres)  # beside a small thing, two metres are off its table
@@ -135,21 +129,17 @@ class ThingsControl(NumberControl):
 
     def measured(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Value]:
         """Where each thing stands in the end, as `with` says places."""
-        found: dict[str, Value] = {}
-        for name, stand in self._stands(values, so_far).items():
-            place = (stand.place - middle(self.scene)[:2]) * self.scene.metres
-            found |= {
-                f"{name}.at_{axis}": {"value": float(one), "unit": "metres"}
-                for axis, one in zip("xy", place, strict=True)
-            }
-        return found
+        return {
+            f"{name}.at_{axis}": measure(coordinate, "metres")
+            for name, stand in self._stands(values, so_far).items()
+            for axis, coordinate in zip("xy", (stand.place - middle(self.scene)[:2]) * self.scene.metres, strict=True)
+        }
 
     def _stands(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Stand]:
         """Where the things that move stand, by name; without derivatives."""
         scene, metres = self.scene, self.scene.metres
         thing = _footprint(scene, OBJECT, so_far)
-        camera = so_far.get("camera.to_world")
-        eye = (camera_to_world(scene) if camera is None else camera.detach().cpu().double().numpy())[:3, 3]
+        eye = camera_in(scene, so_far)[:3, 3].detach().double().cpu().numpy()
         middle_of = (thing.outline.min(axis=0) + thing.outline.max(axis=0)) / 2.0
         free = min(CAMERA / metres, NEAR * float(np.linalg.norm(eye[:2] - middle_of)))
         around = eye[:2] + free * np.stack([np.cos(EIGHTHS), np.sin(EIGHTHS)], axis=1)

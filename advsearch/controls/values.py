@@ -31,8 +31,7 @@ from advsearch.scene.settings import SETTINGS, Parameter
 
 Number = float | str
 
-LARGEST_EPSILON = 1e6
-"""No distance from where a control starts is larger, in whichever norm."""
+LARGEST_EPSILON = 1e6  # no distance from where a control starts is larger, in whichever norm
 
 
 @dataclass(frozen=True)
@@ -84,10 +83,8 @@ def read(where: str, parameter: Parameter, given: object) -> Spec:
                 + ("" if parameter.options else " or {distribution: NAME, ...}")
                 + f", got {dict(given)!r}"
             )
-        values = [_value(where, parameter, one) for one in given[CHOICES]]
-        return (
-            _weighted(where, _choices(where, values), given[WEIGHTS]) if WEIGHTS in given else _choices(where, values)
-        )
+        choices = _choices(where, [_value(where, parameter, value) for value in given[CHOICES]])
+        return _weighted(where, choices, given[WEIGHTS]) if WEIGHTS in given else choices
     if not _is_list(given):
         return Fixed(_value(where, parameter, given))
     values = [_value(where, parameter, one) for one in given]  # type: ignore[attr-defined]
@@ -120,8 +117,7 @@ def _choices(where: str, values: Sequence[Number]) -> OneOf:
     return OneOf(tuple(values))
 
 
-MOST_SHARES = 1000
-"""Equal shares of probability that weights are rounded to, at most."""
+MOST_SHARES = 1000  # equal shares of probability that weights are rounded to, at most
 
 
 def _weighted(where: str, choice: OneOf, weights: object) -> OneOf:
@@ -214,8 +210,7 @@ def option_index(count: int, u: Tensor) -> int:
 
 
 TURN = 360.0
-CLOSE = 1e-6
-"""Relative difference up to which two values are the same."""
+CLOSE = 1e-6  # relative difference up to which two values are the same
 
 
 @dataclass(frozen=True)
@@ -233,11 +228,10 @@ class Moved:
 
 def sentences(moved: Sequence[Moved]) -> list[str]:
     """Return what is said of the values that had to move: one sentence a control."""
-    lines = []
-    for control, several in groupby(moved, key=lambda one: one.control):
-        values = " and ".join(map(_instead, several))
-        lines.append(f"The clean scene has {values}, which the control {control} leaves out.")
-    return lines
+    return [
+        f"The clean scene has {' and '.join(map(_instead, several))}, which the control {control} leaves out."
+        for control, several in groupby(moved, key=lambda one: one.control)
+    ]
 
 
 def check_prepared(control: str, before: SceneDescription, after: SceneDescription) -> Iterator[Moved]:
@@ -269,15 +263,14 @@ def check_start(
 ) -> None:
     """Raise InputError where a value `wanted` of a control's parameter, which is outside what is `allowed` (in words)
     and so cannot be that of the clean scene, was asked for in the scene's `setting` that says the same."""
-    if setting not in scene.given:
-        return
-    asked = f"`environment={scene.environment_spec}`"
-    if setting != ENVIRONMENT:
-        asked = f"`set` {setting}={shown(scene.number(setting))}"
-    raise InputError(
-        f"{asked} and `controls` {control} contradict each other: {control}.{parameter} is {allowed}, which leaves "
-        f"{shown(wanted)} out; change one of the two, or leave one out"
-    )
+    if setting in scene.given:
+        asked = f"`environment={scene.environment_spec}`"
+        if setting != ENVIRONMENT:
+            asked = f"`set` {setting}={shown(scene.number(setting))}"
+        raise InputError(
+            f"{asked} and `controls` {control} contradict each other: {control}.{parameter} is {allowed}, which leaves "
+            f"{shown(wanted)} out; change one of the two, or leave one out"
+        )
 
 
 def same(one: Number, other: Number, *, turns: bool = False) -> bool:

@@ -663,8 +663,6 @@ def test_all_that_a_run_writes_is_known_to_overwrite(home: Path) -> None:
         run.record(Row("search", 0))
         run.save_image("clean", np.zeros((4, 4, 3)))
         run.save_exr("texture", np.zeros((4, 4, 3)), folder="artifacts")
-        with run.replacing("artifacts/mesh.obj") as part:
-            part.write_text("v 0 0 0")
         run.write_summary(attack())
         assert {path.name for path in run.path.iterdir()} - {".lock"} <= set(directory.CONTENTS)
 

@@ -334,7 +334,7 @@ def _panes(t: Texels) -> Array:
 
 def _lamps(t: Texels) -> Array:
     """A headlight: two round lamps in a bright housing."""
-    x, y, z = t.xyz.T
+    _, y, z = t.xyz.T
     out = np.abs(y)
     lamp = np.minimum(np.hypot(out - 0.58, z - 0.62), np.hypot(out - 0.71, z - 0.64))
     base = mix(hexed("9aa4ab"), hexed("f4f7f8"), step(0.032 - lamp, 0.0, 0.01))

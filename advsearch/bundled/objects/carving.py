@@ -20,8 +20,7 @@ Bools = npt.NDArray[np.bool_]
 Field = Callable[[Array], Array]
 """(N, 3) points to (N,) values, positive inside; about the distance to the edge."""
 
-SNAP = 0.1
-"""Share of an edge within which a cut goes through the edge's end: thinner slivers are not worth a triangle."""
+SNAP = 0.1  # share of an edge within which a cut goes through the edge's end: thinner slivers are not worth a triangle
 
 
 def carved(patches: Iterable[Patch], inside: Field, tag: str | None) -> list[Patch]:

@@ -12,9 +12,6 @@ from .family import Instance, family, finish
 from .shapes import Patch, box, lathe, placed, sphere, sweep
 from .textures import Paint, between, checks, clouded, dots, gradient, natural, over, rings, shade, solid, stripes, wood
 
-# ------------------------------------------------------------------------------------------------------- chair
-
-
 Place = tuple[float, float, float]
 
 
@@ -32,10 +29,8 @@ def chair(draw: Draw) -> Instance:
     """Faces +x; the back stands at -x."""
     wide, deep = draw(43.0, 36.0, 50.0), draw(42.0, 36.0, 48.0)
     seat, total = draw(45.0, 40.0, 50.0), draw(92.0, 78.0, 108.0)
-    thick = draw(3.6, 2.4, 5.5)
-    leg = draw(2.1, 1.5, 3.0)
-    splay = draw(1.5, 0.0, 6.0)
-    lean = draw(5.0, 1.0, 11.0)
+    thick, leg = draw(3.6, 2.4, 5.5), draw(2.1, 1.5, 3.0)
+    splay, lean = draw(1.5, 0.0, 6.0), draw(5.0, 1.0, 11.0)
     square = draw.chance(0.5, True)
     section = rectangle(2.0, 2.0, 0.5, 2) if square else ellipse(1.0, 1.0, 16)
     taper = (leg * draw(0.75, 0.55, 1.0), leg)
@@ -118,9 +113,6 @@ def _chair_back(
         tall = draw(0.6, 0.35, 0.75) * high
         patches += slat("cushion" if draw.chance(0.3) else "up", total - tall / 2 - 0.04 * high, inner, tall)
     return patches
-
-
-# -------------------------------------------------------------------------------------------------------- lamp
 
 
 def _shade(draw: Draw, low: float, high: float, wide: float, narrow: float) -> list[Patch]:

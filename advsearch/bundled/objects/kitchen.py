@@ -26,8 +26,6 @@ from .textures import (
     wood,
 )
 
-# ------------------------------------------------------------------------------------------------------ teapot
-
 
 def _spout(draw: Draw, radius: float, height: float) -> list[Patch]:
     """A spout along +x with an open, hollow end."""
@@ -54,8 +52,7 @@ def _spout(draw: Draw, radius: float, height: float) -> list[Patch]:
 def teapot(draw: Draw) -> Instance:
     radius, height = draw(7.2, 6.4, 8.0), draw(10.2, 8.0, 12.5)
     foot, mouth = radius * draw(0.58, 0.5, 0.75), radius * draw(0.48, 0.42, 0.6)
-    at = draw(0.45, 0.35, 0.58)
-    full = draw(0.9, 0.82, 0.97)
+    at, full = draw(0.45, 0.35, 0.58), draw(0.9, 0.82, 0.97)
     knots = [
         (foot, 0.5), (radius * full, 0.5 * at * height), (radius, at * height),
         (radius * (0.97 * full), (0.42 * at + 0.58) * height), (mouth, height),
@@ -125,14 +122,10 @@ def teapot(draw: Draw) -> Instance:
     return Instance(patches, paints, finish(draw, 0.25, 0.7), {"base": 0.6})
 
 
-# ---------------------------------------------------------------------------------------------------- frying pan
-
-
 @family(metres=0.01)
 def frying_pan(draw: Draw) -> Instance:
     base, rim = draw(10.5, 9.0, 11.5), draw(13.0, 12.2, 14.5)
-    depth = draw(4.2, 2.8, 5.5)
-    wall = draw(0.38, 0.3, 0.55)
+    depth, wall = draw(4.2, 2.8, 5.5), draw(0.38, 0.3, 0.55)
     side = spline([(base - 0.8, 0.0), (base, 0.25), (base + 0.55 * (rim - base), 0.5 * depth), (rim, depth)], 14)
     body = vessel(side, wall, 0.5, columns=64, step=1.6)
 

@@ -27,7 +27,7 @@ class Patch:
     """A piece of surface with one chart.
 
     Attributes:
-        tag: which paint it gets; any string.
+        tag: which paint it gets; any string. So it is in all functions here.
         vertices: (V, 3) positions.
         normals: (V, 3) unit normals, outwards.
         uvs: (V, 2) chart coordinates in [0, 1].
@@ -81,7 +81,6 @@ def grid(tag: str, points: Array, normals: Array, size: tuple[float, float], dow
     """Return the patch over a grid of points: u runs along columns, v along rows, du x dv points outwards.
 
     Args:
-        tag: which paint it gets.
         points: (R, C, 3) positions.
         normals: (R, C, 3) unit normals.
         size: chart width and height.
@@ -307,7 +306,6 @@ def sweep(
     """Move a closed section along a path.
 
     Args:
-        tag: which paint it gets.
         path: (N, 3) centres.
         section: (M, 2) closed section, counter-clockwise, coordinates along the first and second normal.
         scale: one number, (N,) or (N, 2): the section's scale at each centre; 0 closes the surface in a point.
@@ -364,7 +362,6 @@ def box(
     """A box with rounded edges and corners: six charts, smooth normals.
 
     Args:
-        tag: which paint it gets.
         centre: its middle.
         size: full extent along x, y and z.
         bevel: radius of the edges.

@@ -111,9 +111,6 @@ def ball(draw: Draw) -> Instance:
     return Instance(shaped, {"ball": paint}, finish(draw, 0.4, 0.3))
 
 
-# ------------------------------------------------------------------------------------------------------ banana
-
-
 @family(metres=0.01)
 def banana(draw: Draw) -> Instance:
     length, bend, thick, stem = (
@@ -166,9 +163,6 @@ def banana(draw: Draw) -> Instance:
         return mix(base, tip, step(-end, -0.75, 0.5))
 
     return Instance(patches, {"banana": natural(draw, length, paint, 0.4)}, finish(draw, 0.45, 0.1))
-
-
-# -------------------------------------------------------------------------------------------------------- book
 
 
 @family(metres=0.01)

@@ -12,7 +12,6 @@ from .textures import (
     Texels,
     between,
     clouded,
-    mottled,
     natural,
     over,
     painter,
@@ -24,8 +23,6 @@ from .textures import (
     within,
     wood,
 )
-
-# ------------------------------------------------------------------------------------------------------ hammer
 
 
 def _claw(draw: Draw, half: float, start: float, length: float, drop: float) -> list[Patch]:
@@ -62,8 +59,7 @@ def _peen(draw: Draw, half: float, start: float, length: float) -> list[Patch]:
 @family(metres=0.01)
 def hammer(draw: Draw) -> Instance:
     """The handle runs along -x from the head at the origin; the head lies along y, its striking face at -y."""
-    half = draw(1.35, 1.15, 1.7)
-    length = draw(27.0, 20.0, 31.0)
+    half, length = draw(1.35, 1.15, 1.7), draw(27.0, 20.0, 31.0)
     front = draw(5.0, 3.8, 6.0)
     face = half * draw(1.1, 1.0, 1.35)
     style = draw.pick("claw", "claw", "peen", "sledge")
@@ -107,9 +103,7 @@ def hammer(draw: Draw) -> Instance:
     offset = draw.offset()
     steel = draw.colour("4b4f55", "8d9298", "2b2d30", "6b7078", wild=0.15)
     metal = over(
-        mottled(steel, shade(steel, 0.8), 1.6, offset, 2.4),
-        lambda t: step(-t.xyz[:, 1], 0.86 * front, 0.3),
-        solid(shade(steel, 1.7)),
+        clouded(steel, 0.8, 1.6, offset, 2.4), lambda t: step(-t.xyz[:, 1], 0.86 * front, 0.3), solid(shade(steel, 1.7))
     )
     timber = wood(draw.colour("c48f55", "a8743f", "d9b27c", "7a4f2a", wild=0.05), 0.9, offset, axis=0)
     stain = draw.colour("8f2e22", "1f4e79", "d9a02b", "2d2d33", "3d6b4a")
@@ -122,9 +116,6 @@ def hammer(draw: Draw) -> Instance:
         hold = over(solid(shade(stain, 0.5)), between(-2 * length, -0.45 * length, axis=0, soft=0.05), ribs)
     paints = {"head": natural(draw, length, metal, 0.3), "handle": natural(draw, length, hold, 0.3)}
     return Instance(patches, paints, finish(draw, 0.38, 0.2))
-
-
-# ---------------------------------------------------------------------------------------------------- dumbbell
 
 
 def _weights(draw: Draw, style: str, at: float, length: float, radius: float) -> list[Patch]:
@@ -156,8 +147,7 @@ def dumbbell(draw: Draw) -> Instance:
     style = draw.pick("hex", "plates", "hex", "round", "globe")
     radius = draw(4.6, 3.6, 6.2)
     grip, length = draw(5.6, 5.0, 7.0), draw(5.6, 3.8, 7.0)
-    bar = draw(1.45, 1.2, 1.9)
-    swell = draw(0.16, 0.0, 0.3)
+    bar, swell = draw(1.45, 1.2, 1.9), draw(0.16, 0.0, 0.3)
     z = np.linspace(-grip - 0.6, grip + 0.6, 25)
     profile = np.stack([bar * (1.0 + swell * np.cos(np.pi * z / (2 * grip + 1.2)) ** 2), z], axis=1)
     weights = _weights(draw, style, grip, length, radius)

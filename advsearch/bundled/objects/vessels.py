@@ -33,7 +33,7 @@ from .textures import (
 BACK = rotation("z", 220.0)  # turns the seam of a lathe away from the default camera, at azimuth 40
 
 
-def handle(draw: Draw, style: str, low: float, high: float, reach: float, at_low: float, at_high: float) -> list[Patch]:
+def handle(draw: Draw, style: str, low: float, high: float, reach: float, profile: Array, inset: float) -> list[Patch]:
     """A handle in the x-z plane, on the +x side.
 
     Args:
@@ -42,9 +42,10 @@ def handle(draw: Draw, style: str, low: float, high: float, reach: float, at_low
         low: height of its lower root.
         high: height of its upper root.
         reach: how far it stands out from the wall.
-        at_low: distance of the lower root from the axis.
-        at_high: distance of the upper root from the axis.
+        profile: (K, 2) of the wall that it stands on.
+        inset: how deep in the wall its roots are.
     """
+    at_low, at_high = (at_height(profile, z) - inset for z in (low, high))
     edge = max(at_low, at_high)
     if style == "square":
         corners = [(at_high, high), (edge + reach, high), (edge + reach, low), (at_low, low)]
@@ -90,17 +91,12 @@ def _ceramic(draw: Draw, height: float, glaze: Paint, accent: Paint) -> Paint:
     return glaze
 
 
-# ------------------------------------------------------------------------------------------------------- mug
-
-
 @family(metres=0.01)
 def mug(draw: Draw) -> Instance:
-    height = draw(9.4, 7.6, 12.0)
-    top = draw(4.15, 3.6, 5.0)
+    height, top = draw(9.4, 7.6, 12.0), draw(4.15, 3.6, 5.0)
     foot = top * draw(0.93, 0.72, 1.02)
     belly = draw(0.0, -0.06, 0.13) * top
-    wall = draw(0.36, 0.28, 0.5)
-    low = draw(0.7, 0.3, 1.2)
+    wall, low = draw(0.36, 0.28, 0.5), draw(0.7, 0.3, 1.2)
     corners = [(foot - low, 0.0), (foot, low), (0.5 * (foot + top) + belly, 0.5 * height), (top, height)]
     side = spline(np.array(corners[1:]), 14)
     outside = np.concatenate([[corners[0], (foot - 0.3 * low, 0.25 * low)], side])
@@ -109,14 +105,12 @@ def mug(draw: Draw) -> Instance:
     style = draw.pick("ear", "round", "square", "loop")
     grip_high = height * draw(0.85, 0.76, 0.88)
     grip_low = height * (draw(0.3, 0.34, 0.42) if style == "loop" else draw(0.2, 0.16, 0.3))
-    roots = [at_height(side, z) - 0.55 * wall for z in (grip_low, grip_high)]
-    grip = handle(draw, style, grip_low, grip_high, draw(2.9, 2.3, 3.4), roots[0], roots[1])
+    grip = handle(draw, style, grip_low, grip_high, draw(2.9, 2.3, 3.4), side, 0.55 * wall)
 
     offset = draw.offset()
     clay = draw.colour("e9dfca", "f3f1ec", "d9c7a5", "3a3f45", "8fa7a0", "b5442e", "6f8fb0")
-    glaze = speckled(
-        clouded(clay, 0.93, 3.0, offset), draw.colour("7d6247", wild=0.2), 0.28, offset, draw(0.06, 0.0, 0.14)
-    )
+    specks = draw.colour("7d6247", wild=0.2)
+    glaze = speckled(clouded(clay, 0.93, 3.0, offset), specks, 0.28, offset, draw(0.06, 0.0, 0.14))
     deep = draw.colour("1f4e79", "2c6e63", "a63c2a", "d79b2b", "2d2d33")
     accent = clouded(deep, 1.35, 2.2, offset)
     outer = natural(draw, height, _ceramic(draw, height, glaze, accent))
@@ -132,9 +126,6 @@ def mug(draw: Draw) -> Instance:
     }
     patches = placed([*body, *placed(grip, rotation("z", -108.0))], BACK)
     return Instance(patches, paints, finish(draw, 0.3, 0.5), {"inside": 0.8, "base": 0.6})
-
-
-# ------------------------------------------------------------------------------------------------------- bowl
 
 
 @family(metres=0.01)
@@ -157,9 +148,8 @@ def bowl(draw: Draw) -> Instance:
     outer = natural(draw, 2 * radius, _bowl_paint(draw, height, glaze, accent))
     inner = draw.pick(accent, glaze, outer, solid(draw.colour("f3f1ec")), rings(clay, shade(clay, 1.3), height * 0.2))
     raw = solid("9b7352")
-    return Instance(
-        placed(body, BACK), {"outside": outer, "inside": inner, "base": raw}, finish(draw, 0.28, 0.5), {"base": 0.6}
-    )
+    paints = {"outside": outer, "inside": inner, "base": raw}
+    return Instance(placed(body, BACK), paints, finish(draw, 0.28, 0.5), {"base": 0.6})
 
 
 def _bowl_paint(draw: Draw, height: float, glaze: Paint, accent: Paint) -> Paint:
@@ -169,13 +159,9 @@ def _bowl_paint(draw: Draw, height: float, glaze: Paint, accent: Paint) -> Paint
     return over(rim, between(-1.0, 0.55, soft=0.1), solid("9b7352"))
 
 
-# ------------------------------------------------------------------------------------------------------ bottle
-
-
 @family(metres=0.01)
 def bottle(draw: Draw) -> Instance:
-    height = draw(30.0, 24.0, 32.0)
-    radius = draw(3.75, 3.0, 4.8)
+    height, radius = draw(30.0, 24.0, 32.0), draw(3.75, 3.0, 4.8)
     neck = draw(1.35, 1.0, 1.7)
     shoulder = height * draw(0.62, 0.45, 0.68)
     rise = height * draw(0.15, 0.08, 0.22)
@@ -244,9 +230,6 @@ def _labelled(draw: Draw, surface: Paint, paper: Array, ink: Array, low: float, 
     return over(label, seal, solid("b08d3c"))
 
 
-# ------------------------------------------------------------------------------------------------------- vase
-
-
 @family(metres=0.01)
 def vase(draw: Draw) -> Instance:
     height = 24.0
@@ -262,8 +245,7 @@ def vase(draw: Draw) -> Instance:
     patches = vessel(profile, draw(0.4, 0.35, 0.6), 0.8, step=1.2)
     if draw.chance(0.25):
         low, high = belly_at + 0.15 * (neck_at - belly_at), neck_at - 0.2
-        at = [at_height(profile, z) - 0.2 for z in (low, high)]
-        ear = handle(draw, "ear", low, high, draw(1.6, 1.2, 2.4), at[0], at[1])
+        ear = handle(draw, "ear", low, high, draw(1.6, 1.2, 2.4), profile, 0.2)
         patches += [*placed(ear, rotation("z", 130.0)), *placed(ear, rotation("z", -50.0))]
     offset = draw.offset()
     clay = draw.colour("f2f1ea", "b7562f", "2f6f6a", "26303c", "d9c7a5", "8a2f2a")
@@ -295,17 +277,13 @@ def _vase_paint(draw: Draw, glaze: Paint, height: float, offset: Array) -> Paint
     return over(paint, frieze, solid(ink))
 
 
-# --------------------------------------------------------------------------------------------------- wine glass
-
-
 @family(metres=0.01)
 def wine_glass(draw: Draw) -> Instance:
     foot = draw(3.5, 2.9, 4.2)
     stem, stem_top = draw(0.42, 0.32, 0.6), draw(9.5, 6.0, 12.0)
     bowl, deep = draw(4.1, 3.2, 5.0), draw(9.8, 6.5, 11.5)
     mouth = bowl * draw(0.8, 0.7, 1.12)
-    wide_at = draw(0.42, 0.3, 0.55)
-    wall = draw(0.24, 0.2, 0.3)
+    wide_at, wall = draw(0.42, 0.3, 0.55), draw(0.24, 0.2, 0.3)
     under = [(0.0, 0.12), (foot * 0.8, 0.12), (foot * 0.9, 0.0), (foot - 0.15, 0.0)]
     rising = [(foot, 0.28), (0.55 * foot, 0.6), (0.22 * foot, 1.25), (stem * 1.15, 2.4), (stem, 0.6 * stem_top)]
     knob = draw.chance(0.25)

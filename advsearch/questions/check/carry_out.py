@@ -202,7 +202,7 @@ def _planned(problem: Problem, part: CheckedPart, spp: int, results: Results, pr
         "adjoint renders: no coordinate needs one": not used & BY_ADJOINT,
         "renders for differences: every derivative is an adjoint or of the picture itself": not used & BY_DIFFERENCES,
         "the volumetric integrator: there is no medium": not renderer.scene.volumetric,
-        **{f"by the material form: {limit.what}": "material" in used for limit in LIMITS},
+        **{f"by the material form: {limit}": "material" in used for limit in LIMITS},
     }
     left_out = [text for text, true in not_computed.items() if true]
     yield SearchPlan(

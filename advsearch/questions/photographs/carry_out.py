@@ -216,8 +216,8 @@ def _by_sweep(config: SweepConfig) -> list[_PhotoJudge]:
         number = int(rendering)
         if number >= job.per_scene * len(job.places):
             raise InputError(f"rendering: the sweep has no picture {rendering}; it belongs to another run")
-        scene, _, query = job.queries(range(number, number + 1))[model]
-        return scenes.named(scene).problems[model].truth(query.u, query.values)
+        scene, queries = scenes.asked(number)
+        return scene.problems[model].truth(queries[model].u, queries[model].values)
 
     each = enumerate(zip(job.models, job.tasks, job.sizes, strict=True))
     return [_PhotoJudge(model, task, size, partial(truth, number)) for number, (model, task, size) in each]

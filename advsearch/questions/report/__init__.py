@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from advsearch.cli import output
+from advsearch.cli.commands import Command
 from advsearch.errors import InputError
 
 HELP = "write what runs show, and no more than that, for a model card or a safety case"
@@ -141,3 +142,6 @@ def _is_at(value: object, text: str | None) -> bool:
         return math.isclose(float(str(value)), float(text), rel_tol=1e-3, abs_tol=1e-3)
     except ValueError:
         return False
+
+
+COMMAND = Command(run, (add_arguments,), MORE, EXAMPLES)
