@@ -4,12 +4,13 @@ refused in a sentence."""
 from __future__ import annotations
 
 import inspect
+import re
 from collections.abc import Callable, Mapping, Sequence
 from functools import wraps
-from pathlib import Path
 from typing import Any, TypeVar
 
 from advsearch.errors import InputError, resembling
+from advsearch.files import either
 from advsearch.options import told
 
 SYNONYMS = {
@@ -51,10 +52,7 @@ SYNONYMS = {
 DEVICES = ("device", "cuda", "gpu", "use_cuda")
 
 NOWHERE = {
-    **dict.fromkeys(
-        DEVICES,
-        "pictures are made on the processor, and a model stays on the device that it is on",
-    ),
+    **dict.fromkeys(DEVICES, "pictures are made on the processor, and a model stays on the device that it is on"),
     **dict.fromkeys(("lr", "learning_rate", "step_size", "alpha", "momentum"), "steps are an option of a policy"),
 }
 
@@ -62,6 +60,11 @@ WORDS = {
     "str": "a text", "Path": "a path", "bool": "True or False", "int": "a whole number", "float": "a number",
     "None": "None", "Mapping": "a mapping", "Sequence": "a list", "Callable": "a function",
 }  # fmt: skip
+
+ALIASES = frozenset(
+    "Controls Watched Given Texture Read MakeOptimiser Examples Unpack Literal Names Named Tensor".split()
+)
+"""Names in annotations that are of no class."""
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -74,7 +77,7 @@ def unexpected(function: str, given: Mapping[str, object], known: Sequence[str])
             continue
         meant, reason = meant_by(name, known)
         meant = meant or ([] if name.lower() in DEVICES else resembling(name, known)[:2])
-        hint = f"; did you mean {' or '.join(f'`{one}`' for one in meant)}?" if meant else ""
+        hint = f"; did you mean {' or '.join(f'`{known}`' for known in meant)}?" if meant else ""
         reason = f" ({reason})" if reason else ""
         return TypeError(f"{function}() got an unexpected keyword argument {name!r}{hint}{reason}")
     return None
@@ -82,24 +85,20 @@ def unexpected(function: str, given: Mapping[str, object], known: Sequence[str])
 
 def meant_by(name: str, known: Sequence[str]) -> tuple[list[str], str]:
     """Return which of the known keywords other libraries call so, and why there is none like it here."""
-    meant = [one for one, others in SYNONYMS.items() if one in known and name.lower() in others.split()]
+    meant = [ours for ours, others in SYNONYMS.items() if ours in known and name.lower() in others.split()]
     return meant, NOWHERE.get(name.lower(), "")
 
 
 def check_types(parameters: Mapping[str, inspect.Parameter], given: Mapping[str, object]) -> None:
     """Check values against the annotations of a function's own parameters, as far as these name types and classes.
-
-    Raises:
-        InputError: a value is of none of them.
-    """
+    Raises InputError where a value is of none of them."""
     for name, value in given.items():
-        one = parameters.get(name)
-        if one is None or value is one.default or hasattr(value, "tolist"):
+        parameter = parameters.get(name)
+        if parameter is None or value is parameter.default or hasattr(value, "tolist"):
             continue
-        kinds = _kinds(str(one.annotation))
+        kinds = _kinds(str(parameter.annotation))
         if kinds and not any(_fits(kind, value) for kind in kinds):
-            *words, last = [WORDS.get(kind, f"a {kind.rpartition('.')[2]}") for kind in kinds]
-            expected = f"{', '.join(words)} or {last}" if words else last
+            expected = either([WORDS.get(kind, f"a {kind.rpartition('.')[2]}") for kind in kinds])
             raise InputError(f"{name}: expected {expected}, got {told(value)}")
         if name == "run" and isinstance(value, str) and not value.strip():
             raise InputError("run: expected the name of a run or a folder, got an empty text; leave it out for no run")
@@ -107,37 +106,25 @@ def check_types(parameters: Mapping[str, inspect.Parameter], given: Mapping[str,
 
 def _kinds(annotation: str) -> list[str]:
     """The types that an annotation names; none where it has names of other things."""
-    plain, depth = "", 0
-    for letter in annotation:
-        depth += (letter == "[") - (letter == "]")
-        plain += letter if depth == 0 and letter != "]" else ""
-    kinds = [one.strip().replace("os.PathLike", "Path") for one in plain.split("|")]
-    aliases = {kind for kind in kinds if kind.startswith("Any")} | {*kinds} & {
-        "Controls",
-        "Watched",
-        "Given",
-        "Texture",
-    }
-    aliases |= {*kinds} & {"Read", "MakeOptimiser", "Examples", "Unpack", "Literal", "Names", "Named", "Tensor"}
-    return [] if aliases else list(dict.fromkeys(kinds))
+    plain, count = annotation, 1
+    while count:
+        plain, count = re.subn(r"\[[^][]*\]", "", plain)
+    kinds = dict.fromkeys(kind.strip().replace("os.PathLike", "Path") for kind in plain.split("|"))
+    return [] if kinds.keys() & ALIASES or any(kind.startswith("Any") for kind in kinds) else list(kinds)
 
 
 def _fits(kind: str, value: object) -> bool:
-    if kind == "None":
-        return value is None
-    if kind in ("int", "float"):
-        return (
-            isinstance(value, (int, float)) and not isinstance(value, bool) and (kind == "float" or value == value // 1)
-        )
-    if kind == "Path":
-        return isinstance(value, Path) or hasattr(value, "__fspath__")
-    if kind == "Callable":
-        return callable(value)
-    if kind == "Mapping":
-        return isinstance(value, Mapping)
-    if kind == "Sequence":
-        return isinstance(value, Sequence) and not isinstance(value, (str, bytes))
-    return any(kind.rpartition(".")[2] == base.__name__ for base in type(value).__mro__)
+    number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    fits = {
+        "None": value is None,
+        "int": number and value == value // 1,  # type: ignore[operator]
+        "float": number,
+        "Path": hasattr(value, "__fspath__"),
+        "Callable": callable(value),
+        "Mapping": isinstance(value, Mapping),
+        "Sequence": isinstance(value, Sequence) and not isinstance(value, (str, bytes)),
+    }
+    return fits.get(kind, kind.rpartition(".")[2] in [base.__name__ for base in type(value).__mro__])
 
 
 def helped(function: Function) -> Function:

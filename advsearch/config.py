@@ -61,12 +61,12 @@ def read_joined(value: Any, setting: str, otherwise: str) -> Any:
     parts = re.split(r"\+(?![^{]*\})", value) if isinstance(value, str) else value
     if not isinstance(parts, (list, tuple)) or len(parts) < 2:
         return read_named(value, setting, otherwise)
-    read = [read_named(one.strip() if isinstance(one, str) else one, setting, otherwise) for one in parts]
-    named = [one.get("name") if isinstance(one, Mapping) else one for one in read]
-    names = [name for name in named if isinstance(name, str) and name]
-    if len(names) < len(read):
+    read = [read_named(part.strip() if isinstance(part, str) else part, setting, otherwise) for part in parts]
+    mappings = [part if isinstance(part, Mapping) else {"name": part} for part in read]
+    names = [part.get("name") for part in mappings]
+    if not all(isinstance(name, str) and name for name in names):
         return value
-    options = {one["name"]: {k: v for k, v in one.items() if k != "name"} for one in read if isinstance(one, Mapping)}
+    options = {part["name"]: {k: v for k, v in part.items() if k != "name"} for part in mappings if len(part) > 1}
     last = options.get(names[-1], {})
     if last.keys() <= set(names):  # as a command is written back: detection+depth={depth: {seek: gone}}
         options = {**options, **last} if names[-1] in last else {**options, names[-1]: {}, **last}
@@ -92,21 +92,17 @@ SEVERAL = ("object", "environment", "model", "labels", "label", "target", "held_
 TEXTS = (*SEVERAL, "task", "up", "camera", "run", "objective")
 """The settings that are texts, whatever they are given as."""
 
-ControlsByName = dict[str, dict[str, object]]
-"""Controls as they are asked for: their names, each with its settings."""
+ControlsByName = dict[str, dict[str, object]]  # controls as they are asked for: their names, each with its settings
 
-LARGE = ("car", "person", "stop-sign")
-"""The bundled objects around which lengths were in metres in files of schema 1."""
+LARGE = ("car", "person", "stop-sign")  # bundled objects around which lengths were in metres in files of schema 1
 LENGTHS = frozenset({"camera.distance", "camera.height", "camera.focus", "ground.height", "ground.radius", "path"})
 """What is in metres, and was in object sizes around all others."""
 
 SEARCH_SPP = {"oidn": 8, "none": 16}
 """Samples a pixel of a search that asks for none. `benchmarks/formation.py` shows the noise that is left at each."""
 
-AUTO_SHARE = 2
-"""With `--spp auto` a search takes the default's samples divided by this."""
-CLOSE_LOOKS = 4
-"""Then a candidate is rendered so many times more, at most, while it is not clearly worse than the best."""
+AUTO_SHARE = 2  # with `--spp auto` a search takes the default's samples divided by this
+CLOSE_LOOKS = 4  # then a candidate is rendered so many times more, at most, while it is not clearly worse than the best
 
 
 class SceneConfig(Config):
@@ -271,7 +267,7 @@ class SceneConfig(Config):
     def check_older(self, path: str | Path) -> None:
         given = {**self.controls, **getattr(self, "over", {})}
         named = {*self.set_, *getattr(self, "grid", {})}
-        named |= {f"{one.get('kind', name)}.{parameter}" for name, one in given.items() for parameter in one}
+        named |= {f"{control.get('kind', name)}.{key}" for name, control in given.items() for key in control}
         if ".csv" in str((given, getattr(self, "path", None))):
             named.add("path")
         small = [name for name in self.objects if name not in LARGE and not re.search(r"[./\\#]", name)]
@@ -332,21 +328,18 @@ class SceneConfig(Config):
     @classmethod
     def _as_text(cls, value: Any, info: Any) -> Any:
         listed = info.field_name == "labels" and isinstance(value, (list, tuple))
-        if listed and any("," in str(one) for one in value):
+        if listed and any("," in str(name) for name in value):
             raise ValueError("a name that would be two; a file can have it")
         return as_text(value, several=info.field_name in SEVERAL)
 
-    @field_validator("things", mode="before")
-    @classmethod
-    def _things_as_text(cls, value: Any) -> Any:
-        return things_as_text(value)
+    _things_as_text = field_validator("things", mode="before")(things_as_text)
 
     @field_validator("prompt", mode="before")
     @classmethod
     def _prompts_as_text(cls, value: Any) -> Any:
-        several = isinstance(value, (list, tuple)) and all(isinstance(one, str) for one in value)
+        several = isinstance(value, (list, tuple)) and all(isinstance(text, str) for text in value)
         text = " | ".join(value) if several else value
-        if isinstance(text, str) and not all(one.strip() for one in text.split("|")):
+        if isinstance(text, str) and not all(part.strip() for part in text.split("|")):
             raise ValueError("no text")
         return text
 
@@ -355,13 +348,6 @@ class SceneConfig(Config):
     def _task_with_options(cls, value: Any) -> Any:
         """Accept ``{name: yaw, tolerance: 5}``, ``yaw={tolerance: 5}`` and a name, and several with + between them."""
         return read_joined(value, "task", cls.model_fields["task"].default)
-
-    @field_validator("spp")
-    @classmethod
-    def _spp_in_range(cls, value: Any) -> Any:
-        if isinstance(value, int) and not 1 <= value <= 65536:
-            raise ValueError("out of range")
-        return value
 
     @field_validator("controls", "over", mode="before", check_fields=False)
     @classmethod
@@ -389,10 +375,12 @@ class SceneConfig(Config):
             parts = [parts]
         return [*parts, *parts] if isinstance(parts, (list, tuple)) and len(parts) == 1 else parts
 
-    @field_validator("resolution")
+    @field_validator("spp", "resolution")
     @classmethod
-    def _resolution_in_range(cls, value: tuple[int, int] | None) -> tuple[int, int] | None:
-        if value is not None and not all(8 <= side <= 4096 for side in value):
+    def _in_range(cls, value: Any, info: Any) -> Any:
+        low, most = (1, 65536) if info.field_name == "spp" else (8, 4096)
+        numbers = value if isinstance(value, tuple) else (value,)
+        if any(isinstance(number, int) and not low <= number <= most for number in numbers):
             raise ValueError("out of range")
         return value
 
@@ -409,10 +397,8 @@ def one_only(name: str, names: Sequence[str]) -> InputError:
     return InputError(f"{name}: expected one {name}, got {listed}; give one, or compare several with advsearch sweep")
 
 
-PICTURE_SPP = 64
-"""Samples a pixel of a picture that is made to be looked at."""
-PICTURES = (".png", ".exr")
-"""The pictures that can be written."""
+PICTURE_SPP = 64  # samples a pixel of a picture that is made to be looked at
+PICTURES = (".png", ".exr")  # that can be written
 
 
 class RenderConfig(SceneConfig):
@@ -452,8 +438,7 @@ class RenderConfig(SceneConfig):
         return text
 
 
-LARGEST_EPSILON = 1e6
-"""No control has a distance of that size; far above it, its square is none in float32."""
+LARGEST_EPSILON = 1e6  # no control has a distance of that size; far above it, its square is none in float32
 
 
 class DerivativeConfig(SceneConfig):
@@ -508,14 +493,12 @@ class DerivativeConfig(SceneConfig):
                 value = tuple(parts)
         if isinstance(value, (list, tuple)) and len(value) == 1:
             value = value[0]
-        if isinstance(value, Mapping):
-            numbers = [_positive(one) for one in value.values()]
-        elif isinstance(value, (list, tuple)):
-            numbers = [_positive(one) for one in value]
-            check_once((f"{one:g}" for one in numbers), "epsilon")
-        else:
-            numbers = [1.0 if value is None else _positive(value)]
-        if not numbers:
+        numbers = value.values() if isinstance(value, Mapping) else value
+        numbers = numbers if isinstance(value, (Mapping, list, tuple)) else [1.0 if value is None else value]
+        read = [_positive(number) for number in numbers]
+        if isinstance(value, (list, tuple)):
+            check_once((f"{number:g}" for number in read), "epsilon")
+        if not read:
             raise ValueError("nothing is named")
         return value
 
@@ -546,19 +529,17 @@ class TimedConfig(Config):
     )
 
 
-FIRST = ("attack", "render", "sweep")
-"""The commands that the docs show first."""
+FIRST = ("attack", "render", "sweep")  # the commands that the docs show first
 
 
 class _Configs(Mapping[str, type[Config]]):
     def __iter__(self) -> Iterator[str]:
         there = [name for name in FIRST if name in ("render", *rooms.rooms())]
-        return iter(
-            (*there, *(one for one in rooms.rooms() if one not in FIRST and rooms.Room(one).config is not None))
-        )
+        others = (name for name in rooms.rooms() if name not in FIRST)
+        return iter((*there, *(name for name in others if rooms.Room(name).config is not None)))
 
     def __len__(self) -> int:
-        return len(list(iter(self)))
+        return sum(1 for _ in self)
 
     def __getitem__(self, name: str) -> type[Config]:
         config: type[Config] | None = RenderConfig if name == "render" else getattr(rooms.room(name), "config", None)

@@ -13,48 +13,40 @@ import numpy as np
 
 Value = TypeVar("Value")
 
-OURS = __name__.partition(".")[0]
-
 
 def copied(value: Value) -> Value:
     """Return a copy of all tensors, with their graphs, and arrays in a value, and of the lists, mappings and
     dataclasses that hold them. Anything else is as it is, and so is a dataclass that `gives_copies` of what it holds
     (`Facts`) and a mapping that nobody can write into and that makes its values on demand."""
-    return _copied(value)  # type: ignore[no-any-return]
-
-
-def _copied(value: Any) -> Any:
-    made: Any
-    if hasattr(value, "requires_grad"):
-        return value.clone()
-    if isinstance(value, np.ndarray):
-        return value.copy()
-    if isinstance(value, MutableMapping):
-        made = copy.copy(value)
-        made.update({key: _copied(one) for key, one in value.items()})
-        return made
-    if isinstance(value, MappingProxyType):
-        return MappingProxyType({key: _copied(one) for key, one in value.items()})
-    if isinstance(value, list):
-        entries = copy.copy(value)
-        entries[:] = [_copied(one) for one in value]
-        return entries
-    if isinstance(value, tuple):
-        parts = [_copied(one) for one in value]
-        return type(value)(*parts) if hasattr(value, "_fields") else type(value)(parts)
-    if isinstance(value, SimpleNamespace):
-        return SimpleNamespace(**_copied(vars(value)))
-    if is_dataclass(value) and not isinstance(value, type) and not getattr(value, "gives_copies", False):
-        other = copy.copy(value)
-        for one in fields(value):
-            object.__setattr__(other, one.name, _copied(getattr(value, one.name)))
-        return other
-    return value
+    original: Any = value
+    made: Any = original
+    if hasattr(original, "requires_grad"):
+        made = original.clone()
+    elif isinstance(original, np.ndarray):
+        made = original.copy()
+    elif isinstance(original, MutableMapping):
+        made = copy.copy(original)
+        made.update({key: copied(inner) for key, inner in original.items()})
+    elif isinstance(original, MappingProxyType):
+        made = MappingProxyType({key: copied(inner) for key, inner in original.items()})
+    elif isinstance(original, list):
+        made = copy.copy(original)
+        made[:] = map(copied, original)
+    elif isinstance(original, tuple):
+        parts = map(copied, original)
+        made = type(original)(*parts) if hasattr(original, "_fields") else type(original)(parts)
+    elif isinstance(original, SimpleNamespace):
+        made = SimpleNamespace(**copied(vars(original)))
+    elif is_dataclass(original) and not isinstance(original, type) and not getattr(original, "gives_copies", False):
+        made = copy.copy(original)
+        for field in fields(original):
+            object.__setattr__(made, field.name, copied(getattr(original, field.name)))
+    return made  # type: ignore[no-any-return]
 
 
 def is_ours(kind: type) -> bool:
     """Return whether this package defines a class."""
-    return kind.__module__.partition(".")[0] == OURS
+    return kind.__module__.partition(".")[0] == __name__.partition(".")[0]
 
 
 def hand_copies(kind: type, **places: slice) -> None:
@@ -75,8 +67,8 @@ def hand_copies(kind: type, **places: slice) -> None:
 def _handing(method: Callable[..., Any], which: slice) -> Callable[..., Any]:
     @wraps(method)
     def handed(self: Any, *args: Any, **named: Any) -> Any:
-        given = [*args]
-        given[which] = [_copied(one) for one in given[which]]
-        return method(self, *given, **{name: _copied(one) for name, one in named.items()})
+        handed_on = [*args]
+        handed_on[which] = map(copied, handed_on[which])
+        return method(self, *handed_on, **copied(named))
 
     return handed

@@ -5,17 +5,14 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from typing import Any
 
 from advsearch.errors import InputError
 
 DISTRIBUTION, CHOICES, WEIGHTS = "distribution", "choices", "weights"
-
-FROM_PYTHON = "from Python"
-"""The name of one that no file can hold."""
-
-QUANTILES = (0.05, 0.5, 0.95)
-"""Shares at which settings tell one function from another of its name."""
+FROM_PYTHON = "from Python"  # the name of one that no file can hold
+QUANTILES = (0.05, 0.5, 0.95)  # shares at which settings tell one function from another of its name
 
 
 class OwnQuantiles(dict[str, object]):
@@ -33,18 +30,20 @@ class OwnQuantiles(dict[str, object]):
         self.function = function
 
 
+def _loc_scale(d: Any) -> dict[str, Any]:
+    return {"loc": d.loc, "scale": d.scale}
+
+
 TORCH: Mapping[str, tuple[str, Callable[[Any], dict[str, Any]]]] = {
-    "Normal": ("norm", lambda d: {"loc": d.loc, "scale": d.scale}),
+    **{of: (to, _loc_scale) for of, to in (("Normal", "norm"), ("Laplace", "laplace"), ("Cauchy", "cauchy"))},
+    "Gumbel": ("gumbel_r", _loc_scale),
     "Uniform": ("uniform", lambda d: {"loc": d.low, "scale": d.high - d.low}),
     "LogNormal": ("lognorm", lambda d: {"s": d.scale, "scale": d.loc.exp()}),
     "Beta": ("beta", lambda d: {"a": d.concentration1, "b": d.concentration0}),
     "Gamma": ("gamma", lambda d: {"a": d.concentration, "scale": 1.0 / d.rate}),
     "Exponential": ("expon", lambda d: {"scale": 1.0 / d.rate}),
-    "Laplace": ("laplace", lambda d: {"loc": d.loc, "scale": d.scale}),
-    "Cauchy": ("cauchy", lambda d: {"loc": d.loc, "scale": d.scale}),
-    "Gumbel": ("gumbel_r", lambda d: {"loc": d.loc, "scale": d.scale}),
     "HalfNormal": ("halfnorm", lambda d: {"scale": d.scale}),
-    "StudentT": ("t", lambda d: {"df": d.df, "loc": d.loc, "scale": d.scale}),
+    "StudentT": ("t", lambda d: {"df": d.df, **_loc_scale(d)}),
     "Weibull": ("weibull_min", lambda d: {"c": d.concentration, "scale": d.scale}),
 }
 """Of `torch.distributions`: what each is called in scipy, and its parameters there."""
@@ -61,13 +60,12 @@ def as_setting(given: object) -> object:
         InputError: it is of several numbers, or of whole ones, or a function that is no inverse CDF.
     """
     if isinstance(given, Mapping):
-        weights = [one.item() if getattr(one, "ndim", 1) == 0 else one for one in given.values()]  # numpy's, torch's
-        if not given or given.keys() & {DISTRIBUTION, CHOICES} or not all(map(_is_number, weights)):
-            return given
-        try:
-            return {CHOICES: list(given), WEIGHTS: [float(one) for one in weights]}
-        except OverflowError:  # of no float: whoever reads the setting says what it takes
-            return given
+        weights = [w.item() if getattr(w, "ndim", 1) == 0 else w for w in given.values()]  # numpy's, torch's
+        numbers = all(isinstance(w, (int, float)) and not isinstance(w, bool) for w in weights)
+        if given and numbers and not given.keys() & {DISTRIBUTION, CHOICES}:
+            with suppress(OverflowError):  # of no float: whoever reads the setting says what it takes
+                return {CHOICES: list(given), WEIGHTS: list(map(float, weights))}
+        return given
     kind = type(given)
     if kind.__module__.startswith("torch.distributions") and kind.__name__ in TORCH:
         name, parameters = TORCH[kind.__name__]
@@ -78,18 +76,19 @@ def as_setting(given: object) -> object:
             f"distribution {getattr(family, 'name', kind.__name__)}: expected one of real numbers, got one of whole "
             "ones; give its values as {choices: [...], weights: [...]}"
         )
-    if family is not given and _is_scipys(family):
-        return _of_scipy(given)
+    # one's own may have the name of scipy's, too
+    of_scipy = getattr(sys.modules.get("scipy.stats"), str(getattr(family, "name", "")), NotImplemented)
+    if family is not given and type(family) is type(of_scipy):
+        frozen: Any = given
+        shapes, loc, scale = frozen.dist._parse_args(*frozen.args, **frozen.kwds)
+        names = [name.strip() for name in (frozen.dist.shapes or "").split(",") if name.strip()]
+        return _named(frozen.dist.name, {**dict(zip(names, shapes, strict=True)), "loc": loc, "scale": scale})
     for method in ("icdf", "ppf"):
         if hasattr(given, method):
             return OwnQuantiles(kind.__name__, _called(given, getattr(given, method)))
     if callable(given) and not isinstance(given, type):
         return OwnQuantiles(str(getattr(given, "__name__", kind.__name__)), given)
     return given
-
-
-def _is_number(given: object) -> bool:
-    return isinstance(given, (int, float)) and not isinstance(given, bool)
 
 
 def _called(given: object, method: Callable[[Any], Any]) -> Callable[[float], float]:
@@ -99,21 +98,9 @@ def _called(given: object, method: Callable[[Any], Any]) -> Callable[[float], fl
     return lambda share: float(method(torch.tensor(share, dtype=torch.float64)))
 
 
-def _is_scipys(family: object) -> bool:
-    """Return whether a family is the one that scipy has under its name, which one's own may have too."""
-    stats = sys.modules.get("scipy.stats")
-    return type(family) is type(getattr(stats, str(getattr(family, "name", "")), NotImplemented))
-
-
-def _of_scipy(given: Any) -> dict[str, object]:
-    shapes, loc, scale = given.dist._parse_args(*given.args, **given.kwds)
-    names = [one.strip() for one in (given.dist.shapes or "").split(",") if one.strip()]
-    return _named(given.dist.name, {**dict(zip(names, shapes, strict=True)), "loc": loc, "scale": scale})
-
-
 def _named(name: str, parameters: Mapping[str, Any]) -> dict[str, object]:
     try:
-        return {DISTRIBUTION: name, **{key: float(f"{float(one):.12g}") for key, one in parameters.items()}}
+        return {DISTRIBUTION: name, **{key: float(f"{float(value):.12g}") for key, value in parameters.items()}}
     except (TypeError, ValueError, RuntimeError):
         raise InputError(
             f"distribution {name}: expected one of a single number, got parameters of several; give one for each "

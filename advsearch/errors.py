@@ -53,7 +53,7 @@ class UnknownNameError(InputError):
 
     def __init__(self, kind: str, name: str, known: Iterable[str], hint: str = "") -> None:
         names = sorted(known)
-        near = [one for one in names if name.casefold() in ELSEWHERE.get(one, "").split()]
+        near = [known for known in names if name.casefold() in ELSEWHERE.get(known, "").split()]
         near = near or resembling(name, names)[:3]
         guess = f" Did you mean {' or '.join(repr(n) for n in near)}?" if near else ""
         super().__init__(f"unknown {kind} {name!r}.{guess} Known: {', '.join(names)}.{' ' + hint if hint else ''}")
@@ -92,12 +92,12 @@ def resembling(name: str, known: Iterable[str]) -> list[str]:
     Where there is none, those of nearly the same spelling, as a whole or in one word.
     """
     asked, names = _words(name), list(dict.fromkeys(known))
-    ranked = [(rank, one) for one in names if (rank := _rank(asked, _words(one))) is not None]
-    if ranked:
-        return [one for _, one in sorted(ranked, key=lambda pair: pair[0])]
+    ranks = {known: rank for known in names if (rank := _rank(asked, _words(known))) is not None}
+    if ranks:
+        return sorted(ranks, key=ranks.__getitem__)
     matcher = difflib.SequenceMatcher(None, "", name.casefold())
-    near = {one: _similarity(matcher, one) for one in names}
-    return sorted((one for one in names if near[one]), key=lambda one: -near[one])
+    near = {known: _similarity(matcher, known) for known in names}
+    return sorted(filter(near.get, names), key=lambda known: -near[known])
 
 
 def _words(name: str) -> list[str]:
@@ -120,11 +120,9 @@ def _rank(asked: Sequence[str], words: Sequence[str]) -> tuple[int, int, bool] |
 
 def _similarity(asked: difflib.SequenceMatcher[str], name: str) -> float:
     """How near a name's spelling is to what was asked for, as a whole or in one word; 0 where it is not."""
-    return max([_ratio(asked, name.casefold(), SIMILAR), *(_ratio(asked, word, SIMILAR_WORD) for word in _words(name))])
-
-
-def _ratio(asked: difflib.SequenceMatcher[str], name: str, least: float) -> float:
-    asked.set_seq1(name)
-    quick = asked.real_quick_ratio() >= least and asked.quick_ratio() >= least
-    ratio = asked.ratio() if quick else 0.0
-    return ratio if ratio >= least else 0.0
+    best = 0.0
+    for text, least in [(name.casefold(), SIMILAR), *((word, SIMILAR_WORD) for word in _words(name))]:
+        asked.set_seq1(text)
+        if asked.real_quick_ratio() >= least and asked.quick_ratio() >= least and asked.ratio() >= least:
+            best = max(best, asked.ratio())
+    return best

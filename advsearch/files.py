@@ -18,23 +18,15 @@ from typing import Any, BinaryIO
 
 from advsearch.errors import FileFormatError, InputError
 
-FACTOR = "ADVSEARCH_LIMITS"
-"""Environment variable with a number that all limits on the size of input are multiplied by."""
-
-JsonValue = bool | int | float | str | list["JsonValue"] | dict[str, "JsonValue"] | None
-"""Whatever JSON can hold."""
-
-JsonObject = dict[str, JsonValue]
-"""A JSON object, before a type has taken it or once it has been written out."""
+FACTOR = "ADVSEARCH_LIMITS"  # environment variable with a number that all limits on the size of input are multiplied by
+JsonValue = bool | int | float | str | list["JsonValue"] | dict[str, "JsonValue"] | None  # whatever JSON can hold
+JsonObject = dict[str, JsonValue]  # A JSON object, before a type has taken it or once it has been written out
 
 MESHES = (".obj", ".ply", ".stl", ".gltf", ".glb", ".vrm", ".blend", ".usd", ".usda", ".usdc", ".usdz")
 """Endings of the files that an object can be read from."""
 
-DEPTH = 100
-"""Deepest nesting of JSON, in lists and objects."""
-
-DIGITS = 300
-"""Most digits of a whole number; more than these have no floating-point form."""
+DEPTH = 100  # deepest nesting of JSON, in lists and objects
+DIGITS = 300  # most digits of a whole number; more than these have no floating-point form
 
 _KINDS = (
     (stat.S_ISDIR, "a directory; name a file inside it"),
@@ -70,9 +62,9 @@ def opened_for(path: Path | str) -> list[str]:
     return list(_OPENED.get(os.path.abspath(path), {}))
 
 
-def either(endings: Sequence[str]) -> str:
-    """Return endings of files as a sentence lists them: ".a, .b or .c"."""
-    return " or ".join([*([", ".join(endings[:-1])] if endings[1:] else []), endings[-1]])
+def either(names: Sequence[str], word: str = "or") -> str:
+    """Return names as a sentence lists them: ".a, .b or .c"."""
+    return f" {word} ".join([*([", ".join(names[:-1])] if names[1:] else []), names[-1]])
 
 
 def scaled(limit: int) -> int:
@@ -98,11 +90,9 @@ def too_large(path: Path | str, expected: str, size: str) -> FileFormatError:
 
 
 def open_regular(path: Path, expected: str, limit: int) -> BinaryIO:
-    """Return an ordinary file, such as ``"a label file"``, opened for reading; close it. Links are followed.
-
-    Raises FileFormatError: a directory, a pipe, a socket or a device, none of which is read; or more bytes than the
-    limit, which is `scaled`. Raises OSError as `open`: it is not there, or there is no permission.
-    """
+    """Return an ordinary file, such as ``"a label file"``, opened for reading; close it. Links are followed. Raises
+    FileFormatError: a directory, a pipe, a socket or a device, none of which is read; or more bytes than the limit,
+    which is `scaled`. Raises OSError as `open`: it is not there, or there is no permission."""
     if "\0" in str(path):
         raise FileFormatError(f"{path}: expected the name of a file, got one with a zero byte in it")
     _check(path, os.stat(path), expected, limit)  # before it is opened: to open a device or a pipe may change it
@@ -133,12 +123,8 @@ def read_bytes(path: Path, expected: str, limit: int) -> bytes:
 
 
 def read_text(path: Path, expected: str, limit: int) -> str:
-    """Return the text of an ordinary file in UTF-8, without a byte order mark.
-
-    Raises:
-        FileFormatError: as for `open_regular`, or the bytes are not UTF-8.
-        OSError: as for `open_regular`.
-    """
+    """Return the text of an ordinary file in UTF-8, without a byte order mark. Raises FileFormatError: as for
+    `open_regular`, or the bytes are not UTF-8; OSError: as for `open_regular`."""
     try:
         return read_bytes(path, expected, limit).decode("utf-8-sig")
     except UnicodeDecodeError:

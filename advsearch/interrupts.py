@@ -14,8 +14,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
 
-ONE = 0.5
-"""Seconds within which a second signal is the same Ctrl-C: programs pass on what the terminal has sent to all."""
+ONE = 0.5  # seconds within which a second signal is the same Ctrl-C: programs pass on what the terminal has sent to all
 
 
 class Interrupts:
@@ -46,48 +45,38 @@ class Interrupts:
             raise KeyboardInterrupt
 
 
-INTERRUPTS = Interrupts()
-"""Those of this process."""
+INTERRUPTS = Interrupts()  # those of this process
 
 
 @contextmanager
 def interruptible() -> Iterator[None]:
     """Raise an interrupt that comes inside the block, whatever was made of it, once: what follows the block handles it.
     Raises KeyboardInterrupt where one waits at the end of the block, and in place of any error inside it."""
-    with _counted():
-        try:
-            yield
-            INTERRUPTS.look()
-        except KeyboardInterrupt:
-            INTERRUPTS.handled = INTERRUPTS.count
-            raise
-        except Exception as error:
-            if INTERRUPTS.waiting:
-                INTERRUPTS.handled = INTERRUPTS.count
-                raise KeyboardInterrupt from error
-            raise
-
-
-@contextmanager
-def _counted() -> Iterator[None]:
-    """Count interrupts inside the block where Python's own handler would raise them, as in a script or a notebook."""
     handler = signal.getsignal(signal.SIGINT)
-    if handler is not signal.default_int_handler or threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    INTERRUPTS.handled = INTERRUPTS.count
-    signal.signal(signal.SIGINT, INTERRUPTS)
+    in_main = threading.current_thread() is threading.main_thread()
+    counted = in_main and handler is signal.default_int_handler  # where Python's own would raise them: in a notebook
+    if counted:
+        INTERRUPTS.handled = INTERRUPTS.count
+        signal.signal(signal.SIGINT, INTERRUPTS)
     try:
         yield
+        INTERRUPTS.look()
+    except KeyboardInterrupt:
+        INTERRUPTS.handled = INTERRUPTS.count
+        raise
+    except Exception as error:
+        if INTERRUPTS.waiting:
+            INTERRUPTS.handled = INTERRUPTS.count
+            raise KeyboardInterrupt from error
+        raise
     finally:
-        signal.signal(signal.SIGINT, handler)
+        if counted:
+            signal.signal(signal.SIGINT, handler)
 
 
 def end_at_the_second() -> None:
     """Let a second Ctrl-C end this process at once, wherever it is: a thread hears of it, also while native code runs.
-
-    What is stored is kept, as with a kill. Call it in the main thread, once.
-    """
+    What is stored is kept, as with a kill. Call it in the main thread, once."""
     ours, theirs = socket.socketpair()
     theirs.setblocking(False)
     signal.set_wakeup_fd(theirs.fileno(), warn_on_full_buffer=False)

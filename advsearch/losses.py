@@ -114,8 +114,7 @@ def non_printability(colors: Tensor, palette: Tensor | None = None) -> Tensor:
     return torch.stack([objective.off_print(one, palette) for one in _pictures(colors)])
 
 
-nps = non_printability
-"""Its usual short name."""
+nps = non_printability  # its usual short name
 
 
 # ---- as objectives --------------------------------------------------------------------------------------------------

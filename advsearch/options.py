@@ -12,67 +12,50 @@ from typing import Any
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.files import JsonValue
 
-FROM_RUN = {"set by": "the run"}
-"""Metadata of a field that is no option: what a run works with decides it."""
-
-MOST = 1_000_000
-"""Of whatever an option counts: no budget has more renders."""
+FROM_RUN = {"set by": "the run"}  # metadata of a field that is no option: what a run works with decides it
+MOST = 1_000_000  # of whatever an option counts: no budget has more renders
 
 
-BY_KEY = "mitsuba"
-"""The control whose parameters have Mitsuba's names."""
-
-
-JOINED = "+"
-"""Between the names of tasks that are asked of several models at once."""
+BY_KEY = "mitsuba"  # the control whose parameters have Mitsuba's names
+JOINED = "+"  # between the names of tasks that are asked of several models at once
 
 
 def by_key(controls: Mapping[str, object]) -> dict[str, object]:
     """Return controls with ``{"mitsuba:KEY": RANGE}`` as ``{"mitsuba": {KEY: RANGE}}``, all keys together.
-
-    ``{"pose.yaw": RANGE}`` becomes ``{"pose.yaw": {"yaw": RANGE}}``.
-
-    Raises:
-        InputError: a key has no range, or is given twice.
-    """
-    found, ranges = dict[str, object](), dict[str, object]()
+    ``{"pose.yaw": RANGE}`` becomes ``{"pose.yaw": {"yaw": RANGE}}``. Raises InputError: a key has no range, or is given
+    twice."""
+    plain, ranges = dict[str, object](), dict[str, object]()
     for name, given in controls.items():
         kind, colon, key = str(name).partition(":")
         if kind != BY_KEY or not colon:
             _, dot, parameter = str(name).partition(".")
             spec = isinstance(given, Mapping) and bool(given.keys() & {"distribution", "choices", "range"})
             alone = dot and ":" not in name and not (given is None or (isinstance(given, Mapping) and not spec))
-            found[name] = {parameter: given} if alone else given
+            plain[name] = {parameter: given} if alone else given
         elif not key or given is None or given in ({}, ""):
             raise InputError(f"`controls` {name}: expected a range, as in {BY_KEY}:{key or 'KEY'}=[0.2, 0.8]")
         else:
             ranges[key] = given
     if not ranges:
-        return found
-    together = found.get(BY_KEY) or {}
+        return plain
+    together = plain.get(BY_KEY) or {}
     if not isinstance(together, Mapping) or together.keys() & ranges.keys():
         raise InputError(f"`controls` {BY_KEY}: expected each of Mitsuba's names once, with a range")
-    return {**found, BY_KEY: {**together, **ranges}}
+    return {**plain, BY_KEY: {**together, **ranges}}
 
 
 def things_as_text(things: object) -> str | None:
     """Return things beside an object in the one text that settings have, of a text, a mapping, or a list of such:
     ``car@12,3.5,heading=180; person@6,-2``. Files are named by their absolute paths, so that a run may go on from
-    anywhere.
-
-    Raises:
-        InputError: it is something else.
-    """
+    anywhere. Raises InputError where it is something else."""
     listed = things if isinstance(things, (list, tuple)) else [] if things is None else [things]
-    if not all(isinstance(one, (str, Mapping)) for one in listed):
+    if not all(isinstance(thing, (str, Mapping)) for thing in listed):
         raise InputError(
             f"things: expected a text such as 'car@12,3.5', a mapping or a list of these, got {things!r:.80}"
         )
-    parts = [
-        part for one in listed for part in (_thing_as_text(one) if isinstance(one, Mapping) else str(one)).split(";")
-    ]
+    text = ";".join(_thing_as_text(thing) if isinstance(thing, Mapping) else thing for thing in listed)
     named = []
-    for part in filter(None, map(str.strip, parts)):
+    for part in filter(None, map(str.strip, text.split(";"))):
         what, at, rest = part.rpartition("@")
         file, mark, node = what.strip().partition("#")
         what = f"{Path(file).resolve()}{mark}{node}" if "." in file and Path(file).is_file() else what.strip()
@@ -81,19 +64,19 @@ def things_as_text(things: object) -> str | None:
 
 
 def _thing_as_text(thing: Mapping[str, Any]) -> str:
-    options = {name: one for name, one in thing.items() if name not in ("object", "x", "y")}
+    options = [f"{name}={value}" for name, value in thing.items() if name not in ("object", "x", "y")]
     for name in ("object", "x", "y"):
         if name not in thing:
             raise InputError(
                 f"things: expected an object, x and y, such as {{'object': 'car', 'x': 12, 'y': 3.5}}, "
                 f"got {dict(thing)!r:.80}"
             )
-    return ",".join([f"{thing['object']}@{thing['x']}", f"{thing['y']}", *(f"{k}={v}" for k, v in options.items())])
+    return ",".join([f"{thing['object']}@{thing['x']}", f"{thing['y']}", *options])
 
 
 def declared_options(kind: type[Any]) -> dict[str, Field[Any]]:
     """Return the options of a dataclass by name."""
-    return {one.name: one for one in fields(kind) if one.init and one.metadata != FROM_RUN}
+    return {field.name: field for field in fields(kind) if field.init and field.metadata != FROM_RUN}
 
 
 def check_options(what: str, name: str, kind: type[Any], given: Mapping[str, object]) -> None:
@@ -135,28 +118,25 @@ def _expected(kind: str, value: object) -> str | None:
 def _as_json(value: object) -> JsonValue:
     """Return a finite number, a truth value, a text, or lists and mappings of these; None of all else."""
     if isinstance(value, Mapping):
-        mapping = {name: _as_json(one) for name, one in value.items() if isinstance(name, str)}
+        mapping = {name: _as_json(inner) for name, inner in value.items() if isinstance(name, str)}
         return mapping if len(mapping) == len(value) and None not in mapping.values() else None
     if isinstance(value, (list, tuple)):
-        listed = [_as_json(one) for one in value]
+        listed = [_as_json(inner) for inner in value]
         return None if None in listed else listed
     finite = isinstance(value, float) and math.isfinite(value)
     return value if finite or isinstance(value, (bool, int, str)) else None  # type: ignore[return-value]
 
 
 def as_setting(entry: Any) -> str | dict[str, JsonValue]:
-    """Return what a file says of a policy or a task: its name, with the options that differ from their defaults.
-
-    An option that is no finite number, truth value, text, or list or mapping of these, has no form there and is left
-    out.
-    """
-    name, given = str(entry.name), {}
+    """Return what a file says of a policy or a task: its name, with the options that differ from their defaults. An
+    option that is no finite number, truth value, text, or list or mapping of these, has no form there and is left
+    out."""
+    name, options = str(entry.name), {}
     for option, declared in declared_options(type(entry)).items():
         value = getattr(entry, option)
-        plain = _as_json(value)
-        if plain is not None and value != default_of(declared):
-            given[option] = plain
-    return {"name": name, **given} if given else name
+        if (plain := _as_json(value)) is not None and value != default_of(declared):
+            options[option] = plain
+    return {"name": name, **options} if options else name
 
 
 def told(given: object) -> str:

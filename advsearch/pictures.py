@@ -18,8 +18,7 @@ from advsearch.errors import FileFormatError
 FORMATS = ("BMP", "DDS", "GIF", "JPEG", "PNG", "PPM", "SGI", "TGA", "TIFF", "WEBP")
 """Formats of pictures, as Pillow names them. Pillow knows more; for some (EPS) it runs other programs."""
 
-LARGEST_FILE = 1 << 28
-"""Bytes of a file that `upright` reads, before `advsearch.files.scaled`."""
+LARGEST_FILE = 1 << 28  # bytes of a file that `upright` reads, before `advsearch.files.scaled`
 
 LARGEST_PIXELS = 1 << 26
 """Pixels that a picture may have (8192 x 8192), before `advsearch.files.scaled`; decoded they take 4 bytes each."""

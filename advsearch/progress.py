@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import threading
 import time
+import unicodedata
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import wraps
@@ -57,14 +58,9 @@ def watcher(watched: Watched) -> Progress:
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
-PATIENCE = 2.0
-"""Seconds after which a stage is announced where there is no terminal; a shorter one is not worth a line."""
-
-MOST_BARS = 5
-"""Stages that a terminal shows at once."""
-
-UPDATE = 0.2
-"""Least seconds between two changes of a notebook's line."""
+PATIENCE = 2.0  # seconds after which a stage is announced where there is no terminal; a shorter one is not worth a line
+MOST_BARS = 5  # stages that a terminal shows at once
+UPDATE = 0.2  # least seconds between two changes of a notebook's line
 
 LINE_INTERVAL, LINE_SHARE = 5.0, 0.1
 """Seconds between two lines where there is no terminal, and the share of a stage's time so far that they are at least.
@@ -226,17 +222,17 @@ class BarProgress:
             self.bars.update(task.id, visible=False)
         if hint:
             self._print(f"{name}: {self._written(hint)}", style="dim")
-        self.bars.add_task(_escaped(name + (", at most" if at_most else "")), total=total, info="")
+        self.bars.add_task(escaped(name + (", at most" if at_most else "")), total=total, info="")
 
     def advance(self, n: int = 1, **info: float | str) -> None:
         for task in self.bars.tasks[-1:]:
-            self.bars.update(task.id, advance=n, info=_escaped(info_text(info)) if info else task.fields["info"])
+            self.bars.update(task.id, advance=n, info=escaped(info_text(info)) if info else task.fields["info"])
 
     def message(self, text: str) -> None:
         self._print(self._written(text))
 
     def _print(self, text: str, **look: Any) -> None:
-        self.bars.console.print(_escaped(text), markup=False, highlight=False, **look)
+        self.bars.console.print(escaped(text), markup=False, highlight=False, **look)
 
     def __enter__(self) -> BarProgress:
         self.bars.start()
@@ -247,8 +243,7 @@ class BarProgress:
 
 
 def _seconds(seconds: float) -> str:
-    # late, so that --help answers at once
-    from advsearch.report.wording import seconds_text
+    from advsearch.report.wording import seconds_text  # late, so that --help answers at once
 
     return f"{seconds:.0f} s" if seconds < 99.5 else seconds_text(seconds)
 
@@ -260,6 +255,16 @@ def info_text(info: dict[str, float | str]) -> str:
     )
 
 
-def _escaped(text: str) -> str:
-    """A text with what would steer a terminal written as an escape: names in it are others'."""
-    return "".join(one if one.isprintable() or one in "\n\t" else one.encode("unicode_escape").decode() for one in text)
+def escaped(text: str, encoding: str = "utf-8") -> str:
+    """Return `text` with everything but line ends and tabs that a terminal would not show, or that would steer it,
+    written as an escape: names in it are others'."""
+
+    def shown(sign: str) -> str:
+        if sign in "\n\t" or sign.isprintable() or unicodedata.category(sign) == "Zs":
+            return sign
+        code = ord(sign)
+        return f"\\x{code:02x}" if code < 0x100 else f"\\u{code:04x}" if code < 0x10000 else f"\\U{code:08x}"
+
+    if not text.isascii() or not text.isprintable():
+        text = "".join(map(shown, text))
+    return text.encode(encoding, "backslashreplace").decode(encoding)

@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Generic, TypeVar, get_args, get_type_hints
@@ -78,23 +78,11 @@ class Asked(Generic[Settings]):
     def result(self, kind: type[Made], **fields: Any) -> Made:
         """Return a result with these fields, and with those that all results have: what the settings say of object,
         model and so on, the run, how it ended and how long it took, beside the seconds of its parts."""
-        said = {name: getattr(self.config, of) for name, of in SAID.items() if hasattr(self.config, of)}
-        said |= {name: list(said[name]) for name in ("objects", "controls") if name in said}
+        common = {name: getattr(self.config, of) for name, of in SAID.items() if hasattr(self.config, of)}
+        common |= {name: list(common[name]) for name in ("objects", "controls") if name in common}
         seconds = {"total": time.perf_counter() - self._begun, **fields.pop("seconds", {})}
-        said |= {"run": str(self.run.path), "ending": self.ending, "seconds": seconds}
-        return kind(**{**said, "command_line": self.config.command_line(), **fields})
-
-
-def carried_out(function: Callable[[Asked[Settings]], AnyResult], asked: Asked[Settings]) -> AnyResult:
-    """Return the result of a function, which is kept in its run with its page and its figure, unless the function has
-    kept it itself."""
-    with asked:
-        result = function(asked)
-        if "run" not in vars(asked):
-            return result
-        for suffix, data in result_figure(shown(result)).items():
-            write_bytes(asked.run.path / "images" / f"{asked.config.command}.{suffix}", data)
-        return keep_result(asked.run, result)
+        common |= {"run": str(self.run.path), "ending": self.ending, "seconds": seconds}
+        return kind(**{**common, "command_line": self.config.command_line(), **fields})
 
 
 def carry_out(config: Config, *, progress: Progress | None = None, resumed: Path | None = None) -> Result:
@@ -114,10 +102,10 @@ def carry_out(config: Config, *, progress: Progress | None = None, resumed: Path
     keeps_run = resumed is None and getattr(config, "out", None) is None
     with begun(config) if keeps_run else nullcontext(resumed) as folder:  # before what is heavy is imported
         room = rooms.room(config.command)
-        own = room.from_config if room else None
-        if own is None:
-            own = getattr(import_module(f"advsearch.api.{config.command}"), f"{config.command}_from_config")
-        made = own(config, progress=progress, **({} if folder is None else {"resumed": folder}))
+        ask = room.from_config if room else None
+        if ask is None:
+            ask = getattr(import_module(f"advsearch.api.{config.command}"), f"{config.command}_from_config")
+        made = ask(config, progress=progress, **({} if folder is None else {"resumed": folder}))
     result: Result = made if isinstance(made, Result) else made.summary
     return result
 
@@ -142,8 +130,15 @@ class Question(Generic[AnyResult]):
     def from_config(
         self, config: Any, *, progress: Progress | None = None, resumed: Path | None = None, **more: Any
     ) -> AnyResult:
-        """Do what a configuration describes, and keep it in its run; `more` is for the function alone."""
-        return carried_out(partial(self.function, **more), Asked(config, progress, resumed))
+        """Do what a configuration describes. The result is kept in its run with its page and its figure, if there is
+        one; `more` is for the function alone."""
+        with Asked(config, progress, resumed) as asked:
+            result = self.function(asked, **more)
+            if "run" not in vars(asked):
+                return result
+            for suffix, data in result_figure(shown(result)).items():
+                write_bytes(asked.run.path / "images" / f"{config.command}.{suffix}", data)
+            return keep_result(asked.run, result)
 
     def __call__(self, *args: Any, **settings: Any) -> AnyResult:
         """Ask it from Python."""
@@ -164,22 +159,18 @@ class Question(Generic[AnyResult]):
             return self.from_config(configured(self.config, **given, **settings), progress=watcher(progress))
 
         fields = self.config.model_fields
-        parameters = [
-            inspect.Parameter(
-                name,
-                inspect.Parameter.POSITIONAL_OR_KEYWORD,
-                default=inspect.Parameter.empty if fields[name].is_required() else fields[name].default,
-                annotation=TYPES.get(name, "str | Path"),
-            )
-            for name in self.place
-        ]
+        Parameter = inspect.Parameter
+        parameters = []
+        for name in self.place:
+            default = Parameter.empty if fields[name].is_required() else fields[name].default
+            kind = TYPES.get(name, "str | Path")
+            parameters.append(Parameter(name, Parameter.POSITIONAL_OR_KEYWORD, default=default, annotation=kind))
         parameters += [
-            inspect.Parameter("progress", inspect.Parameter.KEYWORD_ONLY, default=None, annotation="Watched"),
-            inspect.Parameter("settings", inspect.Parameter.VAR_KEYWORD),
+            Parameter("progress", Parameter.KEYWORD_ONLY, default=None, annotation="Watched"),
+            Parameter("settings", Parameter.VAR_KEYWORD),
         ]
-        function.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
-            parameters, return_annotation=self.result.__name__
-        )
+        signature = inspect.Signature(parameters, return_annotation=self.result.__name__)
+        function.__signature__ = signature  # type: ignore[attr-defined]
         function.__name__, function.__doc__ = self.config.command, self.function.__doc__
         function.__qualname__, function.__module__ = function.__name__, self.function.__module__
         return asks(self.config)(function)

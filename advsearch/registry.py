@@ -12,6 +12,7 @@ import re
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from functools import cached_property, wraps
 from importlib import import_module
 from importlib.machinery import PathFinder
@@ -25,6 +26,7 @@ Entry = TypeVar("Entry")
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
+@dataclass(eq=False, repr=False)
 class Registry(Mapping[str, Entry], Generic[Entry]):
     """Entries by name: our own first, in the order given, then those of installed packages; ours win a name.
 
@@ -37,43 +39,34 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
             with a capital letter, from the Python path or the current directory.
     """
 
-    def __init__(
-        self,
-        group: str,
-        own: Mapping[str, Entry | str],
-        expected: str,
-        fits: Callable[[str, Any], bool],
-        *,
-        imports: bool = False,
-    ) -> None:
-        self.group = group
-        self._own, self._expected, self._fits, self._imports = own, expected, fits, imports
+    group: str
+    own: Mapping[str, Entry | str]
+    expected: str
+    fits: Callable[[str, Any], bool]
+    imports: bool = False
 
     def __getitem__(self, name: str) -> Entry:
         if self.names_class(name):
             return self._class(name)
-        if name not in self._own:
-            return self._installed[name]
-        entry = self._own[name]
+        entry: Any = self.own[name] if name in self.own else self._installed[name]
         if isinstance(entry, str):
             module, _, attribute = entry.partition(":")
-            imported: Entry = getattr(import_module(module), attribute)
-            return imported
-        return entry
+            entry = getattr(import_module(module), attribute)
+        return entry  # type: ignore[no-any-return]
 
     def __iter__(self) -> Iterator[str]:
-        return iter([*self._own, *(name for name in self._installed if name not in self._own)])
+        return iter([*self.own, *(name for name in self._installed if name not in self.own)])
 
     def __len__(self) -> int:
-        return len(list(iter(self)))
+        return sum(1 for _ in self)
 
     def names_class(self, name: str) -> bool:
         """Whether a name is that of a class to import, and not of an instance of a registered entry ("light:Key")."""
         module, colon, attribute = name.partition(":")
-        if not (self._imports and colon and attribute[:1].isupper() and attribute.isidentifier()):
+        if not (self.imports and colon and attribute[:1].isupper() and attribute.isidentifier()):
             return False
         parts = module.split(".")
-        return all(part.isidentifier() for part in parts) and not (parts[0] in self._own or parts[0] in self._installed)
+        return all(part.isidentifier() for part in parts) and not (parts[0] in self.own or parts[0] in self._installed)
 
     def _class(self, name: str) -> Entry:
         """Import "package.module:Class". Raises InputError where it cannot be imported, is something else, or must not
@@ -86,15 +79,15 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
         except Exception as error:  # the user's code may raise anything
             mend = f"a module is looked for on the Python path and in {os.getcwd()}"
             raise InputError(f"{name}: cannot be imported ({type(error).__name__}: {error}); {mend}") from error
-        if not self._fits(getattr(entry, "kind", ""), entry):
-            raise InputError(f"{name}: expected {self._expected}, got {entry!r}")
+        if not self.fits(getattr(entry, "kind", ""), entry):
+            raise InputError(f"{name}: expected {self.expected}, got {entry!r}")
         return entry
 
     @cached_property
     def _installed(self) -> dict[str, Entry]:
         """Entries of other packages. Raises InputError where what an entry point names cannot be imported, or is
         something else."""
-        found: dict[str, Entry] = {}
+        entries: dict[str, Entry] = {}
         for point in entry_points(group=self.group):
             where = f"entry point {point.name} = {point.value} of group {self.group}"
             mend = "repair or uninstall the package that declares it"
@@ -102,10 +95,10 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
                 entry = point.load()
             except (ImportError, AttributeError) as error:
                 raise InputError(f"{where}: cannot be imported ({error}); {mend}") from None
-            if not self._fits(point.name, entry):
-                raise InputError(f"{where}: expected {self._expected}; {mend}")
-            found[point.name] = entry
-        return found
+            if not self.fits(point.name, entry):
+                raise InputError(f"{where}: expected {self.expected}; {mend}")
+            entries[point.name] = entry
+        return entries
 
 
 _ALLOWED: set[str] = set()
@@ -141,17 +134,19 @@ def allow_named(settings: Mapping[str, Any]) -> None:
     """Allow the code that stands in settings which a person has typed or given in Python: as models, controls or
     metrics, in any form that they may have there. Settings that come from a file are never given to this."""
     names: list[object] = []
-    for value in (settings.get(key) for key in ("model", "compared", "than")):
-        names += [part.partition("@")[0] for one in _listed(value) if isinstance(one, str) for part in one.split(",")]
-    for value in (settings.get(key) for key in ("controls", "over")):
-        given = value if isinstance(value, Mapping) else {}
-        for one in (*_listed(value), *given.values()):
-            names += one.split(",") if isinstance(one, str) else [getattr(one, "kind", None)]
-            names += [one.get("kind")] if isinstance(one, Mapping) else []
+    for key in ("model", "compared", "than"):
+        texts = [text for text in _listed(settings.get(key)) if isinstance(text, str)]
+        names += [part.partition("@")[0] for text in texts for part in text.split(",")]
+    for key in ("controls", "over"):
+        value = settings.get(key)
+        for control in (*_listed(value), *(value.values() if isinstance(value, Mapping) else ())):
+            names += control.split(",") if isinstance(control, str) else [getattr(control, "kind", None)]
+            names += [control.get("kind")] if isinstance(control, Mapping) else []
     metrics = settings.get("metrics")
-    for one in metrics.values() if isinstance(metrics, Mapping) else ():
-        names.append(f"{one.__module__}:{getattr(one, '__qualname__', '')}" if callable(one) else one)
-    _ALLOWED.update(name for one in names if isinstance(one, str) and _CODE.fullmatch(name := one.strip()))
+    for metric in metrics.values() if isinstance(metrics, Mapping) else ():
+        names.append(f"{metric.__module__}:{getattr(metric, '__qualname__', '')}" if callable(metric) else metric)
+    texts = [name.strip() for name in names if isinstance(name, str)]
+    _ALLOWED.update(filter(_CODE.fullmatch, texts))
 
 
 def names_code(function: Function) -> Function:
@@ -188,20 +183,20 @@ def may_fetch(model: str) -> bool:
     return model in _ALLOWED or model.partition("@")[0] in _ALLOWED
 
 
-def check_import(name: str) -> None:
-    """Check that "package.module:attribute" may be imported.
+def how_to_allow(name: str) -> str:
+    """Return how a person allows what only a file names, for messages."""
+    return f"if you trust it, allow it yourself: in Python with advsearch.allow_code({name!r}), or with `code={name}`"
 
-    Raises:
-        InputError: nobody but a file names it.
-    """
+
+def check_import(name: str) -> None:
+    """Check that "package.module:attribute" may be imported. Raises InputError where nobody but a file names it."""
     if name in _ALLOWED:
         return
     importlib.invalidate_caches()
-    found = PathFinder.find_spec(name.partition(":")[0].partition(".")[0], [*sys.path, os.getcwd()])
-    where = f" from {found.origin}" if found is not None and found.origin else ""
+    spec = PathFinder.find_spec(name.partition(":")[0].partition(".")[0], [*sys.path, os.getcwd()])
+    where = f" from {spec.origin}" if spec is not None and spec.origin else ""
     raise InputError(
-        f"a file names {name}, Python code{where} that would be imported and run; read it, and if you trust it, allow "
-        f"it yourself: in Python with advsearch.allow_code({name!r}), or with `code={name}`"
+        f"a file names {name}, Python code{where} that would be imported and run; read it, and {how_to_allow(name)}"
     )
 
 

@@ -9,7 +9,6 @@ question is an object of its own name, which `advsearch.question.question` has m
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
 from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
@@ -51,53 +50,39 @@ def there(module: str) -> bool:
     return parts[:2] != ["advsearch", "questions"] or parts[2] in rooms()
 
 
+PARTS = {
+    "config": ("settings", "CONFIG"), "result": ("result", "RESULT"), "others": ("result", "BY_FIELD"),
+    "from_config": ("carry_out", "{}_from_config"), "shown": ("result", "shown"), "claims": ("result", "claims"),
+    "page": ("page", "page"),
+}  # fmt: skip
+"""Where an older form has the parts of a `Room`: a module of its folder, and the name there."""
+
+
 class Room:
-    """What a question has; None for what it has not. Each is imported when it is asked for."""
+    """What a question has; None for what it has not. Each is imported when it is asked for.
+
+    Attributes:
+        config, result: the classes of its settings and of its result.
+        others: other classes of its result, by a field that they alone have.
+        from_config: what carries it out.
+        shown: what makes of its result what a person is shown of it.
+        claims: what yields the sentences that its result stands for.
+        page: what makes a page of its own kind.
+    """
 
     def __init__(self, name: str) -> None:
         self.name = name
 
-    def _own(self, module: str, what: str) -> Any:
-        package = import_module(f"advsearch.questions.{self.name}")
-        return getattr(package, what, None) if made_question(self.name) else in_room(self.name, module, what)
-
-    @property
-    def config(self) -> Any:
-        """The class of its settings."""
-        made = made_question(self.name)
-        return made.config if made else in_room(self.name, "settings", "CONFIG")
-
-    @property
-    def result(self) -> Any:
-        """The class of its result."""
-        made = made_question(self.name)
-        return made.result if made else in_room(self.name, "result", "RESULT")
-
-    @property
-    def others(self) -> Mapping[str, Any]:
-        """Other classes of its result, by a field that they alone have."""
-        return self._own("result", "BY_FIELD") or {}
-
-    @property
-    def from_config(self) -> Any:
-        """What carries it out."""
-        made = made_question(self.name)
-        return made.from_config if made else in_room(self.name, "carry_out", f"{self.name}_from_config")
-
-    @property
-    def shown(self) -> Any:
-        """What makes of its result what a person is shown of it."""
-        return self._own("result", "shown")
-
-    @property
-    def claims(self) -> Any:
-        """What yields the sentences that its result stands for."""
-        return self._own("result", "claims")
-
-    @property
-    def page(self) -> Any:
-        """What makes a page of its own kind."""
-        return self._own("page", "page")
+    def __getattr__(self, part: str) -> Any:
+        """Return a part."""
+        if part not in PARTS:
+            raise AttributeError(part)
+        made, (module, what) = made_question(self.name), PARTS[part]
+        if made and hasattr(made, part):
+            return getattr(made, part)
+        place = f"advsearch.questions.{self.name}" + ("" if made else f".{module}")
+        there = find_spec(place) is not None
+        return getattr(import_module(place), what.format(self.name), None) if there else None
 
 
 def room(name: str) -> Room | None:
@@ -108,11 +93,3 @@ def room(name: str) -> Room | None:
 def made_question(name: str) -> Any:
     """Return the question of a name that `advsearch.question.question` has made; None of the older form."""
     return getattr(import_module(f"advsearch.questions.{name}"), name) if name in made_questions() else None
-
-
-def in_room(name: str, module: str, what: str) -> Any:
-    """Return what a question has in one of the modules of its folder; None where it has no such."""
-    path = f"advsearch.questions.{name}.{module}"
-    if name not in rooms() or find_spec(path) is None:
-        return None
-    return getattr(import_module(path), what, None)

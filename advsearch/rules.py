@@ -29,25 +29,19 @@ from advsearch.runs.results import ConditionRow
 
 Mask = npt.NDArray[np.bool_]
 
-FEWEST_ROWS = 100
-"""Rows of which one half can choose and the other can count."""
+FEWEST_ROWS = 100  # rows of which one half can choose and the other can count
 MOST_RULES = 5
-DEPTH = 3
-"""Conditions of a rule, at most."""
+DEPTH = 3  # conditions of a rule, at most
 TREES = 24
 LEAST_SHARE, LEAST_ROWS, LEAST_UNITS = 0.01, 12, 3
 """Of the rows that choose, a rule covers at least so many, and as many as so many units have."""
-KEPT = 0.97
-"""Share of its weighted relative accuracy that a rule keeps when a condition is left out."""
-PASSES, BOUNDS = 3, 250
-"""How often all bounds of a rule are moved, and to how many places (quantiles) of their factor."""
+KEPT = 0.97  # share of its weighted relative accuracy that a rule keeps when a condition is left out
+PASSES, BOUNDS = 3, 250  # how often all bounds of a rule are moved, and to how many places (quantiles) of their factor
 CHANCE = 0.01
 """Probability that any rule is told that is none. Rules are tested one after the other, each only where all before it
 were told, so that each may be tested at all of it (a fixed sequence: Maurer, Hothorn and Lehmacher 1995)."""
-MOST_NEEDED = 1_000_000
-"""Rows up to which it is said how many a rule would take."""
-LEAST_GAP = 0.1
-"""By how much more often the model is wrong under a rule than elsewhere, at least."""
+MOST_NEEDED = 1_000_000  # rows up to which it is said how many a rule would take
+LEAST_GAP = 0.1  # by how much more often the model is wrong under a rule than elsewhere, at least
 AROUND = 270.0
 """Degrees that the values of an angle span, at least, where it goes all the way round: a grid of four values does."""
 ARCS = ((360.0, 180.0), (180.0, 0.0), (180.0, 90.0))
@@ -154,8 +148,7 @@ class RuleCondition:
         )
 
 
-RuleConditions = tuple[RuleCondition, ...]
-"""All of which hold, at most one for each factor."""
+RuleConditions = tuple[RuleCondition, ...]  # all of which hold, at most one for each factor
 
 
 def covered(conditions: RuleConditions, table: pd.DataFrame) -> Mask:
@@ -301,8 +294,13 @@ class Split(NamedTuple):
 
 def _candidates(table: pd.DataFrame, least: int, seed: int) -> Iterator[RuleConditions]:
     """The nodes of one tree of all rows and of a random forest."""
-    one_tree = import_library("sklearn.tree").DecisionTreeClassifier
-    forest = import_library("sklearn.ensemble").RandomForestClassifier
+    try:
+        trees_of, forests = (importlib.import_module(f"sklearn.{part}") for part in ("tree", "ensemble"))
+    except ImportError as error:
+        raise InputError(
+            "explain needs scikit-learn, which cannot be imported: pip install 'advsearch[explain]'"
+        ) from error
+    one_tree, forest = trees_of.DecisionTreeClassifier, forests.RandomForestClassifier
     columns: list[npt.NDArray[np.float64]] = []
     splits: list[Split] = []
     for factor, unit in table.attrs["units"].items():
@@ -357,13 +355,3 @@ def _nodes(tree: Any, splits: list[Split]) -> Iterator[dict[Split, RuleCondition
             names = before.options
             below, above = (replace(before, options=one) for one in (names - {split.name}, names & {split.name}))
         open_nodes += [(left, {**conditions, key: below}), (right, {**conditions, key: above})]
-
-
-def import_library(name: str) -> Any:
-    """Return a module of scikit-learn, such as ``sklearn.tree``."""
-    try:
-        return importlib.import_module(name)
-    except ImportError as error:
-        raise InputError(
-            "explain needs scikit-learn, which cannot be imported: pip install 'advsearch[explain]'"
-        ) from error

@@ -131,9 +131,8 @@ def assert_suite(suite: str | Path, **settings: Any) -> SuiteResult:
     allow_named(settings)
     with in_turn():
         result = test_from_config(SuiteConfig(**{"suite": str(suite), **settings}))
-    bad = [one for one in result.claims if not one.accepted]
-    if bad:
-        raise AssertionError("\n\n".join(_told(result, one, one.repeat) for one in bad))
+    if bad := [claim for claim in result.claims if not claim.accepted]:
+        raise AssertionError("\n\n".join(_report(result, claim, claim.repeat) for claim in bad))
     return result
 
 
@@ -181,12 +180,12 @@ def _asserted(
     if claimed.answer != "held":
         test = os.environ.get("PYTEST_CURRENT_TEST", "").rpartition(" ")[0]
         again = f"pytest {shlex.quote(test)}" if test else "call the same function with the same arguments"
-        raise AssertionError(_told(result, claimed, again))
+        raise AssertionError(_report(result, claimed, again))
     return result
 
 
-def _told(result: SuiteResult, one: ClaimResult, again: str) -> str:
+def _report(result: SuiteResult, claim: ClaimResult, again: str) -> str:
     run = Path(result.run or "")
-    lines = [f"{one.name}: {one.answer}: {one.reason}", f"  claimed: {one.statement}"]
-    lines += [f"  picture: {(run / one.picture).resolve()}"] if one.picture else []
+    lines = [f"{claim.name}: {claim.answer}: {claim.reason}", f"  claimed: {claim.statement}"]
+    lines += [f"  picture: {(run / claim.picture).resolve()}"] if claim.picture else []
     return "\n".join([*lines, f"  run: {run}", f"  again: {again}"])

@@ -13,11 +13,8 @@ import yaml
 
 from advsearch.files import DEPTH, DIGITS, scaled
 
-LARGEST = 1 << 17
-"""Most bytes of a YAML file."""
-
-MOST_VALUES = 100_000
-"""Most values of a YAML text, those that an alias repeats counted again."""
+LARGEST = 1 << 17  # most bytes of a YAML file
+MOST_VALUES = 100_000  # most values of a YAML text, those that an alias repeats counted again
 
 _PLAIN = frozenset(f"tag:yaml.org,2002:{kind}" for kind in "str int float bool null seq map merge".split())
 
@@ -40,13 +37,10 @@ class _Loader(yaml.SafeLoader):  # type: ignore[misc, unused-ignore]
         return number
 
 
-def _without(*kinds: str) -> dict[str, list[Any]]:
-    tags = {f"tag:yaml.org,2002:{kind}" for kind in kinds}
-    resolvers = yaml.SafeLoader.yaml_implicit_resolvers
-    return {first: [(tag, form) for tag, form in forms if tag not in tags] for first, forms in resolvers.items()}
-
-
-_Loader.yaml_implicit_resolvers = _without("int", "float", "timestamp")
+_Loader.yaml_implicit_resolvers = {
+    first: [(tag, form) for tag, form in forms if tag.rpartition(":")[2] not in ("int", "float", "timestamp")]
+    for first, forms in yaml.SafeLoader.yaml_implicit_resolvers.items()
+}
 _Loader.add_constructor("tag:yaml.org,2002:int", _Loader.construct_yaml_int)
 _Loader.add_implicit_resolver(
     "tag:yaml.org,2002:int",

@@ -171,7 +171,7 @@ def swept(workers: int, pictures: int, watch: Any = None) -> tuple[float, float,
     side = max(1, round(pictures / 10))
     grid = {"pose.yaw": f"0:360:{side}", "camera.elevation": "5:60:10"}
     config = SweepConfig(object="mug", grid=grid, trials=0, resolution=64)
-    answer = Judgement(-3.2, -3.2, right=True, prediction=Prediction("mug", 3, 0.93))
+    answer = Judgement(-3.2, 3.2, right=True, prediction=Prediction("mug", 3, 0.93))
 
     def seen(sent: Sequence[Sent]) -> list[Evaluation]:
         return [Evaluation.of(answer, seconds=0.03) for _ in sent]

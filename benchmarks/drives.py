@@ -166,7 +166,7 @@ def explained(runs: int) -> int:
                 rng = np.random.default_rng(seed)
                 found = observed(rng, answer(rng, drives, 0.7))
                 told += bool(find_rules(*halves(found, seed), seed=seed).told)
-                weights = {one.factors: one.interval[0] > 0.0 for one in find_importance(found)}
+                weights = {tuple(one.parameters): one.interval[0] > 0.0 for one in find_importance(found)}
                 decides += [weights.get(("pose.yaw",), False), weights.get(("path.time",), False)]
             bad += too_many(told, runs, 0.01) + sum(too_many(int(one), runs, 0.025) for one in decides)
             shares = ", ".join(f"{100 * one / runs:.1f}" for one in decides)

@@ -3,7 +3,7 @@
     python benchmarks/every_control.py [--controls pose texture,pose] [--seed 0] [-- more flags of `advsearch attack`]
 
 Every one has to end in a verified result, found or not, and never in one that is worse than the random search's with as
-many renders: it fools the model in at least as many fresh renders, and its verified margin is as large, or smaller by
+many renders: it fools the model in at least as many fresh renders, and its verified margin is as small, or larger by
 less than noise and chance make of it (`TIE` logits). The exit status is 3 if one falls short.
 """
 
@@ -65,7 +65,7 @@ def judged(summary: dict[str, Any]) -> tuple[bool, str]:
         summary["ending"] in VERIFIED
         and ours["trials"] == theirs["trials"] > 0
         and ours["successes"] >= theirs["successes"]
-        and ours["margin"] >= theirs["margin"] - TIE
+        and ours["margin"] <= theirs["margin"] + TIE
     )
     wrong = [f"{one['successes']}/{one['trials']}" for one in (ours, theirs)]
     row = f"{summary['ending']:14s} {wrong[0]:>7s} {wrong[1]:>7s} {ours['margin']:8.2f} {theirs['margin']:8.2f}"

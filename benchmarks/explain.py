@@ -127,8 +127,8 @@ def coverage(name: str, rows: int, samples: int) -> str:
         x = generator.random((rows, 3))
         right = generator.random(rows) < accuracy(x)
         for one in find_importance(table(dict(zip("xyz", x.T, strict=True)), right)):
-            if len(one.factors) == 1:
-                place, (low, high) = "xyz".index(one.factors[0]), one.interval
+            if len(one.parameters) == 1:
+                place, (low, high) = "xyz".index(one.parameters[0]), one.interval
                 hit[place] += low <= true[place] <= high
                 width[place] += high - low
     each = zip(true, hit / samples, 50 * width / samples, strict=True)

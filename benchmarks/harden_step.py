@@ -11,6 +11,8 @@ from __future__ import annotations
 import argparse
 import statistics
 import time
+from functools import partial
+from typing import Any
 
 from advsearch import threads
 
@@ -24,7 +26,6 @@ from advsearch.questions.harden.lessons import Lesson  # noqa: E402
 from advsearch.questions.harden.result import HardenConfig  # noqa: E402
 from advsearch.questions.harden.scenes import (  # noqa: E402
     TRAINING,
-    Drawing,
     SceneWork,
     splits_of,
 )
@@ -66,7 +67,8 @@ def draw(work: SceneWork, numbers: range, controls: tuple[str, ...], views: int)
     found, seconds = list[Lesson](), list[float]()
     for number in numbers:
         begun = time.perf_counter()
-        (lessons,) = work([Drawing(TRAINING, number, controls, views, 0)])
+        how: dict[str, Any] = {"controls": controls, "views": views, "plain": 0}
+        (lessons,) = work([partial(SceneWork.drawn, side=TRAINING, number=number, **how)])
         assert isinstance(lessons, list)
         found += lessons
         seconds.append(time.perf_counter() - begun)

@@ -2,10 +2,11 @@
 
     python benchmarks/own_loss.py [time] [paper] [gradients] [--seeds 10] [--turns 7]
 
-- `time`: a whole attack on the bundled mug's texture with an objective that asks for the texture (margin less total
-  variation) over one with the margin alone, as CPU time, in turns in one process; median ratio (asked for: 1.05);
+- `time`: a whole attack on the bundled mug's texture with an objective that asks for the texture (margin loss less
+  total variation) over one with the margin loss alone, as CPU time, in turns in one process; median ratio (asked for:
+  1.05);
 - `paper`: the loss of Sharif et al. 2016 as docs/own-loss.md has it, the terms of `printable` from `advsearch.losses`,
-  `printable` itself, and the margin alone: verified margin, and how rough and how far from ink each texture is;
+  `printable` itself, and the margin loss alone: verified margin, and how rough and how far from ink each texture is;
 - `gradients`: a search over poses along gradients with secants of the loss, with those over a pixel alone, and with
   differences of the picture, at equal renders: verified margins over ten seeds, 64 x 64 pixels.
 """
@@ -38,12 +39,12 @@ WEIGHT = 10.0
 
 
 def alone(logits: Tensor, images: Tensor, labels: Tensor) -> Tensor:
-    """The margin."""
+    """The margin loss."""
     return losses.margin(logits, labels)
 
 
 def smooth(logits: Tensor, images: Tensor, labels: Tensor, texture: Tensor) -> Tensor:
-    """The margin less total variation."""
+    """The margin loss less total variation."""
     return losses.margin(logits, labels) - WEIGHT * losses.total_variation(texture)
 
 
@@ -77,7 +78,7 @@ def paper(scene: advsearch.Scene, model: advsearch.Model) -> None:
     """Print what each loss finds."""
     page = of_the_page()
     wanted: dict[str, dict[str, Any]] = {
-        "the margin alone": {"objective": "margin"},
+        "the margin loss alone": {"objective": "margin"},
         "printable": {"printable": True},
         "the same terms of one's own": {"objective": ours},
         "Sharif et al. 2016": {"objective": page["sharif"]},
@@ -115,10 +116,10 @@ def gradients(scene: advsearch.Scene, model: advsearch.Model, seeds: int) -> Non
         print(f"seed {seed}:", *(f"{one[-1]:7.2f}" for one in margins.values()), flush=True)
     first = next(iter(margins.values()))
     for name, found in margins.items():
-        wins = sum(one < mine for one, mine in zip(found, first, strict=True))
-        over = sum(one > 0.0 for one in found)
+        wins = sum(one > mine for one, mine in zip(found, first, strict=True))
+        below = sum(one < 0.0 for one in found)
         print(
-            f"{name:28s} median margin {statistics.median(found):6.2f}, over 0 with {over} of {seeds} seeds; "
+            f"{name:28s} median margin {statistics.median(found):6.2f}, below 0 with {below} of {seeds} seeds; "
             f"secants find more with {wins}"
         )
 

@@ -28,7 +28,7 @@ from advsearch.questions.attack.carry_out import problem_from_config  # noqa: E4
 from advsearch.questions.precision.benches import GradientBench, PictureBench, TimeBudget, gradient_parts  # noqa: E402
 from advsearch.questions.precision.carry_out import precision_from_config  # noqa: E402
 from advsearch.questions.precision.result import PrecisionConfig, Recommended  # noqa: E402
-from advsearch.questions.precision.rule import ReferenceValue, Setting, point_of  # noqa: E402
+from advsearch.questions.precision.rule import ReferenceValue, SampleSetting, point_of  # noqa: E402
 
 SCENES = ("bowl/kitchen", "bottle/noon", "ball/studio")
 CONTROL = "environment"
@@ -70,7 +70,7 @@ def intervals() -> int:
             covered, all_covered = [], []
             for _ in range(TRIES):
                 samples, true = simulated(noise, repeats, rng)
-                setting = Setting("picture", noise, 4, 4.0)
+                setting = SampleSetting("picture", noise, 4, 4.0)
                 point = point_of(setting, samples)
                 bare = point_of(setting, [{**numbers, "fourth": math.nan} for numbers in samples])
                 assert bare.interval is not None
@@ -146,7 +146,7 @@ def measured(config: PrecisionConfig, found: Recommended) -> tuple[float, bool]:
     problem, _ = problem_from_config(config)
     renderer, budget = problem.renderer, TimeBudget(config.seconds / 3.0)
     assert found.estimator is not None and found.spp is not None
-    setting = Setting(found.quantity, found.estimator, found.spp, 1.0, found.control, found.family)
+    setting = SampleSetting(found.quantity, found.estimator, found.spp, 1.0, found.control, found.family)
     bench: Any
     if found.quantity == "picture":
         samplers = dict.fromkeys(("multijitter", found.estimator.partition(" ")[0]))

@@ -8,10 +8,10 @@
     python benchmarks/searches.py --transport [--seeds 10] [--renders 40] [--epsilon E] [--resolution 128]
 
 The first prints, for each space and policy, the median over seeds of the verified margin (the mean of fresh trials at a
-high sample count, in logits; above 0 the model is wrong), how far `auto` is below the best single policy, and which
-share of a dense sample of the space, ten times as many configurations, has a lower margin than what `auto` finds. Those
-are verified by `--dense-trials` trials each: the best of many noisy values is a noisy one. `--spp` is what the searches
-render with; the trials always have 64 samples.
+high sample count, in logits; below 0 the model is wrong), how far `auto` is above the best single policy, and which
+share of a dense sample of the space, ten times as many configurations, has a higher margin than what `auto` finds.
+Those are verified by `--dense-trials` trials each: the best of many noisy values is a noisy one. `--spp` is what the
+searches render with; the trials always have 64 samples.
 
 The second compares the renders that gradient search needs with those of the best policy without gradients: the margin
 that `pgd` reaches within a tenth of the renders, and the margins of the others with all of them.
@@ -107,7 +107,7 @@ def _verified(problem: Problem, u: Tensor, trials: int = TRIALS) -> float:
 
 
 def _spaces(args: argparse.Namespace) -> None:
-    print(f"| space | {' | '.join(args.policies)} | auto below the best | share of {args.dense} below auto |")
+    print(f"| space | {' | '.join(args.policies)} | auto above the best | share of {args.dense} above auto |")
     print("|" + " --- |" * (len(args.policies) + 3))
     for space in args.spaces:
         problem = _problem(args, space)
@@ -119,14 +119,14 @@ def _spaces(args: argparse.Namespace) -> None:
         generator = torch.Generator().manual_seed(5)
         dense = [_verified(problem, u, args.dense_trials) for u in problem.domain.sample(generator, args.dense)]
         clean = _verified(problem, problem.domain.start)
-        best = max(medians.values())
+        best = min(medians.values())
         cells = [
             f"{medians[policy]:.2f} ({min(margins[policy]):.1f} to {max(margins[policy]):.1f})" for policy in margins
         ]
         behind = share = "-"
         if "auto" in medians:
-            behind = f"{100 * max(0.0, best - medians['auto']) / max(best - clean, 1e-9):.0f} %"
-            share = f"{100 * sum(value < medians['auto'] for value in dense) / len(dense):.1f} %"
+            behind = f"{100 * max(0.0, medians['auto'] - best) / max(clean - best, 1e-9):.0f} %"
+            share = f"{100 * sum(value > medians['auto'] for value in dense) / len(dense):.1f} %"
         print(f"| {space} | {' | '.join(cells)} | {behind} | {share} |", flush=True)
 
 

@@ -231,7 +231,7 @@ def compare(
     light.fixed = None
     pictures += [pictures[0].roll(1, dims=1), pictures[0]]
     once: Any = Once(renderer)
-    found = [view_of(once, one, whole, search, SPP, lambda at, _: -margin(model, at, label)) for one in pictures]
+    found = [view_of(once, one, whole, search, SPP, lambda at, _: margin(model, at, label)) for one in pictures]
     return [*found[:-1], replace(found[-1], margin=found[-1].margin + 0.5)]
 
 

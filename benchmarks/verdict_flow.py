@@ -97,8 +97,8 @@ class Drawn:
         return {}
 
 
-def _judged(margin: float) -> Evaluation:
-    return Evaluation(margin, None, margin > 0.0, judgement=Judgement(margin, margin, margin <= 0.0, Prediction("")))
+def _judged(score: float) -> Evaluation:
+    return Evaluation(score, None, score > 0.0, judgement=Judgement(score, -score, score <= 0.0, Prediction("")))
 
 
 def claimed(at: float, failures: Failures | None = None) -> SearchResult:

@@ -92,8 +92,8 @@ def ended(script: str) -> Verification:
             answer = "0" if float(query.u[0]) == 0.0 else next(told, None)
             if answer is None:
                 raise Unknown
-            margin = 1.0 if answer == "1" else -1.0
-            yield Evaluation.of(Judgement(margin, margin, margin <= 0.0, Prediction("")))
+            score = 1.0 if answer == "1" else -1.0
+            yield Evaluation.of(Judgement(score, -score, score <= 0.0, Prediction("")))
 
     domain = Domain(torch.zeros(1), (Block(1, "linf", 1.0),))
     return verify(evaluate, domain, torch.ones(1), claim=Ending.NOT_VERIFIED, spp=1, seed=0, trials=TRIAL_LOOKS)
@@ -311,9 +311,9 @@ def drawn(clean: float, answer: float, lift: float) -> tuple[Counted, Domain, Te
     def asked(query: Query) -> Evaluation:
         place = clean if float(query.u[0]) == 0.0 else answer
         noise = float(np.random.default_rng([query.seed, query.spp, int(query.u[0])]).normal())
-        margin = place + math.sqrt(16 / query.spp) * (lift + 0.4 * noise)
-        judged = Judgement(margin, margin, margin <= 0.0, Prediction(""))
-        return Evaluation(margin, None, margin > 0.0, judgement=judged)
+        score = place + math.sqrt(16 / query.spp) * (lift + 0.4 * noise)
+        judged = Judgement(score, -score, score <= 0.0, Prediction(""))
+        return Evaluation(score, None, score > 0.0, judgement=judged)
 
     return Counted(asked), domain, torch.ones(1)
 

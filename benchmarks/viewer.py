@@ -78,7 +78,7 @@ def row(step: int, chance: random.Random) -> Row:
         "pose.x": {"value": chance.uniform(-0.2, 0.2), "unit": "object sizes"},
     }
     label = "cup" if wrong else "mug"
-    margin = chance.gauss(2.0 if wrong else -3.0, 1.0)
+    margin = chance.gauss(-2.0 if wrong else 3.0, 1.0)
     return Row("sweep", step, correct=not wrong, margin=margin, label=label, probability=0.9, values=values)
 
 

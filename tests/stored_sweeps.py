@@ -56,7 +56,7 @@ def make_sweep(
                 "light.power": described(power + step / 1000, "1"),
             }
             rows.append(
-                Row("sweep", step, correct=not wrong, margin=2.0 + step / 100 if wrong else -3.0, probability=0.9,
+                Row("sweep", step, correct=not wrong, margin=-2.0 - step / 100 if wrong else 3.0, probability=0.9,
                     label="cup" if wrong else label, values=values, payload=payload)
             )  # fmt: skip
             if keep == "all" or (keep == "wrong" and wrong):

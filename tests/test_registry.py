@@ -145,7 +145,7 @@ def test_its_names_are_listed_and_its_parts_work_together(installed: Path, tmp_p
     assert (found["task"], found["objective"], found["model"]) == ("fading", "score", "gauge")
     assert found["label_set"] == ["0.0"] and found["clean"]["correct"] and found["clean"]["index"] is None
     assert found["ending"] == "found" and found["configuration"]["fade.amount"]["value"] > 0.7
-    assert found["adversarial"]["label"].endswith(" faded") and found["verified"]["margin"] > 0.0
+    assert found["adversarial"]["label"].endswith(" faded") and found["verified"]["margin"] < 0.0
     assert "task: fading" in (run / "run.yaml").read_text("utf-8")
 
     assert (swept["task"], swept["correct"], swept["configurations"]) == ("fading", 2, 3)

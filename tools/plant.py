@@ -103,8 +103,8 @@ FAULTS = (
     Fault(
         "exporting: normals are flipped",
         "advsearch/scene/glb.py",
-        "_y_up(_unit(mesh.normals))",
-        "_y_up(_unit(-mesh.normals))",
+        "_y_up(normals)",
+        "_y_up(-normals)",
         ("tests/api/test_export_scene.py",),
     ),
     Fault(
@@ -264,8 +264,8 @@ FAULTS = (
     Fault(
         "viewer: the best pictures come first",
         "advsearch/viewer/thumbnails.py",
-        "np.argsort(-np.nan_to_num(margins, nan=-np.inf)",
-        "np.argsort(np.nan_to_num(margins, nan=-np.inf)",
+        "np.argsort(np.nan_to_num(margins, nan=np.inf)",
+        "np.argsort(-np.nan_to_num(margins, nan=np.inf)",
         ("tests/viewer/test_columns.py",),
     ),
     Fault(
@@ -327,7 +327,7 @@ FAULTS = (
     Fault(
         "hardening: what judges is trained on",
         "advsearch/questions/harden/training.py",
-        "own, model = [copy.copy(one) for one in held_back], self.student.model",
+        "own, model = [copy.copy(lesson) for lesson in held_back], self.student.model",
         "own, model = list(held_back), self.student.model",
         ("tests/questions/test_hardening.py",),
     ),

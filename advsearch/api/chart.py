@@ -32,13 +32,11 @@ COLOURS = np.array(list(itertools.product((0.1, 0.3, 0.5, 0.7, 0.9), repeat=3)))
 COLUMNS, PITCH, PATCH, CORNER = 9, 15.0, 12.0, 9.0
 """Patches in a row; from one to the next, and the side of one and of a black square, millimetres."""
 ROWS = -(-len(COLOURS) // COLUMNS)
-SIZE = (COLUMNS * PITCH, ROWS * PITCH)
-"""Width and height of all patches with the paper around them, millimetres."""
+SIZE = (COLUMNS * PITCH, ROWS * PITCH)  # width and height of all patches with the paper around them, millimetres
 CORNERS = np.array([(x, y) for y in (-CORNER, SIZE[1] + CORNER) for x in (-CORNER, SIZE[0] + CORNER)])
 """(4, 2) middles of the black squares, from the upper left corner of the patches, in the order of reading."""
 LARGEST_SIDE = 8192
-DARK = 0.35
-"""Of the brightness of paper, under which a pixel may belong to a black square."""
+DARK = 0.35  # of the brightness of paper, under which a pixel may belong to a black square
 
 
 def chart_page(title: str, paper: tuple[float, float], convert: Any) -> Figure:
@@ -61,7 +59,6 @@ def chart_page(title: str, paper: tuple[float, float], convert: Any) -> Figure:
 
 
 def _middles() -> Floats:
-    """(125, 2) middles of the patches."""
     row, column = np.divmod(np.arange(len(COLOURS)), COLUMNS)
     return (np.stack([column, row], axis=1) + 0.5) * PITCH
 

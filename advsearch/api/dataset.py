@@ -45,25 +45,15 @@ from advsearch.tasks import Facts, Task
 from advsearch.tasks.classification import ClassTask
 from advsearch.tasks.together import Together
 
-IMAGES, LABELS, COCO, YOLO = "images", "labels", "annotations.json", "data.yaml"
-"""What is in the folder of a dataset."""
-
-CLEAN = ("first control", "control")
-"""Kinds of rows of an attack that look at the clean scene."""
+IMAGES, LABELS, COCO, YOLO = "images", "labels", "annotations.json", "data.yaml"  # what is in the folder of a dataset
+CLEAN = ("first control", "control")  # kinds of rows of an attack that look at the clean scene
 
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """One picture of a run.
-
-    Attributes:
-        name: of its file, without ending.
-        picture: (H, W, 3) sRGB in [0, 1], rounded to 8 bits: what the model sees.
-        things: that it shows, each with the number of its category.
-        rows: what the models of the run say of it.
-        values: the configuration by parameter.
-        same: whether the first model is right, or wrong, as its row says.
-    """
+    """One picture (H, W, 3) of a run, sRGB in [0, 1], rounded to 8 bits as the model sees it: the name of its file
+    without ending, the things that it shows, each with the number of its category, what the models of the run say of
+    it, the configuration by parameter, and whether the first model is right, or wrong, as its row says."""
 
     name: str
     picture: Tensor
@@ -94,14 +84,14 @@ class Categories:
             raise InputError(
                 f"RUN: its parts have other categories, {facts.object} among them; export one of its parts"
             )
-        self.labels, meshes, found = labels, renderer.scene.made[0].meshes, []
-        for one in seen_things(renderer, u):
+        self.labels, meshes, things = labels, renderer.scene.made[0].meshes, []
+        for thing in seen_things(renderer, u):
             try:
-                name = meshes[one.name].label or one.name
-                found.append((one, right if one.name == OBJECT else find_label_set(name, labels).indices[0]))
+                name = meshes[thing.name].label or thing.name
+                things.append((thing, right if thing.name == OBJECT else find_label_set(name, labels).indices[0]))
             except InputError:
-                self.unnamed.add(one.name)
-        return found
+                self.unnamed.add(thing.name)
+        return things
 
 
 def write_dataset(run: str | Path, out: Path, format: str, *, every: bool, progress: Progress) -> tuple[int, list[str]]:
@@ -113,13 +103,9 @@ def write_dataset(run: str | Path, out: Path, format: str, *, every: bool, progr
         format: "coco" or "yolo".
         every: also pictures that all models are right about.
 
-    Returns:
-        How many pictures there are (of 0, nothing is written), and sentences that a reader has to know.
-
-    Raises:
-        InputError: the scene of the run is not to be had any more, or `out` is not empty.
-        UnknownNameError: there is no such run.
-        FileFormatError: the run is of another command, or has not ended.
+    Returns how many pictures there are (of 0, nothing is written), and sentences that a reader has to know. Raises
+    InputError where the scene of the run is not to be had any more, or `out` is not empty, and FileFormatError where
+    the run is of another command, or has not ended.
     """
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"out: {out} is there already and not empty; name another folder")
@@ -144,7 +130,16 @@ def write_dataset(run: str | Path, out: Path, format: str, *, every: bool, progr
                 names: JsonObject = {"train": IMAGES, "val": IMAGES, "names": [*categories.labels]}
                 write_text(place / YOLO, json.dumps(names, indent=1) + "\n")
             else:
-                write_text(place / COCO, json.dumps(_coco(categories, images, things), allow_nan=False))
+                # labels that name nothing, such as a background, are no categories, and the others keep their numbers
+                named = [(number, name) for number, name in enumerate(categories.labels) if not names_nothing(name)]
+                dataset: JsonObject = {
+                    "info": {"description": "pictures of advsearch", "version": advsearch.__version__},
+                    "licenses": [],
+                    "images": [*images],
+                    "annotations": [*things],
+                    "categories": [{"id": number, "name": name, "supercategory": ""} for number, name in named],
+                }
+                write_text(place / COCO, json.dumps(dataset, allow_nan=False))
             with storage_errors(out):
                 os.replace(place, out)
     notes = []
@@ -159,12 +154,10 @@ def write_dataset(run: str | Path, out: Path, format: str, *, every: bool, progr
 
 
 def _pictures(folder: Path, categories: Categories, every: bool, progress: Progress) -> Iterator[Shown]:
-    """Render what can be rendered again of a run, or of its parts."""
-    parts = [one for one in sorted((folder / PARTS).glob("*")) if is_run(one)]
-    for part in parts:
-        for shown in _pictures(part, categories, every, progress):
-            yield replace(shown, name=f"{part.name}-{shown.name}")
-    if parts:
+    if parts := [part for part in sorted((folder / PARTS).glob("*")) if is_run(part)]:
+        for part in parts:
+            for shown in _pictures(part, categories, every, progress):
+                yield replace(shown, name=f"{part.name}-{shown.name}")
         return
     command = str(read_yaml(folder / CONFIG).get("command"))
     if command not in READ:
@@ -177,7 +170,6 @@ def _pictures(folder: Path, categories: Categories, every: bool, progress: Progr
 
 
 def _swept(folder: Path, categories: Categories, every: bool, progress: Progress) -> Iterator[Shown]:
-    """The pictures of a sweep as its first model sees them."""
     scenes = scenes_of(SweepConfig.from_yaml(folder / CONFIG).model_copy(update={"metrics": {}}))
     job, rows = scenes.job, defaultdict[int, list[Row]](list)
     with Store(folder / NAME, read_only=True) as store:
@@ -189,8 +181,8 @@ def _swept(folder: Path, categories: Categories, every: bool, progress: Progress
         raise FileFormatError(f"{folder / NAME}: expected rows of its {count} pictures, got one of another")
     progress.stage("rendering pictures", len(chosen))
     for number in chosen:
-        ((scene, _, query), *_) = job.queries(range(number, number + 1))
-        view, place, some = scenes.named(scene), job.places[int(scene)], sorted(rows[number], key=lambda row: row.step)
+        view, (query, *_) = scenes.asked(number)
+        place, some = job.places[view.number], sorted(rows[number], key=lambda row: row.step)
         facts, size = object_facts(place.scene, place.object, job.config), job.sizes[0]
         picture = view.pictures([query])[0]
         things = categories.things(job.tasks[0], facts, view.renderers[size], query.u)
@@ -204,9 +196,8 @@ def _attacked(folder: Path, categories: Categories, every: bool, progress: Progr
     """The trials of an attack's adversarial scene, and of the clean one; where nothing varies, the first of each."""
     summary, parts = attack_of(folder), parts_in(folder)
     problem, _ = problem_of_parts(parts)
-    attacked = summary.adversarial is not None
     kinds = dict.fromkeys(CLEAN, problem.domain.start)
-    if attacked:
+    if summary.adversarial is not None:
         kinds["baseline verification" if summary.answer_from else "verification"] = kept_configuration(folder, problem)
     with Store(folder / NAME, read_only=True) as store:
         tried = {kind: [row for row in store.rows(kind) if every or not row.correct] for kind in kinds}
@@ -215,9 +206,8 @@ def _attacked(folder: Path, categories: Categories, every: bool, progress: Progr
     for row in chosen:
         u, seed, spp = kinds[row.kind], max(0, row.seed or 0), row.spp or problem.spp
         picture, whole = problem.picture(u, seed, spp), problem.whole(u, seed)
-        things = categories.things(
-            problem.task, object_facts(parts.scene, parts.config.object, parts.config), problem.renderer, whole
-        )
+        facts = object_facts(parts.scene, parts.config.object, parts.config)
+        things = categories.things(problem.task, facts, problem.renderer, whole)
         same = row.correct in (None, problem.judge(picture, whole).right)
         values = {**problem.describe(u, seed), **row.values}
         yield Shown(f"{row.kind.replace(' ', '-')}-{row.step:02d}", picture, things, [row], values, same)
@@ -234,18 +224,6 @@ READ = {SweepConfig.command: _swept, AttackConfig.command: _attacked}
 
 
 # ---- as COCO has them -----------------------------------------------------------------------------------------------
-
-
-def _coco(categories: Categories, images: list[JsonObject], things: list[JsonObject]) -> JsonObject:
-    """Labels that name nothing, such as a background, are no categories, and the others keep their numbers."""
-    named = [(number, name) for number, name in enumerate(categories.labels) if not names_nothing(name)]
-    return {
-        "info": {"description": "pictures of advsearch", "version": advsearch.__version__},
-        "licenses": [],
-        "images": [*images],
-        "annotations": [*things],
-        "categories": [{"id": number, "name": name, "supercategory": ""} for number, name in named],
-    }
 
 
 def _image(number: int, shown: Shown) -> JsonObject:
@@ -292,8 +270,8 @@ def _runs(mask: Bools) -> list[int]:
 def _lines(things: Sequence[Mapping[str, Any]], height: int, width: int) -> str:
     """Number of the class, middle of the box and its size, as shares of the picture."""
     lines = []
-    for one in things:
-        left, top, across, down = one["bbox"]
+    for thing in things:
+        left, top, across, down = thing["bbox"]
         box = ((left + across / 2) / width, (top + down / 2) / height, across / width, down / height)
-        lines.append(f"{one['category_id']} " + " ".join(f"{side:.6f}" for side in box))
+        lines.append(f"{thing['category_id']} " + " ".join(f"{side:.6f}" for side in box))
     return "\n".join([*lines, ""])

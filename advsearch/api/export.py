@@ -26,7 +26,7 @@ from advsearch.controls.texture import TextureControl
 from advsearch.engine.loading import Scene, as_controls, load_scene
 from advsearch.engine.problem import Problem
 from advsearch.engine.verifier import kept_configuration
-from advsearch.errors import FileFormatError, InputError
+from advsearch.errors import InputError
 from advsearch.questions.attack.carry_out import judged_alone, problem_from_config
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.summary import AttackSummary, attack_of
@@ -34,7 +34,6 @@ from advsearch.report.sheets import Mask, Piece
 from advsearch.runs.directory import ARTIFACTS, CONFIG, find_run
 from advsearch.runs.files import placed_by, storage_errors, write_bytes, write_text
 from advsearch.runs.images import read_png, to_8bit
-from advsearch.runs.summary import read_result
 from advsearch.scene.assembly import ON_PICTURE
 from advsearch.scene.assets import Floats, Ints, Mesh
 from advsearch.scene.description import NO_MAP, OBJECT
@@ -71,14 +70,10 @@ class AdversarialRun:
 
 
 def adversarial_of(run: str | Path) -> AdversarialRun:
-    """Load a run's scene and its adversarial configuration.
+    """Load the scene of a run of `attack` that has ended, by its name or folder, and its adversarial configuration.
 
-    Args:
-        run: name or folder of a run of `attack` that has ended.
-
-    Raises:
-        InputError: the run has no adversarial configuration, or its scene is another one now.
-        FileFormatError: the run did not end, or is of another command.
+    Raises InputError where it has none, or its scene is another one now, and FileFormatError where it did not end, or
+    is of another command.
     """
     folder = find_run(run)
     summary = attack_of(folder)
@@ -93,31 +88,22 @@ def adversarial_of(run: str | Path) -> AdversarialRun:
 
 
 def write_mitsuba(run: str | Path, out: Path) -> list[str]:
-    """Write the adversarial scene of a run as XML with its meshes and pictures beside it.
+    """Write the adversarial scene of a run as XML with its meshes and pictures beside it, whose names begin with its
+    own, to a file that ends in .xml, or a folder for `scene.xml`; return sentences about how its picture becomes that
+    of the run, and what is no part of it.
 
-    Args:
-        run: name or folder of a run of `attack` that has ended.
-        out: a file that ends in .xml, or a folder for `scene.xml`; what is beside it has names that begin with its own.
-
-    Returns:
-        Sentences about how its picture becomes that of the run, and what is no part of it.
-
-    Raises:
-        InputError: the run has no adversarial configuration, files of these names are there, or stock Mitsuba has no
-            such scene.
-        FileFormatError: the run did not end, or is of another command.
+    Raises errors as `adversarial_of`, and InputError where such files are there, or stock Mitsuba has no such scene.
     """
     path = out if out.suffix.lower() == XML else out / NAME
     taken = [path, *path.parent.glob(f"{path.stem}-*")] if path.parent.is_dir() else []
-    there = [one for one in taken if one.exists()]
+    there = [file for file in taken if file.exists()]
     if there or path.parent.is_file():
         raise InputError(f"out: {(there or [path.parent])[0]} is there already; choose another name")
     adversarial = adversarial_of(run)
-    renderer = adversarial.problem.renderer
-    inputs = adversarial.inputs
+    renderer, inputs = adversarial.problem.renderer, adversarial.inputs
     on_picture = {name: inputs.pop(name) for name in ON_PICTURE if name in inputs}
     backdrop = on_picture.get("backdrop.color")
-    hazes = [part.name for part in renderer.scene.made[0].parts if isinstance(part, HazePart)]
+    hazes = (part.name for part in renderer.scene.made[0].parts if isinstance(part, HazePart))
     hazy = any(float(inputs[f"{name}.density"]) > 0.0 for name in hazes)
     if hazy and backdrop is not None:
         raise InputError(f"{adversarial.folder}: haze before a plain background is no part of a Mitsuba scene")
@@ -146,28 +132,16 @@ def write_mitsuba(run: str | Path, out: Path) -> list[str]:
             write_scene(renderer.scene, inputs, Path(made) / path.name, " ".join(notes), hide=backdrop is not None)
             for one in sorted(Path(made).iterdir()):
                 os.replace(one, path.parent / one.name)
-        text = (
-            f"The adversarial scene of {adversarial.folder.name} as a scene for Mitsuba 3 (advsearch "
-            f"{advsearch.__version__}).\n"
-        )
-        write_text(path.with_name(f"{path.stem}-README.txt"), "\n".join([text, *notes, ""]), durable=False)
+        what = f"The adversarial scene of {adversarial.folder.name} as a scene for Mitsuba 3"
+        text = [f"{what} (advsearch {advsearch.__version__}).\n", *notes, ""]
+        write_text(path.with_name(f"{path.stem}-README.txt"), "\n".join(text), durable=False)
     return notes
 
 
 def write_gltf(run: str | Path, out: Path) -> list[str]:
-    """Write the object of a run's adversarial scene as binary glTF: displaced and in its pose, with its texture.
-
-    Args:
-        run: name or folder of a run of `attack` that has ended.
-        out: a file that ends in .glb.
-
-    Returns:
-        Sentences about what is not as in the run.
-
-    Raises:
-        InputError: the run has no adversarial configuration, or the file is called otherwise.
-        FileFormatError: the run did not end, or is of another command.
-    """
+    """Write the object of a run's adversarial scene as binary glTF, a file that ends in .glb: displaced and in its
+    pose, with its texture; return sentences about what is not as in the run. Raises errors as `adversarial_of`, and
+    InputError where the file is called otherwise."""
     if out.suffix.lower() != GLB:
         raise InputError(f"out: expected the name of a .glb file, got {out}")
     adversarial = adversarial_of(run)
@@ -190,31 +164,20 @@ def write_gltf(run: str | Path, out: Path) -> list[str]:
     return notes
 
 
-BLEED = 3.0
-"""Millimetres of colour beyond the line to cut."""
+BLEED = 3.0  # millimetres of colour beyond the line to cut
 FINEST = 0.2
 """Millimetres of a pixel that is fine enough: texels are divided until they are no larger, and are interpolated between
 as the renderer does it."""
-MOST_PARTS = 9
-"""Parts of a texel along each side, odd: the middle one has the texel's own colour."""
-
-
-LONGEST = 100_000.0
-"""Longest side of a printed object, in millimetres."""
+MOST_PARTS = 9  # parts of a texel along each side, odd: the middle one has the texel's own colour
+LONGEST = 100_000.0  # longest side of a printed object, in millimetres
 
 
 def real_size(run: str | Path) -> float | None:
     """Return the longest side of the object of a run of `attack`, in millimetres; None where its size is not known."""
-    _, config = _attack_in(find_run(run))
-    metres = _alone(config).description.object.metres
+    folder = find_run(run)
+    attack_of(folder)  # refuses others
+    metres = _alone(AttackConfig.from_yaml(folder / CONFIG)).description.object.metres
     return None if metres is None else metres * 1000.0
-
-
-def _attack_in(folder: Path) -> tuple[AttackSummary, AttackConfig]:
-    summary = read_result(folder)
-    if not isinstance(summary, AttackSummary):
-        raise FileFormatError(f"{folder}: expected a run of attack, got one of {summary.command}")
-    return summary, AttackConfig.from_yaml(folder / CONFIG)
 
 
 def _alone(config: AttackConfig) -> Scene:
@@ -233,21 +196,18 @@ def printable(run: str | Path, size: float) -> list[Piece]:
 
     Raises:
         InputError: nothing of it can be printed, or the size is out of range.
-        UnknownNameError: there is no such run.
         FileFormatError: the run is of another kind or has not ended, or lacks its files.
     """
     if not 1.0 <= size <= LONGEST:
         raise InputError(f"size: expected the object's longest side in millimetres, 1 to {LONGEST:.0f}, got {size}")
     folder = find_run(run)
-    summary, config = _attack_in(folder)
-    scene = _alone(config)
-    pieces: list[Piece] = []
+    summary, config = attack_of(folder), AttackConfig.from_yaml(folder / CONFIG)
+    scene, pieces = _alone(config), list[Piece]()
     for control in as_controls(config.controls):
         picture = folder / ARTIFACTS / f"{file_name(control.name)}.png"
         if control.kind == "patch":
             pixels = read_png(folder / ARTIFACTS / f"{control.name}-pixels.png")
-            given = config.controls.get(control.name, {}).get("size")
-            side = size * _side(control, summary, given)
+            side = size * _side(control, summary, config.controls.get(control.name, {}).get("size"))
             pieces.append(_piece(f"{control.name}, {side:.1f} mm a side", pixels, (side / len(pixels),) * 2, None))
         elif isinstance(control, TextureControl) and picture.is_file():
             mesh, named = control.mesh_in(scene.description).mesh, control.materials_in(scene.description)
@@ -309,7 +269,6 @@ def _steps(places: np.ndarray, inside: Mask, axis: int) -> np.ndarray:
 
 
 def _piece(name: str, picture: Floats, pixel: tuple[float, float], inside: Mask | None) -> Piece:
-    """Divide the pixels, and put the bleed around them."""
     parts = min(MOST_PARTS, 2 * math.ceil((max(pixel) / FINEST - 1.0) / 2.0) + 1) if max(pixel) > FINEST else 1
     fine = enlarged(torch.from_numpy(np.ascontiguousarray(picture)), parts) if parts > 1 else torch.from_numpy(picture)
     size = pixel[0] / parts, pixel[1] / parts

@@ -28,12 +28,8 @@ from advsearch.progress import watched
 from advsearch.registry import allow_named
 from advsearch.settings import Config, as_python, is_shallow, settings
 
-Names = str | Sequence[str]
-"""Names in a list, or in a text with commas between them."""
-
-
-LOADED = (loading.Scene, Model, nn.Module)
-"""What a question may be given in place of a name."""
+Names = str | Sequence[str]  # names in a list, or in a text with commas between them
+LOADED = (loading.Scene, Model, nn.Module)  # what a question may be given in place of a name
 
 
 class _Signature(inspect.Signature):
@@ -142,7 +138,6 @@ WRITTEN = {
 }  # fmt: skip
 """What may be written for some settings beside what they become."""
 
-
 LISTED = (*SEVERAL, "prompt", "vary", "ways", "quantities", "samplers", "case", "group")
 """Settings that may be a list of names."""
 
@@ -160,14 +155,8 @@ def hint_of(field: str, kind: Any) -> str:
 
 
 def _docstring(text: str, names: Sequence[str], command: str, settings: Sequence[str]) -> str:
-    """A question's own docstring with what all of them say: where the run is kept, their arguments, and what is raised.
-
-    Args:
-        text: its own: what it does, and the arguments of which `SAME` does not say it.
-        names: of its arguments.
-        command: of its settings.
-        settings: a line for each.
-    """
+    """A question's own docstring (what it does, and arguments that `SAME` does not describe) with what all of them say:
+    where the run is kept, their arguments by `names`, a line for each setting, and what is raised."""
     said, _, own = inspect.cleandoc(text).partition("\n\nArgs:\n")
     if "other arguments are the settings of" not in " ".join(said.split()):
         said += f"\n\nAll other arguments are the settings of `advsearch {command}`. {KEPT}"

@@ -14,8 +14,7 @@ from advsearch.runs.directory import find_run
 from advsearch.scene.library import MAP_HINT, OBJECT_HINT, list_environments, list_objects
 from advsearch.settings import Config, split_names
 
-WORD = re.compile(r"[^\W\d][\w-]{0,59}")
-"""What can only be the name of something bundled: no path, no file, no code."""
+WORD = re.compile(r"[^\W\d][\w-]{0,59}")  # what can only be the name of something bundled: no path, no file, no code
 LABEL_SETS = ("imagenet", "cifar10", "cifar100", "coco", "coco90", "coco91", "voc")
 """`advsearch.models.labels.SETS`, which a test holds this to."""
 PACKAGE = Path(__file__).parent.parent
@@ -79,7 +78,10 @@ def check_names(config: Config) -> None:
                 find_run(run)
     suite = said.get("suite")
     if suite and not Path(suite).exists():
-        raise InputError(f"suite: there is no file {suite}{_near_file(Path(suite))}")
+        there = [str(file) for folder in {Path(suite).parent, Path("suites")} for file in sorted(folder.glob("*.y*ml"))]
+        near = resembling(Path(suite).stem, [Path(file).stem for file in there])[:1]
+        like = [file for file in there if Path(file).stem in near]
+        raise InputError(f"suite: there is no file {suite}{f'; did you mean {like[0]}?' if like else ''}")
 
 
 def _check(kind: str, names: Iterable[str], known: Iterable[str], hint: str = "") -> None:
@@ -92,11 +94,3 @@ def _check(kind: str, names: Iterable[str], known: Iterable[str], hint: str = ""
             known = [*own_names(kind), *(point.name for point in entry_points(group=f"advsearch.{known}"))]
         if name not in (known := list(known)):
             raise UnknownNameError(kind, name, known, hint)
-
-
-def _near_file(path: Path) -> str:
-    """Where a file of nearly the same name is, as the end of a sentence."""
-    there = [str(one) for folder in {path.parent, Path("suites")} for one in sorted(folder.glob("*.y*ml"))]
-    near = resembling(path.stem, [Path(one).stem for one in there])[:1]
-    like = [one for one in there if Path(one).stem in near]
-    return f"; did you mean {like[0]}?" if like else ""

@@ -21,28 +21,17 @@ from advsearch.runs.images import write_png
 from advsearch.scene.assembly import ON_PICTURE
 from advsearch.scene.color import linear_to_srgb
 
-ROWS = 1024
-"""Least height of the pictures to project, in pixels."""
-SHARES = (1 / 8, 1 / 2, 7 / 8)
-"""Where the nine marks are in a picture, of its width and height."""
-SPP = 64
-"""Samples a pixel of the picture of the scene with the marks."""
+ROWS = 1024  # least height of the pictures to project, in pixels
+SHARES = (1 / 8, 1 / 2, 7 / 8)  # where the nine marks are in a picture, of its width and height
+SPP = 64  # samples a pixel of the picture of the scene with the marks
 
 
 def write_projection(run: str | Path, out: Path) -> list[str]:
     """Write a folder for each projector of a run's adversarial scene: `picture.png` to project, `texels.png` with the
-    exact values, `marks.png` to project first, `seen.png`, where the run's camera sees these marks, and `README.txt`.
+    exact values, `marks.png` to project first, `seen.png`, where the run's camera sees these marks, and `README.txt`;
+    return sentences about what to set.
 
-    Args:
-        run: name or folder of a run of `attack` that has ended.
-        out: a new folder.
-
-    Returns:
-        Sentences about what to set.
-
-    Raises:
-        InputError: the run has no adversarial configuration or no projector, or the folder is there already.
-        FileFormatError: the run did not end, or is of another command.
+    Raises errors as `adversarial_of`, and InputError where it has no projector, or the folder is there already.
     """
     if out.exists():
         raise InputError(f"out: {out} is there already; choose another name")

@@ -70,31 +70,25 @@ def load_run(run: str | Path) -> AttackResult | SweepResult | Result:
     result = read_result(path)
     if isinstance(result, AttackSummary):
         return _attack(path, result)
-    if isinstance(result, SweepSummary):
-        return SweepResult(result, path)
-    return result
+    return SweepResult(result, path) if isinstance(result, SweepSummary) else result
 
 
 def _attack(path: Path, summary: AttackSummary) -> AttackResult:
-    clean, adversarial = (
-        torch.from_numpy(read_png(path / IMAGES / f"{name}.png")) for name in ("clean", "adversarial")
-    )
+    clean, adversarial = (read_png(path / IMAGES / f"{name}.png") for name in ("clean", "adversarial"))
+    artifacts = dict[str, Tensor]()
+    for file in sorted((path / ARTIFACTS).glob("*.exr")):
+        planes, _ = read_exr(file, read_bytes(file, "a picture of a run", LARGEST_FILE))
+        artifacts[file.stem] = torch.from_numpy(np.stack([np.asarray(plane, np.float32) for plane in planes], axis=-1))
     return AttackResult(
         summary=summary,
         run=path,
         u=torch.from_numpy(read_configuration(path)),
-        clean=clean,
-        adversarial=adversarial,
-        artifacts={one.stem: _layer(one) for one in sorted((path / ARTIFACTS).glob("*.exr"))},
+        clean=torch.from_numpy(clean),
+        adversarial=torch.from_numpy(adversarial),
+        artifacts=artifacts,
         search=None,
         parts=cache(partial(parts_in, path)),
     )
-
-
-def _layer(path: Path) -> Tensor:
-    """What a control handed over, (h, w, 3) float32."""
-    planes, _ = read_exr(path, read_bytes(path, "a picture of a run", LARGEST_FILE))
-    return torch.from_numpy(np.stack([np.asarray(plane, np.float32) for plane in planes], axis=-1))
 
 
 class ModelKeywords(TypedDict, total=False):
@@ -125,17 +119,12 @@ load_model.__doc__ = models.load_model.__doc__
 load_model.__signature__ = inspect.signature(models.load_model)  # type: ignore[attr-defined]
 load_model = helped(load_model)
 
-
 render = names_code(helped(in_turn()(shows_progress(rendering.render))))
 
 
 def render_from_config(config: RenderConfig, *, progress: Progress | None = None) -> RenderResult:
-    """Render what a configuration describes, write the file, and return what is known about it.
-
-    Raises:
-        InputError: as for `render`, or the file would replace one that is read.
-        StorageError: the file could not be written.
-    """
+    """Render what a configuration describes, write the file, and return what is known about it. Raises InputError as
+    `render`, or where the file would replace one that is read, StorageError where it could not be written."""
     progress = progress or NullProgress()
     out, aovs = writable(config.out, config.around or 1), aovs_of(config.aov)
     if aovs and config.around is not None:
@@ -145,9 +134,7 @@ def render_from_config(config: RenderConfig, *, progress: Progress | None = None
             raise InputError(f"out: would replace {spec}, which is read; choose another name")
     progress.stage("loading the scene and the model")
     check_run_settings(config)
-    controls = given_to(config, config.controls)
-    scene = scene_of(config)
-    task = make_task(config.task)
+    controls, scene, task = given_to(config, config.controls), scene_of(config), make_task(config.task)
     (model,), notes = load_models([config.model], task, config)
     rendering = render(
         scene,

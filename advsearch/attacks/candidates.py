@@ -15,15 +15,13 @@ from advsearch.attacks.domain import Domain
 from advsearch.attacks.trials import CONFIDENCE, edge_of
 from advsearch.errors import InputError
 
-SAME = 1e-4
-"""Configurations that differ by less than this in every element are one candidate (an 8-bit level is 4e-3)."""
+SAME = 1e-4  # configurations that differ by less than this in every element are one candidate (an 8-bit level is 4e-3)
 
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
     """A configuration (d,) worth a second look: the objective (biased upwards) and success of the render that admitted
-    it, the objectives of its renders since then, -inf for one that was not finite, and how many of these were a
-    success."""
+    it, the objectives of its renders since then, -inf where not finite, and how many were a success."""
 
     u: Tensor
     objective: float
@@ -40,6 +38,9 @@ class Candidate:
     def rate(self) -> float:
         return self.successes / len(self.again) if self.again else float(self.success)
 
+    def seen_again(self, objective: float, success: bool) -> Candidate:
+        return replace(self, again=(*self.again, objective), successes=self.successes + success)
+
 
 def admit(pool: tuple[Candidate, ...], new: Candidate, size: int) -> tuple[Candidate, ...]:
     """Return the pool with `new` in it if it belongs to the best `size` distinct ones, best first.
@@ -49,22 +50,22 @@ def admit(pool: tuple[Candidate, ...], new: Candidate, size: int) -> tuple[Candi
     """
     for old in pool:
         if torch.equal(old.u, new.u):
-            looked = replace(old, again=(*old.again, new.objective), successes=old.successes + new.success)
-            return tuple(looked if c is old else c for c in pool)
+            looked = old.seen_again(new.objective, new.success)
+            return tuple(looked if candidate is old else candidate for candidate in pool)
     if len(pool) >= size and _raw(new) <= _raw(pool[-1]):
         return pool
     for old in pool:
         if float((old.u - new.u).abs().amax()) < SAME:
             if _raw(new) <= _raw(old):
                 return pool
-            pool = tuple(c for c in pool if c is not old)
+            pool = tuple(candidate for candidate in pool if candidate is not old)
             break
     return tuple(sorted((*pool, new), key=_raw, reverse=True)[:size])
 
 
 def with_last(pool: tuple[Candidate, ...], last: Candidate | None, size: int) -> tuple[Candidate, ...]:
     """Return the pool, of at most `size`, with the last configuration of a search in it, if need be for its worst."""
-    if last is None or any(torch.equal(one.u, last.u) for one in pool):
+    if last is None or any(torch.equal(candidate.u, last.u) for candidate in pool):
         return pool
     return (*pool[: size - 1], last)
 
@@ -77,23 +78,22 @@ def contenders(pool: tuple[Candidate, ...], shared: int) -> tuple[Candidate, ...
     if shared < 2 or len(pool) < 2:
         return pool
     leader = best(pool)
-    return tuple(one for one in pool if one is leader or not _worse(one, leader, shared))
 
+    def worse(candidate: Candidate) -> bool:
+        behind = [a - b for a, b in zip(leader.again[-shared:], candidate.again[-shared:], strict=True)]
+        if not all(map(math.isfinite, behind)):
+            return not math.isfinite(candidate.believed)
+        mean = math.fsum(behind) / shared
+        variance = math.fsum((each - mean) ** 2 for each in behind) / (shared - 1)
+        return candidate.rate <= leader.rate and mean > math.sqrt(variance / shared)
 
-def _worse(one: Candidate, leader: Candidate, shared: int) -> bool:
-    behind = [a - b for a, b in zip(leader.again[-shared:], one.again[-shared:], strict=True)]
-    if not all(map(math.isfinite, behind)):
-        return not math.isfinite(one.believed)
-    mean = math.fsum(behind) / shared
-    variance = math.fsum((each - mean) ** 2 for each in behind) / (shared - 1)
-    return one.rate <= leader.rate and mean > math.sqrt(variance / shared)
+    return tuple(candidate for candidate in pool if candidate is leader or not worse(candidate))
 
 
 def best(pool: tuple[Candidate, ...]) -> Candidate:
-    """Return the winner: by success rate, then by objective, of the new renders where every candidate has had its
-    own."""
-    if all(c.again for c in pool):
-        return max(pool, key=lambda c: (c.rate, c.believed))
+    """Return the winner: by success rate, then by objective, of new renders where all have had some."""
+    if all(candidate.again for candidate in pool):
+        return max(pool, key=lambda candidate: (candidate.rate, candidate.believed))
     return pool[0]
 
 
@@ -101,23 +101,16 @@ def _raw(candidate: Candidate) -> tuple[bool, float]:
     return candidate.success, candidate.objective
 
 
-LEAST_EFFECTIVE = 10.0
-"""With fewer failures than so many, each of equal weight, no estimate is stated."""
-
-BETS = 8
-"""Sizes of a bet, each half of the one before; the capital is shared equally among them."""
+LEAST_EFFECTIVE = 10.0  # with fewer failures than so many, each of equal weight, no estimate is stated
+BETS = 8  # sizes of a bet, each half of the one before; the capital is shared equally among them
 
 
 @dataclass(frozen=True)
 class FailureShare:
-    """The share of configurations, drawn evenly from the budget, in which one render of the search is a success.
-
-    Attributes:
-        estimate: mean of the weighted draws; None where `effective` is under `LEAST_EFFECTIVE`, or a draw could not be
-            evaluated.
-        interval: 95 %; covers the share at least as often, however the draws were adapted, at any number of them.
-        effective: failures of equal weight that would be worth as much: (sum w)^2 / sum w^2 (Kish 1965).
-    """
+    """The share of configurations, drawn evenly from the budget, in which one render of the search is a success: the
+    mean of the weighted draws (None where `effective` is under `LEAST_EFFECTIVE`, or a draw could not be evaluated); an
+    interval that covers the share in 95 % at least, however the draws were adapted, at any number of them; and how many
+    failures of equal weight would be worth as much: (sum w)^2 / sum w^2 (Kish 1965)."""
 
     estimate: float | None
     interval: tuple[float, float]
@@ -138,11 +131,8 @@ def failure_share(weights: Tensor, bounds: Tensor, failed: Tensor, unknown: Tens
     does are a 95 % interval (Waudby-Smith and Ramdas 2024, "Estimating means of bounded random variables by betting").
     Both are monotone in p.
 
-    Args:
-        weights: (n,) w_t, over 0, n at least 1.
-        bounds: (n,) b_t, at least 1 and w_t, known before draw t.
-        failed: (n,) bool.
-        unknown: (n,) bool: could not be evaluated; the interval holds whatever these are.
+    All are (n,), n at least 1: w_t over 0; b_t, at least 1 and w_t, known before draw t; whether it failed; and whether
+    it is unknown, as it could not be evaluated: the interval holds whatever these are.
     """
     weights, bounds = weights.double(), bounds.double()
     low, high = weights * (failed & ~unknown), weights * (failed | unknown)
@@ -162,8 +152,7 @@ def failure_share(weights: Tensor, bounds: Tensor, failed: Tensor, unknown: Tens
     return FailureShare(min(1.0, total / len(low)) if stated else None, ends, effective, len(low))
 
 
-MOST = 24
-"""Failures that a result lists, at most."""
+MOST = 24  # failures that a result lists, at most
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,16 +199,12 @@ def most_different(at: Tensor, worst: Sequence[float], around: Tensor, apart: Te
     return [order[number] for number in picked]
 
 
-RATIO = 1.05
-"""The bracket is closed once high / low is at most this."""
-
-SMALLEST_SCALE = 1e-3
-"""No smaller scale than this is tried."""
+RATIO = 1.05  # the bracket is closed once high / low is at most this
+SMALLEST_SCALE = 1e-3  # no smaller scale than this is tried
 
 ROUNDS = 12
 
-ATTEMPTS = 6
-"""Steps outwards that the confirmation of the upper end takes at most."""
+ATTEMPTS = 6  # steps outwards that the confirmation of the upper end takes at most
 
 SHORTENED = 1.0 + (RATIO - 1.0) / 5.0
 """A configuration's length is bisected until the ends are within this: a fifth of the bracket's ratio."""
@@ -233,7 +218,6 @@ Search = Callable[[Domain, int], Tensor]
 Passes = Callable[[Tensor, int], bool]
 """(u, check) -> whether a configuration passes the trials; check numbers its seeds."""
 
-
 Likely = Callable[[Tensor], bool]
 """u -> whether a configuration would probably pass: a guess that costs next to nothing."""
 
@@ -241,8 +225,7 @@ Likely = Callable[[Tensor], bool]
 @dataclass(frozen=True, eq=False)
 class Bracket:
     """Where the smallest scale lies: a search found nothing at `low` (0 where none has failed), and `u` (d,) passes at
-    `high`, infinity where nothing did; it is of the search `found_by`, and has passed again, with new seeds, if
-    `confirmed`."""
+    `high`, infinity where nothing did; of the search `found_by`; if `confirmed` it has passed again with new seeds."""
 
     low: float
     high: float
@@ -261,8 +244,7 @@ class Bracket:
 def scaled(domain: Domain, scale: float) -> Domain:
     """Return the domain with every budget multiplied by `scale`, in (0, 1]."""
     names = (block.name.partition(".")[0] for block in domain.blocks if block.epsilon is None)
-    bare = [name or "a block" for name in dict.fromkeys(names)]
-    if bare:
+    if bare := [name or "a block" for name in dict.fromkeys(names)]:
         raise InputError(
             f"smallest: expected controls with a budget (texture, geometry, patch, ...), got {', '.join(bare)}, "
             "whose parameters have ranges and no epsilon; leave it out"
@@ -283,35 +265,29 @@ def smallest(search: Search, passes: Passes, domain: Domain, likely: Likely | No
     2. The configuration is moved towards the start, by bisection in the logarithm of its length, to the shortest that
        passes: a handful of trials, no search.
     3. A search at half the scale reached, then at the geometric mean of the bracket's ends; each configuration that
-       passes is shortened as in 2, each that fails raises the lower end; until it is closed or `ROUNDS` searches are
-       done.
+       passes is shortened as in 2, each that fails raises the lower end; until it is closed, or after `ROUNDS`.
 
     For a linear model and a gradient policy the first search points the right way and 2 ends within its own step of the
     optimum, so that the result is within `RATIO` of the closed form.
 
-    Args:
-        likely: says where 2 begins, and from where it goes on in growing steps; None to bisect from the whole length.
-
-    Returns:
-        The bracket; not `closed` if the searches did not suffice.
+    `likely` says where 2 begins, and from where it goes on in growing steps; None to bisect from the whole length. The
+    bracket is not `closed` if the searches did not suffice.
     """
     u = search(domain, 0)
     state = Bracket(0.0, math.inf, None, 1, 1)
     if not passes(u, 0):
         return replace(state, low=1.0)
-    state = _shorten(replace(state, high=1.0, u=u), passes, domain, likely)
+    state = _shorten(state, u, 1.0, passes, domain, likely)
     while state.searches < ROUNDS and state.high > RATIO * state.low and state.high > SMALLEST_SCALE:
-        floor = state.high / 2.0 if state.low == 0.0 else math.sqrt(state.low * state.high)
-        scale = max(floor, state.high / RATIO if state.high <= RATIO**2 * state.low else floor)
-        inside = scaled(domain, scale)
-        u = search(inside, state.searches)
+        scale = state.high / 2.0 if state.low == 0.0 else math.sqrt(state.low * state.high)
+        if state.high <= RATIO**2 * state.low:
+            scale = max(scale, state.high / RATIO)
+        u = search(scaled(domain, scale), state.searches)
         passed = passes(u, state.checks)
-        state = replace(state, searches=state.searches + 1, checks=state.checks + 1)
         if passed:
-            state = replace(state, high=scale, u=u, found_by=state.searches - 1)
-            state = _shorten(state, passes, domain, likely)
-        else:
-            state = replace(state, low=scale)
+            state = replace(state, found_by=state.searches)
+        state = replace(state, searches=state.searches + 1, checks=state.checks + 1)
+        state = _shorten(state, u, scale, passes, domain, likely) if passed else replace(state, low=scale)
     return state
 
 
@@ -332,37 +308,33 @@ def confirmed(bracket: Bracket, passes: Passes, domain: Domain, *, times: int = 
     return bracket
 
 
-def _shorten(state: Bracket, passes: Passes, domain: Domain, likely: Likely | None) -> Bracket:
-    """Bisect the length of the configuration until the ends are within `SHORTENED`.
+def _shorten(
+    state: Bracket, u: Tensor, length: float, passes: Passes, domain: Domain, likely: Likely | None
+) -> Bracket:
+    """Bisect the length of a configuration that passes until the ends are within `SHORTENED`.
 
-    With a guess it is tried there first, and then farther and farther from there, but never beyond the middle.
+    With a guess it is tried first at the shortest length of which that says that it passes, and then farther and
+    farther from there, but never beyond the middle.
     """
-    if state.u is None:
-        raise RuntimeError("there is no configuration to shorten")
-    longest, length, low = state.u, state.high, max(state.low, SMALLEST_SCALE * state.high)
+    low, high, shortest, checks = max(state.low, SMALLEST_SCALE * length), length, u, state.checks
 
     def at(scale: float) -> Tensor:
-        return shrunk(scaled(domain, scale), longest, scale / length)
+        return shrunk(scaled(domain, scale), u, scale / length)
 
-    best, high, checks = state.u, length, state.checks
     middle, stride = math.sqrt(high * low), math.inf
     if likely is not None:
-        middle, stride = _crossing(lambda scale: likely(at(scale)), low, high), SHORTENED
+        least, most, stride = low, high, SHORTENED
+        while most > SHORTENED * least:
+            middle = math.sqrt(most * least)
+            least, most = (least, middle) if likely(at(middle)) else (middle, most)
+        middle = math.sqrt(most * least)
     while high > SHORTENED * low:
         shorter = at(middle)
         if passes(shorter, checks):
-            best, high = shorter, middle
+            shortest, high = shorter, middle
             middle = max(math.sqrt(high * low), high / stride)
         else:
             low = middle
             middle = min(math.sqrt(high * low), low * stride)
         stride, checks = stride * stride, checks + 1
-    return replace(state, high=high, u=best, checks=checks)
-
-
-def _crossing(likely: Callable[[float], bool], low: float, high: float) -> float:
-    """Return the shortest length in (low, high) of which a guess says that it passes, to within `SHORTENED`."""
-    while high > SHORTENED * low:
-        middle = math.sqrt(high * low)
-        low, high = (low, middle) if likely(middle) else (middle, high)
-    return math.sqrt(high * low)
+    return replace(state, high=high, u=shortest, checks=checks)

@@ -57,10 +57,9 @@ class Block:
             raise InputError(f"`norm`{where}: expected one of {', '.join(NORMS)}, got {self.norm!r}")
         if not 0.0 <= self.low < self.high <= 1.0:
             raise InputError(f"bounds{where}: expected 0 <= low < high <= 1, got [{self.low}, {self.high}]")
-        if self.norm == "box":
-            if self.epsilon is not None:
-                raise InputError(f"`epsilon`{where}: has bounds and no norm budget; leave `epsilon` out")
-        elif self.epsilon is None or not (math.isfinite(self.epsilon) and self.epsilon > 0.0):
+        if self.norm == "box" and self.epsilon is not None:
+            raise InputError(f"`epsilon`{where}: has bounds and no norm budget; leave `epsilon` out")
+        if self.norm != "box" and not (self.epsilon is not None and 0.0 < self.epsilon < math.inf):
             raise InputError(
                 f"`epsilon`{where}: expected a finite number over 0 (the {self.norm} radius, in units where the "
                 f"parameter's whole range is 1), got {self.epsilon}; try `epsilon=0.1`"
@@ -71,20 +70,17 @@ class Block:
             raise InputError(
                 f"block{where}: expected a reach over 0 and norm 'box', got {self.reach} and {self.norm!r}"
             )
-        if self.options:
-            whole = (self.size, self.norm, self.low, self.high, self.periodic) == (1, "box", 0.0, 1.0, False)
-            if self.options < 0 or not whole:
-                raise InputError(
-                    f"block{where}: expected a discrete choice to have at least one option, size 1, norm 'box' and "
-                    f"bounds [0, 1], got {self}"
-                )
+        whole = (self.size, self.norm, self.low, self.high, self.periodic) == (1, "box", 0.0, 1.0, False)
+        if self.options and (self.options < 0 or not whole):
+            raise InputError(
+                f"block{where}: expected a discrete choice to have at least one option, size 1, norm 'box' and "
+                f"bounds [0, 1], got {self}"
+            )
 
     @property
     def radius(self) -> float:
-        """The length of one whole step, in the block's own norm: epsilon, or the reach in a box.
-
-        Never more than the bounds let the start move.
-        """
+        """The length of one whole step, in the block's own norm: epsilon, or the reach in a box; never more than the
+        bounds let the start move."""
         width = self.high - self.low
         if self.norm == "box":
             return 0.5 * width * math.sqrt(self.size) if self.reach is None else self.reach
@@ -107,12 +103,10 @@ class Domain:
         blocks: consecutive slices of u that add up to d.
         gradient_cost: pictures that one whole gradient costs on top of the one it belongs to: 0 for an adjoint, two
             for each number with central differences.
-        partial_gradients: whether `evaluate` understands `gradient="free"`, the part of the gradient that costs
-            nothing.
+        partial_gradients: whether `evaluate` understands `gradient="free"`, the part that costs nothing.
         exact: whether evaluations are free of noise: equal configurations have equal objectives and gradients, as where
             a matrix predicts the pictures (docs/transport.md).
-        drawn: whether evaluations are free of noise but for the conditions that each draws anew, from a bank
-            (docs/transport.md).
+        drawn: whether they are but for the conditions that each draws anew from a bank (docs/transport.md).
         first: (d,) where a policy should begin, if not at the start; it moves no ball. For wrappers that begin
             several times.
         lower, upper: (d,) float32 bounds; those of an l-infinity ball are cut into them already.
@@ -173,10 +167,14 @@ class Domain:
     @property
     def names(self) -> list[str]:
         """The name of each element of u: "pose.yaw"; "camera.target.0" of several numbers."""
-        names = []
-        for block in self.blocks:
-            names += [block.name + (f".{number}" if block.size > 1 else "") for number in range(block.size)]
-        return names
+        numbered = [(block, number) for block in self.blocks for number in range(block.size)]
+        return [block.name + (f".{number}" if block.size > 1 else "") for block, number in numbered]
+
+    @property
+    def options(self) -> Tensor:
+        """(d,) how many options each element of u has that is a discrete choice; 0 of a number."""
+        sizes = torch.tensor([block.size for block in self.blocks], dtype=torch.long)
+        return torch.tensor([block.options for block in self.blocks], dtype=torch.long).repeat_interleave(sizes)
 
     def block_of(self, place: int) -> Block:
         """Return the block that an element of u belongs to."""
@@ -191,15 +189,10 @@ class Domain:
         return parts
 
     def project(self, u: Tensor) -> Tensor:
-        """Return the nearest configuration of the domain, block by block (Euclidean; periodic blocks wrap instead).
+        """Return the configuration (d,) of the domain that is nearest to u (d,), both float32, finite, block by block
+        (Euclidean; periodic blocks wrap instead). Configurations inside come back bit for bit.
 
         An l-infinity ball cut by bounds is itself a box, so clipping is exact; for an l2 ball see `project_l2_box`.
-
-        Args:
-            u: (d,) float32, finite.
-
-        Returns:
-            (d,) float32. Configurations inside come back bit for bit.
         """
         u = u.detach()
         projected = torch.clamp(u, self.lower, self.upper)
@@ -230,7 +223,7 @@ class Domain:
         return u.shape == self.start.shape and self.violation(u) <= tolerance
 
     def sample(self, generator: torch.Generator, n: int = 1, *, extreme: bool = False) -> Tensor:
-        """Draw configurations at random within the budget.
+        """Draw configurations (n, d) float32 at random within the budget; the generator advances.
 
         - "linf" and "box": uniform in the box that the bounds (and the ball) leave; of a discrete choice, the centre of
           a random option.
@@ -238,47 +231,32 @@ class Domain:
         - with `extreme`, a norm ball is sampled where random search is strongest: an l-infinity ball at random
           corners, an l2 ball at its surface in a direction of random signs. A "box" has no such place (the corners of
           a range of poses are no worse than its middle) and is sampled as before.
-
-        Args:
-            generator: source of randomness; advances.
-            n: number of configurations.
-            extreme: sample the norm balls at their extremes.
-
-        Returns:
-            (n, d) float32, all inside.
         """
-        return torch.stack([self._draw(generator, extreme) for _ in range(n)])
-
-    def _draw(self, generator: torch.Generator, extreme: bool) -> Tensor:
-        """One sample of `sample`."""
-        u = torch.empty_like(self.start)
-        for block, part in self.parts():
-            noise = torch.rand(block.size, generator=generator)
-            if block.options:
-                noise = centre_of_option(noise, block.options)
-            if block.norm == "l2" and block.epsilon is not None:
-                u[part] = self.start[part] + _l2_offset(noise, block.epsilon, generator, extreme)
-                continue
-            if extreme and block.norm == "linf":
-                noise.round_()
-            u[part] = torch.lerp(self.lower[part], self.upper[part], noise)
-        return self.project(u)
+        drawn = []
+        for _ in range(n):
+            u = torch.empty_like(self.start)
+            for block, part in self.parts():
+                noise = torch.rand(block.size, generator=generator)
+                if block.options:
+                    noise = centre_of_option(noise, block.options)
+                elif extreme and block.norm != "box":
+                    noise.round_()
+                if block.norm == "l2" and block.epsilon is not None:
+                    u[part] = self.start[part] + _l2_offset(noise, block.epsilon, generator, extreme)
+                else:
+                    u[part] = torch.lerp(self.lower[part], self.upper[part], noise)
+            drawn.append(self.project(u))
+        return torch.stack(drawn)
 
     def steepest(self, u: Tensor, gradient: Tensor) -> Tensor:
-        """Return one whole step uphill: the displacement that a linear objective likes most, in each block's norm.
+        """Return one whole step (d,) from u uphill: the displacement that a linear objective likes most, in each
+        block's norm, from the gradient (d,), finite. Add a multiple of it to u and project. All are float32.
 
         - "linf": radius * sign(gradient);
         - "l2": radius * gradient / ||gradient||;
-        - a discrete choice: nothing;
         - "box": the same, without the elements that point out of a bound at which u already lies (the free part of
-          the gradient, as in projected-gradient methods for bounds), so that they do not use up the step.
-
-        Args:
-            u: (d,) float32, the configuration to step from.
-            gradient: (d,) float32, finite.
-
-        Returns:
-            (d,) float32; zero for a block whose gradient is zero. Add a multiple of it to u and project.
+          the gradient, as in projected-gradient methods for bounds), so that they do not use up the step;
+        - a discrete choice, and a block whose gradient is zero: nothing.
         """
         step = torch.empty_like(gradient)
         for block, part in self.parts():
@@ -304,20 +282,17 @@ def centre_of_option(u: Tensor, options: Tensor | int) -> Tensor:
 
 
 def _l2_offset(noise: Tensor, radius: float, generator: torch.Generator, extreme: bool) -> Tensor:
-    """An offset uniform in the l2 ball (Muller 1959), or far beyond it in a direction of random signs."""
+    """An offset uniform in the l2 ball (Muller 1959), or far beyond it in a direction of random signs, 0 and 1."""
     size = noise.numel()
     if extreme:
-        return (noise.round_() * 2.0 - 1.0) * (2.0 * max(radius, math.sqrt(size)))
+        return (noise * 2.0 - 1.0) * (2.0 * max(radius, math.sqrt(size)))
     direction = torch.randn(size, generator=generator)
     length = radius * math.pow(float(noise[0]), 1.0 / size)
     return direction * (length / max(float(torch.linalg.vector_norm(direction)), 1e-30))
 
 
-CHUNK = 32768
-"""Elements worked on at once: small enough for a core's cache, and torch uses one thread below it."""
-
-SLACK = 1e-6
-"""A norm at most this fraction over the radius counts as inside, so that projecting twice changes nothing."""
+CHUNK = 32768  # elements worked on at once: small enough for a core's cache, and torch uses one thread below it
+SLACK = 1e-6  # a norm at most this fraction over the radius counts as inside, so that projecting twice changes nothing
 
 _MAX_ITERATIONS = 100
 
@@ -337,15 +312,9 @@ def project_l2_box(u: Tensor, centre: Tensor, radius: float, low: float = 0.0, h
     root after finitely many steps (two to six in practice). It is the scheme known from continuous quadratic knapsack
     problems (Cominetti, Mascarenhas, Silva 2014, "A Newton's method for the continuous quadratic knapsack problem").
 
-    Args:
-        u: (d,) float32, finite.
-        centre: (d,) float32 inside the box.
-        radius: radius of the ball, over 0.
-        low, high: the box's bounds.
-
-    Returns:
-        (d,) float32, rounded towards the centre, so that rounding leaves no ball. Points inside come back bit for bit;
-        projecting again changes at most the last bits.
+    u is (d,) float32, finite, and so is the centre, inside the bounds; the radius is over 0. The point is rounded
+    towards the centre, so that rounding leaves no ball. Points inside come back bit for bit; projecting again changes
+    at most the last bits.
     """
     squares, rooms = [], []
     full = inside = 0.0
@@ -384,12 +353,8 @@ def _multiplier(squares: list[Tensor], rooms: list[Tensor], target: float, s: fl
 
 @dataclass(frozen=True, eq=False)
 class Distribution:
-    """A normal distribution with independent elements, projected onto the domain.
-
-    Attributes:
-        mean: (d,) float32, inside the domain.
-        deviation: (d,) float32, at least 0.
-    """
+    """A normal distribution with independent elements, projected onto the domain: the mean (d,) float32, inside it, and
+    the deviation (d,) float32, at least 0."""
 
     mean: Tensor
     deviation: Tensor
@@ -397,7 +362,7 @@ class Distribution:
     def sample(self, generator: torch.Generator, n: int, domain: Domain) -> Tensor:
         """Return (n, d) float32 configurations P(mean + deviation * z), z standard normal, P the projection."""
         noise = torch.randn(n, domain.dim, generator=generator)
-        return torch.stack([domain.project(self.mean + self.deviation * one) for one in noise])
+        return torch.stack([domain.project(self.mean + self.deviation * z) for z in noise])
 
 
 def half_widths(domain: Domain) -> Tensor:
@@ -416,7 +381,5 @@ def half_widths(domain: Domain) -> Tensor:
 
 def wraps(domain: Domain) -> Tensor:
     """Return (d,) bool: the elements that may leave their bounds, because there they come round again."""
-    around = torch.zeros(domain.dim, dtype=torch.bool)
-    for block, part in domain.parts():
-        around[part] = block.periodic
-    return around
+    sizes = torch.tensor([block.size for block in domain.blocks], dtype=torch.long)
+    return torch.tensor([block.periodic for block in domain.blocks], dtype=torch.bool).repeat_interleave(sizes)

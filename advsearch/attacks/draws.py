@@ -27,24 +27,16 @@ from advsearch.seeds import stream
 Sampler = Literal["sobol", "random"]
 SAMPLERS: tuple[str, ...] = get_args(Sampler)
 
-NET = 1 << 16
-"""Points of one scrambled net."""
-
-MOST_DIMENSIONS = 21201
-"""Numbers of a Sobol point, at most: for so many Joe and Kuo give directions."""
-
-BLOCK_NUMBERS = 1 << 18
-"""Numbers that are drawn at once, at most (unless one point has more)."""
-
-SEEDS = 1024
-"""Seeds that are made at once."""
+NET = 1 << 16  # points of one scrambled net
+MOST_DIMENSIONS = 21201  # numbers of a Sobol point, at most: for so many Joe and Kuo give directions
+BLOCK_NUMBERS = 1 << 18  # numbers that are drawn at once, at most (unless one point has more)
+SEEDS = 1024  # seeds that are made at once
 
 Doubles = NDArray[np.float64]
 
 
 class Draws:
-    """Points of [0, 1)^dimensions by number, by a sampler of `SAMPLERS`; their streams are called `name`. 0 dimensions
-    are fine."""
+    """Points of [0, 1)^dimensions by number, by a sampler of `SAMPLERS`; their streams are called `name`."""
 
     def __init__(self, dimensions: int, sampler: str, seed: int, name: str = "draws") -> None:
         if sampler not in SAMPLERS:
@@ -71,14 +63,13 @@ class Draws:
             number, begin = divmod(first, self._rows)
             size = min(self._rows - begin, end - first)
             if number != self._number:
-                self._block = self._sobol(number) if self._sampler == "sobol" else self._random(number)
+                rng = np.random.default_rng(stream(self._seed, self._name, number))
+                shape = (self._rows, self.dimensions)
+                self._block = self._sobol(number) if self._sampler == "sobol" else rng.random(shape)
                 self._number = number
             parts.append(self._block[begin : begin + size])
             first += size
         return parts[0] if len(parts) == 1 else np.concatenate(parts)
-
-    def _random(self, number: int) -> Doubles:
-        return np.random.default_rng(stream(self._seed, self._name, number)).random((self._rows, self.dimensions))
 
     def _sobol(self, number: int) -> Doubles:
         from scipy.stats import qmc  # takes a quarter of a second, and few runs draw from nets
@@ -126,10 +117,11 @@ class Product:
         """Return the place of a point on every axis."""
         if not 0 <= index < self.count:
             raise IndexError(f"expected a point from 0 to {self.count - 1}, got {index}")
-        digits = [0] * len(self.sizes)
-        for place in range(len(self.sizes) - 1, -1, -1):
-            index, digits[place] = divmod(index, self.sizes[place])
-        return tuple(digits)
+        digits = []
+        for size in reversed(self.sizes):
+            index, digit = divmod(index, size)
+            digits.append(digit)
+        return tuple(reversed(digits))
 
     def index(self, digits: Sequence[int]) -> int:
         number = 0
@@ -139,11 +131,8 @@ class Product:
 
 
 def batches(first: int, count: int, size: int) -> Iterator[range]:
-    """Yield the numbers from `first` to `count` in batches that begin at multiples of `size`.
-
-    Whoever starts in the middle of a batch gets the rest of it first; after that the batches are those of somebody who
-    started at 0.
-    """
+    """Yield the numbers from `first` to `count` in batches that begin at multiples of `size`, so that they are those of
+    somebody who started at 0; the first may be the rest of one."""
     while first < count:
         last = min(count, (first // size + 1) * size)
         yield range(first, last)

@@ -47,13 +47,11 @@ class Query:
     Attributes:
         u: (d,) float32 in [0, 1], the configuration; must not be written to.
         seed: of the noise, and of the conditions that are drawn. Equal seeds mean equal noise.
-        kind: which rows the evaluation belongs to, such as "search" or "verification".
-        number: its place among these rows, from 0.
+        kind: which rows the evaluation belongs to, such as "search" or "verification"; `number`, its place among these.
         phase: of a search; None for a trial.
         gradient: whether the derivative is wanted. "free" only ever comes where the domain has `partial_gradients`.
         samples: of a search: how many times its own samples per pixel to render with, at least 1. The evaluation costs
-            as
-            many times its renders: samples * (1 + gradient_cost) with a gradient, samples without.
+            as many times its renders: samples * (1 + gradient_cost) with a gradient, samples without.
         spp: of a trial: samples a pixel.
         drawn: of a trial: whether conditions are drawn; otherwise the scene has those it comes with.
         values: of a trial: what its row says of the configuration, which trials of one kind may have in common.
@@ -153,18 +151,15 @@ def usable(evaluation: Evaluation) -> Evaluation:
     - an objective that is NaN or infinite becomes -inf ("the worst there is"), its gradient zero and its success
       false.
     """
-    gradient, bad = evaluation.gradient, 0
+    gradient = evaluation.gradient
     if gradient is not None and not math.isfinite(float(gradient.sum(dtype=torch.float64))):
-        bad = int((~torch.isfinite(gradient)).sum())
-        gradient = torch.nan_to_num(gradient, nan=0.0, posinf=0.0, neginf=0.0)
-    if not evaluation.finite:
-        zero = None if gradient is None else torch.zeros_like(gradient)
-        return replace(
-            evaluation, objective=-math.inf, gradient=zero, success=False, non_finite=evaluation.non_finite + bad
-        )
-    if bad:
-        return replace(evaluation, gradient=gradient, non_finite=evaluation.non_finite + bad)
-    return evaluation
+        if bad := int((~torch.isfinite(gradient)).sum()):
+            gradient = torch.nan_to_num(gradient, nan=0.0, posinf=0.0, neginf=0.0)
+            evaluation = replace(evaluation, gradient=gradient, non_finite=evaluation.non_finite + bad)
+    if evaluation.finite:
+        return evaluation
+    zero = None if gradient is None else torch.zeros_like(gradient)
+    return replace(evaluation, objective=-math.inf, gradient=zero, success=False)
 
 
 State = TypeVar("State")
@@ -177,8 +172,7 @@ class Proposal:
     Attributes:
         u: (d,) float32 inside the domain; the caller must not write to it.
         gradient: whether the policy wants the derivative there: not, all of it (`Domain.gradient_cost` more pictures),
-            or what is "free" (only where the domain has `partial_gradients`). A wish: the last evaluations of a budget
-            get none, and `update` sees None.
+            or what is "free" (only where the domain has `partial_gradients`). A wish: the end of a budget gets none.
         step_size: the step that led here in units of each block's radius, for the log; NaN where there is none.
         samples: render with so many times the search's samples per pixel, at least 1, for as many times the renders.
             A wish too: the end of a budget gets what is left.
@@ -217,10 +211,10 @@ Evaluated = Sequence[tuple[Tensor, Evaluation]]
 class Policy(ABC, Generic[State]):
     """Proposes configurations, in batches. Write a new one by implementing the three methods below.
 
-    Attributes:
-        name: for messages and the log.
-        handles_choices: whether it searches discrete choices (`Block.options`) itself. `search` wraps one that does
-            not in `Choices`, so that it never sees any.
+    Its `name` is for messages and the log. One that `handles_choices` searches discrete choices (`Block.options`)
+    itself; any other is wrapped in `Choices` by `search`, so that it never sees any. Its options are the fields of a
+    dataclass; what is outside their range is an InputError when it is made, and a domain that it cannot search (of too
+    many numbers, say) when it starts.
     """
 
     name: ClassVar[str]
@@ -307,18 +301,14 @@ def draw_seed(generator: torch.Generator) -> int:
 
 
 def seeded(seed: int, number: int) -> torch.Generator:
-    """Return the generator for draw `number` of a policy: it depends on nothing else, so that a state can be
-    replayed."""
+    """Return the generator for draw `number` of a policy: it depends on nothing else."""
     return torch.Generator().manual_seed(stream(seed, "policy", number))
 
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Let torch use one thread for a while.
-
-    For small matrices it is faster, on a busy machine many times so, and the last bits are the same whatever the number
-    of threads. Setting the number costs less than a microsecond.
-    """
+    """Let torch use one thread for a while: faster for small matrices, on a busy machine many times so, and the last
+    bits are the same whatever the number of threads. Setting the number costs less than a microsecond."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

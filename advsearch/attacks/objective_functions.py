@@ -27,11 +27,8 @@ SUREST = -15.0
 """Log-odds below which cross-entropy is continued by its tangent. In float32 its own slope, exp(log-odds), would be
 lost at -103 and count for nothing beside other numbers long before."""
 
-RELIEF = 1e-4
-"""What is added to a denominator of `dlr`, as a fraction of the distance from the largest to the smallest logit."""
-
-SAME = 1e-12
-"""Logits that lie closer together than this are all the same to `dlr`."""
+RELIEF = 1e-4  # added to a denominator of `dlr`, as a fraction of the distance from the largest to the smallest logit
+SAME = 1e-12  # logits that lie closer together than this are all the same to `dlr`
 
 
 def margin(logits: Tensor, images: Tensor, labels: Labels) -> Tensor:
@@ -55,8 +52,7 @@ def log_odds(logits: Tensor, images: Tensor, labels: Labels) -> Tensor:
     function of `cross_entropy`, so the two rank configurations alike; between it and `margin` lies at most the
     logarithm of the number of classes.
     """
-    right = members(logits, labels)
-    return _log_odds(logits, ~right)
+    return _log_odds(logits, ~members(logits, labels))
 
 
 def targeted_log_odds(logits: Tensor, images: Tensor, target: Labels) -> Tensor:
@@ -102,11 +98,8 @@ def dlr(logits: Tensor, images: Tensor, labels: Labels) -> Tensor:
     Raises:
         InputError: fewer than two wrong classes. Of two numbers only the order is left without scale and offset.
     """
-    right = members(logits, labels)
-    _check_rivals(right, "label")
-    difference = margin(logits, images, labels)
-    top, spread = _sorted(logits, right)
-    wide = top[:, 0] - top[:, 2]
+    top, spread = _sorted(logits, members(logits, labels), "label")
+    difference, wide = margin(logits, images, labels), top[:, 0] - top[:, 2]
     return difference / _safe(torch.where(difference > 0.0, _wider(top), wide), spread)
 
 
@@ -116,9 +109,7 @@ def targeted_dlr(logits: Tensor, images: Tensor, target: Labels) -> Tensor:
     The targeted ratio of Croce and Hein 2020, section 4, whose numerator is z_t - z_y instead: that is over 0 also
     where a third class wins. Otherwise as `dlr`.
     """
-    hit = members(logits, target, "target")
-    _check_rivals(hit, "target")
-    top, spread = _sorted(logits, hit)
+    top, spread = _sorted(logits, members(logits, target, "target"), "target")
     return targeted_margin(logits, images, target) / _safe(_wider(top), spread)
 
 
@@ -133,22 +124,17 @@ def _softplus(x: Tensor) -> Tensor:
     return torch.where(x < SUREST, value + slope * (x - SUREST), functional.softplus(x))
 
 
-def _check_rivals(members_: Tensor, setting: str) -> None:
-    """Refuse a label set that leaves fewer than two other classes."""
-    classes, size = len(members_), int(members_.sum())
-    if classes - size < 2:
+def _sorted(logits: Tensor, group: Tensor, setting: str) -> tuple[Tensor, Tensor]:
+    """Return the 4 largest logits (3, if there are no more), (N, 3 or 4), in falling order, the classes of a group
+    taken for a single one with their largest, and the distance (N,) from the largest to the smallest of all. Refuses a
+    label set that leaves fewer than two other classes."""
+    size, others = int(group.sum()), int((~group).sum())
+    if others < 2:
         raise InputError(
-            f"`objective` dlr: expected at least 2 classes beside the {size} of `{setting}`, got {classes - size}; "
+            f"`objective` dlr: expected at least 2 classes beside the {size} of `{setting}`, got {others}; "
             "its ratio needs a third logit: use `objective=margin`"
         )
-
-
-def _sorted(logits: Tensor, one: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the 4 largest logits (3, if there are no more), (N, 3 or 4), in falling order, the classes of `one` taken
-    for a single one with their largest, and the distance (N,) from the largest to the smallest of all."""
-    single = largest(logits, one)[:, None]
-    others = logits[:, ~one]
-    collapsed = torch.cat([single, others], dim=1)
+    collapsed = torch.cat([largest(logits, group)[:, None], logits[:, ~group]], dim=1)
     top = collapsed.topk(min(4, collapsed.shape[1]), dim=1).values
     return top, top[:, 0] - collapsed.amin(dim=1)
 
@@ -163,8 +149,7 @@ def _safe(denominator: Tensor, spread: Tensor) -> Tensor:
     return torch.where(spread > SAME, denominator + RELIEF * spread, torch.ones_like(spread))
 
 
-NEARBY = 1e-3
-"""Distances under this fraction of the clean features' length count as none: the distance is rounded off there."""
+NEARBY = 1e-3  # distances under this fraction of the clean features' length count as none: it is rounded off there
 
 ReadFeatures = Callable[[Tensor], Tensor]
 """From images (N, H, W, 3), display-referred sRGB in [0, 1], to features (N, F): what
@@ -191,16 +176,12 @@ def feature_distance(features: ReadFeatures, clean: Tensor) -> Callable[[Tensor,
     checked by the prediction as ever. Where f0 is zero its length counts as 1.
 
     Args:
-        features: differentiable; called once here, and once more per evaluation, which costs one more run of the
-            network.
+        features: differentiable; called once here, and once more per evaluation. InputError: not (N, F), or not finite.
         clean: (H, W, 3) or (N, H, W, 3): the clean picture, or several renders of it, whose features are averaged.
             Take as little noise as you can afford: noise of the search's own renders is a distance as well.
 
     Returns:
         An objective (logits, images, labels) -> (N,), at least 0 but for h, that looks at the images only.
-
-    Raises:
-        InputError: the features are not (N, F), or not finite.
     """
     reference = _reference(features, clean)
     length = torch.linalg.vector_norm(reference)
@@ -228,9 +209,8 @@ def cosine_distance(features: ReadFeatures, clean: Tensor) -> Callable[[Tensor, 
         features: of the clean picture; called once, here.
         clean: as for `feature_distance`.
 
-    Returns:
-        An objective (features (N, F), images, labels) -> (N,), at least 0 but for `h`^2, that looks at the features
-        only, whatever their length.
+    Returns: An objective (features (N, F), images, labels) -> (N,), at least 0 but for `h`^2, that looks at the
+        features only.
     """
     reference = functional.normalize(_reference(features, clean), dim=0)
     away = _away(reference)

@@ -37,14 +37,12 @@ from advsearch.tasks.depth import GOALS as DEPTH_GOALS
 from advsearch.tasks.detection import GOALS, Detection
 from advsearch.tasks.together import Together
 
-ASKED = ("u", "texture", "textures", "inputs", "configuration")
-"""What a function may ask for by the names of further parameters."""
+ASKED = ("u", "texture", "textures", "inputs", "configuration")  # what a function may ask for by further parameters
 
 TRUTHS = ("target", "targets", "labels", "label", "truth")
 """What the second of two parameters is called in a loss of outputs and right labels alone."""
 
-IMAGES = ("images", "image")
-"""What the second of two parameters is called in a function that forgot the third."""
+IMAGES = ("images", "image")  # what the second of two parameters is called in a function that forgot the third
 
 More = Callable[[str], Any]
 """Gives what is asked for by one of the names in `ASKED`, at the configuration of each picture."""
@@ -73,30 +71,25 @@ class Form:
 
 
 def form_of(function: Callable[..., Any]) -> Form:
-    """Return which arguments a function takes.
-
-    The names of its first two parameters ask for nothing, nor does a third one in the place of the truth.
-    """
+    """Return which arguments a function takes. The names of its first two parameters ask for nothing, nor does a third
+    one in the place of the truth."""
     if isinstance(function, type):
         raise InputError(f"objective: expected a name or a function (output, images, truth), got {told(function)}")
     try:
         signature = inspect.signature(function.forward if isinstance(function, nn.Module) else function)
     except ValueError:  # built in: nothing to look at
         return Form()
-    by_position = [one.name for one in signature.parameters.values() if one.kind in (0, 1)]
+    parameters = signature.parameters.values()
+    by_position = [parameter.name for parameter in parameters if parameter.kind in (0, 1)]
     if by_position[:1] and by_position[0] in IMAGES:  # as a metric takes them
         raise InputError(
             f"objective {name_of(function)!r}: its first argument is called {by_position[0]!r}, but gets what the "
             "model says; write (output, images, truth)"
         )
-    asked = tuple(
-        one.name for one in signature.parameters.values() if one.name in ASKED and one.name not in by_position[:2]
-    )
+    asked = tuple(name for name in signature.parameters if name in ASKED and name not in by_position[:2])
     unnamed = [name for name in by_position if name not in asked]
-    images = not (
-        len(unnamed) >= 2 and (unnamed[1] in TRUTHS or (len(unnamed) == 2 and unnamed[1] not in (*IMAGES, *ASKED)))
-    )
-    images = images or any(one.kind is one.VAR_POSITIONAL for one in signature.parameters.values())
+    images = len(unnamed) < 2 or any(parameter.kind is parameter.VAR_POSITIONAL for parameter in parameters)
+    images = images or (unnamed[1] not in TRUTHS and (len(unnamed) > 2 or unnamed[1] in (*IMAGES, *ASKED)))
     try:
         signature.bind(*([None] * (3 if images else 2)), **dict.fromkeys(asked))
     except TypeError as error:
@@ -117,13 +110,13 @@ def checked(function: Callable[..., Tensor]) -> Objective:
     name, form = name_of(function), form_of(function)
 
     def objective(output: Any, images: Tensor, truth: Any, more: More = nothing_more, /) -> Tensor:
-        asked, count = {one: more(one) for one in form.asked}, images.shape[0]
-        given = (output, images, labels_of(truth, output, count))
-        handed, handed_by_name = copied(given if form.images else given[::2]), copied(asked)
+        asked, count = {asks: more(asks) for asks in form.asked}, images.shape[0]
+        arguments = (output, images, labels_of(truth, output, count))
+        handed, handed_by_name = copied(arguments if form.images else arguments[::2]), copied(asked)
         try:
             values = function(*handed, **handed_by_name)
         except TypeError as error:
-            if not (isinstance(given[2], tuple) and "not tuple" in str(error)):
+            if not (isinstance(arguments[2], tuple) and "not tuple" in str(error)):
                 raise
             raise InputError(
                 f"objective {name!r}: expected one right label for a loss of torch, got {len(truth)} (indices "
@@ -133,12 +126,11 @@ def checked(function: Callable[..., Tensor]) -> Objective:
             each = [objective(output[k : k + 1], images[k : k + 1], truth, _part(asked, k)) for k in range(count)]
             values = torch.cat(each)
         values = _values(name, values, count)
-        if values.requires_grad and any(one._version for one in _tensors((handed, handed_by_name))):
-            read = [one for one in _tensors((output, asked)) if one.requires_grad]
+        if values.requires_grad and any(tensor._version for tensor in _tensors((handed, handed_by_name))):
+            read = [tensor for tensor in _tensors((output, asked)) if tensor.requires_grad]
             _check_in_place(name, values, read or [images])
-        seen = [one for one in (images, output, *asked.values()) if isinstance(one, Tensor)]
-        wanted = torch.is_grad_enabled() and any(one.requires_grad for one in seen)
-        if wanted and not values.requires_grad:
+        seen = [value for value in (images, output, *asked.values()) if isinstance(value, Tensor)]
+        if torch.is_grad_enabled() and any(value.requires_grad for value in seen) and not values.requires_grad:
             raise InputError(
                 f"objective {name!r}: the result does not depend on the output or the images differentiably; "
                 "remove .detach(), torch.no_grad() or argmax, or choose a policy without gradients (random)"
@@ -153,13 +145,13 @@ def _tensors(value: Any) -> list[Tensor]:
     if isinstance(value, Tensor):
         return [value]
     parts = value.values() if isinstance(value, dict) else value if isinstance(value, (list, tuple)) else ()
-    return [one for part in parts for one in _tensors(part)]
+    return [tensor for part in parts for tensor in _tensors(part)]
 
 
-def _check_in_place(name: str, values: Tensor, given: Sequence[Tensor]) -> None:
+def _check_in_place(name: str, values: Tensor, read: Sequence[Tensor]) -> None:
     """Refuse what a function has written into, where torch can't differentiate it any more."""
     try:
-        torch.autograd.grad(values.sum(), given, retain_graph=True, allow_unused=True)
+        torch.autograd.grad(values.sum(), read, retain_graph=True, allow_unused=True)
     except RuntimeError as error:
         if "inplace" not in str(error):
             raise
@@ -204,11 +196,11 @@ def labels_of(truth: Any, output: Any, count: int) -> Any:
 
 def _part(asked: Mapping[str, Any], picture: int) -> More:
     """Return what gives what was asked for of several pictures for one of them."""
-    one = slice(picture, picture + 1)
+    part = slice(picture, picture + 1)
 
     def more(name: str) -> Any:
-        found = asked[name]
-        return found[one] if isinstance(found, Tensor) else {key: value[one] for key, value in found.items()}
+        value = asked[name]
+        return value[part] if isinstance(value, Tensor) else {key: values[part] for key, values in value.items()}
 
     return more
 
@@ -249,10 +241,10 @@ class ObjectiveKind:
 
     def form(self, *, targeted: bool) -> Callable[..., Tensor]:
         """Return the plain or the targeted function."""
-        found = self.targeted if targeted else self.plain
-        if found is None:
+        function = self.targeted if targeted else self.plain
+        if function is None:
             raise InputError(f"objective {self.name!r}: has no {'targeted' if targeted else 'plain'} form; use another")
-        return found
+        return function
 
 
 def _plain(function: Callable[[Any, Tensor, Any], Tensor]) -> Objective:
@@ -281,10 +273,10 @@ _OWN = {
         *(
             ObjectiveKind(name, summary, unit, getattr(functions, name), getattr(functions, f"targeted_{name}"))
             for name, summary, unit in (
-                ("margin", "the largest wrong logit minus the largest right one", "logits (log-odds)"),
+                ("margin", "the margin loss: the largest wrong logit minus the largest right one", "logits (log-odds)"),
                 ("log_odds", "the log-odds of a wrong prediction, over all classes", "logits (log-odds)"),
                 ("cross_entropy", "minus the logarithm of the probability of the right labels", "nats"),
-                ("dlr", "the margin over a distance between logits: independent of their scale", "none (a ratio)"),
+                ("dlr", "the margin loss over a distance between logits: independent of their scale", "none (a ratio)"),
             )
         ),
         ObjectiveKind(
@@ -296,7 +288,7 @@ _OWN = {
             task=Similarity.name, of_features=functions.cosine_distance,
         ),
         ObjectiveKind(
-            "score", "the task's own score, over 0 where a prediction is a success; in classification the margin",
+            "score", "the task's own score, over 0 where a prediction is a success; in classification the margin loss",
             "that of the task", task=None, of_task=_score_of,
         ),
         *(
@@ -366,10 +358,11 @@ def get_objective(
     targeted = task.target is not None
     check_objective(objective, task.name, targeted=targeted, minimise=task.minimise)
     kind, by_task = _kind_of(objective), False
+    ours = kind is not None and _OWN.get(kind.name) is kind
     if kind is None:
         function = checked(objective)  # type: ignore[arg-type]
     elif kind.of_task is not None:
-        return kind.of_task(task) if _OWN.get(kind.name) is kind else _handed(kind.of_task(task))
+        return kind.of_task(task) if ours else _handed(kind.of_task(task))
     elif kind.of_features is not None:
         if features is None or clean is None:
             raise InputError(
@@ -377,12 +370,11 @@ def get_objective(
                 "get_objective(name, features=advsearch.models.features.features_of(model), clean=picture)"
             )
         function = _plain(kind.of_features(features, clean))
-        function = function if _OWN.get(kind.name) is kind else _handed(function)
+        function = function if ours else _handed(function)
     else:
         form = kind.form(targeted=targeted)
-        function = _plain(form) if _OWN.get(kind.name) is kind else checked(form)
+        function = _plain(form) if ours else checked(form)
         by_task = isinstance(task, Similarity) or (isinstance(task, ClassTask) and bool(task.nothing))
-
     looks = kind is None and targeted
 
     def sought(output: Any, images: Tensor, truth: Any, more: More = nothing_more, /) -> Tensor:
@@ -400,7 +392,7 @@ def get_objective(
 def _warn_of_direction(name: str, values: Tensor, output: Tensor, target: Any) -> None:
     """Warn of a user's function that falls as the target's logit rises."""
     (slope,) = torch.autograd.grad(values.sum(), output, retain_graph=True, allow_unused=True)
-    classes = [one for one in target if isinstance(one, int)] if isinstance(target, tuple) else []
+    classes = [index for index in target if isinstance(index, int)] if isinstance(target, tuple) else []
     if slope is not None and classes and bool((slope[:, classes].sum(dim=1) < 0.0).all()):
         warnings.warn(
             f"objective {name!r} falls as the target becomes more likely, and an objective is maximised: the search "
@@ -412,18 +404,10 @@ def _warn_of_direction(name: str, values: Tensor, output: Tensor, target: Any) -
 def check_objective(
     objective: object, task: str = Classification.name, *, targeted: bool = False, minimise: bool = False
 ) -> None:
-    """Check, before anything is loaded, that there is such an objective and that it can do what is asked.
-
-    Args:
-        task: name of the task whose outputs it will get.
-        targeted: whether there is a target.
-        minimise: whether a right prediction is sought.
-
-    Raises:
-        UnknownNameError: no such name.
-        InputError: neither a name nor a function of three arguments; an objective of another task; a target to
-            minimise; an objective of features with either of them.
-    """
+    """Check, before anything is loaded, that there is such an objective and that it can do what is asked: for the task
+    of that name, with a target or where a right prediction is sought. Raises UnknownNameError, or InputError: neither a
+    name nor a function of three arguments; an objective of another task; a target to minimise; an objective of features
+    with either of them."""
     if targeted and minimise:
         raise InputError(
             "minimise: expected no `target` beside it; to make the object easier to recognise as something else, "
@@ -439,17 +423,17 @@ def check_objective(
         form_of(objective)  # type: ignore[arg-type]
         return
     if not kind.fits(task):
-        fitting = [name for name, one in OBJECTIVE_KINDS.items() if one.fits(task)]
+        fitting = [name for name, other in OBJECTIVE_KINDS.items() if other.fits(task)]
         raise InputError(
             f"objective: expected an objective of task {task} ({', '.join(fitting)}), got {kind.name}, which takes "
             f"outputs of {kind.task}"
         )
     if kind.needs_features and (targeted or minimise):
-        setting, reason = "minimise", "it is least at the start already"
-        if targeted:
-            setting, reason = "target", "it leads away from the clean picture, to no class in particular"
-        expected = f"expected `objective` {' or '.join(OBJECTIVES)}"
-        raise InputError(f"{setting}: {expected}, got {kind.name}; {reason}")
+        reason = "it leads away from the clean picture, to no class in particular"
+        raise InputError(
+            f"{'target' if targeted else 'minimise'}: expected `objective` {' or '.join(OBJECTIVES)}, got {kind.name}; "
+            f"{reason if targeted else 'it is least at the start already'}"
+        )
 
 
 def asked_by(objective: str | Callable[..., Tensor]) -> tuple[str, ...]:

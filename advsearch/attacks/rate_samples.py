@@ -17,17 +17,10 @@ from scipy.special import ndtr, stdtrit
 from advsearch.attacks.trials import CONFIDENCE, LADDER, MarginsOf, Rung, SampleCount
 from advsearch.seeds import stream
 
-CONDITIONS = 30
-"""Conditions under which each configuration is rendered at each sample count."""
-
-MOVED = 0.05
-"""Share of the conditions that more samples may carry over zero."""
-
-OVER_LADDER = LADDER[:3]
-"""Sample counts to try."""
-
-MOST_TIMES = 2
-"""Samples of a check over those of the searches, at most, beyond the second rung."""
+CONDITIONS = 30  # conditions under which each configuration is rendered at each sample count
+MOVED = 0.05  # share of the conditions that more samples may carry over zero
+OVER_LADDER = LADDER[:3]  # sample counts to try
+MOST_TIMES = 2  # samples of a check over those of the searches, at most, beyond the second rung
 
 Floats = npt.NDArray[np.float64]
 
@@ -39,18 +32,14 @@ def affordable(ladder: Sequence[int], pictures: int, searched: int) -> Sequence[
 
 
 def choose_rate_spp(margins: Mapping[str, MarginsOf], *, seed: int, ladder: Sequence[int] = OVER_LADDER) -> SampleCount:
-    """Climb a ladder of sample counts until more of them would leave the share of conditions with a margin over zero
-    where it is, of each configuration; return the highest rung that one of them needed.
+    """Climb a ladder of sample counts until more of them would leave the share of conditions with a margin below
+    zero where it is, of each configuration; return the highest rung that one of them needed.
 
     Each is rendered under the same `CONDITIONS` at a rung and at the one below. It has settled where the mean change of
     the margin, taken once more and at either end of its 95 % interval (Student's t), would carry at most `MOVED` of the
     conditions over zero (`moved`). The error that is left falls with the sample count, so it is smaller than the change
-    that led here (`benchmarks/verdicts.py` has how far the rate is off then). No render of it is a trial.
-
-    Args:
-        margins: the configurations; each renders what it is asked for, conditions drawn by the seeds.
-        seed: root seed.
-        ladder: sample counts, rising, at least one. A single one is returned as it is, unmeasured and not converged.
+    that led here (`benchmarks/verdicts.py` has how far the rate is off then). No render of it is a trial. Arguments are
+    as of `choose_spp`; conditions are drawn by the seeds.
     """
     if len(ladder) == 1:
         return SampleCount(ladder[0], False, (), 0)
@@ -60,11 +49,14 @@ def choose_rate_spp(margins: Mapping[str, MarginsOf], *, seed: int, ladder: Sequ
         below: Floats | None = None
         for place, spp in enumerate(ladder):
             here = np.array(render(spp, seeds), dtype=np.float64)
-            table.append(_rung(name, spp, here, below))
-            below = here
-            if table[-1].settled:
+            half = stdtrit(len(here) - 1, CONFIDENCE) * here.std(ddof=1) / math.sqrt(len(here))
+            drift = math.nan if below is None else float(here.mean() - below.mean())
+            settled = below is not None and moved(here, below) <= MOVED
+            table.append(Rung(name, spp, float(here.mean()), float(half), drift, settled))
+            if settled:
                 reached = max(reached, place)
                 break
+            below = here
         else:
             return SampleCount(ladder[-1], False, tuple(table), CONDITIONS * len(table))
     return SampleCount(ladder[reached], True, tuple(table), CONDITIONS * len(table))
@@ -81,10 +73,3 @@ def moved(here: Floats, below: Floats) -> float:
     ends = np.array([0.0, change.mean() - half, change.mean() + half])[:, None]
     shares = ndtr((here + ends) / max(width, 1e-12)).mean(axis=1)
     return float(np.abs(shares[1:] - shares[0]).max())
-
-
-def _rung(name: str, spp: int, here: Floats, below: Floats | None) -> Rung:
-    mean, half = here.mean(), stdtrit(len(here) - 1, CONFIDENCE) * here.std(ddof=1) / math.sqrt(len(here))
-    if below is None:
-        return Rung(name, spp, float(mean), float(half), math.nan, False)
-    return Rung(name, spp, float(mean), float(half), float(mean - below.mean()), moved(here, below) <= MOVED)

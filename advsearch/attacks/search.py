@@ -34,8 +34,7 @@ from advsearch.errors import InputError
 from advsearch.interrupts import interruptible
 from advsearch.seeds import stream
 
-NON_FINITE_LIMIT = 3
-"""Non-finite objectives in a row after which a search gives up."""
+NON_FINITE_LIMIT = 3  # non-finite objectives in a row after which a search gives up
 
 
 @dataclass(frozen=True)
@@ -44,7 +43,7 @@ class StepRecord:
 
     Attributes:
         step: number of the evaluation, from 0; ranking goes on counting.
-        seed: that it was rendered with.
+        seed, samples: that it was rendered with; the second as of `Proposal`.
         phase: "search", or "ranking" for a candidate rendered again at the end.
         objective: raw objective; NaN where it was not finite.
         best: best raw objective of the search so far; NaN before there is one. Biased upwards.
@@ -54,7 +53,6 @@ class StepRecord:
         non_finite: gradient elements that had to be set to zero.
         seconds: time the evaluation took.
         renders: pictures that all evaluations so far took together, this one included.
-        samples: times the search's own samples per pixel that it was rendered with.
     """
 
     step: int
@@ -148,38 +146,30 @@ def search(
 
     1. Until `steps` renders are spent: the policy proposes as many configurations as do not wait for each other; they
        are checked against the domain and evaluated, each with a new seed (docs/design.md, "The search"); the policy is
-       told. An evaluation costs one render, and a gradient by differences `Domain.gradient_cost` more, all times the
-       `samples` of the proposal. What cannot be paid is not asked for (`affordable`): no more samples than there are
-       renders left, and no gradient after which none would be left to use it, so never in the last evaluation.
-    2. The `candidates` best distinct configurations are each evaluated `repeats` times more, with new seeds
-       that are the same for all, without gradient. The best by these renders is what the search found (see
-       `candidates`). With `candidates=0`, for an objective without noise, the raw best is what it found. Where
-       evaluations draw conditions (`Domain.drawn`), the raw best had easy ones, and the last configuration, to which
-       all of them led, takes the place of the worst candidate. Those that are not clearly worse
-       than the best by then are rendered again, up to `close` times more (see `candidates.contenders`).
+       told. An evaluation costs `Proposal.cost` renders at most. What cannot be paid is not asked for (`affordable`).
+    2. The `candidates` best distinct configurations are each evaluated `repeats` times more, with new seeds that are
+       the same for all, without gradient. The best by these renders is what the search found (see `candidates`). With
+       `candidates=0`, for an objective without noise, the raw best is what it found. Where evaluations draw conditions
+       (`Domain.drawn`), the raw best had easy ones, and the last configuration, to which all of them led, takes the
+       place of the worst candidate. Those that are not clearly worse than the best by then are rendered again, up to
+       `close` times more (see `candidates.contenders`).
 
     A policy that does not handle discrete choices is wrapped in `Choices` where the domain has some.
 
     A non-finite objective is counted, is never best, and reaches the policy as -inf; `NON_FINITE_LIMIT` in a row end
-    the search. KeyboardInterrupt, wherever it strikes, ends it with what there is. Every other exception passes
-    through.
+    the search. KeyboardInterrupt, wherever it strikes, ends it with what there is.
 
     Args:
         evaluate: renders and judges configurations.
-        domain: where to search.
-        policy: what proposes.
         steps: renders of the search, at least 1; as many evaluations where no gradient costs any. By default all are
             spent: the worst case is wanted, not the first.
-        seed: root seed of this search's own randomness (not of the renders), at least 0.
-        candidates, repeats, close: see above; together they cost at most `candidates * (repeats + close)` renders on
-            top of `steps`.
+        seed, noise: root seeds of the search's own randomness, and of the renders; at least 0.
+        candidates, repeats, close: see above; they cost at most `candidates * (repeats + close)` renders more.
         on_step: called after every evaluation.
         seconds: end step 1 after the first evaluation that is done later than this, over 0; None for no limit. There
             is always one evaluation, and step 2 comes on top. Policies still plan for `steps`.
-        late: says, after so many evaluations, whether the time is over; in place of `seconds`, for a run that goes on
-            after it was stopped.
+        late: says, after so many evaluations, whether the time is over; in place of `seconds`, for a run that goes on.
         kind: of the queries.
-        noise: root seed of the renders.
 
     Raises:
         InputError: steps, candidates, repeats, close or seconds out of range, or the policy cannot search this domain.
@@ -233,19 +223,10 @@ class _Log:
 
     def evaluated(self, proposals: Sequence[Proposal], indices: Sequence[int], phase: Phase) -> Iterator[Evaluation]:
         """Have proposals evaluated, each with the seed of an index, and take note of each as it comes."""
-        first, begun = len(self.records), time.perf_counter()
-        queries = [
-            Query(
-                one.u.clone(),
-                seed=stream(self.noise, self.kind, index),
-                kind=self.kind,
-                number=first + place,
-                phase=phase,
-                gradient=one.gradient,
-                samples=one.samples,
-            )
-            for place, (one, index) in enumerate(zip(proposals, indices, strict=True))
-        ]
+        queries, begun = list[Query](), time.perf_counter()
+        for number, (proposal, index) in enumerate(zip(proposals, indices, strict=True), len(self.records)):
+            u, seed, wanted = proposal.u.clone(), stream(self.noise, self.kind, index), proposal.gradient
+            queries.append(Query(u, seed, self.kind, number, phase, wanted, proposal.samples))
         for proposal, query, raw in zip(proposals, queries, self.evaluate(queries), strict=True):
             seconds = time.perf_counter() - begun
             _check_evaluation(raw, proposal, self.domain)
@@ -274,18 +255,15 @@ class _Log:
                     samples=proposal.samples,
                 )
             )
-            self._compare(evaluation.gradient)
+            gradient = evaluation.gradient
+            if gradient is not None and bool(gradient.any()):
+                if self.before is not None:
+                    self.agreement.append(float(torch.cosine_similarity(gradient, self.before, dim=0, eps=1e-30)))
+                self.before = gradient
             if self.on_step is not None:
                 self.on_step(self.records[-1], *copied((proposal.u, evaluation)))
             yield evaluation
             begun = time.perf_counter()
-
-    def _compare(self, gradient: Tensor | None) -> None:
-        if gradient is None or not bool(gradient.any()):
-            return
-        if self.before is not None:
-            self.agreement.append(float(torch.cosine_similarity(gradient, self.before, dim=0, eps=1e-30)))
-        self.before = gradient
 
 
 def _explore(log: _Log, policy: Policy[Any], steps: int, seed: int, late: Late) -> Ending:
@@ -325,33 +303,26 @@ def _explore(log: _Log, policy: Policy[Any], steps: int, seed: int, late: Late) 
     return Ending.BUDGET_SPENT
 
 
-def _rank(log: _Log, first_index: int, repeats: int, close: int) -> None:
+def _rank(log: _Log, first: int, repeats: int, close: int) -> None:
     """Render every candidate again, all with the same new seeds, and those that are close once more and once more."""
-    _look(log, range(first_index, first_index + repeats))
-    for index in range(first_index + repeats, first_index + repeats + close):
-        log.pool = contenders(log.pool, index - first_index)
-        if len(log.pool) < 2:
-            break
-        _look(log, range(index, index + 1))
-
-
-def _look(log: _Log, indices: Sequence[int]) -> None:
-    """Render every candidate again with the same seeds."""
-    pool = log.pool
-    evaluations = log.evaluated([Proposal(one.u) for one in pool for _ in indices], [*indices] * len(pool), "ranking")
-    for place, candidate in enumerate(pool):
-        again, successes = candidate.again, candidate.successes
-        for evaluation in islice(evaluations, len(indices)):
-            again, successes = (*again, evaluation.objective), successes + evaluation.success
-            seen = replace(candidate, again=again, successes=successes)
-            log.pool = (*log.pool[:place], seen, *pool[place + 1 :])
+    end = first + repeats
+    for indices in (range(first, end), *(range(index, index + 1) for index in range(end, end + close))):
+        if indices[0] >= end:
+            log.pool = contenders(log.pool, indices[0] - first)
+            if len(log.pool) < 2:
+                break
+        pool = log.pool
+        proposals = [Proposal(candidate.u) for candidate in pool for _ in indices]
+        evaluations = log.evaluated(proposals, [*indices] * len(pool), "ranking")
+        for place, candidate in enumerate(pool):
+            for evaluation in islice(evaluations, len(indices)):
+                candidate = candidate.seen_again(evaluation.objective, evaluation.success)
+                log.pool = (*log.pool[:place], candidate, *pool[place + 1 :])
 
 
 def _result(log: _Log, stopped: Ending, seconds: float) -> SearchResult:
-    nothing = Candidate(log.domain.start, math.nan, False)
-    chosen = best(log.pool) if log.pool else nothing
-    found = chosen.rate >= 0.5 and stopped is not Ending.INTERRUPTED
-    ending = Ending.FOUND if found else stopped
+    chosen = best(log.pool) if log.pool else Candidate(log.domain.start, math.nan, False)
+    claimed = chosen.rate >= 0.5 and stopped is not Ending.INTERRUPTED
     policy, state = (log.policy, log.state) if log.state is not None else (None, None)
     if policy is not None and log.told:  # a batch that was cut
         state = policy.update(state, log.told)
@@ -360,7 +331,7 @@ def _result(log: _Log, stopped: Ending, seconds: float) -> SearchResult:
         best_objective=chosen.believed if math.isfinite(chosen.believed) else math.nan,
         claimed_objective=chosen.objective,
         success_rate=chosen.rate,
-        ending=ending,
+        ending=Ending.FOUND if claimed else stopped,
         stopped=stopped,
         history=tuple(r for r in log.records if r.phase == "search"),
         ranking=tuple(r for r in log.records if r.phase == "ranking"),
@@ -392,19 +363,14 @@ def _check_inside(proposal: Proposal, domain: Domain, name: str) -> None:
 
 
 def _check_evaluation(evaluation: Evaluation, proposal: Proposal, domain: Domain) -> None:
-    """Raise RuntimeError unless a gradient came as it was asked for, at the cost that the domain said: the budget rests
-    on that."""
-    gradient, least, most = evaluation.gradient, proposal.samples, proposal.cost(domain)
+    """Raise RuntimeError unless a gradient came as it was asked for, at the cost that the domain said."""
+    gradient, u, least, most = evaluation.gradient, proposal.u, proposal.samples, proposal.cost(domain)
     if proposal.gradient and gradient is None:
         raise RuntimeError("evaluate returned no gradient although one was asked for")
-    if (
-        proposal.gradient
-        and gradient is not None
-        and (gradient.shape, gradient.dtype) != (proposal.u.shape, proposal.u.dtype)
-    ):
+    if proposal.gradient and gradient is not None and (gradient.shape, gradient.dtype) != (u.shape, u.dtype):
         raise RuntimeError(
             f"evaluate returned a gradient of {gradient.dtype}, shape {tuple(gradient.shape)}; expected "
-            f"{proposal.u.dtype}, shape {tuple(proposal.u.shape)}"
+            f"{u.dtype}, shape {tuple(u.shape)}"
         )
     if not least <= evaluation.cost <= most:
         raise RuntimeError(

@@ -23,27 +23,16 @@ from advsearch.attacks.evaluation import Evaluate, Query
 from advsearch.errors import InputError
 from advsearch.seeds import stream
 
-CONFIDENCE = 0.95
-"""Confidence of every interval that is printed."""
+CONFIDENCE = 0.95  # confidence of every interval that is printed
 
 
 def clopper_pearson(successes: int, trials: int, confidence: float = CONFIDENCE) -> tuple[float, float]:
     """Return the exact two-sided binomial interval of a success rate.
 
-    low solves P(X >= successes | low) = a/2 and high solves P(X <= successes | high) = a/2, with a = 1 - confidence.
-    These are quantiles of beta distributions: low = B(a/2; k, n - k + 1), high = B(1 - a/2; k + 1, n - k). The interval
-    covers the true rate at least as often as it says, at every n (Clopper and Pearson 1934).
-
-    Args:
-        successes: k, from 0 to n.
-        trials: n, at least 1.
-        confidence: between 0 and 1.
-
-    Returns:
-        (low, high); low is exactly 0 for k = 0, high exactly 1 for k = n.
-
-    Raises:
-        InputError: an argument is out of range.
+    Of k successes, from 0 to n, in n trials, at least 1, with a = 1 - confidence in (0, 1): low solves P(X >= k | low)
+    = a/2 and high P(X <= k | high) = a/2, quantiles of beta distributions: B(a/2; k, n - k + 1), exactly 0 for k = 0,
+    and B(1 - a/2; k + 1, n - k), exactly 1 for k = n. The interval covers the true rate at least as often as it says,
+    at every n (Clopper and Pearson 1934). Raises InputError where an argument is out of range.
     """
     if trials < 1:
         raise InputError(f"trials: expected at least 1, got {trials}")
@@ -178,11 +167,11 @@ class ConfidenceSequence:
 
     @property
     def count(self) -> int:
-        return sum(self._counts.values())
+        return self._counts.total()
 
     @property
     def mean(self) -> float:
-        return sum(value * count for value, count in self._counts.items()) / self.count if self.count else float("nan")
+        return sum(value * count for value, count in self._counts.items()) / self.count if self.count else math.nan
 
     def is_over(self, mean: float) -> bool:
         """Whether the true mean is shown to be over a number in (0, 1)."""
@@ -216,29 +205,30 @@ def draws_needed(mean: float, *, confidence: float, value: float = 1.0) -> int:
 
 def capital(mean: float, counts: Mapping[float, int]) -> float:
     """Return the logarithm of what the bets on "more than `mean`" have made of 1, -inf where all is lost."""
-    total: npt.NDArray[np.float64] = np.zeros(len(STAKES))
+    values = np.array(list(counts), dtype=np.float64)
+    return capital_of_units(mean, values, np.ones_like(values), np.array(list(counts.values())))
+
+
+def capital_of_units(mean: float, counted: npt.NDArray[Any], of: npt.NDArray[Any], times: npt.NDArray[Any]) -> float:
+    """Return the same of units (n,), so many `times` each, that count for `of` draws of the largest; see `units`."""
     with np.errstate(divide="ignore"):
-        for value, count in counts.items():
-            total += count * np.log(1.0 - STAKES + STAKES * (value / mean))
+        won = np.log(np.maximum(1.0 - STAKES * of[:, None] + STAKES * (counted / mean)[:, None], 0.0))
+        total = (times[:, None] * won).sum(axis=0)
     return float(np.logaddexp.reduce(total) - np.log(len(STAKES)))
 
 
-LADDER = (4, 16, 64, 256)
-"""Sample counts to try; each quarters the variance of the one before."""
-
-LOOKS = (4, 8)
-"""Renders of a configuration at each sample count after which one looks at them."""
-
-MOST_LOOKED_AT = 20
-"""Renders of a sample count of which no more are made to look at, though there be more trials."""
+LADDER = (4, 16, 64, 256)  # sample counts to try; each quarters the variance of the one before
+LOOKS = (4, 8)  # renders of a configuration at each sample count after which one looks at them
+MOST_LOOKED_AT = 20  # renders of a sample count of which no more are made to look at, though there be more trials
 
 MarginsOf = Callable[[int, Sequence[int]], Sequence[float]]
 """(spp, seeds) -> margins in logits, one of each render."""
 
 
 def margins_of(evaluate: Evaluate, kind: str, u: Tensor, *, keep: int = 0, drawn: bool = False) -> MarginsOf:
-    """Return the margins of one configuration under the conditions that the scene comes with, or under those `drawn` by
-    the seeds; the rows of all sample counts are numbered together, and the first `keep` pictures of each are wanted."""
+    """Return the margins of one configuration, its scores with their sign turned, under the conditions that the scene
+    comes with, or under those `drawn` by the seeds; the rows of all sample counts are numbered together, and the first
+    `keep` pictures of each are wanted."""
     made = Counter[int]()
 
     def margins(spp: int, seeds: Sequence[int]) -> list[float]:
@@ -246,7 +236,7 @@ def margins_of(evaluate: Evaluate, kind: str, u: Tensor, *, keep: int = 0, drawn
         asked = enumerate(zip(seeds, numbers, strict=True), made.total())
         made[spp] += len(seeds)
         queries = [Query(u, seed, kind, row, spp=spp, drawn=drawn, keep=number < keep) for row, (seed, number) in asked]
-        return [evaluation.said.score for evaluation in evaluate(queries)]
+        return [-evaluation.said.score for evaluation in evaluate(queries)]
 
     return margins
 
@@ -267,14 +257,8 @@ class Rung:
 
 @dataclass(frozen=True)
 class SampleCount:
-    """The choice, and everything it rests on.
-
-    Attributes:
-        spp: samples per pixel to verify with.
-        converged: whether all margins are shown to stay on their sides; if not, it is the last rung of the ladder.
-        table: one row per configuration and rung that was measured, in this order.
-        renders: renders spent.
-    """
+    """The samples a pixel to verify with; whether all margins are shown to stay on their sides (if not, it is the last
+    rung of the ladder); a row for each configuration and rung that was measured, in this order; and renders spent."""
 
     spp: int
     converged: bool
@@ -296,16 +280,11 @@ def choose_spp(
       the error that is left falls with the sample count, so it is smaller than the change that led here,
     - every single render of the rung; and, where these are fewer than the trials, m even with the deviation of one.
 
-    So the mean without noise is on that side, and noise moves no trial to the other. A margin at zero never settles:
-    its verdict does depend on the noise, and `converged` says so. That a margin settles on the wrong side happens in
-    about 5 % of all cases at most: 5.1 % of those that are hardest to tell (`benchmarks/verdicts.py`).
-
-    The rungs are looked at after some of the renders, and again after more if that does not settle it. Each look has
-    its share of the 5 % (Bonferroni).
-
-    Three quarters of the samples of a whole ladder are those of its last rung. So a look that cannot settle anything,
-    as far as the noise so far tells (`_may_settle`), is left out; where none is left that could, or one configuration
-    has not settled, the last rung is taken as it is. That may take `converged` away, but never gives it.
+    A margin at zero never settles: its verdict depends on the noise. About 5 % settle on the wrong side at most: 5.1 %
+    of those that are hardest to tell (`benchmarks/verdicts.py`). A rung is looked at after some of the renders, and
+    again after more, and each look has its share of the 5 % (Bonferroni). A look that cannot settle anything, as far as
+    the noise so far tells (`_may_settle`), is left out; where none is left that could, or one configuration has not
+    settled, the last rung, which has three quarters of all samples, is taken as it is and not `converged`.
 
     A rung is chosen because its renders agree, so they are no trials: those have seeds of their own (`run_trials`).
     Counted among them, they would make what holds in 75 % `found` in 5.9 % of all cases in place of 2.2 %.
@@ -314,12 +293,9 @@ def choose_spp(
         margins: the configurations, e.g. {"adversarial": ..., "clean": ...}; each renders what it is asked for. The
             first should be the one that is least likely to settle.
         seed: root seed.
-        ladder: sample counts, rising, at least one. A single one is returned as it is, unmeasured and not converged.
+        ladder: sample counts, rising, at least one, or InputError. A single one is returned unmeasured.
         trials: that will follow under the same conditions. So many renders are one more look, the last one, at which
             only the mean and every single render have to be on one side; 0 where other trials follow.
-
-    Raises:
-        InputError: ladder out of range.
     """
     if not ladder or ladder[0] < 1 or any(b <= a for a, b in pairwise(ladder)):
         raise InputError(f"verify_spp: expected rising sample counts of at least 1, got {list(ladder)}")
@@ -329,9 +305,12 @@ def choose_spp(
     for name, render in margins.items():
         values = _climbed(render, seed, ladder, looks, trials)
         below: list[float] = []
-        for spp, found in zip(ladder, values, strict=False):
-            table.append(_rung(name, spp, found, below, len(looks), trials))
-            below = found
+        for spp, here in zip(ladder, values, strict=False):
+            half_width = _quantile(len(here), len(looks)) * _deviation(here) / math.sqrt(len(here))
+            drift = _mean(here) - _mean(below) if below else math.nan
+            settled = bool(below) and _settled(here, below, len(looks), trials)
+            table.append(Rung(name, spp, _mean(here), half_width, drift, settled))
+            below = here
         renders, reached = renders + sum(map(len, values)), max(reached, len(values) - 1)
         if not table[-1].settled:
             return SampleCount(ladder[-1], False, tuple(table), renders)
@@ -341,8 +320,7 @@ def choose_spp(
 def _climbed(
     margins: MarginsOf, seed: int, ladder: Sequence[int], looks: Sequence[int], trials: int
 ) -> list[list[float]]:
-    """Return the margins of one configuration at each rung, up to that at which it settles or beyond which none can
-    settle it."""
+    """Return the margins of one configuration at each rung, up to that at which it settles or none above can."""
     values: list[list[float]] = [[] for _ in ladder]
     places = list(product(range(1, len(ladder)), looks))
     for number, (level, count) in enumerate(places):
@@ -350,12 +328,12 @@ def _climbed(
             break
         if not _may_settle(values, ladder, level, count, len(looks)):
             continue
-        for one in (level - 1, level):
-            new = range(len(values[one]), count)
-            values[one] += margins(ladder[one], [stream(seed, "sample count", number) for number in new]) if new else []
+        for rung in (level - 1, level):
+            if new := [stream(seed, "sample count", number) for number in range(len(values[rung]), count)]:
+                values[rung] += margins(ladder[rung], new)
         if _settled(values[level], values[level - 1], len(looks), trials):
             break
-    return [found for found in values if found]
+    return [measured for measured in values if measured]
 
 
 def _settled(here: Sequence[float], below: Sequence[float], looks: int, trials: int) -> bool:
@@ -374,17 +352,16 @@ def _may_settle(values: Sequence[list[float]], ladder: Sequence[int], level: int
     The mean may be off by its standard error, and may move on by as much as it has moved before. Deviations stay; at
     rungs that were not rendered they fall with the root of the samples.
     """
-    known = [one for one in range(level + 1) if values[one]]
+    known = [rung for rung in range(level + 1) if values[rung]]
     if not known:
         return True
     if values[level] and min(values[level]) <= 0.0 <= max(values[level]):
         return False
-    best, mean = values[known[-1]], {one: _mean(values[one]) for one in known}
-    moved = abs(mean[known[-1]] - mean[known[-2]])
-    largest = abs(mean[known[-1]]) + moved + _deviation(best) / math.sqrt(len(best))
+    best, mean = values[known[-1]], _mean(values[known[-1]])
+    largest = abs(mean) + abs(mean - _mean(values[known[-2]])) + _deviation(best) / math.sqrt(len(best))
     below, here = (
-        _deviation(values[one]) if values[one] else _deviation(best) * math.sqrt(ladder[known[-1]] / ladder[one])
-        for one in (level - 1, level)
+        _deviation(values[rung]) if values[rung] else _deviation(best) * math.sqrt(ladder[known[-1]] / ladder[rung])
+        for rung in (level - 1, level)
     )
     return math.hypot(2.0 * here, below) * _quantile(count, looks) / math.sqrt(count) <= largest
 
@@ -397,13 +374,6 @@ def looks_of(trials: int = 0) -> tuple[int, ...]:
 def most_samples(configurations: int, ladder: Sequence[int] = LADDER, trials: int = 0) -> int:
     """Return the samples a pixel that `choose_spp` renders in all, at most: where only the last rung settles it."""
     return configurations * looks_of(trials)[-1] * sum(ladder) if len(ladder) > 1 else 0
-
-
-def _rung(name: str, spp: int, values: Sequence[float], below: Sequence[float], looks: int, trials: int) -> Rung:
-    mean, half_width = _mean(values), _quantile(len(values), looks) * _deviation(values) / math.sqrt(len(values))
-    if not below:
-        return Rung(name, spp, mean, half_width, math.nan, False)
-    return Rung(name, spp, mean, half_width, mean - _mean(below), _settled(values, below, looks, trials))
 
 
 def _mean(values: Sequence[float]) -> float:

@@ -2,17 +2,14 @@
 one draw. What was drawn, the *unit*, is independent of others, so that intervals and tests are over units.
 
 Of units with o_u predictions each, of which k_u count, the share is sum k_u / sum o_u. With m for the true one and O
-for the largest o_u, a gambler who stakes a share c of what he has, at each unit, on "more than m" has a game in which
-he
-wins nothing on average:
+for the largest o_u, who stakes a share c of what he has, at each unit, on "more than m" wins nothing on average:
 
     K(m, c) = prod_u (1 - c o_u / O + c k_u / (O m))
 
 So K exceeds 2 / a with a probability of a / 2 at most (Markov), whatever units are like and however few there are, also
 where each has a share of its own (the product's mean is at most 1, by the inequality of the means). These are the bets
-of `trials.ConfidenceSequence`, whose stakes they take (Waudby-Smith and Ramdas 2024). Where each unit has one
-prediction,
-the exact tests of independent ones are taken, which are sharper: Clopper and Pearson, Newcombe, McNemar.
+of `trials.ConfidenceSequence`, whose stakes they take. Where each unit has one prediction, the exact tests of
+independent ones are taken, which are sharper: Clopper and Pearson, Newcombe, McNemar.
 """
 
 from __future__ import annotations
@@ -23,14 +20,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.stats import hypergeom
 
-from advsearch.attacks.trials import (
-    CONFIDENCE,
-    STAKES,
-    clopper_pearson,
-    edge_of,
-    mcnemar,
-    paired_difference,
-)
+from advsearch.attacks import trials
+from advsearch.attacks.trials import CONFIDENCE, STAKES, capital_of_units, edge_of
 from advsearch.errors import InputError
 
 Numbers = npt.NDArray[np.float64]
@@ -44,28 +35,21 @@ def per_unit(values: npt.ArrayLike, units: Units) -> Numbers:
 
 
 def share_interval(counted: npt.ArrayLike, of: npt.ArrayLike, confidence: float = CONFIDENCE) -> tuple[float, float]:
-    """Return the interval of a share of predictions, from the counts of independent units; it holds at any number of
-    them.
-
-    Args:
-        counted: (n,) of each unit, from 0 to `of`.
-        of: (n,) predictions of each unit, from 0; one of them is over 0 at least.
-        confidence: between 0 and 1.
-    """
+    """Return the interval of a share of predictions, whatever the number of independent units. Each has predictions,
+    (n,) from 0, and one of them some; `counted` are (n,) from 0 to `of`; the confidence is between 0 and 1."""
     k, o = np.asarray(counted, dtype=np.float64), np.asarray(of, dtype=np.float64)
     if k.shape != o.shape or not o.size or o.max() <= 0 or (k < 0).any() or (k > o).any():
         raise InputError("share: expected counts from 0 to the predictions of each unit, and one prediction at least")
     if o.max() == 1.0:
-        return clopper_pearson(round(k.sum()), round(o.sum()), confidence)
+        return trials.clopper_pearson(round(k.sum()), round(o.sum()), confidence)
     return _by_bets(k, o, confidence)
 
 
 def _by_bets(counted: Numbers, of: Numbers, confidence: float) -> tuple[float, float]:
     rows, times = np.unique(np.stack([counted, of - counted, of], axis=1) / of.max(), axis=0, return_counts=True)
     least = np.log(2.0 / (1.0 - confidence))
-    low = edge_of(lambda mean: _capital(mean, rows[:, 0], rows[:, 2], times) < least)
-    high = edge_of(lambda mean: _capital(1.0 - mean, rows[:, 1], rows[:, 2], times) >= least)
-    return low, high
+    low = edge_of(lambda mean: capital_of_units(mean, rows[:, 0], rows[:, 2], times) < least)
+    return low, edge_of(lambda mean: capital_of_units(1.0 - mean, rows[:, 1], rows[:, 2], times) >= least)
 
 
 def mean_interval(values: npt.ArrayLike, low: float, high: float) -> tuple[float, float]:
@@ -91,29 +75,17 @@ def paired_by_unit(first: Any, second: Any, units: Units) -> tuple[float, tuple[
     if len(np.unique(units)) == len(units):
         both, lost, won = (first & second).sum(), (first & ~second).sum(), (~first & second).sum()
         counts = int(both), int(lost), int(won), len(first) - int(both + lost + won)
-        return *paired_difference(*counts), mcnemar(counts[1], counts[2])
+        return *trials.paired_difference(*counts), trials.mcnemar(counts[1], counts[2])
     of = per_unit(np.ones(len(first)), units)
     ahead = per_unit((1.0 + second - 1.0 * first) / 2.0, units)
     low, high = _by_bets(ahead, of, CONFIDENCE)
     scaled = np.stack([ahead, of - ahead, of]) / of.max()
-    ones = np.ones(len(of))
-    won = max(_capital(0.5, scaled[side], scaled[2], ones) for side in (0, 1))
+    won = max(capital_of_units(0.5, scaled[side], scaled[2], np.ones(len(of))) for side in (0, 1))
     return float(second.mean() - first.mean()), (2 * low - 1, 2 * high - 1), float(min(1.0, 2.0 * np.exp(-won)))
 
 
-def _capital(mean: float, counted: Numbers, of: Numbers, times: npt.NDArray[Any]) -> float:
-    """The logarithm of what the bets on "more than `mean`" have made of 1, -inf where all is lost."""
-    with np.errstate(divide="ignore"):
-        won = np.log(np.maximum(1.0 - STAKES * of[:, None] + STAKES * (counted / mean)[:, None], 0.0))
-        total = (times[:, None] * won).sum(axis=0)
-    return float(np.logaddexp.reduce(total) - np.log(len(STAKES)))
-
-
-SHARES = np.linspace(0.0, 1.0, 402)[1:-1]
-"""Of right predictions on both sides, at which two shares are compared."""
-
-EXCHANGES = 9_999
-"""How often units are dealt out anew, so that no probability is under 0.0001."""
+SHARES = np.linspace(0.0, 1.0, 402)[1:-1]  # of right predictions on both sides, at which two shares are compared
+EXCHANGES = 9_999  # how often units are dealt out anew, so that no probability is under 0.0001
 
 
 def fewer_by_chance(
@@ -132,11 +104,11 @@ def fewer_by_chance(
         beside, rest: (n,) those elsewhere.
         times: how many times there are each of these units.
     """
-    k, a, r, b = (np.asarray(one, dtype=np.float64) for one in (inside, of, beside, rest))
+    k, a, r, b = (np.asarray(counts, dtype=np.float64) for counts in (inside, of, beside, rest))
     if not a.any() or not b.any():
         return 1.0
     if (a + b).max() == 1.0:
-        here, there, right, others = (round(times * float(one.sum())) for one in (k, a, r, b))
+        here, there, right, others = (round(times * float(counts.sum())) for counts in (k, a, r, b))
         return float(hypergeom.cdf(here, there + others, here + right, there))
     if (np.minimum(a, b) == 0.0).all() and len(np.unique(a + b)) == 1:
         values, copies = np.unique(k + r, return_counts=True)

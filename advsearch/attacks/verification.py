@@ -19,10 +19,8 @@ from advsearch.tasks import Judgement
 
 
 class Ending(Enum):
-    """Why a search or a run stopped. The value is what JSON holds; `explanation` is one sentence for a person.
-
-    A search ends with a claim at most; only `verify` makes it `FOUND` (docs/design.md, "Verification").
-    """
+    """Why a search or a run stopped. The value is what JSON holds; `explanation` is one sentence for a person. What a
+    search ends with is a claim; only `verify` makes it a finding (docs/design.md, "Verification")."""
 
     FOUND = "found"
     BUDGET_SPENT = "budget spent"
@@ -49,11 +47,8 @@ _EXPLANATIONS = {
 }
 
 
-PASS_PERCENT = 95
-"""What a claim must hold in, in per cent of the trials, and what the clean control must pass: 14 of 14, 19 of 20."""
-
-PASS_PERCENT_OVER = 90
-"""What a claim over many conditions must hold in, in per cent of those in which the clean configuration is right."""
+PASS_PERCENT = 95  # of trials in which a claim must hold, and the clean control be right: 14 of 14, 19 of 20
+PASS_PERCENT_OVER = 90  # of conditions in which a claim must hold, of those in which the clean configuration is right
 
 TRIAL_LOOKS = 14, 23
 """Trials after which a verdict may stand, where nobody asked for a number: `found` takes 14 of 14, or 22 of 23.
@@ -92,11 +87,9 @@ class Rule:
     conditional: bool = False
 
     def needed(self, trials: int, *, early: bool = False) -> int:
-        """Return how many of `trials` must succeed: the percentage, rounded up, and never under `fewest`.
-
-        Of conditions, `early` asks for those of `OVER_EARLY`: more of them could follow."""
-        share = OVER_EARLY[trials] if early and self.conditional else self.share(trials)
-        return max(share, self.fewest)
+        """Return how many of `trials` must succeed: the percentage, rounded up, and never under `fewest`. Of
+        conditions, `early` asks for those of `OVER_EARLY`: more of them could follow."""
+        return max(OVER_EARLY[trials] if early and self.conditional else self.share(trials), self.fewest)
 
     def allowed(self, trials: int) -> int:
         return trials - self.needed(trials)
@@ -110,11 +103,8 @@ class Rule:
         return -(-self.percent * trials // 100)
 
     def succeeded(self, trial: Judgement, clean: Judgement) -> bool:
-        """Whether a trial counts beside that of the clean configuration with the same seed.
-
-        That has to be right, so that what the noise does by itself does not count; where it may be wrong, the trial has
-        to have the larger score.
-        """
+        """Whether a trial counts beside that of the clean configuration with the same seed: which has to be right, so
+        that what the noise does by itself does not count; where it may be wrong, the trial has the larger score."""
         return trial.success and (clean.right if self.control else trial.score > clean.score)
 
     def counted(self, clean: Sequence[Judgement]) -> int:
@@ -132,16 +122,8 @@ class Rule:
         return successes >= self.needed(trials)
 
     def verdict(self, search: Ending, clean: Trials, adversarial: Trials) -> Ending:
-        """Return the run's ending from the search's ending and the trials of both groups.
-
-        In this order:
-
-        1. INTERRUPTED stays interrupted.
-        2. The control group is `already_wrong`: ALREADY_WRONG. There was nothing to attack.
-        3. Control group and successes both reach what the rule needs: FOUND, whatever the search itself believed.
-        4. The search claimed FOUND: NOT_VERIFIED.
-        5. Else what the search ended with.
-        """
+        """Return the run's ending from the search's ending and the trials of both groups: FOUND if both reach what the
+        rule needs, whatever the search itself believed."""
         if search is Ending.INTERRUPTED:
             return search
         if self.already_wrong(clean):
@@ -173,8 +155,7 @@ class Verification:
         clean_trials, adversarial_trials: every single trial, in the order of their seeds; of curtailed ones the second
             group is the shorter.
         renders: renders spent here.
-        stopped: why there are no more trials: "asked for" (as many as were), "decided" (the verdict is certain, or
-            stands).
+        stopped: why there are no more trials: "asked for" (as many as were), "decided" (the verdict stands).
         outcomes: of each trial of the second group, whether it is a success; None where it does not count, as under
             its conditions the clean configuration is wrong.
         begin: the number of the first trial.
@@ -199,7 +180,7 @@ class Verification:
 
     @property
     def successes(self) -> tuple[Judgement, ...]:
-        return tuple(trial for trial, outcome in zip(self.adversarial_trials, self.outcomes, strict=True) if outcome)
+        return tuple(itertools.compress(self.adversarial_trials, self.outcomes))
 
 
 def run_trials(
@@ -215,25 +196,17 @@ def run_trials(
     keep: int = 0,
     until: Callable[[Sequence[Judgement]], bool] | None = None,
 ) -> tuple[Judgement, ...]:
-    """Render and judge one configuration `trials` times, trial k with seed k of the stream "verification".
-
-    Two groups run with the same root seed get the same seeds, trial by trial, which is what a control group needs. They
-    end sooner where `until`, asked after every trial, says so.
+    """Render and judge one configuration (d,) `trials` times, trial k with seed k of the stream "verification" of the
+    root `seed`: two groups of one root get the same seeds, which is what a control group needs.
 
     Args:
         evaluate: answers the queries; see `Query`.
-        u: (d,) the configuration.
-        spp: samples a pixel.
-        seed: root of the seeds.
-        trials: how many there are then.
+        spp, trials: samples a pixel, and how many trials there are then; under 1 they are an InputError.
         first: how many of them there are already, which are left out.
         begin: the number of the first of all.
         kind: of their rows.
         keep: the pictures of the first so many are wanted.
-        until: see above.
-
-    Raises:
-        InputError: trials or spp under 1.
+        until: asked after every trial, ends them sooner.
     """
     if trials < 1:
         raise InputError(f"trials: expected at least 1, got {trials}")
@@ -277,8 +250,6 @@ def verify(
 ) -> Verification:
     """Check what a search found in fresh trials against the clean configuration as control group.
 
-    See `Rule` for what counts as a success, and for the ending. KeyboardInterrupt passes through.
-
     Several numbers of trials, such as `TRIAL_LOOKS`, are looks: the trials end at the first at which that is
     found. Over conditions, those that count are looked at (`OVER_LOOKS`), and the last look is at all.
 
@@ -290,28 +261,22 @@ def verify(
     is shown by the probability of every outcome (`benchmarks/verdicts.py`).
 
     Args:
-        evaluate: answers the queries; see `Query`.
+        evaluate, spp, keep, begin: as of `run_trials`; of a configuration that was chosen by trials, fresh ones begin
+            after these.
         domain: the budget; the clean configuration is its start.
         u: (d,) the adversarial configuration; projected into the domain again.
         claim: the search's ending.
-        spp: samples per pixel, from `choose_spp`.
         seed: root seed. Must not be one that the search rendered with through the same stream.
         trials: per group; or rising numbers, see above.
         clean: the first trials of the clean configuration, where `run_trials` has run them with the same spp and seed
             (one control group serves the attack and its baseline); what is missing is run here.
-        rule: when the claim counts.
-        kind: of the rows of its trials.
-        control: of the rows of those of the clean configuration.
-        keep: the pictures of so many of them are wanted.
+        rule: what counts as a success, and which ending it is.
+        kind, control: of the rows of its trials, and of those of the clean configuration.
         curtailed: see above; where of what was found only the verdict matters.
-        begin: the number of the first trial: of a configuration that was chosen by its trials, that of fresh ones.
-
-    Raises:
-        InputError: trials or spp under 1.
     """
     looks = (trials,) if isinstance(trials, int) else tuple(trials)
     least = 0 if curtailed or len(looks) == 1 else rule.fewest
-    u, beside, done, renders = domain.project(u), list(clean), list[Judgement](), 0
+    u, beside, done = domain.project(u), list(clean), list[Judgement]()
 
     def tried(others: Sequence[Judgement]) -> tuple[bool | None, ...]:
         return tuple(
@@ -326,34 +291,21 @@ def verify(
         return len(made) >= least and tried(made).count(False) > allowed
 
     more = partial(run_trials, evaluate, spp=spp, seed=seed, begin=begin)
-
-    def clean_until(counted: int) -> int:
-        """Try the clean configuration until so many trials count, or all are made; return how many that takes."""
-        nonlocal renders
-        count = counted
-        while True:
-            missing = more(domain.start, trials=count, first=len(beside), kind=control)
-            beside.extend(missing)
-            renders += len(missing)
-            short = counted - rule.counted(beside[:count])
-            if short <= 0 or count == looks[-1]:
-                return count
-            count = min(count + short, looks[-1])
-
     for look in looks:
-        count = clean_until(look)
+        count = look
+        beside += more(domain.start, trials=count, first=len(beside), kind=control)
+        while (short := look - rule.counted(beside[:count])) > 0 and count < looks[-1]:
+            count = min(count + short, looks[-1])
+            beside += more(domain.start, trials=count, first=len(beside), kind=control)
         until = lost if curtailed or len(looks) > 1 else None
-        made = more(u, trials=count, first=len(done), kind=kind, keep=keep, until=until)
-        done, renders = [*done, *made], renders + len(made)
+        done += more(u, trials=count, first=len(done), kind=kind, keep=keep, until=until)
         early = count < looks[-1]
         needed = rule.needed(rule.counted(beside[:count]), early=early)
         enough = tried(done).count(True) >= needed and not rule.already_wrong(count_right(beside[:count], spp))
         if len(done) < count or lost(()) or enough or not early:
             break
-    outcomes = tried(done)
-    right = count_right(beside, spp)
-    counted = max(1, len(outcomes) - outcomes.count(None))
-    successes = outcomes.count(True)
+    outcomes, right, renders = tried(done), count_right(beside, spp), len(done) + len(beside) - len(clean)
+    successes, counted = outcomes.count(True), max(1, len(outcomes) - outcomes.count(None))
     confidence = OVER_CONFIDENCE if rule.conditional and len(looks) > 1 else CONFIDENCE
     verified = Trials(successes, counted, spp, confidence)
     ending = rule.verdict(claim, right, verified)

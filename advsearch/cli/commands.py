@@ -1,9 +1,8 @@
 """The commands: what the help lists, and what carries each out.
 
-A question's command is a module with `HELP` (one line), where there is more to say `MORE` (what the description says
-after that) and `EXAMPLES` (lines of a shell), and a `QuestionCommand` called `COMMAND`, or else `add_arguments(parser)`
-and `run(args) -> int`. It imports what is heavy inside functions, so that `advsearch --help` answers at once. Other
-commands are a `Command` in this package, which is imported when it is asked for.
+A question's command is made of it (`advsearch.question.question`), or a module with `HELP` (one line) and a
+`QuestionCommand` or `Command` called `COMMAND`. It imports what is heavy inside functions, so that `advsearch --help`
+answers at once. Other commands are a `Command` in this package, which is imported when it is asked for.
 """
 
 from __future__ import annotations
@@ -12,6 +11,7 @@ import argparse
 import importlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from operator import methodcaller
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,21 +25,34 @@ if TYPE_CHECKING:
     from advsearch.settings import Config
 
 
+Argument = Callable[[argparse.ArgumentParser], object]  # adds something to a parser
+
+
+def argument(*names: str, **options: Any) -> Argument:
+    """Return what adds an argument to a parser, as its `add_argument` does."""
+    return methodcaller("add_argument", *names, **options)
+
+
 @dataclass(frozen=True)
 class Command:
     """A command that asks no question.
 
     Attributes:
-        add_arguments: adds its arguments to a parser.
-        run: does what they say, and returns the exit status.
+        run: does what the arguments say, and returns the exit status.
+        arguments: what adds them, in the order in which the help shows them.
         more: what its help says after what it does.
         examples: lines of a shell, without `advsearch`.
     """
 
-    add_arguments: Callable[[argparse.ArgumentParser], None]
     run: Callable[[argparse.Namespace], int]
+    arguments: tuple[Argument, ...]
     more: str = ""
     examples: tuple[str, ...] = ()
+
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        """Add its arguments to a parser."""
+        for add in self.arguments:
+            add(parser)
 
 
 @dataclass(frozen=True)
@@ -86,7 +99,7 @@ class QuestionCommand:
         from advsearch.config import CONFIGS
 
         add_settings(parser, CONFIGS[self.name])
-        output.add_flags(parser, quiet=True)
+        output.add_quiet_flags(parser)
         if self.place:
             parser.add_argument(
                 self.about,
@@ -104,12 +117,8 @@ class QuestionCommand:
         if self.listed and named == "list":
             module, _, function = self.listed.partition(":")
             lines = getattr(importlib.import_module(module), function)()
-            if args.json:
-                listed = [{"name": name, "title": text} for name, text in lines.items()]
-                output.print_json({"schema": 1, f"{self.name}s": listed})
-            else:
-                print(output.aligned([[name, text] for name, text in lines.items()]))
-            return 0
+            listed = [{"name": name, "title": text} for name, text in lines.items()]
+            return output.say(args.json, {f"{self.name}s": listed}, output.aligned([*lines.items()]))
         if self.place and named in (None, []):
             command = f"advsearch {self.name}"
             raise InputError(f"{command}: expected {self.place.expected}; see {command} --help")
@@ -140,35 +149,25 @@ class QuestionCommand:
         config = CONFIGS[self.name]
         if self.brought and (file := self.file(args)):
             over = {**self.brought(file, vars(args)), **over}
-        elif self.brought and (missing := [one for one in settings(config) if one.required and one.field not in args]):
+        elif self.brought and (missing := [s.flag for s in settings(config) if s.required and s.field not in args]):
             command, run = f"advsearch {self.name}", f"--{self.about.replace('_', '-')} RUN"
-            raise InputError(f"{command}: expected {missing[0].flag} NAME, or {run}; see {command} --help")
+            raise InputError(f"{command}: expected {missing[0]} NAME, or {run}; see {command} --help")
         return config_from(args, config, **over)
 
     def carry_out(self, config: Config, *, as_json: bool, quiet: bool, resumed: Path | None = None) -> int:
         """Ask what `config` describes, or go on with it; print the result and return the exit status."""
         with at_work(as_json=as_json, quiet=quiet) as progress:
-            # late, so that --help answers at once
-            from advsearch.question import carry_out
+            from advsearch.question import carry_out  # late, so that --help answers at once
 
             result = carry_out(config, progress=progress, resumed=resumed)
         status = output.finish(result, self.text, as_json=as_json)
         return status or (output.FELL_SHORT if self.short(result) else 0)
 
 
-ROOM = "advsearch.questions."
-
 GROUPS = {
-    "ask: what does a model get wrong?": {
-        "attack": "",
-        "sweep": "",
-        "gap": "",
-        "region": "",
-        "explain": "",
-        "compare": "",
-        "recipe": "",
-        "harden": "",
-    },
+    "ask: what does a model get wrong?": dict.fromkeys(
+        ("attack", "sweep", "gap", "region", "explain", "compare", "recipe", "harden"), ""
+    ),
     "look: at scenes, names and predictions": {
         "render": "advsearch.cli.show:RENDER render a picture of a scene, and say what the model sees in it",
         "show": "advsearch.cli.show:SHOW "
@@ -181,11 +180,7 @@ GROUPS = {
         "labels": "advsearch.cli.show:LABELS find the names of a model's classes, as --label takes them",
     },
     "trust: does a result hold, and is the tool right?": {
-        "test": "",
-        "replay": "",
-        "check": "",
-        "precision": "",
-        "stability": "",
+        **dict.fromkeys(("test", "replay", "check", "precision", "stability"), ""),
         "doctor": "advsearch.cli.doctor:DOCTOR check every part that a run needs, with versions and how to mend it",
     },
     "files and runs: repeat, continue, bring in, take out": {
@@ -212,7 +207,7 @@ COMMANDS = {name: place for group in GROUPS.values() for name, place in group.it
 
 
 def command_named(name: str) -> Any:
-    """Return what adds the arguments of a command and runs it: its `QuestionCommand` or `Command`, or a module."""
+    """Return the `QuestionCommand` or `Command` of a name."""
     if COMMANDS[name]:
         place, _, attribute = COMMANDS[name].partition(" ")[0].partition(":")
         return getattr(importlib.import_module(place), attribute)
@@ -222,17 +217,9 @@ def command_named(name: str) -> Any:
             name, short=made.short, about=made.about, place=unflagged, brought=made.brought, listed=made.listed,
             more=made.more, examples=made.examples,
         )  # fmt: skip
-    module = importlib.import_module(f"{ROOM}{name}")
-    return getattr(module, "COMMAND", module)
+    return importlib.import_module(f"advsearch.questions.{name}").COMMAND
 
 
 def help_of(name: str) -> str:
     """Return what a command does, in a line."""
     return COMMANDS[name].partition(" ")[2] or help_of_question(name)
-
-
-def texts_of(name: str) -> tuple[str, tuple[str, ...]]:
-    """Return what the help of a command says after what it does, and its examples."""
-    module = command_named(name) if COMMANDS[name] or made_question(name) else importlib.import_module(f"{ROOM}{name}")
-    more = getattr(module, "more", getattr(module, "MORE", ""))
-    return more, getattr(module, "examples", getattr(module, "EXAMPLES", ()))

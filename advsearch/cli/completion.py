@@ -6,7 +6,7 @@ import argparse
 from typing import Any
 
 from advsearch.cli import output
-from advsearch.cli.commands import COMMANDS, Command
+from advsearch.cli.commands import COMMANDS, Command, argument
 from advsearch.cli.main import add_command, without_commands
 from advsearch.cli.show import REGISTRIES, list_names
 from advsearch.errors import InputError
@@ -24,11 +24,6 @@ NAMED = {
 """Flags whose value is a name, and the kind of that name."""
 
 OR_A_FILE = ("--object", "--environment", "--model")
-
-
-def _arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("shell", choices=["bash", "zsh", "tcsh"], help="the shell that the script is for")
-    output.add_flags(parser)
 
 
 def _completion(args: argparse.Namespace) -> int:
@@ -49,11 +44,7 @@ def _completion(args: argparse.Namespace) -> int:
             else:  # where shtab looks for it
                 action.complete = _names_or_files(flag, named) if named else shtab.FILE  # type: ignore[attr-defined]
     script = shtab.complete(parser, shell=args.shell)
-    if args.json:
-        output.print_json({"schema": 1, "command": "completion", "shell": args.shell, "script": script})
-    else:
-        print(script)
-    return 0
+    return output.say(args.json, {"command": "completion", "shell": args.shell, "script": script}, script)
 
 
 def _names_or_files(flag: str, names: list[str]) -> dict[str, Any]:
@@ -69,8 +60,11 @@ def _names_or_files(flag: str, names: list[str]) -> dict[str, Any]:
 
 
 COMPLETION = Command(
-    _arguments,
     _completion,
+    (
+        argument("shell", choices=["bash", "zsh", "tcsh"], help="the shell that the script is for"),
+        output.add_flags,
+    ),
     more=". It needs the package shtab (pip install shtab)",
     examples=(
         "completion bash > ~/.local/share/bash-completion/completions/advsearch",

@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from advsearch.cli import output
-from advsearch.cli.commands import Command
+from advsearch.cli.commands import Command, argument
 from advsearch.errors import InputError
 from advsearch.questions.sweep.page import write_bundle
 from advsearch.runs.directory import find_run
 from advsearch.viewer.clients import NO_QR, qr_text
-from advsearch.viewer.pages import renewed
+from advsearch.viewer.pages import write_page
 from advsearch.viewer.server import Dashboard
 
 if TYPE_CHECKING:
@@ -32,33 +32,14 @@ SEEN = (
 )
 
 
-def _dashboard_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("runs", nargs="*", metavar="RUN", help="names or folders of runs (default: all in runs/)")
-    parser.add_argument(
-        "--host",
-        default="127.0.0.1",
-        help="address to listen at (default: %(default)s); at others, whoever has the printed "
-        "token sees the runs and can add photographs, which the run's model judges here",
-    )
-    parser.add_argument("--port", type=int, default=PORT, help="port; 0 takes a free one (default: %(default)s)")
-    parser.add_argument(
-        "--https", action="store_true", help="speak HTTPS on this machine too; at other addresses that is always so"
-    )
-    parser.add_argument("--json", action="store_true", help="print the address as JSON")
-    output.add_code_flag(parser)
-
-
 def _dashboard(args: argparse.Namespace) -> int:
     if not 0 <= args.port <= 65535:
         raise InputError(f"--port: expected a number from 0 to 65535, got {args.port}")
     runs = [find_run(name, checked=False) for name in args.runs]  # the list says what is wrong with one
     server = Dashboard(runs, args.host, args.port, https=args.https, photographs=_LoadedLater())
-    if args.json:
-        told = {"address": server.address, "token": server.token, "fingerprint": server.fingerprint}
-        output.print_json({"schema": 1, "command": "dashboard", **told})
-        sys.stdout.flush()
-    else:
-        print(server.address, flush=True)
+    facts = {"address": server.address, "token": server.token, "fingerprint": server.fingerprint}
+    output.say(args.json, {"command": "dashboard", **facts}, server.address)
+    sys.stdout.flush()
     if server.fingerprint:
         print(
             "The browser will warn of the certificate, which was made for this server alone. Its SHA-256 is "
@@ -93,29 +74,41 @@ class _LoadedLater:
 
 
 DASHBOARD = Command(
-    _dashboard_arguments,
     _dashboard,
+    (
+        argument("runs", nargs="*", metavar="RUN", help="names or folders of runs (default: all in runs/)"),
+        argument(
+            "--host",
+            default="127.0.0.1",
+            help="address to listen at (default: %(default)s); at others, whoever has the printed "
+            "token sees the runs and can add photographs, which the run's model judges here",
+        ),
+        argument("--port", type=int, default=PORT, help="port; 0 takes a free one (default: %(default)s)"),
+        argument(
+            "--https", action="store_true", help="speak HTTPS on this machine too; at other addresses that is always so"
+        ),
+        argument("--json", action="store_true", help="print the address as JSON"),
+        output.add_code_flag,
+    ),
     ". It keeps the photographs that are taken on a run's page, writes nothing else, and ends with Ctrl-C",
     ("dashboard", "dashboard mug-sweep-001 mug-sweep-002", "dashboard --host 0.0.0.0"),
 )
-
-
-def _view_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("runs", nargs="+", metavar="RUN", help="a run's name or folder; several sweeps with --bundle")
-    parser.add_argument("--bundle", metavar="DIR", help="write a folder: a page, the rows and the small pictures")
-    output.add_flags(parser)
 
 
 def _view(args: argparse.Namespace) -> int:
     folders = [find_run(name) for name in args.runs]
     if args.bundle is None and len(folders) > 1:
         raise InputError("--bundle: pages of several runs go into a folder; name one, or give one run")
-    out = renewed(folders[0]) if args.bundle is None else write_bundle(folders, Path(args.bundle))
-    if args.json:
-        output.print_json({"schema": 1, "command": "view", "runs": [str(one) for one in folders], "out": str(out)})
-    else:
-        print(out)
-    return 0
+    out = write_page(folders[0]) if args.bundle is None else write_bundle(folders, Path(args.bundle))
+    return output.say(args.json, {"command": "view", "runs": list(map(str, folders)), "out": str(out)}, str(out))
 
 
-VIEW = Command(_view_arguments, _view, "", ("view mug-sweep-001", "view mug-sweep-001 mug-sweep-002 --bundle site"))
+VIEW = Command(
+    _view,
+    (
+        argument("runs", nargs="+", metavar="RUN", help="a run's name or folder; several sweeps with --bundle"),
+        argument("--bundle", metavar="DIR", help="write a folder: a page, the rows and the small pictures"),
+        output.add_flags,
+    ),
+    examples=("view mug-sweep-001", "view mug-sweep-001 mug-sweep-002 --bundle site"),
+)

@@ -43,7 +43,6 @@ OPTIONAL = {"pyarrow": "advsearch export does not write Parquet"}
 PROBE = (sys.executable, "-m", "advsearch.cli.doctor_probe")
 
 _SMALL_PACKAGES = ("OpenEXR", "imageio", "matplotlib", "cma", "xatlas", "pyarrow")
-_NO_FIX_NEEDED = ""
 
 
 @dataclass(frozen=True)
@@ -55,7 +54,7 @@ class Component:
     version: str
     status: str
     detail: str = ""
-    fix: str = _NO_FIX_NEEDED
+    fix: str = ""
 
 
 def _doctor(args: argparse.Namespace) -> int:
@@ -63,8 +62,7 @@ def _doctor(args: argparse.Namespace) -> int:
     parts = diagnose()
     good = all(part.status in (OK, WARNING) for part in parts)
     if args.json:
-        outcome = {"schema": 1, "command": "doctor", "ok": good, "parts": [asdict(part) for part in parts]}
-        print(json.dumps(outcome, indent=2))
+        output.print_json({"schema": 1, "command": "doctor", "ok": good, "parts": [asdict(part) for part in parts]})
     else:
         _print_table(parts, good)
     return 0 if good else output.FELL_SHORT
@@ -87,18 +85,17 @@ def diagnose() -> list[Component]:
 
 
 def run_probe(command: Sequence[str] = PROBE) -> dict[str, tuple[bool, str]]:
-    """Try the parts that load native code, in another process: name to whether it worked and a detail or the error.
-
-    The part that ended the process, and those after it, are absent; under the name ``""`` stands how it ended.
-    """
+    """Try the parts that load native code, in another process: name to whether it worked and a detail or the error. The
+    part that ended the process, and those after it, are absent; under the name ``""`` stands how it ended."""
     try:
         done = subprocess.run(
             command, capture_output=True, text=True, timeout=SECONDS_ALLOWED, check=False, cwd=OWN_FOLDER
         )
         output, errors, status = done.stdout, done.stderr, done.returncode
     except subprocess.TimeoutExpired as expired:
-        text = expired.stdout.decode("utf-8", "replace") if isinstance(expired.stdout, bytes) else expired.stdout or ""
-        output, errors, status = text, "", None
+        partial = expired.stdout
+        output = partial.decode("utf-8", "replace") if isinstance(partial, bytes) else partial or ""
+        errors, status = "", None
     tried = {}
     for line in output.splitlines():
         try:
@@ -119,22 +116,27 @@ def packages(tried: dict[str, tuple[bool, str]]) -> Iterator[Component]:
             yield Component(name, "", status, f"not installed{why}", _reinstall(name))
         elif name in ("mitsuba", "drjit"):
             yield Component(name, version, OK, "tried by the render below")
+        elif name not in tried:
+            yield Component(name, version, BROKEN, f"not reached: {tried[''][1]}", "see libLLVM below")
+        elif tried[name][0]:
+            yield Component(name, version, OK, tried[name][1])
         else:
-            yield _tried(name, version, tried)
+            mend = (
+                "see libLLVM below, then mend mitsuba and drjit: make setup" if name == "render" else _reinstall(name)
+            )
+            yield Component(name, version, WARNING if name in OPTIONAL else BROKEN, tried[name][1], mend)
 
 
 def other_packages(requirements: Sequence[str] | None = None) -> Component:
     """The dependencies that need no trial: present or not. Requirements are as in the package's metadata, e.g.
     ``"rich>=13"``; None reads them there."""
     wanted = (metadata.requires("advsearch") or []) if requirements is None else requirements
-    names = {re.split(r"[^\w.-]", one, maxsplit=1)[0] for one in wanted if "extra ==" not in one}
+    names = {re.split(r"[^\w.-]", wish, maxsplit=1)[0] for wish in wanted if "extra ==" not in wish}
     rest = sorted(names - {"numpy", "torch", "mitsuba", "mitsuba-oidn", *_SMALL_PACKAGES}, key=str.lower)
     versions = {name: installed_version(name) for name in rest}
-    absent = [name for name, version in versions.items() if version is None]
-    if absent:
-        return Component(
-            "other packages", "", MISSING, f"not installed: {', '.join(absent)}", _reinstall(" ".join(absent))
-        )
+    if absent := [name for name, version in versions.items() if version is None]:
+        why = f"not installed: {', '.join(absent)}"
+        return Component("other packages", "", MISSING, why, _reinstall(" ".join(absent)))
     return Component("other packages", "", OK, ", ".join(f"{name} {version}" for name, version in versions.items()))
 
 
@@ -144,18 +146,6 @@ def installed_version(name: str) -> str | None:
         return metadata.version(name)
     except metadata.PackageNotFoundError:
         return None
-
-
-def _tried(name: str, version: str, tried: dict[str, tuple[bool, str]]) -> Component:
-    if name not in tried:
-        return Component(name, version, BROKEN, f"not reached: {tried[''][1]}", "see libLLVM below")
-    worked, detail = tried[name]
-    if worked:
-        return Component(name, version, OK, detail)
-    if name == "render":
-        return Component(name, version, BROKEN, detail, "see libLLVM below, then mend mitsuba and drjit: make setup")
-    status = WARNING if name in OPTIONAL else BROKEN
-    return Component(name, version, status, detail, _reinstall(name))
 
 
 def _reinstall(name: str) -> str:
@@ -188,9 +178,8 @@ def bundled_scenes() -> Component:
         objects, environments = list_objects(), list_environments()
     except (ImportError, OSError, ValueError, KeyError, AdvsearchError) as error:
         return Component(name, "", MISSING, f"{type(error).__name__}: {error}", fix)
-    status = OK if objects and environments else MISSING
     detail = f"{len(objects)} objects, {len(environments)} environments"
-    return Component(name, "", status, detail, _NO_FIX_NEEDED if status == OK else fix)
+    return Component(name, "", OK, detail) if objects and environments else Component(name, "", MISSING, detail, fix)
 
 
 def reference_weights() -> Component:
@@ -222,9 +211,8 @@ def disk(folder: Path) -> Component:
     """The space left where runs are written by default."""
     free = shutil.disk_usage(folder).free
     if free < DISK_WANTED:
-        return Component(
-            "disk", "", WARNING, f"{free / GIB:.1f} GiB free in {folder}", "free some space, or --run elsewhere"
-        )
+        mend = "free some space, or --run elsewhere"
+        return Component("disk", "", WARNING, f"{free / GIB:.1f} GiB free in {folder}", mend)
     return Component("disk", "", OK, f"{free / GIB:.0f} GiB free in {folder}")
 
 
@@ -274,4 +262,4 @@ def _print_table(parts: list[Component], good: bool) -> None:
     console.print("Everything that is necessary works." if good else "[red]Something necessary does not work.[/]")
 
 
-DOCTOR = Command(output.add_flags, _doctor)
+DOCTOR = Command(_doctor, (output.add_flags,))

@@ -15,8 +15,7 @@ from collections.abc import Callable
 from functools import partial
 
 PIXELS = 8
-NOISE = 0.08
-"""Four standard deviations of the brightness of those pixels at 4 samples; the slope's are twice as large."""
+NOISE = 0.08  # four standard deviations of the brightness of those pixels at 4 samples; the slope's are twice as large
 
 
 def imported(name: str) -> str:

@@ -7,11 +7,12 @@ import io
 import os
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 from advsearch.cli import output
-from advsearch.cli.commands import Command
+from advsearch.cli.commands import Command, argument
 from advsearch.cli.output import at_work, output_errors
 from advsearch.described import rounded
 from advsearch.errors import InputError, UnknownNameError
@@ -21,8 +22,7 @@ from advsearch.runs.files import placed_by, replacing
 from advsearch.runs.store import NAME, Store
 from advsearch.viewer.thumbnails import kept_pictures
 
-Written = tuple[dict[str, object], str]
-"""What to tell of a file, as JSON and in words."""
+Written = tuple[dict[str, object], str]  # what to tell of a file, as JSON and in words
 
 
 class Writer(NamedTuple):
@@ -43,45 +43,32 @@ class Writer(NamedTuple):
     ending: str = ""
 
 
-def _dataset(format: str) -> Callable[[argparse.Namespace, Path], Written]:
-    def write(args: argparse.Namespace, out: Path) -> Written:
-        with at_work(as_json=True, quiet=False) as progress:
-            from advsearch.api.dataset import write_dataset  # takes seconds
+def _dataset(args: argparse.Namespace, out: Path, format: str) -> Written:
+    with at_work(as_json=True, quiet=False) as progress:
+        from advsearch.api.dataset import write_dataset  # takes seconds
 
-            count, notes = write_dataset(args.run, out, format, every=bool(args.all), progress=progress)
-        if not count:
-            raise InputError(f"{args.run}: no model is wrong in a picture of its rows; --all takes the others too")
-        return {"pictures": count, "notes": notes}, " ".join([f"{count} pictures in {out}.", *notes])
-
-    return write
+        count, notes = write_dataset(args.run, out, format, every=bool(args.all), progress=progress)
+    if not count:
+        raise InputError(f"{args.run}: no model is wrong in a picture of its rows; --all takes the others too")
+    return {"pictures": count, "notes": notes}, " ".join([f"{count} pictures in {out}.", *notes])
 
 
-def _gltf(args: argparse.Namespace, out: Path) -> Written:
+def _scene(args: argparse.Namespace, out: Path, format: str) -> Written:
     with at_work(as_json=True, quiet=False):
-        from advsearch.api.export import write_gltf  # takes seconds
+        # take seconds
+        from advsearch.api.export import write_gltf, write_mitsuba
+        from advsearch.api.projection import write_projection
 
-        notes = write_gltf(args.run, out)
-    return {"notes": notes}, " ".join([f"The object is in {out}.", *notes])
-
-
-def _mitsuba(args: argparse.Namespace, out: Path) -> Written:
-    with at_work(as_json=True, quiet=False):
-        from advsearch.api.export import write_mitsuba  # takes seconds
-
-        notes = write_mitsuba(args.run, out)
-    return {"notes": notes}, " ".join([f"The scene is in {out}.", *notes])
-
-
-def _projector(args: argparse.Namespace, out: Path) -> Written:
-    with at_work(as_json=True, quiet=False):
-        from advsearch.api.projection import write_projection  # takes seconds
-
-        notes = write_projection(args.run, out)
-    return {"notes": notes}, "\n".join([f"What to project is in {out}. Set:", *notes])
+        write, begin, between = {
+            "gltf": (write_gltf, f"The object is in {out}.", " "),
+            "mitsuba": (write_mitsuba, f"The scene is in {out}.", " "),
+            "projector": (write_projection, f"What to project is in {out}. Set:", "\n"),
+        }[format]
+        notes = write(args.run, out)
+    return {"notes": notes}, between.join([begin, *notes])
 
 
-USUAL_SIZE = 100.0
-"""Longest side of a printed object whose size is not known, in millimetres."""
+USUAL_SIZE = 100.0  # longest side of a printed object whose size is not known, in millimetres
 
 
 def _print(args: argparse.Namespace, out: Path) -> Written:
@@ -93,11 +80,14 @@ def _print(args: argparse.Namespace, out: Path) -> Written:
         known = real_size(args.run) if args.size is None else args.size
         longest = USUAL_SIZE if known is None else known
         pieces = printable(args.run, longest)
-        profile = None if args.icc is None else Path(args.icc)
+        options = {
+            "paper": (args.paper or "a4").lower(),
+            "profile": None if args.icc is None else Path(args.icc),
+            "most": MOST_SHEETS if args.sheets is None else args.sheets,
+        }
         title = f"{Path(args.run).name}, object of {rounded(longest)} mm"
         with placed_by("out"), replacing(out) as part:
-            paper, most = (args.paper or "a4").lower(), MOST_SHEETS if args.sheets is None else args.sheets
-            pages = write_sheets(part, pieces, title, paper=paper, profile=profile, most=most, last=chart_page)
+            pages = write_sheets(part, pieces, title, last=chart_page, **options)
     sizes = [{"name": piece.name, "width_mm": piece.size[0], "height_mm": piece.size[1]} for piece in pieces]
     text = f"{pages} pages in {out}; print them at 100 % and measure the square on the first"
     if known is None:
@@ -117,19 +107,20 @@ def _threedb(args: argparse.Namespace, out: Path) -> Written:
 WRITERS = {
     "coco": Writer(
         "The pictures with boxes and masks, as COCO has them.", "a folder",
-        "export mug-sweep-001 --format coco --out folder", _dataset("coco"),
+        "export mug-sweep-001 --format coco --out folder", partial(_dataset, format="coco"),
     ),
     "yolo": Writer(
         "The pictures with boxes, to train a YOLO.", "a folder", "export mug-sweep-001 --format yolo --out folder",
-        _dataset("yolo"),
+        partial(_dataset, format="yolo"),
     ),
     "gltf": Writer(
-        "The adversarial object as glTF.", "a .glb file", "export mug-texture-001 --format gltf --out mug.glb", _gltf,
-        "glb",
+        "The adversarial object as glTF.", "a .glb file", "export mug-texture-001 --format gltf --out mug.glb",
+        partial(_scene, format="gltf"), "glb",
     ),
     "mitsuba": Writer(
         "The adversarial scene for Mitsuba.", "an XML file and what belongs to it, or a new folder for them",
-        "export mug-texture-001 --format mitsuba --out folder", _mitsuba, "xml",
+        "export mug-texture-001 --format mitsuba --out folder",
+        partial(_scene, format="mitsuba"), "xml",
     ),
     "print": Writer(
         "A patch or texture as sheets to print.", "a PDF file",
@@ -137,7 +128,8 @@ WRITERS = {
     ),
     "projector": Writer(
         "A projector's picture, and marks to line it up.", "a new folder",
-        "export mug-projector-001 --format projector --out folder", _projector,
+        "export mug-projector-001 --format projector --out folder",
+        partial(_scene, format="projector"),
     ),
     "3db": Writer(
         "A sweep as a folder for 3DB's dashboard.", "a folder", "export mug-sweep-001 --format 3db --out folder",
@@ -147,37 +139,16 @@ WRITERS = {
 """What is no table, by the word of `--format`."""
 
 
-def _arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("run", metavar="RUN", help="a run's name or folder")
-    known = "; ".join(f"{format}: {one.text[0].lower()}{one.text[1:-1]}" for format, one in WRITERS.items())
+def _add_format(parser: argparse.ArgumentParser) -> None:
+    known = "; ".join(f"{format}: {writer.text[0].lower()}{writer.text[1:-1]}" for format, writer in WRITERS.items())
     text = f"csv, json or parquet: the rows as a table; {known} (default: by the name of --out, or csv)"
     parser.add_argument("--format", help=text.replace("%", "%%"))
-    parser.add_argument("--out", metavar="FILE", help="the file to write (default: standard output)")
-    parser.add_argument(
-        "--json", action="store_true", help="the same as --format json; with --out, tell what was written"
-    )
-    parser.add_argument("--kind", help="only rows of this kind: search, baseline, sweep, ... (default: all)")
-    parser.add_argument(
-        "--size", metavar="MM", type=float,
-        help=f"print: the real object's longest side in millimetres (default: its own where "
-        f"that is known, or {USUAL_SIZE:g})",
-    )  # fmt: skip
-    parser.add_argument(
-        "--sheets", metavar="N", type=int, help="print: sheets that may be written; more are refused (default: 200)"
-    )
-    parser.add_argument("--paper", help="print: a4, a3 or letter (default: a4)")
-    parser.add_argument(
-        "--all", action="store_true", default=None,
-        help="coco, yolo: right predictions too (default: pictures that a model is wrong about)",
-    )  # fmt: skip
-    output.add_code_flag(parser)
-    parser.add_argument("--icc", metavar="FILE", help="print: ICC profile of an RGB printer (default: sRGB)")
 
 
 def _export(args: argparse.Namespace) -> int:
     out = None if args.out is None else Path(args.out)
     by_name = "" if out is None else out.suffix.removeprefix(".").lower()
-    endings = {one.ending or format: format for format, one in WRITERS.items()}
+    endings = {writer.ending or format: format for format, writer in WRITERS.items()}
     format = args.format or endings.get(by_name, by_name)
     if format == "fiftyone":
         raise InputError("--format: fiftyone was removed, since FiftyOne reads COCO; use --format coco")
@@ -193,12 +164,8 @@ def _export(args: argparse.Namespace) -> int:
         raise InputError(f"--out: {format} writes {WRITERS[format].writes}; give its name")
     if args.kind is not None and format != "3db":
         raise InputError("--kind: is only for tables of rows; leave it out")
-    told, text = WRITERS[format].write(args, out)
-    if args.json:
-        output.print_json({"schema": 1, "command": "export", "format": format, **told, "out": str(out)})
-    else:
-        print(text, file=sys.stderr)
-    return 0
+    facts, text = WRITERS[format].write(args, out)
+    return output.say(args.json, {"command": "export", "format": format, **facts, "out": str(out)}, text, sys.stderr)
 
 
 def _table(args: argparse.Namespace, out: Path | None, by_name: str) -> int:
@@ -210,27 +177,47 @@ def _table(args: argparse.Namespace, out: Path | None, by_name: str) -> int:
         raise InputError(f"--out: expected the name of a file, got the folder {out}")
     folder = find_run(args.run)
     if (folder / PARTS).is_dir():
-        parts = ", ".join(str(one) for one in sorted((folder / PARTS).iterdir()))
+        parts = ", ".join(map(str, sorted((folder / PARTS).iterdir())))
         raise InputError(f"{folder}: is a study, whose rows are those of its parts; export one of {parts}")
     on_screen = io.BytesIO() if out is None and sys.stdout.isatty() else None
     with Store(folder / NAME, read_only=True) as store, output_errors():
         count = write_rows(store, format, out, on_screen or sys.stdout.buffer, args.kind)
     if on_screen is not None:
         print(on_screen.getvalue().decode("utf-8", "replace"), end="")
-    if out is not None and args.json:
-        output.print_json({"schema": 1, "command": "export", "rows": count, "format": format, "out": str(out)})
-    elif out is not None:
-        print(f"{count} rows in {out}" + ("" if by_name == format else f", as {format}"), file=sys.stderr)
-    return 0
+    if out is None:
+        return 0
+    text = f"{count} rows in {out}" + ("" if by_name == format else f", as {format}")
+    facts = {"command": "export", "rows": count, "format": format, "out": str(out)}
+    return output.say(args.json, facts, text, sys.stderr)
 
 
 EXPORT = Command(
-    _arguments,
     _export,
-    "",
     (
+        argument("run", metavar="RUN", help="a run's name or folder"),
+        _add_format,
+        argument("--out", metavar="FILE", help="the file to write (default: standard output)"),
+        argument("--json", action="store_true", help="the same as --format json; with --out, tell what was written"),
+        argument("--kind", help="only rows of this kind: search, baseline, sweep, ... (default: all)"),
+        argument(
+            "--size", metavar="MM", type=float,
+            help="print: the real object's longest side in millimetres (default: its own where that is known, or "
+            f"{USUAL_SIZE:g})",
+        ),
+        argument(
+            "--sheets", metavar="N", type=int, help="print: sheets that may be written; more are refused (default: 200)"
+        ),
+        argument("--paper", help="print: a4, a3 or letter (default: a4)"),
+        argument(
+            "--all", action="store_true", default=None,
+            help="coco, yolo: right predictions too (default: pictures that a model is wrong about)",
+        ),
+        output.add_code_flag,
+        argument("--icc", metavar="FILE", help="print: ICC profile of an RGB printer (default: sRGB)"),
+    ),
+    examples=(
         "export mug-texture-001",
         "export runs/mug-texture-001 --kind search --out search.parquet",
-        *(one.example for one in WRITERS.values()),
+        *(writer.example for writer in WRITERS.values()),
     ),
-)
+)  # fmt: skip

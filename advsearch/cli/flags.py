@@ -35,11 +35,8 @@ SCENE = (
     "surroundings (the same as --object FILE#NAME)"
 )
 
-IN_A_FILE = tuple(name for name in CONFIGS if name != "render")
-"""What the `command` of a file may say."""
-
-MOST_NAMES = 50
-"""Names of what is in a scene that one message lists."""
+IN_A_FILE = tuple(name for name in CONFIGS if name != "render")  # what the `command` of a file may say
+MOST_NAMES = 50  # names of what is in a scene that one message lists
 
 AnyConfig = TypeVar("AnyConfig", bound=Config)
 
@@ -54,32 +51,26 @@ def add_settings(
             continue
         if setting.group not in headings:
             headings[setting.group] = parser.add_argument_group(setting.group)
-        add = partial(
-            headings[setting.group].add_argument,
-            setting.flag,
-            dest=setting.field,
-            default=argparse.SUPPRESS,
-            help=help_text(setting),
-        )
+        add = partial(headings[setting.group].add_argument, default=argparse.SUPPRESS)
         if setting.field == "object":
-            headings[setting.group].add_argument("--scene", metavar="FILE", default=argparse.SUPPRESS, help=SCENE)
+            add("--scene", metavar="FILE", help=SCENE)
         if setting.form == "switch":
-            add(action="store_const", const=not setting.default)
+            options: dict[str, Any] = {"action": "store_const", "const": not setting.default}
         else:
-            add(action="store" if setting.form == "text" else "append", metavar=setting.metavar)
+            options = {"action": "store" if setting.form == "text" else "append", "metavar": setting.metavar}
+        add(setting.flag, dest=setting.field, help=help_text(setting), **options)
         for old in (old for old, new in config.formerly.items() if new == setting.field):
-            flag, hidden = f"--{old.replace('_', '-')}", argparse.SUPPRESS
-            headings[setting.group].add_argument(flag, dest=setting.field, default=hidden, help=hidden)
+            add(f"--{old.replace('_', '-')}", dest=setting.field, help=argparse.SUPPRESS)
 
 
 def config_from(args: argparse.Namespace, config: type[AnyConfig], **otherwise: Any) -> AnyConfig:
     """Return the configuration of a kind that the flags describe, with values for settings that were not given. Raises
     InputError where a value is not allowed."""
     typed: dict[str, Any] = {}
-    for one in settings(config):
-        if one.field in args:
-            text, read = getattr(args, one.field), READERS.get(one.form)
-            typed[one.field] = text if read is None else read(text, one.flag)
+    for setting in settings(config):
+        if setting.field in args:
+            text, read = getattr(args, setting.field), READERS.get(setting.form)
+            typed[setting.field] = text if read is None else read(text, setting.flag)
     allow_named(typed)
     data = {**otherwise, **typed}
     if "scene" in args and data.get("object") is None:
@@ -104,8 +95,7 @@ def config_of_file(command: str, file: str | Path, changes: Mapping[str, object]
 
 def _inside(scene: str) -> str:
     """Return the names of what can be the object in a scene file, as a message lists them."""
-    # late: another thing has this name here
-    from advsearch.scene.importing.files import shown
+    from advsearch.scene.importing.files import shown  # late: another thing has this name here
 
     # late, so that --help answers at once
     from advsearch.scene.importing.scenes import MITSUBA_FILE, node_names
@@ -126,9 +116,9 @@ def with_flags(message: str) -> str:
     or without. ``epsilon: ...; lower `steps` or use `denoise=none` `` becomes
     ``--epsilon: ...; lower --steps or use --denoise none``.
     """
-    known = [one for config in CONFIGS.values() for one in settings(config)]
-    flags = {**_NO_SETTINGS, **{one.name: one.flag for one in known}}
-    switches = {one.name for one in known if one.form == "switch"}
+    known = [setting for config in CONFIGS.values() for setting in settings(config)]
+    flags = {**_NO_SETTINGS, **{setting.name: setting.flag for setting in known}}
+    switches = {setting.name for setting in known if setting.form == "switch"}
 
     def written(match: re.Match[str]) -> str:
         name, value = match["name"], match["value"]
@@ -160,8 +150,7 @@ def _choices(given: Sequence[str], flag: str) -> dict[str, object]:
 def _axes(given: Sequence[str], flag: str) -> dict[str, object]:
     """Return parameter to values from ``PARAMETER=VALUES``, which YAML would take for numbers to the base of 60."""
     names = [text.partition("=")[0].strip() for text in given]
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
+    if twice := sorted({name for name in names if names.count(name) > 1}):
         raise InputError(f"{flag} {twice[0]}: given twice; write all values in one, separated by commas")
     quoted = [re.sub(r"=\s*([^\s\"'\[{].*)", lambda match: f'="{match[1]}"', text, count=1) for text in given]
     return _assignments(quoted, flag)

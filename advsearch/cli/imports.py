@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import advsearch
 from advsearch.cli import output
-from advsearch.cli.commands import Command
+from advsearch.cli.commands import Command, argument
 from advsearch.cli.output import at_work
 from advsearch.errors import InputError
 from advsearch.files import MESHES, either
@@ -20,14 +18,8 @@ if TYPE_CHECKING:
     from advsearch.scene.assets import ObjectAsset
     from advsearch.scene.importing.scenes import Contents
 
-VIEWS, SIDE = 4, 192
-"""Views of the picture, and the side of each in pixels."""
-
-
-def _import_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("file", metavar="FILE", help=f"a {either(MESHES)} file, or an .xml file of Mitsuba")
-    parser.add_argument("--out", metavar="FILE", help="a picture of all that is in it, from four sides (.png)")
-    output.add_flags(parser)
+VIEWS, SIDE = 4, 192  # views of the picture, and the side of each in pixels
+Told = tuple[dict[str, Any], list[str]]  # what is understood of a file, as JSON and in lines
 
 
 def _import(args: argparse.Namespace) -> int:
@@ -35,152 +27,106 @@ def _import(args: argparse.Namespace) -> int:
     if out is not None and out.suffix.lower() != ".png":
         raise InputError(f"--out: expected the name of a .png file, got {args.out}")
     with at_work(as_json=True, quiet=False):
-        # late: another thing has this name here
-        from advsearch.scene.importing.scenes import MITSUBA_FILE, contents
+        from advsearch.scene.importing.scenes import MITSUBA_FILE, contents  # late: another thing has this name here
 
         if Path(args.file).suffix.lower() == MITSUBA_FILE:
-            tell = _mitsuba(args, out)
+            facts, lines = _mitsuba_file(args.file, out)
         else:
-            found = contents(Path(args.file))
-            tell = partial(_tell_mesh_file, args, found)
+            inside = contents(Path(args.file))
+            facts, lines = _mesh_file(args.file, inside)
             if out is not None:
-                advsearch.render(advsearch.load_scene(found.object), around=VIEWS, resolution=SIDE).save(out)
-    return tell()  # standard output is kept clean until here
+                advsearch.render(advsearch.load_scene(inside.object), around=VIEWS, resolution=SIDE).save(out)
+    facts = {"command": "import", "file": args.file, **facts, "out": args.out}
+    return output.say(args.json, facts, "\n".join(lines))
 
 
-def _tell_mesh_file(args: argparse.Namespace, found: Contents) -> int:
-    whole = found.object
+def _mesh_file(file: str, inside: Contents) -> Told:
+    whole, nodes, rig = inside.object, inside.nodes, inside.object.mesh.rig
+    materials = {name: len(faces) for name, faces in whole.mesh.materials.items()}
+    width, height = whole.base_color.shape[1::-1]
+    up = None if whole.up is None else whole.up.axis
+    joints = [] if rig is None else [name.removesuffix(".x") for name in rig.defaults if name.endswith(".x")]
+    targets = [] if rig is None else [name.removesuffix(".weight") for name in rig.defaults if name.endswith(".weight")]
+    moves = {"clips": [] if rig is None else list(rig.clips), "joints": joints, "targets": targets}
+    slow = _slow(whole)
     facts = {
         "triangles": len(whole.mesh.faces),
-        "texture": list(whole.base_color.shape[1::-1]),
-        "up": None if whole.up is None else whole.up.axis,
+        "texture": [width, height],
+        "up": up,
+        "materials": [{"name": name, "triangles": count} for name, count in materials.items()],
+        "nodes": [{"name": n.name, "mesh": n.mesh, "triangles": n.triangles, "size": list(n.size)} for n in nodes],
+        "lights": list(inside.lights),
+        "cameras": list(inside.cameras),
+        **moves,
+        "slow": slow,
+        "warnings": list(whole.warnings),
     }
-    materials = {name: len(faces) for name, faces in whole.mesh.materials.items()}
-    slow = _slow(whole)
-    nodes = [
-        {"name": one.name, "mesh": one.mesh, "triangles": one.triangles, "size": list(one.size)} for one in found.nodes
-    ]
-    rig = whole.mesh.rig
-    moves: dict[str, list[str]] = {"clips": [], "joints": [], "targets": []}
-    if rig is not None:
-        moves["clips"] = list(rig.clips)
-        moves["joints"] = [name.removesuffix(".x") for name in rig.defaults if name.endswith(".x")]
-        moves["targets"] = [name.removesuffix(".weight") for name in rig.defaults if name.endswith(".weight")]
-    if args.json:
-        told = {
-            "file": args.file,
-            **facts,
-            "materials": [{"name": name, "triangles": count} for name, count in materials.items()],
-            "nodes": nodes,
-            "lights": list(found.lights),
-            "cameras": list(found.cameras),
-            **moves,
-        }
-        said = {"slow": slow, "warnings": list(whole.warnings), "out": args.out}
-        output.print_json({"schema": 1, "command": "import", **told, **said})
-        return 0
-    width, height = whole.base_color.shape[1], whole.base_color.shape[0]
-    print(f"{args.file}: {facts['triangles']:,} triangles, a texture of {width} x {height}, {facts['up']} up")
+    lines = [f"{file}: {len(whole.mesh.faces):,} triangles, a texture of {width} x {height}, {up} up"]
     if nodes:
-        rows = [
-            [one.name, one.mesh, f"{one.triangles:,} triangles", " x ".join(f"{side:.3g}" for side in one.size)]
-            for one in found.nodes
-        ]
-        print(output.aligned([["node", "in controls", "", "size"], *rows]))
-        print(f"One of them as the object, the rest around it: --object '{args.file}#{found.nodes[-1].name}'")
-        if len(found.nodes) > 1:
-            print(f"Another one moves with it: --control pose,pose:{found.nodes[0].mesh}")
-    paint = "materials (--control 'texture={materials: [NAME]}')"
-    turns, mixes = (
-        "joints (--control 'body={NAME.x: [-30, 30]}')",
-        "morph targets (--control 'body={NAME.weight: [0, 1]}')",
-    )
-    plays = "clips (--control 'body={clip: NAME, time: [0, 1]}')"
-    listed = {paint: materials, "lights": found.lights, "cameras (--camera NAME)": found.cameras}
-    listed |= {plays: moves["clips"], turns: moves["joints"], mixes: moves["targets"]}
-    for what, names in listed.items():
-        if names:
-            print(f"{what}: {', '.join(names)}")
-    for note in (*whole.warnings, *slow):
-        print(f"Note: {note}")
-    return 0
+        sizes = [" x ".join(f"{side:.3g}" for side in node.size) for node in nodes]
+        rows = [[n.name, n.mesh, f"{n.triangles:,} triangles", size] for n, size in zip(nodes, sizes, strict=True)]
+        lines.append(output.aligned([["node", "in controls", "", "size"], *rows]))
+        lines.append(f"One of them as the object, the rest around it: --object '{file}#{nodes[-1].name}'")
+        if len(nodes) > 1:
+            lines.append(f"Another one moves with it: --control pose,pose:{nodes[0].mesh}")
+    listed = {
+        "materials (--control 'texture={materials: [NAME]}')": materials,
+        "lights": inside.lights,
+        "cameras (--camera NAME)": inside.cameras,
+        "clips (--control 'body={clip: NAME, time: [0, 1]}')": moves["clips"],
+        "joints (--control 'body={NAME.x: [-30, 30]}')": joints,
+        "morph targets (--control 'body={NAME.weight: [0, 1]}')": targets,
+    }
+    lines += [f"{what}: {', '.join(names)}" for what, names in listed.items() if names]
+    return facts, lines + [f"Note: {note}" for note in (*whole.warnings, *slow)]
 
 
 def _slow(whole: ObjectAsset) -> list[str]:
     """Return what of an object makes searches slower, and why."""
     features = {"what it lets light through": whole.opacity, "its normal map": whole.normal_map}
     features["its emission"] = whole.emission
-    found = [name for name, one in features.items() if one is not None]
-    if not found:
-        return []
-    *others, last = found
-    named = f"{', '.join(others)} and {last}" if others else last
-    return [
-        f"slow: for {named}, controls that move outlines (pose, camera, geometry) are differentiated by differences, "
-        "which takes several renders a step; textures and light are not slower"
+    slow = [name for name, feature in features.items() if feature is not None]
+    return slow and [
+        f"slow: for {either(slow, 'and')}, controls that move outlines (pose, camera, geometry) are differentiated by "
+        "differences, which takes several renders a step; textures and light are not slower"
     ]
 
 
-def _mitsuba(args: argparse.Namespace, out: Path | None) -> Callable[[], int]:
-    """Read and picture, as its first camera sees it, a Mitsuba scene; return what prints what was understood."""
-    # late: another thing has this name here
-    from advsearch.scene.mitsuba_backend.scene_files import contents
+def _mitsuba_file(file: str, out: Path | None) -> Told:
+    """Read and picture, as its first camera sees it, a Mitsuba scene."""
+    from advsearch.scene.mitsuba_backend.scene_files import contents  # late: another thing has this name here
 
-    found = contents(Path(args.file))
+    inside = contents(Path(file))
     warnings: tuple[str, ...] = ()
-    if found.objects:
-        plain = next((name for name in found.objects if name not in found.lights), found.objects[0])
-        scene = advsearch.load_scene(plain, scene=args.file)
+    if inside.objects:
+        plain = next((name for name in inside.objects if name not in inside.lights), inside.objects[0])
+        scene = advsearch.load_scene(plain, scene=file)
         warnings = scene.description.object.warnings
         if out is not None:
             advsearch.render(scene, resolution=2 * SIDE).save(out)
     elif out is not None:
-        raise InputError(
-            f"{args.file}: no shape of it can be the object, so that it cannot be pictured; leave --out out"
-        )
-    listed = {
-        "objects": list(found.objects),
-        "kept": dict(found.kept),
-        "lights": list(found.lights),
-        "cameras": list(found.cameras),
-    }
-    return partial(_tell_scene, args, listed, warnings)
-
-
-def _tell_scene(args: argparse.Namespace, listed: Mapping[str, Any], warnings: Sequence[str]) -> int:
-    """Print what was understood of a Mitsuba scene: names by what they are."""
-    if args.json:
-        told = {"file": args.file, **listed, "warnings": list(warnings), "out": args.out}
-        output.print_json({"schema": 1, "command": "import", **told})
-        return 0
-    print(f"{args.file}: a Mitsuba scene")
-    for what, names in listed.items():
-        if names:
-            shown = [f"{name} ({names[name]})" if isinstance(names, dict) else name for name in names]
-            print(f"{what}: {', '.join(shown)}")
-    if listed["objects"]:
-        print(f"One of them as the object, the rest around it: --scene {args.file} --object {listed['objects'][-1]}")
-    for warning in warnings:
-        print(f"Note: {warning}")
-    return 0
+        raise InputError(f"{file}: no shape of it can be the object, so that it cannot be pictured; leave --out out")
+    kept = dict(inside.kept)
+    listed = {"objects": list(inside.objects), "kept": [f"{name} ({why})" for name, why in kept.items()]}
+    listed |= {"lights": list(inside.lights), "cameras": list(inside.cameras)}
+    lines = [f"{file}: a Mitsuba scene"]
+    lines += [f"{what}: {', '.join(names)}" for what, names in listed.items() if names]
+    if inside.objects:
+        lines.append(f"One of them as the object, the rest around it: --scene {file} --object {inside.objects[-1]}")
+    lines += [f"Note: {warning}" for warning in warnings]
+    return {**listed, "kept": kept, "warnings": list(warnings)}, lines
 
 
 IMPORT = Command(
-    _import_arguments,
     _import,
+    (
+        argument("file", metavar="FILE", help=f"a {either(MESHES)} file, or an .xml file of Mitsuba"),
+        argument("--out", metavar="FILE", help="a picture of all that is in it, from four sides (.png)"),
+        output.add_flags,
+    ),
     ". Nothing is written but the picture",
     ("import mug.obj", "import room.glb --json", "import room.glb --out room.png", "import box.xml --json"),
 )
-
-
-def _threedb_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.description = (
-        "Read details.log, class_maps.json and images/ of 3DB into a run: rows, small pictures, a page."
-    )
-    parser.add_argument("folder", metavar="FOLDER", help="what 3DB wrote")
-    parser.add_argument("--run", help="name or folder of the run (default: runs/FOLDER-3db-NNN)")
-    parser.add_argument("--overwrite", action="store_true", help="replace the run that is there")
-    output.add_flags(parser)
 
 
 def _import_threedb(args: argparse.Namespace) -> int:
@@ -194,4 +140,19 @@ def _import_threedb(args: argparse.Namespace) -> int:
     return 0
 
 
-IMPORT_3DB = Command(_threedb_arguments, _import_threedb)
+def _describe(parser: argparse.ArgumentParser) -> None:
+    parser.description = (
+        "Read details.log, class_maps.json and images/ of 3DB into a run: rows, small pictures, a page."
+    )
+
+
+IMPORT_3DB = Command(
+    _import_threedb,
+    (
+        _describe,
+        argument("folder", metavar="FOLDER", help="what 3DB wrote"),
+        argument("--run", help="name or folder of the run (default: runs/FOLDER-3db-NNN)"),
+        argument("--overwrite", action="store_true", help="replace the run that is there"),
+        output.add_flags,
+    ),
+)

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from typing import Any, NoReturn, cast
 
 from advsearch import __version__
-from advsearch.cli.commands import COMMANDS, GROUPS, command_named, help_of, texts_of
+from advsearch.cli.commands import COMMANDS, GROUPS, command_named, help_of
 from advsearch.cli.output import BAD_INPUT, INTERRUPTED, OK, end_output, open_descriptors, screens, shortened
 from advsearch.errors import AdvsearchError, InputError, UnknownNameError
 from advsearch.interrupts import INTERRUPTS, end_at_the_second, unless_interrupted
@@ -150,7 +150,7 @@ def _listing() -> str:
     lines = []
     for title, commands in GROUPS.items():
         lines.append(title)
-        for name in (one for one in commands if one in COMMANDS):
+        for name in filter(COMMANDS.__contains__, commands):
             begin = f"  {name}".ljust(column)
             lines.append(textwrap.fill(begin + help_of(name), width, subsequent_indent=" " * column))
         lines.append("")
@@ -164,13 +164,13 @@ def add_command(
     if not whole:
         return cast(argparse.ArgumentParser, subparsers.add_parser(name))
     command, text = command_named(name), help_of(name)
-    more, lines = texts_of(name)
+    examples = "".join(f"  advsearch {line}\n" for line in command.examples)
     parser: argparse.ArgumentParser = subparsers.add_parser(
         name,
         help=text,
-        description=f"{text[0].upper()}{text[1:]}{more}.",
-        epilog="".join(["examples:\n", *(f"  advsearch {line}\n" for line in lines)]) if lines else None,
-        formatter_class=argparse.RawDescriptionHelpFormatter if lines else argparse.HelpFormatter,
+        description=f"{text[0].upper()}{text[1:]}{command.more}.",
+        epilog=f"examples:\n{examples}" if examples else None,
+        formatter_class=argparse.RawDescriptionHelpFormatter if examples else argparse.HelpFormatter,
         allow_abbrev=False,
     )
     command.add_arguments(parser)
@@ -188,12 +188,12 @@ def _unknown_argument(argument: str, parser: argparse.ArgumentParser) -> InputEr
     if not name.startswith("--"):
         hint = f"; for the object write --object {argument}" if "--object" in known else ""
         return InputError(f"expected flags, got {argument!r}{hint}; see {parser.prog} --help")
-    owners = [one for one, config in CONFIGS.items() if name in (setting.flag for setting in settings(config))]
+    owners = [owner for owner, config in CONFIGS.items() if name in (setting.flag for setting in settings(config))]
     if owners:
         return InputError(f"{parser.prog} has no {name}, a flag of advsearch {', '.join(owners)}; leave it out")
     meant, reason = meant_by(name[2:].replace("-", "_"), [flag[2:] for flag in known])
     if meant or reason:
-        hint = f"; did you mean {' or '.join(f'--{one}' for one in meant)}?" if meant else ""
+        hint = f"; did you mean {' or '.join(f'--{flag}' for flag in meant)}?" if meant else ""
         return InputError(f"{parser.prog} has no {name}{hint}{f' ({reason})' if reason else ''}")
     return UnknownNameError("flag", name, set(known))
 

@@ -13,15 +13,14 @@ import json
 import os
 import shlex
 import sys
-import unicodedata
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, redirect_stdout, suppress
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, TextIO, cast
 
 from advsearch.errors import AdvsearchError, StorageError
 from advsearch.interrupts import INTERRUPTS
-from advsearch.progress import Progress, watched
+from advsearch.progress import Progress, escaped, watched
 
 if TYPE_CHECKING:
     from advsearch.runs.results import Result
@@ -31,16 +30,7 @@ OK, BAD_INPUT, FELL_SHORT, INTERRUPTED = 0, 2, 3, 130
 """Exit statuses of a command that did its work, was given what it cannot take, is a check that fell short, and was
 interrupted."""
 
-LONGEST_WORD = 300
-"""Most characters of a name in a message; of a longer one the ends are shown."""
-
-
-def escaped(text: str, encoding: str = "utf-8") -> str:
-    """Return `text` with everything but line ends and tabs that a terminal would not show written as an escape."""
-    if not text.isascii() or not text.isprintable():
-        plain = (one in "\n\t" or one.isprintable() or unicodedata.category(one) == "Zs" for one in text)
-        text = "".join(sign if shown else _escape(sign) for sign, shown in zip(text, plain, strict=True))
-    return text.encode(encoding, "backslashreplace").decode(encoding)
+LONGEST_WORD = 300  # most characters of a name in a message; of a longer one the ends are shown
 
 
 def shortened(text: str) -> str:
@@ -49,11 +39,6 @@ def shortened(text: str) -> str:
         word if len(word) <= LONGEST_WORD else f"{word[:100]}...{word[-40:]} ({len(word):,} characters)"
         for word in text.split(" ")
     )
-
-
-def _escape(sign: str) -> str:
-    code = ord(sign)
-    return f"\\x{code:02x}" if code < 0x100 else f"\\u{code:04x}" if code < 0x10000 else f"\\U{code:08x}"
 
 
 class Screen:
@@ -84,12 +69,8 @@ class Screen:
 
 @contextmanager
 def output_errors() -> Iterator[None]:
-    """Turn what goes wrong with standard output inside the block into a message.
-
-    Raises:
-        StorageError: it could not be written, for another reason than that nobody reads any more.
-        BrokenPipeError: nobody reads any more.
-    """
+    """Turn what goes wrong with standard output inside the block into a message. Raises StorageError: it could not be
+    written, for another reason than that nobody reads any more; BrokenPipeError: nobody reads any more."""
     try:
         yield
     except BrokenPipeError:
@@ -140,11 +121,15 @@ def _screen(stream: Any, *, needed: bool) -> TextIO:
     return cast(TextIO, Screen(there, needed=needed))
 
 
-def add_flags(parser: argparse.ArgumentParser, *, quiet: bool = False) -> None:
-    """Add ``--json`` and, for commands that take their time, ``--quiet``."""
+def add_flags(parser: argparse.ArgumentParser) -> None:
+    """Add ``--json``."""
     parser.add_argument("--json", action="store_true", help="print one JSON value on standard output")
-    if quiet:
-        parser.add_argument("--quiet", action="store_true", help="no progress and no messages on standard error")
+
+
+def add_quiet_flags(parser: argparse.ArgumentParser) -> None:
+    """Add ``--json`` and ``--quiet``, for commands that take their time."""
+    add_flags(parser)
+    parser.add_argument("--quiet", action="store_true", help="no progress and no messages on standard error")
 
 
 def add_code_flag(parser: argparse.ArgumentParser) -> None:
@@ -158,10 +143,19 @@ def add_code_flag(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def say(as_json: bool, facts: Mapping[str, object], text: str, stream: IO[str] | None = None) -> int:
+    """Print what a command has to say: facts as JSON, or a text, on standard output or another stream. Return the exit
+    status of a command that did its work."""
+    if as_json:
+        print_json({"schema": 1, **facts})
+    else:
+        print(text, file=stream)
+    return OK
+
+
 def print_json(value: Any) -> None:
     """Print `value` as JSON on standard output; NaN and infinity become null."""
-    # late, so that --help answers at once
-    from advsearch.runs.results import plain
+    from advsearch.runs.results import plain  # late, so that --help answers at once
 
     text = json.dumps(plain(value), indent=2, allow_nan=False, ensure_ascii=False)
     text = "".join(sign if sign.isprintable() or sign == "\n" else json.dumps(sign)[1:-1] for sign in text)
@@ -188,8 +182,7 @@ def go_on_text(result: Result) -> str:
 
 def go_on_command(run: str | Path) -> str:
     """Return the shell command that goes on with the run in a folder, with the Python code that its settings name."""
-    # late, so that --help answers at once
-    from advsearch.runs.directory import CONFIG, typed_name
+    from advsearch.runs.directory import CONFIG, typed_name  # late, so that --help answers at once
 
     words = ["advsearch", "resume", typed_name(run)]
     with suppress(AdvsearchError):
@@ -217,13 +210,22 @@ def _code_in(file: Path) -> Sequence[str]:
 
 @contextmanager
 def output_kept_clean() -> Iterator[None]:
-    """Send whatever is printed inside the block to standard error, be it by Python or by a native library.
-
-    So one JSON value, printed afterwards, is all that standard output holds.
-    """
+    """Send whatever is printed inside the block to standard error, be it by Python or by a native library. So one JSON
+    value, printed afterwards, is all that standard output holds."""
     sys.stdout.flush()
-    with redirect_stdout(sys.stderr), _descriptor_redirected(1, 2):
-        yield
+    kept: int | None = None
+    with suppress(OSError):  # where one of them is closed
+        kept = os.dup(1)
+        os.dup2(2, 1)
+    try:
+        with redirect_stdout(sys.stderr):
+            yield
+    finally:
+        if kept is not None:
+            with suppress(OSError, AttributeError):  # what the C library holds back, before its descriptor changes
+                ctypes.CDLL(None).fflush(None)
+            os.dup2(kept, 1)
+            os.close(kept)
 
 
 def shown_text(result: Result) -> str:
@@ -233,20 +235,18 @@ def shown_text(result: Result) -> str:
     from advsearch.report.shown import facts_of, remarks_of, shown
     from advsearch.runs.directory import REPORT
 
-    given, run = shown(result), getattr(result, "run", None)
-    parts = [given.said]
-    for one in given.sections:
-        if one.only not in ("", "text") or one.empty:
+    content, run = shown(result), getattr(result, "run", None)
+    parts = [content.said]
+    for part in content.sections:
+        if part.only not in ("", "text") or part.empty:
             continue
-        table = aligned([one.heads, *one.rows] if one.heads else one.rows)
-        pictures = [[picture.file, picture.caption] for group in one.pictures for picture in group]
-        inside = [*map(with_flags, one.text), "\n".join(filter(None, [table, aligned(pictures)]))]
-        parts.append("\n".join(filter(None, [one.title, "\n\n".join(filter(None, inside))])))
-    facts = [[name.lower(), text] for name, text in facts_of(result, given).items()]
+        table = aligned([part.heads, *part.rows] if part.heads else part.rows)
+        pictures = [[picture.file, picture.caption] for group in part.pictures for picture in group]
+        inside = [*map(with_flags, part.text), "\n".join(filter(None, [table, aligned(pictures)]))]
+        parts.append("\n".join(filter(None, [part.title, "\n\n".join(filter(None, inside))])))
+    facts = [[name.lower(), text] for name, text in facts_of(result, content).items()]
     parts.append(aligned([*facts, *([["page", f"{run}/{REPORT}"]] if run else [])]))
-    return "\n\n".join(filter(None, parts)) + "".join(
-        f"\n\nNote: {with_flags(text)}" for text in remarks_of(result, given)
-    )
+    return "\n\n".join([*filter(None, parts), *(f"Note: {with_flags(text)}" for text in remarks_of(result, content))])
 
 
 def aligned(rows: Sequence[Sequence[str]]) -> str:
@@ -255,25 +255,6 @@ def aligned(rows: Sequence[Sequence[str]]) -> str:
     return "\n".join(
         ("  " + "   ".join(cell.ljust(width) for cell, width in zip(row, wide, strict=False))).rstrip() for row in rows
     )
-
-
-@contextmanager
-def _descriptor_redirected(source: int, target: int) -> Iterator[None]:
-    """Let file descriptor `source` stand for `target` inside the block; do nothing where one of them is closed."""
-    try:
-        kept = os.dup(source)
-        os.dup2(target, source)
-    except OSError:
-        yield
-        return
-    try:
-        yield
-    finally:
-        # write out what the C library holds back, before its descriptor changes
-        with suppress(OSError, AttributeError):
-            ctypes.CDLL(None).fflush(None)
-        os.dup2(kept, source)
-        os.close(kept)
 
 
 @contextmanager

@@ -10,11 +10,12 @@ import importlib
 import inspect
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from advsearch.cli import commands, output
-from advsearch.cli.commands import Command, QuestionCommand
+from advsearch.cli.commands import Command, QuestionCommand, argument
 from advsearch.cli.flags import add_settings
 from advsearch.cli.output import at_work, raw
 from advsearch.errors import InputError, UnknownNameError
@@ -33,18 +34,6 @@ if TYPE_CHECKING:
     from advsearch.questions.photographs.result import PhotoAgreement
 
 
-def _show_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.usage = "advsearch show [--json] RUN [--picture] | control NAME | policy NAME | task NAME | recipe NAME"
-    parser.add_argument(
-        "what",
-        nargs="+",
-        metavar="WHAT",
-        help="a run's name or folder; or: control NAME, policy NAME, task NAME, recipe NAME",
-    )
-    parser.add_argument("--picture", action="store_true", help="draw a run's pictures in a terminal that can")
-    output.add_flags(parser)
-
-
 def _show(args: argparse.Namespace) -> int:
     """Print the result of a run, a control's parameters, or the options of a policy or a task."""
     if args.picture and (args.json or len(args.what) > 1):
@@ -58,11 +47,9 @@ def _show(args: argparse.Namespace) -> int:
             from advsearch.questions.recipe.description import read_recipe, recipe_yaml  # works without that room
 
             text = recipe_yaml(name)
-            if args.json:
-                output.print_json({"schema": 1, "recipe": name, **read_recipe(name).model_dump(mode="json")})
-            else:
-                print(text, end="")
-            return 0
+            return output.say(
+                args.json, {"recipe": name, **read_recipe(name).model_dump(mode="json")}, text.rstrip("\n")
+            )
         case [name]:
             try:
                 return show_run(name, args.json, picture=args.picture)
@@ -119,9 +106,6 @@ def _photos_text(table: PhotoAgreement) -> str:
 def _show_unfinished(run: Listed, as_json: bool) -> int:
     """Say what a run is, how far it has come and how to go on."""
     go_on = output.go_on_command(run.path) if run.begun and run.state == "stopped" else None
-    if as_json:
-        output.print_json({"schema": 1, **vars(run), "run": run.path, "ending": None, "resume": go_on})
-        return 0
     what = run.command
     if run.object:
         what += f" of {run.object}, {' and '.join(run.controls) or 'nothing searched'}"
@@ -131,12 +115,8 @@ def _show_unfinished(run: Listed, as_json: bool) -> int:
     if go_on is not None:
         lines += ["", f"Go on with: {go_on}"]
     elif run.state == "stopped":
-        lines += [
-            "",
-            "It was stopped before its settings were written, so it can't be resumed; start again.",
-        ]
-    print("\n".join(lines))
-    return 0
+        lines += ["", "It was stopped before its settings were written, so it can't be resumed; start again."]
+    return output.say(as_json, {**vars(run), "run": run.path, "ending": None, "resume": go_on}, "\n".join(lines))
 
 
 def _show_control(name: str, as_json: bool) -> int:
@@ -148,17 +128,15 @@ def _show_control(name: str, as_json: bool) -> int:
         raise UnknownNameError("control", name, CONTROLS)
     control = CONTROLS[name]
     parameters, choices = control.parameters, control.choices
-    if as_json:
-        output.print_json({"schema": 1, "control": name, "parameters": plain(parameters), "choices": plain(choices)})
-        return 0
-    print(f"{name}: {first_doc_line(control)}")
-    if not parameters:
-        print(f"\nThe scene names its parameters: --control {name}:KEY=[low, high]")
+    parts = [f"{name}: {first_doc_line(control)}"]
+    if parameters:
+        parts.append("parameters, searched or fixed:\n" + _table(list(map(_of_parameter, parameters))))
     else:
-        print(f"\nparameters, searched or fixed:\n{_table([_of_parameter(one) for one in parameters])}")
+        parts.append(f"The scene names its parameters: --control {name}:KEY=[low, high]")
     if choices:
-        print(f"\nsettings, chosen:\n{_table([_of_choice(one) for one in choices])}")
-    return 0
+        parts.append("settings, chosen:\n" + _table(list(map(_of_choice, choices))))
+    facts = {"control": name, "parameters": plain(parameters), "choices": plain(choices)}
+    return output.say(as_json, facts, "\n\n".join(parts))
 
 
 def _show_options(kind: str, name: str, as_json: bool) -> int:
@@ -170,49 +148,45 @@ def _show_options(kind: str, name: str, as_json: bool) -> int:
     registry: Mapping[str, type[Any]] = POLICIES if kind == "policy" else TASKS
     if name not in registry:
         raise UnknownNameError(kind, name, registry)
-    entry = registry[name]
-    options = {option: (type_of(one), default_of(one)) for option, one in declared_options(entry).items()}
-    defaults = {option: plain(getattr(default, "name", default)) for option, (_, default) in options.items()}
-    if as_json:
-        declared = [{"name": one, "type": options[one][0], "default": defaults[one]} for one in options]
-        output.print_json({"schema": 1, kind: name, "options": declared})
-        return 0
-    print(f"{name}: {first_doc_line(entry)}\n")
-    rows = [{"name": one, "type": options[one][0], "default": _cell(defaults[one])} for one in options]
-    print(f"options, as in --{kind} '{name}={{OPTION: VALUE}}':\n{_table(rows)}" if rows else "It has no options.")
-    return 0
+    entry, options = registry[name], list[dict[str, Any]]()
+    for option, field in declared_options(entry).items():
+        default = default_of(field)
+        options.append({"name": option, "type": type_of(field), "default": plain(getattr(default, "name", default))})
+    rows = [{**option, "default": _cell(option["default"])} for option in options]
+    table = f"options, as in --{kind} '{name}={{OPTION: VALUE}}':\n{_table(rows)}" if rows else "It has no options."
+    return output.say(as_json, {kind: name, "options": options}, f"{name}: {first_doc_line(entry)}\n\n{table}")
 
 
-def _of_parameter(one: Parameter) -> dict[str, str]:
+def _of_parameter(parameter: Parameter) -> dict[str, str]:
     """What a person wants to read of a parameter, in few columns."""
-    count = " x ".join("any" if side is None else str(side) for side in one.shape)
-    low, high = one.search or (0.0, 0.0)
-    searched = f"{low:g} to {high:g}" + (", log" if one.log else "")
+    count = " x ".join("any" if side is None else str(side) for side in parameter.shape)
+    low, high = parameter.search or (0.0, 0.0)
+    searched = f"{low:g} to {high:g}" + (", log" if parameter.log else "")
     return {
-        "name": one.name,
-        "unit": one.unit + (f" ({count})" if count else ""),
-        "allowed": ", ".join(one.options) or f"{one.low:g} to {one.high:g}",
-        "searched": "if asked" if one.search is None else "all" if one.options else searched,
-        "default": _cell(one.default),
-        "periodic": _cell(one.periodic),
-        "moves outlines": _cell(one.moves_silhouettes),
-        "derivative": "none" if one.options else ", ".join(one.estimators),
-        "description": one.description,
+        "name": parameter.name,
+        "unit": parameter.unit + (f" ({count})" if count else ""),
+        "allowed": ", ".join(parameter.options) or f"{parameter.low:g} to {parameter.high:g}",
+        "searched": "if asked" if parameter.search is None else "all" if parameter.options else searched,
+        "default": _cell(parameter.default),
+        "periodic": _cell(parameter.periodic),
+        "moves outlines": _cell(parameter.moves_silhouettes),
+        "derivative": "none" if parameter.options else ", ".join(parameter.estimators),
+        "description": parameter.description,
     }
 
 
-def _of_choice(one: Choice) -> dict[str, str]:
-    allowed = ", ".join(one.options)
-    if one.whole:
-        allowed = f"{one.whole[0]} to {one.whole[1]}"
-    elif one.most:
-        allowed = f"over 0 to {one.most:g}"
-    return {"name": one.name, "allowed": allowed, "default": _cell(one.default), "description": one.description}
+def _of_choice(choice: Choice) -> dict[str, str]:
+    allowed = ", ".join(choice.options)
+    if choice.whole:
+        allowed = f"{choice.whole[0]} to {choice.whole[1]}"
+    elif choice.most:
+        allowed = f"over 0 to {choice.most:g}"
+    default = _cell(choice.default)
+    return {"name": choice.name, "allowed": allowed, "default": default, "description": choice.description}
 
 
-def _table(declared: Sequence[Mapping[str, str]]) -> str:
-    rows = [list(one.values()) for one in declared]
-    return output.aligned([list(declared[0]), *rows])
+def _table(rows: Sequence[Mapping[str, str]]) -> str:
+    return output.aligned([list(rows[0]), *(list(row.values()) for row in rows)])
 
 
 def _cell(value: JsonValue) -> str:
@@ -221,20 +195,17 @@ def _cell(value: JsonValue) -> str:
     return "" if value is None else f"{value:g}" if isinstance(value, float) else str(value)
 
 
-HEIGHT = 16
-"""Of a picture, in lines."""
-
+HEIGHT = 16  # of a picture, in lines
 EXTRA = "pip install 'advsearch[terminal]'"
 
-FIRST = ("clean", "adversarial")
-"""What is shown of an attack; of another run, the first picture there is."""
+FIRST = ("clean", "adversarial")  # what is shown of an attack; of another run, the first picture there is
 
 
 def best_pictures(run: Path) -> list[Path]:
     """Return the pictures of a run that say most; none where it has none."""
     folder = run / IMAGES
     files = [folder / f"{name}.png" for name in FIRST]
-    if not all(one.is_file() for one in files):
+    if not all(file.is_file() for file in files):
         files = sorted(folder.glob("*.png"))[:1]
     return files
 
@@ -273,7 +244,24 @@ def _drawing() -> tuple[Callable[[Path], None] | None, str]:
     return lambda file: console.print(renderable.Image(file, height=HEIGHT)), ""
 
 
-SHOW = Command(_show_arguments, _show)
+def _set_usage(parser: argparse.ArgumentParser) -> None:
+    parser.usage = "advsearch show [--json] RUN [--picture] | control NAME | policy NAME | task NAME | recipe NAME"
+
+
+SHOW = Command(
+    _show,
+    (
+        _set_usage,
+        argument(
+            "what",
+            nargs="+",
+            metavar="WHAT",
+            help="a run's name or folder; or: control NAME, policy NAME, task NAME, recipe NAME",
+        ),
+        argument("--picture", action="store_true", help="draw a run's pictures in a terminal that can"),
+        output.add_flags,
+    ),
+)
 
 
 def render_text(result: RenderResult) -> str:
@@ -283,18 +271,15 @@ def render_text(result: RenderResult) -> str:
     lines += [f"{result.answered}: with the predictions drawn in"] if result.answered else []
     lines += [""]
     if len(result.views) == 1:
-        rows = [seen_cells(result.task, one) for one in result.views[0].answers]
+        rows = [seen_cells(result.task, answer) for answer in result.views[0].answers]
         lines += [f"Model {result.model} sees", output.aligned(rows)]
         if (things := result.views[0].things) is not None:
-            lines += [
-                "",
-                "In the picture",
-                output.aligned([["", *SEEN], *things_rows({k: vars(one) for k, one in things.items()})]),
-            ]
+            rows = things_rows({name: vars(thing) for name, thing in things.items()})
+            lines += ["", "In the picture", output.aligned([["", *SEEN], *rows])]
         return "\n".join(lines)
     rows = [["azimuth", f"model {result.model} sees"]]
     for view in result.views:
-        rows.append([f"{view.azimuth:g}", "; ".join(seen_text(result.task, one) for one in view.answers)])
+        rows.append([f"{view.azimuth:g}", "; ".join(seen_text(result.task, answer) for answer in view.answers)])
     return "\n".join([*lines, output.aligned(rows)])
 
 
@@ -312,8 +297,7 @@ RENDER = QuestionCommand(
 # ---- names -----------------------------------------------------------------------------------------------------------
 
 
-CASES = "cases"
-"""Of `stability`, which are not among all names."""
+CASES = "cases"  # of `stability`, which are not among all names
 
 _EVERY = {
     "objects": "advsearch.scene.library:list_objects",
@@ -332,23 +316,14 @@ REGISTRIES = {kind: place for kind, place in _EVERY.items() if there(place)}
 MODELS = {"reference": "the bundled classifier of household objects; models of your own are given as files"}
 
 
-def _list_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("kind", nargs="?", default="all", choices=[*REGISTRIES, "all"], help="default: all")
-    output.add_flags(parser)
-
-
 def _list(args: argparse.Namespace) -> int:
-    kinds = [one for one in REGISTRIES if one != CASES] if args.kind == "all" else [args.kind]
+    kinds = [kind for kind in REGISTRIES if kind != CASES] if args.kind == "all" else [args.kind]
     with at_work(as_json=True, quiet=False):
-        found = {kind: list_names(kind) for kind in kinds}
-    if args.json:
-        output.print_json({"schema": 1, **{kind: list(entries) for kind, entries in found.items()}})
-        return 0
-    for number, (kind, entries) in enumerate(found.items()):
-        if args.kind == "all":
-            print(("\n" if number else "") + f"{kind}:")
-        print(output.aligned([[name, text] for name, text in entries.items()]))
-    return 0
+        names = {kind: list_names(kind) for kind in kinds}
+    tables = {kind: output.aligned([*entries.items()]) for kind, entries in names.items()}
+    text = "\n\n".join(f"{kind}:\n{table}" for kind, table in tables.items())
+    facts = {kind: list(entries) for kind, entries in names.items()}
+    return output.say(args.json, facts, text if args.kind == "all" else tables[args.kind])
 
 
 def list_names(kind: str) -> dict[str, str]:
@@ -369,21 +344,17 @@ def first_doc_line(entry: Any) -> str:
     return (inspect.getdoc(documented) or "").partition("\n")[0]
 
 
-LIST = Command(_list_arguments, _list)
-
-
-def _labels_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("word", metavar="WORD", nargs="?", help="what the names should be like; all without it")
-    add_settings(parser, only=("model", "labels"))
-    output.add_flags(parser)
+LIST = Command(
+    _list,
+    (argument("kind", nargs="?", default="all", choices=[*REGISTRIES, "all"], help="default: all"), output.add_flags),
+)
 
 
 def _labels(args: argparse.Namespace) -> int:
     """Print index and name of the classes, best first. Raises InputError where no class is like the word, or the model
     has no names for its classes."""
     with at_work(as_json=True, quiet=False):
-        # late, so that --help answers at once
-        from advsearch.models.labels import matching_labels, names_nothing
+        from advsearch.models.labels import matching_labels, names_nothing  # late, so that --help answers at once
 
         labels = class_names(getattr(args, "model", "reference"), getattr(args, "labels", None))
         if args.word is None:
@@ -394,19 +365,15 @@ def _labels(args: argparse.Namespace) -> int:
             indices = [index for index in indices if not names_nothing(labels[index])]
     if not indices:
         raise InputError(f"none of the {len(labels)} labels is like {args.word!r}; leave the word out to see all")
-    if args.json:
-        listed = [{"index": index, "label": labels[index]} for index in indices]
-        output.print_json({"schema": 1, "command": "labels", "word": args.word, "labels": listed})
-    else:
-        print(output.aligned([[f"#{index}", labels[index]] for index in indices]))
-    return 0
+    listed = [{"index": index, "label": labels[index]} for index in indices]
+    text = output.aligned([[f"#{index}", labels[index]] for index in indices])
+    return output.say(args.json, {"command": "labels", "word": args.word, "labels": listed}, text)
 
 
 def class_names(model: str, labels: str | None) -> tuple[str, ...]:
     """Return the names of a model's classes in index order: those of a file, or else the model's own. Raises InputError
     where the model has none."""
-    # late, so that --help answers at once
-    from advsearch.models import load_model, read_labels
+    from advsearch.models import load_model, read_labels  # late, so that --help answers at once
 
     if labels is not None:
         return read_labels(labels)
@@ -418,8 +385,12 @@ def class_names(model: str, labels: str | None) -> tuple[str, ...]:
 
 
 LABELS = Command(
-    _labels_arguments,
     _labels,
+    (
+        argument("word", metavar="WORD", nargs="?", help="what the names should be like; all without it"),
+        partial(add_settings, only=("model", "labels")),
+        output.add_flags,
+    ),
     ". With --labels the model itself is not loaded. What stands for no thing, such as background, is left out",
     ("labels", "labels mug --labels labels.json", "labels mug --model model.pt2 --labels labels.json --json"),
 )

@@ -18,26 +18,19 @@ from advsearch.cluster.worker import Carried, Failure, Files, MachineInfo, Ready
 from advsearch.errors import ClusterError
 from advsearch.interrupts import INTERRUPTS
 
-DEATHS = 3
-"""Workers that may die of a batch before it is cut in halves or given up."""
-
-LOADS = 5
-"""Times that as many workers as there are may die while they get ready, and none gets ready, before all is given up."""
+DEATHS = 3  # workers that may die of a batch before it is cut in halves or given up
+LOADS = 5  # times that as many workers as there are may die while they get ready, and none does, before all is given up
 
 SLOW, LEAST_DEADLINE, FIRST_DEADLINE = 10.0, 60.0, 900.0
 """Times the median that a batch may take, least seconds of that, and seconds before there is a median."""
 
-MEDIAN_OF = 101
-"""Batches, the last ones, of which the median is taken."""
-
-ENOUGH = 5
-"""Batches that a median takes."""
+MEDIAN_OF = 101  # batches, the last ones, of which the median is taken
+ENOUGH = 5  # batches that a median takes
 
 PATIENCE, LESS_PATIENCE = 300.0, 15.0
 """Seconds without any worker after which there is no hope; where those that are there are refused, fewer."""
 
-POLL = 0.5
-"""Seconds between two looks at the clock, and at who is there."""
+POLL = 0.5  # seconds between two looks at the clock, and at who is there
 
 
 @dataclass(eq=False)
@@ -132,9 +125,9 @@ class Coordinator:
                 self._under_way += 1
                 self._submit(worker, carry_out_batch, self._key, batch.items)
 
-    def _prepare(self, worker: _Worker, *, send: bool = False) -> None:
-        """Have a worker get ready; `send` it the files then, which it may have already."""
-        files = self._files if send else Files(self._files.digests, {})
+    def _prepare(self, worker: _Worker) -> None:
+        """Have a worker get ready; it may have the files already, and is `sent` them otherwise."""
+        files = self._files if worker.sent else Files(self._files.digests, {})
         self._submit(worker, prepare, self._key, self._work, files, self._version)
 
     def _submit(self, worker: _Worker, function: Callable[..., Any], *args: Any) -> None:
@@ -183,7 +176,7 @@ class Coordinator:
             raise TypeError(f"on {worker.address}: {value!r:.80}")
         elif value.missing and not worker.sent:
             worker.sent = True
-            self._prepare(worker, send=True)
+            self._prepare(worker)
         elif value.unfit or value.missing or value.forgotten:
             if batch is not None and wanted:
                 self._todo.appendleft(batch)
@@ -233,7 +226,7 @@ class Coordinator:
             self.facts.link, self._alone_since = self._pool.link, self._clock()
             self._looked_at = float("-inf")
             return
-        for worker in [one for one in self._workers.values() if one.address not in there]:
+        for worker in [worker for worker in self._workers.values() if worker.address not in there]:
             yield from self._died(worker)
         self._avoided = {address: why for address, why in self._avoided.items() if address in there}
         for address in there:
@@ -241,13 +234,12 @@ class Coordinator:
                 self._workers[address] = worker = _Worker(address)
                 self._seen = max(self._seen, len(self._workers))
                 self._prepare(worker)
-        median = statistics.median(self._per_item) if len(self._per_item) >= ENOUGH else None
-        for worker in [one for one in self._workers.values() if one.call is not None]:
+        for worker in [worker for worker in self._workers.values() if worker.call is not None]:
             batch, deadline = worker.batch, FIRST_DEADLINE
-            if batch is not None and median is not None:
-                deadline = max(LEAST_DEADLINE, SLOW * median * len(batch.items))
-            if batch is not None and self._work.seconds is not None:
-                deadline = max(deadline, self._work.seconds)
+            if batch is not None:
+                if len(self._per_item) >= ENOUGH:
+                    deadline = max(LEAST_DEADLINE, SLOW * statistics.median(self._per_item) * len(batch.items))
+                deadline = max(deadline, self._work.seconds or 0.0)
             if now - worker.since > deadline:
                 self._tell(f"{worker.address} has not answered for {now - worker.since:.0f} s, so it is ended")
                 self._pool.restart(worker.address)
@@ -302,7 +294,7 @@ class Coordinator:
 
     def _give_up(self, text: str) -> None:
         reasons = "; ".join(dict.fromkeys(filter(None, self._avoided.values())))
+        why = f" ({reasons})" if reasons and reasons != text else ""
         raise ClusterError(
-            f"{self._pool.where}: {text}" + (f" ({reasons})" if reasons and reasons != text else "") + "; what was "
-            "stored is kept, so that the run can go on with advsearch resume"
+            f"{self._pool.where}: {text}{why}; what was stored is kept, so that the run can go on with advsearch resume"
         )

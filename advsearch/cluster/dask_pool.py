@@ -13,10 +13,10 @@ import time
 from collections.abc import Callable, Collection, Iterator, Mapping
 from concurrent.futures import Future
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from queue import SimpleQueue
-from typing import Any
+from typing import Any, NamedTuple
 
 from advsearch import threads
 from advsearch.cluster import Executor, Pool, SchedulerGoneError, Work, WorkerDiedError
@@ -26,14 +26,9 @@ from advsearch.cluster.worker import Failure, Files, read_files, this_machine, v
 from advsearch.errors import ClusterError, FileFormatError, InputError
 from advsearch.settings import read_yaml
 
-CONNECT, RECONNECT = 30.0, 120.0
-"""Seconds to find a scheduler at first, and to find it again when it has gone."""
-
-LOOK = 0.5
-"""Seconds between two tries to reach a scheduler."""
-
-RESTART = 20.0
-"""Seconds that a worker may take to end, and that a scheduler may take to say who is there."""
+CONNECT, RECONNECT = 30.0, 120.0  # seconds to find a scheduler at first, and to find it again when it has gone
+LOOK = 0.5  # seconds between two tries to reach a scheduler
+RESTART = 20.0  # seconds that a worker may take to end, and that a scheduler may take to say who is there
 
 SILENT = logging.CRITICAL + 1
 """Level of Dask's log: what matters of it is said in a user's words, and a worker that dies is no error here."""
@@ -48,12 +43,10 @@ CONFIG = {
     "distributed.admin.system-monitor.gil.enabled": False,
 }
 
-NO_WORKER = ("NoValidWorkerError", "NoWorkerError")
-"""Errors by which a scheduler ends a call whose worker has not been there for long."""
+NO_WORKER = ("NoValidWorkerError", "NoWorkerError")  # that end a call whose worker is not there
 
 
-@dataclass(frozen=True)
-class Site:
+class Site(NamedTuple):
     """Where workers are, in a user's words: the address of a scheduler that runs, or what starts a cluster and with how
     many workers (None: as it starts); and keywords of Dask's `Security`."""
 
@@ -154,8 +147,13 @@ class DaskPool:
             except KilledWorker as error:
                 raise WorkerDiedError(str(error)) from None
             except Exception as error:
+                # nothing of ours raises, so the worker could not even begin
                 if future.status == "error" and type(error).__name__ not in NO_WORKER:
-                    return _failure(error)
+                    text = f"{type(error).__name__}: {error}"
+                    if not isinstance(error, (ImportError, AttributeError, OSError, MemoryError)):
+                        return Failure(text, trace=text)
+                    advice = "" if isinstance(error, (OSError, MemoryError)) else "; install the same advsearch there"
+                    return Failure(f"it cannot begin ({text}){advice}", unfit=True)
             finally:
                 if client.status == "running":
                     future.release()
@@ -183,24 +181,13 @@ class DaskPool:
         for call in list(self._calls):
             call.cancel()
         client, cluster, self._client, self._cluster = self._client, self._cluster, None, None
-        for one in (client, cluster):
-            if one is not None:
+        for end in (client, cluster):
+            if end is not None:
                 with suppress(Exception):  # whether or not its other end is there
-                    one.close(timeout=RESTART)
-
-
-def _failure(error: Exception) -> Failure:
-    """What a call that raised comes to: nothing of ours does, so the worker could not even begin."""
-    text = f"{type(error).__name__}: {error}"
-    if isinstance(error, (ImportError, AttributeError)):
-        return Failure(f"it cannot begin ({text}); install the same advsearch there", unfit=True)
-    if isinstance(error, (OSError, MemoryError)):
-        return Failure(f"it cannot begin ({text})", unfit=True)
-    return Failure(text, trace=text)
+                    end.close(timeout=RESTART)
 
 
 LOCAL = "local"
-
 SCHEMES = ("tcp://", "tls://", "ws://", "wss://")
 
 CLASSES = {
@@ -243,30 +230,33 @@ def executor_of(
 
 def site_of(workers: int | None, cluster: str) -> Site:
     """Return where workers are, of a scheduler's address or a YAML file, and how many of them are wanted."""
-    path = Path(cluster)
     if cluster.startswith(SCHEMES):
-        found = Site(cluster, address=cluster)
-    elif path.suffix in (".yaml", ".yml"):
-        found = _from_file(path, workers)
+        site = Site(cluster, address=cluster)
+    elif cluster.endswith((".yaml", ".yml")):
+        site = _from_file(Path(cluster), workers)
     else:
         raise InputError(
             f"cluster: expected the address of a scheduler such as tcp://10.0.0.1:8786, local, or a .yaml file, got "
             f"{cluster!r}"
         )
-    if found.address and workers is not None:
+    if site.address and workers is not None:
         raise InputError("workers: the scheduler of `cluster` says how many there are; leave one of the two out")
-    return found
+    return site
 
 
 def _from_file(path: Path, workers: int | None) -> Site:
-    said = read_yaml(path)
+    said: dict[str, Any] = read_yaml(path)
     unknown = sorted(set(said) - {"address", "class", "arguments", "workers", "security"})
     if unknown or ("address" in said) == ("class" in said):
         got = f"got {', '.join(map(str, unknown))}" if unknown else "got both or neither"
         raise FileFormatError(
             f"{path}: expected either address, or class with arguments and workers; beside it security; {got}"
         )
-    security, arguments = (_mapping(path, said, name) for name in ("security", "arguments"))
+    for name in ("security", "arguments"):
+        given = said.get(name) or {}
+        if not isinstance(given, dict) or not all(isinstance(key, str) for key in given):
+            raise FileFormatError(f"{path}: {name}: expected names and values, got {given!r}")
+    security, arguments = {**(said.get("security") or {})}, said.get("arguments") or {}
     for name in ("tls_ca_file", "tls_client_cert", "tls_client_key", "tls_scheduler_cert", "tls_scheduler_key"):
         if isinstance(security.get(name), str):
             security[name] = str(path.parent / security[name])
@@ -282,17 +272,9 @@ def _from_file(path: Path, workers: int | None) -> Site:
     name = str(said["class"])
     if name not in CLASSES:
         raise FileFormatError(f"{path}: class: expected one of {', '.join(CLASSES)}, got {name!r}")
-    module = CLASSES[name]
     try:
-        found = getattr(importlib.import_module(module), name)
+        start = getattr(importlib.import_module(CLASSES[name]), name)
     except ImportError:
-        package = module.partition(".")[0].replace("_", "-")
+        package = CLASSES[name].partition(".")[0].replace("_", "-")
         raise InputError(f"cluster: {name} needs {package}; pip install {package}") from None
-    return Site(name, start=lambda **more: found(**{**arguments, **more}), security=security or None, count=count or 1)
-
-
-def _mapping(path: Path, said: Mapping[str, Any], name: str) -> dict[str, Any]:
-    given = said.get(name) or {}
-    if not isinstance(given, dict) or not all(isinstance(key, str) for key in given):
-        raise FileFormatError(f"{path}: {name}: expected names and values, got {given!r}")
-    return dict(given)
+    return Site(name, start=partial(start, **arguments), security=security or None, count=count or 1)

@@ -16,13 +16,13 @@ import tempfile
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache
 from importlib import metadata
 from pathlib import Path
 from queue import SimpleQueue
-from typing import Any
+from typing import Any, NamedTuple
 
 from advsearch import threads  # before torch: it sets how OpenMP waits
 from advsearch.cluster import Call, Work
@@ -32,8 +32,7 @@ from advsearch.registry import allow_code
 from advsearch.scene.mitsuba_backend.llvm import ensure_llvm
 
 _CPU_INFO = Path("/proc/cpuinfo")
-PACKAGES = ("mitsuba", "drjit", "torch", "numpy")
-"""Whose versions decide last bits."""
+PACKAGES = ("mitsuba", "drjit", "torch", "numpy")  # whose versions decide last bits
 
 MachineInfo = dict[str, str]
 
@@ -102,7 +101,11 @@ class MissingError(Exception):
 
 def read_files(work: Work) -> Files:
     """Read the files that the settings of a work name."""
-    contents = {str(one): one.read_bytes() for path in _paths(work) for one in _with_others(path)}
+    contents: dict[str, bytes] = {}
+    for value in map(work.settings.get, work.files):
+        for part in _split(value) if isinstance(value, str) else ():
+            if os.path.isabs(part) and Path(part).is_file():
+                contents |= {str(path): path.read_bytes() for path in _with_others(Path(part))}
     size = sum(map(len, contents.values()))
     if size > LARGEST:
         raise InputError(
@@ -139,14 +142,6 @@ def _is(path: Path, digest: str) -> bool:
     return path.is_file() and hashlib.sha256(path.read_bytes()).hexdigest() == digest
 
 
-def _paths(work: Work) -> Iterable[Path]:
-    for name in work.files:
-        value = work.settings.get(name)
-        for part in _split(value) if isinstance(value, str) else ():
-            if os.path.isabs(part) and Path(part).is_file():
-                yield Path(part)
-
-
 def _split(value: str) -> Iterator[str]:
     """Take ``/a.glb#NODE,/b.obj`` or ``/camera.csv+/object.csv`` apart into paths and what stands between them."""
     for part in re.split("(,)", value):
@@ -156,42 +151,35 @@ def _split(value: str) -> Iterator[str]:
         yield from ("+", *second) if second else (mark + inner,)
 
 
-def _with_others(path: Path) -> Sequence[Path]:
-    if path.suffix.lower() not in WITH_OTHERS:
-        return [path]
-    kinds = (*WITH_OTHERS[path.suffix.lower()], *PICTURES)
-    beside = (one for one in sorted(path.parent.rglob("*")) if one.suffix.lower() in kinds and one.is_file())
-    return list(dict.fromkeys([path, *beside]))
+def _with_others(path: Path) -> Iterator[Path]:
+    yield path
+    if path.suffix.lower() in WITH_OTHERS:
+        kinds = (*WITH_OTHERS[path.suffix.lower()], *PICTURES)
+        yield from (file for file in sorted(path.parent.rglob("*")) if file.suffix.lower() in kinds and file.is_file())
 
 
-MOST_LOADED = 2
-"""Works that a worker holds; the one that was not used for longest goes."""
-
-KERNELS, INPUTS = "kernels", "inputs"
-"""Folders below the machine's own: Dr.Jit's kernels, and files that were sent."""
+MOST_LOADED = 2  # works that a worker holds; the one that was not used for longest goes
+KERNELS, INPUTS = "kernels", "inputs"  # folders below the machine's own: Dr.Jit's kernels, and files that were sent
 
 _known: dict[str, Work] = {}
 _one_at_a_time = threading.Lock()
 
 
-@dataclass(frozen=True)
-class Ready:
+class Ready(NamedTuple):
     """A worker is ready."""
 
     machine: MachineInfo
     seconds: float
 
 
-@dataclass(frozen=True)
-class Carried:
+class Carried(NamedTuple):
     """A batch was carried out."""
 
     value: Any
     seconds: float
 
 
-@dataclass(frozen=True)
-class Failure:
+class Failure(NamedTuple):
     """Something went wrong, as a user reads it: another worker may do it (`unfit`), the worker is not ready (any more),
     or it lacks files. What is a bug has a trace."""
 
@@ -243,8 +231,8 @@ def own_folder() -> Path:
     """Return a folder on this machine's disk that only this user can write to; it outlives the worker."""
     folder = Path(tempfile.gettempdir()) / f"advsearch-{os.getuid()}"
     folder.mkdir(mode=0o700, exist_ok=True)
-    found = folder.lstat()
-    mine = stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & 0o022
+    facts = folder.lstat()
+    mine = stat.S_ISDIR(facts.st_mode) and facts.st_uid == os.getuid() and not facts.st_mode & 0o022
     return folder if mine else Path(tempfile.mkdtemp(prefix="advsearch-"))
 
 
@@ -264,8 +252,7 @@ def _failure(error: Exception, *, unfit: bool) -> Failure:
     return Failure(text, unfit, trace="" if ours else traceback.format_exc())
 
 
-SERVING = "ADVSEARCH_WORKER"
-"""Environment variable of a process that `serve`s."""
+SERVING = "ADVSEARCH_WORKER"  # environment variable of a process that `serve`s
 
 
 def serve() -> None:

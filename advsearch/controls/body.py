@@ -11,7 +11,7 @@ from advsearch.controls.numbers import NumberControl, Values
 from advsearch.controls.ranges import is_number
 from advsearch.controls.values import Number
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.scene.assets import Rig
+from advsearch.scene.assets import MeshRig
 from advsearch.scene.people import PARAMETERS
 from advsearch.scene.rigged import TIME, part_of_a_rig
 
@@ -32,7 +32,7 @@ class BodyControl(NumberControl):
         return (*cls.parameters, *(one for one in named if one is not None))
 
     @property
-    def rig(self) -> Rig:
+    def rig(self) -> MeshRig:
         """What moves the mesh."""
         mesh = self.mesh_in(self.scene)
         if mesh.mesh.rig is None:

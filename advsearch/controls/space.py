@@ -17,7 +17,7 @@ from advsearch.controls.values import Moved
 from advsearch.copies import is_ours
 from advsearch.errors import InputError
 from advsearch.scene.description import ENVIRONMENT, OWN_MAP, SceneDescription
-from advsearch.scene.validity import View, past, surroundings_of, view_of
+from advsearch.scene.validity import CameraView, past, surroundings_of, view_of
 
 VIEWS = 256  # configurations of a camera, a power of two, by which is found how far it goes
 
@@ -197,7 +197,7 @@ class Space:
         turns = any(group.setting == "environment.rotation" for group in self.groups)
         return (*scene.notes, *past(scene, self._views(scene), turns=turns))
 
-    def _views(self, scene: SceneDescription) -> list[View]:
+    def _views(self, scene: SceneDescription) -> list[CameraView]:
         """How the camera looks in some configurations, evenly spread, and where a coordinate is at an end."""
         if surroundings_of(scene) is None:
             return []

@@ -18,21 +18,15 @@ from torch import Tensor
 from advsearch import seeds
 from advsearch.scene.renderer import Renderer
 
-FIRST, VIEWS = 2, 6
-"""Views that are compared at first, and in all where these don't decide."""
-MARGIN = 0.3
-"""Mean difference of the margin over the views, with its sign, that is accepted (of a classifier: logits)."""
+FIRST, VIEWS = 2, 6  # views that are compared at first, and in all where these don't decide
+MARGIN = 0.3  # mean difference of the margin over the views, with its sign, that is accepted (of a classifier: logits)
 OF_MOVED = 0.05
 """The same as a share of what the search has moved the margin, where that is more: so much is the length of a step that
 is predicted, and not its direction."""
-BOUND = 2.0
-"""Levels of 255, root mean square over the object, that are good enough where a rendered picture has less noise."""
-CLEARLY_GOOD, CLEARLY_BAD = 0.7, 1.4
-"""Shares of what is allowed up to which, and from which on, the first views decide."""
-ACCEPTED = 0.9
-"""Share of the levels that is accepted in the end, so that a prediction beyond the limit seldom is by chance."""
-CHECK_SPP = 16
-"""Samples a pixel of each of the two traced pictures of a view."""
+BOUND = 2.0  # levels of 255, root mean square over the object, that will do where a rendered picture has less noise
+CLEARLY_GOOD, CLEARLY_BAD = 0.7, 1.4  # shares of what is allowed up to which, and from which on, the first views decide
+ACCEPTED = 0.9  # share of the levels that is accepted in the end, so that one beyond the limit seldom is by chance
+CHECK_SPP = 16  # samples a pixel of each of the two traced pictures of a view
 
 MarginOf = Callable[[Tensor, Tensor], float]
 """The margin of what a model says of a picture (H, W, 3) of a configuration (d,)."""
@@ -65,11 +59,11 @@ class Deviation:
 
     @classmethod
     def of(cls, views: Sequence[ComparedView]) -> Deviation:
-        square, allowed = (statistics.fmean(getattr(one, name) for one in views) for name in ("square", "allowed"))
-        logits = statistics.fmean(one.margin for one in views)
-        margin = max(MARGIN, OF_MOVED * statistics.fmean(one.moved for one in views))
-        levels, most = _root(square), max(BOUND, _root(allowed))
-        return cls(levels, logits, most, sum(one.pictures for one in views), margin)
+        square, allowed, logits, moved = (
+            statistics.fmean(getattr(view, name) for view in views) for name in ("square", "allowed", "margin", "moved")
+        )
+        pictures = sum(view.pictures for view in views)
+        return cls(_root(square), logits, max(BOUND, _root(allowed)), pictures, max(MARGIN, OF_MOVED * moved))
 
     @property
     def share(self) -> float:
@@ -90,11 +84,7 @@ class Deviation:
 
 
 def compared(view: Callable[[int], ComparedView]) -> Deviation:
-    """Compare predictions, in few views where these decide.
-
-    Args:
-        view: compares one, by its number below `VIEWS`.
-    """
+    """Compare predictions, in few views where these decide; `view` compares one, by its number below `VIEWS`."""
     views = [view(number) for number in range(FIRST)]
     first = Deviation.of(views)
     clearly = first.share <= CLEARLY_GOOD and abs(first.logits) <= CLEARLY_GOOD * first.margin
@@ -112,40 +102,27 @@ def view_of(
     margin: MarginOf,
     before: Tensor | None = None,
 ) -> ComparedView:
-    """Compare a predicted picture of a configuration with traced ones.
-
-    Args:
-        renderer: that traces paths.
-        predicted: (H, W, 3), without a graph.
-        u: (d,) of the whole space.
-        seed: number of the noise.
-        spp: samples a pixel of a rendered picture of the search.
-        margin: of what the model says.
-        before: the picture (H, W, 3) that was predicted in its place before the search; None where there was none.
-    """
+    """Compare a predicted picture (H, W, 3) of a configuration u (d,) of the whole space with traced ones. The search
+    renders with `spp` samples a pixel; `before` was predicted in its place before the search, if anything was."""
     with torch.no_grad():
         rendered = renderer(u, seeds.stream(seed, "rendered"), spp)
         *halves, clean = renderer.halves(u, seed, CHECK_SPP)
         seen = renderer.mask(u)
-    square, allowed = (squares_off(one, halves, seen) for one in (predicted, rendered))
-    found = margin(predicted, u)
-    moved = 0.0 if before is None else abs(found - margin(before, u))
-    return ComparedView(square, allowed, found - margin(clean, u), pictures=3, moved=moved)
+    square, allowed = (squares_off(picture, halves, seen) for picture in (predicted, rendered))
+    here = margin(predicted, u)
+    moved = 0.0 if before is None else abs(here - margin(before, u))
+    return ComparedView(square, allowed, here - margin(clean, u), pictures=3, moved=moved)
 
 
 def squares_off(picture: Tensor, halves: Sequence[Tensor], seen: Tensor | None = None) -> float:
-    """Return the mean squared difference, levels of 255, of a picture (H, W, 3) from what two traced ones converge to.
+    """Return the mean squared difference, levels of 255, of a picture (H, W, 3) from what two traced ones of
+    independent noise converge to, over the pixels that are seen, (H, W), or all where there are none.
 
     These are traced without the denoiser, which leaves its own marks in all that it is given. The mean product of the
     differences to both is the squared error without their noise, which a square would count.
-
-    Args:
-        picture: to be compared.
-        halves: the two traced ones, of independent noise.
-        seen: (H, W) the pixels that count; all where there are none.
     """
-    one, other = halves
-    products = (picture - one) * (picture - other)
+    first, second = halves
+    products = (picture - first) * (picture - second)
     return 255.0**2 * float((products if seen is None or not bool(seen.any()) else products[seen]).mean())
 
 

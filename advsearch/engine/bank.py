@@ -25,21 +25,14 @@ from advsearch.scene.formation import to_8_bit
 from advsearch.scene.predictor import MOST_BYTES
 from advsearch.scene.transport.matrix import LinearRenderer, Tick
 
-FIRST = 8
-"""Conditions in the bank at first, in what an evaluation draws."""
-GROWTH = 4
-"""An evaluation adds a condition for so many that it draws, while the bank grows."""
+FIRST = 8  # conditions in the bank at first, in what an evaluation draws
+GROWTH = 4  # an evaluation adds a condition for so many that it draws, while the bank grows
 EVERY = 100
-UNSEEN = 16
-"""Conditions that a comparison traces, and as many of the bank that it predicts."""
-SURE = 1.0
-"""Standard errors by which unseen conditions have to be better for the model."""
-SPP = 4
-"""Samples a pixel of the paths of a condition (see `problem.LIGHT_DEPTH`)."""
-TOGETHER = 16
-"""Pictures that the model is asked about at once."""
-SOBOL_MOST = 64
-"""Numbers of a condition up to which they are stratified."""
+UNSEEN = 16  # conditions that a comparison traces, and as many of the bank that it predicts
+SURE = 1.0  # standard errors by which unseen conditions have to be better for the model
+SPP = 4  # samples a pixel of the paths of a condition (see `problem.LIGHT_DEPTH`)
+TOGETHER = 16  # pictures that the model is asked about at once
+SOBOL_MOST = 64  # numbers of a condition up to which they are stratified
 
 
 def stratified(domain: Domain, number: int, seed: int) -> Tensor:
@@ -92,7 +85,7 @@ class Bank(PredictedSearch):
         return self._wanted(0) * SPP
 
     def size(self) -> tuple[int, int]:
-        return sum(one.renderer.entries for one in self._held), self._bytes
+        return sum(condition.renderer.entries for condition in self._held), self._bytes
 
     def conditions(self) -> BankOfConditions:
         gap = self.gaps[-1] if self.gaps else None
@@ -120,7 +113,7 @@ class Bank(PredictedSearch):
         return replace(evaluation, picture=to_8_bit(self._picture(query.u))) if query.keep else evaluation
 
     def _evaluated(self, chosen: Sequence[Condition], u: Tensor, gradient: WhichGradient) -> Evaluation:
-        wholes = [torch.cat([u, one.numbers]) for one in chosen]
+        wholes = [torch.cat([u, condition.numbers]) for condition in chosen]
         evaluation = self.problem.mean_under(lambda s, at: self._pictures(chosen[s], at), wholes, u, gradient, TOGETHER)
         return replace(evaluation, predicted=1)
 
@@ -128,19 +121,22 @@ class Bank(PredictedSearch):
         """The conditions that an evaluation looks at: what is new, and a random choice of the rest."""
         count = min(self.problem.draws, len(self._held))
         before = self._wanted(index - 1 if kind == "search" else self._last)
-        new = [one for one in self._held if one.number >= before][:count]
-        rest = [one for one in self._held if one.number < before]
-        generator = torch.Generator().manual_seed(seeds.stream(self.problem.seed, f"bank {kind}", index))
-        order = torch.randperm(len(rest), generator=generator).tolist()
-        return new + [rest[number] for number in order[: count - len(new)]]
+        new = [condition for condition in self._held if condition.number >= before][:count]
+        rest = [condition for condition in self._held if condition.number < before]
+        return new + self._some(rest, count - len(new), f"bank {kind}", index)
+
+    def _some(self, conditions: Sequence[Condition], count: int, stream: str, index: int) -> list[Condition]:
+        generator = torch.Generator().manual_seed(seeds.stream(self.problem.seed, stream, index))
+        order = torch.randperm(len(conditions), generator=generator).tolist()
+        return [conditions[number] for number in order[:count]]
 
     def _pictures(self, chosen: Sequence[Condition], u: Tensor) -> Tensor:
         """Predicted pictures (N, H, W, 3) of u under conditions, with a graph."""
-        alone = self.problem.searched_space.inputs(u)
-        pictures = []
-        for one in chosen:
-            whole, made = torch.cat([u, one.numbers]), one.renderer
-            pictures.append(made.shown({name: alone[name] for name in made.there}, whole) if one.alone else made(whole))
+        inputs, pictures = self.problem.searched_space.inputs(u), []
+        for condition in chosen:
+            whole, made = torch.cat([u, condition.numbers]), condition.renderer
+            alone = {name: inputs[name] for name in made.there} if condition.alone else None
+            pictures.append(made(whole) if alone is None else made.shown(alone, whole))
         return torch.stack(pictures)
 
     def _picture(self, u: Tensor) -> Tensor:
@@ -208,10 +204,8 @@ class Bank(PredictedSearch):
             noise = seeds.stream(problem.seed, "bank check", index)
             draws = [seeds.stream(noise, "draw", number) for number in range(UNSEEN)]
             unseen = [problem.evaluated(Query(u, draw), problem.whole(u, draw), draw)[0].objective for draw in draws]
-            generator = torch.Generator().manual_seed(noise)
-            order = torch.randperm(len(self._held), generator=generator).tolist()[:UNSEEN]
-            chosen = [self._held[number] for number in order]
-            wholes = [torch.cat([u, one.numbers]) for one in chosen]
+            chosen = self._some(self._held, UNSEEN, "bank check", index)
+            wholes = [torch.cat([u, condition.numbers]) for condition in chosen]
             judged, _ = problem.judged(partial(self._pictures, chosen), wholes, u, False)
             seen = [evaluation.objective for evaluation, _ in judged]
             self.gaps.append(statistics.fmean(seen) - statistics.fmean(unseen))

@@ -34,21 +34,17 @@ CHANGED: dict[str, Callable[[Tensor], Tensor]] = {
 }
 """What makes the changed picture of one (H, W, 3), sRGB in [0, 1]."""
 
-AWAY = "away"
-"""What is rendered again, see `Assembly.away`."""
-
-ALIKE = 0.1
-"""How far the probability of one label may move, and nothing has changed for `must_change`."""
+AWAY = "away"  # what is rendered again, see `Assembly.away`
+ALIKE = 0.1  # how far the probability of one label may move, and nothing has changed for `must_change`
 
 
 def changed(picture: Tensor, when: str, cameras: int = 1) -> Tensor:
     """Return a picture (H, W, 3) that is changed as a name of `CHANGED` says; of a rig those of all its cameras."""
-    return torch.cat([CHANGED[when](one) for one in picture.chunk(cameras, dim=1)], dim=1)
+    return torch.cat([CHANGED[when](part) for part in picture.chunk(cameras, dim=1)], dim=1)
 
 
 def as_claimed(claim: str, before: Prediction, after: Prediction) -> bool:
-    """Return whether a change did what is claimed of it: that it `must_change` what the model says, or
-    `must_not_change` it."""
+    """Return whether a change did what is claimed: that it `must_change` what the model says, or `must_not_change`."""
     moved = abs((before.probability or 0.0) - (after.probability or 0.0))
     another = before.label != after.label
     return another or moved > ALIKE if claim == "must_change" else not another

@@ -23,18 +23,12 @@ from advsearch.scene.renderer import Renderer
 Loss = Callable[[Tensor], Tensor]
 """From a picture (H, W, 3) sRGB to a number, by differentiable torch operations."""
 
-SMALL = 0.1
-"""Share of a control's largest derivative that each of its derivatives counts as, at least."""
-COORDINATEWISE = 8
-"""Groups of at most this many coordinates are probed one by one."""
-TOLERANCE = 0.05
-"""Relative error that the mean of an estimator may have beyond the noise."""
-LOUD = 0.2
-"""Noise of one gradient, relative to its size, from which it is called noisy."""
-CONFIDENCE = 2.5
-"""Standard errors within which two means agree."""
-TURNED = 0.0317
-"""Share of a full turn by which periodic coordinates are off their start where gradients are measured."""
+SMALL = 0.1  # share of a control's largest derivative that each of its derivatives counts as, at least
+COORDINATEWISE = 8  # groups of at most this many coordinates are probed one by one
+TOLERANCE = 0.05  # relative error that the mean of an estimator may have beyond the noise
+LOUD = 0.2  # noise of one gradient, relative to its size, from which it is called noisy
+CONFIDENCE = 2.5  # standard errors within which two means agree
+TURNED = 0.0317  # share of a full turn by which periodic coordinates are off their start where gradients are measured
 FACTORS = (1.0, 3.0, 9.0, 1.0 / 3.0)
 """Steps of differences that are tried in turn, as multiples of the plan's. A step that moves an outline by a pixel is
 as wide as a classifier's loss allows; a smooth loss allows more, and noise falls with the step. What moves no outline
@@ -123,41 +117,32 @@ def inside(renderer: Renderer, share: float = 0.12) -> Tensor:
 
 def probes(renderer: Renderer, loss: Loss, u: Tensor, seed: int, spp: int) -> list[Probe]:
     """Return what is worth measuring in a renderer's space: every continuous coordinate, or a direction in many."""
-    found = []
+    along = []
     for group in renderer.plan.groups:
         if group.estimator == "none":
             continue
-        if group.size <= COORDINATEWISE:
-            for number in range(group.size):
-                direction = torch.zeros_like(u)
-                direction[group.begin + number] = 1.0
-                name = group.name if group.size == 1 else f"{group.name}.{number}"
-                found.append(Probe(group, name, direction, group.step))
-        else:
-            found.append(_steep_probe(renderer, loss, u, group, seed, spp))
-    return found
-
-
-def _steep_probe(renderer: Renderer, loss: Loss, u: Tensor, group: Group, seed: int, spp: int) -> Probe:
-    """One direction in a large group: mostly the estimator's own gradient, so that there is something to see, and a
-    share of random signs, so that what the estimator leaves out shows too."""
-    gradient = estimated(renderer, loss, u, group.estimator, [group.name], seeds.stream(seed, "probe"), spp)
-    generator = torch.Generator().manual_seed(seeds.stream(seed, "probe signs"))
-    part = gradient[group.coordinates]
-    signs = torch.randint(0, 2, part.shape, generator=generator).to(part.dtype) * 2.0 - 1.0
-    direction = torch.zeros_like(u)
-    mixed = part.sign() + 0.5 * signs
-    direction[group.coordinates] = mixed / mixed.abs().max().clamp_min(1e-12)
-    step = group.step if group.size <= 64 else 0.03
-    return Probe(group, group.name, direction, step)
+        for number in range(group.size) if group.size <= COORDINATEWISE else ():
+            direction = torch.zeros_like(u)
+            direction[group.begin + number] = 1.0
+            name = group.name if group.size == 1 else f"{group.name}.{number}"
+            along.append(Probe(group, name, direction, group.step))
+        if group.size > COORDINATEWISE:
+            # mostly the estimator's own gradient, so that there is something to see, and a share of random signs, so
+            # that what the estimator leaves out shows too
+            gradient = estimated(renderer, loss, u, group.estimator, [group.name], seeds.stream(seed, "probe"), spp)
+            generator = torch.Generator().manual_seed(seeds.stream(seed, "probe signs"))
+            part, direction = gradient[group.coordinates], torch.zeros_like(u)
+            signs = torch.randint(0, 2, part.shape, generator=generator).to(part.dtype) * 2.0 - 1.0
+            mixed = part.sign() + 0.5 * signs
+            direction[group.coordinates] = mixed / mixed.abs().max().clamp_min(1e-12)
+            along.append(Probe(group, group.name, direction, group.step if group.size <= 64 else 0.03))
+    return along
 
 
 def only(plan: GradientPlan, names: Collection[str], estimator: str | None = None) -> GradientPlan:
     """Return the plan with the groups of these names differentiated, by an estimator or as planned, and no others."""
-    groups = tuple(
-        replace(one, estimator=(estimator or one.estimator) if one.name in names else "none") for one in plan.groups
-    )
-    return replace(plan, groups=groups)
+    chosen = {group.name: (estimator or group.estimator) if group.name in names else "none" for group in plan.groups}
+    return replace(plan, groups=tuple(replace(group, estimator=chosen[group.name]) for group in plan.groups))
 
 
 def estimated(
@@ -212,7 +197,7 @@ def gradients(
     Each has a seed of its own: a number in the `stream` of the root `seed`. `keep` is asked for each, as `place` and
     its number; `tick` is called after each.
     """
-    parts = [one.coordinates for one in plan.groups if one.estimator != "none"]
+    parts = [group.coordinates for group in plan.groups if group.estimator != "none"]
 
     def timed(number: int) -> dict[str, Any]:
         begun = time.perf_counter()
@@ -221,15 +206,15 @@ def gradients(
         numbers = base64.b64encode(taken.to(torch.float32).numpy().tobytes()).decode("ascii")
         return {"seconds": time.perf_counter() - begun, "numbers": numbers}
 
-    found, times = torch.zeros(repeats, len(u)), []
+    several, times = torch.zeros(repeats, len(u)), []
     for number in range(repeats):
-        one = keep(f"{place} gradient {number}", partial(timed, number))
-        numbers = torch.frombuffer(bytearray(base64.b64decode(one["numbers"])), dtype=torch.float32)
+        kept = keep(f"{place} gradient {number}", partial(timed, number))
+        numbers = torch.frombuffer(bytearray(base64.b64decode(kept["numbers"])), dtype=torch.float32)
         for part, values in zip(parts, numbers.split([part.stop - part.start for part in parts]), strict=True):
-            found[number, part] = values
-        times.append(one["seconds"])
+            several[number, part] = values
+        times.append(kept["seconds"])
         tick()
-    return found, statistics.median(times)
+    return several, statistics.median(times)
 
 
 def estimates(
@@ -247,8 +232,8 @@ def estimates(
     """Measure one estimator of one control's groups along some probes of them; `factor` as in `estimated`."""
     plan = only(renderer.plan.with_steps(factor), {probe.group.name for probe in along}, estimator)
     stream = estimator if factor == 1.0 else f"{estimator} x {factor:g}"
-    found, seconds = gradients(renderer, loss, u, plan, stream, seed=seed, spp=spp, repeats=repeats)
-    values = [[float(one @ probe.direction) for one in found] for probe in along]
+    several, seconds = gradients(renderer, loss, u, plan, stream, seed=seed, spp=spp, repeats=repeats)
+    values = [[float(gradient @ probe.direction) for gradient in several] for probe in along]
     return [
         Estimate(estimator, statistics.fmean(each), statistics.stdev(each), repeats, seconds, factor) for each in values
     ]
@@ -272,48 +257,43 @@ def reference(
     several `factors`, each gets the smaller number of seeds, both steps so many times wider, until one is sure enough;
     if none is, the one with the least noise goes on.
     """
-    before, found, errors = renderer.renders, dict[float, Reference](), dict[float, float]()
-    steps = {factor: probe.step if factor == 1.0 else min(STEP_RANGE[1], factor * probe.step) for factor in factors}
+    before, measured, errors = renderer.renders, dict[float, Reference](), dict[float, float]()
     pairs: dict[float, list[tuple[float, float]]] = {factor: [] for factor in factors}
+
+    def difference(step: float, seed: int) -> float:
+        """The central one, one-sided as far as the box asks for it."""
+        move, width = step * probe.direction, 2.0 * step
+        if probe.group.periodic:
+            above, below = (u + move).remainder(1.0), (u - move).remainder(1.0)
+        else:
+            above, below = (u + move).clamp(0.0, 1.0), (u - move).clamp(0.0, 1.0)
+            if probe.group.size <= COORDINATEWISE:
+                width = float((above - below) @ probe.direction)
+        with torch.no_grad():
+            return (float(loss(renderer(above, seed, spp))) - float(loss(renderer(below, seed, spp)))) / width
 
     def measure(factor: float, count: int) -> None:
         """Take differences at a step and at half of it until there are so many pairs, of the same seeds each."""
+        step = probe.step if factor == 1.0 else min(STEP_RANGE[1], factor * probe.step)
         for number in range(len(pairs[factor]), count):
             noise = seeds.stream(seed, "reference", number)
-            wide, narrow = (
-                _difference(renderer, loss, u, probe, step, noise, spp) for step in (steps[factor], 0.5 * steps[factor])
-            )
-            pairs[factor].append((wide, narrow))
+            pairs[factor].append((difference(step, noise), difference(0.5 * step, noise)))
         values = [(4.0 * fine - coarse) / 3.0 for coarse, fine in pairs[factor]]
         both = statistics.fmean(wide for wide, _ in pairs[factor]), statistics.fmean(fine for _, fine in pairs[factor])
         error = statistics.stdev(values) / math.sqrt(len(values)) if len(values) > 1 else math.inf
         noise_of_both = math.hypot(error, 0.25 * (both[0] - both[1]))
-        found[factor], errors[factor] = Reference(statistics.fmean(values), noise_of_both, both, 0, factor), error
+        measured[factor], errors[factor] = Reference(statistics.fmean(values), noise_of_both, both, 0, factor), error
 
     for factor in factors:
         measure(factor, repeats[0])
-        if errors[factor] <= goal * abs(found[factor].value):
+        if errors[factor] <= goal * abs(measured[factor].value):
             best = factor
             break
     else:
-        best = min(found, key=lambda factor: found[factor].noise)
-        while errors[best] > goal * abs(found[best].value) and len(pairs[best]) < repeats[1]:
+        best = min(measured, key=lambda factor: measured[factor].noise)
+        while errors[best] > goal * abs(measured[best].value) and len(pairs[best]) < repeats[1]:
             measure(best, len(pairs[best]) + 1)
-    return replace(found[best], renders=renderer.renders - before)
-
-
-def _difference(renderer: Renderer, loss: Loss, u: Tensor, probe: Probe, step: float, seed: int, spp: int) -> float:
-    """The central difference along a probe, one-sided as far as the box asks for it."""
-    move = step * probe.direction
-    if probe.group.periodic:
-        above, below, width = (u + move).remainder(1.0), (u - move).remainder(1.0), 2.0 * step
-    else:
-        above, below = (u + move).clamp(0.0, 1.0), (u - move).clamp(0.0, 1.0)
-        width = 2.0 * step
-        if probe.group.size <= COORDINATEWISE:
-            width = float((above - below) @ probe.direction)
-    with torch.no_grad():
-        return (float(loss(renderer(above, seed, spp))) - float(loss(renderer(below, seed, spp)))) / width
+    return replace(measured[best], renders=renderer.renders - before)
 
 
 def agreement(
@@ -360,23 +340,15 @@ def agreement(
     )
 
 
-def as_planned(group: Group) -> list[tuple[str, float]]:
-    """Return the one way to differentiate a group that its plan has, at its step."""
-    return [(group.estimator, 1.0)]
-
-
 def attempts(group: Group) -> list[tuple[str, float]]:
     """Return every estimator to measure on a group, with the multiple of the step; then other steps.
 
     Differences of the loss and of the picture are the same for a linear loss, so that wider steps are tried with one.
     """
-    forced = "forced" in group.reason
+    forced, steps = "forced" in group.reason, {group.step}
     tries = [(name, 1.0) for name in ([group.estimator] if forced else compared(group.valid, group.size))]
     wide = next((name for name in ("differences", "secant") if (name, 1.0) in tries), None)
-    if wide is None:
-        return tries
-    steps = {group.step}
-    for factor in FACTORS[1:]:
+    for factor in () if wide is None else FACTORS[1:]:
         step = min(factor * group.step, STEP_RANGE[1])
         if step not in steps:
             steps.add(step)
@@ -394,7 +366,7 @@ def derivatives(
     reference_spp: int,
     seeds_of_reference: tuple[int, int],
     reference_factors: Sequence[float] = (1.0,),
-    tried: Callable[[Group], Sequence[tuple[str, float]]] = as_planned,
+    tried: Callable[[Group], Sequence[tuple[str, float]]] = lambda group: [(group.estimator, 1.0)],
     repeats: tuple[int, int] = (6, 8),
     value: Callable[[str, Any, Callable[[], Any]], Any] = lambda name, kind, measure: measure(),
     stage: Callable[[str, int], None] = lambda name, steps: None,
@@ -404,7 +376,8 @@ def derivatives(
 
     Args:
         reference_spp, seeds_of_reference, reference_factors: as of `reference`.
-        tried: from a group the estimators to try, with multiples of the step; a wider one on what is not `ok` yet.
+        tried: from a group the estimators to try, by default as planned, with multiples of the step; a wider one on
+            what is not `ok` yet.
         repeats: gradients by an estimator at first, and by one with another step, which has to be surer.
         value: is asked for each measurement, by a name and the type of what the last argument measures.
         stage, tick: are told what begins and of how many steps, and of each step.
@@ -434,8 +407,8 @@ def derivatives(
                 count = repeats[0] if factor == 1.0 else repeats[1]
                 taken = partial(estimates, renderer, loss, u, estimator, wanted, seed=seed, spp=spp, repeats=count)
                 name = f"{estimator} x {factor:g} {','.join(probe.name for probe in wanted)}"
-                found = value(name, list[Estimate], partial(taken, factor=factor))
-                for probe, estimate in zip(wanted, found, strict=True):
+                measured = value(name, list[Estimate], partial(taken, factor=factor))
+                for probe, estimate in zip(wanted, measured, strict=True):
                     row = agreement(estimate, references[probe.name], list(references.values()), probe, spp)
                     good |= {probe.name} if row.status == "ok" else set()
                     yield row

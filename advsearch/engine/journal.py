@@ -15,7 +15,7 @@ from contextlib import closing
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import groupby
-from types import CodeType
+from types import CellType, CodeType
 from typing import Any, Protocol, TypeAlias
 
 import numpy as np
@@ -40,7 +40,7 @@ Sent: TypeAlias = tuple[str, Prepared | None, Query]
 """The name of the problem, what it has been prepared with, and what is asked."""
 
 
-class Evaluator(Protocol):
+class Answerer(Protocol):
     """What answers queries: a `Problem`, or a scene of a sweep."""
 
     def evaluate_all(self, queries: Sequence[Query], prepared: Prepared | None = None) -> Iterable[Evaluation]:
@@ -81,8 +81,8 @@ class Shared:
         """What workers say, each when it is its turn."""
         sent: list[Sent] = [(self.name, self.problem.prepared, query) for query in queries]
         early, turn = dict[int, Evaluation](), 0
-        numbers = {id(one): number for number, one in enumerate(sent)}
-        results: Any = executor.results([one] for one in sent)
+        numbers = {id(item): number for number, item in enumerate(sent)}
+        results: Any = executor.results([item] for item in sent)
         with closing(results):
             for done in results:
                 number = numbers[id(done.items[0])]
@@ -94,16 +94,15 @@ class Shared:
                     turn += 1
 
 
-def worker_call(named: Callable[[str], Evaluator]) -> Call:
+def worker_call(named: Callable[[str], Answerer]) -> Call:
     """Return what answers queries that were sent: what a worker does."""
 
     def call(sent: Sequence[Sent]) -> list[Evaluation]:
-        found = list[Evaluation]()
-        for name, some in groupby(sent, lambda one: one[0]):
-            listed = list(some)
-            prepared = listed[0][1]  # the same of all that are sent together
-            found += named(name).evaluate_all([query for _, _, query in listed], prepared)
-        return found
+        evaluations = list[Evaluation]()
+        for name, items in groupby(sent, lambda item: item[0]):
+            (_, prepared, first), *others = items  # prepared with the same, as they are sent together
+            evaluations += named(name).evaluate_all([first, *(query for _, _, query in others)], prepared)
+        return evaluations
 
     return call
 
@@ -119,14 +118,9 @@ def lost(query: Query, why: str) -> Evaluation:
     return Evaluation(math.nan, gradient, False, cost=cost, judgement=said, lost=True)
 
 
-MADE_OF = "made of"
-"""The note of functions and weights."""
-
-LONGEST = 10_000
-"""Characters of a function's source that are noted."""
-
-NEAR, LEAST = 1e-3, 1e-4
-"""Values of one picture are the same within this part of the larger, and this: other versions round differently."""
+MADE_OF = "made of"  # the note of functions and weights
+LONGEST = 10_000  # characters of a function's source that are noted
+NEAR, LEAST = 1e-3, 1e-4  # values of one picture are the same within this part of the larger, and this
 
 
 def check_made_of(
@@ -134,21 +128,20 @@ def check_made_of(
 ) -> None:
     """Note what networks and functions are, or refuse to go on with others than a run began with. A model behind an
     address keeps its answers in the run."""
-    several = [one.module.models if isinstance(one.module, Ensemble) else (one,) for one in models]
-    networks = [one for some in several for one in some]
-    for one in networks:
-        if isinstance(one.module, Asked):
-            one.module.keep_in(run.store)
-    now: dict[str, Any] = {f"model {one.name}": {"weights": weights_digest(one)} for one in networks}
-    now |= {name: _function(one) for name, one in (functions or {}).items() if one is not None}
+    now: dict[str, Any] = {}
+    for model in models:
+        for network in model.module.models if isinstance(model.module, Ensemble) else (model,):
+            if isinstance(network.module, Asked):
+                network.module.keep_in(run.store)
+            now[f"model {network.name}"] = {"weights": weights_digest(network)}
+    now |= {name: _function(function) for name, function in (functions or {}).items() if function is not None}
     before = run.store.noted(MADE_OF)
     if not isinstance(before, dict):
         run.store.set_note(MADE_OF, json.dumps(now))
         return
     for name, facts in now.items():
         noted = before.get(name)
-        if not isinstance(noted, dict):
-            continue
+        noted = noted if isinstance(noted, dict) else {}
         for key, what in (("weights", "has other weights"), ("code", "is another function")):
             same_python = key != "code" or noted.get("python") == facts.get("python")
             if same_python and None not in (noted.get(key), facts.get(key)) and noted[key] != facts[key]:
@@ -162,11 +155,11 @@ def weights_digest(model: Model) -> str | None:
     """Return the SHA-256 of a network's weights and buffers, with their names; None where it shows none."""
     try:
         state = model.module.state_dict()  # type: ignore[attr-defined]
-        tensors = {name: one for name, one in state.items() if isinstance(one, torch.Tensor)}
+        tensors = {name: tensor for name, tensor in state.items() if isinstance(tensor, Tensor)}
         digest = hashlib.sha256()
-        for name, one in sorted(tensors.items()):
-            digest.update(f"{name} {one.dtype} {tuple(one.shape)}\n".encode())
-            digest.update(one.detach().cpu().contiguous().flatten().view(torch.uint8).numpy().tobytes())
+        for name, tensor in sorted(tensors.items()):
+            digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}\n".encode())
+            digest.update(tensor.detach().cpu().contiguous().flatten().view(torch.uint8).numpy().tobytes())
     except (AttributeError, RuntimeError, TypeError, NotImplementedError):
         return None
     return digest.hexdigest() if tensors else None
@@ -200,37 +193,35 @@ def _function(function: Callable[..., Any]) -> dict[str, str | None]:
         source: str | None = inspect.getsource(bare)[:LONGEST]
     except (OSError, TypeError):
         source = None
-    code = getattr(bare, "__code__", None)
-    kept = (getattr(bare, "__defaults__", None), [_content(one) for one in getattr(bare, "__closure__", None) or ()])
-    said = None if code is None else repr((_parts(code, getattr(bare, "__doc__", None)), *map(_plain, kept)))
-    digest = None if said is None else hashlib.sha256(said.encode()).hexdigest()
+    code, digest = getattr(bare, "__code__", None), None
+    if code is not None:
+        held = [_plain(cell) for cell in getattr(bare, "__closure__", None) or ()]
+        parts = _parts(code, getattr(bare, "__doc__", None)), _plain(getattr(bare, "__defaults__", None)), held
+        digest = hashlib.sha256(repr(parts).encode()).hexdigest()
     return {"source": source, "code": digest, "python": "{}.{}".format(*sys.version_info)}
 
 
 def _parts(code: CodeType, text: str | None = None) -> tuple[Any, ...]:
     """What a function does, without where it stands, what it is called and the text that describes it."""
-    inner = [_parts(one) if isinstance(one, CodeType) else _plain(one) for one in code.co_consts if one != text]
+    inner = [_parts(part) if isinstance(part, CodeType) else _plain(part) for part in code.co_consts if part != text]
     return code.co_code.hex(), inner, code.co_names, code.co_freevars
-
-
-def _content(cell: Any) -> Any:
-    try:
-        return cell.cell_contents
-    except ValueError:  # nothing is in it yet
-        return None
 
 
 def _plain(value: Any) -> Any:
     """Numbers and texts, however deep; of anything else its type, since its text may be another one in each process."""
+    if isinstance(value, CellType):
+        try:
+            return _plain(value.cell_contents)
+        except ValueError:  # nothing is in it yet
+            return None
     if isinstance(value, (tuple, list)):
-        return [_plain(one) for one in value]
+        return [_plain(part) for part in value]
     if isinstance(value, frozenset):
         return sorted(map(repr, value))
     return value if isinstance(value, (int, float, complex, str, bytes, type(None))) else type(value).__name__
 
 
-MACHINES = "machines"
-"""The note under which the store keeps what they are."""
+MACHINES = "machines"  # the note under which the store keeps what they are
 
 
 @dataclass
@@ -256,15 +247,14 @@ class Machines:
         """What a reader has to know."""
         if not self.known:
             return []
-        told = "; ".join(", ".join(f"{key} {text}" for key, text in one.items()) for one in self.known.values())
+        told = "; ".join(", ".join(f"{key} {text}" for key, text in facts.items()) for facts in self.known.values())
         return [
             "Rows come from machines that are not alike, so that their last bits may differ; beside the one that kept "
             f"the run: {told}."
         ]
 
 
-PLAN = "gradient plan"
-"""The note under which the store keeps how derivatives are obtained."""
+PLAN = "gradient plan"  # the note under which the store keeps how derivatives are obtained
 
 
 @dataclass
@@ -321,7 +311,7 @@ class Journal:
                 step: Evaluation.of(judgement_of(row), predicted=0 if row.seed is not None else row.spp or 1)
                 for step, row in stored.items()
             }
-            self.lost += sum(one.said.prediction.label == LOST for one in self._trials[kind].values())
+            self.lost += sum(trial.said.prediction.label == LOST for trial in self._trials[kind].values())
         return self._trials[kind]
 
     def _holds(self, query: Query) -> bool:
@@ -362,7 +352,13 @@ class Journal:
             if evaluation.machine is not None:
                 self.machines.meet(evaluation.machine, self.traced.facts)
             if query.phase is None:
-                row = self._row_of_trial(query, evaluation)
+                values = dict(query.values)
+                if query.drawn:
+                    values |= self.problem.conditions_of(query.u, query.seed)
+                seed = None if evaluation.predicted else query.seed  # it has no noise of its own
+                spp = evaluation.predicted or query.spp
+                row = trial_row(query.kind, query.number, seed, spp, evaluation.said, values, sought=query.sought)
+                row = replace(row, machine=evaluation.machine, renders=evaluation.cost, seconds=evaluation.seconds)
                 if not numbered:
                     self._trials_of(query.kind)[query.number] = replace(evaluation, picture=None)
             elif self._holds(query):  # of a run that was done
@@ -376,18 +372,6 @@ class Journal:
         elif rows:
             self.run.record(*rows, told=told)
         return rows
-
-    def _row_of_trial(self, query: Query, evaluation: Evaluation) -> Row:
-        values = dict(query.values)
-        if query.drawn:
-            values |= self.problem.conditions_of(query.u, query.seed)
-        seed = None if evaluation.predicted else query.seed  # it has no noise of its own
-        spp = evaluation.predicted or query.spp
-        said, told = (
-            evaluation.said,
-            {"machine": evaluation.machine, "renders": evaluation.cost, "seconds": evaluation.seconds},
-        )
-        return trial_row(query.kind, query.number, seed, spp, said, values, sought=query.sought, **told)
 
     def _row_of_search(self, query: Query, evaluation: Evaluation) -> tuple[Row, Told]:
         problem = self.problem

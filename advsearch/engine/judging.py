@@ -6,9 +6,11 @@ import math
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from importlib import import_module
+from operator import attrgetter
 from types import MappingProxyType
 from typing import Any
 
@@ -34,7 +36,7 @@ from advsearch.scene.renderer import Renderer
 from advsearch.scene.surfaces import Surfaces
 from advsearch.scene.things import ALL
 from advsearch.scene.transport.matrix import linear_inputs
-from advsearch.tasks import Facts, Judgement, Prediction, Task
+from advsearch.tasks import Facts, Judgement, Task
 from advsearch.tasks.base import Output, Truth, mean
 
 Metric = Callable[[Tensor, Any, Any], Any]
@@ -43,8 +45,7 @@ tensor without axes."""
 
 Metrics = Mapping[str, Metric]
 
-MAIN = "__main__"
-"""The script that runs, which has another name in every other process."""
+MAIN = "__main__"  # the script that runs, which has another name in every other process
 
 
 def metrics_as_settings(metrics: Mapping[str, str | Metric]) -> dict[str, str]:
@@ -58,15 +59,15 @@ def metrics_as_settings(metrics: Mapping[str, str | Metric]) -> dict[str, str]:
             raise InputError(f"metrics: {name}: expected a function of (image, output, truth), got {function!r:.80}")
         if not isinstance(function, str):
             check_takes(f"metrics: {name}", function, "image", "output", "truth")
-    return {name: one if isinstance(one, str) else _text(one) for name, one in metrics.items()}
+    return {name: function if isinstance(function, str) else _text(function) for name, function in metrics.items()}
 
 
 def _text(metric: Metric) -> str:
     module, name = getattr(metric, "__module__", None), getattr(metric, "__qualname__", None)
-    found: Any = sys.modules.get(str(module))
+    named: Any = sys.modules.get(str(module))
     for part in str(name).split("."):
-        found = getattr(found, part, None)
-    return f"{module}:{name}" if found is metric else str(getattr(metric, "__name__", type(metric).__name__))
+        named = getattr(named, part, None)
+    return f"{module}:{name}" if named is metric else str(getattr(metric, "__name__", type(metric).__name__))
 
 
 def only_here(settings: Mapping[str, str]) -> list[str]:
@@ -85,31 +86,26 @@ def check_shared(settings: Mapping[str, str]) -> None:
 
 def load_metrics(settings: Mapping[str, str], given: Mapping[str, str | Metric] | None = None) -> Metrics:
     """Return the functions that settings name; `given` ones are there already, and take their place."""
-    return {
-        name: one if callable(one := (given or {}).get(name)) else _imported(name, text)
-        for name, text in settings.items()
-    }
-
-
-def _imported(name: str, text: str) -> Metric:
-    module, colon, attribute = text.partition(":")
-    if not colon or not attribute:
-        raise InputError(f"metrics: {name}: expected package.module:function, got {text!r}")
-    check_import(text)
-    try:
-        with current_directory_importable():
-            found: Any = import_module(module)
-            for part in attribute.split("."):
-                found = getattr(found, part)
-    except Exception as error:  # the user's code may raise anything
-        raise InputError(
-            f"metrics: {name}: {text} cannot be imported ({type(error).__name__}: {error}); a module is looked for on "
-            f"the Python path and in {os.getcwd()}"
-        ) from error
-    if not callable(found):
-        raise InputError(f"metrics: {name}: expected a function of (image, output, truth), got {found!r:.80}")
-    metric: Metric = found
-    return metric
+    functions: dict[str, Any] = {name: one for name, one in (given or {}).items() if name in settings and callable(one)}
+    for name, text in settings.items():
+        if name in functions:
+            continue
+        module, colon, attribute = text.partition(":")
+        if not colon or not attribute:
+            raise InputError(f"metrics: {name}: expected package.module:function, got {text!r}")
+        check_import(text)
+        try:
+            with current_directory_importable():
+                functions[name] = attrgetter(attribute)(import_module(module))
+        except Exception as error:  # the user's code may raise anything
+            raise InputError(
+                f"metrics: {name}: {text} cannot be imported ({type(error).__name__}: {error}); a module is looked for "
+                f"on the Python path and in {os.getcwd()}"
+            ) from error
+        if not callable(functions[name]):
+            got = f"{functions[name]!r:.80}"
+            raise InputError(f"metrics: {name}: expected a function of (image, output, truth), got {got}")
+    return {name: functions[name] for name in settings}
 
 
 def judgements(
@@ -142,60 +138,53 @@ def measured(judgement: Judgement, metrics: Metrics, image: Tensor, output: Outp
     as an objective does, of one picture; all that it gets are copies."""
     if not metrics:
         return judgement
-    found: dict[str, float | None] = {}
+    said, numbers = dict[str, Any](), dict[str, float | None]()
     seen, right = _of_one(output, truth)
     with torch.no_grad():
         for name, metric in metrics.items():
-            said = metric(*copied((image.detach(), seen, right)))
-            if isinstance(said, Mapping):
-                found |= {f"{name}.{key}": _number(f"{name}.{key}", one) for key, one in said.items()}
-            else:
-                found[name] = _number(name, said)
-    return replace(judgement, metrics=found)
+            value = metric(*copied((image.detach(), seen, right)))
+            values = {f"{name}.{key}": each for key, each in value.items()} if isinstance(value, Mapping) else None
+            said |= {name: value} if values is None else values
+        for name, value in said.items():
+            try:
+                number = float(value)
+            except (TypeError, ValueError, RuntimeError):
+                raise InputError(
+                    f"metrics: {name}: expected a number, or a dict from names to numbers, got {value!r:.80}"
+                ) from None
+            numbers[name] = number if math.isfinite(number) else None
+    return replace(judgement, metrics=numbers)
 
 
 def _of_one(output: Output, truth: Truth) -> tuple[Any, Any]:
     """The output and the truth of one picture as a metric gets them; of several models, a tuple of each."""
-    one = output[0]
-    if isinstance(one, (tuple, list)):
-        each = [_of_one(own, true) for own, true in zip(one, truth, strict=True)]
+    first = output[0]
+    if isinstance(first, (tuple, list)):
+        each = [_of_one(*both) for both in zip(first, truth, strict=True)]
         return tuple(seen for seen, _ in each), tuple(right for _, right in each)
     labels = labels_of(truth, output, 1)
-    return one, labels[0] if isinstance(labels, Tensor) else labels
+    return first, labels[0] if isinstance(labels, Tensor) else labels
 
 
-def mean_metrics(judgements: Sequence[Judgement | None]) -> dict[str, float | None] | None:
+def mean_metrics(judgements: Sequence[Judgement]) -> dict[str, float | None] | None:
     """Return the mean of each metric over pictures of which it is a number; None where there are no metrics."""
-    each = [one.metrics for one in judgements if one is not None and one.metrics is not None]
+    each = [judgement.metrics for judgement in judgements if judgement.metrics is not None]
     names = dict.fromkeys(name for metrics in each for name in metrics)
-    numbers = {name: [one for metrics in each if (one := metrics.get(name)) is not None] for name in names}
-    return {name: mean(found) if found else None for name, found in numbers.items()} or None
+    numbers = {name: [number for metrics in each if (number := metrics.get(name)) is not None] for name in names}
+    return {name: mean(known) if known else None for name, known in numbers.items()} or None
 
 
-def _number(name: str, said: Any) -> float | None:
-    try:
-        number = float(said)
-    except (TypeError, ValueError, RuntimeError):
-        raise InputError(
-            f"metrics: {name}: expected a number, or a dict from names to numbers, got {said!r:.80}"
-        ) from None
-    return number if math.isfinite(number) else None
-
-
-LOOK_SPP = 16
-"""Samples a pixel of the clean picture that the model is shown."""
+LOOK_SPP = 16  # samples a pixel of the clean picture that the model is shown
 
 Described = Callable[[], Mapping[str, Value]]
 """What says the configuration in named values, when it is asked."""
-
 
 Looked = Callable[[], Surfaces]
 """What says what the camera sees, when it is asked."""
 
 
 def facts_of(scene: Scene, name: str, config: SceneConfig, describe: Described, look: Looked | None = None) -> Facts:
-    """Return what a scene gives a task to judge by, with what is right and what is judged by the settings; see
-    `facts_about`."""
+    """Return what a scene gives a task to judge by, with what the settings say; see `facts_about`."""
     return facts_about(scene.description, name, config.label, describe, look, config.judge)
 
 
@@ -219,12 +208,21 @@ def check_truth(task: Task, model: Model, scene: Scene, facts: Facts, config: Sc
     """Refuse a scene of which the task cannot say what is right, before anything is prepared; where no label was given,
     with the model's first predictions of a clean picture."""
     try:
-        for one in facts.each.values() or (facts,):
-            task.check(one)
+        for each in facts.each.values() or (facts,):
+            task.check(each)
     except InputError as error:
         if facts.label is not None:
             raise
-        raise InputError(f"{error}; {_advice(task, model, scene, config)}") from None
+        predictions = render(scene, model, task=task, spp=LOOK_SPP, **pictures_of(config)).views[0].predictions
+        said = ", ".join(seen_text(task.name, replace(each, label=repr(each.label))) for each in predictions)
+        term = f"#{predictions[0].index}"
+        with suppress(InputError):  # the label, where that names this class and no other
+            if model.label_set(predictions[0].label).indices == (predictions[0].index,):
+                term = predictions[0].label
+        raise InputError(
+            f"{error}; model {model.name} calls a clean picture of it {said}; name what is right, such as "
+            f'`label="{term}"`'
+        ) from None
 
 
 def one_label_for_several(models: Sequence[Model], label: str | None, objects: Mapping[str, str | None]) -> list[str]:
@@ -232,47 +230,25 @@ def one_label_for_several(models: Sequence[Model], label: str | None, objects: M
     called, by the labels of their own."""
     if label is None or len(objects) < 2:
         return []
-    others = [f"{name} (its own is {own!r})" for name, own in objects.items() if own and _differs(models, label, own)]
+
+    def differ(own: str) -> bool:
+        """Whether a model has classes for both labels, and none in common."""
+        for model in models:
+            try:
+                known = set(model.label_set(own).indices)
+            except InputError:
+                continue
+            if not known & set(model.label_set(label).indices):
+                return True
+        return False
+
+    others = [f"{name} (its own is {own!r})" for name, own in objects.items() if own and differ(own)]
     if not others:
         return []
     return [
         f"The label {label!r} is taken as the right label for every object, also for {', '.join(others)}; without a "
         "label, each object has its own."
     ]
-
-
-def _differs(models: Sequence[Model], label: str, own: str) -> bool:
-    """Whether a model has classes for both labels, and none in common."""
-    for model in models:
-        try:
-            known = set(model.label_set(own).indices)
-        except InputError:
-            continue
-        if not known & set(model.label_set(label).indices):
-            return True
-    return False
-
-
-def _advice(task: Task, model: Model, scene: Scene, config: SceneConfig) -> str:
-    """What the model predicts of a clean picture, and how to take the first of these for right."""
-    looked = render(scene, model, task=task, spp=LOOK_SPP, **pictures_of(config))
-    predictions = looked.views[0].predictions
-    listed = ", ".join(
-        seen_text(task.name, replace(prediction, label=repr(prediction.label))) for prediction in predictions
-    )
-    return (
-        f"model {model.name} calls a clean picture of it {listed}; name what is right, such as "
-        f'`label="{_term(model, predictions[0])}"`'
-    )
-
-
-def _term(model: Model, prediction: Prediction) -> str:
-    """What names the class of a prediction and no other: its label, or else its number."""
-    try:
-        known = model.label_set(prediction.label).indices == (prediction.index,)
-    except InputError:
-        known = False
-    return prediction.label if known else f"#{prediction.index}"
 
 
 MOST_NUMBERS, MOST = 64, 512

@@ -52,8 +52,7 @@ its instance, and ``mitsuba:KEY`` a range."""
 
 Texture = str | Path | npt.ArrayLike | Tensor
 
-CONTROL, SCENE, MODEL = "control", "scene", "model"
-"""Kinds of things that may stand for a name (`lent`)."""
+CONTROL, SCENE, MODEL = "control", "scene", "model"  # kinds of things that may stand for a name (`lent`)
 
 DEFAULT_RESOLUTION = 128
 
@@ -103,18 +102,13 @@ class Scene:
             return make_renderer(description, space, resolution, denoise, seed, estimators, sampler=sampler)
 
     def lit_by(self, environment: EnvironmentAsset | None) -> Scene:
-        """Return the scene under another environment that was asked for; None for no map.
-
-        Raises:
-            InputError: its ground shows a photograph, and there is none.
-        """
-        name = NO_MAP if environment is None else environment.name
-        own = self.description
-        given = own.given | {ENVIRONMENT}
+        """Return the scene under another environment that was asked for; None for no map. Raises InputError where its
+        ground shows a photograph, and there is none."""
+        name, own = NO_MAP if environment is None else environment.name, self.description
         check_ground(own.given_values, name)
         if environment is not None:
             check_one_environment(own.parts, f"`environment={name}`")
-        lit = replace(own, environment=environment, environment_spec=name, given=given)
+        lit = replace(own, environment=environment, environment_spec=name, given=own.given | {ENVIRONMENT})
         return Scene(with_lamps(on_its_ground(lit)), self.only_here)
 
     def __getattr__(self, name: str) -> Any:
@@ -131,24 +125,15 @@ class Scene:
         return f"Scene({described.object_name!r}, {described.environment_name!r}{fixed})"
 
     def with_texture(self, texture: Texture) -> Scene:
-        """Return the scene with another texture of the object; see `load_scene`.
-
-        Raises:
-            FileFormatError: the file is no picture.
-            InputError: it is no (h, w, 3) picture in [0, 1].
-        """
-        own = self.description
-        painted = replace(own.object, base_color=_texels(texture))
-        return Scene(replace(own, object=painted), only_here=True)
+        """Return the scene with another texture of the object; see `load_scene`. Raises FileFormatError (the file is no
+        picture), or InputError: it is no (h, w, 3) picture in [0, 1]."""
+        painted = replace(self.description.object, base_color=_texels(texture))
+        return Scene(replace(self.description, object=painted), only_here=True)
 
     def with_settings(self, given: Given) -> Scene:
-        """Return the scene with some of its parameters fixed to other values.
-
-        Raises:
-            InputError: a name is unknown or a value out of range.
-        """
-        resolved = settings.resolve(given)
-        own = self.description
+        """Return the scene with some of its parameters fixed to other values. Raises InputError: a name is unknown or a
+        value out of range."""
+        resolved, own = settings.resolve(given), self.description
         check_meshes(own, given)
         if own.camera_model is not None:
             own.camera_model.check_given(given)
@@ -200,24 +185,21 @@ def load_scene(
     Raises:
         InputError: a name is unknown, a file cannot be used, or a value is out of range.
     """
-    said: dict[str, Any] = {
-        "given": None if settings is None else as_python(settings),
-        "up": up,
-        "size": size,
-        "unit": unit,
-        "things": things_as_text(things),
-    }
-    if scene is None:
-        described = describe(object, environment, **said)
-    elif not isinstance(object, str):
+    if scene is not None and not isinstance(object, str):
         raise InputError(f"object: expected the name of a node or shape of the scene, got {object!r}")
-    elif isinstance(scene, Mapping):
-        described = describe(object, environment, **said, plugins=scene)
-    else:
-        described = describe(f"{scene}#{object}", environment, **said)
-    only_here = isinstance(scene, Mapping) or not all(
-        one is None or isinstance(one, (str, Path)) for one in (object, environment)
+    plugins = scene if isinstance(scene, Mapping) else None
+    described = describe(
+        object if scene is None or plugins is not None else f"{scene}#{object}",
+        environment,
+        given=None if settings is None else as_python(settings),
+        up=up,
+        size=size,
+        unit=unit,
+        plugins=plugins,
+        things=things_as_text(things),
     )
+    named = all(given is None or isinstance(given, (str, Path)) for given in (object, environment))
+    only_here = plugins is not None or not named
     loaded = Scene(described if camera is None else described.seen_by(camera), only_here)
     return loaded if texture is None else loaded.with_texture(texture)
 
@@ -257,11 +239,8 @@ def named_camera(description: SceneDescription) -> str | None:
     """Return the camera in use, as `load_scene` takes it; None for the pinhole around the object."""
     if description.rig:
         return description.rig_spec
-    if description.preset:
-        return description.preset
-    if description.camera_model is not None and description.camera_model.name:
-        return description.camera_model.name
-    return None if description.camera == ORBIT_CAMERA else description.camera
+    model, turned = description.camera_model, description.camera == ORBIT_CAMERA
+    return description.preset or (model.name if model is not None else "") or (None if turned else description.camera)
 
 
 def framed(description: SceneDescription, resolution: int | tuple[int, int]) -> SceneDescription:
@@ -303,17 +282,14 @@ def make_renderer(
             "environment: the scene has neither a map nor a lamp, so that every picture is black; give it one of the "
             "two, such as `controls=light`"
         )
+    exposure = description.number("camera.exposure")
     formation = ImageFormation(
-        denoiser=denoise,
-        sampler=sampler,
-        exposure=description.number("camera.exposure"),
-        resolution=size,
-        gain=description.gain,
+        denoiser=denoise, sampler=sampler, exposure=exposure, resolution=size, gain=description.gain
     )
     scene = MitsubaScene(description, size, filter=formation.filter, leave_out=leave_out, sampler=sampler)
     exposed = any(space.exposure)
     if any(mount.later for mount in description.rig):
-        moved = any(one is not then for one, then in zip(space.controls, space.later(1.0).controls, strict=True))
+        moved = any(now is not then for now, then in zip(space.controls, space.later(1.0).controls, strict=True))
         if exposed or not moved:
             wrong = "have motion blur or a rolling shutter" if exposed else "show the same: nothing knows a time"
             raise InputError(
@@ -326,17 +302,15 @@ def make_renderer(
     return Renderer(scene, space, formation, seed, motion=measured, estimators=estimators, moments=moments)
 
 
-A_FLASH = 8
-"""Moments of each flash of a light."""
-LOOKS = 64
-"""Configurations in which it is measured how far points move in the picture while it is taken."""
+A_FLASH = 8  # moments of each flash of a light
+LOOKS = 64  # configurations in which it is measured how far points move in the picture while it is taken
 
 
 def exposed_in(space: Space, motion: Motion, assembly: Assembly, height: int) -> tuple[Moment, ...]:
     """Return the moments of an exposure, so many that no point goes far in the picture between two of them, and that
     light which flashes is seen on and off."""
     shutter, rolling = space.exposure
-    moving = replace(space, controls=tuple(one for one in space.controls if any(one.exposure)))
+    moving = replace(space, controls=tuple(control for control in space.controls if any(control.exposure)))
     ends = [moving.later(side * (shutter + rolling) / 2.0) for side in (-1.0, 1.0)]
     draws = torch.rand(LOOKS, len(moving.start), generator=torch.Generator().manual_seed(0))
     travelled = 0.0
@@ -344,7 +318,7 @@ def exposed_in(space: Space, motion: Motion, assembly: Assembly, height: int) ->
         (before, seen), (after, still) = (motion.pixels(assembly(end.inputs(u))) for end in ends)
         moved = (after - before)[seen & still].norm(dim=1)
         travelled = max(travelled, float(moved.max()) if len(moved) else 0.0)
-    flashes = max(one.flashes for one in space.controls) * (shutter + rolling)
+    flashes = max(control.flashes for control in space.controls) * (shutter + rolling)
     count = min(max(FEWEST, math.ceil(A_PIXEL * travelled), math.ceil(A_FLASH * flashes)), MOST)
     offsets, rows, samples = moments_of(shutter, rolling, height, count)
     return tuple(Moment(space.later(float(at)), own, samples) for at, own in zip(offsets, rows, strict=True))
@@ -358,36 +332,36 @@ def settings_of(controls: Controls) -> dict[str, dict[str, object]]:
     asked = controls_by_name(controls)
     if not isinstance(controls, Mapping):
         as_controls(asked)
-    return {name: one.settings() if isinstance(one, Control) else dict(one) for name, one in asked.items()}
+    return {name: given.settings() if isinstance(given, Control) else dict(given) for name, given in asked.items()}
 
 
 def as_controls(controls: Controls) -> tuple[Control, ...]:
     """Return control instances for whatever form they were given in, in the order in which they were given."""
     asked = controls_by_name(controls)
-    ready = {name: one for name, one in asked.items() if isinstance(one, Control)}
-    named = gathered({name: {} if isinstance(one, Control) else one for name, one in asked.items()})
+    ready = {name: given for name, given in asked.items() if isinstance(given, Control)}
+    named = gathered({name: {} if isinstance(given, Control) else given for name, given in asked.items()})
     for name in ready:
         if named[name]:
             raise InputError(f"controls: {name} is given twice, by an instance and by name; say all of it in one")
-    return tuple(ready.get(name) or lent(CONTROL, name) or make_control(name, one) for name, one in named.items())
+    return tuple(ready.get(name) or lent(CONTROL, name) or make_control(name, given) for name, given in named.items())
 
 
 def controls_by_name(controls: Controls) -> dict[str, Control | Mapping[str, object]]:
     """Return instances and settings by name, in the order in which they were given."""
     if isinstance(controls, Mapping):
-        asked = {name: _plain(one) for name, one in controls.items()}
-        for name, one in asked.items():
-            if isinstance(one, type) or (isinstance(one, Control) and one.name != name):
-                got = f"one that is called {one.name}" if isinstance(one, Control) else told(one)
+        asked = {name: _plain(given) for name, given in controls.items()}
+        for name, given in asked.items():
+            if isinstance(given, type) or (isinstance(given, Control) and given.name != name):
+                got = f"one that is called {given.name}" if isinstance(given, Control) else told(given)
                 raise InputError(
                     f"`controls` {name}: expected settings, or an instance of that name, got {got}; instances stand in "
                     "a list as well, controls=[...]"
                 )
     else:
         asked = _listed(controls)
-    ready = {name: one for name, one in asked.items() if isinstance(one, Control)}
+    ready = {name: given for name, given in asked.items() if isinstance(given, Control)}
     named = settings_by_name({**asked, **dict.fromkeys(ready)})
-    return {name: ready.get(name, given) for name, given in named.items()}
+    return {name: ready.get(name, said) for name, said in named.items()}
 
 
 def _plain(given: object) -> object:
@@ -395,35 +369,33 @@ def _plain(given: object) -> object:
     if isinstance(given, (Control, type)):
         return given
     if isinstance(given, Mapping) and not given.keys() & {"distribution", "choices", "range"}:
-        return {key: as_setting(one) for key, one in given.items()}
+        return {key: as_setting(value) for key, value in given.items()}
     return as_setting(given)
 
 
 def _listed(controls: str | Control | Iterable[object]) -> dict[str, object]:
     """Return controls that were given in a list or a text, by name: an instance, or what the text says of it."""
-    given = [controls] if isinstance(controls, (str, Control)) or not isinstance(controls, Iterable) else controls
-    listed: list[tuple[object, object]] = []
-    for one in given:
-        listed += read_controls([one], "controls").items() if isinstance(one, str) else [(one, None)]
-    found: dict[str, object] = {}
-    for one, said in listed:
-        if not isinstance(one, (str, Control)):
-            raise InputError(f"controls: expected names or Control instances, got {told(one)}")
-        name = one if isinstance(one, str) else one.name
-        if name in found:
-            raise InputError(
-                f"controls: every instance needs a name of its own, got {name} twice; write KIND:NAME, such as "
-                "light:key,light:fill"
-            )
-        found[name] = one if isinstance(one, Control) else said
-    return found
+    several = [controls] if isinstance(controls, (str, Control)) or not isinstance(controls, Iterable) else controls
+    listed: dict[str, object] = {}
+    for control in several:
+        if not isinstance(control, (str, Control)):
+            raise InputError(f"controls: expected names or Control instances, got {told(control)}")
+        named = read_controls([control], "controls") if isinstance(control, str) else {control.name: control}
+        for name, given in named.items():
+            if name in listed:
+                raise InputError(
+                    f"controls: every instance needs a name of its own, got {name} twice; write KIND:NAME, such as "
+                    "light:key,light:fill"
+                )
+            listed[name] = given
+    return listed
 
 
 def instances_in(controls: object) -> list[Control]:
     """Return the instances among controls."""
     listed = controls.values() if isinstance(controls, Mapping) else controls
     listed = listed if isinstance(listed, (list, tuple, ValuesView)) else [listed]
-    return [one for one in listed if isinstance(one, Control)]
+    return [control for control in listed if isinstance(control, Control)]
 
 
 _LENT: ContextVar[Mapping[tuple[str, str], Any]] = ContextVar("lent", default=MappingProxyType({}))
@@ -452,7 +424,9 @@ def lending(kind: str, things: Mapping[str, Any]) -> Iterator[None]:
 def only_here(controls: Controls) -> list[str]:
     """Return the classes of controls that have no name by which a file or another process could ask for them, and the
     parameters that functions from Python draw."""
-    classes = [type(one).__name__ for one in instances_in(controls) if CONTROLS.get(one.kind) is not type(one)]
+    classes = [
+        type(control).__name__ for control in instances_in(controls) if CONTROLS.get(control.kind) is not type(control)
+    ]
     drawn = [
         f"{name if '.' in name else f'{name}.{parameter}'} (drawn by {value['name']})"
         for name, given in settings_of(controls).items()

@@ -39,8 +39,8 @@ def scene_of(config: SceneConfig, name: str | None = None, environment: str | No
 
 def told_of_scene(config: SceneConfig) -> dict[str, Any]:
     """Return what `load_scene` is told beside object and environment."""
-    said = {name: getattr(config, name) for name in ("up", "size", "unit", "camera", "things")}
-    return {**said, "settings": scene_settings(config)}
+    names = ("up", "size", "unit", "camera", "things")
+    return {**{name: getattr(config, name) for name in names}, "settings": scene_settings(config)}
 
 
 def scene_settings(config: SceneConfig) -> Given:
@@ -69,21 +69,29 @@ def load_models(models: Sequence[Any], task: Task, config: SceneConfig) -> tuple
     asked = several(models) if isinstance(task, Together) else models
     if len(asked) != len(parts):
         raise InputError(f"model: expected {len(parts)}, one for each task, got {len(asked)}")
+
+    def load(model: Any, of: Task) -> Model:
+        """Of several tasks, those that take no label or have names of their own are given none."""
+        part = of.part if isinstance(of, Rig) else of
+        told = of is task or (part.labelled and not part.names_from)
+        labels, prompt = (config.labels, config.prompt) if told else (None, None)
+        model = (lent(MODEL, model) if isinstance(model, str) else None) or model
+        return load_model(model, labels=labels, prompt=prompt, task=part, ask=config.ask)
+
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", ModelWarning)
-        given = [(lent(MODEL, one) if isinstance(one, str) else None) or one for one in asked]
-        loaded = tuple(_load(one, own, config, alone=own is task) for one, own in zip(given, parts, strict=True))
-    sentences = [str(one.message) for one in caught if issubclass(one.category, ModelWarning)]
-    for one in caught:
-        if not issubclass(one.category, ModelWarning):
-            warnings.warn_explicit(one.message, one.category, one.filename, one.lineno)
+        loaded = tuple(map(load, asked, parts))
+    sentences = [str(warning.message) for warning in caught if issubclass(warning.category, ModelWarning)]
+    for warning in caught:
+        if not issubclass(warning.category, ModelWarning):
+            warnings.warn_explicit(warning.message, warning.category, warning.filename, warning.lineno)
     if rig := () if config.camera is None else read_rig(config.camera):
         if not isinstance(task, Rig):
             raise InputError(
                 f"camera: {config.camera} has {len(rig)} cameras, and task {task.name} is of one picture; say what is "
                 f"made of several, as in `task='rig={{task: {task.name}, rule: any}}'`"
             )
-        loaded = tuple(replace(one, cameras=len(rig)) for one in loaded)
+        loaded = tuple(replace(model, cameras=len(rig)) for model in loaded)
     for model in loaded:
         if isinstance(model.module, AllAtOnce) and model.module.cameras != model.cameras:
             raise InputError(
@@ -93,21 +101,13 @@ def load_models(models: Sequence[Any], task: Task, config: SceneConfig) -> tuple
     return (together(loaded, config.resolution),) if isinstance(task, Together) else loaded, sentences
 
 
-def _load(model: Any, task: Task, config: SceneConfig, *, alone: bool) -> Model:
-    """Load a model; of several tasks, those that take no label or have names of their own are given none."""
-    task = task.part if isinstance(task, Rig) else task
-    if not alone and (task.names_from or not task.labelled):
-        return load_model(model, task=task, ask=config.ask)
-    return load_model(model, labels=config.labels, prompt=config.prompt, task=task, ask=config.ask)
-
-
 AnyModel = Model | nn.Module | str | Path
 
 
 def several(models: AnyModel | Sequence[AnyModel]) -> list[AnyModel]:
     """Return one model or several in a list; names may stand in a text with commas between them."""
     listed: list[AnyModel] = list(models) if isinstance(models, (list, tuple)) else [models]  # type: ignore[list-item]
-    return [one for given in listed for one in (split_names(given) if isinstance(given, str) else (given,))]
+    return [name for model in listed for name in (split_names(model) if isinstance(model, str) else (model,))]
 
 
 def model_name(model: AnyModel) -> str:
@@ -161,16 +161,26 @@ def given_to(config: SceneConfig, controls: Controls) -> tuple[Control, ...]:
     """Return control instances, with what they take of the configuration where they say nothing themselves."""
     asked = controls_by_name(controls)
     as_controls(controls)  # refuses what is none
-    for one in (one if isinstance(one, Control) else lent(CONTROL, name) for name, one in asked.items()):
-        for choice in _counting(type(one), one.settings()) if one is not None else ():
+    ready: dict[str, Control | Mapping[str, object]] = {}
+    for name, given in asked.items():
+        instance = given if isinstance(given, Control) else lent(CONTROL, name)
+        for choice in _counting(type(instance), instance.settings()) if instance is not None else ():
             if getattr(config, choice.run_setting, None) is not None:
                 raise InputError(
-                    f"{choice.run_setting}: control {one.name} was given as an instance; set it there, as in "
-                    f"{type(one).__name__}({choice.name}=...)"
+                    f"{choice.run_setting}: control {instance.name} was given as an instance; set it there, as in "
+                    f"{type(instance).__name__}({choice.name}=...)"
                 )
-    return as_controls(
-        {name: one if isinstance(one, Control) else {**_taken(config, name, one), **one} for name, one in asked.items()}
-    )
+        ready[name] = given
+        if not isinstance(given, Control):
+            _, own_name = names_of(name, given)
+            taken = {}
+            for choice in _choices(name, given) or ():
+                value = getattr(config, choice.run_setting, None)
+                value = value.get(own_name) if isinstance(value, Mapping) else value
+                if value is not None and not isinstance(value, tuple):  # each run of a curve has its own epsilon
+                    taken[choice.name] = value
+            ready[name] = {**taken, **given}
+    return as_controls(ready)
 
 
 def settings_alone(config: SceneConfig, asked: str, given: Mapping[str, object]) -> dict[str, Any]:
@@ -180,7 +190,7 @@ def settings_alone(config: SceneConfig, asked: str, given: Mapping[str, object])
     for setting in RUN_SETTINGS:
         value = getattr(config, setting, None)
         if isinstance(value, Mapping):
-            value = {own: number for own, number in value.items() if own == name} or None
+            value = {name: value[name]} if name in value else None
         kept[setting] = value if takes(asked, given, setting) else None
     return kept
 
@@ -194,55 +204,42 @@ def check_run_settings(config: SceneConfig) -> None:
         drawn = {} if setting == "epsilon" else getattr(config, "over", {})
         asked = gathered({**config.controls, **drawn})
         if isinstance(value, Mapping):
-            known = {names_of(one, given)[1]: one for one, given in asked.items()}
+            known = {names_of(name, given)[1]: name for name, given in asked.items()}
             for name in value:
                 if name not in known:
                     raise UnknownNameError(f"control in `{setting}`", name, known)
                 if not takes(known[name], asked[known[name]], setting):
                     raise _not_taken(setting, name, names_of(known[name], asked[known[name]])[0])
             continue
-        without = [one for one, given in asked.items() if not takes(one, given, setting)]
+        without = [name for name, given in asked.items() if not takes(name, given, setting)]
         if without and (isinstance(value, tuple) or len(without) == len(asked)):
             raise _not_taken(setting, without[0], names_of(without[0], asked[without[0]])[0])
 
 
-def _taken(config: SceneConfig, asked: str, given: Mapping[str, object]) -> dict[str, object]:
-    """What one control takes, by the names of its own settings."""
-    _, name = names_of(asked, given)
-    taken = {}
-    for choice in _choices(asked, given):
-        value = getattr(config, choice.run_setting, None)
-        value = value.get(name) if isinstance(value, Mapping) else value
-        if value is not None and not isinstance(value, tuple):  # the several epsilons of a curve: each run has its own
-            taken[choice.name] = value
-    return taken
-
-
 def takes(asked: str, given: Mapping[str, object], setting: str) -> bool:
     """Whether a control takes one of the run's settings; one that is not known counts as one that does."""
-    kind, _ = names_of(asked, given)
-    return kind not in CONTROLS or setting in {choice.run_setting for choice in _choices(asked, given)}
+    choices = _choices(asked, given)
+    return choices is None or setting in {choice.run_setting for choice in choices}
 
 
-def _choices(asked: str, given: Mapping[str, object]) -> list[Choice]:
-    """The choices of a control, as it is asked for, that count."""
+def _choices(asked: str, given: Mapping[str, object]) -> list[Choice] | None:
+    """The choices of a control, as it is asked for, that count; None of one that is not known."""
     ((name, settings),) = gathered({asked: given}).items()
     kind, _ = names_of(name, settings)
-    return _counting(CONTROLS[kind], settings) if kind in CONTROLS else []
+    return _counting(CONTROLS[kind], settings) if kind in CONTROLS else None
 
 
 def _counting(kind: type[Control], given: Mapping[str, object]) -> list[Choice]:
     """The choices that count beside the settings that are given: what they are about is searched."""
-    return [choice for choice in kind.choices if not choice.bounds or _is_searched(kind, choice.bounds, given)]
 
+    def searched(name: str) -> bool:
+        if any(choice.fixes == name and given.get(choice.name) is not None for choice in kind.choices):
+            return False
+        if given.get(name) is not None:
+            return not is_number(given[name])
+        return any(parameter.name == name and parameter.search is not None for parameter in kind.parameters)
 
-def _is_searched(kind: type[Control], parameter: str, given: Mapping[str, object]) -> bool:
-    """Whether a parameter of a control is searched beside the settings that are given."""
-    if any(choice.fixes == parameter and given.get(choice.name) is not None for choice in kind.choices):
-        return False
-    if given.get(parameter) is not None:
-        return not is_number(given[parameter])
-    return any(one.name == parameter and one.search is not None for one in kind.parameters)
+    return [choice for choice in kind.choices if not choice.bounds or searched(choice.bounds)]
 
 
 def _not_taken(setting: str, name: str, kind: str) -> InputError:

@@ -55,7 +55,7 @@ class Named(Mapping[str, Tensor]):
     def __getitem__(self, name: str) -> Tensor:
         if name not in self:  # also of `get`
             raise UnknownNameError(self._what, name, self._each[0])
-        return torch.stack([one[name] for one in self._each])
+        return torch.stack([tensors[name] for tensors in self._each])
 
     def __contains__(self, name: object) -> bool:
         return name in self._each[0]
@@ -95,8 +95,8 @@ class ConfigurationInputs:
             got = ", ".join(printed or (control.name for control in self._searched.controls)) or "nothing"
             instead = "ask for `textures`, which has them by name" if printed else "add `texture` or `patch`"
             raise InputError(
-                f"objective: it asks for `texture`, so it needs one control whose colours are searched, got "
-                f"{got}; {instead}"
+                f"objective: it asks for `texture`, so it needs one control whose colours are searched, got {got}; "
+                f"{instead}"
             )
         (colors,) = printed.values()
         return colors.expand(len(self._wholes), *colors.shape)
@@ -105,12 +105,8 @@ class ConfigurationInputs:
 LOW, HIGH, STEP = 0.1, 0.9, 0.2
 """The printable colours: all 125 of which each channel is 0.1, 0.3, 0.5, 0.7 or 0.9 in sRGB. No printer was measured:
 that ink on paper reaches neither the black, nor the white, nor the pure colours of a screen is all that they say."""
-WEIGHT = 10.0
-"""Of either term, in the objective's unit (logits for a margin) per unit of sRGB."""
-
-
-LEAST = 2.0**-40
-"""Shortest step in sRGB that has a gradient."""
+WEIGHT = 10.0  # of either term, in the objective's unit (logits for a margin) per unit of sRGB
+LEAST = 2.0**-40  # shortest step in sRGB that has a gradient
 
 
 def variation(colors: Tensor) -> Tensor:
@@ -139,13 +135,13 @@ def off_print(colors: Tensor, palette: Tensor | None = None) -> Tensor:
 
 
 def _terms(space: Space, u: Tensor) -> tuple[Tensor, Tensor]:
-    found = list(space.printed(u).values())
-    if not found:
+    printed = list(space.printed(u).values())
+    if not printed:
         raise InputError(
             "printable: expected a search over the colours of a texture or a patch, got "
             f"{', '.join(control.name for control in space.controls)}; add `texture` or `patch`, or leave it out"
         )
-    return torch.stack([variation(one) for one in found]).sum(), torch.stack([off_print(one) for one in found]).sum()
+    return torch.stack(list(map(variation, printed))).sum(), torch.stack(list(map(off_print, printed))).sum()
 
 
 def print_terms(space: Space, u: Tensor) -> PrintTerms:
@@ -169,8 +165,7 @@ AnyObjective = str | Callable[..., Tensor]
 
 Way = Literal["mean", "worst"]
 
-CLEAN_SPP = 64
-"""Samples a pixel of the clean picture that an objective compares features with."""
+CLEAN_SPP = 64  # samples a pixel of the clean picture that an objective compares features with
 
 
 def task_for(task: Task, model: Model) -> Task:
@@ -192,7 +187,7 @@ def objective_for(
         if of_features:
             raise InputError(f"objective: {wanted} compares the features of one model; take another for `ensemble`")
         own = wanted == Together.objective
-        each = [get_objective(one.objective if own else wanted, one) for one in task.tasks]
+        each = [get_objective(part.objective if own else wanted, part) for part in task.tasks]
         return of_ensemble(each, ensemble or ("worst" if own else "mean")), ""
     if not of_features:
         return get_objective(wanted, task), ""
@@ -214,7 +209,7 @@ def of_ensemble(objectives: Sequence[Objective], way: Way) -> Objective:
         output: Sequence[Outputs], images: Tensor, truth: tuple[Any, ...], more: More = nothing_more, /
     ) -> Tensor:
         each = zip(objectives, of_each(output), truth, strict=True)
-        values = torch.stack([one(own, images, right, more) for one, own, right in each])
+        values = torch.stack([value_of(own, images, right, more) for value_of, own, right in each])
         return values.mean(dim=0) if way == "mean" else values.amin(dim=0)
 
     return objective

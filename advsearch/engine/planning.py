@@ -7,9 +7,10 @@ from __future__ import annotations
 import itertools
 import math
 import statistics
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -21,19 +22,16 @@ from advsearch.runs.results import GradientStatus, Measured, PathCut, PathLength
 from advsearch.scene.gradients import BY_ADJOINT, BY_DIFFERENCES, GradientPlan, Group, compared
 from advsearch.scene.renderer import Renderer
 
-GOAL = 0.9
-"""Cosine with the converged gradient that a working gradient should have."""
+GOAL = 0.9  # cosine with the converged gradient that a working gradient should have
 FACTORS = (1.0, 3.0, 9.0)
 """Steps that are tried, as multiples of the plan's; the last only where no other will do:
 it smooths away all but the coarse shape of the loss."""
 COUNTS = (8, 16, 32, 64, 128)
-ADJOINT_RENDERS = 3.0
-"""Renders that take about as long as an adjoint."""
+ADJOINT_RENDERS = 3.0  # renders that take about as long as an adjoint
 CONVERGED, AGAIN = 128, 4
 """Samples a pixel of a gradient that counts as converged, and times as many where these do not agree, or where a
 working gradient has more."""
-WITNESSES = 3
-"""Converged gradients that are taken. Two of a few numbers can agree by luck."""
+WITNESSES = 3  # converged gradients that are taken. Two of a few numbers can agree by luck.
 TELLS = 0.5
 """Converged gradients of which two have a smaller cosine than this tell nothing: the cosine of the mean of three with
 the truth is then about sqrt(3 c / (1 + 2 c)) (Spearman and Brown), 0.87 and less. Above it the noise of the converged
@@ -56,19 +54,15 @@ def contested(plan: GradientPlan, *, every: bool = False) -> list[tuple[tuple[Gr
     the model's loss is so rough that none has won, and over shapes the material form is the quietest."""
     sets: dict[tuple[str, tuple[str, ...]], list[Group]] = {}
     for group in plan.groups:
-        if "forced" in group.reason or not group.valid:
-            continue
-        sets.setdefault((group.control, group.valid), []).append(group)
-    found = []
-    for (_, valid), groups in sets.items():
-        candidates = compared(valid, sum(group.size for group in groups))
-        if len(candidates) > 1 and (every or valid[0] == "adjoint"):
-            found.append((tuple(groups), candidates))
-    return found
+        if "forced" not in group.reason and group.valid and (every or group.valid[0] == "adjoint"):
+            sets.setdefault((group.control, group.valid), []).append(group)
+    choices = [
+        (tuple(groups), compared(valid, sum(group.size for group in groups))) for (_, valid), groups in sets.items()
+    ]
+    return [choice for choice in choices if len(choice[1]) > 1]
 
 
-REPEATS = 3
-"""Gradients that are taken of everything that is compared."""
+REPEATS = 3  # gradients that are taken of everything that is compared
 
 
 def plan_gradients(plan: GradientPlan, *, every: bool = False) -> int:
@@ -93,67 +87,54 @@ def measured_plan(
     `counted`, the renders that an estimator needs stand for its time (`ADJOINT_RENDERS` for an adjoint), so that the
     choice is the same on a busy machine."""
     plan = renderer.plan
-    taken = partial(gradients, renderer, loss, u, seed=seed, spp=spp, keep=keep, tick=tick)
+
+    def scores_of(groups: Sequence[Group], candidates: Sequence[str]) -> dict[str, float]:
+        """Squared error x seconds. The reference is the mean of the differences among the candidates, whose own noise
+        is taken off the others' errors."""
+        measured, seconds, noise = dict[str, Tensor](), dict[str, float](), dict[str, float]()
+        for estimator in candidates:
+            alone = only(plan, {group.name for group in groups}, estimator)
+            how: dict[str, Any] = {"seed": seed, "spp": spp, "repeats": repeats, "keep": keep, "tick": tick}
+            how["place"] = f"{groups[0].name} by {estimator}"
+            several, seconds[estimator] = gradients(renderer, loss, u, alone, "plan", **how)
+            if counted:
+                seconds[estimator] = 1.0 + alone.renders + (ADJOINT_RENDERS if estimator in BY_ADJOINT else 0.0)
+            measured[estimator] = several
+            noise[estimator] = float((several - several.mean(dim=0)).square().sum() / max(1, repeats - 1))
+        judge = next(estimator for estimator in candidates if estimator in BY_DIFFERENCES)
+        errors, truth = dict[str, float](), measured[judge].mean(dim=0)
+        for estimator, several in measured.items():
+            error = float((several - truth).square().sum(dim=1).mean()) - noise[judge] / repeats
+            errors[estimator] = noise[judge] if estimator == judge else max(error, noise[estimator])
+        return {estimator: error * seconds[estimator] for estimator, error in errors.items()}
+
     for groups, candidates in contested(plan, every=every):
-        scores = _scores(plan, groups, candidates, taken, repeats, counted)
+        scores = scores_of(groups, candidates)
         best = min(scores, key=lambda name: scores[name])
-        time = "renders" if counted else "time"
-        reason = f"least squared error x {time}, measured at {spp} samples"
+        reason = f"least squared error x {'renders' if counted else 'time'}, measured at {spp} samples"
         if scores[best] > 0.0:
             others = ", ".join(f"{name} {score / scores[best]:.3g}" for name, score in scores.items() if name != best)
             reason += f" (others, as multiples of it: {others})"
         elif not any(scores.values()):  # a loss that is flat here, as of a detector that sees nothing
             reason = f"as preferred: none of them has an error, measured at {spp} samples"
-        names = {group.name for group in groups}
-        plan = replace(
-            plan,
-            groups=tuple(
-                replace(one, estimator=best, reason=reason, measured=scores) if one.name in names else one
-                for one in plan.groups
-            ),
-        )
+        chosen = {group.name: replace(group, estimator=best, reason=reason, measured=scores) for group in groups}
+        plan = replace(plan, groups=tuple(chosen.get(group.name, group) for group in plan.groups))
     return plan
-
-
-def _scores(
-    plan: GradientPlan,
-    groups: Sequence[Group],
-    candidates: Sequence[str],
-    taken: Callable[..., tuple[Tensor, float]],
-    repeats: int,
-    counted: bool,
-) -> dict[str, float]:
-    """Squared error x seconds of each candidate. The reference is the mean of the differences among them, whose own
-    noise is taken off the others' errors."""
-    found: dict[str, Tensor] = {}
-    seconds: dict[str, float] = {}
-    for estimator in candidates:
-        alone = only(plan, {group.name for group in groups}, estimator)
-        place = f"{groups[0].name} by {estimator}"
-        found[estimator], seconds[estimator] = taken(alone, "plan", repeats=repeats, place=place)
-        if counted:
-            seconds[estimator] = 1.0 + alone.renders + (ADJOINT_RENDERS if estimator in BY_ADJOINT else 0.0)
-    own = {
-        estimator: float((several - several.mean(dim=0)).square().sum() / max(1, repeats - 1))
-        for estimator, several in found.items()
-    }
-    judge = next(one for one in candidates if one in BY_DIFFERENCES)
-    truth = found[judge].mean(dim=0)
-    scores = {}
-    for estimator, several in found.items():
-        error = float((several - truth).square().sum(dim=1).mean()) - own[judge] / repeats
-        scores[estimator] = (own[judge] if estimator == judge else max(error, own[estimator])) * seconds[estimator]
-    return scores
 
 
 def cosine_samples(plan: GradientPlan, *, counts: Sequence[int] = COUNTS) -> int:
     """Return the samples a pixel that the gradients of `cosines` take in all, at most."""
     each = REPEATS * sum(counts) + WITNESSES * (1 + AGAIN) * CONVERGED
-    by_control: dict[str, set[str]] = {}
-    for group in plan.groups:
-        if group.estimator != "none":
-            by_control.setdefault(group.control, set()).add(group.estimator)
-    return each * sum(len(FACTORS) if used & BY_DIFFERENCES else 1 for used in by_control.values())
+    return each * sum(len(factors) for _, factors in _controls_of(plan))
+
+
+def _controls_of(plan: GradientPlan) -> list[tuple[list[Group], Sequence[float]]]:
+    """The groups of each control that are differentiated, and the steps that are tried of them."""
+    differentiated = [group for group in plan.groups if group.estimator != "none"]
+    names = dict.fromkeys(group.control for group in differentiated)
+    controls = [[group for group in differentiated if group.control == name] for name in names]
+    by_steps = [any(group.estimator in BY_DIFFERENCES for group in groups) for groups in controls]
+    return [(groups, FACTORS if steps else FACTORS[:1]) for groups, steps in zip(controls, by_steps, strict=True)]
 
 
 def cosines(
@@ -173,67 +154,54 @@ def cosines(
     for each gradient, by a name.
     """
     base, taken = renderer.plan, partial(gradients, renderer, loss, u, seed=seed, keep=keep)
-    for control in dict.fromkeys(group.control for group in base.groups):
-        names = {one.name for one in base.groups if one.control == control and one.estimator != "none"}
-        if not names:
-            continue
-        by_steps = any(one.estimator in BY_DIFFERENCES for one in base.groups if one.control == control)
-        reached = False
-        tried: list[GradientPlan] = []
-        for factor in FACTORS if by_steps else FACTORS[:1]:
+
+    def rows_at(plan: GradientPlan, groups: Sequence[Group], factor: float) -> Iterator[Measured]:
+        """Those of a control, at one step."""
+        control, estimators = groups[0].control, ", ".join(dict.fromkeys(group.estimator for group in groups))
+        place = f"{control} x {factor:g}"
+
+        def converged(spp: int) -> tuple[Tensor, float]:
+            named = f"{place} converged {spp}"
+            several, _ = taken(plan, "converged", spp=spp, repeats=WITNESSES, place=named, tick=partial(tick, spp))
+            agreements = torch.tensor([_cosine(*pair) for pair in itertools.combinations(several, 2)])
+            return several.mean(dim=0), float(agreements.min())  # NaN if one is
+
+        many = CONVERGED
+        truth, agreement = converged(many)
+        for spp in counts:
+            if many == CONVERGED and (agreement < GOAL or spp > CONVERGED):
+                many = AGAIN * CONVERGED
+                truth, agreement = converged(many)
+            how: dict[str, Any] = {"spp": spp, "place": f"{place} {spp}", "tick": partial(tick, spp)}
+            several, seconds = taken(plan, "working", repeats=REPEATS, **how)
+            mean = statistics.fmean(_cosine(gradient, truth) for gradient in several)
+            yield Measured(
+                quantity="gradient",
+                control=control,
+                estimator=estimators,
+                factor=factor,
+                spp=spp,
+                repeats=REPEATS,
+                cosine=mean,
+                reference_cosine=agreement,
+                seconds=seconds,
+                status=status_of(mean, agreement),
+            )
+            if mean >= GOAL:
+                break
+
+    for groups, factors in _controls_of(base):
+        reached, tried = False, list[GradientPlan]()
+        for factor in factors:
             if factor == FACTORS[-1] and reached:
                 break
-            plan = only(base.with_steps(factor), names)
+            plan = only(base.with_steps(factor), {group.name for group in groups})
             if plan in tried:  # no step can be wider
                 continue
             tried.append(plan)
-            for row in _cosines_at(plan, taken, factor, counts, tick):
+            for row in rows_at(plan, groups, factor):
                 reached = reached or row.status == "ok"
                 yield row
-
-
-def _cosines_at(
-    plan: GradientPlan,
-    taken: Callable[..., tuple[Tensor, float]],
-    factor: float,
-    counts: Sequence[int],
-    tick: Callable[[int], None],
-) -> Iterator[Measured]:
-    """The rows of the one control that a plan differentiates, at its step."""
-    groups = [group for group in plan.groups if group.estimator != "none"]
-    control, estimators = groups[0].control, ", ".join(dict.fromkeys(group.estimator for group in groups))
-    place = f"{control} x {factor:g}"
-
-    def converged(spp: int) -> tuple[Tensor, float]:
-        named = f"{place} converged {spp}"
-        found, _ = taken(plan, "converged", spp=spp, repeats=WITNESSES, place=named, tick=partial(tick, spp))
-        agreements = torch.tensor([_cosine(*pair) for pair in itertools.combinations(found, 2)])
-        return found.mean(dim=0), float(agreements.min())  # NaN if one is
-
-    many = CONVERGED
-    truth, agreement = converged(many)
-    for spp in counts:
-        if many == CONVERGED and (agreement < GOAL or spp > CONVERGED):
-            many = AGAIN * CONVERGED
-            truth, agreement = converged(many)
-        found, seconds = taken(
-            plan, "working", spp=spp, repeats=REPEATS, place=f"{place} {spp}", tick=partial(tick, spp)
-        )
-        mean = statistics.fmean(_cosine(one, truth) for one in found)
-        yield Measured(
-            quantity="gradient",
-            control=control,
-            estimator=estimators,
-            factor=factor,
-            spp=spp,
-            repeats=REPEATS,
-            cosine=mean,
-            reference_cosine=agreement,
-            seconds=seconds,
-            status=status_of(mean, agreement),
-        )
-        if mean >= GOAL:
-            break
 
 
 def _cosine(one: Tensor, other: Tensor) -> float:
@@ -248,43 +216,28 @@ def tuned(plan: GradientPlan, table: Sequence[Measured]) -> tuple[GradientPlan, 
     that with the greatest cosine; where none does, the one with the greatest cosine, and the reason says so. The sample
     count is None where nothing was measured.
     """
-    counts = []
-    for control in dict.fromkeys(row.control for row in table):
-        rows = [row for row in table if row.control == control and not math.isnan(_of(row.cosine))]
-        if not rows:
-            continue
-        good = [row for row in rows if row.status == "ok"]
-        chosen = (
-            min(good, key=lambda row: (row.spp, -_of(row.cosine)))
-            if good
-            else max(rows, key=lambda row: _of(row.cosine))
-        )
+    counts, measured = [], [(row, row.cosine) for row in table if row.cosine is not None and not math.isnan(row.cosine)]
+    for control in dict.fromkeys(row.control for row, _ in measured):
+        rows = [(row, cosine) for row, cosine in measured if row.control == control]
+        chosen, cosine = max(rows, key=lambda measured: measured[1])
+        shortfall = f": below {GOAL:g}, the best that was found"
+        if chosen.reference_cosine is not None and chosen.reference_cosine < TELLS:
+            shortfall = f": which says little, two converged ones have {chosen.reference_cosine:.2f}"
+        if good := [(row, cosine) for row, cosine in rows if row.status == "ok"]:
+            shortfall, (chosen, cosine) = "", min(good, key=lambda measured: (measured[0].spp, -measured[1]))
         counts.append(chosen.spp)
-        said = f"cosine {chosen.cosine:.2f} with the converged gradient at {chosen.spp} samples"
-        said += f" and {chosen.factor:g} x the step" + ("" if good else f": {_shortfall(chosen)}")
-        scaled = {one.name: one.step for one in plan.with_steps(chosen.factor).groups}
+        said = f"cosine {cosine:.2f} with the converged gradient at {chosen.spp} samples"
+        said += f" and {chosen.factor:g} x the step{shortfall}"
         groups = tuple(
-            replace(one, step=scaled[one.name], reason=f"{one.reason}; {said}") if one.control == control else one
-            for one in plan.groups
+            replace(group, step=scaled.step, reason=f"{group.reason}; {said}") if group.control == control else group
+            for group, scaled in zip(plan.groups, plan.with_steps(chosen.factor).groups, strict=True)
         )
         plan = replace(plan, groups=groups)
     return plan, max(counts) if counts else None
 
 
-def _of(cosine: float | None) -> float:
-    return math.nan if cosine is None else cosine
-
-
-def _shortfall(chosen: Measured) -> str:
-    if _of(chosen.reference_cosine) < TELLS:
-        return f"which says little, two converged ones have {chosen.reference_cosine:.2f}"
-    return f"below {GOAL:g}, the best that was found"
-
-
-SHORTEST = 2
-"""Segments of the shortest path tried: light that reaches the camera from a surface that it falls on directly."""
-BOUND = 0.5
-"""Root-mean-square change of the displayed picture, in 8-bit levels, that a search accepts."""
+SHORTEST = 2  # segments of the shortest path tried: light that reaches the camera from a surface that it falls on
+BOUND = 0.5  # root-mean-square change of the displayed picture, in 8-bit levels, that a search accepts
 LEVELS = 255.0
 
 
@@ -304,9 +257,12 @@ def measured_bounces(
     noises = [seeds.stream(seed, "half", half) for half in range(2)]
 
     def pictures(u: Tensor, depth: int) -> list[tuple[Tensor, Tensor]]:
+        """Radiance and pictures by both noises."""
         rendered = []
         for noise in noises:
-            rendered.append(_pictures(raw, u, noise, spp, depth))
+            with torch.no_grad(), raw.scene.shorter(depth):
+                radiance = raw.radiance(u, noise, spp)
+                rendered.append((radiance, raw.space.picture(u, raw.formation.display(radiance))))
             tick()
         return rendered
 
@@ -315,48 +271,33 @@ def measured_bounces(
     for depth in range(full - 1, SHORTEST - 1, -1):
         light = levels = 0.0
         for u, whole in zip(configurations, wholes, strict=True):
-            cut = pictures(u, depth)
-            first, second = (one[1] - other[1] for one, other in zip(whole, cut, strict=True))
+            shorter = pictures(u, depth)
+            first, second = (long[1] - short[1] for long, short in zip(whole, shorter, strict=True))
             # the product of two independent differences has no noise in its mean
             bias = float((first * second).mean().clamp_min(0.0).sqrt())
-            all_of_it, left = (sum(float(radiance.mean()) for radiance, _ in one) for one in (whole, cut))
+            all_of_it, left = (sum(float(radiance.mean()) for radiance, _ in both) for both in (whole, shorter))
             light = max(light, 1.0 - left / all_of_it if all_of_it > 0.0 else 0.0)
             levels = max(levels, LEVELS * bias)
         cuts.append(PathCut(depth=depth, light=light, levels=levels))
         if not levels <= bound:
             break
         chosen = depth
-    reason = _reason(chosen, full, {cut.depth: cut for cut in cuts})
+    said = []
+    for cut in cuts:
+        if cut.depth == chosen:
+            said.append(
+                f"paths of {chosen} segments leave out {cut.light:.2%} of the light, which moves the picture by "
+                f"{cut.levels:.2f} of 255 levels (bound {BOUND:g})"
+            )
+        elif cut.depth < chosen:
+            said.append(f"{cut.depth} would leave out {cut.light:.2%} and move it by {cut.levels:.2f}")
+    reason = "; ".join(said) or f"all {full} segments"
     return PathLength(depth=chosen, full=full, cuts=cuts, configurations=len(configurations), reason=reason)
 
 
-def _reason(depth: int, full: int, cuts: Mapping[int, PathCut]) -> str:
-    """Why a search renders paths of this length, by what cuts at other lengths leave out."""
-    said = []
-    if depth < full:
-        cut = cuts[depth]
-        said.append(
-            f"paths of {depth} segments leave out {cut.light:.2%} of the light, which moves the picture by "
-            f"{cut.levels:.2f} of 255 levels (bound {BOUND:g})"
-        )
-    if depth - 1 in cuts:
-        rejected = cuts[depth - 1]
-        said.append(f"{rejected.depth} would leave out {rejected.light:.2%} and move it by {rejected.levels:.2f}")
-    return "; ".join(said) or f"all {full} segments"
-
-
-def _pictures(renderer: Renderer, u: Tensor, seed: int, spp: int, depth: int) -> tuple[Tensor, Tensor]:
-    with torch.no_grad(), renderer.scene.shorter(depth):
-        radiance = renderer.radiance(u, seed, spp)
-        return radiance, renderer.space.picture(u, renderer.formation.display(radiance))
-
-
-DRAWS = 2
-"""Configurations, beside the clean one, that the measurement looks at."""
-BOUNCE_SPP = 4
-"""Samples a pixel: the same paths are compared, so that few are enough."""
-WORTH_BOUNCES = 200
-"""Renders of a search from which the measurement pays; each path length costs a compilation."""
+DRAWS = 2  # configurations, beside the clean one, that the measurement looks at
+BOUNCE_SPP = 4  # samples a pixel: the same paths are compared, so that few are enough
+WORTH_BOUNCES = 200  # renders of a search from which the measurement pays; each path length costs a compilation
 
 
 def most_pictures(problem: Problem) -> int:

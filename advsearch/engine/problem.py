@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -33,8 +33,7 @@ from advsearch.tasks.base import Output, Truth, mean, typical
 
 
 class Prepared(NamedTuple):
-    """What is measured before a search, and holds for its queries; the longest light path is in segments, None for the
-    scene's."""
+    """What is measured before a search; the longest light path is in segments, None for the scene's."""
 
     spp: int
     search_depth: int | None
@@ -99,21 +98,17 @@ class Problem:
     @plan.setter
     def plan(self, plan: GradientPlan) -> None:
         """Take a plan: nothing is computed for the conditions, and the domain's cost follows."""
-        names = {control.name for control in self.space.controls[self.searched :]} if self._over else set()
+        count = len(self.space.controls) if self.searched is None else self.searched
+        searched, by_chance = self.space.controls[:count], self.space.controls[count:]
+        names = {control.name for control in by_chance}
         none = {group.name: "none" for group in plan.groups if group.control in names}
         self.renderer.plan = plan.with_estimator(none, BY_CHANCE)
-        controls = self.space.controls
-        cost = self.renderer.plan.renders
-        self.domain = domain_of(controls[: self.searched], gradient_cost=cost, partial_gradients=True)
-        self.conditions = domain_of(controls[self.searched :]) if self._over else None
+        self.domain = domain_of(searched, gradient_cost=self.renderer.plan.renders, partial_gradients=True)
+        self.conditions = domain_of(by_chance) if by_chance else None
 
     @property
     def prepared(self) -> Prepared:
         return Prepared(self.spp, self.search_depth, self.plan)
-
-    @property
-    def _over(self) -> bool:
-        return self.searched is not None and self.searched < len(self.space.controls)
 
     @cached_property
     def searched_space(self) -> Space:
@@ -169,17 +164,19 @@ class Problem:
             output = self.model(pictures)
             truths = [self.truth()] if not self.task.varies else list(map(self.truth, wholes, listed))
             said = self._judged(output, pictures, truths, wholes)
-        return [
-            replace(Judgement.of(one.score, one.margin, one.prediction, one.payload), metrics=one.metrics)
-            for one in said
-        ]
+        kept = [(Judgement.of(each.score, each.margin, each.prediction, each.payload), each.metrics) for each in said]
+        return [replace(judgement, metrics=metrics) for judgement, metrics in kept]
+
+    def trial(self, shown: Tensor, whole: Tensor, /, **more: Any) -> Evaluation:
+        """Return the answer to a trial, of the picture (H, W, 3) that the model was shown, with `more` fields."""
+        return Evaluation.of(self.judge(shown, whole), **more)
 
     def _judged(
         self, output: Output, pictures: Tensor, truths: Sequence[Truth], wholes: Sequence[Tensor]
     ) -> list[Judgement]:
         """What task and metrics say of pictures (N, H, W, 3), and what these show of each thing."""
         said = judgements(self.task, output, pictures, truths, self.metrics)
-        return [with_things(one, self._truths.things(at)) for one, at in zip(said, wholes, strict=True)]
+        return [with_things(judgement, self._truths.things(at)) for judgement, at in zip(said, wholes, strict=True)]
 
     def view(
         self, predict: Callable[[Tensor], Tensor], whole: Tensor, seed: int, spp: int, *, drawn: Tensor | None = None
@@ -199,8 +196,7 @@ class Problem:
         return self.seen(picture, whole)[1]
 
     def seen(self, picture: Tensor, whole: Tensor) -> tuple[bool, list[Mark]]:
-        """Return whether the model's prediction of a picture (H, W, 3) of the whole space at `whole` is right, and what
-        shows it."""
+        """Return whether the model's prediction of a picture (H, W, 3) at `whole` is right, and what shows it."""
         with torch.no_grad():
             output, truth = self.model(picture), self.truth(whole)
             return self.task.judge(output, truth)[0].right, self.task.marks(output, truth)[0]
@@ -238,8 +234,7 @@ class Problem:
 
     def _in_unit(self, group: Group) -> tuple[float | None, str]:
         """The step of one number in the middle of its range, and its unit; None of what has no number of its own."""
-        u, half = self.whole(self.domain.start).clone(), min(group.step, 0.5)
-        ends = []
+        u, half, ends = self.whole(self.domain.start).clone(), min(group.step, 0.5), []
         for side in (0.5 - half, 0.5 + half):
             u[group.coordinates] = side
             ends.append(self.space.describe(u).get(group.name))
@@ -267,8 +262,23 @@ class Problem:
 
     def evaluate(self, query: Query) -> Evaluation:
         """Answer one query: the only place where a run renders, asks and judges."""
-        before = self.renderer.non_finite
-        evaluation = self._evaluation(query)
+        u, seed, before = query.u, query.seed, self.renderer.non_finite
+        if query.wanted == "light":
+            evaluation = Evaluation(math.nan, None, False, light=self.linearised(u, seed, query.spp).collected)
+        elif query.wanted == "picture":
+            evaluation = Evaluation(math.nan, None, False, picture=self.picture(u, seed, query.spp))
+        elif query.phase is None:
+            picture = self.picture(u, seed, query.spp, drawn=query.drawn)
+            whole = self.whole(u, seed if query.drawn else None)
+            evaluation = self.trial(picture, whole, picture=picture if query.keep else None)
+        elif self.conditions is None:
+            evaluation = self.evaluated(query, u, seed)[0]
+        else:
+            draws = [seeds.stream(seed, "draw", number) for number in range(self.draws)]
+            alone = replace(query, keep=False)
+            evaluation = self.mean([self.evaluated(alone, self.whole(u, draw), draw) for draw in draws], u)
+            if query.keep:
+                evaluation = replace(evaluation, picture=self.picture(u, seed, self.spp, drawn=False))
         lost = self.renderer.non_finite - before
         return replace(evaluation, non_finite=lost) if lost else evaluation
 
@@ -278,33 +288,15 @@ class Problem:
             raise RuntimeError("a sweep has no objective")
         return self.objective(outputs, pictures, truth, asked)
 
-    def _evaluation(self, query: Query) -> Evaluation:
-        u, seed = query.u, query.seed
-        if query.wanted == "light":
-            return Evaluation(math.nan, None, False, light=self.linearised(u, seed, query.spp).collected)
-        if query.wanted == "picture":
-            return Evaluation(math.nan, None, False, picture=self.picture(u, seed, query.spp))
-        if query.phase is None:
-            picture = self.picture(u, seed, query.spp, drawn=query.drawn)
-            said = self.judge(picture, self.whole(u, seed if query.drawn else None))
-            return Evaluation.of(said, picture=picture if query.keep else None)
-        if self.conditions is None:
-            return self.evaluated(query, u, seed)[0]
-        draws = [seeds.stream(seed, "draw", number) for number in range(self.draws)]
-        evaluation = self.mean([self.evaluated(replace(query, keep=False), self.whole(u, d), d) for d in draws], u)
-        return replace(evaluation, picture=self.picture(u, seed, self.spp, drawn=False)) if query.keep else evaluation
-
     def linearised(self, whole: Tensor, seed: int, spp: int, collected: Linearised | None = None) -> LinearRenderer:
         """Return what predicts pictures near a configuration of the whole space, from light that was collected there or
         is collected now."""
-        own, there = {one.name for one in self.searched_space.controls}, linear_inputs(self.renderer)
-        names = frozenset().union(
-            *(self.renderer.routes.get(one.name, frozenset()) for one in self.plan.groups if one.control in own)
-        )
+        own = {control.name for control in self.searched_space.controls}
+        groups = [group.name for group in self.plan.groups if group.control in own]
+        names = frozenset().union(*(self.renderer.routes.get(name, frozenset()) for name in groups))
+        names &= linear_inputs(self.renderer)
         with self.renderer.scene.shorter(min(LIGHT_DEPTH, self.search_depth or LIGHT_DEPTH)):
-            return LinearRenderer(
-                self.renderer, whole, seed, spp=spp, quick=True, names=names & there, collected=collected
-            )
+            return LinearRenderer(self.renderer, whole, seed, spp=spp, quick=True, names=names, collected=collected)
 
     def evaluated(
         self, query: Query, whole: Tensor, seed: int, renderer: Renderer | None = None
@@ -324,12 +316,11 @@ class Problem:
             seen.append((image.detach(), output))
             value = self._values(output, image[None], truth, asked)[0]
             if asked.used and len(seen) == 1 and value.requires_grad:  # exact, whatever the plan does with the picture
-                (found,) = torch.autograd.grad(value, at, retain_graph=True, allow_unused=True)
-                slope = slope if found is None else found
+                (by_input,) = torch.autograd.grad(value, at, retain_graph=True, allow_unused=True)
+                slope = slope if by_input is None else by_input
             return value
 
-        spp, derivative = self.spp * samples, None
-        depth = self.search_depth
+        spp, depth, derivative = self.spp * samples, self.search_depth, None
         with nullcontext() if depth is None else renderer.scene.shorter(depth):
             if gradient:
                 value, derivative = renderer.gradient(loss, whole, seed, spp, free=gradient == "free")
@@ -365,20 +356,18 @@ class Problem:
             places = [torch.cat([at, whole[len(at) :]]) for whole in wholes]
             if self.task.varies:
                 of_each = zip(each, pictures.split(1), truths, map(self.asked, places), strict=True)
-                values = torch.cat([self._values(*one) for one in of_each])
+                values = torch.cat([self._values(*picture) for picture in of_each])
             else:
                 values = self._values(outputs, pictures, truths[0], self.asked(*places))
-            derivative = None
+            derivative = torch.zeros_like(u) if gradient else None
             if values.requires_grad:
                 derivative = torch.autograd.grad((values * hard_first(values)).sum(), at)[0]
-        said = self._judged(outputs, pictures, truths, wholes)
+        said = zip(values.detach(), self._judged(outputs, pictures, truths, wholes), each, strict=True)
         evaluations = [
-            Evaluation(float(value), None, judgement.success, judgement=judgement)
-            for value, judgement in zip(values.detach(), said, strict=True)
+            (Evaluation(float(value), None, judgement.success, judgement=judgement), output)
+            for value, judgement, output in said
         ]
-        if gradient and derivative is None:
-            derivative = torch.zeros_like(u)
-        return list(zip(evaluations, each, strict=True)), derivative
+        return evaluations, derivative
 
     def mean_under(
         self,
@@ -390,41 +379,38 @@ class Problem:
     ) -> Evaluation:
         """Return the mean over conditions whose pictures are predicted: `render` goes from some of them and u to
         pictures (N, H, W, 3), with a graph. The model is asked about `at_once` of them at once."""
-        found, total = [], None
+        evaluated, total = [], None
         for begin in range(0, len(wholes), at_once):
             some = slice(begin, begin + at_once)
             each, derivative = self.judged(partial(render, some), wholes[some], u, gradient)
-            found += each
+            evaluated += each
             if derivative is not None:
                 total = derivative if total is None else total + derivative
-        return self.mean(found, u, None if total is None else total / len(wholes))
+        return self.mean(evaluated, u, None if total is None else total / len(wholes))
 
-    def mean(self, found: Sequence[tuple[Evaluation, Output]], u: Tensor, gradient: Tensor | None = None) -> Evaluation:
+    def mean(
+        self, evaluated: Sequence[tuple[Evaluation, Output]], u: Tensor, gradient: Tensor | None = None
+    ) -> Evaluation:
         """Return the mean over conditions, from evaluations with the model's outputs, and the gradient of the mean
         where these have none. Its cost is counted in evaluations, each of which takes a picture a draw."""
-        each, count = [one for one, _ in found], len(found)
-        gradients = [one.gradient[: u.numel()] for one in each if one.gradient is not None]
+        each, outputs = zip(*evaluated, strict=True)
+        gradients = [evaluation.gradient[: u.numel()] for evaluation in each if evaluation.gradient is not None]
+        judged = [evaluation.judgement for evaluation in each if evaluation.judgement is not None]
         if self.task.varies:  # each condition has a truth of its own
-            judgement = self._usual([one.judgement for one in each if one.judgement is not None])
+            usual, score = typical(judged), mean([judgement.score for judgement in judged])
+            margin = mean([judgement.margin for judgement in judged])
+            judgement = Judgement.of(score, margin, usual.prediction, usual.payload)
         else:
             with torch.no_grad():
-                output = self.task.average([output for _, output in found])
-                judgement = self.task.judge(output, self.truth())[0]
-        judgement = replace(judgement, metrics=mean_metrics([one.judgement for one in each]))
+                judgement = self.task.judge(self.task.average(list(outputs)), self.truth())[0]
         return Evaluation(
-            objective=sum(one.objective for one in each) / count,
+            objective=sum(evaluation.objective for evaluation in each) / len(each),
             gradient=torch.stack(gradients).mean(dim=0) if gradients else gradient,
-            success=sum(one.success for one in each) >= OVER_CONDITIONS.share(count),
-            non_finite=sum(one.non_finite for one in each),
-            cost=max(one.cost for one in each),
-            judgement=judgement,
+            success=sum(evaluation.success for evaluation in each) >= OVER_CONDITIONS.share(len(each)),
+            non_finite=sum(evaluation.non_finite for evaluation in each),
+            cost=max(evaluation.cost for evaluation in each),
+            judgement=replace(judgement, metrics=mean_metrics(judged)),
         )
-
-    @staticmethod
-    def _usual(each: Sequence[Judgement]) -> Judgement:
-        score, margin = (mean(values) for values in ([one.score for one in each], [one.margin for one in each]))
-        usual = typical(each)
-        return Judgement.of(score, margin, usual.prediction, usual.payload)
 
     def loss(self, image: Tensor) -> Tensor:
         """The objective of a picture (H, W, 3) sRGB near the start, as a number with a graph."""

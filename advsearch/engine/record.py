@@ -28,8 +28,7 @@ from advsearch.tasks import Judgement, Prediction
 from advsearch.tasks.base import mean
 from advsearch.viewer.pages import keep_result
 
-KEPT = 4
-"""Pictures of each group of trials that are kept."""
+KEPT = 4  # pictures of each group of trials that are kept
 
 
 @dataclass
@@ -38,14 +37,11 @@ class Findings:
 
     Attributes:
         first_look: a few renders of the clean configuration at the search's sample count.
-        search: what the policy claims.
-        baseline: what the random search claims.
+        search, verification: what the policy claims, and what trials say of it.
+        baseline, baseline_verification: the same of the random search.
+        unprinted, unprinted_verification: the same of the policy without print terms, where the search has them.
         sample_count: how the sample count of the verification was chosen.
         clean: the control group's trials.
-        verification: of what the policy found.
-        baseline_verification: of the random search's.
-        unprinted: what the policy claims without print terms, where the search has them.
-        unprinted_verification: of that.
         beaten: verification of what the policy found, where the random search's turned out worse for the model and is
             the run's adversarial scene instead.
         failures: verification of the first of the different failures that the policy found.
@@ -116,8 +112,7 @@ class Stages:
         return time.perf_counter() - self._started
 
 
-LOST = "(no answer)"
-"""The label of a picture that nobody could make; what the row keeps beside it says why."""
+LOST = "(no answer)"  # the label of a picture that nobody could make; what the row keeps beside it says why
 
 
 def lost_remarks(lost: int) -> list[str]:
@@ -137,39 +132,28 @@ def trial_row(
     values: Mapping[str, Value] | None = None,
     *,
     sought: bool = True,
-    **more: Any,
 ) -> Row:
     """Return what the store keeps of a trial; the seed is None of a picture that was predicted. There is a success only
     where a search sought some prediction."""
-    return Row(
-        kind=kind,
-        step=number,
-        seed=seed,
-        spp=spp,
-        objective=_number(trial.objective),
-        success=trial.success if sought else None,
-        values=values or {},
-        **{"renders": 1, **_said(trial), **more},
-    )
+    objective, success = _number(trial.objective), trial.success if sought else None
+    row = Row(kind, number, seed=seed, spp=spp, objective=objective, success=success, values=values or {}, renders=1)
+    return judged(row, trial)
 
 
 def judged(row: Row, judgement: Judgement) -> Row:
     """Return the row with what a task said of its picture."""
-    return replace(row, **_said(judgement))
-
-
-def _said(judgement: Judgement) -> dict[str, Any]:
     prediction = judgement.prediction
-    return {
-        "score": _number(judgement.score),
-        "correct": judgement.right,
-        "margin": _number(judgement.margin),
-        "label": None if judgement.not_a_number else prediction.label,
-        "label_index": prediction.index,
-        "probability": prediction.probability,
-        "payload": judgement.payload,
-        "metrics": judgement.metrics or {},
-    }
+    return replace(
+        row,
+        score=_number(judgement.score),
+        correct=judgement.right,
+        margin=_number(judgement.margin),
+        label=None if judgement.not_a_number else prediction.label,
+        label_index=prediction.index,
+        probability=prediction.probability,
+        payload=judgement.payload,
+        metrics=judgement.metrics or {},
+    )
 
 
 def _number(value: float | None) -> float | None:
@@ -178,7 +162,7 @@ def _number(value: float | None) -> float | None:
 
 def judgement_of(row: Row) -> Judgement:
     """Return what was said of a trial from its row: nothing where it has no label, for the output was not a number."""
-    score, margin = (math.nan if one is None else one for one in (row.score, row.margin))
+    score, margin = (math.nan if value is None else value for value in (row.score, row.margin))
     prediction = Prediction(row.label or NOT_A_NUMBER, row.label_index, row.probability)
     return Judgement(score, margin, bool(row.correct), prediction, row.payload, row.objective, row.metrics or None)
 
@@ -194,23 +178,22 @@ def rate_of(rate: Trials, trials: Sequence[Judgement], successes: Sequence[Judge
     labels = Counter(trial.prediction.label for trial in successes)
     return VerifiedRate(
         successes=rate.successes,
-        trials=rate.trials,
-        rate=rate.rate,
-        interval=rate.interval,
         spp=rate.spp,
         labels=dict(labels.most_common()),
-        margin=mean_number(trial.score for trial in trials),
-        not_a_number=sum(trial.not_a_number for trial in trials),
+        margin=0.0 - mean_number(trial.score for trial in trials),
+        **_counted(rate, trials),
     )
 
 
 def control_group(trials: Sequence[Judgement], spp: int) -> ControlGroup:
     """Return how many trials of the clean scene are right."""
-    counted, nothing = count_right(trials, spp), sum(trial.not_a_number for trial in trials)
-    rate, interval = counted.rate, counted.interval
-    return ControlGroup(
-        correct=counted.successes, trials=counted.trials, rate=rate, interval=interval, not_a_number=nothing
-    )
+    right = count_right(trials, spp)
+    return ControlGroup(correct=right.successes, **_counted(right, trials))
+
+
+def _counted(rate: Trials, trials: Sequence[Judgement]) -> dict[str, Any]:
+    nothing = sum(trial.not_a_number for trial in trials)
+    return {"trials": rate.trials, "rate": rate.rate, "interval": rate.interval, "not_a_number": nothing}
 
 
 def mean_number(values: Iterable[float]) -> float:
@@ -259,7 +242,7 @@ class Results:
         return kind.of(self.get(key, lambda: measure().to_dict()))
 
     def rows(self, key: str, kind: type[Kind], measure: Callable[[], Sequence[Kind]]) -> list[Kind]:
-        return [kind.of(one) for one in self.get(key, lambda: [one.to_dict() for one in measure()])]
+        return [kind.of(row) for row in self.get(key, lambda: [row.to_dict() for row in measure()])]
 
     def put(self, key: str, value: Any) -> None:
         if self._run is not None:
@@ -274,8 +257,7 @@ def kept_rows(
 ) -> Ending:
     """Take rows until they end, the time is up or there is an interrupt, and keep what they come to after each.
 
-    The summary never has fewer rows than an earlier sitting left in it: those are read back before anything is
-    measured.
+    The summary never has fewer rows than an earlier sitting left in it: those are read back first.
     """
     taken: list[Kept] = []
     ending = INTERRUPTED

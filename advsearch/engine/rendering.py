@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from advsearch import seeds
 from advsearch.config import PICTURE_SPP, PICTURES, SceneConfig
-from advsearch.controls import Space, compose
+from advsearch.controls import compose
 from advsearch.controls.values import sentences
 from advsearch.described import Value
 from advsearch.engine.loading import Controls, Scene, Texture, as_controls, framed, load_scene, make_renderer
@@ -39,8 +39,7 @@ from advsearch.tasks import AnyTask, Facts, Mark, Prediction, Sight, make_task
 from advsearch.tasks.each_thing import each_thing
 from advsearch.tasks.rig import Rig
 
-MOST_PREDICTIONS = 5
-"""Predictions of the model that are kept of a picture."""
+MOST_PREDICTIONS = 5  # predictions of the model that are kept of a picture
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -98,16 +97,10 @@ class Rendering:
 
     def save(self, path: str | Path) -> tuple[int, int]:
         """Write the picture, whole or not at all; several views become one sheet with the predictions under each.
+        Return height and width of what was written, in pixels.
 
-        Args:
-            path: a .png holds what the model sees, an .exr linear radiance times the gain; an older file is replaced.
-
-        Returns:
-            Height and width of what was written, in pixels.
-
-        Raises:
-            InputError: another ending, or an .exr of several views.
-            StorageError: the file could not be written.
+        A .png holds what the model sees, an .exr linear radiance times the gain; an older file is replaced. Raises
+        InputError (another ending, or an .exr of several views), or StorageError where it could not be written.
         """
         file = writable(path, len(self.views))
         with placed_by("out"):
@@ -118,16 +111,9 @@ class Rendering:
         return self._shown.shape[0], self._shown.shape[1]
 
     def save_aov(self, path: str | Path, aovs: Sequence[str]) -> Path:
-        """Write ground truth of the view as layers of one EXR, whole or not at all, and return the path.
-
-        Args:
-            path: of the picture; the layers go beside it, as ``NAME.aov.exr``.
-            aovs: names of `advsearch.scene.surfaces.AOVS`.
-
-        Raises:
-            InputError: `render` was not asked for it.
-            StorageError: the file could not be written.
-        """
+        """Write ground truth of the view as layers of one EXR, whole or not at all, beside the picture of this path, as
+        ``NAME.aov.exr``, and return its path; `aovs` are names of `advsearch.scene.surfaces.AOVS`. Raises InputError
+        where `render` was not asked for it, or StorageError."""
         (surfaces, *others) = [view.surfaces for view in self.views]
         if surfaces is None or others:
             raise InputError("aov: ground truth is written for a single view, rendered with `aov`; leave `around` out")
@@ -139,17 +125,8 @@ class Rendering:
         return contact_sheet([view.picture.numpy() for view in self.views], self._captions)
 
     def save_predictions(self, path: str | Path) -> Path | None:
-        """Write the picture, or the sheet, with boxes and masks drawn in beside that of `save`, as NAME-prediction.png.
-
-        Args:
-            path: of the picture.
-
-        Returns:
-            The file that was written; None where the task draws nothing.
-
-        Raises:
-            StorageError: the file could not be written.
-        """
+        """Write the picture, or the sheet, with boxes and masks drawn in beside that of `save`, as NAME-prediction.png,
+        and return its path; None where the task draws nothing. Raises StorageError."""
         if not any(view.marks for view in self.views):
             return None
         drawn = [marked(view.picture.numpy(), view.marks) for view in self.views]
@@ -174,22 +151,14 @@ class Rendering:
 
     @property
     def _captions(self) -> list[list[str]]:
-        return [
-            [f"azimuth {view.azimuth:g}", *(seen_text(self.task, one) for one in view.predictions)]
-            for view in self.views
-        ]
+        said = [[seen_text(self.task, prediction) for prediction in view.predictions] for view in self.views]
+        return [[f"azimuth {view.azimuth:g}", *texts] for view, texts in zip(self.views, said, strict=True)]
 
     def result(
         self, out: Path, size: tuple[int, int], warnings: Sequence[str], answered: Path | None = None
     ) -> RenderResult:
-        """Return everything but the pictures.
-
-        Args:
-            out: the file that was written.
-            size: its height and width in pixels.
-            warnings: all that were said.
-            answered: the file with the predictions drawn in.
-        """
+        """Return everything but the pictures: with the file that was written, its height and width in pixels, all that
+        was said, and the file with the predictions drawn in."""
         return RenderResult(
             out=str(out),
             answered=None if answered is None else str(answered),
@@ -260,21 +229,24 @@ def render(
     check_judged(scene.description, judge)
     asked = made.on(model) if judge != ALL else each_thing(made.on(model))
     instances = as_controls(controls)
-    if around is not None and any(one.kind == "camera" and "azimuth" in one.settings() for one in instances):
+    if around is not None and any(
+        control.kind == "camera" and "azimuth" in control.settings() for control in instances
+    ):
         raise InputError("around: sets camera.azimuth itself, and `controls` fixes it; leave one of them out")
     size = as_python(resolution) or model.input_size
     progress = watcher(progress)
     progress.stage("rendering", around or 1)
-    formation = None
-    views = []
-    untold: list[str] = []
-    remarks: tuple[str, ...] = ()
+    formation, views, untold, remarks = None, list[View](), list[str](), tuple[str, ...]()
     for description in _turned(scene.description, around):
         description = framed(description, size)
         space = compose(instances, description)
         renderer = make_renderer(description, space, size, denoise, seed, sampler=sampler)
         formation = renderer.formation  # the same for all, exposure included
-        u = space.start if at is None else _configuration(at, space)
+        u = space.start if at is None else torch.as_tensor(at, dtype=torch.float32)
+        if u.shape != space.start.shape:
+            raise InputError(
+                f"at: expected ({len(space.start)},) numbers, as `controls` have in this scene, got {tuple(u.shape)}"
+            )
         with torch.no_grad():
             radiance = renderer.radiance(u, seeds.stream(seed, "pictures"), spp)
             picture = to_8_bit(space.picture(u, formation.display(radiance)))
@@ -292,27 +264,15 @@ def render(
             predictions = asked.predictions(output, MOST_PREDICTIONS)[0]
             marks = () if truth is None else tuple(asked.marks(output, truth)[0])
         remarks = remarks or asked.remarks
-        azimuth = description.number("camera.azimuth")
-        surfaces = renderer.surfaces(u) if aov else None
-        things = things_seen(renderer, u)
-        views.append(
-            View(azimuth, picture, radiance * formation.gain, predictions, marks, surfaces, output, truth, things)
-        )
+        azimuth, linear = description.number("camera.azimuth"), radiance * formation.gain
+        surfaces, things = renderer.surfaces(u) if aov else None, things_seen(renderer, u)
+        views.append(View(azimuth, picture, linear, predictions, marks, surfaces, output, truth, things))
         progress.advance(1)
     assert formation is not None
     own = scene.description
     warnings = (*space.notes(own), *sentences(space.moved), *untold, *remarks)
     shown = replace(own, environment_spec=space.environment or own.environment_spec)
     return Rendering(shown, model.name, made.name, formation, spp, tuple(views), warnings)
-
-
-def _configuration(at: Tensor, space: Space) -> Tensor:
-    u = torch.as_tensor(at, dtype=torch.float32)
-    if u.shape != space.start.shape:
-        raise InputError(
-            f"at: expected ({len(space.start)},) numbers, as `controls` have in this scene, got {tuple(u.shape)}"
-        )
-    return u
 
 
 def check_judged(description: SceneDescription, judge: str) -> None:
@@ -333,28 +293,21 @@ def facts_about(
     look: Callable[[], Surfaces] | None = None,
     judge: str = OBJECT,
 ) -> Facts:
-    """Return what a scene gives a task to judge by.
+    """Return what a scene, whose object is called `name`, gives a task to judge by.
 
     Args:
-        description: the scene.
-        name: what the object is called.
         label: what is right, of the thing that is judged, or of the object where all are.
         values: says the configuration; of the rest is said what the scene was given.
         look: sees it.
-        judge: the thing that is judged: `OBJECT`, the name of one beside it, or `ALL`.
-
-    Raises:
-        UnknownNameError: there is no such thing.
+        judge: the thing that is judged: `OBJECT`, the name of one beside it, or `ALL`; another is an UnknownNameError.
     """
-    fixed = {key: value for key, value in description.values.items() if value is not None}
 
     def numbers() -> dict[str, float]:
-        said = {**fixed, **{key: one["value"] for key, one in values().items()}}
-        return {key: float(v) for key, v in said.items() if isinstance(v, (int, float))}
+        said = {**description.values, **{key: value["value"] for key, value in values().items()}}
+        return {key: float(number) for key, number in said.items() if isinstance(number, (int, float))}
 
-    things = description.things
     check_judged(description, judge)
-    looked = None if look is None else cache(look)
+    things, looked = description.things, None if look is None else cache(look)
 
     def of(mesh: str, label: str | None) -> Facts:
         sight = None if looked is None else lambda: sight_of(looked(), mesh, description.object.metres)
@@ -381,29 +334,24 @@ def things_seen(renderer: Renderer, u: Tensor) -> JsonObject | None:
     if not description.things:
         return None
     names = (OBJECT, *description.things)
-    found = {one.name: one for one in seen_things(renderer, u, names)}
-    shown: JsonObject = {}
-    for name in names:
-        one = found.get(name)
-        shown[name] = {
-            "label": description.meshes[name].label,
-            "box": None if one is None else [*one.box],
-            "pixels": 0 if one is None else int(one.mask.sum()),
-            "share": 0.0 if one is None else None if one.share is None else round(one.share, 4),
-            "truncated": None if one is None else one.truncated,
-            "distance": None if one is None else round(one.distance, 3),
+    unseen: JsonObject = {"box": None, "pixels": 0, "share": 0.0, "truncated": None, "distance": None}
+    shown: JsonObject = {name: {"label": description.meshes[name].label, **unseen} for name in names}
+    for seen in seen_things(renderer, u, names):
+        shown[seen.name] = {
+            "label": description.meshes[seen.name].label,
+            "box": [*seen.box],
+            "pixels": int(seen.mask.sum()),
+            "share": None if seen.share is None else round(seen.share, 4),
+            "truncated": seen.truncated,
+            "distance": round(seen.distance, 3),
         }
     return shown
 
 
 def pictures_of(config: SceneConfig) -> dict[str, Any]:
     """Return how `render` makes the pictures that a configuration's models are shown."""
-    return {
-        "resolution": config.resolution,
-        "denoise": config.denoise,
-        "sampler": config.pixel_sampler,
-        "seed": config.seed,
-    }
+    sampler, size = config.pixel_sampler, config.resolution
+    return {"resolution": size, "denoise": config.denoise, "sampler": sampler, "seed": config.seed}
 
 
 def writable(path: str | Path, views: int) -> Path:

@@ -29,13 +29,10 @@ from advsearch.scene.transport.matrix import Tick
 WORTH = 32
 """Pictures of a search from which on the light pays: it and a comparison take as long as some 25 rendered ones, or 45
 where the first views do not decide."""
-NO_CAMERA = "no camera moves"
-"""The reason where light on surfaces has no advantage."""
-LIGHTS = 64
-"""Environments in the bank, where they vary."""
+NO_CAMERA = "no camera moves"  # the reason where light on surfaces has no advantage
+LIGHTS = 64  # environments in the bank, where they vary
 EVERY = 100
-TOGETHER = 8
-"""Pictures that the model is asked about at once."""
+TOGETHER = 8  # pictures that the model is asked about at once
 AGAIN = 4
 """Evaluations of a random search from which on cameras and environments come again: nothing learns from them, and what
 each camera sees is known then."""
@@ -47,7 +44,7 @@ def reason_against(problem: Problem, steps: int, policy: Policy[Any], specialise
         return "nothing is left out"
     if problem.renderer.composed:
         return problem.renderer.composed
-    names = [one.name for one in problem.space.controls]
+    names = [control.name for control in problem.space.controls]
     if not surface_renderer.varied(problem.renderer, names) & CAMERAS:
         return NO_CAMERA
     if steps * problem.draws < WORTH:
@@ -81,10 +78,10 @@ class SurfaceLight(PredictedSearch):
         changes = {control.name: surface_renderer.varied(renderer, [control.name]) for control in space.controls}
 
         def changing(inputs: frozenset[str]) -> Tensor:
-            found = torch.zeros(len(space.start), dtype=torch.bool)
+            which = torch.zeros(len(space.start), dtype=torch.bool)
             for group in space.groups:
-                found[group.coordinates] = bool(changes[group.control] & inputs)
-            return found
+                which[group.coordinates] = bool(changes[group.control] & inputs)
+            return which
 
         self._moving = changing(CAMERAS | {MAP})[:searched]
         if self.places is not None:
@@ -163,8 +160,8 @@ class SurfaceLight(PredictedSearch):
                 yield from traced(queries[place:])
                 return
             if place not in ahead and self.problem.conditions is None and not self._colored:
-                some = [one.u for one in queries[place : place + self.renderer.at_once]]
-                ahead = dict(enumerate(self.renderer.pictures(some), place))
+                us = [later.u for later in queries[place : place + self.renderer.at_once]]
+                ahead = dict(enumerate(self.renderer.pictures(us), place))
             yield self.evaluate(query, ahead.get(place))
 
     def evaluate(self, query: Query, picture: Tensor | None = None) -> Evaluation:
@@ -174,8 +171,7 @@ class SurfaceLight(PredictedSearch):
             whole = problem.whole(query.u)
             with torch.no_grad():
                 shown = to_8_bit(self.renderer(whole) if picture is None else picture)
-            kept = shown if query.keep else None
-            return Evaluation.of(problem.judge(shown, whole), cost=0, predicted=RAYS, picture=kept)
+            return problem.trial(shown, whole, cost=0, predicted=RAYS, picture=shown if query.keep else None)
         if picture is not None:
             ((evaluation, _),), _ = problem.judged(lambda at: picture[None], [query.u], query.u, False)
             kept = to_8_bit(picture) if query.keep else None
@@ -209,20 +205,18 @@ class SurfaceLight(PredictedSearch):
         """What a configuration of the whole space sets in the scene; without the base colour, where the searched
         controls set nothing else."""
         with torch.no_grad():
-            return self.problem.renderer.scene.assembly(
-                self._asked.inputs(whole[len(whole) - len(self._asked.start) :])
-            )
+            inputs = self._asked.inputs(whole[len(whole) - len(self._asked.start) :])
+            return self.problem.renderer.scene.assembly(inputs)
 
     def _pictures(self, wholes: Sequence[Tensor], u: Tensor, key: tuple[int, int] | None = None) -> Tensor:
         """Return pictures (n, H, W, 3) of u under conditions, with a graph. What the cameras of a key see is kept."""
         color = self.renderer.color(self.problem.searched_space.inputs(u))
         places = [torch.cat([u, whole[len(u) :]]) for whole in wholes]
         inputs = [self._inputs(whole) for whole in wholes]
-        if key is None:
-            return self.renderer.shown(self.renderer.looks(inputs), inputs, color, places)
-        if key not in self._looks:
+        if key is not None and key not in self._looks:
             self._looks[key] = list(self.renderer.looks(inputs))
-        return self.renderer.shown(self._looks[key], inputs, color, places)
+        looks = self.renderer.looks(inputs) if key is None else self._looks[key]
+        return self.renderer.shown(looks, inputs, color, places)
 
     # ---- comparisons ------------------------------------------------------------------------------------------------
 
@@ -232,14 +226,11 @@ class SurfaceLight(PredictedSearch):
         due = query.kind == "search" and query.phase == "search" and query.number >= (self._next or EVERY)
         if not due or self.given_up:
             return
-        before = self.deviations[-1]
-        deviation = self._compare(query.u, query.number)
-        self._next = query.number + (query.number if deviation.good and not self._colored else EVERY)
-        if deviation.good:
-            return
-        if not before.good:
+        before, good = self.deviations[-1].good, self._compare(query.u, query.number).good
+        self._next = query.number + (query.number if good and not self._colored else EVERY)
+        if not good and not before:
             self.give_up("search", query.number)
-        elif self._colored:
+        elif not good and self._colored:
             with self.timed():
                 self.renderer.renew(self.problem.whole(query.u))
             self.renewed = (self.renewed or 0) + 1

@@ -30,13 +30,10 @@ from advsearch.scene.transport.matrix import TOO_LARGE, Tick
 WORTH = 16
 """Evaluations from which a search pays for the matrix, which costs as much as some 6 rendered ones with gradients
 (`benchmarks/transport.py`)."""
-WORTH_A_LIGHT = 8
-"""Evaluations for each light from which a search pays for its basis picture."""
+WORTH_A_LIGHT = 8  # evaluations for each light from which a search pays for its basis picture
 EVERY = 20
-FEWEST_SCORES = 4
-"""Trials whose spread says something."""
-SPREAD = 1.64
-"""Standard deviations under their mean above which 19 of 20 scores lie."""
+FEWEST_SCORES = 4  # trials whose spread says something
+SPREAD = 1.64  # standard deviations under their mean above which 19 of 20 scores lie
 AVOIDABLE = {
     HAZE: "leave the haze out",
     NOISE: "`denoise=oidn` takes the noise out",
@@ -70,8 +67,7 @@ def remark(reason: str) -> str:
 
 @dataclass
 class PredictedSearch(ABC):
-    """What predicts the pictures of a run's searches. All of it follows from the seed, so that a run that goes on makes
-    the same again.
+    """What predicts the pictures of a run's searches. All of it follows from the seed, so that it can be made again.
 
     Attributes:
         way: how, in words.
@@ -189,8 +185,7 @@ class Transport(PredictedSearch):
         return samples_to_collect(self.problem.renderer)
 
     def prepare(self, tick: Tick = lambda samples: None) -> None:
-        if self.clean.made is None:
-            self.clean.made = self._made(self.problem.domain.start, "start", 0, tick)
+        self.clean.made = self.clean.made or self._made(self.problem.domain.start, "start", 0, tick)
 
     @property
     def start(self) -> Predictor:
@@ -252,6 +247,5 @@ class Transport(PredictedSearch):
             self._optimism = self._score(u) - lower
 
     def _score(self, u: Tensor) -> float:
-        """That of the picture that is predicted from the start, rounded to 8 bits."""
         with torch.no_grad():
-            return self.problem.judge(to_8_bit(self.start(u)), u).score
+            return self.problem.trial(to_8_bit(self.start(u)), u).said.score

@@ -1,5 +1,4 @@
-"""Trials of configurations, kept as rows: of what was found, of different failures, of it on other models or
-pictures."""
+"""Trials of configurations, kept as rows: of what was found, of different failures, also on other models."""
 
 from __future__ import annotations
 
@@ -13,19 +12,11 @@ import torch
 from torch import Tensor
 
 from advsearch import seeds
-from advsearch.attacks import (
-    Ending,
-    Evaluation,
-    SearchResult,
-    Verification,
-    choose_spp,
-    run_trials,
-    verify,
-)
+from advsearch.attacks import Ending, Evaluation, SearchResult, Verification, choose_spp, run_trials, verify
 from advsearch.attacks.draws import batches
 from advsearch.attacks.evaluation import Query, most_at_once
 from advsearch.attacks.rate_samples import CONDITIONS, OVER_LADDER, affordable, choose_rate_spp
-from advsearch.attacks.trials import LADDER, margins_of, most_samples
+from advsearch.attacks.trials import LADDER, SampleCount, margins_of, most_samples
 from advsearch.cluster import Executor
 from advsearch.config import SceneConfig
 from advsearch.engine.journal import Journal, Shared
@@ -40,13 +31,11 @@ from advsearch.runs.summary import read_configuration
 from advsearch.scene.formation import next_count, to_8_bit
 from advsearch.tasks import Judgement
 
-MANY = 64
-"""Of a configuration with more numbers than this, a trial's row does not hold the values."""
+MANY = 64  # of a configuration with more numbers than this, a trial's row does not hold the values
 
 
 def ladder_of(config: SceneConfig) -> Sequence[int]:
-    """Return the samples a pixel that a verification climbs, as the sampler has them; the only count, if one was asked
-    for."""
+    """Return the samples a pixel that a verification climbs, as the sampler has them; one, if that was asked for."""
     asked = getattr(config, "verify_spp", None)
     return LADDER if asked is None else (next_count(config.pixel_sampler, asked),)
 
@@ -98,31 +87,27 @@ class Verifier:
         until they would not change the share of conditions, where these vary. There, searches that took so many samples
         bound those of the check."""
         over, ladder, trials = self.problem.conditions is not None, self.ladder, self.looks[0]
-        if over and len(ladder) > 1:
-            ladder = OVER_LADDER
-            if searched is not None:
-                ladder = affordable(ladder, (len(candidates) + 1) * self.count, searched)
+        choose: Callable[..., SampleCount] = partial(choose_spp, trials=trials)
+        most = most_samples(len(candidates), ladder, trials)
+        if over:
+            if len(ladder) > 1:
+                ladder = OVER_LADDER
+                if searched is not None:
+                    ladder = affordable(ladder, (len(candidates) + 1) * self.count, searched)
+            choose, most = choose_rate_spp, CONDITIONS * len(candidates) * sum(ladder)
         if len(ladder) > 1:
-            most = CONDITIONS * len(candidates) * sum(ladder) if over else most_samples(len(candidates), ladder, trials)
-            self.stages.begin(
-                "verification",
-                "finding how many samples the check needs",
-                most,
-                hint="more and more samples a pixel until noise no longer moves the result (counted in samples a "
-                "pixel); `verify_spp=NUMBER` leaves it out",
-                at_most=True,
+            hint = (
+                "more and more samples a pixel until noise no longer moves the result (counted in samples a pixel); "
+                "`verify_spp=NUMBER` leaves it out"
             )
+            title = "finding how many samples the check needs"
+            self.stages.begin("verification", title, most, hint=hint, at_most=True)
         evaluate = partial(self.evaluate_all, in_samples=True)
         margins = {
             name: margins_of(evaluate, f"sample count {name}", u, keep=KEPT, drawn=over)
             for name, u in candidates.items()
         }
-        seed = self.problem.seed
-        self.findings.sample_count = (
-            choose_rate_spp(margins, seed=seed, ladder=ladder)
-            if over
-            else choose_spp(margins, seed=seed, ladder=ladder, trials=trials)
-        )
+        self.findings.sample_count = choose(margins, seed=self.problem.seed, ladder=ladder)
 
     def try_clean(self) -> None:
         """The control group: the clean configuration under the seeds that every other group gets.
@@ -136,7 +121,7 @@ class Verifier:
         self.findings.clean = run_trials(
             self.evaluate_all,
             self.problem.domain.start,
-            spp=self.findings.spp,
+            spp=self._clean_spp,
             seed=self.problem.seed,
             trials=self.looks[0],
             kind=self._clean_kind,
@@ -151,7 +136,6 @@ class Verifier:
     def verified(self, kind: str, found: SearchResult, *, curtailed: bool = False, again: bool = False) -> Verification:
         """Verify what one search found against the control group; `curtailed` where only the verdict matters. A control
         group that has too few trials gets more. `again`: in trials after all others, both groups anew."""
-        clean = () if again else self.findings.clean
         checked = verify(
             self.evaluate_all,
             self.problem.domain,
@@ -160,7 +144,7 @@ class Verifier:
             spp=self.findings.spp,
             seed=self.problem.seed,
             trials=self.looks,
-            clean=clean,
+            clean=() if again else self.findings.clean,
             rule=self.problem.rule,
             kind=kind,
             control=self._clean_kind,
@@ -192,13 +176,15 @@ class Verifier:
 
     def average(self, count: int) -> None:
         """Try configurations drawn from the whole space and budget: how often the model is wrong on average."""
-        problem, found = self.problem, list[Judgement]()
+        domain, judgements = self.problem.domain, list[Judgement]()
+
+        def drawn(number: int) -> Tensor:
+            return domain.sample(torch.Generator().manual_seed(seeds.stream(self.problem.seed, "draw", number)))[0]
+
         self.begin("trying random configurations", count, name="average", flags="`average`")
-        for numbers in batches(0, count, most_at_once(problem.domain.dim)):
-            generators = [torch.Generator().manual_seed(seeds.stream(problem.seed, "draw", one)) for one in numbers]
-            drawn = [problem.domain.sample(one)[0] for one in generators]
-            found += self.trials("average", dict(zip(numbers, drawn, strict=True)))
-        self.findings.average = tuple(found)
+        for numbers in batches(0, count, most_at_once(domain.dim)):
+            judgements += self.trials("average", {number: drawn(number) for number in numbers})
+        self.findings.average = tuple(judgements)
 
     def begin(
         self,
@@ -251,12 +237,13 @@ class Retrials:
         self._conditions, self._progress, self._count, self._seed = conditions, progress, trials, seed
         first = Journal(run, Shared(conditions[0].problem))
         self._journals = {
-            one.name: replace(first, traced=Shared(one.problem, executor, one.name)) for one in conditions
+            condition.name: replace(first, traced=Shared(condition.problem, executor, condition.name))
+            for condition in conditions
         }
         self._clean: dict[str, tuple[Judgement, ...]] = {}
         self._pictures: dict[tuple[Hashable, int, int], Tensor] = {}
         self._lights: dict[tuple[Hashable, int, int], Tensor] = {}
-        self._sharing = Counter(one.light for one in conditions if one.light is not None)
+        self._sharing = Counter(condition.light for condition in conditions if condition.light is not None)
         self._pictured = ""
 
     def clean(self, condition: RetrialCondition) -> tuple[Judgement, ...]:
@@ -294,35 +281,25 @@ class Retrials:
             yield evaluation
 
     def _changed(self, kind: str, condition: RetrialCondition, queries: Sequence[Query]) -> Iterator[Evaluation]:
-        """Judge pictures as the condition changes them; those of the configuration that is tried now are kept for other
-        conditions."""
+        """Judge pictures as the condition changes them; those of the present configuration are kept for others."""
         if kind != self._pictured:
             self._pictures.clear()
             self._lights.clear()
             self._pictured = kind
-        keys = [(condition.source, one.seed, condition.spp) for one in queries]
-        new = [
-            replace(one, wanted="picture") for one, key in zip(queries, keys, strict=True) if key not in self._pictures
-        ]
-        made = self._made(condition, new)
-        for query, key in zip(queries, keys, strict=True):
-            machine = None
-            if key not in self._pictures:
-                self._pictures[key], machine = next(made)
-            picture = condition.change(self._pictures[key], query.seed)
-            said = condition.problem.judge(to_8_bit(picture), condition.problem.whole(query.u, query.seed))
-            yield Evaluation.of(said, machine=machine)
-
-    def _made(self, condition: RetrialCondition, queries: Sequence[Query]) -> Iterator[tuple[Tensor, str | None]]:
-        """Pictures of a condition's problem, by workers where there are some, and on which machine."""
+        problem, keys = condition.problem, {q.seed: (condition.source, q.seed, condition.spp) for q in queries}
+        new = [replace(query, wanted="picture") for query in queries if keys[query.seed] not in self._pictures]
         shared = self._journals[condition.name].traced
-        if shared.executor is None or len(queries) < 2:
-            for query in queries:
-                yield self._rendered(condition, query.u, query.seed), None
-            return
-        for evaluation in shared(queries):
-            assert evaluation.picture is not None
-            yield evaluation.picture, evaluation.machine
+        sent = iter(shared(new)) if shared.executor is not None and len(new) > 1 else None
+        for query in queries:
+            key, machine = keys[query.seed], None
+            if key not in self._pictures and sent is None:
+                self._pictures[key] = self._rendered(condition, query.u, query.seed)
+            elif key not in self._pictures and sent is not None:
+                evaluation = next(sent)
+                assert evaluation.picture is not None
+                self._pictures[key], machine = evaluation.picture, evaluation.machine
+            picture, whole = condition.change(self._pictures[key], query.seed), problem.whole(query.u, query.seed)
+            yield problem.trial(to_8_bit(picture), whole, machine=machine)
 
     def _rendered(self, condition: RetrialCondition, u: Tensor, seed: int) -> Tensor:
         """As `Problem.picture`, from the radiance of other conditions with the same light where there are any."""

@@ -21,6 +21,7 @@ import urllib.error
 import urllib.request
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, field
 from email.message import Message
 from functools import partial
@@ -40,13 +41,11 @@ from advsearch.models.model import Model, Preprocessing
 from advsearch.models.source import Purpose, Source
 from advsearch.models.zoo.language import QUESTION, SIDE
 from advsearch.pictures import png_of
-from advsearch.registry import may_fetch
+from advsearch.registry import how_to_allow, may_fetch
 
-KEY = "ADVSEARCH_MODEL_KEY"
-"""The environment variable with the key that is sent as ``Authorization: Bearer``."""
+KEY = "ADVSEARCH_MODEL_KEY"  # the environment variable with the key that is sent as ``Authorization: Bearer``
 
-CHAT = "/chat/completions"
-"""How the path of an address ends that is asked as OpenAI's chat is."""
+CHAT = "/chat/completions"  # how the path of an address ends that is asked as OpenAI's chat is
 
 LIMITS: dict[str, float] = {
     "calls": 2000, "at_once": 4, "tokens": float("inf"), "money": float("inf"),
@@ -56,29 +55,17 @@ LIMITS: dict[str, float] = {
 at the same time; the most tokens and money; the price of a call and of a
 million tokens in and out, in the unit of `money`; how long an answer may take."""
 
-MOST_AT_ONCE = 64
-
 TRIES, FIRST_WAIT, LONGEST_WAIT = 5, 1.0, 60.0
 """How often a picture is sent to a server that is busy or fails, and the seconds between: twice as long each time."""
 
-BUSY = (408, 409, 425, 429, 500, 502, 503, 504, 529)
-"""Statuses of a server that may answer later."""
+MOST_AT_ONCE = 64
+BUSY = (408, 409, 425, 429, 500, 502, 503, 504, 529)  # statuses of a server that may answer later
+LARGEST = 1 << 20  # bytes of an answer
+LONGEST = 1000  # characters that are kept of an answer in words
+LEAST = 1e-6  # the share of a name that an answer leaves out, or gives less: its logarithm is the logit
+REFUSED = "(refused)"  # the words of a model that declines to answer
 
-LARGEST = 1 << 20
-"""Most bytes of an answer."""
-
-LONGEST = 1000
-"""Most characters that are kept of an answer in words."""
-
-LEAST = 1e-6
-"""The share that a name has which an answer leaves out, or gives less: its logarithm is the logit."""
-
-REFUSED = "(refused)"
-"""What stands for the words of a model that declines to answer."""
-
-
-Levels: TypeAlias = npt.NDArray[np.uint8]
-"""A picture (H, W, 3) as a file has it."""
+Levels: TypeAlias = npt.NDArray[np.uint8]  # A picture (H, W, 3) as a file has it
 
 
 class Store(Protocol):
@@ -93,15 +80,12 @@ class Store(Protocol):
 
 def load(spec: str) -> Source:
     """Return the source of a model behind an address, which is finished by what it is asked for; nobody is asked yet.
-
-    Raises:
-        InputError: only a file names it, it is no address that may be kept, or the key would go over it unencrypted.
-    """
+    Raises InputError: only a file names it, or as `checked`."""
     address = checked(spec)
     if not may_fetch(spec):
         raise InputError(
-            f"a file names the model {spec}, to which pictures would be sent, and the key in {KEY}; if you trust it, "
-            f"allow it yourself: in Python with advsearch.allow_code({spec!r}), or with `code={spec}`"
+            f"a file names the model {spec}, to which pictures would be sent, and the key in {KEY}; "
+            f"{how_to_allow(spec)}"
         )
     finish = partial(_finished, spec, address)
     return Source(_never, address.fragment or address.netloc, finish=finish, reads_text=True)
@@ -112,7 +96,8 @@ def _never(pictures: Tensor) -> Any:
 
 
 def checked(spec: str) -> SplitResult:
-    """Return the parts of an address. Raises InputError: it has no host, or something that is no secret's place."""
+    """Return the parts of an address. Raises InputError: it has no host, a secret in it, which would be stored with the
+    run, or the key would go over it unencrypted."""
     try:
         address = urlsplit(spec)
         host, _ = address.hostname, address.port
@@ -165,21 +150,16 @@ def limits_of(ask: Mapping[str, float]) -> dict[str, float]:
 def _finished(spec: str, address: SplitResult, purpose: Purpose) -> Model:
     chat, name = address.path.endswith(CHAT), address.fragment or address.netloc
     purpose.check(name, "is behind an address", "classification", "answer")
-    free = purpose.task == "answer"
-    if free and purpose.names is not None:
-        raise InputError("labels: task answer has no classes; leave them out, and say the right words with `label`")
+    free = purpose.is_free()
     if chat and not free:
         raise InputError(f"task: a chat such as {name} answers in words; use `task=answer`, and say the right `label`")
     if chat and not address.fragment:
         raise InputError(f"model {spec}: expected the name of the chat's model behind a #: {spec}#NAME")
-    if len(purpose.prompts or ()) > 1:
-        raise InputError(f"prompt: expected one question for model {name}, got {len(purpose.prompts or ())}")
-    question = (purpose.prompts or (QUESTION,))[0] if free or purpose.prompts else ""
+    question = purpose.one_prompt(name) or (QUESTION if free else "")
     line = Line(urlunsplit(address._replace(fragment="")), name, limits_of(purpose.ask), spec)
     asked = Asked(line, address.fragment if chat else "", question, purpose.tokens, purpose.times if free else 1)
-    names = purpose.names
     if not free:
-        asked.names = names or tuple(asked.scores(np.full((SIDE, SIDE, 3), 128, np.uint8)))
+        asked.names = purpose.names or tuple(asked.scores(np.full((SIDE, SIDE, 3), 128, np.uint8)))
         if len(asked.names) < 2:
             raise ModelError(f"model {name}: expected scores of two names at least, got {len(asked.names)}")
     return Model(
@@ -223,35 +203,45 @@ class Line:
     def _note(self) -> str:
         return f"asked {self.spec}"
 
+    def _keep(self) -> None:
+        if self.store is not None:
+            self.store.set_note(self._note, json.dumps(vars(self.spent)))
+
     @property
-    def money(self) -> float:
-        """What has been spent, in the unit of the prices."""
+    def _so_far(self) -> dict[str, float]:
+        """What has been spent, by the name of its limit; money in the unit of the prices."""
         limits, spent = self.limits, self.spent
         by_token = limits["per_million_in"] * spent.tokens_in + limits["per_million_out"] * spent.tokens_out
-        return limits["per_call"] * spent.calls + by_token / 1e6
+        money = limits["per_call"] * spent.calls + by_token / 1e6
+        return {"calls": spent.calls, "tokens": spent.tokens_in + spent.tokens_out, "money": money}
 
     @property
     def sentence(self) -> str:
         """What a run has spent, for its reader."""
-        tokens = self.spent.tokens_in + self.spent.tokens_out
-        more = [f"{tokens:,} tokens"] * bool(tokens) + [f"{self.money:.4g} of money"] * bool(self.money)
-        return f"The model {self.name} was asked {self.spent.calls:,} times{''.join(f', {one}' for one in more)}."
+        calls, tokens, money = self._so_far.values()
+        more = (f", {tokens:,} tokens" if tokens else "") + (f", {money:.4g} of money" if money else "")
+        return f"The model {self.name} was asked {calls:,} times{more}."
 
-    def _check_limits(self) -> None:
-        spent = {"calls": self.spent.calls, "tokens": self.spent.tokens_in + self.spent.tokens_out, "money": self.money}
-        for name, number in spent.items():
-            limit = self.limits[name]
-            if number >= limit:
-                raise ModelError(
+    @property
+    def _over(self) -> str:
+        """Which limit is reached; nothing where another call is allowed."""
+        for name, number in self._so_far.items():
+            if number >= (limit := self.limits[name]):
+                return (
                     f"model {self.name}: {number:,.10g} {name} are spent, and `ask` allows {limit:,.10g}; `advsearch "
                     f"resume RUN ask.{name}={2 * limit or 1:.10g}` goes on with more, and asks nothing twice"
                 )
+        return ""
+
+    @property
+    def _priced_by_token(self) -> bool:
+        return bool(self.limits["per_million_in"] or self.limits["per_million_out"])
 
     @property
     def at_once(self) -> int:
         """Requests that are under way at the same time: one where only its answer tells whether another is allowed."""
-        by_token = self.limits["per_million_in"] or self.limits["per_million_out"]
-        waits = self.limits["tokens"] < LIMITS["tokens"] or (by_token and self.limits["money"] < LIMITS["money"])
+        by_token = self._priced_by_token and self.limits["money"] < LIMITS["money"]
+        waits = self.limits["tokens"] < LIMITS["tokens"] or by_token
         return 1 if waits else int(self.limits["at_once"])
 
     def send(self, bodies: Sequence[Mapping[str, Any]]) -> Iterator[tuple[int, dict[str, Any]]]:
@@ -283,18 +273,14 @@ class Line:
 
     def _reserve(self, most: int) -> int:
         """Count calls before they are made, as many as the limits allow, and return how many these are."""
-        for count in range(most):
-            try:
-                self._check_limits()
-            except ModelError:
-                if not count:
-                    raise
-                most = count
-                break
+        count = 0
+        while count < most and not (over := self._over):
             self.spent.calls += 1
-        if self.store is not None:
-            self.store.set_note(self._note, json.dumps(vars(self.spent)))
-        return most
+            count += 1
+        if not count:
+            raise ModelError(over)
+        self._keep()
+        return count
 
     def _together(self, bodies: Sequence[bytes]) -> list[dict[str, Any] | Exception]:
         """What is answered to each, or why nothing is."""
@@ -340,16 +326,16 @@ class Line:
                 parts.append(part)
                 size += len(part)
                 if size > scaled(LARGEST):
-                    raise self._wrong(f"an answer of at most {scaled(LARGEST):,} bytes", "a longer one")
+                    raise self.wrong(f"an answer of at most {scaled(LARGEST):,} bytes", "a longer one")
                 if time.monotonic() > end:
                     raise TimeoutError(f"no answer within {self.limits['seconds']:g} seconds")
         text = b"".join(parts)
         try:
             answer = parse_json(text.decode(), finite=True)
         except ValueError as error:  # UnicodeDecodeError is one
-            raise self._wrong("JSON", f"{self._clean(text[:60].decode(errors='replace'))!r} ({error})") from None
+            raise self.wrong("JSON", f"{self._clean(text[:60].decode(errors='replace'))!r} ({error})") from None
         if not isinstance(answer, dict):
-            raise self._wrong("a JSON object", type(answer).__name__)
+            raise self.wrong("a JSON object", type(answer).__name__)
         return answer
 
     def _why(self, error: urllib.error.HTTPError) -> str:
@@ -357,36 +343,35 @@ class Line:
             there = self._clean(error.headers.get("Location", "elsewhere"))
             return f"sends on to {there}, and pictures and keys are not sent there; give that address if you trust it"
         if error.code in (401, 403):
-            told = "is not accepted" if _key() else "is missing"
-            return f"status {error.code}: the key in {KEY} {told}"
-        try:
-            said = self._clean(error.read(2000).decode(errors="replace"))
-        except (OSError, http.client.HTTPException):
-            said = ""
-        return f"status {error.code} {self._clean(str(error.reason))}: {said[:300]}"
+            return f"status {error.code}: the key in {KEY} {'is not accepted' if _key() else 'is missing'}"
+        body = ""
+        with suppress(OSError, http.client.HTTPException):
+            body = self._clean(error.read(2000).decode(errors="replace"))
+        return f"status {error.code} {self._clean(str(error.reason))}: {body[:300]}"
 
     def _clean(self, text: str) -> str:
         """What a server says, in one line and without the key, which it may send back."""
         text = text.replace(_key(), "(key)") if _key() else text
         return " ".join("".join(sign if sign.isprintable() else " " for sign in text).split())
 
-    def _wrong(self, expected: str, got: str) -> ModelError:
+    def wrong(self, expected: str, got: str | Mapping[str, Any]) -> ModelError:
+        """Return the error for an answer that is something else, or an object with other keys."""
+        if isinstance(got, Mapping):
+            got = self._clean(", ".join(map(str, got)) or "nothing")[:100]
         return ModelError(f"model {self.name}: expected {expected}, got {got} ({self.url})")
 
     def count_tokens(self, answer: Mapping[str, Any]) -> None:
         """Count the tokens that an answer says it took. Raises ModelError where a limit needs them and it says none."""
-        used = answer.get("usage")
-        used = used if isinstance(used, Mapping) else {}
-        numbers = [used.get(name) for name in ("prompt_tokens", "completion_tokens")]
-        told = [one for one in numbers if isinstance(one, int) and not isinstance(one, bool) and one >= 0]
-        by_token = self.limits["per_million_in"] or self.limits["per_million_out"]
-        if len(told) < 2 and (self.limits["tokens"] < LIMITS["tokens"] or by_token):
-            raise self._wrong("`usage` with prompt_tokens and completion_tokens, as `ask` counts tokens", "none")
-        if len(told) == 2:
-            self.spent.tokens_in += told[0]
-            self.spent.tokens_out += told[1]
-            if self.store is not None:
-                self.store.set_note(self._note, json.dumps(vars(self.spent)))
+        usage = answer.get("usage")
+        usage = usage if isinstance(usage, Mapping) else {}
+        numbers = [usage.get(name) for name in ("prompt_tokens", "completion_tokens")]
+        tokens = [n for n in numbers if isinstance(n, int) and not isinstance(n, bool) and n >= 0]
+        if len(tokens) == 2:
+            self.spent.tokens_in += tokens[0]
+            self.spent.tokens_out += tokens[1]
+            self._keep()
+        elif self.limits["tokens"] < LIMITS["tokens"] or self._priced_by_token:
+            raise self.wrong("`usage` with prompt_tokens and completion_tokens, as `ask` counts tokens", "none")
 
 
 class _NoRedirect(urllib.request.HTTPRedirectHandler):
@@ -400,9 +385,8 @@ class _NoRedirect(urllib.request.HTTPRedirectHandler):
 
 def _text(answer: Mapping[str, Any]) -> str:
     """What is said, the likeliest name where there are scores."""
-    if "scores" in answer:
-        return str(max(answer["scores"], key=answer["scores"].__getitem__))
-    return str(answer["text"])
+    scores = answer.get("scores")
+    return str(max(scores, key=scores.get) if scores else answer["text"])
 
 
 class Asked:
@@ -484,26 +468,25 @@ class Asked:
     def _read(self, answer: Mapping[str, Any]) -> dict[str, Any]:
         scores, text = answer.get("scores"), answer.get("text")
         if isinstance(scores, dict) and scores:
-            bad = [one for one in scores.values() if isinstance(one, bool) or not isinstance(one, (int, float))]
-            if bad or not all(0.0 <= one <= 1.0 for one in scores.values()):
-                raise self.line._wrong("scores from 0 to 1", f"{bad or [min(scores.values()), max(scores.values())]}")
+            shares = list(scores.values())
+            bad = [share for share in shares if isinstance(share, bool) or not isinstance(share, (int, float))]
+            if bad or not all(0.0 <= share <= 1.0 for share in shares):
+                raise self.line.wrong("scores from 0 to 1", f"{bad or [min(shares), max(shares)]}")
             return {"scores": scores}
         if isinstance(text, str):
             return {"text": text[:LONGEST]}
-        keys = self.line._clean(", ".join(map(str, answer)) or "nothing")[:100]
-        raise self.line._wrong('{"scores": {NAME: SHARE}} or {"text": WORDS}', keys)
+        raise self.line.wrong('{"scores": {NAME: SHARE}} or {"text": WORDS}', answer)
 
     def _read_chat(self, answer: Mapping[str, Any]) -> dict[str, Any]:
         try:
             message = answer["choices"][0]["message"]
             content, refusal = message.get("content"), message.get("refusal")
         except (KeyError, IndexError, TypeError, AttributeError):
-            keys = self.line._clean(", ".join(map(str, answer)) or "nothing")[:100]
-            raise self.line._wrong("choices with a message, as a chat answers", keys) from None
+            raise self.line.wrong("choices with a message, as a chat answers", answer) from None
         if isinstance(content, list):
-            content = " ".join(str(one.get("text", "")) for one in content if isinstance(one, dict))
+            content = " ".join(str(part.get("text", "")) for part in content if isinstance(part, dict))
         if not content and (refusal or answer["choices"][0].get("finish_reason") == "content_filter"):
             return {"text": REFUSED}
         if not isinstance(content, str):
-            raise self.line._wrong("an answer in words", type(content).__name__)
+            raise self.line.wrong("an answer in words", type(content).__name__)
         return {"text": content[:LONGEST]}

@@ -22,17 +22,10 @@ from advsearch import files
 from advsearch.errors import FileFormatError
 from advsearch.models.probe import first_line
 
-LARGEST = 16 << 30
-"""Most bytes of a model file, and of what it unpacks to."""
-
-LARGEST_TEXT = 64 << 20
-"""Most bytes of a member that describes the network: JSON, source code, a pickle of names."""
-
-LARGEST_RATIO = 20
-"""Most bytes that a byte of the file may unpack to. torch itself does not compress."""
-
-SLACK = 4 << 20
-"""Bytes that a small file may unpack to, whatever the ratio."""
+LARGEST = 16 << 30  # bytes of a model file, and of what it unpacks to
+LARGEST_TEXT = 64 << 20  # bytes of a member that describes the network: JSON, source code, a pickle of names
+LARGEST_RATIO = 20  # bytes that a byte of the file may unpack to; torch itself does not compress
+SLACK = 4 << 20  # bytes that a small file may unpack to, whatever the ratio
 
 _NAME = re.compile(r"[\w.+ -]+(/[\w.+ -]+)*")
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
@@ -79,9 +72,15 @@ def open_archive(path: Path, file: BinaryIO, size: int) -> Archive:
         entries = archive.infolist()
     except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError) as error:
         raise truncated(path, error) from None
-    _check_size(path, entries, size)
-    names = [entry.filename for entry in entries]
-    roots = {name.partition("/")[0] if "/" in name else "" for name in names}
+    unpacked, limit = sum(entry.file_size for entry in entries), ""
+    if unpacked > files.scaled(LARGEST):
+        limit, got = f"a model of at most {files.scaled(LARGEST):,} bytes unpacked", f"{unpacked:,}"
+    elif unpacked > files.scaled(LARGEST_RATIO) * size + SLACK:
+        limit = f"a model that unpacks to at most {files.scaled(LARGEST_RATIO)} times its size"
+        got = f"{size:,} bytes that unpack to {unpacked:,}"
+    if limit:
+        raise files.too_large(path, limit, got)
+    roots = {entry.filename.partition("/")[0] if "/" in entry.filename else "" for entry in entries}
     root = f"{roots.pop()}/" if len(roots) == 1 and "" not in roots else ""
     members = {entry.filename.removeprefix(root): entry for entry in entries}
     if len(members) < len(entries):
@@ -104,27 +103,10 @@ def truncated(path: Path, error: BaseException) -> FileFormatError:
     return FileFormatError(f"model file {path}: truncated or damaged archive ({first_line(error)})")
 
 
-def _check_size(path: Path, entries: list[zipfile.ZipInfo], size: int) -> None:
-    unpacked = sum(entry.file_size for entry in entries)
-    if unpacked > files.scaled(LARGEST):
-        limit = f"a model of at most {files.scaled(LARGEST):,} bytes unpacked"
-        raise files.too_large(path, limit, f"{unpacked:,}")
-    if unpacked > files.scaled(LARGEST_RATIO) * size + SLACK:
-        limit = f"a model that unpacks to at most {files.scaled(LARGEST_RATIO)} times its size"
-        raise files.too_large(path, limit, f"{size:,} bytes that unpack to {unpacked:,}")
-
-
-LARGEST_PICKLE = 8 << 20
-"""Most bytes of a pickle that describes the modules."""
-
-LARGEST_CODE = 16 << 20
-"""Most bytes of source code, all files together."""
-
-DEPTH = 200
-"""Deepest nesting of modules and values."""
-
-PICKLES = {"data.pkl": "data", "constants.pkl": "constants"}
-"""The pickles that torch reads, and the folder of their tensors."""
+LARGEST_PICKLE = 8 << 20  # bytes of a pickle that describes the modules
+LARGEST_CODE = 16 << 20  # bytes of source code, all files together
+DEPTH = 200  # of modules and values in one another
+PICKLES = {"data.pkl": "data", "constants.pkl": "constants"}  # that torch reads, and the folder of their tensors
 
 _HARMFUL = re.compile(
     r"\b(save|load|from_file|load_tensor|read_file|write_file|set_data|print|debugprims|symm_mem|inductor|profiler"
@@ -150,17 +132,19 @@ def rewritten_torchscript(archive: Archive) -> io.BytesIO:
     """Return an archive for `torch.jit.load` that holds the code, the pickles and the tensors of this one. Raises
     FileFormatError where its code calls what a network has no use for, or its pickles state what is not there."""
     code = {name: archive.read(name, LARGEST_CODE) for name in archive.members if _is_code(name)}
-    _check_code(archive, code)
+    if sum(map(len, code.values())) > LARGEST_CODE:
+        raise refused(archive.path, f"has more than {LARGEST_CODE:,} bytes of source code")
+    for name, content in code.items():
+        if wrong := _code_problem(content):
+            raise refused(archive.path, f"{name!r} {wrong}, which no plain network does")
     for name in PICKLES:
         _check_pickle(archive, name)
     tensors = [name for name in archive.members if name.partition("/")[0] in PICKLES.values()]
     buffer = io.BytesIO()
     writer = torch._C.PyTorchFileWriter(buffer)
     writer.set_min_version(_version(archive))
-    for name, content in code.items():
-        writer.write_record(name, content, len(content))
-    for name in (*PICKLES, *tensors):
-        content = archive.read(name)
+    for name in (*code, *PICKLES, *tensors):
+        content = code[name] if name in code else archive.read(name)
         writer.write_record(name, content, len(content))
     writer.write_end_of_file()
     buffer.seek(0)
@@ -184,14 +168,6 @@ def _version(archive: Archive) -> int:
     return int(text)
 
 
-def _check_code(archive: Archive, code: dict[str, bytes]) -> None:
-    if sum(map(len, code.values())) > LARGEST_CODE:
-        raise refused(archive.path, f"has more than {LARGEST_CODE:,} bytes of source code")
-    for name, content in code.items():
-        if wrong := _code_problem(content):
-            raise refused(archive.path, f"{name!r} {wrong}, which no plain network does")
-
-
 def _code_problem(content: bytes) -> str:
     """Return what source code does that a network has no use for, or nothing."""
     try:
@@ -202,17 +178,12 @@ def _code_problem(content: bytes) -> str:
         return f"uses {found[0]!r}"
     if any(family not in _CLASSES for family in _CLASS.findall(text)):
         return "uses native classes other than those of quantized networks"
-    if any(ord(sign) < 32 and ord(sign) not in _WHITE for sign in text) or any(map(_hides, _ESCAPE.findall(text))):
+    # an escape in a text may stand for something that torch writes plainly, or that steers a terminal
+    escapes = _ESCAPE.findall(text)
+    hidden = any(not e.isdigit() or (int(e, 8) < 128 and int(e, 8) not in _WHITE) for e in escapes)
+    if hidden or any(ord(sign) < 32 and ord(sign) not in _WHITE for sign in text):
         return "has text with hidden characters"
     return ""
-
-
-def _hides(escape: str) -> bool:
-    """Whether an escape in a text stands for something that torch writes plainly, or that steers a terminal."""
-    if not escape.isdigit():
-        return True
-    value = int(escape, 8)
-    return value < 128 and value not in _WHITE
 
 
 class _Inert:
@@ -232,10 +203,8 @@ class _Inert:
 
 
 class _Unpickler(pickle._Unpickler):
-    """Reads a pickle without making anything that it names: every class and every function is an `_Inert`.
-
-    It is Python's own slow reader, since the fast one makes room for any number that a pickle gives its memory.
-    """
+    """Reads a pickle without making anything that it names: every class and every function is an `_Inert`. It is
+    Python's own slow reader, since the fast one makes room for any number that a pickle gives its memory."""
 
     def __init__(self, data: bytes) -> None:
         super().__init__(io.BytesIO(data))
@@ -261,17 +230,22 @@ def _check_pickle(archive: Archive, name: str) -> None:
     if any(family not in _CLASSES for text in reader.names for family in _CLASS.findall(text)):
         raise refused(archive.path, f"{name!r} holds native objects, which are never loaded")
     _check_values(archive, name, value)
-    for storage in reader.storages:
-        _check_storage(archive, PICKLES[name], storage)
+    for storage in reader.storages:  # torch reads as many numbers as are stated, be they there or not
+        parts = storage if isinstance(storage, tuple) and len(storage) == 5 else (None,) * 5
+        kind, key, count = getattr(parts[1], "name", ""), f"{PICKLES[name]}/{parts[2]}", parts[4]
+        if kind not in _ITEM_BYTES or not isinstance(count, int) or count < 0:
+            raise refused(archive.path, f"has a tensor of another kind in {key[:80]!r}")
+        size = archive.members[key].file_size if key in archive else 0
+        if count * _ITEM_BYTES[kind] > size:
+            got = f"{key[:80]!r} has {size:,} bytes, but should hold {count:,} numbers"
+            raise refused(archive.path, f"is damaged: {got}")
 
 
 def _check_values(archive: Archive, name: str, value: Any) -> None:
     level, seen = [value], {id(value)}
     for _ in range(DEPTH):
-        if any(
-            isinstance(item, str) and not all(ord(sign) in _WHITE or sign.isprintable() for sign in item)
-            for item in level
-        ):
+        signs = {sign for item in level if isinstance(item, str) for sign in item}
+        if any(ord(sign) not in _WHITE and not sign.isprintable() for sign in signs):
             raise refused(archive.path, f"{name!r} has text with hidden characters")
         level = [inner for outer in level for inner in _inside(outer) if id(inner) not in seen]
         seen.update(map(id, level))
@@ -286,15 +260,3 @@ def _inside(value: Any) -> list[Any]:
     if isinstance(value, _Inert):
         return value.parts
     return list(value) if isinstance(value, (list, tuple)) else []
-
-
-def _check_storage(archive: Archive, folder: str, storage: Any) -> None:
-    """torch reads as many numbers as are stated, be they there or not."""
-    parts = storage if isinstance(storage, tuple) and len(storage) == 5 else (None,) * 5
-    kind, key, count = getattr(parts[1], "name", ""), f"{folder}/{parts[2]}", parts[4]
-    if kind not in _ITEM_BYTES or not isinstance(count, int) or count < 0:
-        raise refused(archive.path, f"has a tensor of another kind in {key[:80]!r}")
-    size = archive.members[key].file_size if key in archive else 0
-    if count * _ITEM_BYTES[kind] > size:
-        got = f"{key[:80]!r} has {size:,} bytes, but should hold {count:,} numbers"
-        raise refused(archive.path, f"is damaged: {got}")

@@ -20,21 +20,13 @@ from pathlib import Path
 from typing import Any
 
 from advsearch import files
-from advsearch.errors import FileFormatError
 from advsearch.files import JsonObject, JsonValue
 from advsearch.models.archive import LARGEST_TEXT, Archive, open_archive, refused
 
-LENGTH = 20_000
-"""Most characters."""
-
-DEPTH = 60
-"""Deepest nesting."""
-
-EXPONENT = 64
-"""Largest exponent, multiplied over nested powers: nobody writes s0**65, and 9**9**9 never ends."""
-
-NUMBER = 1 << 63
-"""Numbers are smaller than this."""
+LENGTH = 20_000  # characters of an expression
+DEPTH = 60  # of its nesting
+EXPONENT = 64  # multiplied over nested powers: nobody writes s0**65, and 9**9**9 never ends
+NUMBER = 1 << 63  # numbers are smaller than this
 
 FUNCTIONS = frozenset(
     "Integer Rational Float Add Mul Max Min Mod Abs Eq Ne Lt Le Gt Ge Equality Unequality StrictLessThan LessThan "
@@ -47,7 +39,7 @@ NAMES = frozenset(["true", "false", "oo", "int_oo"])
 
 _SYMBOL = re.compile(r"[A-Za-z_]{1,40}[0-9]{0,5}")
 _DECIMAL = re.compile(r"-?[0-9]{1,40}(\.[0-9]{0,40})?(e[-+]?[0-9]{1,3})?")
-_OPERATORS = (ast.Add, ast.Sub, ast.Mult, ast.Div, ast.FloorDiv, ast.Mod, ast.Pow)
+_OPERATORS = (ast.Add, ast.Sub, ast.Mult, ast.Div, ast.FloorDiv, ast.Mod, ast.BitAnd, ast.BitOr)
 _SIGNS = (ast.UAdd, ast.USub, ast.Not, ast.Invert)
 _COMPARISONS = (ast.Eq, ast.NotEq, ast.Lt, ast.LtE, ast.Gt, ast.GtE)
 
@@ -83,8 +75,6 @@ def _check(node: ast.expr, depth: int, power: int) -> None:
     elif isinstance(node, ast.Name):
         if not (node.id in NAMES or (is_symbol(node.id) and node.id[-1].isdigit())):
             raise ValueError(f"the name {node.id[:40]!r}")
-    elif isinstance(node, ast.Call):
-        _check_call(node, depth, power)
     else:
         operands, power = _operands(node, power)
         for operand in operands:
@@ -92,15 +82,17 @@ def _check(node: ast.expr, depth: int, power: int) -> None:
 
 
 def _operands(node: ast.expr, power: int) -> tuple[list[ast.expr], int]:
-    """Return the operands of an operator, and the power that is left for them."""
+    """Return the operands of an operator or a call, and the power that is left for them."""
+    if isinstance(node, ast.Call):
+        return _arguments(node, power)
     if isinstance(node, ast.UnaryOp) and isinstance(node.op, _SIGNS):
         return [node.operand], power
     if isinstance(node, ast.BoolOp):
         return node.values, power
-    if isinstance(node, ast.BinOp) and isinstance(node.op, (*_OPERATORS, ast.BitAnd, ast.BitOr)):
-        return (
-            _powered(node.left, node.right, power) if isinstance(node.op, ast.Pow) else ([node.left, node.right], power)
-        )
+    if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Pow):
+        return _powered(node.left, node.right, power)
+    if isinstance(node, ast.BinOp) and isinstance(node.op, _OPERATORS):
+        return [node.left, node.right], power
     if isinstance(node, ast.Compare) and all(isinstance(op, _COMPARISONS) for op in node.ops):
         return [node.left, *node.comparators], power
     if isinstance(node, ast.Tuple):  # the cases of a Piecewise
@@ -108,60 +100,48 @@ def _operands(node: ast.expr, power: int) -> tuple[list[ast.expr], int]:
     raise ValueError(f"{type(node).__name__} is none")
 
 
-def _check_call(node: ast.Call, depth: int, power: int) -> None:
+def _arguments(node: ast.Call, power: int) -> tuple[list[ast.expr], int]:
+    """Return the arguments of a call that are left to check, as `_operands` does."""
     name = node.func.id if isinstance(node.func, ast.Name) else ""
-    if name == "Symbol":
-        _check_symbol(node)
-        return
-    operands: list[ast.expr] = node.args
-    if name == "Float":
-        operands = _check_decimal(node)
-    elif node.keywords:
+    first = node.args[0].value if len(node.args) == 1 and isinstance(node.args[0], ast.Constant) else None
+    keys = {word.arg for word in node.keywords}
+    values = [word.value.value if isinstance(word.value, ast.Constant) else None for word in node.keywords]
+    if name == "Symbol":  # Symbol('s0', positive=True, integer=True)
+        assumed = None not in keys and all(isinstance(value, bool) for value in values)
+        if not (isinstance(first, str) and is_symbol(first) and assumed):
+            raise ValueError("a symbol of another form")
+        return [], power
+    if name == "Float":  # Float('0.5', precision=53)
+        if not (isinstance(first, str) and _DECIMAL.fullmatch(first)):
+            raise ValueError("a number of another form")
+        digits = all(isinstance(value, int) and 0 < value <= 200 for value in values)
+        if not digits or not keys <= {"precision", "prec", "dps"}:
+            raise ValueError("a number of another precision")
+        return [], power
+    if keys:
         raise ValueError("keywords")
-    elif name in POWERS and len(operands) == 2:
-        operands, power = _powered(operands[0], operands[1], power)
-    elif name not in FUNCTIONS or len(operands) > 16:
+    if name in POWERS and len(node.args) == 2:
+        return _powered(*node.args, power)
+    if name not in FUNCTIONS or len(node.args) > 16:
         raise ValueError(f"a call of {ast.unparse(node.func)[:40]!r}")
-    for operand in operands:
-        _check(operand, depth - 1, power)
-
-
-def _check_symbol(node: ast.Call) -> None:
-    """Symbol('s0', positive=True, integer=True)."""
-    name = node.args[0].value if len(node.args) == 1 and isinstance(node.args[0], ast.Constant) else None
-    assumed = all(isinstance(word.value, ast.Constant) and isinstance(word.value.value, bool) for word in node.keywords)
-    if not (isinstance(name, str) and is_symbol(name) and assumed and None not in {word.arg for word in node.keywords}):
-        raise ValueError("a symbol of another form")
-
-
-def _check_decimal(node: ast.Call) -> list[ast.expr]:
-    """Float('0.5', precision=53); return the operands that are left to check."""
-    text = node.args[0].value if len(node.args) == 1 and isinstance(node.args[0], ast.Constant) else None
-    digits = [word.value.value if isinstance(word.value, ast.Constant) else None for word in node.keywords]
-    if not (isinstance(text, str) and _DECIMAL.fullmatch(text)):
-        raise ValueError("a number of another form")
-    if any(word.arg not in ("precision", "prec", "dps") for word in node.keywords) or any(
-        not isinstance(value, int) or not 0 < value <= 200 for value in digits
-    ):
-        raise ValueError("a number of another precision")
-    return []
+    return node.args, power
 
 
 def _powered(base: ast.expr, exponent: ast.expr, power: int) -> tuple[list[ast.expr], int]:
     """Return the base and the power that is left for it; the exponent has to be a number."""
-    sign = 1
-    if isinstance(exponent, ast.UnaryOp) and isinstance(exponent.op, ast.USub):
-        sign, exponent = -1, exponent.operand
+    exponent = _without_sign(exponent)
     if isinstance(exponent, ast.Call) and isinstance(exponent.func, ast.Name) and exponent.func.id == "Integer":
-        exponent = exponent.args[0] if len(exponent.args) == 1 else exponent
-        if isinstance(exponent, ast.UnaryOp) and isinstance(exponent.op, ast.USub):
-            sign, exponent = -sign, exponent.operand
+        exponent = _without_sign(exponent.args[0]) if len(exponent.args) == 1 else exponent
     if isinstance(exponent, ast.Call) and ast.unparse(exponent) in ("Rational(1, 2)", "Rational(-1, 2)"):
         return [base], power
     value = exponent.value if isinstance(exponent, ast.Constant) else None
     if not isinstance(value, int) or isinstance(value, bool) or value > power:
         raise ValueError("an exponent that is not a small number")
     return [base], power // max(value, 1)
+
+
+def _without_sign(node: ast.expr) -> ast.expr:
+    return node.operand if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub) else node
 
 
 PROGRAM = "models/model.json"
@@ -242,28 +222,22 @@ def _copy_tensors(archive: Archive, writer: Any, folder: str, config: str) -> No
     copied: set[str] = set()
     for name, entry in table.items():
         record = entry.get("path_name") if isinstance(entry, dict) else None
-        if (
-            not isinstance(entry, dict)
-            or entry.get("use_pickle")
-            or not (isinstance(record, str) and _RECORD.fullmatch(record))
-        ):
+        plain = isinstance(record, str) and _RECORD.fullmatch(record)
+        if not isinstance(entry, dict) or entry.get("use_pickle") or not plain:
             raise refused(archive.path, f"{name[:80]!r} is a pickled object or compiled code, which is never loaded")
-        _check_tensor(archive, f"{folder}{record}", entry.get("tensor_meta"))
-        if record not in copied:
-            writer.write_bytes(f"{folder}{record}", archive.read(f"{folder}{record}"))
-            copied.add(record)
+        member, meta = f"{folder}{record}", entry.get("tensor_meta")
+        sizes: Any = meta.get("sizes") if isinstance(meta, dict) else None
+        listed = sizes if isinstance(sizes, list) else [None]
+        numbers: list[Any] = [size.get("as_int") if isinstance(size, dict) else None for size in listed]
+        if not all(isinstance(number, int) and number >= 0 for number in numbers):
+            raise refused(archive.path, f"expected the sizes of a tensor for {member[:80]!r}, got something else")
+        # torch makes a tensor without data of whatever size it is told
+        if member in archive and archive.members[member].file_size == 0 and math.prod(numbers) > 0:
+            raise refused(archive.path, f"{member[:80]!r} is empty, but should hold a tensor of {numbers[:8]}")
+        if member not in copied:
+            writer.write_bytes(member, archive.read(member))
+            copied.add(member)
     writer.write_bytes(config, json.dumps({"config": table}).encode())
-
-
-def _check_tensor(archive: Archive, record: str, meta: Any) -> None:
-    """torch makes a tensor without data of whatever size it is told."""
-    sizes: Any = meta.get("sizes") if isinstance(meta, dict) else None
-    listed = sizes if isinstance(sizes, list) else [None]
-    numbers: list[Any] = [size.get("as_int") if isinstance(size, dict) else None for size in listed]
-    if not all(isinstance(number, int) and number >= 0 for number in numbers):
-        raise refused(archive.path, f"expected the sizes of a tensor for {record[:80]!r}, got something else")
-    if record in archive and archive.members[record].file_size == 0 and math.prod(numbers) > 0:
-        raise refused(archive.path, f"{record[:80]!r} is empty, but should hold a tensor of {numbers[:8]}")
 
 
 # ---- the description of the network ----------------------------------------------------------------------------------
@@ -275,8 +249,7 @@ def _checked(path: Path, value: JsonValue, key: str) -> JsonValue:
         return _checked_object(path, value, key)
     if isinstance(value, list):
         return [_checked(path, inner, key) for inner in value]
-    wrong = _problem(value, key)
-    if wrong:
+    if wrong := _problem(value, key):
         raise refused(path, wrong)
     return value
 
@@ -319,8 +292,8 @@ def _argument_problem(text: str) -> str:
 
 
 def _operator_problem(text: str) -> str:
-    found = _OPERATOR.fullmatch(text)
-    if _ARITHMETIC.fullmatch(text) or (found and found[1] not in HARMFUL):
+    operator = _OPERATOR.fullmatch(text)
+    if _ARITHMETIC.fullmatch(text) or (operator and operator[1] not in HARMFUL):
         return ""
     return f"names the operator {text[:80]!r}, which is none of a plain network, and is never run"
 
@@ -367,20 +340,15 @@ def _check_pickle(archive: Archive, name: str) -> None:
     data = archive.read(name)
     if not data:
         return
+    what = f"cannot be read as torch.export ({name!r} is in need of unpickling, which is never done)"
     inner = open_archive(archive.path, io.BytesIO(data), len(data)) if data[:2] == b"PK" else None
     if inner is None or "data.pkl" not in inner:
-        raise _needs_unpickling(archive, name)
+        raise refused(archive.path, what)
     try:
         steps = list(pickletools.genops(inner.read("data.pkl", LARGEST_TEXT)))
     except (ValueError, IndexError, UnicodeDecodeError):
-        raise _needs_unpickling(archive, name) from None
+        raise refused(archive.path, what) from None
     for step, argument, _ in steps:
         foreign = step.name == "GLOBAL" and not _GLOBALS.fullmatch(str(argument))
         if foreign or step.name in ("STACK_GLOBAL", "INST", "OBJ", "EXT1", "EXT2", "EXT4"):
-            raise _needs_unpickling(archive, name)
-
-
-def _needs_unpickling(archive: Archive, name: str) -> FileFormatError:
-    return refused(
-        archive.path, f"cannot be read as torch.export ({name!r} is in need of unpickling, which is never done)"
-    )
+            raise refused(archive.path, what)

@@ -8,34 +8,25 @@ For any other network it is the logits less their mean. Maps and sequences are a
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass, field
-from typing import Any, final
+from typing import Any, NamedTuple, final
 
 import torch
 from torch import Tensor, fx, nn
 
-from advsearch.models.model import Model, checked_images
+from advsearch.models.model import Model, checked_images, joined
 
 LAYERS = (nn.Linear, nn.Conv1d, nn.Conv2d, nn.Conv3d)
 
 _ATEN = torch.ops.aten
 
-OPERATORS: dict[Any, int] = {
-    _ATEN.linear.default: 0,
-    _ATEN.addmm.default: 1,
-    _ATEN.mm.default: 0,
-    _ATEN.matmul.default: 0,
-    _ATEN.conv1d.default: 0,
-    _ATEN.conv2d.default: 0,
-    _ATEN.conv3d.default: 0,
-    _ATEN.convolution.default: 0,
-}
+CHANNELS_LAST = {getattr(_ATEN, name).default: int(name == "addmm") for name in ("linear", "addmm", "mm", "matmul")}
+CHANNELS_SECOND = {getattr(_ATEN, name).default: 0 for name in ("conv1d", "conv2d", "conv3d", "convolution")}
+OPERATORS: dict[Any, int] = {**CHANNELS_LAST, **CHANNELS_SECOND}
 """Operators that may be a last layer, and which of their arguments is the activation."""
 
-CHANNELS_LAST = (_ATEN.linear.default, _ATEN.addmm.default, _ATEN.mm.default, _ATEN.matmul.default)
-
-Read = Callable[[Tensor], Tensor]
-"""From a batch as `Model.batches` yields it, N images, to features (N, F)."""
+Read = Callable[[Tensor], Tensor]  # from a batch as `Model.batches` yields it, N images, to features (N, F)
 
 
 @final
@@ -67,8 +58,7 @@ class Features:
         """
         images = checked_images(images)
         batches = images.split(self.model.batch_limits[1])
-        parts = [self.read(self.model.prepared(one))[: len(one)].float() for one in batches]
-        return (parts[0] if len(parts) == 1 else torch.cat(parts)).to(images.device)
+        return joined([self.read(self.model.prepared(b))[: len(b)].float() for b in batches]).to(images.device)
 
 
 def features_of(model: Model) -> Features:
@@ -76,10 +66,9 @@ def features_of(model: Model) -> Features:
     grey = torch.full((min(2, model.batch_limits[1]), *model.input_size, 3), 0.5)
     with torch.no_grad():
         x = model.prepared(grey)
-        for find in (_layer, _node):
-            found = find(model, x)
-            if found is not None:
-                read, where = found
+        for calls in (_of_modules, _of_graph):
+            if (last := _last(calls, model, x)) is not None:
+                read, where = last
                 size = read(x).shape[1]
                 return Features(model, read, size, f"the {where}, {size} numbers")
     why = f"the logits, {model.classes} numbers: no layer before them can be read in a {type(model.module).__name__}"
@@ -91,90 +80,73 @@ def features_of(model: Model) -> Features:
     return Features(model, centred, model.classes, why, penultimate=False)
 
 
-def _layer(model: Model, x: Tensor) -> tuple[Read, str] | None:
-    """Return how to read the last layer of a module that calls its layers, if it has one."""
-    network = model.module
-    if not isinstance(network, nn.Module) or isinstance(network, torch.jit.ScriptModule):
-        return None
-    named: dict[nn.Module, str] = {layer: name for name, layer in network.named_modules() if isinstance(layer, LAYERS)}
-    calls: list[tuple[nn.Module, Tensor, Tensor]] = []
-    _watch(network, list(named), x, calls)
-    usable = [(layer, made) for layer, given, made in calls if len(given) == len(made) == len(x) and given.dim() > 1]
-    heads = [layer for layer, made in usable if made.shape[_axis(layer)] == model.classes]
+class _Call(NamedTuple):
+    """A call of a layer: what it is of, what went in (None for weights) and came out, and the axis of channels."""
+
+    layer: Any
+    name: str
+    input: Tensor | None
+    output: Tensor
+    axis: int
+
+
+Calls = Callable[[Any, Tensor, Any], list[_Call]]
+"""Runs a network on a batch and returns the calls of its layers, or of one of them, in their order."""
+
+
+def _last(calls: Calls, model: Model, x: Tensor) -> tuple[Read, str] | None:
+    """Return how to read the last layer of a network, if it has one, and what that is."""
+    usable = [call for call in calls(model.module, x, None) if len(call.output) == len(x)]
+    heads = [call for call in usable if call.output.shape[call.axis] == model.classes]
     if not usable:
         return None
-    layer = heads[-1] if heads else usable[-1][0]
-    where = f"{'input' if heads else 'output'} of {named[layer] or 'the network'} ({type(layer).__name__})"
+    last, part = (heads or usable)[-1], "input" if heads else "output"
+    if getattr(last, part) is None:
+        return None
 
     def read(batch: Tensor) -> Tensor:
-        seen: list[tuple[nn.Module, Tensor, Tensor]] = []
-        _watch(network, [layer], batch, seen)
-        _, given, made = seen[-1]
-        return _pooled(given if heads else made, _axis(layer))
+        return _pooled(getattr(calls(model.module, batch, last.layer)[-1], part), last.axis)
 
-    return read, where
+    return read, f"{part} of {last.name}"
 
 
-def _watch(
-    network: nn.Module, layers: list[nn.Module], x: Tensor, calls: list[tuple[nn.Module, Tensor, Tensor]]
-) -> None:
-    """Run the network and append every call of the layers: the layer, what went in, what came out."""
+def _of_modules(network: Any, x: Tensor, only: nn.Module | None) -> list[_Call]:
+    """Those of a module that calls its layers."""
+    calls: list[_Call] = []
+    if not isinstance(network, nn.Module) or isinstance(network, torch.jit.ScriptModule):
+        return calls
+    names = {layer: name for name, layer in network.named_modules() if isinstance(layer, LAYERS)}
 
-    def keep(layer: nn.Module, args: tuple[Tensor, ...], kwargs: dict[str, Tensor], made: Tensor) -> None:
-        calls.append((layer, args[0] if args else kwargs["input"], made))
+    def keep(layer: nn.Module, args: tuple[Tensor, ...], kwargs: dict[str, Tensor], output: Tensor) -> None:
+        input = args[0] if args else kwargs["input"]
+        if len(input) == len(output) and input.dim() > 1:
+            name = f"{names[layer] or 'the network'} ({type(layer).__name__})"
+            calls.append(_Call(layer, name, input, output, -1 if isinstance(layer, nn.Linear) else 1))
 
-    handles = [layer.register_forward_hook(keep, with_kwargs=True) for layer in layers]
-    try:
+    with ExitStack() as hooks:
+        for layer in names if only is None else [only]:
+            hooks.callback(layer.register_forward_hook(keep, with_kwargs=True).remove)
         network(x)
-    finally:
-        for handle in handles:
-            handle.remove()
+    return calls
 
 
-def _axis(layer: nn.Module) -> int:
-    return -1 if isinstance(layer, nn.Linear) else 1
-
-
-def _node(model: Model, x: Tensor) -> tuple[Read, str] | None:
-    """Return how to read the last layer of a graph of operators, such as a program of `torch.export`, if it has one."""
-    graph = model.module
-    if not isinstance(graph, fx.GraphModule):
-        return None
-    layers = [node for node in graph.graph.nodes if node.op == "call_function" and node.target in OPERATORS]
-    made = _values(graph, layers, x)
-    layers = [node for node in layers if node in made and len(made[node]) == len(x)]
-    heads = [node for node in layers if made[node].shape[_axis_of(node)] == model.classes]
-    if not layers:
-        return None
-    layer = heads[-1] if heads else layers[-1]
-    wanted = layer.args[OPERATORS[layer.target]] if heads else layer
-    if not isinstance(wanted, fx.Node) or wanted.op == "get_attr":
-        return None
-    where = f"{'input' if heads else 'output'} of the operator {layer.name}"
-
-    def read(batch: Tensor) -> Tensor:
-        return _pooled(_values(graph, [wanted], batch)[wanted], _axis_of(layer))
-
-    return read, where
-
-
-def _values(graph: fx.GraphModule, nodes: list[fx.Node], x: Tensor) -> dict[fx.Node, Tensor]:
-    """Run a graph and return the values of some of its nodes."""
-    wanted, found = set(nodes), {}
+def _of_graph(network: Any, x: Tensor, only: fx.Node | None) -> list[_Call]:
+    """Those of a graph of operators, such as a program of `torch.export`."""
+    calls: list[_Call] = []
 
     class Reader(fx.Interpreter):
         def run_node(self, n: fx.Node) -> Any:
             value = super().run_node(n)
-            if n in wanted and isinstance(value, Tensor):
-                found[n] = value
+            if n.op == "call_function" and n.target in OPERATORS and only in (None, n) and isinstance(value, Tensor):
+                source = n.args[OPERATORS[n.target]]
+                weights = not isinstance(source, fx.Node) or source.op == "get_attr"
+                axis = -1 if n.target in CHANNELS_LAST else 1
+                calls.append(_Call(n, f"the operator {n.name}", None if weights else self.env[source], value, axis))
             return value
 
-    Reader(graph).run(x)
-    return found
-
-
-def _axis_of(node: fx.Node) -> int:
-    return -1 if node.target in CHANNELS_LAST else 1
+    if isinstance(network, fx.GraphModule):
+        Reader(network).run(x)
+    return calls
 
 
 def _pooled(value: Tensor, axis: int) -> Tensor:

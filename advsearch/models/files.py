@@ -6,13 +6,13 @@ files whose makers you trust. ONNX files are run by onnxruntime, which gives pre
 
 from __future__ import annotations
 
-import contextlib
 import difflib
 import logging
 import os
 import re
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
@@ -25,9 +25,9 @@ from advsearch.files import open_regular
 from advsearch.models import exported
 from advsearch.models.all_at_once import AllAtOnce
 from advsearch.models.archive import LARGEST, Archive, open_archive, refused, rewritten_torchscript, runs_while_loading
-from advsearch.models.guards import TookTooLong, try_torchscript
+from advsearch.models.guards import try_torchscript
 from advsearch.models.labels import names_in
-from advsearch.models.probe import first_line
+from advsearch.models.probe import foreign
 from advsearch.models.source import Source, source_of
 from advsearch.models.zoo.library import library, without_unpickling
 
@@ -45,12 +45,8 @@ LARGEST_BATCH = 64
 
 
 def load_file(path: Path) -> Source:
-    """Return the model in a file.
-
-    Raises:
-        FileFormatError: missing, empty, truncated, damaged, a pickle, or of another kind; the message names the file.
-        ModelError: a program that does not take one floating-point image.
-    """
+    """Return the model in a file. Raises FileFormatError: missing, empty, truncated, damaged, a pickle, or of another
+    kind; the message names the file; ModelError: a program that does not take one floating-point image."""
     try:
         opened = open_regular(path, "a model file", LARGEST)
     except FileNotFoundError:
@@ -70,7 +66,7 @@ def load_file(path: Path) -> Source:
             return _load_torchscript(path, archive)
         checked = exported.rewritten(archive)
         logger = logging.getLogger("torch.export")  # prints a traceback of what is refused with a message anyway
-        with _damaged(path, "torch.export"), without_unpickling(), contextlib.ExitStack() as stack:
+        with _damaged(path, "torch.export"), without_unpickling(), ExitStack() as stack:
             stack.callback(logger.setLevel, logger.level)
             logger.setLevel(logging.CRITICAL)
             program = torch.export.load(checked)
@@ -82,11 +78,8 @@ def _kind(archive: Archive) -> str:
     """Return ``"exported"`` or ``"torchscript"``; raise for everything else."""
     path, names = archive.path, archive.members
     if any(name.startswith("models/") and name.endswith(".json") for name in names):
-        compiled = [
-            name
-            for name in names
-            if name.startswith("data/aotinductor/") or Path(name).name.startswith(("opaque_obj", "custom_obj"))
-        ]
+        kinds = ("opaque_obj", "custom_obj")
+        compiled = [n for n in names if n.startswith("data/aotinductor/") or Path(n).name.startswith(kinds)]
         if compiled:
             raise refused(path, f"holds {min(compiled)!r}, which is a pickled object or compiled code and never loaded")
         return "exported"
@@ -124,13 +117,8 @@ def _near_files(path: Path) -> str:
 
 def _load_torchscript(path: Path, archive: Archive) -> Source:
     checked = rewritten_torchscript(archive)
-    if runs_while_loading(archive):
-        try:
-            wrong = try_torchscript(checked)
-        except TookTooLong as error:
-            wrong = str(error)
-        if wrong:
-            raise FileFormatError(f"model file {path}: {wrong}")
+    if runs_while_loading(archive) and (wrong := try_torchscript(checked)):
+        raise FileFormatError(f"model file {path}: {wrong}")
     with warnings.catch_warnings(), _damaged(path, "TorchScript"):
         for kind in (DeprecationWarning, FutureWarning):  # the second from torch 2.14 on
             warnings.filterwarnings("ignore", message=r".*torch\.jit\.\w+.* is deprecated", category=kind)
@@ -139,38 +127,29 @@ def _load_torchscript(path: Path, archive: Archive) -> Source:
 
 
 def _with_signature(source: Source, program: torch.export.ExportedProgram) -> Source:
-    """Return the source with what the program's signature tells: input size, layout, batch limits, dtype."""
-    name = source.name
-    inputs = program.graph_signature.user_inputs
+    """Return the source with what the program's signature tells: input size, layout, batch limits, dtype. A program may
+    take (N, K, 3, H, W) or (N, K, H, W, 3), all pictures of a rig at once."""
     nodes = {node.name: node for node in program.graph.nodes if node.op == "placeholder"}
-    values = [nodes[key].meta.get("val") for key in inputs if key in nodes]
-    tensors = bool(values) and all(isinstance(one, torch.Tensor) for one in values)
-    if tensors and len(values) == 1 and values[0].dim() == 5 and isinstance(values[0].shape[1], int):
-        return _of_a_rig(source, values[0], *_batch_limits(program, values[0].shape[0]))
-    if not tensors or values[0].dim() != 4 or any(one.dim() != 2 for one in values[1:]):
-        raise ModelError(f"model {name}: expected a program with one input, a batch of images of 4 dimensions")
-    value = values[0]
-    if not value.is_floating_point():
-        raise ModelError(f"model {name}: expected a floating-point image as input, the program takes {value.dtype}")
-    layout = "NHWC" if value.shape[3] == 3 and value.shape[1] != 3 else "NCHW"
-    limits = _batch_limits(program, value.shape[0])
-    source = replace(source, dtype=value.dtype, batch_limits=limits, layout=layout, takes_more=len(values) > 1)
-    height, width = value.shape[1:3] if layout == "NHWC" else value.shape[2:4]
-    fixed = isinstance(height, int) and isinstance(width, int)
-    return replace(source, input_size=(height, width)) if fixed else source
-
-
-def _of_a_rig(source: Source, value: Tensor, low: int, high: int) -> Source:
-    """The source of a program that takes (N, K, 3, H, W) or (N, K, H, W, 3), all pictures of a rig at once."""
-    if not value.is_floating_point():
-        raise ModelError(f"model {source.name}: expected floating-point images as input, got {value.dtype}")
-    last = value.shape[4] == 3 and value.shape[2] != 3
-    height, width = value.shape[2:4] if last else value.shape[3:5]
-    cameras = int(value.shape[1])
-    module = AllAtOnce(cast(nn.Module, source.module), cameras, "NKHWC" if last else "NKCHW")
+    values = [nodes[key].meta.get("val") for key in program.graph_signature.user_inputs if key in nodes]
+    tensors = bool(values) and all(isinstance(value, Tensor) for value in values)
+    rig = tensors and len(values) == 1 and values[0].dim() == 5 and isinstance(values[0].shape[1], int)
+    if not rig and (not tensors or values[0].dim() != 4 or any(value.dim() != 2 for value in values[1:])):
+        raise ModelError(f"model {source.name}: expected a program with one input, a batch of images of 4 dimensions")
+    images = values[0]
+    if not images.is_floating_point():
+        what = "floating-point images as input, got" if rig else "a floating-point image as input, the program takes"
+        raise ModelError(f"model {source.name}: expected {what} {images.dtype}")
+    picture = images.shape[-3:]
+    last = picture[2] == 3 and picture[0] != 3
+    height, width = picture[:2] if last else picture[1:]
     size = (height, width) if isinstance(height, int) and isinstance(width, int) else None
-    limits = (low * cameras, high * cameras)
-    return replace(source, module=module, dtype=value.dtype, batch_limits=limits, input_size=size)
+    low, high = _batch_limits(program, images.shape[0])
+    source = replace(source, dtype=images.dtype, input_size=size, takes_more=len(values) > 1)
+    if not rig:
+        return replace(source, batch_limits=(low, high), layout="NHWC" if last else "NCHW")
+    cameras = int(images.shape[1])
+    module = AllAtOnce(cast(nn.Module, source.module), cameras, "NKHWC" if last else "NKCHW")
+    return replace(source, module=module, batch_limits=(low * cameras, high * cameras))
 
 
 def _batch_limits(program: torch.export.ExportedProgram, batch: int | torch.SymInt) -> tuple[int, int]:
@@ -183,16 +162,13 @@ def _batch_limits(program: torch.export.ExportedProgram, batch: int | torch.SymI
     return low, max(low, int(min(allowed.upper, LARGEST_BATCH)))
 
 
-@contextlib.contextmanager
-def _damaged(path: Path, kind: str) -> Iterator[None]:
+def _damaged(path: Path, kind: str) -> AbstractContextManager[None]:
     """Turn whatever a loader raises into a FileFormatError that names the file."""
-    try:
-        yield
-    except Exception as error:  # loaders raise nearly every type on damaged files
-        raise FileFormatError(
-            f"model file {path}: cannot be read as {kind} with torch {torch.__version__}; damaged, made by another "
-            f"version, or in need of unpickling, which is never done ({first_line(error)})"
-        ) from error
+    what = (
+        f"model file {path}: cannot be read as {kind} with torch {torch.__version__}; damaged, made by another "
+        "version, or in need of unpickling, which is never done"
+    )
+    return foreign(what, kind=FileFormatError)
 
 
 FLOATS = {"tensor(float)": torch.float32, "tensor(float16)": torch.float16, "tensor(double)": torch.float64}
@@ -224,12 +200,8 @@ class OnnxNetwork(nn.Module):
 
 def load_onnx(path: Path) -> Source:
     """Return the network in an ONNX file that is known to be an ordinary one; onnxruntime holds its other files to its
-    folder.
-
-    Raises:
-        FileFormatError: it is damaged, or refers to files that are elsewhere.
-        ModelError: onnxruntime is missing or too old, or the network does not take one batch of images.
-    """
+    folder. Raises FileFormatError where it is damaged, or refers to files that are elsewhere, and ModelError where
+    onnxruntime is missing or too old, or the network does not take one batch of images."""
     runtime = library("onnxruntime", str(path), "onnx")
     release = re.match(r"(\d+)\.(\d+)", runtime.__version__)
     if release is None or (int(release[1]), int(release[2])) < OLDEST:
@@ -240,7 +212,8 @@ def load_onnx(path: Path) -> Source:
     options = runtime.SessionOptions()
     options.intra_op_num_threads = torch.get_num_threads()
     options.log_severity_level = 4  # what is wrong is raised as well
-    try:
+    what = f"model file {path}: cannot be read as ONNX with onnxruntime {runtime.__version__}"
+    with foreign(what, kind=FileFormatError):
         # What is constant is computed in each call, which has a deadline: while a session is made, nothing ends it.
         session = runtime.InferenceSession(
             str(path),
@@ -249,23 +222,19 @@ def load_onnx(path: Path) -> Source:
             disabled_optimizers=["ConstantFolding"],
             enable_fallback=0,  # it would print, and try the same again
         )
-    except Exception as error:  # its errors have no type in common
-        raise FileFormatError(
-            f"model file {path}: cannot be read as ONNX with onnxruntime {runtime.__version__} ({first_line(error)})"
-        ) from error
     inputs = session.get_inputs()
     shape = inputs[0].shape if inputs else []
     fixed = [side for side in shape if isinstance(side, int)]
     if len(inputs) != 1 or len(shape) != 4 or inputs[0].type not in FLOATS or min(fixed, default=1) < 1:
-        found = ", ".join(f"{one.name} {one.type} {one.shape}" for one in inputs) or "none"
+        got = ", ".join(f"{tensor.name} {tensor.type} {tensor.shape}" for tensor in inputs) or "none"
         raise ModelError(
-            f"model file {path}: expected one input, a batch of floating-point images of 4 dimensions, got {found}"
+            f"model file {path}: expected one input, a batch of floating-point images of 4 dimensions, got {got}"
         )
     layout = "NHWC" if shape[3] == 3 and shape[1] != 3 else "NCHW"
     sides = shape[1:3] if layout == "NHWC" else shape[2:4]
-    said = session.get_modelmeta().custom_metadata_map
+    metadata = session.get_modelmeta().custom_metadata_map
     if not all(isinstance(side, int) for side in sides):  # YOLO's exporters write it, such as "[640, 640]"
-        written = re.fullmatch(r"\[(\d{1,5}), ?(\d{1,5})\]", said.get("imgsz", ""))
+        written = re.fullmatch(r"\[(\d{1,5}), ?(\d{1,5})\]", metadata.get("imgsz", ""))
         sides = [int(side) for side in written.groups()] if written else []
         sides = sides if all(sides) else []
     return Source(
@@ -273,7 +242,7 @@ def load_onnx(path: Path) -> Source:
         path.stem,
         input_size=(sides[0], sides[1]) if sides else None,
         layout=layout,
-        labels=names_in(said.get("names", "")),
+        labels=names_in(metadata.get("names", "")),
         batch_limits=(shape[0], shape[0]) if isinstance(shape[0], int) else (1, LARGEST_BATCH),
         dtype=FLOATS[inputs[0].type],
     )

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from typing import Any, TypeVar
@@ -19,14 +20,11 @@ import torch
 from torch import nn
 
 from advsearch import files
+from advsearch.models.model import CPU
 from advsearch.registry import OWN_FOLDER
 
-LONGEST = 120
-"""Seconds that a file's first passes may take each, and its loading, where that runs a part of it."""
-
-GRACE = 5
-"""Seconds for a call to end that was asked to."""
-
+LONGEST = 120  # seconds that a file's first passes may take each, and its loading, where that runs a part of it
+GRACE = 5  # seconds for a call to end that was asked to
 _TRIAL = "import io, sys, torch; torch.jit.load(io.BytesIO(sys.stdin.buffer.read()), map_location='cpu')"
 
 Result = TypeVar("Result")
@@ -44,20 +42,16 @@ class TookTooLong(Exception):
 
 def within(call: Callable[[], Result], stop: Callable[[], None] | None = None) -> Result:
     """Return what `call`, which may never end, returns, or raise what it raises; `stop` asks it to end when the time is
-    up.
-
-    Raises TookTooLong: it has not ended in `LONGEST` seconds (times `ADVSEARCH_LIMITS`); its thread may go on.
-    """
-    results: list[Result] = []
-    errors: list[BaseException] = []
+    up. Raises TookTooLong: it has not ended in `LONGEST` seconds (times `ADVSEARCH_LIMITS`); its thread may go on."""
+    outcome: Future[Result] = Future()
     gradients = torch.is_grad_enabled()  # a thread has its own
 
     def work() -> None:
         try:
             with torch.set_grad_enabled(gradients):
-                results.append(call())
+                outcome.set_result(call())
         except BaseException as error:
-            errors.append(error)
+            outcome.set_exception(error)
 
     thread = threading.Thread(target=work, daemon=True)  # a daemon's: the process may end before it
     thread.start()
@@ -67,31 +61,20 @@ def within(call: Callable[[], Result], stop: Callable[[], None] | None = None) -
             stop()
             thread.join(GRACE)
         raise TookTooLong
-    if errors:
-        raise errors[0]
-    return results[0]
+    return outcome.result()
 
 
 def try_torchscript(archive: io.BytesIO) -> str:
     """Load TorchScript in a process of its own, and return what is wrong, or nothing: torch keeps Python waiting
-    meanwhile.
-
-    An error that torch raises is not told: loading it here raises it again.
-
-    Raises:
-        TookTooLong: as for `within`.
-    """
+    meanwhile. An error that torch raises is not told: loading it here raises it again."""
     command = [sys.executable, "-W", "ignore", "-c", _TRIAL]
     try:
         done = subprocess.run(
             command, input=archive.getbuffer(), capture_output=True, timeout=files.scaled(LONGEST), cwd=OWN_FOLDER
         )
     except subprocess.TimeoutExpired:
-        raise TookTooLong from None
+        return str(TookTooLong())
     return f"torch crashed while loading it (signal {-done.returncode})" if done.returncode < 0 else ""
-
-
-CPU = torch.device("cpu")
 
 
 @dataclass(frozen=True)
@@ -132,33 +115,32 @@ class Switches:
 
 PLAIN = Switches()
 
-_outside: list[Switches] = []
-"""As `plainly` found them, the outermost first."""
+_outside: list[Switches] = []  # as `plainly` found them, the outermost first
 
 
 @contextmanager
 def plainly() -> Iterator[None]:
     """Turn torch's switches as it comes, and back at the end: also out of `torch.inference_mode`."""
     with torch.inference_mode(False) if torch.is_inference_mode_enabled() else nullcontext():
-        found = Switches.now()
-        _outside.append(found)
-        if found != PLAIN:
+        before = Switches.now()
+        _outside.append(before)
+        if before != PLAIN:
             PLAIN.turn()
         try:
             yield
         finally:
             _outside.pop()
-            if Switches.now() != found:
-                found.turn()
+            if Switches.now() != before:
+                before.turn()
 
 
 def turned_by_code() -> Switches:
     """Return the switches as the code of a network has turned them just now, or had before; they are `PLAIN` then."""
-    found = Switches.now()
-    if found == PLAIN:
+    turned = Switches.now()
+    if turned == PLAIN:
         return _outside[0] if _outside else PLAIN
     PLAIN.turn()
-    return found
+    return turned
 
 
 def called_under(module: nn.Module, switches: Switches) -> None:

@@ -14,27 +14,18 @@ from typing import Any
 from advsearch.errors import FileFormatError, InputError, resembling
 from advsearch.files import parse_json, read_text
 
-LARGEST = 16 << 20
-"""Most bytes of a label file."""
+PROMPT = "a photo of a {}"  # the text that a name is put into where nothing else is said
 
-PROMPT = "a photo of a {}"
-"""The text that a name is put into where nothing else is said."""
-
-LONGEST = 1000
-"""Most characters of a label name; those of ImageNet have up to 130."""
-
-LONGEST_NAMES = 1 << 20
-"""Most characters of all names that a network's metadata say."""
-
-MOST_SUGGESTIONS = 4
-"""Labels that a message suggests for an unknown one."""
+LARGEST = 16 << 20  # bytes of a label file
+LONGEST = 1000  # characters of a label name; those of ImageNet have up to 130
+LONGEST_NAMES = 1 << 20  # characters of all names that a network's metadata say
+MOST_SUGGESTIONS = 4  # labels that a message suggests for an unknown one
 
 DATA = Path(__file__).parent / "data"
 SETS = ("imagenet", "cifar10", "cifar100", "coco", "coco90", "coco91", "voc")
 """Names of the classes of data sets that many networks are trained on, in the order of their outputs. `coco91` has the
 background first and the numbers that its authors gave, of which 11 have no class; `coco90` is that without background;
 `voc` has the background first."""
-
 
 NOTHING = frozenset(
     "background bg noobject noobj noclass nothing none null void n/a n.a. unlabeled unlabelled unused ??? ∅".split()
@@ -102,9 +93,10 @@ def matching_labels(word: str, labels: Sequence[str]) -> list[tuple[int, str]]:
     """
     table = {name: indices for name, indices in _name_table(labels).items() if "," not in name}
     everyday = [[_key(name) for name in names] for names in json.loads((DATA / "synonyms.json").read_text("utf-8"))]
-    same = [name for names in everyday if _key(word) in names for name in names if name in table]
+    key = _key(word)
+    same = [name for names in everyday if key in names for name in names if name in table]
     like = resembling(word, table)
-    if same and not any(_key(word) in name for name in like):  # nothing but other spellings
+    if same and not any(key in name for name in like):  # nothing but other spellings
         like = []
     parts: dict[int, str] = {}
     for name in (*like, *same):
@@ -114,27 +106,22 @@ def matching_labels(word: str, labels: Sequence[str]) -> list[tuple[int, str]]:
 
 
 def _find(term: str, table: dict[str, list[int]], labels: Sequence[str], named: bool) -> int:
-    explicit = re.fullmatch(r"#\s*(-?\d+)", term)
-    if explicit:
-        return _checked_index(int(explicit[1]), labels)
-    found = table.get(_key(term), [])
-    if not found and re.fullmatch(r"-?\d+", term):
-        return _checked_index(int(term), labels)
-    if not found:
-        raise InputError(_unknown(term, table, labels, named))
-    if len(found) > 1:
-        listed = ", ".join(f"#{index} ({labels[index]})" for index in found)
-        raise InputError(f"label {term!r} names {len(found)} classes: {listed}. Give the index, e.g. '#{found[0]}'")
-    return found[0]
+    indices = table.get(_key(term), [])
+    number = re.fullmatch(r"#\s*(-?\d+)", term) or (None if indices else re.fullmatch(r"(-?\d+)", term))
+    if number:
+        index = int(number[1])
+        if not 0 <= index < len(labels):
+            raise InputError(f"label: expected a class index from 0 to {len(labels) - 1}, got {index}")
+        return index
+    if not indices:
+        raise InputError(_unknown(term, labels, named))
+    if len(indices) > 1:
+        listed = ", ".join(f"#{index} ({labels[index]})" for index in indices)
+        raise InputError(f"label {term!r} names {len(indices)} classes: {listed}. Give the index, e.g. '#{indices[0]}'")
+    return indices[0]
 
 
-def _checked_index(index: int, labels: Sequence[str]) -> int:
-    if not 0 <= index < len(labels):
-        raise InputError(f"label: expected a class index from 0 to {len(labels) - 1}, got {index}")
-    return index
-
-
-def _unknown(term: str, table: dict[str, list[int]], labels: Sequence[str], named: bool) -> str:
+def _unknown(term: str, labels: Sequence[str], named: bool) -> str:
     message = f"the model has no label {term!r}."
     if not named:
         fitting = "".join(f" or `labels={name}`" for name in sets_of(len(labels)))
@@ -142,8 +129,7 @@ def _unknown(term: str, table: dict[str, list[int]], labels: Sequence[str], name
             f"{message} Its {len(labels)} classes have no names: give a label file (`labels`){fitting}, or an index "
             "such as '#0'"
         )
-    near = matching_labels(term, labels)[:MOST_SUGGESTIONS]
-    if near:
+    if near := matching_labels(term, labels)[:MOST_SUGGESTIONS]:
         options = [f"{name!r} (#{index})" for index, name in near]
         return f"{message} Did you mean {' or '.join(options)}?"
     shown = ", ".join(labels[:20]) + (", ..." if len(labels) > 20 else "")
@@ -188,28 +174,23 @@ def read_labels(source: str | os.PathLike[str] | Sequence[str]) -> tuple[str, ..
         source = str(source).split(",")
     if not isinstance(source, Sequence):
         raise InputError(f"labels: expected a path or a list of names, got {type(source).__name__}")
-    problem = _problem(source)
-    if problem:
-        raise InputError(f"labels: {problem}")
-    return tuple(name.strip() for name in source)
+    return _checked(source, InputError, "labels")
 
 
-def names_in(said: Any) -> tuple[str, ...] | None:
+def names_in(names: Any) -> tuple[str, ...] | None:
     """Return the names that a network says its classes have, in order: as YOLO's do in `names`, and their files in
     metadata. A stranger says them: a mapping from 0, 1, ... to names, a list of names, or the text of one; None of
     anything else."""
-    if isinstance(said, str):
-        if len(said) > LONGEST_NAMES or not _FLAT.fullmatch(said):
+    if isinstance(names, str):
+        if len(names) > LONGEST_NAMES or not _FLAT.fullmatch(names):
             return None
         try:
-            said = ast.literal_eval(said)
+            names = ast.literal_eval(names)
         except (ValueError, SyntaxError, MemoryError):
             return None
-    if isinstance(said, Mapping):
-        if list(said) != list(range(len(said))):
-            return None
-        said = list(said.values())
-    return read_labels(said) if isinstance(said, (list, tuple)) and not _problem(said) else None
+    if isinstance(names, Mapping):
+        names = list(names.values()) if list(names) == list(range(len(names))) else None
+    return read_labels(names) if isinstance(names, (list, tuple)) and not _problem(names) else None
 
 
 _TEXT = r"""(?:'(?:[^'\\\n]|\\.)*'|"(?:[^"\\\n]|\\.)*")"""
@@ -236,19 +217,19 @@ def read_prompts(given: str | Sequence[str] | None) -> tuple[str, ...] | None:
     InputError where one is no text, or empty."""
     if given is None:
         return None
-    listed = [part.strip() for part in given.split("|")] if isinstance(given, str) else list(given)
-    for one in listed or [""]:
-        if not isinstance(one, str) or not one:
-            raise InputError(f"prompt: expected a text, such as {PROMPT!r}, got {one!r}")
-    return tuple(listed)
+    texts = [part.strip() for part in given.split("|")] if isinstance(given, str) else list(given)
+    for text in texts or [""]:
+        if not isinstance(text, str) or not text:
+            raise InputError(f"prompt: expected a text, such as {PROMPT!r}, got {text!r}")
+    return tuple(texts)
 
 
 def patterns(prompts: tuple[str, ...] | None) -> tuple[str, ...]:
     """Return the texts that a name is put into, ``{}`` in its place; one of our own for None. Raises InputError where
     one has no ``{}``."""
-    for one in prompts or ():
-        if "{}" not in one:
-            raise InputError(f"prompt: expected a text with {{}} where the name goes, such as {PROMPT!r}, got {one!r}")
+    for text in prompts or ():
+        if "{}" not in text:
+            raise InputError(f"prompt: expected a text with {{}} where the name goes, such as {PROMPT!r}, got {text!r}")
     return prompts or (PROMPT,)
 
 
@@ -258,7 +239,6 @@ def sets_of(classes: int) -> list[str]:
 
 
 def _label_sets() -> dict[str, tuple[str, ...]]:
-    """Return the names of the classes of each of `SETS`."""
     stored = json.loads((DATA / "labels.json").read_text("utf-8"))
     stored["coco90"] = stored["coco91"][1:]
     return {name: tuple(stored[name]) for name in SETS}
@@ -279,40 +259,42 @@ def fitting_labels(classes: int, labels: tuple[str, ...] | None, source: str, mo
 
 
 def _read_file(path: Path) -> tuple[str, ...]:
+    where = f"label file {path}"
     try:
         text = read_text(path, "a label file", LARGEST)
     except OSError as error:
         advice = "" if path.suffix else ", and several names have commas between them, such as 'mug,cup'"
-        raise FileFormatError(f"label file {path}: cannot be read ({error.strerror or error}){advice}") from None
+        raise FileFormatError(f"{where}: cannot be read ({error.strerror or error}){advice}") from None
     if not text.strip():
-        raise FileFormatError(f"label file {path}: expected label names, got an empty file")
+        raise FileFormatError(f"{where}: expected label names, got an empty file")
     if path.suffix.lower() == ".json" or text.lstrip()[0] in "[{":
-        names = _from_json(path, text)
+        names = _from_json(where, text)
     else:
         names = [line.strip() for line in text.strip("\r\n").splitlines()]
-    problem = _problem(names)
-    if problem:
-        raise FileFormatError(f"label file {path}: {problem}")
-    return tuple(name.strip() for name in names)
+    return _checked(names, FileFormatError, where)
 
 
-def _from_json(path: Path, text: str) -> list[Any]:
+def _from_json(where: str, text: str) -> list[Any]:
     try:
         data = parse_json(text)
     except json.JSONDecodeError as error:
-        raise FileFormatError(f"label file {path}: not valid JSON (line {error.lineno}: {error.msg})") from None
+        raise FileFormatError(f"{where}: not valid JSON (line {error.lineno}: {error.msg})") from None
     except ValueError as error:
-        raise FileFormatError(f"label file {path}: expected label names, got {error}") from None
+        raise FileFormatError(f"{where}: expected label names, got {error}") from None
     if isinstance(data, list):
         return data
     if not isinstance(data, dict):
-        raise FileFormatError(f"label file {path}: expected a list of names or an object from index to name")
-    expected = [str(index) for index in range(len(data))]
-    if set(data) != set(expected):
-        raise FileFormatError(
-            f"label file {path}: expected the {len(data)} keys to be the indices 0 to {len(data) - 1}, each once"
-        )
-    return [data[key] for key in expected]
+        raise FileFormatError(f"{where}: expected a list of names or an object from index to name")
+    indices, last = list(map(str, range(len(data)))), len(data) - 1
+    if set(data) != set(indices):
+        raise FileFormatError(f"{where}: expected the {len(data)} keys to be the indices 0 to {last}, each once")
+    return [data[key] for key in indices]
+
+
+def _checked(names: Sequence[Any], kind: type[InputError], where: str) -> tuple[str, ...]:
+    if problem := _problem(names):
+        raise kind(f"{where}: {problem}")
+    return tuple(name.strip() for name in names)
 
 
 def _problem(names: Sequence[Any]) -> str:

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import os
 import re
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from torch import Tensor, nn
+from torch import nn
 
 from advsearch.errors import InputError, ModelError, UnknownNameError, resembling
 from advsearch.models import address, files, reference
@@ -24,8 +24,7 @@ from advsearch.models.with_state import WithState
 from advsearch.models.zoo import named, transformers
 from advsearch.registry import Registry
 
-#: Size of the input where neither the model nor the caller says.
-DEFAULT_INPUT_SIZE = (224, 224)
+DEFAULT_INPUT_SIZE = (224, 224)  # where neither the model nor the caller says
 
 SOURCES: Registry[Callable[[str], Source | Model]] = Registry(
     "advsearch.models",
@@ -100,68 +99,63 @@ def load_model(
     Warns:
         ModelWarning: see `advsearch.models.probe.probe`.
     """
-    options = {
-        "input_size": input_size,
-        "mean": mean,
-        "std": std,
-        "value_range": value_range,
-        "layout": layout,
-        "channels": channels,
-        "max_batch": max_batch,
-    }
+    options = {"input_size": input_size, "mean": mean, "std": std, "value_range": value_range}
+    options |= {"layout": layout, "channels": channels, "max_batch": max_batch}
     given = {key: value for key, value in options.items() if value is not None}
     read = read or (task and task.reader)
     names, origin = None if labels is None else read_labels(labels), labels_origin(labels)
     if names is not None and task and task.names_from:
         raise InputError(f"labels: the names of task {task.name} are those of {task.names_from}; leave `labels` out")
     prompts = read_prompts(prompt)  # first, because loading a model takes seconds
-    found = _find(spec)
+    source = _find(spec)
     switches = turned_by_code()
-    if prompts is not None and not (isinstance(found, Source) and found.reads_text):
-        raise InputError(f"prompt: model {found.name} has classes of its own and reads no text; leave `prompt` out")
-    if isinstance(found, Source) and found.finish is not None:
+    if prompts is not None and not (isinstance(source, Source) and source.reads_text):
+        raise InputError(f"prompt: model {source.name} has classes of its own and reads no text; leave `prompt` out")
+    if isinstance(source, Source) and source.finish is not None:
         wanted = task.name if task else "classification"
         lengths = getattr(task, "tokens", 16), getattr(task, "times", 1)
-        found = found.finish(Purpose(wanted, names, prompts, *lengths, ask or {}))
-    if isinstance(found, Source) and isinstance(found.module, nn.Module):
-        called_under(found.module, switches)
+        source = source.finish(Purpose(wanted, names, prompts, *lengths, ask or {}))
+    if isinstance(source, Source) and isinstance(source.module, nn.Module):
+        called_under(source.module, switches)
     if task:
-        found = dataclasses.replace(found, module=task.wrapped(found.module))
-    if isinstance(found, Source) and found.takes_more and not isinstance(found.module, WithState):
-        raise ModelError(f"model {found.name}: takes more than pictures; give task command the `state` that it takes")
-    if isinstance(found, Model):
-        found = dataclasses.replace(found, read=read or found.read)
-        found = found if names is None and name is None else dataclasses.replace(found, asked=None)
-        loaded = _relabelled(found, names, origin, name, given)
+        source = replace(source, module=task.wrapped(source.module))
+    if isinstance(source, Source) and source.takes_more and not isinstance(source.module, WithState):
+        raise ModelError(f"model {source.name}: takes more than pictures; give task command the `state` that it takes")
+    if isinstance(source, Model):
+        if given:
+            raise InputError(
+                f"model {source.name} brings its own preprocessing: leave out {', '.join(given)}, or load its network "
+                "anew"
+            )
+        asked = source.asked if names is None and name is None else None
+        model = replace(source, name=name or source.name, read=read or source.read, asked=asked)
+        if names is not None:
+            if model.read is None:  # the classes of others are counted by their task
+                names = fitting_labels(model.classes, names, origin, model.name)
+            model = replace(model, labels=names, named=True)
     else:
-        if read is not None and isinstance(found.module, nn.Module):
-            found = _with_what_it_says(found)
-        low, high = found.batch_limits
+        if read is not None and isinstance(source.module, nn.Module):  # YOLO's have names, and `args` from training
+            args = getattr(source.module, "args", None)
+            side = args.get("imgsz") if isinstance(args, Mapping) else None
+            size = (side, side) if isinstance(side, int) and side > 1 else None
+            its_names = names_in(getattr(source.module, "names", None))
+            source = replace(source, labels=source.labels or its_names, input_size=source.input_size or size)
+        if max_batch is not None and (isinstance(max_batch, bool) or not isinstance(max_batch, int) or max_batch < 1):
+            raise InputError(f"max_batch: expected a whole number of at least 1, got {max_batch!r}")
+        low, high = source.batch_limits
         bare = Model(
-            module=found.module,
-            name=name or found.name,
+            module=source.module,
+            name=name or source.name,
             labels=(),
-            preprocessing=_preprocessing(found, given),
-            batch_limits=(low, max(low, min(high, _positive("max_batch", max_batch, high)))),
-            dtype=found.dtype,
-            device=found.device,
+            preprocessing=_preprocessing(source, given),
+            batch_limits=(low, max(low, min(high, max_batch or high))),
+            dtype=source.dtype,
+            device=source.device,
             read=read,
         )
-        loaded = probe(bare, found.labels if names is None else names, origin)
+        model = probe(bare, source.labels if names is None else names, origin)
     alone = isinstance(spec, (str, os.PathLike)) and not given and labels is None and name is None
-    return dataclasses.replace(loaded, asked=os.fspath(spec)) if alone else loaded  # type: ignore[arg-type]
-
-
-def _with_what_it_says(found: Source) -> Source:
-    """Return a source with the names and the size that its module has as attributes, as those of YOLO's do.
-
-    These are `names`, and `args` from training with `imgsz`.
-    """
-    args = getattr(found.module, "args", None)
-    side = args.get("imgsz") if isinstance(args, Mapping) else None
-    size = (side, side) if isinstance(side, int) and side > 1 else None
-    names = names_in(getattr(found.module, "names", None))
-    return dataclasses.replace(found, labels=found.labels or names, input_size=found.input_size or size)
+    return replace(model, asked=os.fspath(spec)) if alone else model  # type: ignore[arg-type]
 
 
 def named_code(spec: str) -> str | None:
@@ -197,49 +191,21 @@ def _find(spec: object) -> Source | Model:
         return files.load_file(Path(text))
     forms = {"hf": "hf:REPOSITORY", "http": "http://ADDRESS", "https": "https://ADDRESS"}
     known = ["reference", *(forms.get(source, f"{source}:NAME") for source in SOURCES)]
-    raise UnknownNameError("model", text, known, f"{_by_library(text)}{FORMS}")
+    hint = FORMS
+    if re.fullmatch(r"[\w.-]+", text) and not resembling(text, ["reference"]):  # it may be a library's
+        hint = f"A library's network is written with its library: 'torchvision:{text}' or 'timm:{text}'. {FORMS}"
+    raise UnknownNameError("model", text, known, hint)
 
 
-def _by_library(text: str) -> str:
-    """Return how the networks of libraries are written, for a bare name that may be one's; else nothing."""
-    if not re.fullmatch(r"[\w.-]+", text) or resembling(text, ["reference"]):
-        return ""
-    return f"A library's network is written with its library: 'torchvision:{text}' or 'timm:{text}'. "
-
-
-def _preprocessing(found: Source, given: Mapping[str, object]) -> Preprocessing:
-    made = Preprocessing(found.input_size or DEFAULT_INPUT_SIZE, processor=found.processor)
-    instead = [key for key in ("mean", "std", "value_range", "channels") if found.processor and key in given]
+def _preprocessing(source: Source, given: Mapping[str, object]) -> Preprocessing:
+    instead = [key for key in ("mean", "std", "value_range", "channels") if source.processor and key in given]
     if instead:
-        raise InputError(f"{instead[0]}: model {found.name} has a processor that does all of this; leave it out")
-    own = {"mean": found.mean, "std": found.std, **parse_normalisation(given.get("mean"), given.get("std"))}
-    made = dataclasses.replace(made, mean=own["mean"] or made.mean, std=own["std"] or made.std)
-    made = dataclasses.replace(made, layout=found.layout or made.layout, channels=found.channels or made.channels)
-    return dataclasses.replace(made, **{key: parse(given[key]) for key, parse in READERS.items() if key in given})
-
-
-def _relabelled(
-    model: Model, labels: tuple[str, ...] | None, origin: str, name: str | None, given: Mapping[str, object]
-) -> Model:
-    """Return a model that was complete already, with other labels or another name at most."""
-    if given:
-        raise InputError(
-            f"model {model.name} brings its own preprocessing: leave out {', '.join(given)}, or load its network anew"
-        )
-    name = name or model.name
-    if labels is None:
-        return dataclasses.replace(model, name=name)
-    if model.read is None:  # the classes of others are counted by their task
-        labels = fitting_labels(model.classes, labels, origin, name)
-    return dataclasses.replace(model, name=name, labels=labels, named=True)
-
-
-def _positive(key: str, value: int | None, default: int) -> int:
-    if value is None:
-        return default
-    if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-        raise InputError(f"{key}: expected a whole number of at least 1, got {value!r}")
-    return value
+        raise InputError(f"{instead[0]}: model {source.name} has a processor that does all of this; leave it out")
+    fields: dict[str, Any] = {key: getattr(source, key) for key in ("mean", "std", "layout", "channels", "processor")}
+    fields |= {"input_size": source.input_size or DEFAULT_INPUT_SIZE}
+    fields |= parse_normalisation(given.get("mean"), given.get("std"))
+    fields |= {key: parse(given[key]) for key, parse in READERS.items() if key in given}
+    return Preprocessing(**{key: value for key, value in fields.items() if value})
 
 
 # ---- what a user writes of preprocessing: Python values, or strings from a command line ------------------------------
@@ -265,22 +231,16 @@ def parse_value_range(value: Any) -> tuple[float, float]:
 
 
 def parse_normalisation(mean: Any, std: Any) -> dict[str, Triple]:
-    """Return the fields among `mean` and `std` that were given.
-
-    A preset's name (``"imagenet"``, ``"half"``, ``"clip"``) in one of the two also fills the other if that one is None.
-    """
+    """Return the fields among `mean` and `std` that were given. A preset's name (``"imagenet"``, ``"half"``,
+    ``"clip"``) in one of the two also fills the other if that one is None."""
     fields: dict[str, Triple] = {}
-    for position, (key, value) in enumerate((("mean", mean), ("std", std))):
-        if value is None:
-            continue
+    both = {"mean": mean, "std": std}
+    for key, value in both.items():
         if isinstance(value, str) and value.strip().lower() in PRESETS:
-            preset = PRESETS[value.strip().lower()]
-            fields[key] = preset[position]
-            if (mean, std)[1 - position] is None:
-                fields[("std", "mean")[position]] = preset[1 - position]
-        else:
-            expected = f"one number, three numbers, or one of {', '.join(PRESETS)}"
-            numbers = _numbers(key, value, (1, 3), expected)
+            preset = zip(both, PRESETS[value.strip().lower()], strict=True)
+            fields |= {name: numbers for name, numbers in preset if name == key or both[name] is None}
+        elif value is not None:
+            numbers = _numbers(key, value, (1, 3), f"one number, three numbers, or one of {', '.join(PRESETS)}")
             fields[key] = (numbers[0], numbers[len(numbers) // 2], numbers[-1])
     if any(number <= 0 for number in fields.get("std", ())):
         raise InputError(f"std: expected numbers greater than 0, got {std!r}")
@@ -307,13 +267,8 @@ READERS: dict[str, Callable[[Any], Any]] = {
 def _numbers(key: str, value: Any, counts: tuple[int, ...], expected: str) -> tuple[float, ...]:
     """Return finite numbers from a number, a sequence, or comma-separated text; their count is one of `counts`."""
     problem = InputError(f"{key}: expected {expected}, got {value!r}")
-    if isinstance(value, str):
-        parts: list[Any] = value.split(",")
-    elif isinstance(value, Tensor) or hasattr(value, "tolist"):
-        listed = value.tolist()
-        parts = listed if isinstance(listed, list) else [listed]
-    else:
-        parts = list(value) if isinstance(value, Sequence) else [value]
+    value = value.split(",") if isinstance(value, str) else value.tolist() if hasattr(value, "tolist") else value
+    parts = list(value) if isinstance(value, Sequence) else [value]
     try:
         numbers = tuple(float(part) for part in parts)
     except (TypeError, ValueError):

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 from functools import cached_property, partial
+from itertools import chain
 from typing import Any, final
 
 import torch
@@ -35,10 +37,8 @@ Read = Callable[[Any, int], Any]
 
 #: Probabilities below this count as this before the logarithm is taken (its derivative stays finite in float32).
 SMALLEST_PROBABILITY = 1e-30
-
 #: How far outside [0, 1] a pixel may lie (finite differences overshoot a little) before the image is refused.
 RANGE_TOLERANCE = 0.01
-
 #: Pictures of a rig of which all that the network has computed is kept for the gradient; of more, it computes it again.
 KEPT = 4
 
@@ -55,6 +55,11 @@ GIVEN_BY = {
 
 class ModelWarning(UserWarning):
     """A model that works, but not as an attack would like it to (probabilities, randomness, no gradient)."""
+
+
+def warn(message: str) -> None:
+    """Warn of a model (ModelWarning)."""
+    warnings.warn(message, ModelWarning, stacklevel=4)
 
 
 @dataclass(frozen=True)
@@ -188,14 +193,18 @@ class Model:
             again = alone and len(images) > KEPT and images.requires_grad and torch.is_grad_enabled()
             most = min(most, KEPT) if again else most
 
+        def kept(output: Tensor) -> Tensor:
+            moved = output.to(images.device)  # a copy, for a network may write into the same memory again
+            return moved.clone() if moved is output and not output.requires_grad else moved
+
         def asked(part: Tensor) -> Any:
-            return each_tensor(self.ask(self.prepared(part))[: len(part)], lambda one: _kept(one, images.device))
+            return each_tensor(self.ask(self.prepared(part))[: len(part)], kept)
 
         parts = [recomputed(asked, part) if again else asked(part) for part in images.split(most)]
-        found = parts[0] if len(parts) == 1 else joined(parts)
+        output = parts[0] if len(parts) == 1 else joined(parts)
         if self.cameras == 1:
-            return found
-        each = [found[number : number + 1] for number in range(len(found))]
+            return output
+        each = [output[number : number + 1] for number in range(len(output))]
         return [tuple(each[begin : begin + self.cameras]) for begin in range(0, len(each), self.cameras)]
 
     def label_set(self, text: str | int | Sequence[str | int]) -> LabelSet:
@@ -210,9 +219,8 @@ class Model:
         """
         missing = self.batch_limits[0] - len(images)
         full = torch.cat([images, images[-1:].expand(missing, -1, -1, -1)]) if missing > 0 else images
-        given = self.preprocessing(full.to(device=self.device, dtype=torch.float32)).to(self.dtype)
-        shared = given.untyped_storage().data_ptr() == images.untyped_storage().data_ptr()
-        return given.clone() if shared else given
+        x = self.preprocessing(full.to(device=self.device, dtype=torch.float32)).to(self.dtype)
+        return x.clone() if x.untyped_storage().data_ptr() == images.untyped_storage().data_ptr() else x
 
     def ask(self, x: Tensor, *, raw: bool = False) -> Any:
         """Return the output for a batch as `prepared` returns it, or, if `raw`, what the network itself gives."""
@@ -226,12 +234,6 @@ class Model:
             return read_by(self.read, returned, len(x), self.name)
         logits = logits_of(returned, len(x), len(self.labels), self.name)
         return logits.clamp_min(SMALLEST_PROBABILITY).log() if self.probabilities else logits
-
-
-def _kept(output: Tensor, device: torch.device) -> Tensor:
-    """An output on a device; a copy, for a network may write into the same memory again."""
-    moved = output.to(device)
-    return moved.clone() if moved is output and not output.requires_grad else moved
 
 
 class Detaching(TorchFunctionMode):
@@ -284,8 +286,8 @@ def read_by(read: Read, returned: Any, count: int, name: str) -> Any:
     try:
         output = read(returned, count)
     except ValueError as error:
-        meant, own = _task_of(returned), getattr(getattr(read, "__self__", None), "name", None)
-        known = meant and own not in (meant, "command")  # actions look like rows of scores
+        meant, task = _task_of(returned), getattr(getattr(read, "__self__", None), "name", None)
+        known = meant and task not in (meant, "command")  # actions look like rows of scores
         other = _other_task(str(meant)) if known else "wrap the network, or ask for another task"
         advice = _no_scores(returned) or other
         raise ModelError(f"model {name}: {error}, got {described(returned)}; {advice}") from None
@@ -302,7 +304,7 @@ def described(returned: Any) -> str:
 
 def joined(parts: Sequence[Any]) -> Any:
     """Return the outputs of several batches as one: tensors (N, ...) and lists are put end to end."""
-    return torch.cat(list(parts)) if isinstance(parts[0], Tensor) else [one for part in parts for one in part]
+    return torch.cat(list(parts)) if isinstance(parts[0], Tensor) else list(chain.from_iterable(parts))
 
 
 def each_tensor(output: Any, function: Callable[[Tensor], Tensor]) -> Any:
@@ -310,10 +312,18 @@ def each_tensor(output: Any, function: Callable[[Tensor], Tensor]) -> Any:
     if isinstance(output, Tensor):
         return function(output)
     if isinstance(output, Mapping):
-        return {name: each_tensor(one, function) for name, one in output.items()}
+        return {name: each_tensor(part, function) for name, part in output.items()}
     if isinstance(output, (list, tuple)):
-        return [each_tensor(one, function) for one in output]
+        return [each_tensor(part, function) for part in output]
     return output
+
+
+def tensors_in(output: Any) -> list[Tensor]:
+    """Return the tensors in an output, in their order."""
+    if isinstance(output, Tensor):
+        return [output]
+    parts = output.values() if isinstance(output, Mapping) else output if isinstance(output, (list, tuple)) else ()
+    return [tensor for part in parts for tensor in tensors_in(part)]
 
 
 def logits_of(output: Any, count: int, classes: int | None, name: str) -> Tensor:
@@ -353,16 +363,7 @@ def mend_batch_norms(output: Any) -> None:
     Of a single picture torch 2.13 reads a gradient that comes from ``flatten(2).transpose(1, 2)``, as
     in networks whose convolutions end in a transformer, in a wrong order on the CPU, without a word. Batches are right.
     """
-    waiting: list[Any] = []
-
-    def keep(one: Tensor) -> Tensor:
-        waiting.append(one.grad_fn)
-        return one
-
-    if isinstance(output, Tensor):
-        waiting.append(output.grad_fn)
-    else:
-        each_tensor(output, keep)
+    waiting: list[Any] = [tensor.grad_fn for tensor in tensors_in(output)]
     seen = {None}
     while waiting:
         node = waiting.pop()
@@ -393,12 +394,16 @@ def _tensor_in(output: Any) -> Tensor | None:
     return output if isinstance(output, Tensor) else None
 
 
+def _scores_in(returned: Any) -> Any:
+    return returned["out"] if isinstance(returned, Mapping) and "out" in returned else _tensor_in(returned)
+
+
 def _no_scores(returned: Any) -> str:
     """What to do with an output that has no scores: the classes that it chose, or losses; "" of any other."""
     parts = list(returned.values()) if isinstance(returned, Mapping) else [returned]
-    if parts and all(isinstance(one, Tensor) and one.ndim == 0 for one in parts):
+    if parts and all(isinstance(part, Tensor) and part.ndim == 0 for part in parts):
         return "one number for all pictures is what a loss is: give the network as it is outside of training"
-    tensor = returned.get("out") if isinstance(returned, Mapping) and "out" in returned else _tensor_in(returned)
+    tensor = _scores_in(returned)
     listed = isinstance(returned, (list, tuple))  # whose first part may be the labels of boxes
     if tensor is None or listed or tensor.is_floating_point() or tensor.ndim not in (1, 3):
         return ""
@@ -406,34 +411,23 @@ def _no_scores(returned: Any) -> str:
 
 
 def _task_of(returned: Any) -> str | None:
-    """Return the task whose networks return such a thing: boxes, features, numbers for each pixel, or rows of scores.
-
-    None where it is none of these.
-    """
-    if _has_boxes(returned):
+    """Return the task whose networks return such a thing: boxes, features, numbers for each pixel, or rows of scores;
+    None where it is none of these."""
+    listed = isinstance(returned, (tuple, list))
+    first = returned[0] if listed and returned else returned
+    names = first if isinstance(first, Mapping) else dir(first)
+    if not isinstance(first, Tensor) and ("boxes" in names or "pred_boxes" in names):
         return "detection"
+    if listed and len(returned) > 1 and isinstance(first, Tensor) and first.dim() == 3 and first.shape[2] == 4:
+        return "detection"  # (boxes (N, K, 4), scores ...)
     if isinstance(returned, Mapping) and any(word in str(key) for key in returned for word in ("depth", "disparity")):
         return "depth"
     if hasattr(returned, "last_hidden_state") and not hasattr(returned, "logits"):
         return "similarity"
-    tensor = returned.get("out") if isinstance(returned, Mapping) and "out" in returned else _tensor_in(returned)
-    kinds = {2: "classification", 4: "segmentation"}
-    if (
-        isinstance(returned, (list, tuple))
-        and len({one.shape[2:] for one in returned if isinstance(one, Tensor) and one.ndim == 4}) > 1
-    ):
+    if listed and len({part.shape[2:] for part in returned if isinstance(part, Tensor) and part.ndim == 4}) > 1:
         return None  # maps of several sizes
-    return kinds.get(tensor.dim()) if isinstance(tensor, Tensor) else None
-
-
-def _has_boxes(output: Any) -> bool:
-    """Whether an output is a detector's: (boxes (N, K, 4), scores ...), or mappings or objects with "boxes"."""
-    first = output[0] if isinstance(output, (tuple, list)) and output else output
-    names = first if isinstance(first, Mapping) else dir(first)
-    if not isinstance(first, Tensor) and ("boxes" in names or "pred_boxes" in names):
-        return True
-    several = isinstance(output, (tuple, list)) and len(output) > 1
-    return several and isinstance(first, Tensor) and first.dim() == 3 and first.shape[2] == 4
+    tensor = _scores_in(returned)
+    return {2: "classification", 4: "segmentation"}.get(tensor.dim()) if isinstance(tensor, Tensor) else None
 
 
 def _other_task(name: str) -> str:

@@ -5,45 +5,31 @@ from __future__ import annotations
 import dataclasses
 import inspect
 import re
-import warnings
-from collections.abc import Callable, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from advsearch import files
-from advsearch.errors import ModelError
+from advsearch.errors import AdvsearchError, ModelError
 from advsearch.models.all_at_once import AllAtOnce
 from advsearch.models.guards import TookTooLong, within
 from advsearch.models.labels import fitting_labels
-from advsearch.models.model import Detaching, Model, ModelWarning, each_tensor, logits_of, read_by
+from advsearch.models.model import Detaching, Model, logits_of, read_by, tensors_in, warn
 from advsearch.models.with_state import WithState
 
-#: Rows that are non-negative and sum to 1 within this are taken for probabilities.
-PROBABILITY_TOLERANCE = 1e-3
-
-#: Rows that are non-negative and sum to 100 within this share of it are taken for percentages.
-PERCENT_TOLERANCE = 5e-3
-
-#: How far from [0, 1] colours are that show whether scores stay in it whatever the picture is.
-FAR = 1000.0
-
-ODD_ADVICE = (
-    "They are taken for logits: the probabilities that are shown are none, and margins are differences of such scores. "
-    "Return what stands before the last function"
-)
-
-#: Two outputs are the same if they differ by less than this times the largest logit (float32 kernels differ by 1e-6).
-REPEAT_TOLERANCE = 1e-3
+PROBABILITY_TOLERANCE = 1e-3  # rows that are non-negative and sum to 1 within this are taken for probabilities
+PERCENT_TOLERANCE = 5e-3  # rows that are non-negative and sum to 100 within this share of it, for percentages
+FAR = 1000.0  # how far from [0, 1] colours are that show whether scores stay in it whatever the picture is
+REPEAT_TOLERANCE = 1e-3  # share of the largest logit by which outputs differ that are the same; kernels' differ by 1e-6
 
 ROUNDING = 4.0
 """Steps between neighbouring numbers of the network's type by which its pictures are changed at least, and outputs may
 differ: a network in bfloat16 tells 0.50 from 0.51 and no less."""
 
-STEP = 1e-3
-"""Change of each value of an image, in [0, 1], along the gradient that is checked."""
+STEP = 1e-3  # change of each value of an image, in [0, 1], along the gradient that is checked
 
 MASKED = 0.9
 """Share of a change by which outputs may miss what the gradient foretells: a sign that is wrong is a miss of 2, a step
@@ -52,14 +38,12 @@ function one of 1; kinks of ordinary networks stay under a half."""
 AGREES = 0.5
 """Share of a change by which outputs may miss what a gradient foretells that takes the place of the network's own."""
 
-SMALLEST = 1e-5
-"""Smallest change that is looked at, as a share of the outputs: what is less may be rounding."""
+SMALLEST = 1e-5  # smallest change that is looked at, as a share of the outputs: what is less may be rounding
 
 PROGRAMS = (torch.fx.GraphModule, torch.jit.ScriptModule)
 """What torch makes of a model file. Others that are made of one have a method `stop`, which ends what they run."""
 
-LARGEST = 1 << 26
-"""Most pixels of all the images that a network takes at once, at least: 67 million are 800 MB of numbers."""
+LARGEST = 1 << 26  # pixels of all the images that a network takes at once, at least: 800 MB of numbers
 
 
 def probe(model: Model, labels: tuple[str, ...] | None, labels_source: str) -> Model:
@@ -82,7 +66,15 @@ def probe(model: Model, labels: tuple[str, ...] | None, labels_source: str) -> M
         ModelWarning: it returns probabilities (a segmenter's too), differently every time, differently in a batch,
             or no gradient reaches the image.
     """
-    grey, noise = _test_images(model)
+    (height, width), count = model.input_size, max(model.batch_limits[0], 1)
+    if count * height * width > files.scaled(LARGEST):
+        raise ModelError(
+            f"model {model.name}: takes {count:,} images of {height:,} x {width:,} pixels at once, expected at most "
+            f"{files.scaled(LARGEST):,} pixels; if you trust it, {files.FACTOR}=10 in the environment allows ten times "
+            "as many"
+        )
+    grey = torch.full((1, height, width, 3), 0.5)
+    noise = torch.rand(grey.shape, generator=torch.Generator().manual_seed(0))
     with torch.no_grad():
         rows = torch.cat([_run(model, grey), _run(model, noise)])
         again = _run(model, grey)
@@ -94,57 +86,49 @@ def probe(model: Model, labels: tuple[str, ...] | None, labels_source: str) -> M
             f"model {model.name}: expected finite {what}, got NaN or infinity for a {which} image; "
             "check its weights and the value range and normalisation that it expects"
         )
-    found = fitting_labels(rows.shape[1], labels, labels_source, model.name) if logits else labels or ()
+    names = fitting_labels(rows.shape[1], labels, labels_source, model.name) if logits else labels or ()
     percentages = logits and _probabilities(rows / 100.0, PERCENT_TOLERANCE)
     probabilities = logits and (percentages or _probabilities(rows))
     if probabilities:
         kind = "percentages that sum to 100" if percentages else "probabilities"
-        _warn(
+        warn(
             f"model {model.name} returns {kind}. Their logarithm is used, so that margins are log-odds, "
             "but gradients vanish where a probability rounds to 0 or 1: remove the final softmax if you can"
         )
     if not logits and _pixel_probabilities(model, noise):
-        _warn(
+        warn(
             f"model {model.name} returns probabilities for each pixel: margins are differences of these and no "
             "log-odds, and gradients vanish where one rounds to 0 or 1: remove the final softmax if you can"
         )
     repeatable = _same(model, rows[:1], again)
     if repeatable and logits and not probabilities and (odd := _odd_scores(model, rows)):
-        _warn(f"model {model.name} returns {odd}. {ODD_ADVICE}")
+        warn(
+            f"model {model.name} returns {odd}. They are taken for logits: the probabilities that are shown are none, "
+            "and margins are differences of such scores. Return what stands before the last function"
+        )
     if not repeatable:
-        _warn(f"model {model.name} differs each time on the same image: results hold for single draws only")
+        warn(f"model {model.name} differs each time on the same image: results hold for single draws only")
     return dataclasses.replace(
         _with_gradient(model, noise, repeatable),
-        labels=found,
+        labels=names,
         named=labels is not None,
         probabilities=probabilities,
         batch_limits=_batch_limits(model, torch.cat([grey, noise]), rows if repeatable else None),
     )
 
 
-def _test_images(model: Model) -> tuple[Tensor, Tensor]:
-    """Return a grey and a noise image, each (1, H, W, 3) in [0, 1]."""
-    (height, width), count = model.input_size, max(model.batch_limits[0], 1)
-    if count * height * width > files.scaled(LARGEST):
-        raise ModelError(
-            f"model {model.name}: takes {count:,} images of {height:,} x {width:,} pixels at once, expected at most "
-            f"{files.scaled(LARGEST):,} pixels; if you trust it, {files.FACTOR}=10 in the environment allows ten times "
-            "as many"
-        )
-    shape = (1, height, width, 3)
-    return torch.full(shape, 0.5), torch.rand(shape, generator=torch.Generator().manual_seed(0))
-
-
 def _run(model: Model, images: Tensor) -> Tensor:
-    """Return the raw output of the network for images (N, H, W, 3) as (N, classes) float32 on the CPU.
-
-    An output of another kind comes as three numbers of each image, (N, 3); see `_numbers`.
-    """
-    output, count = _returned(model, images)
+    """Return the raw output of the network for images (N, H, W, 3) as (N, classes) float32 on the CPU. An output of
+    another kind comes as three numbers of each image, (N, 3); see `_numbers`."""
     if model.read is None:
-        return logits_of(output, count, None, model.name)[: len(images)].cpu()
-    outputs = read_by(model.read, output, count, model.name)[: len(images)]
-    return torch.stack([_numbers(one) for one in outputs]).cpu()
+        return logits_of(*_returned(model, images), None, model.name)[: len(images)].cpu()
+    return torch.stack([_numbers(output) for output in _read(model, images)]).cpu()
+
+
+def _read(model: Model, images: Tensor) -> Any:
+    """Return what is read for images (N, H, W, 3) of a network that returns something other than logits."""
+    assert model.read is not None
+    return read_by(model.read, *_returned(model, images), model.name)[: len(images)]
 
 
 def _returned(model: Model, images: Tensor) -> tuple[Any, int]:
@@ -156,22 +140,14 @@ def _returned(model: Model, images: Tensor) -> tuple[Any, int]:
 
 def _numbers(output: Any) -> Tensor:
     """Return three numbers (3,) of the output for one image: how many it has, their sum, and the sum of their sizes."""
-    found: list[Tensor] = []
-
-    def keep(one: Tensor) -> Tensor:
-        found.append(one.float().flatten())
-        return one
-
-    each_tensor(output, keep)
-    values = torch.cat(found) if found else torch.zeros(0)
+    parts = [tensor.float().flatten() for tensor in tensors_in(output)]
+    values = torch.cat(parts) if parts else torch.zeros(0)
     return torch.stack([torch.tensor(float(len(values))).to(values), values.sum(), values.abs().sum()])
 
 
 def _guarded(model: Model, call: Callable[[], Any]) -> Any:
-    """Return what the foreign network returns; whatever it raises becomes a ModelError with advice.
-
-    A program has to end, for nothing ends it; code of one's own that does not is ended by Ctrl-C.
-    """
+    """Return what the foreign network returns; whatever it raises becomes a ModelError with advice. A program has to
+    end, for nothing ends it; code of one's own that does not is ended by Ctrl-C."""
     network = model.module
     while isinstance(network, (AllAtOnce, WithState)):
         network = network.network
@@ -181,8 +157,7 @@ def _guarded(model: Model, call: Callable[[], Any]) -> Any:
     except TookTooLong as error:
         raise ModelError(f"model {model.name}: {error}") from None
     except Exception as error:  # any network may raise anything
-        height, width = model.input_size
-        preprocessing = model.preprocessing
+        (height, width), preprocessing = model.input_size, model.preprocessing
         if isinstance(model.module, WithState) and model.module.state:
             sizes = ", ".join(f"{name} (N, {len(numbers)})" for name, numbers in model.module.state.items())
             raise ModelError(
@@ -206,20 +181,18 @@ def _unlike_pictures(network: object, error: str) -> str:
     """What a network that raised an error wants beside pictures or in place of them; "" where that does not show."""
     if not isinstance(network, nn.Module):
         return ""
-    try:
+    taken: list[inspect.Parameter] = []
+    with suppress(TypeError, ValueError):  # it is not written in Python
         taken = list(inspect.signature(network.forward).parameters.values())[1:]
-    except (TypeError, ValueError):  # it is not written in Python
-        taken = []
     variable = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
     needed = {one.name for one in taken if one.kind not in variable and one.default is inspect.Parameter.empty}
     missed = TRUTHS & set(re.findall(r"\w+", error))
-    more = [one.name for one in taken if one.name in needed | missed]
-    if more:
+    if more := [parameter.name for parameter in taken if parameter.name in needed | missed]:
         return (
             f"wants {' and '.join(more)} beside pictures; wrap it in an nn.Module that is called with pictures alone, "
             "as it is used outside of training"
         )
-    if any(isinstance(one, nn.Conv3d) for one in network.modules()):
+    if any(isinstance(layer, nn.Conv3d) for layer in network.modules()):
         return (
             "is made for videos or volumes (it has an nn.Conv3d), and pictures (N, 3, H, W) are what is given; wrap it "
             "in an nn.Module that makes one of each picture"
@@ -233,11 +206,9 @@ def _probabilities(rows: Tensor, tolerance: float = PROBABILITY_TOLERANCE) -> bo
 
 
 def _odd_scores(model: Model, rows: Tensor) -> str:
-    """What rows of scores (N, classes) are that are neither logits nor probabilities; empty of others.
-
-    A black picture tells a sigmoid from means of the picture, which are 0 there; colours far outside of [0, 1] tell it
-    from logits that are small, as those of a network that is not trained.
-    """
+    """What rows of scores (N, classes) are that are neither logits nor probabilities; empty of others. A black picture
+    tells a sigmoid from means of the picture, which are 0 there; colours far outside of [0, 1] tell it from logits that
+    are small, as those of a network that is not trained."""
     least = float(rows.min())
     if least >= 0.0 and float(rows.max()) <= 1.0:
         with torch.no_grad():
@@ -255,9 +226,8 @@ def _odd_scores(model: Model, rows: Tensor) -> str:
 
 def _pixel_probabilities(model: Model, images: Tensor) -> bool:
     """Whether what is read in the network's output is (N, classes, h, w) of probabilities, two classes at least."""
-    assert model.read is not None
     with torch.no_grad():
-        output = read_by(model.read, *_returned(model, images), model.name)
+        output = _read(model, images)
     if not isinstance(output, Tensor) or output.ndim != 4 or output.shape[1] < 2:
         return False
     return _probabilities(output.movedim(1, -1).reshape(-1, output.shape[1]))
@@ -281,7 +251,7 @@ def _batch_limits(model: Model, pair: Tensor, rows: Tensor | None) -> tuple[int,
     except ModelError:
         return 1, 1
     if rows is not None and not _same(model, rows, together):
-        _warn(
+        warn(
             f"model {model.name} sees an image differently in a batch: was it exported in training mode? "
             "Call .eval() before exporting"
         )
@@ -289,8 +259,7 @@ def _batch_limits(model: Model, pair: Tensor, rows: Tensor | None) -> tuple[int,
 
 
 def _with_gradient(model: Model, images: Tensor, repeatable: bool) -> Model:
-    """Return the model with `differentiable` and `attached` set; warn if no gradient of its outputs reaches the image,
-    and if outputs do not follow it."""
+    """Set `differentiable` and `attached`; warn if no gradient reaches the image, or outputs do not follow it."""
     try:
         with Detaching() as detaching:
             rows, gradient = _slope(model, images)
@@ -308,7 +277,7 @@ def _with_gradient(model: Model, images: Tensor, repeatable: bool) -> Model:
     except (RuntimeError, ModelError) as error:
         reaches, why = False, first_line(error)
     if not reaches:
-        _warn(f"no gradient of model {model.name} reaches its image ({why}): use `auto` or a policy without gradients")
+        warn(f"no gradient of model {model.name} reaches its image ({why}): use `auto` or a policy without gradients")
     return dataclasses.replace(model, differentiable=reaches)
 
 
@@ -327,18 +296,25 @@ def _told(rows: Tensor) -> Tensor:
     return (rows * torch.linspace(-1.0, 1.0, rows.shape[1])).sum()
 
 
-def _is_better(model: Model, images: Tensor, whole: Tensor, own: Tensor) -> bool:
-    """Return whether outputs change as a gradient without `detach` says, and less so as the network's own does.
+@torch.no_grad()
+def _moved(
+    model: Model, images: Tensor, step: Tensor, *slopes: Tensor
+) -> tuple[float, list[float], list[Tensor], float]:
+    """Return by how much `_told` differs a step before and behind images, what each slope foretells of that, both ends
+    of the step, and the size of outputs."""
+    ends = [(images + step).clamp(0.0, 1.0), (images - step).clamp(0.0, 1.0)]
+    outputs = [_run(model, end) for end in ends]
+    foretold = [float(((ends[0] - ends[1]) * slope).sum()) for slope in slopes]
+    return float(_told(outputs[0] - outputs[1])), foretold, ends, float(outputs[0].abs().sum())
 
-    Changes are taken along the signs of the difference of the two. Networks that round behind a `detach` keep their
-    own: the other one is zero.
-    """
+
+def _is_better(model: Model, images: Tensor, whole: Tensor, own: Tensor) -> bool:
+    """Return whether outputs change as a gradient without `detach` says, and less so as the network's own does. Changes
+    are taken along the signs of the difference of the two. Networks that round behind a `detach` keep their own: the
+    other one is zero."""
     for size in (STEP, STEP / 8.0):
         step = max(size, ROUNDING * torch.finfo(model.dtype).eps) * (whole - own).sign()
-        ends = (images + step).clamp(0.0, 1.0), (images - step).clamp(0.0, 1.0)
-        with torch.no_grad():
-            seen = float(_told(_run(model, ends[0]) - _run(model, ends[1])))
-        told, less = (float(((ends[0] - ends[1]) * slope).sum()) for slope in (whole, own))
+        seen, (told, less), *_ = _moved(model, images, step, whole, own)
         if abs(seen - told) < min(abs(seen - less), AGREES * abs(told)):
             return True
     return False
@@ -351,46 +327,35 @@ def _check_gradient(model: Model, images: Tensor, gradient: Tensor, detached: bo
     if told_apart > STEP:
         sizes = (told_apart, told_apart / 8.0)  # a network in half precision bends in the first, and rounds the second
     for size in sizes:
-        step = size * gradient.sign()
-        ends = (images + step).clamp(0.0, 1.0), (images - step).clamp(0.0, 1.0)
-        with torch.no_grad():
-            outputs = [_run(model, end) for end in ends]
-            if model.read is not None and len({_choices(model, one) for one in (images, *ends)}) > 1:
-                return  # nothing can be said of what jumps
-        seen = float(_told(outputs[0] - outputs[1]))
-        expected = float(((ends[0] - ends[1]) * gradient).sum())
+        seen, (expected,), ends, total = _moved(model, images, size * gradient.sign(), gradient)
+        if model.read is not None and len({_choices(model, image) for image in (images, *ends)}) > 1:
+            return  # nothing can be said of what jumps
         change = max(abs(seen), abs(expected))
-        if change <= SMALLEST * float(outputs[0].abs().sum()) or abs(seen - expected) <= MASKED * change:
+        if change <= SMALLEST * total or abs(seen - expected) <= MASKED * change:
             return
     why = "Steps that round, or a defence that masks gradients?"
     if detached:
         why = "It detaches a part of what it computes, where it rounds or for another reason."
-    _warn(
+    warn(
         f"the gradient of model {model.name} does not say how its outputs change: {expected:.3g} expected, "
         f"{seen:.3g} seen for a small step along it. {why} A search "
         "that follows them may find nothing: try a policy without gradients beside it"
     )
 
 
+@torch.no_grad()
 def _choices(model: Model, images: Tensor) -> str:
-    """What an output has that no gradient moves: how many numbers, which of them are whole, and texts.
-
-    A detector that has suppressed boxes finds more or fewer of them, or others, after a small step, and what is
-    returned in words goes on otherwise after another word.
-    """
-    assert model.read is not None
-    found: list[Any] = []
-
-    def keep(one: Tensor) -> Tensor:
-        columns = one.flatten(1).T if one.ndim > 1 else one[None]
-        found.append((one.shape, columns[(columns == columns.round()).all(dim=1)].tolist()))
-        return one
-
-    outputs = read_by(model.read, *_returned(model, images), model.name)[: len(images)]
-    if not isinstance(outputs, Tensor):
-        each_tensor(outputs, keep)
-        found += [text for one in outputs if isinstance(one, Mapping) for text in one.values() if type(text) is str]
-    return str(found)
+    """What an output has that no gradient moves: how many numbers, which of them are whole, and texts. A detector that
+    has suppressed boxes finds more or fewer of them, or others, after a small step, and what is returned in words goes
+    on otherwise after another word."""
+    outputs, choices = _read(model, images), list[Any]()
+    if isinstance(outputs, Tensor):
+        return ""
+    for tensor in tensors_in(outputs):
+        columns = tensor.flatten(1).T if tensor.ndim > 1 else tensor[None]
+        choices.append((tensor.shape, columns[(columns == columns.round()).all(dim=1)].tolist()))
+    mappings = (output for output in outputs if isinstance(output, Mapping))
+    return str(choices + [text for mapping in mappings for text in mapping.values() if type(text) is str])
 
 
 def first_line(error: BaseException) -> str:
@@ -401,5 +366,13 @@ def first_line(error: BaseException) -> str:
     return text if len(text) <= 300 else text[:297] + "..."
 
 
-def _warn(message: str) -> None:
-    warnings.warn(message, ModelWarning, stacklevel=3)
+@contextmanager
+def foreign(what: str, kind: type[AdvsearchError] = ModelError) -> Iterator[None]:
+    """Turn what code of others raises inside the block, which may be anything, into an error: what failed, and the
+    foreign error. One of ours is left as it is."""
+    try:
+        yield
+    except AdvsearchError:
+        raise
+    except Exception as error:
+        raise kind(f"{what} ({first_line(error)})") from error

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import copy
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
@@ -23,17 +23,12 @@ from torch.nn.utils import fuse_conv_bn_eval
 
 from advsearch.errors import ModelError
 from advsearch.models.model import Model, Preprocessing, logits_of
-from advsearch.models.probe import probe
-from advsearch.models.source import frozen, load_weights, sharing_copy, source_of, split_weights
+from advsearch.models.probe import PROGRAMS, probe
+from advsearch.models.source import frozen, load_weights, sharing_copy, split_weights
 
 INPUT_SIZE = (128, 128)
-STEM = 24
-WIDTHS = (32, 64, 128, 192)
-DEPTHS = (1, 1, 2, 1)
-
-#: Mean and standard deviation of display-referred values; one pair for all channels is enough.
-MEAN, STD = 0.45, 0.25
-
+STEM, WIDTHS, DEPTHS = 24, (32, 64, 128, 192), (1, 1, 2, 1)
+MEAN, STD = 0.45, 0.25  # of display-referred values; one pair for all channels is enough
 WEIGHTS, RECORD = "reference.safetensors", "reference.json"
 REMEDY = "run `make reference` to train it, or install a release, which contains it"
 
@@ -114,9 +109,9 @@ def folded(net: ReferenceNet) -> ReferenceNet:
     """Return a copy for inference: evaluation mode, normalisation merged into the convolutions, parameters frozen."""
     copied = copy.deepcopy(net).eval().requires_grad_(False)
     for module in list(copied.modules()):
-        for name, one in module.named_children():
-            if isinstance(one, _Convolution):
-                setattr(module, name, fuse_conv_bn_eval(one.convolve, one.normalise))
+        for name, layer in module.named_children():
+            if isinstance(layer, _Convolution):
+                setattr(module, name, fuse_conv_bn_eval(layer.convolve, layer.normalise))
     return copied.to(memory_format=torch.channels_last)  # type: ignore[call-overload, no-any-return]
 
 
@@ -137,8 +132,8 @@ def load(folder: Path | None = None, weights: Path | None = None) -> Model:
         FileFormatError: `weights` is missing or is not safetensors.
     """
     net, labels = network(folder, weights)
-    source = source_of(folded(net), "reference" if weights is None else f"reference@{weights}")
-    bare = Model(source.module, source.name, (), Preprocessing(INPUT_SIZE))
+    name = "reference" if weights is None else f"reference@{weights}"
+    bare = Model(frozen(folded(net), name), name, (), Preprocessing(INPUT_SIZE))
     return probe(bare, labels, "labels of the reference model")
 
 
@@ -191,16 +186,14 @@ class Trainable:
 
     def parameters(self) -> list[nn.Parameter]:
         """The parameters that are trained."""
-        return [one for one in self.net.parameters() if one.requires_grad]
+        return [weights for weights in self.net.parameters() if weights.requires_grad]
 
     def _mixed_precision(self) -> torch.autocast:
-        """Convolutions and products of matrices in bfloat16, on a processor that has instructions for it.
-
-        Several threads at one of them wait for each other busily: where others want the cores too it takes five
-        times as long as in float32.
-        """
-        found: Mapping[str, object] = getattr(torch.cpu, "get_capabilities", dict)()  # torch 2.8 says nothing
-        bfloat16 = self.model.device.type == "cpu" and bool(found.get("avx512_bf16"))
+        """Convolutions and products of matrices in bfloat16, on a processor that has instructions for it. Several
+        threads at one of them wait for each other busily: where others want the cores too it takes five times as long
+        as in float32."""
+        processor: Mapping[str, object] = getattr(torch.cpu, "get_capabilities", dict)()  # torch 2.8 says nothing
+        bfloat16 = self.model.device.type == "cpu" and bool(processor.get("avx512_bf16"))
         return torch.autocast("cpu", torch.bfloat16, enabled=bfloat16)
 
 
@@ -215,15 +208,14 @@ def trainable(model: Model, layers: str = "all", *, logits: bool = True) -> Trai
         logits: whether it has to return logits.
 
     Raises:
-        ModelError: the network is no `nn.Module` that can be copied, is a program that was exported or scripted, or
-            returns something other than logits.
+        ModelError: as `copied_network`, or the network returns something other than logits.
     """
     if logits and (model.probabilities or model.read is not None):
         raise ModelError(f"model {model.name}: only a classifier that returns logits can be hardened")
     net = copied_network(model)
     net.eval().requires_grad_(True)
     if layers == "last":
-        owners = [one for one in net.modules() if next(one.parameters(recurse=False), None) is not None]
+        owners = [layer for layer in net.modules() if next(layer.parameters(recurse=False), None) is not None]
         net.requires_grad_(False)
         owners[-1].requires_grad_(True)
     made = Trainable(net, replace(model, module=frozen(net, model.name)))
@@ -238,11 +230,9 @@ def copied_network(model: Model) -> nn.Module:
     name, weights = split_weights(model.name)
     if name == "reference":  # its model has lost its normalisation
         return network(weights=weights)[0]
-    module: Callable[[Tensor], object] = model.module
-    programs = (torch.fx.GraphModule, torch.jit.ScriptModule)
-    if not isinstance(module, nn.Module) or isinstance(module, programs):
+    if not isinstance(model.module, nn.Module) or isinstance(model.module, PROGRAMS):
         raise ModelError(
             f"model {model.name}: an exported program cannot be trained; name the code that builds the network "
             "(package.module:callable@weights.safetensors), or give an nn.Module from Python"
         )
-    return copy.deepcopy(module)
+    return copy.deepcopy(model.module)

@@ -11,12 +11,12 @@ import importlib
 import os
 import pickle
 import traceback
-import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from safetensors import SafetensorError
@@ -27,12 +27,9 @@ from torch.nn.parameter import is_lazy
 from advsearch.errors import FileFormatError, InputError, ModelError, UnknownNameError, resembling
 from advsearch.files import open_regular
 from advsearch.models.archive import LARGEST
-from advsearch.models.model import CPU, GIVEN_BY, Model, ModelWarning, Triple
-from advsearch.models.probe import first_line
+from advsearch.models.model import CPU, GIVEN_BY, Model, Triple, warn
+from advsearch.models.probe import PROGRAMS, first_line
 from advsearch.registry import check_import, current_directory_importable
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
 
 
 @dataclass(frozen=True)
@@ -54,6 +51,18 @@ class Purpose:
         if self.task in (*GIVEN_BY, "answer") and self.task not in tasks:
             instead = " or ".join(f"`task={task}`" for task in tasks)
             raise ModelError(f"model {model} {what} and cannot do task {self.task}; use {instead}")
+
+    def is_free(self) -> bool:
+        """Whether it is a free answer. Raises InputError where names are given, of which that has none."""
+        if self.task == "answer" and self.names is not None:
+            raise InputError("labels: task answer has no classes; leave them out, and say the right words with `label`")
+        return self.task == "answer"
+
+    def one_prompt(self, model: str) -> str | None:
+        """Return the question that its user asks, None for a default. Raises InputError where there are several."""
+        if len(self.prompts or ()) > 1:
+            raise InputError(f"prompt: expected one question for model {model}, got {len(self.prompts or ())}")
+        return self.prompts[0] if self.prompts else None
 
     def named(self, model: str, what: str, task: str) -> tuple[str, ...]:
         """Return the names, for a network that does a task and has no classes of its own. Raises ModelError as `check`,
@@ -125,46 +134,36 @@ def frozen(module: nn.Module, name: str) -> nn.Module:
     original, and the copy sees the new weights as long as they are changed in place (as optimisers do). Exported and
     scripted programs, and modules that cannot be copied (with a warning), are frozen themselves.
     """
-    if not isinstance(module, (torch.fx.GraphModule, torch.jit.ScriptModule)):
+    if not isinstance(module, PROGRAMS):
         try:
             module = sharing_copy(module)
         except (TypeError, AttributeError, RuntimeError, pickle.PickleError, copy.Error) as error:  # locks, files
-            warnings.warn(
+            warn(
                 f"model {name} cannot be copied ({first_line(error)}): the module itself is set to evaluation mode and "
-                "its parameters are frozen",
-                ModelWarning,
-                stacklevel=3,
+                "its parameters are frozen"
             )
-    try:
+    with suppress(NotImplementedError):  # programs of torch.export have no modes
         module.eval()
-    except NotImplementedError:  # programs of torch.export have no modes
-        pass
     for parameter in module.parameters():
         parameter.requires_grad_(False)
     return module
 
 
 def sharing_copy(module: nn.Module) -> nn.Module:
-    """Return a copy that has the same weights, but gradients of its own.
+    """Return a copy that has the same weights, but gradients of its own. Weights that were made in
+    `torch.inference_mode` are copied: nothing can be differentiated through them."""
 
-    Weights that were made in `torch.inference_mode` are copied: nothing can be differentiated through them.
-    """
-    memo: dict[int, Any] = {id(p): nn.Parameter(_usable(p.detach()), p.requires_grad) for p in module.parameters()}
-    memo.update({id(buffer): _usable(buffer) for buffer in module.buffers()})
+    def usable(weights: torch.Tensor) -> torch.Tensor:
+        return weights.clone() if weights.is_inference() else weights
+
+    memo: dict[int, Any] = {id(p): nn.Parameter(usable(p.detach()), p.requires_grad) for p in module.parameters()}
+    memo.update({id(buffer): usable(buffer) for buffer in module.buffers()})
     return copy.deepcopy(module, memo)
 
 
-def _usable(weights: torch.Tensor) -> torch.Tensor:
-    return weights.clone() if weights.is_inference() else weights
-
-
 def load_weights(module: nn.Module, path: Path, name: str) -> None:
-    """Load a safetensors file into the module; its keys and shapes must be the module's own.
-
-    Raises:
-        FileFormatError: the file is missing or is not safetensors.
-        ModelError: keys or shapes do not fit.
-    """
+    """Load a safetensors file into the module; its keys and shapes must be the module's own. Raises FileFormatError:
+    the file is missing or is not safetensors; ModelError: keys or shapes do not fit."""
     try:
         open_regular(path, "weights", LARGEST).close()
         state = load_file(path)
@@ -183,16 +182,14 @@ def load_weights(module: nn.Module, path: Path, name: str) -> None:
         for key in own
         if key in state and state[key].shape != own[key].shape
     ]
-    problems = [*_some("missing", missing), *_some("not in the network", unexpected), *shapes[:2]]
-    if problems:
-        raise ModelError(f"weights {path} do not fit model {name}: {'; '.join(problems)}")
+    problems = [
+        f"{len(keys)} {what} ({', '.join(keys[:3])}{', ...' if len(keys) > 3 else ''})"
+        for what, keys in (("missing", missing), ("not in the network", unexpected))
+        if keys
+    ]
+    if problems or shapes:
+        raise ModelError(f"weights {path} do not fit model {name}: {'; '.join([*problems, *shapes[:2]])}")
     module.load_state_dict(state, strict=False)
-
-
-def _some(what: str, keys: list[str]) -> list[str]:
-    if not keys:
-        return []
-    return [f"{len(keys)} {what} ({', '.join(keys[:3])}{', ...' if len(keys) > 3 else ''})"]
 
 
 def split_weights(spec: str) -> tuple[str, Path | None]:
@@ -202,20 +199,12 @@ def split_weights(spec: str) -> tuple[str, Path | None]:
 
 
 def load_callable(spec: str, libraries: Iterable[str] = ()) -> Source | Model:
-    """Return the model behind ``package.module:callable[@weights.safetensors]``.
-
-    The module is looked for on `sys.path` and in the current directory. The attribute is an `nn.Module`, a `Model`, or
-    something that returns one when called without arguments (a function, or a class of modules).
-
-    Args:
-        spec: what is written above.
-        libraries: what else may stand before the colon; a module that there is not may be one of them, misspelt.
-
-    Raises:
-        ModelError: it cannot be imported, raises, returns something else, or the weights do not fit.
-        UnknownNameError: the module has no such attribute; near matches are named.
-        InputError: it must not be imported (`registry.check_import`).
-    """
+    """Return the model behind ``package.module:callable[@weights.safetensors]``. The module is looked for on `sys.path`
+    and in the current directory. The attribute is an `nn.Module`, a `Model`, or something that returns one when called
+    without arguments (a function, or a class of modules). `libraries` may stand before the colon too: a module that
+    there is not may be one of them, misspelt. Raises ModelError: it cannot be imported, raises, returns something else,
+    or the weights do not fit; UnknownNameError: the module has no such attribute; near matches are named; InputError:
+    it must not be imported (`registry.check_import`)."""
     target, weights = split_weights(spec)
     check_import(target)
     module_name, _, attribute = target.partition(":")
@@ -225,16 +214,26 @@ def load_callable(spec: str, libraries: Iterable[str] = ()) -> Source | Model:
             known = [key for key in vars(value) if not key.startswith("_") and callable(getattr(value, key))]
             raise UnknownNameError(f"attribute of {module_name}", part, near_names(part, known))
         value = getattr(value, part)
-    built = _build(value, spec)
-    if isinstance(built, Model):
+    if not isinstance(value, (nn.Module, Model)):
+        if not callable(value):
+            raise ModelError(f"model {spec}: expected a callable or an nn.Module, got {type(value).__name__}")
+        try:
+            value = value()
+        except Exception as error:  # the user's code may raise anything
+            raise ModelError(f"model {spec}: calling it without arguments failed ({_where(error)})") from error
+    if isinstance(value, Model):
         if weights is not None:
             raise ModelError(
                 f"model {spec}: {target} returns a ready Model, weights cannot be put into it; leave out '@...'"
             )
-        return built
+        return value
+    if not isinstance(value, nn.Module):
+        raise ModelError(
+            f"model {spec}: expected it to return an nn.Module or an advsearch Model, got {type(value).__name__}"
+        )
     if weights is not None:
-        load_weights(built, weights, target)
-    return source_of(built, spec)
+        load_weights(value, weights, target)
+    return source_of(value, spec)
 
 
 def _import_module(name: str, spec: str, libraries: Iterable[str]) -> ModuleType:
@@ -242,37 +241,19 @@ def _import_module(name: str, spec: str, libraries: Iterable[str]) -> ModuleType
         try:
             return importlib.import_module(name)
         except ModuleNotFoundError as error:
+            message = f"module {name!r} needs {error.name!r}, which is not installed"
             if error.name is not None and (name == error.name or name.startswith(error.name + ".")):
                 near = resembling(name, libraries)
                 meant = f"; did you mean '{near[0]}:{spec.partition(':')[2]}'?" if near else ""
                 message = f"no module named {error.name!r} on the Python path or in {os.getcwd()}{meant}"
-            else:
-                message = f"module {name!r} needs {error.name!r}, which is not installed"
             raise ModelError(f"model {spec}: {message}") from error
         except Exception as error:  # the user's code may raise anything
             raise ModelError(f"model {spec}: importing {name!r} failed ({_where(error)})") from error
 
 
-def _build(value: Any, spec: str) -> nn.Module | Model:
-    made_here = not isinstance(value, (nn.Module, Model))
-    if made_here:
-        if not callable(value):
-            raise ModelError(f"model {spec}: expected a callable or an nn.Module, got {type(value).__name__}")
-        try:
-            value = value()
-        except Exception as error:  # the user's code may raise anything
-            raise ModelError(f"model {spec}: calling it without arguments failed ({_where(error)})") from error
-    if not isinstance(value, (nn.Module, Model)):
-        raise ModelError(
-            f"model {spec}: expected it to return an nn.Module or an advsearch Model, got {type(value).__name__}"
-        )
-    return value
-
-
 def _where(error: BaseException) -> str:
     frames = traceback.extract_tb(error.__traceback__)
-    place = f" at {frames[-1].filename}:{frames[-1].lineno}" if frames else ""
-    return f"{first_line(error)}{place}"
+    return first_line(error) + (f" at {frames[-1].filename}:{frames[-1].lineno}" if frames else "")
 
 
 def near_names(name: str, known: Iterable[str]) -> list[str]:

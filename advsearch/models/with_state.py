@@ -8,8 +8,7 @@ from typing import Any, final
 import torch
 from torch import Tensor, nn
 
-PICTURE = "observation.image"
-"""What a policy's `select_action` calls the picture."""
+PICTURE = "observation.image"  # what a policy's `select_action` calls the picture
 
 
 @final

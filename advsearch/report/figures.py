@@ -19,30 +19,16 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-Figures = dict[str, bytes]
-"""A suffix, png or svg, to the content of a file."""
+Figures = dict[str, bytes]  # A suffix, png or svg, to the content of a file
 
 BLUE, RED, GREY = "#1d5fd0", "#b3261e", "#5c606a"
 STYLE: dict[Any, Any] = {
-    "font.family": ["DejaVu Sans"],
-    "font.size": 9.0,
-    "axes.axisbelow": True,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.edgecolor": GREY,
-    "axes.labelcolor": "#1c1d20",
-    "axes.titlelocation": "left",
-    "axes.titlesize": 10.0,
-    "axes.titleweight": "bold",
-    "grid.color": "#dfe0e3",
-    "grid.linewidth": 0.7,
-    "legend.frameon": False,
-    "legend.fontsize": 8.0,
-    "svg.hashsalt": "advsearch",
-    "svg.fonttype": "none",
-    "text.parse_math": False,
-}
-"""Names come from users: a dollar sign in one is no formula."""
+    "font.family": ["DejaVu Sans"], "font.size": 9.0, "legend.frameon": False, "legend.fontsize": 8.0,
+    "axes.axisbelow": True, "axes.spines.top": False, "axes.spines.right": False, "axes.edgecolor": GREY,
+    "axes.labelcolor": "#1c1d20", "axes.titlelocation": "left", "axes.titlesize": 10.0, "axes.titleweight": "bold",
+    "grid.color": "#dfe0e3", "grid.linewidth": 0.7, "svg.hashsalt": "advsearch", "svg.fonttype": "none",
+    "text.parse_math": False,  # names come from users: a dollar sign in one is no formula
+}  # fmt: skip
 
 
 def new_axes() -> Any:
@@ -77,8 +63,7 @@ def drawn(
 
 
 SERIES = (BLUE, RED, "#1f7a45", "#b4540a", "#6b3fa0", GREY)
-MARKS = "os^DvP"
-"""What tells series apart."""
+MARKS = "os^DvP"  # What tells series apart
 
 
 def draw_shares(
@@ -104,21 +89,16 @@ def draw_shares(
 def search_axes(
     objectives: Mapping[str, Sequence[float | None]], meaning: str, axes: Any, zero_means: str = ""
 ) -> None:
-    """Draw searches on matplotlib axes: the best objective so far over the evaluations, and each single one.
-
-    Args:
-        objectives: name of a search to its objectives in order; None where one was not a number.
-        meaning: label of the vertical axis.
-        axes: of matplotlib.
-        zero_means: what stands at the zero line, which is not drawn where it is empty.
-    """
+    """Draw searches on matplotlib axes, by their names: the best objective so far over the evaluations, and each single
+    one, None where it was not a number. The meaning is the label of the vertical axis, and `zero_means` stands at the
+    zero line, which is not drawn where that is empty."""
     styles = cycle(((BLUE, "-"), (RED, (0.0, (4.0, 1.5))), (GREY, "-")))
     for (name, values), (colour, dashes) in zip(objectives.items(), styles, strict=False):
-        each = np.array([math.nan if one is None else one for one in values], dtype=float)
+        each = np.array(values, dtype=float)  # None is NaN
         best = np.fmax.accumulate(each) if len(each) else each
         shown = np.unique(np.linspace(0, len(each) - 1, min(len(each), MOST_POINTS)).round().astype(int))
         # a dot is a line without a length: all of them are one path, and a page stays small
-        at, dots = (np.stack([one, one, one * np.nan], 1).ravel() for one in (shown + 1.0, each[shown]))
+        at, dots = (np.stack([ends, ends, ends * np.nan], 1).ravel() for ends in (shown + 1.0, each[shown]))
         axes.plot(at, dots, solid_capstyle="round", linewidth=4, alpha=0.35, color=colour)
         axes.plot(shown + 1, best[shown], linestyle=dashes, linewidth=2, color=colour, label=name)
     if zero_means:
@@ -132,11 +112,9 @@ def search_axes(
 
 # ---- parts ----------------------------------------------------------------------------------------------------------
 
-MARGIN, ACCURACY = "margin [logits]; above 0: wrong", "accuracy"
+MARGIN, ACCURACY = "margin [logits]; below 0: wrong", "accuracy"
 """What the colours of a map may mean: red is wrong in both."""
-
-MOST_POINTS = 400
-"""Values of an axis that are drawn."""
+MOST_POINTS = 400  # Values of an axis that are drawn
 
 
 def heat(
@@ -148,7 +126,7 @@ def heat(
         colours: dict[str, str | float] = {"cmap": "RdBu", "vmin": 0.0, "vmax": 1.0}
     else:
         largest = max([*finite, 1e-6])
-        colours = {"cmap": "RdBu_r", "vmin": -largest, "vmax": largest}
+        colours = {"cmap": "RdBu", "vmin": -largest, "vmax": largest}
     shown = axes.imshow(values, origin="lower", extent=extent, aspect="auto", **colours)
     axes.set(xlabel=across, ylabel=up)
     axes.figure.colorbar(shown, ax=axes, label=meaning)

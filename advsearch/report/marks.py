@@ -13,40 +13,28 @@ from PIL import Image, ImageDraw, ImageFont
 from advsearch.runs.images import to_8bit
 
 Floats = npt.NDArray[np.float32]
-
 TRUE, SAID = (0, 190, 255), (255, 110, 0)
 """Colours of what is true and of what the model says; told apart in any kind of colour vision."""
-SMALLEST = 512
-"""Pixels of the longest side at least; smaller pictures are magnified, so that text can be read."""
-TINT, LETTERS = 0.45, 28
-"""How much of a tint covers a picture; how many letters are as high as its longest side."""
+SMALLEST = 512  # Pixels of the longest side at least; smaller pictures are magnified, so that text can be read
+TINT, LETTERS = 0.45, 28  # How much of a tint covers a picture; how many letters are as high as its longest side
 
 Box = tuple[float, float, float, float]
-
-
-Shape = Any
-"""What is drawn, a box or the pixels of a mask: `advsearch.tasks.Mark`."""
+Shape = Any  # What is drawn, a box or the pixels of a mask: `advsearch.tasks.Mark`
 
 
 def marked(picture: Any, shapes: Sequence[Shape]) -> Floats:
-    """Return a picture with shapes drawn into it, magnified where it is small.
+    """Return a picture (H, W, 3), display-referred sRGB in [0, 1], with shapes drawn into it, magnified where it is
+    small: (h, w, 3) float32.
 
     The box or the outline of what is true is blue; a box of the model is orange, and its mask tinted so. The text of a
     box stands at its upper left corner, that of the true one at the lower left. Maps stand to the right of the picture,
     what is true first, in greys of one range: that of what is true.
-
-    Args:
-        picture: (H, W, 3) display-referred sRGB in [0, 1].
-        shapes: what to draw.
-
-    Returns:
-        (h, w, 3) float32, display-referred sRGB in [0, 1].
     """
     levels = to_8bit(picture)
     factor = max(1, -(-SMALLEST // max(levels.shape[:2])))
     size = levels.shape[1] * factor, levels.shape[0] * factor
     image = Image.fromarray(levels).resize(size, Image.Resampling.NEAREST)
-    for shape in sorted(shapes, key=lambda one: one.true):
+    for shape in sorted(shapes, key=lambda shape: shape.true):
         if shape.mask is not None:
             _draw_mask(image, np.asarray(shape.mask, dtype=bool), shape.true)
     draw, font = ImageDraw.Draw(image), ImageFont.load_default(max(size) // LETTERS)
@@ -56,26 +44,23 @@ def marked(picture: Any, shapes: Sequence[Shape]) -> Floats:
     written: list[tuple[int, int, int, int]] = []
     for shape, ends in boxes:
         written.append(_write(draw, shape, ends, size, font, written))
-    maps = sorted((shape for shape in shapes if shape.map is not None), key=lambda one: not one.true)
+    maps = sorted((shape for shape in shapes if shape.map is not None), key=lambda shape: not shape.true)
     panels = [image, *(_panel(shape, maps[0].map, size, font) for shape in maps)]
-    found: Floats = np.hstack([np.asarray(one, dtype=np.float32) for one in panels]) / np.float32(255.0)
-    return found
+    sheet: Floats = np.hstack([np.asarray(panel, dtype=np.float32) for panel in panels]) / np.float32(255.0)
+    return sheet
 
 
 def _panel(shape: Shape, first: Any, size: tuple[int, int], font: Any) -> Image.Image:
     """A map in greys, in the range that the first of them has."""
     low, high = float(first.min()), float(first.max())
     greys = np.clip((np.asarray(shape.map, dtype=np.float64) - low) / max(high - low, 1e-12), 0.0, 1.0)
-    panel = Image.fromarray(np.rint(255.0 * np.nan_to_num(greys)).astype(np.uint8)).resize(
-        size, Image.Resampling.NEAREST
-    )
-    panel = panel.convert("RGB")
+    levels = np.rint(255.0 * np.nan_to_num(greys)).astype(np.uint8)
+    panel = Image.fromarray(levels).resize(size, Image.Resampling.NEAREST).convert("RGB")
     _write(ImageDraw.Draw(panel), shape, (0, 0, size[0] - 1, size[1] - 1), size, font, [])
     return panel
 
 
 def _draw_mask(image: Image.Image, mask: npt.NDArray[np.bool_], true: bool) -> None:
-    """Tint what the model says; outline what is true."""
     whole = np.asarray(Image.fromarray(mask).resize(image.size, Image.Resampling.NEAREST))
     colour, strength = Image.new("RGB", image.size, TRUE if true else SAID), whole * TINT
     if true:
@@ -113,21 +98,20 @@ def _write(
     wide, high = right - left + 6, bottom - top + 6
     y = ends[3] if shape.true else ends[1] - high
     x, y = max(0, min(ends[0], size[0] - wide)), max(0, min(y, size[1] - high))
-    rows = sorted(range(0, max(size[1] - high, 0) + 1), key=lambda one: (abs(one - y), one))
-    free = (
-        one for one in rows if all(x > x1 or x0 > x + wide or one > y1 or y0 > one + high for x0, y0, x1, y1 in others)
-    )
-    y = next(free, y)
+
+    def free(row: int) -> bool:
+        return all(x > x1 or x0 > x + wide or row > y1 or y0 > row + high for x0, y0, x1, y1 in others)
+
+    rows = sorted(range(max(size[1] - high, 0) + 1), key=lambda row: (abs(row - y), row))
+    y = next(filter(free, rows), y)
     draw.rectangle((x, y, x + wide, y + high), fill=_colour(shape))
     draw.text((x + 3 - left, y + 3 - top), text, fill=(0, 0, 0), font=font)
     return x, y, x + wide, y + high
 
 
-GAP, LINE = 8, 15
-"""Pixels between tiles, and of a line of text."""
+GAP, LINE = 8, 15  # Pixels between tiles, and of a line of text
 FONT = 12
-NARROWEST = 160
-"""Pixels that a tile is wide at least, so that its text can be read; smaller pictures are magnified."""
+NARROWEST = 160  # Pixels that a tile is wide at least, so that its text can be read; smaller pictures are magnified
 
 
 def contact_sheet(pictures: Sequence[Floats], captions: Sequence[Sequence[str]]) -> Floats:
@@ -158,7 +142,6 @@ def columns_for(count: int) -> int:
 
 
 def _cut(line: str, width: int, draw: ImageDraw.ImageDraw, font: ImageFont.FreeTypeFont | ImageFont.ImageFont) -> str:
-    """The line on one line of the tile, with dots where it does not fit."""
     text = " ".join(line[:200].split())
     if draw.textlength(text, font=font) <= width:
         return text

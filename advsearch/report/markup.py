@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from advsearch.errors import InputError
-from advsearch.report.figures import BLUE, GREY, RED, Figures, drawn, new_axes
+from advsearch.report.figures import BLUE, GREY, RED, Figures, drawn, figure_of, new_axes
 from advsearch.report.shown import ResultPart, ShownResult, shown
 from advsearch.runs.images import png_bytes
 from advsearch.runs.results import Result
@@ -53,17 +53,10 @@ def join_html(*parts: str | None) -> Html:
     return Html("".join(part if isinstance(part, Html) else escape(part) for part in parts if part is not None))
 
 
-SHOWN = 224
-"""Width of a picture on the page, in pixels."""
-
-GAP = 4
-"""White between pictures, in pixels."""
-
-PIXELS = 94
-"""Of a chart's height, to an inch of the figure."""
-
-WIDTH = 6.2
-"""Of a figure, in inches."""
+SHOWN = 224  # Width of a picture on the page, in pixels
+GAP = 4  # White between pictures, in pixels
+PIXELS = 94  # Of a chart's height, to an inch of the figure
+WIDTH = 6.2  # Of a figure, in inches
 
 
 class InNotebook:
@@ -110,21 +103,19 @@ def _shown(result: object) -> ShownResult:
 
 def result_html(given: ShownResult, pictures: Mapping[str, ArrayLike] | None = None) -> str:
     """Return a result as a cell of a notebook, with pictures (H, W, 3), sRGB in [0, 1]."""
-    figures = [
-        element(
-            "figure", _picture(png_bytes(image), SHOWN, name), element("figcaption", name), style="display:inline-block"
-        )
-        for name, image in (pictures or {}).items()
-    ]
+    figures = []
+    for name, image in (pictures or {}).items():
+        inside = _picture(png_bytes(image), SHOWN, name), element("figcaption", name)
+        figures.append(element("figure", *inside, style="display:inline-block"))
     figure = result_figure(given)
     chart = _picture(figure["png"], 2 * SHOWN, "the numbers of the table") if figure else None
-    parts = [_part(one) for one in given.sections if one.only in ("", "notebook") and not one.empty]
+    parts = [_part(part) for part in given.sections if part.only in ("", "notebook") and not part.empty]
     return element("div", element("p", given.said), *figures, chart, *parts)
 
 
 def drawn_part(given: ShownResult) -> ResultPart | None:
     """Return the first part of a result that is drawn."""
-    return next((one for one in given.sections if one.draw is not None), None)
+    return next((part for part in given.sections if part.draw is not None), None)
 
 
 def result_figure(given: ShownResult) -> Figures:
@@ -132,27 +123,24 @@ def result_figure(given: ShownResult) -> Figures:
     part = drawn_part(given)
     if part is None or part.draw is None:
         return {}
-    draw = part.draw
-    return drawn(lambda figure: draw(figure.subplots()), part.size or (WIDTH, part.height / PIXELS))
+    return figure_of(part.draw, part.size or (WIDTH, part.height / PIXELS))
 
 
 def side_by_side(pictures: Sequence[ArrayLike]) -> bytes:
     """Return pictures (H, W, 3) sRGB in [0, 1] beside each other as a PNG."""
-    arrays = [np.asarray(one, dtype=np.float32) for one in pictures]
+    arrays = [np.asarray(picture, dtype=np.float32) for picture in pictures]
     gap = np.ones((len(arrays[0]), GAP, 3), np.float32)
-    return png_bytes(np.concatenate([part for one in arrays for part in (one, gap)][:-1], axis=1))
+    return png_bytes(np.concatenate([part for array in arrays for part in (array, gap)][:-1], axis=1))
 
 
-def _part(one: ResultPart) -> Html:
-    head = element("thead", element("tr", *(element("th", cell) for cell in one.heads))) if one.heads else None
-    body = (element("tr", *(element("td", cell) for cell in row)) for row in one.rows)
-    inside = [
-        *(element("p", text) for text in one.text if text and one.draw is None),
-        element("table", head, element("tbody", *body)) if one.rows else None,
-    ]
-    if one.folded:
-        return element("details", element("summary", one.title), *inside)
-    return element("div", element("p", element("b", one.title)) if one.title else None, *inside)
+def _part(part: ResultPart) -> Html:
+    head = element("thead", element("tr", *(element("th", cell) for cell in part.heads))) if part.heads else None
+    body = (element("tr", *(element("td", cell) for cell in row)) for row in part.rows)
+    texts = [element("p", text) for text in part.text if text and part.draw is None]
+    table = element("table", head, element("tbody", *body)) if part.rows else None
+    if part.folded:
+        return element("details", element("summary", part.title), *texts, table)
+    return element("div", element("p", element("b", part.title)) if part.title else None, *texts, table)
 
 
 def _picture(png: bytes, width: int, alt: str) -> Html:
@@ -164,36 +152,18 @@ WIDE, NARROW = 720, 350
 """Height and widths of a chart in CSS pixels: for a screen, and for a phone, which would shrink the letters of the wide
 one until nobody can read them. The style sheet shows one of them.
 """
-
 COLORS = {"search": "#010101", "baseline": "#020202", "soft": "#030303", "line": "#040404"}
 """Variables of the style sheet, and what stands for them while matplotlib draws."""
-OF_FIGURES = {"search": BLUE, "baseline": RED, "soft": GREY}
-"""The same of the colours that figures have."""
+OF_FIGURES = {"search": BLUE, "baseline": RED, "soft": GREY}  # The same of the colours that figures have
 STYLE: dict[Any, Any] = {
-    "font.size": 13.0,
-    "legend.fontsize": 13.0,
-    "legend.labelcolor": "linecolor",
-    "legend.borderpad": 0.0,
-    "legend.handlelength": 1.6,
-    "axes.edgecolor": COLORS["line"],
-    "axes.labelcolor": COLORS["soft"],
-    "axes.spines.left": False,
-    "axes.axisbelow": True,
-    "axes.grid.axis": "y",
-    "axes.grid": True,
-    "grid.color": COLORS["line"],
-    "text.color": COLORS["soft"],
-    "xtick.color": COLORS["line"],
-    "ytick.color": COLORS["line"],
-    "xtick.labelcolor": COLORS["soft"],
-    "ytick.labelcolor": COLORS["soft"],
-    "xtick.major.size": 0.0,
-    "ytick.major.size": 0.0,
-    "figure.facecolor": "none",
-    "axes.facecolor": "none",
-    "savefig.facecolor": "none",
-    "path.simplify": False,
-}
+    "font.size": 13.0, "path.simplify": False,
+    "legend.fontsize": 13.0, "legend.labelcolor": "linecolor", "legend.borderpad": 0.0, "legend.handlelength": 1.6,
+    "axes.spines.left": False, "axes.grid.axis": "y", "axes.grid": True,
+    **dict.fromkeys(("axes.edgecolor", "grid.color", "xtick.color", "ytick.color"), COLORS["line"]),
+    **dict.fromkeys(("axes.labelcolor", "text.color", "xtick.labelcolor", "ytick.labelcolor"), COLORS["soft"]),
+    **dict.fromkeys(("xtick.major.size", "ytick.major.size"), 0.0),
+    **dict.fromkeys(("figure.facecolor", "axes.facecolor", "savefig.facecolor"), "none"),
+}  # fmt: skip
 
 
 def study_chart(draw: Callable[[Axes], object], words: str, width: int = WIDE, height: int = HEIGHT) -> Html:
@@ -209,11 +179,7 @@ def study_chart(draw: Callable[[Axes], object], words: str, width: int = WIDE, h
         columns = 1 if width == NARROW else 2
         figure.legend(loc="outside upper left", ncols=columns, labelcolor=COLORS["soft"])
 
-    return _chart(on_figure, width, height, words)
-
-
-def _chart(draw: Callable[[Figure], object], width: int, height: int, words: str) -> Html:
-    (file,) = drawn(draw, (width / 72, height / 72), ("svg",), STYLE).values()
+    (file,) = drawn(on_figure, (width / 72, height / 72), ("svg",), STYLE).values()
     return element(
         "svg",
         element("title", words),

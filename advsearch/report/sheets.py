@@ -28,17 +28,12 @@ Bytes = npt.NDArray[np.uint8]
 Mask = npt.NDArray[np.bool_]
 
 INCH = 25.4
-PAPERS = {"a4": (210.0, 297.0), "a3": (297.0, 420.0), "letter": (215.9, 279.4)}
-"""Width and height in millimetres."""
-MARGIN, FOOT = 15.0, 20.0
-"""White around what is printed, and more below for the ruler, millimetres."""
-SQUARE = 50.0
-"""Side of the square that is measured with a ruler, millimetres."""
+PAPERS = {"a4": (210.0, 297.0), "a3": (297.0, 420.0), "letter": (215.9, 279.4)}  # Width and height in millimetres
+MARGIN, FOOT = 15.0, 20.0  # White around what is printed, and more below for the ruler, millimetres
+SQUARE = 50.0  # Side of the square that is measured with a ruler, millimetres
 RULER = 100.0
-MARK, AWAY = 5.0, 1.0
-"""Length of a mark where to cut, and its distance from the bleed, millimetres."""
-MOST_SHEETS = 200
-"""Sheets that are written unless more are asked for."""
+MARK, AWAY = 5.0, 1.0  # Length of a mark where to cut, and its distance from the bleed, millimetres
+MOST_SHEETS = 200  # Sheets that are written unless more are asked for
 SHEETS_EVER = 10_000
 CHECKLIST = (
     "\u2610 Print all pages, and measure the square.",
@@ -96,20 +91,12 @@ def write_sheets(
     most: int = MOST_SHEETS,
     last: Callable[[str, tuple[float, float], Any], Figure] | None = None,
 ) -> int:
-    """Write the PDF and return how many pages it has.
+    """Write the PDF of at least one piece, and return how many pages it has.
 
-    Args:
-        path: of the file.
-        pieces: at least one.
-        title: of the first page.
-        paper: one of `PAPERS`.
-        profile: an ICC profile of an RGB printer, into which the colours are converted; None leaves them sRGB.
-        most: sheets that may follow the first page, 1 to `SHEETS_EVER`.
-        last: makes one more page, of the title, the size of the paper and the conversion of the profile, if any.
-
-    Raises:
-        InputError: there is no such paper, or there would be more sheets; the message says how many.
-        FileFormatError: the profile is none of an RGB printer.
+    Colours are converted into an ICC `profile` of an RGB printer; None leaves them sRGB. At most so many sheets, 1 to
+    `SHEETS_EVER`, may follow the first page, which has the title. `last` makes one more page, of the title, the size of
+    the paper and the conversion of the profile, if any. Raises InputError where there is no such paper, or there would
+    be more sheets, and FileFormatError where the profile is none of an RGB printer.
     """
     if paper not in PAPERS:
         raise InputError(f"paper: expected one of {', '.join(PAPERS)}, got {paper!r}")
@@ -125,7 +112,13 @@ def write_sheets(
     with PdfPages(path, metadata={"Title": title, "CreationDate": None}) as file:
         file.savefig(_cover(pieces, title, PAPERS[paper], len(pages), profile))
         for number, page in enumerate(pages, 1):
-            file.savefig(_page(page, f"{title}: sheet {number} of {len(pages)}", PAPERS[paper], convert))
+            figure, axes = blank(PAPERS[paper])
+            for part in page:
+                _draw(axes, part, convert)
+            right, bottom = (side - MARGIN for side in PAPERS[paper])
+            axes.text(right, bottom, f"{title}: sheet {number} of {len(pages)}", fontsize=7, ha="right", va="bottom")
+            _ruler(axes, PAPERS[paper])
+            file.savefig(figure)
         if last is not None:
             file.savefig(last(title, PAPERS[paper], convert))
     return len(pages) + 1 + (last is not None)
@@ -239,17 +232,7 @@ def _ruler(axes: Axes, paper: tuple[float, float]) -> None:
     axes.text(x + RULER + 3.0, y, f"{RULER:g} mm", fontsize=7, va="bottom")
 
 
-def _page(page: Sequence[Placed], title: str, paper: tuple[float, float], convert: Any) -> Figure:
-    figure, axes = blank(paper)
-    for part in page:
-        _draw(axes, part, convert)
-    axes.text(paper[0] - MARGIN, paper[1] - MARGIN, title, fontsize=7, ha="right", va="bottom")
-    _ruler(axes, paper)
-    return figure
-
-
 def _draw(axes: Axes, part: Placed, convert: Any) -> None:
-    """One part: its picture with bleed, marks at its corners, the line to cut where it is no rectangle, its name."""
     piece, (x0, x1, y0, y1) = part.piece, part.trim
     (left, top), (wide, high) = piece.bleed, piece.pixel
     picture = piece.picture[y0 - top : y1 + top, x0 - left : x1 + left]

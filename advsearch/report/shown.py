@@ -25,15 +25,12 @@ from advsearch.report import wording
 from advsearch.report.wording import percent
 from advsearch.runs.results import INTERRUPTED, RUNNING, AverageCase, Fields, Formation, Interval, Result, VerifiedRate
 
-LONG = 24
-"""Rows of a table of fields above which it is folded."""
-
+LONG = 24  # Rows of a table of fields above which it is folded
 _ELSEWHERE = (
     *("run", "object", "objects", "controls", "environment", "ending", "warnings", "seconds", "command_line"),
     *("figures", "model", "renders", "seed"),
 )
 """Fields that stand in the heading or below, or nowhere."""
-
 Column = str | Callable[[Any], str]
 """How a cell is made of a row, which is called `0`: ``{0.seconds:.2f}``, or a function."""
 
@@ -132,8 +129,8 @@ def remarks_of(result: Result, given: ShownResult) -> list[str]:
 
 def subject_of(result: Result, given: ShownResult) -> list[str]:
     """Return what a result is about: objects, controls, model."""
-    found = [getattr(result, name, None) or () for name in ("object", "objects", "controls", "model")]
-    return [*given.about] or [", ".join([one] if isinstance(one, str) else one) for one in found if one]
+    named = [getattr(result, name, None) or () for name in ("object", "objects", "controls", "model")]
+    return [*given.about] or [", ".join([names] if isinstance(names, str) else names) for names in named if names]
 
 
 def facts_of(result: Result, given: ShownResult) -> dict[str, str]:
@@ -157,45 +154,31 @@ def facts_of(result: Result, given: ShownResult) -> dict[str, str]:
 def fields_shown(result: Result) -> ShownResult:
     """Return the lists of a result as tables, its other fields as facts, and what their names mean."""
     values = {name: getattr(result, name) for name in type(result).described()}
-    tables = {name: found for name, value in values.items() if (found := _rows(value))}
+    tables = {name: rows for name, value in values.items() if (rows := _rows(value))}
     elsewhere = (*_ELSEWHERE, *tables, *(name.replace(" ", "_") for name in result.facts()))
-    plain = {_words(name): _text(one) for name, one in values.items() if name not in elsewhere}
-    sections = [
-        ResultPart(
-            _words(name),
-            heads=[_words(one) for one in _columns(rows)],
-            rows=[[_text(getattr(row, one, None)) for one in _columns(rows)] for row in rows],
-            folded=len(rows) > LONG,
-        )
-        for name, rows in tables.items()
-    ]
-    meanings = list(_meanings(result, {name for name, text in plain.items() if text}, list(tables.values())).items())
-    sections.append(ResultPart("What these words mean", rows=meanings, folded=True, only="page"))
-    said = result.brief or str(values.get("ending", "done"))
-    return ShownResult(said[:1].upper() + said[1:] + ".", sections, plain)
-
-
-def _meanings(result: Result, plain: set[str], tables: Sequence[Sequence[Fields]]) -> dict[str, str]:
-    """What the names that are shown mean, as far as the fields say it."""
-    described: list[tuple[Fields, set[str]]] = [(result, plain)]
-    described += [(rows[0], set(map(_words, _columns(rows)))) for rows in tables]
-    found: dict[str, str] = {}
-    for one, words in described:
-        for name, about in type(one).described().items():
+    plain = {_words(name): _text(value) for name, value in values.items() if name not in elsewhere}
+    described: list[tuple[Fields, set[str]]] = [(result, {name for name, text in plain.items() if text})]
+    sections, meanings = [], dict[str, str]()
+    for name, rows in tables.items():
+        names = dict.fromkeys(name for row in rows for name in type(row).model_fields)
+        columns = [column for column in names if any(_text(getattr(row, column, None)) for row in rows)]
+        cells = [[_text(getattr(row, column, None)) for column in columns] for row in rows]
+        heads = list(map(_words, columns))
+        sections.append(ResultPart(_words(name), heads=heads, rows=cells, folded=len(rows) > LONG))
+        described.append((rows[0], set(heads)))
+    for fields, words in described:
+        for name, about in type(fields).described().items():
             if about.description and _words(name) in words:
-                found.setdefault(_words(name), about.description.replace("`", ""))
-    return found
+                meanings.setdefault(_words(name), about.description.replace("`", ""))
+    meaning = [[*pair] for pair in meanings.items()]
+    sections.append(ResultPart("What these words mean", rows=meaning, folded=True, only="page"))
+    brief = result.brief or str(values.get("ending", "done"))
+    return ShownResult(brief[:1].upper() + brief[1:] + ".", sections, plain)
 
 
 def _rows(value: object) -> Sequence[Fields]:
-    """The rows of a table, where a value is a list of fields."""
     rows = value if isinstance(value, (list, tuple)) else ()
-    return rows if all(isinstance(one, Fields) for one in rows) else ()
-
-
-def _columns(rows: Sequence[Fields]) -> list[str]:
-    names = dict.fromkeys(name for row in rows for name in type(row).model_fields)
-    return [name for name in names if any(_text(getattr(row, name, None)) for row in rows)]
+    return rows if all(isinstance(row, Fields) for row in rows) else ()
 
 
 def _text(value: object) -> str:
@@ -210,10 +193,11 @@ def _text(value: object) -> str:
     if isinstance(value, Fields):
         return _text({name: getattr(value, name) for name in type(value).model_fields})
     if isinstance(value, Mapping):
-        return ", ".join(f"{_words(str(name)).lower()} {_text(one)}" for name, one in value.items() if _text(one))
+        texts = {_words(str(name)).lower(): _text(inner) for name, inner in value.items()}
+        return ", ".join(f"{name} {text}" for name, text in texts.items() if text)
     if isinstance(value, (list, tuple)):
-        inner = " to " if len(value) == 2 and all(isinstance(one, float) for one in value) else "; "
-        return inner.join(filter(None, map(_text, value)))
+        between = " to " if len(value) == 2 and all(isinstance(inner, float) for inner in value) else "; "
+        return between.join(filter(None, map(_text, value)))
     return str(value)
 
 
@@ -242,14 +226,8 @@ class Claim(Fields):
     extent: Extent | None = Field(description="null where nothing was counted")
 
 
-NOTHING = "Nothing is claimed"
-
-
-NO_PROOF = "This does not show that there is none."
-
-
-ENDED = ("budget spent", "stalled")
-"""Endings of a search that ran to its end without finding anything."""
+NOTHING, NO_PROOF = "Nothing is claimed", "This does not show that there is none."
+ENDED = ("budget spent", "stalled")  # Endings of a search that ran to its end without finding anything
 
 
 WHY = {
@@ -278,15 +256,10 @@ def case_claim(name: str, ending: str, rate: VerifiedRate | None, spent: str | N
 
 
 def average_claim(case: AverageCase, name: str) -> Claim:
-    extent = Extent(
-        what="configurations in which the model is right",
-        count=case.correct,
-        total=case.configurations,
-        interval=case.interval,
-    )
+    what = "configurations in which the model is right"
+    extent = counted(what, case.correct, case.configurations, case.interval)
     text = f"{name}: the model is right in {share_text(extent)} configurations drawn by chance"
-    text += " from the whole space and budget."
-    return claim("measured", text, extent)
+    return claim("measured", f"{text} from the whole space and budget.", extent)
 
 
 def searches_text(renders: Mapping[str, int], policy: str, random: bool) -> str:
@@ -299,9 +272,11 @@ def searches_text(renders: Mapping[str, int], policy: str, random: bool) -> str:
 
 
 def extent_of(what: str, rate: VerifiedRate | None) -> Extent | None:
-    if rate is None:
-        return None
-    return Extent(what=what, count=rate.successes, total=rate.trials, interval=rate.interval)
+    return None if rate is None else counted(what, rate.successes, rate.trials, rate.interval)
+
+
+def counted(what: str, count: int, total: int, interval: Interval | None) -> Extent:
+    return Extent(what=what, count=count, total=total, interval=interval or (0.0, 1.0))
 
 
 def share_text(extent: Extent) -> str:

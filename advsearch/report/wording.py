@@ -19,12 +19,12 @@ DEPTH, SIMILARITY, COMMAND = "depth", "similarity", "command"
 """Tasks whose predictions have words of their own; others are quoted."""
 
 _MARGINS = {
-    CLASSIFICATION: "how far the wrong prediction leads the right one, in logits",
-    DETECTION: "how far the best right box is under the score that counts, in log-odds; over 0 where none is found",
-    SEGMENTATION: "the lead of wrong classes at the pixel that decides, in logits; over 0 where too few are right",
-    DEPTH: "the logarithm of the factor by which the object's distance is off, less that of the tolerance",
-    SIMILARITY: "how far the nearest wrong name leads the right one, in logits",
-    COMMAND: "how many envelopes the action is from the clean one, less 1; over 0 outside of it",
+    CLASSIFICATION: "how far the right prediction leads the wrong one, in logits",
+    DETECTION: "how far the best right box is over the score that counts, in log-odds; below 0 where none is found",
+    SEGMENTATION: "the lead of right classes at the pixel that decides, in logits; below 0 where too few are right",
+    DEPTH: "the logarithm of the tolerance, less that of the factor by which the object's distance is off",
+    SIMILARITY: "how far the right name leads the nearest wrong one, in logits",
+    COMMAND: "1 less how many envelopes the action is from the clean one; below 0 outside of it",
 }
 _MARKS = {
     DETECTION: "Blue is the true box, orange what the model finds with a score that counts.",
@@ -53,13 +53,9 @@ _UNITS = {
     "those of the tasks": ("each",),
 }
 
-MOST_DECIMALS = 4
-"""Of a percentage."""
-PROBABILITY_DECIMALS = 1
-"""Of a probability that a model gives."""
-
-WHOLE = ("background", "itself", "something else")
-"""Labels without an article."""
+MOST_DECIMALS = 4  # Of a percentage
+PROBABILITY_DECIMALS = 1  # Of a probability that a model gives
+WHOLE = ("background", "itself", "something else")  # Labels without an article
 
 _NONE, _ELSEWHERE = "no ", " elsewhere"
 
@@ -67,8 +63,7 @@ _DOING = {"calls": "calling", "finds": "finding", "sees": "seeing", "takes": "ta
 _DOING |= {"predicts": "predicting", "commands": "commanding"}
 
 
-Said = Any
-"""A prediction of a model: `advsearch.tasks.Prediction`, or what a result holds of one."""
+Said = Any  # A prediction of a model: `advsearch.tasks.Prediction`, or what a result holds of one
 
 
 def percent(share: float | None, most: int = MOST_DECIMALS) -> str:
@@ -109,9 +104,9 @@ def with_article(name: str) -> str:
 def beside_text(run: str, pair: Any) -> str:
     """Return what a model does without and with the adversarial scene of a run (`PairedRates`), in sentences."""
     sides = [
-        f"{one.correct} of {one.configurations} ({percent(one.accuracy)}, 95 % interval "
-        f"{percent_number(one.interval[0])}-{percent_number(one.interval[1])} %)"
-        for one in (pair.clean, pair.answer)
+        f"{side.correct} of {side.configurations} ({percent(side.accuracy)}, 95 % interval "
+        f"{interval_text(side.interval)})"
+        for side in (pair.clean, pair.answer)
     ]
     low, high = (100.0 * end for end in pair.interval)
     ends = f"{-high:.0f} to {-low:.0f}" if pair.difference < 0 else f"{low:.0f} to {high:.0f}"
@@ -126,7 +121,7 @@ def beside_text(run: str, pair: Any) -> str:
 
 def margin_text(task: str) -> str:
     """Return what the margin of a task is, as a clause."""
-    return _MARGINS.get(task, "over 0 where the prediction is wrong")
+    return _MARGINS.get(task, "below 0 where the prediction is wrong")
 
 
 def is_command(text: str) -> bool:
@@ -135,8 +130,14 @@ def is_command(text: str) -> bool:
 
 
 def objective_label(objective: str) -> str:
-    """Return an objective with its unit, for an axis: ``margin [logits]``."""
-    return next((f"{objective} [{unit}]" for unit, names in _UNITS.items() if objective in names), objective)
+    """Return an objective with its unit, for an axis: ``margin loss [logits]``."""
+    named = objective_name(objective)
+    return next((f"{named} [{unit}]" for unit, names in _UNITS.items() if objective in names), named)
+
+
+def objective_name(objective: str) -> str:
+    """Return what an objective is called beside its value: that of a margin has the margin's sign turned."""
+    return {"margin": "margin loss", "pixel_margin": "margin loss of the pixels"}.get(objective, objective)
 
 
 def marks_text(task: str) -> str:
@@ -159,7 +160,13 @@ def prediction_cells(task: str, prediction: Said) -> list[str]:
     if share is None:
         return [label, ""]
     if task == SIMILARITY:
-        return [label, _similar(percent(share, PROBABILITY_DECIMALS), getattr(prediction, "payload", None))]
+        kept, similar = getattr(prediction, "payload", None), percent(share, PROBABILITY_DECIMALS)
+        if isinstance(kept, dict) and "cosine" in kept:
+            if "rank" not in kept:
+                similar = f"cosine {kept['cosine']:.2f}"
+            elif kept["rank"] > 1:
+                similar += f", right one at rank {kept['rank']} of {kept['references']}"
+        return [label, similar]
     if task == DETECTION:
         if label.startswith(_NONE):
             return [f"{label} found", f"best score of {label.removeprefix(_NONE)} {share:.2f}"]
@@ -179,17 +186,16 @@ def prediction_text(task: str, prediction: Said) -> str:
     return f"{label}, {number}" if number else label
 
 
-SEEN = ("seen", "box", "distance")
-"""Heads of `things_rows`, behind the name."""
+SEEN = ("seen", "box", "distance")  # Heads of `things_rows`, behind the name
 
 
 def things_rows(things: Mapping[str, Any]) -> list[list[str]]:
     """Return what is seen of each thing, for a table, from its name to `runs.results.ThingSeen` as a mapping."""
     rows = []
-    for name, one in things.items():
-        share = "nothing" if one["box"] is None else "in part" if one["share"] is None else percent(one["share"])
-        box = "" if one["box"] is None else ", ".join(map(str, one["box"]))
-        rows.append([name, share, box, "" if one["distance"] is None else f"{one['distance']:.1f} m"])
+    for name, seen in things.items():
+        share = "nothing" if seen["box"] is None else "in part" if seen["share"] is None else percent(seen["share"])
+        box = "" if seen["box"] is None else ", ".join(map(str, seen["box"]))
+        rows.append([name, share, box, "" if seen["distance"] is None else f"{seen['distance']:.1f} m"])
     return rows
 
 
@@ -232,15 +238,6 @@ def calling(task: str, label: str) -> str:
     """Return the same of a thing that was named already: ``calling it a vase``, ``finding no cup``."""
     verb, _, rest = calls(task, "it", label).partition(" ")
     return f"{_DOING[verb]} {rest.removesuffix(' for it')}"
-
-
-def _similar(share: str, kept: Any) -> str:
-    """Return how sure a prediction of similarity is, and where the right one stands or how like the clean one it is."""
-    if not isinstance(kept, dict) or "cosine" not in kept:
-        return share
-    if "rank" not in kept:
-        return f"cosine {kept['cosine']:.2f}"
-    return f"{share}, right one at rank {kept['rank']} of {kept['references']}" if kept["rank"] > 1 else share
 
 
 NO_INTERVAL = "no interval"
@@ -316,12 +313,11 @@ def workers_text(shared: SharedWork | None) -> str:
     """How many shared the work, and where their time went; empty where nothing was shared."""
     if shared is None:
         return ""
-    told = [f"{shared.most} at most"]
-    if shared.utilisation is not None:
-        told.append(f"busy {percent(shared.utilisation)} of {seconds_text(shared.alive)}")
-    told.append(f"loading took {seconds_text(shared.loading)}")
+    busy = None if shared.utilisation is None else f"busy {percent(shared.utilisation)} of {seconds_text(shared.alive)}"
     counts = {"lost": shared.lost, "refused": shared.refused, "given out again": shared.retried}
-    return ", ".join([*told, *(f"{number} {what}" for what, number in counts.items() if number)])
+    listed = [f"{number} {what}" for what, number in counts.items() if number]
+    first = [f"{shared.most} at most", busy, f"loading took {seconds_text(shared.loading)}"]
+    return ", ".join(filter(None, [*first, *listed]))
 
 
 def formation_text(formation: Formation, gains: Mapping[str, float] | None = None) -> str:
@@ -332,14 +328,10 @@ def formation_text(formation: Formation, gains: Mapping[str, float] | None = Non
     exposure = f"exposure {number_text(formation.exposure)} stops"
     made = f"{height} x {width} pixels, {formation.filter} filter, {denoised}, {exposure}"
     if formation.gain is not None:
-        gain = f"gain {number_text(formation.gain)}"
-    else:
-        each = "; ".join(
-            f"{', '.join(map(short_name, name.split(', ')))} {number_text(value)}"
-            for name, value in (gains or {}).items()
-        )
-        gain = "a gain for each scene" + (f": {each}" if each else "")
-    return f"{made}, sampler {formation.sampler}, {gain}"
+        return f"{made}, sampler {formation.sampler}, gain {number_text(formation.gain)}"
+    names = {name: ", ".join(map(short_name, name.split(", "))) for name in gains or {}}
+    each = "; ".join(f"{names[name]} {number_text(value)}" for name, value in (gains or {}).items())
+    return f"{made}, sampler {formation.sampler}, a gain for each scene" + (f": {each}" if each else "")
 
 
 def number_text(value: Any) -> str:

@@ -9,43 +9,34 @@ import os
 import re
 import shutil
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, final
 
 from advsearch.errors import AdvsearchError, FileFormatError, InputError, RunExistsError, StorageError, UnknownNameError
-from advsearch.files import JsonObject, open_regular
+from advsearch.files import open_regular
 from advsearch.runs import files, images, store, summary, tracking
-from advsearch.runs.files import PART, replacing, storage_errors, write_bytes, write_text
+from advsearch.runs.files import PART, storage_errors, write_bytes, write_text
 from advsearch.settings import HEADER
 from advsearch.yaml_text import LARGEST
 
 if TYPE_CHECKING:
-    from contextlib import AbstractContextManager
-
     from advsearch.runs.results import Result
     from advsearch.settings import Config
 
-HOME = Path("runs")
-"""Where runs live that are called by name, in the current directory."""
+HOME = Path("runs")  # where runs live that are called by name, in the current directory
 
 CONFIG = "run.yaml"
 REPORT = "report.html"
-COLUMNS = "columns.bin"
-"""Of a sweep that has ended: its rows as columns of numbers (advsearch/viewer/columns.py)."""
+COLUMNS = "columns.bin"  # of a sweep that has ended: its rows as columns of numbers (advsearch/viewer/columns.py)
 
 IMAGES = "images"
-SMALL_PICTURES = f"{IMAGES}/rows"
-"""Of a sweep, in folders of a thousand."""
+SMALL_PICTURES = f"{IMAGES}/rows"  # of a sweep, in folders of a thousand
 ARTIFACTS = "artifacts"
-OBJECT_FILE = f"{ARTIFACTS}/object.glb"
-"""What was attacked, before and after, to turn in a browser."""
-AOV_FOLDER = "aov"
-"""Of a sweep: the ground truth of each picture, by its number."""
-
-PARTS = "parts"
-"""Runs that a study consists of."""
+OBJECT_FILE = f"{ARTIFACTS}/object.glb"  # what was attacked, before and after, to turn in a browser
+AOV_FOLDER = "aov"  # of a sweep: the ground truth of each picture, by its number
+PARTS = "parts"  # runs that a study consists of
 
 ONLY_HERE = "only in Python"
 """The note under which the store keeps, in words, what a run has that no file and no command can name."""
@@ -97,29 +88,24 @@ class RunDirectory:
         with storage_errors(path):
             path.mkdir(parents=True, exist_ok=True)
         try:
-            return cls._in_place(path, overwrite)
+            with ExitStack() as undo:
+                held = files.RunLock(path)
+                undo.callback(held.release)
+                check_free(path, overwrite=overwrite)
+                with storage_errors(path):
+                    _clear(path)
+                try:
+                    made = cls(path, held)
+                except BaseException:
+                    with suppress(OSError):
+                        _clear(path)
+                    raise
+                undo.pop_all()
+                return made
         except InputError:  # it is another's
             raise
         except BaseException:
             _remove_if_bare(path)
-            raise
-
-    @classmethod
-    def _in_place(cls, path: Path, overwrite: bool) -> RunDirectory:
-        """Lock the directory, empty it if it may be, and start the run; leave none of it when that fails."""
-        held = files.RunLock(path)
-        try:
-            check_free(path, overwrite=overwrite)
-            with storage_errors(path):
-                _clear(path)
-            try:
-                return cls(path, held)
-            except BaseException:
-                with suppress(OSError):
-                    _clear(path)
-                raise
-        except BaseException:
-            held.release()
             raise
 
     @classmethod
@@ -152,20 +138,16 @@ class RunDirectory:
         files.check_there(run_path(run))
         path = find_run(run)
         check_links(path)
-        held = files.RunLock(path)
-        try:
+        with ExitStack() as undo:
+            held = files.RunLock(path)
+            undo.callback(held.release)
             opened = cls(path, held)
-        except BaseException:
-            held.release()
-            raise
-        opened._began = False
-        try:
+            undo.callback(opened.close)
+            opened._began = False
             if config is not None:
                 opened._check_same(config)
                 opened.note_sitting(config)
-        except BaseException:
-            opened.close()
-            raise
+            undo.pop_all()
         return opened
 
     @property
@@ -177,27 +159,19 @@ class RunDirectory:
 
     def _check_same(self, config: Config) -> None:
         """Refuse settings that decide other numbers than those that are stored: the rest would not fit to them."""
-        before, now = self._begun_with(), config.deciding()
-        changed = [
-            f"{name} was {value!r} and is {now[name]!r}"
-            for name, value in before.items()
-            if name in now and value != now[name]
-        ]
-        if changed:
-            raise InputError(
-                f"{self.path}: cannot resume: {', '.join(changed)} now; set it back to what the run began with, or "
-                f"{self.again}"
-            )
-
-    def _begun_with(self) -> JsonObject:
-        """What the store notes of the settings; empty of a run that is older than that note."""
+        now = config.deciding()
         try:
-            noted = json.loads(self.store.note(BEGUN_WITH) or "{}")
+            before = json.loads(self.store.note(BEGUN_WITH) or "{}")  # older runs note nothing
         except ValueError:
-            noted = None
-        if not isinstance(noted, dict):
+            before = None
+        if not isinstance(before, dict):
             raise FileFormatError(f"{self.store.path}: expected the settings the run began with, got a damaged note")
-        return noted
+        changed = [name for name, value in before.items() if name in now and value != now[name]]
+        if changed:
+            differ = ", ".join(f"{name} was {before[name]!r} and is {now[name]!r}" for name in changed)
+            raise InputError(
+                f"{self.path}: cannot resume: {differ} now; set it back to what the run began with, or {self.again}"
+            )
 
     def finish(self) -> None:
         """Remove what only a run that goes on needs."""
@@ -246,10 +220,6 @@ class RunDirectory:
         """Write ``images/<name>.gif`` of display-referred pictures, at most 3 MB, and return its path."""
         return write_bytes(self.path / IMAGES / f"{name}.gif", images.animation_bytes(frames))
 
-    def replacing(self, name: str) -> AbstractContextManager[Path]:
-        """Return `files.replacing` of a file of this run: ``with run.replacing("artifacts/mesh.obj") as path: ...``."""
-        return replacing(self.path / name)
-
     def write_summary(self, result: Result) -> Path:
         return summary.write_summary(self.path, result)
 
@@ -272,8 +242,7 @@ class RunDirectory:
             self.store.close()
             _clear(self.path)
             _remove_if_bare(self.path)
-        self.store.close()
-        self._lock.release()
+        self.close()
 
     def __enter__(self) -> RunDirectory:
         return self
@@ -331,13 +300,8 @@ def default_name(object_name: str, controls: Iterable[str]) -> str:
 
 def check_links(run: Path) -> None:
     """Check that what a run's folder has is its own: one that somebody else made may link to any file, which would be
-    shown, copied or overwritten. The folder itself may be reached by a link.
-
-    Small pictures, of which there may be a million, are checked as each is read (`viewer.thumbnails`).
-
-    Raises:
-        FileFormatError: there is a link in it, or a pipe or the like.
-    """
+    shown, copied or overwritten. The folder itself may be reached by a link. Small pictures, of which there may be a
+    million, are checked as each is read (`viewer.thumbnails`). Raises FileFormatError."""
     folders = [str(run)]
     while folders:
         folder = folders.pop()
@@ -372,15 +336,9 @@ def typed_name(path: str | Path) -> str:
 
 
 def find_run(run: str | Path, *, checked: bool = True) -> Path:
-    """Return the directory of an existing run, called by name or by path (of the directory, or of its run.yaml).
-
-    Args:
-        checked: whether links in it are refused, as they must be before anything in it is read.
-
-    Raises:
-        UnknownNameError: there is no such run.
-        FileFormatError: it has links in it (`check_links`).
-    """
+    """Return the directory of an existing run, called by name or by path (of the directory, or of its run.yaml). Raises
+    UnknownNameError where there is none, and, unless it is not `checked`, as it must be before anything in it is read,
+    FileFormatError where it has links in it (`check_links`)."""
     for path in (Path(run).expanduser(), run_path(run)):
         folder = path.parent if path.name in CONTENTS and os.path.isfile(path) else path
         if is_run(folder):
@@ -432,7 +390,6 @@ def check_free(run: str | Path, *, overwrite: bool = False) -> None:
 
 
 def _numbered(default: str) -> Path:
-    """Make ``runs/<default>-NNN`` with the next free number and return it; two processes never get the same."""
     pattern = re.compile(re.escape(default) + r"-(\d{3,})")
     with storage_errors(HOME):
         HOME.mkdir(parents=True, exist_ok=True)
@@ -478,7 +435,6 @@ def _is_leftover(path: Path) -> bool:
 
 
 def _remove_if_bare(path: Path) -> None:
-    """Remove the directory if it holds nothing but the lock."""
     with suppress(OSError):
         if all(_is_leftover(found) for found in path.iterdir()):
             for found in list(path.iterdir()):

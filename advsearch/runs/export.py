@@ -10,9 +10,9 @@ import itertools
 import json
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, TypeGuard
 
 from advsearch.described import NOT_A_NUMBER, Value
 from advsearch.errors import FileFormatError, InputError, UnknownNameError
@@ -27,11 +27,8 @@ OWN = (
     *("id", "kind", "step", "phase", "seed", "spp", "objective", "score", "success", "correct", "margin"),
     *("label", "label_index", "probability", PAYLOAD),
 )
-AFTER = ("renders", "machine", "seconds", "time")
-"""Columns of the store before and after the values."""
-
-GROUP = 8192
-"""Rows of a Parquet row group, and so what is held in memory at once."""
+AFTER = ("renders", "machine", "seconds", "time")  # columns of the store before and after the values
+GROUP = 8192  # rows of a Parquet row group, and so what is held in memory at once
 
 
 def write_rows(store: Store, format: str, out: Path | None, stream: IO[bytes], kind: str | None = None) -> int:
@@ -45,17 +42,16 @@ def write_rows(store: Store, format: str, out: Path | None, stream: IO[bytes], k
     write = {"csv": _csv, "json": _json, "parquet": _parquet}[format]
     names = as_columns(store.rows(kind))
     if out is None:
-        write(_records(store.rows(kind)), names, stream)
+        write(map(as_record, store.rows(kind)), names, stream)
     else:
         with placed_by("out"), replacing(out) as part, part.open("wb") as file:
-            write(_records(store.rows(kind)), names, file)
+            write(map(as_record, store.rows(kind)), names, file)
     return counts[kind] if kind is not None else sum(counts.values())
 
 
 def as_columns(rows: Iterable[Row]) -> list[str]:
     """Return the columns of a table of these rows; metrics and values in the order in which they first occur."""
-    metrics: dict[str, None] = {}
-    seen: dict[str, None] = {}
+    metrics, seen = dict[str, None](), dict[str, None]()
     for row in rows:
         metrics |= dict.fromkeys(row.metrics)
         seen |= dict.fromkeys(_values(row.values))
@@ -68,12 +64,7 @@ def as_record(row: Row) -> JsonObject:
     return own | dict(row.metrics) | _values(row.values)
 
 
-def _records(rows: Iterable[Row]) -> Iterator[JsonObject]:
-    return (as_record(row) for row in rows)
-
-
 def _values(values: Mapping[str, Value | JsonValue]) -> JsonObject:
-    """Column to number or text."""
     found: JsonObject = {}
     for name, told in values.items():
         value, unit = (told.get("value"), told.get("unit", "")) if isinstance(told, Mapping) else (told, "")
@@ -89,10 +80,8 @@ def _csv(records: Iterable[JsonObject], names: list[str], stream: IO[bytes]) -> 
     text = io.TextIOWrapper(stream, encoding="utf-8", newline="", write_through=True)
     writer = csv.DictWriter(text, names, restval="", lineterminator="\n")
     writer.writeheader()
-    writer.writerows(
-        {name: int(value) if isinstance(value, bool) else value for name, value in _flat(one).items()}
-        for one in records
-    )
+    for record in map(_flat, records):
+        writer.writerow({name: int(value) if isinstance(value, bool) else value for name, value in record.items()})
     text.detach()
 
 
@@ -121,13 +110,16 @@ def _parquet(records: Iterable[JsonObject], names: list[str], stream: IO[bytes])
     schema = pyarrow.schema([(name, _arrow_type(name, first, pyarrow)) for name in names])
     with pyarrow.parquet.ParquetWriter(stream, schema) as writer:
         while first:
-            told = {name: [_as(one.get(name), schema.field(name).type, pyarrow) for one in first] for name in names}
-            writer.write_table(pyarrow.table(told, schema))
+            columns: dict[str, list[Any]] = {}
+            for name, kind in zip(names, schema.types, strict=True):
+                made: Any = str if kind == pyarrow.string() else float if kind == pyarrow.float64() else None
+                values = [record.get(name) for record in first]
+                columns[name] = [made(value) if made and value is not None else value for value in values]
+            writer.write_table(pyarrow.table(columns, schema))
             first = list(itertools.islice(rows, GROUP))
 
 
 def _arrow_type(name: str, rows: Sequence[JsonObject], pyarrow: Any) -> Any:
-    """Type of a column: by its name in the store, by its first values otherwise."""
     declared = {one.name: str(one.type) for one in fields(Row)}.get(name)
     if name == PAYLOAD:
         return pyarrow.string()
@@ -138,29 +130,18 @@ def _arrow_type(name: str, rows: Sequence[JsonObject], pyarrow: Any) -> Any:
     return pyarrow.string() if texts else pyarrow.float64()
 
 
-def _as(value: Any, wanted: Any, pyarrow: Any) -> Any:
-    if value is None:
-        return None
-    return str(value) if wanted == pyarrow.string() else float(value) if wanted == pyarrow.float64() else value
-
-
 DETAILS, CLASSES, IMAGES = "details.log", "class_maps.json", "images"
 
 LARGEST = 4 << 30
 
-LONGEST = 1 << 20
-"""Most bytes of one of its lines."""
-
-MOST_CLASSES = 16 << 20
-"""Most bytes of a `class_maps.json`."""
-
-_PLACED = ("environment", "object")
-"""Values that have a place of their own in a line."""
+LONGEST = 1 << 20  # most bytes of one of its lines
+MOST_CLASSES = 16 << 20  # most bytes of a `class_maps.json`
+_PLACED = ("environment", "object")  # values that have a place of their own in a line
 
 
 def write_threedb(rows: Callable[[], Iterable[Row]], out: Path, picture: Callable[[int], bytes | None]) -> int:
     """Write the rows of a sweep as such a folder, made or empty, with the PNG of each, where one was kept, and return
-    how many there were. ``loss`` holds the margin: how wrong a prediction is, over 0 where it is not right. The
+    how many there were. ``loss`` is the margin with its sign turned: over 0 where a prediction is not right. The
     parameter ``network`` tells what several networks predict apart."""
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"out: {out} is there already and not empty; name another folder")
@@ -198,24 +179,24 @@ def _line(row: Row, names: Iterable[str], prediction: int) -> JsonObject:
         "environment": environment,
         "model": model,
         "is_correct": str(bool(row.correct)),
-        "loss": row.margin,
+        "loss": None if row.margin is None else 0.0 - row.margin,
         "prediction": [prediction],
         "output_type": "classes",
         "render_args": parameters,  # type: ignore[dict-item]
     }
 
 
-@dataclass(frozen=True)
-class Imported:
-    """One line of such a folder, as a sweep stores it, and the file of its picture, if there is one."""
-
-    row: Row
-    picture: Path | None
-
-
-def read_threedb(folder: Path) -> Iterator[Imported]:
-    """Yield the rows of such a folder; a FileFormatError names the line that is not what it should be."""
-    classes = _read_classes(folder / CLASSES)
+def read_threedb(folder: Path) -> Iterator[tuple[Row, Path | None]]:
+    """Yield each line of such a folder as a row of a sweep, and the file of its picture, if there is one; a
+    FileFormatError names the line that is not what it should be."""
+    try:
+        classes = parse_json(read_text(folder / CLASSES, "the classes of 3DB", MOST_CLASSES))
+        if not isinstance(classes, list):
+            raise ValueError(type(classes).__name__)
+    except FileNotFoundError:
+        classes = []
+    except (OSError, ValueError) as error:
+        raise FileFormatError(f"{folder / CLASSES}: expected a list of names, got {error}") from None
     try:
         file = open_regular(folder / DETAILS, "the log of 3DB", LARGEST)
     except OSError as error:
@@ -228,22 +209,10 @@ def read_threedb(folder: Path) -> Iterator[Imported]:
             if len(line) > LONGEST:
                 raise _wrong(folder, number, f"more than {LONGEST} bytes")
             if line.strip():
-                yield _imported(folder, number, line, classes)
+                yield _imported(folder, number, line, list(map(str, classes)))
 
 
-def _read_classes(path: Path) -> Sequence[str]:
-    try:
-        names = parse_json(read_text(path, "the classes of 3DB", MOST_CLASSES))
-    except FileNotFoundError:
-        return ()
-    except (OSError, ValueError) as error:
-        raise FileFormatError(f"{path}: expected a list of names, got {error}") from None
-    if not isinstance(names, list):
-        raise FileFormatError(f"{path}: expected a list of names, got {type(names).__name__}")
-    return [str(name) for name in names]
-
-
-def _imported(folder: Path, number: int, line: bytes, classes: Sequence[str]) -> Imported:
+def _imported(folder: Path, number: int, line: bytes, classes: Sequence[str]) -> tuple[Row, Path | None]:
     try:
         told = parse_json(line.decode())
     except ValueError as error:
@@ -256,34 +225,31 @@ def _imported(folder: Path, number: int, line: bytes, classes: Sequence[str]) ->
             values |= {f"{name}[{place}]": _value(one) for place, one in enumerate(value)}
         else:
             values["model" if name == "network" else name] = _value(value)
-    index = _first(told.get("prediction"))
+    prediction = told.get("prediction")
+    first = prediction[0] if isinstance(prediction, list) and prediction else prediction
+    index = int(first) if _is_number(first) else None
     label = classes[index] if index is not None and 0 <= index < len(classes) else "" if index is None else str(index)
     loss = told.get("loss")
-    name = str(told.get("id"))
-    safe = re.fullmatch(r"[A-Za-z0-9_-]{1,100}", name)
-    picture = folder / IMAGES / f"{name}_rgb.png" if safe else None
-    return Imported(
-        Row(
-            kind="sweep",
-            step=number,
-            correct=str(told.get("is_correct")) == "True",
-            margin=float(loss) if isinstance(loss, (int, float)) else None,
-            label=label,
-            label_index=index,
-            values=values,
-        ),
-        picture if picture is not None and picture.is_file() and not picture.is_symlink() else None,
+    row = Row(
+        kind="sweep",
+        step=number,
+        correct=str(told.get("is_correct")) == "True",
+        margin=0.0 - loss if isinstance(loss, (int, float)) else None,
+        label=label,
+        label_index=index,
+        values=values,
     )
+    picture = folder / IMAGES / f"{told.get('id')}_rgb.png"
+    safe = re.fullmatch(r"[A-Za-z0-9_-]{1,100}", str(told.get("id")))
+    return row, picture if safe and picture.is_file() and not picture.is_symlink() else None
 
 
-def _first(prediction: JsonValue) -> int | None:
-    found = prediction[0] if isinstance(prediction, list) and prediction else prediction
-    return int(found) if isinstance(found, (int, float)) and not isinstance(found, bool) else None
+def _is_number(value: JsonValue) -> TypeGuard[int | float]:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
 def _value(value: JsonValue) -> Value:
-    number = isinstance(value, (int, float)) and not isinstance(value, bool)
-    return {"value": value if number else str(value), "unit": ""}  # type: ignore[typeddict-item]
+    return {"value": value if _is_number(value) else str(value), "unit": ""}
 
 
 def _wrong(folder: Path, number: int, got: str) -> FileFormatError:

@@ -18,8 +18,7 @@ from typing import Any
 from advsearch.errors import FileFormatError, InputError, StorageError
 from advsearch.files import open_regular
 
-PART = ".part-"
-"""Prefix of a file that is still being written; what a killed process may leave behind."""
+PART = ".part-"  # prefix of a file that is still being written; what a killed process may leave behind
 
 _ADVICE = {
     errno.ENOSPC: "the disk is full; free some space or choose another place with `run`",
@@ -104,10 +103,8 @@ def _flush(path: Path) -> None:
 def _advice(error: OSError | sqlite3.Error) -> str:
     if isinstance(error, OSError):
         return _ADVICE.get(error.errno or 0, f"{error.strerror or error}; choose another place with `run`")
-    for words, advice in _SQLITE_ADVICE.items():
-        if words in str(error):
-            return advice
-    return f"{error}; choose another place with `run`"
+    known = (advice for words, advice in _SQLITE_ADVICE.items() if words in str(error))
+    return next(known, f"{error}; choose another place with `run`")
 
 
 _open: dict[Path, tuple[Path, tuple[int, int]]] = {}
@@ -129,11 +126,7 @@ def note_open(results: Path) -> Callable[[], None]:
 
 def check_there(path: Path) -> None:
     """Check that a path does not lie in the folder of a run that is written to here and was removed or renamed since:
-    what is open is still written then, but to nowhere.
-
-    Raises:
-        StorageError: the folder, or the results in it, are gone or others.
-    """
+    what is open is still written then, but to nowhere. Raises StorageError."""
     for folder in (path, *path.parents):
         if folder not in _open:
             continue
@@ -207,10 +200,9 @@ DAMAGED = "it is damaged, or not made by advsearch: take it from a copy, or run 
 
 LARGEST = 64 << 30
 
-APPLICATION_ID = 0x41445653
-"""In the header of every results.sqlite that is ours: "ADVS"."""
+APPLICATION_ID = 0x41445653  # in the header of every results.sqlite that is ours: "ADVS"
 
-VERSION = 8
+VERSION = 9
 """Of the tables; in the header of the file. Files of another version are read by the advsearch that wrote them."""
 
 SCHEMA = f"""
@@ -232,7 +224,7 @@ SCHEMA = f"""
         score        REAL,                -- what the task says of the prediction, over 0 where it is what is sought
         success      INTEGER,             -- 1 when the prediction is what is sought, 0 when not, NULL in a sweep
         correct      INTEGER,             -- 1 when the prediction was a right one, else 0
-        margin       REAL,                -- largest logit of a wrong class minus largest of a right one
+        margin       REAL,                -- largest logit of a right class minus largest of a wrong one
         label        TEXT,                -- the class that the model predicted
         label_index  INTEGER,             -- its number
         probability  REAL,                -- the model's probability for it, in [0, 1]
@@ -260,7 +252,6 @@ SCHEMA = f"""
     );
     PRAGMA user_version = {VERSION};
 """
-
 
 _JOURNAL = bytes.fromhex("d9d505f920a163d7")
 """The last bytes of a journal that names a file (https://www.sqlite.org/fileformat2.html)."""
@@ -365,10 +356,9 @@ def check_version(db: sqlite3.Connection, path: Path) -> None:
     version, day = _version(db), ""
     if version == VERSION:
         return
-    if version:
-        with suppress(sqlite3.Error):
-            found = db.execute("SELECT value FROM meta WHERE key = 'created'").fetchone()
-            day = f", that of {str(found[0])[:10]}" if found else ""
+    with suppress(sqlite3.Error):
+        created = db.execute("SELECT value FROM meta WHERE key = 'created'").fetchone()
+        day = f", that of {str(created[0])[:10]}" if created else ""
     db.close()
     advice = f"read it with the advsearch that wrote it{day}" if version else "it is not a finished results.sqlite"
     raise FileFormatError(f"{path}: expected version {VERSION} of the results, got {version}; {advice}")

@@ -16,6 +16,7 @@ import numpy.typing as npt
 from PIL import Image
 
 from advsearch.errors import FileFormatError
+from advsearch.pictures import png_of
 from advsearch.runs.files import replacing, write_bytes
 
 Bytes = npt.NDArray[np.uint8]
@@ -28,11 +29,8 @@ DIFFERENCE_GAIN = 5.0
 
 ANIMATION_BYTES = 3_000_000
 
-ANIMATION_FRAMES = 60
-"""Most frames of an animation; of more, every second, third, ... is shown, and always the last."""
-
-ANIMATION_SIDE = 320
-"""Longest side of an animation in pixels; larger pictures are averaged down."""
+ANIMATION_FRAMES = 60  # most frames of an animation; of more, every second, third, ... is shown, and always the last
+ANIMATION_SIDE = 320  # longest side of an animation in pixels; larger pictures are averaged down
 
 _PALETTE_PIXELS = 200_000
 
@@ -53,9 +51,7 @@ def difference(before: Any, after: Any, gain: float = DIFFERENCE_GAIN) -> Floats
 
 def png_bytes(image: Any) -> bytes:
     """Return the display-referred picture as an 8-bit PNG; equal pictures give equal bytes."""
-    buffer = io.BytesIO()
-    Image.fromarray(_picture(to_8bit(image))).save(buffer, "PNG")
-    return buffer.getvalue()
+    return png_of(_picture(to_8bit(image)))
 
 
 def smaller_png(data: bytes, side: int) -> bytes:
@@ -134,17 +130,9 @@ def _gif(pictures: Sequence[Bytes]) -> bytes:
     stride = 1 + pixels.shape[0] * pixels.shape[1] // _PALETTE_PIXELS
     palette = Image.fromarray(np.ascontiguousarray(pixels[::stride])).quantize(256)
     frames = [Image.fromarray(one).quantize(palette=palette, dither=Image.Dither.NONE) for one in pictures]
-    several = len(frames) > 1
-    durations = [FRAME_MS] * (len(frames) - 1) + [LAST_FRAME_MS]
-    buffer = io.BytesIO()
-    frames[0].save(
-        buffer,
-        "GIF",
-        loop=0,
-        duration=durations if several else LAST_FRAME_MS,
-        save_all=several,
-        append_images=frames[1:],
-    )
+    several, buffer = len(frames) > 1, io.BytesIO()
+    durations = [FRAME_MS] * (len(frames) - 1) + [LAST_FRAME_MS] if several else LAST_FRAME_MS
+    frames[0].save(buffer, "GIF", loop=0, duration=durations, save_all=several, append_images=frames[1:])
     return buffer.getvalue()
 
 

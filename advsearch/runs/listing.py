@@ -68,32 +68,26 @@ def listed_run(path: Path, *, counts: bool = True) -> Listed:
     read = [path / name for name in (CONFIG, summary.NAME, store.NAME, f"{store.NAME}-wal")]
     key, state = (os.path.abspath(path), counts), (str(path), running, *map(_state, read))
     if key not in _LISTED or _LISTED[key][0] != state or (running and counts):
-        _LISTED[key] = state, _listed(path, counts=counts, running=running)
+        faults: list[str] = []
+        try:
+            check_links(path)
+            listed = _as_far_as_read(path, counts, running, faults)
+        except Exception as error:  # whatever is wrong with one run, the others are listed
+            faults.append(str(error) if isinstance(error, AdvsearchError) else f"{FAULT}: {type(error).__name__}")
+            listed = Listed(path.name, str(path), "?", "?", (), 0, "damaged", "", {}, False, None)
+        _LISTED[key] = state, replace(listed, fault=faults[0] if faults else "")
     return _LISTED[key][1]
 
 
 def _state(path: Path) -> object:
     with suppress(OSError):
-        found = os.lstat(path)
-        return (
-            (found.st_ino, found.st_size, found.st_mtime_ns) if found.st_size else None
-        )  # who reads leaves such a log
+        file = os.lstat(path)
+        if file.st_size:  # who reads leaves an empty log
+            return file.st_ino, file.st_size, file.st_mtime_ns
     return None
 
 
-def _listed(path: Path, *, counts: bool, running: bool) -> Listed:
-    faults: list[str] = []
-    try:
-        check_links(path)
-        found = _as_far_as_read(path, counts, running, faults)
-    except Exception as error:  # whatever is wrong with one run, the others are listed
-        faults.append(str(error) if isinstance(error, AdvsearchError) else f"{FAULT}: {type(error).__name__}")
-        found = Listed(path.name, str(path), "?", "?", (), 0, "damaged", "", {}, False, None)
-    return replace(found, fault=faults[0] if faults else "")
-
-
 def _as_far_as_read(path: Path, counts: bool, running: bool, faults: list[str]) -> Listed:
-    """What a run is, as far as it can be read; `faults` gets what cannot."""
     config: dict[str, object] = {}
     result: Result | None = None
     kinds: dict[str, int] = {}
@@ -118,7 +112,7 @@ def _as_far_as_read(path: Path, counts: bool, running: bool, faults: list[str]) 
         answer=result.brief if result else "",
         kinds=kinds,
         begun=bool(config),
-        when=_when(path),
+        when=next((file.stat().st_mtime for file in (path / CONFIG, path / summary.NAME) if file.exists()), None),
     )
 
 
@@ -130,10 +124,3 @@ def _told(faults: list[str], file: Path) -> Iterator[None]:
     except AdvsearchError as error:
         if os.path.lexists(file):
             faults.append(str(error))
-
-
-def _when(path: Path) -> float | None:
-    for name in (CONFIG, summary.NAME):
-        with suppress(OSError):
-            return (path / name).stat().st_mtime
-    return None

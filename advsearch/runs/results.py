@@ -24,19 +24,14 @@ if TYPE_CHECKING:
 
 SCHEMA = 1
 
-INTERRUPTED, OUT_OF_TIME = "interrupted", "out of time"
-"""Endings of a run that can go on."""
-RUNNING = "running"
-"""How a result stands that is read while a process works on its run; none is kept so."""
-
-END = ("warnings", "seconds", "seed", "command_line")
-"""Fields that are written last, in this order."""
+INTERRUPTED, OUT_OF_TIME = "interrupted", "out of time"  # endings of a run that can go on
+RUNNING = "running"  # how a result stands that is read while a process works on its run; none is kept so
+END = ("warnings", "seconds", "seed", "command_line")  # fields that are written last, in this order
 
 JsonFloat = Annotated[float, BeforeValidator(lambda value: math.nan if value is None else value)]
 """A number that may be NaN or infinite: null in JSON, which is read as NaN."""
 
-Interval = tuple[JsonFloat, JsonFloat]
-"""Both ends of a 95 % interval."""
+Interval = tuple[JsonFloat, JsonFloat]  # both ends of a 95 % interval
 
 
 def having(*names: str) -> AfterValidator:
@@ -54,12 +49,17 @@ def having(*names: str) -> AfterValidator:
 def as_fact(form: str = "{}") -> dict[str, JsonValue]:
     """Return the `json_schema_extra` of a field that terminal, page and notebook show under its name, as in
 
-        speed: float | None = Field(default=None, description="pictures a second", json_schema_extra=as_fact("{:.3g}"))
+        speed: float | None = optional("pictures a second", json_schema_extra=as_fact("{:.3g}"))
 
     Args:
         form: how its value becomes a text.
     """
     return {"fact": form}
+
+
+def optional(description: str, **more: Any) -> Any:
+    """Return a field that is None, and then left out, by what it is; `more` as for `pydantic.Field`."""
+    return Field(default=None, description=description, **more)
 
 
 class Fields(BaseModel):
@@ -160,9 +160,9 @@ class VariedValue(Fields):
     """What a value was drawn from by chance."""
 
     unit: str
-    low: float | None = Field(default=None, description="the least; absent of names")
-    high: float | None = Field(default=None, description="the most; absent of names")
-    names: list[str] | None = Field(default=None, description="of which one was drawn; absent of numbers")
+    low: float | None = optional("the least; absent of names")
+    high: float | None = optional("the most; absent of names")
+    names: list[str] | None = optional("of which one was drawn; absent of numbers")
 
 
 class CleanScene(Fields):
@@ -186,10 +186,7 @@ class Formation(Fields):
 
 def plain(value: Any) -> Any:
     """Return `value` made of what JSON has: numbers of numpy and torch become Python's, NaN and infinity become None.
-
-    Raises:
-        TypeError: there is something in it that has no JSON form.
-    """
+    Raises TypeError where something in it has no JSON form."""
     if isinstance(value, enum.Enum):
         return plain(value.value)
     if value is None or isinstance(value, (str, bool, int)):
@@ -219,10 +216,9 @@ class ConditionRow(Fields):
     over: float | None = Field(description="values are larger; null without that bound, and for names")
     at_most: float | None = Field(description="values are no larger; null without that bound, and for names")
     options: list[str] = Field(description="the names it is about; empty for numbers")
-    turn: float | None = Field(
-        default=None,
-        description="degrees after which values count as the same, 180 or 360; `over` may then be over `at_most`: the "
-        "part goes through 0. Null for other parts",
+    turn: float | None = optional(
+        "degrees after which values count as the same, 180 or 360; `over` may then be over `at_most`: the "
+        "part goes through 0. Null for other parts"
     )
     text: str
 
@@ -307,19 +303,17 @@ class Measured(Fields):
     repeats: int = Field(description="how often it was computed, each time with other noise")
     seconds: float = Field(description="of one, median")
     status: GradientStatus = Field(description="whether it agrees with its reference")
-    error: JsonFloat | None = Field(
-        default=None, description="of one, root mean square; an upper limit where the reference is unusable"
-    )
-    interval: Interval | None = Field(default=None, description="of `error`")
-    bias: JsonFloat | None = Field(default=None, description="error of the mean")
-    doubt: JsonFloat | None = Field(default=None, description="how much of `bias` the noise explains")
-    noise: JsonFloat | None = Field(default=None, description="standard deviation of one")
-    cosine: JsonFloat | None = Field(default=None, description="of a gradient with its reference, mean")
-    value: JsonFloat | None = Field(default=None, description="of a derivative, mean")
-    reference: JsonFloat | None = Field(default=None, description="what `value` should be")
-    reference_error: JsonFloat | None = Field(default=None, description="the reference's own")
-    reference_cosine: JsonFloat | None = Field(
-        default=None, description="smallest of two converged gradients, of which the reference is the mean"
+    error: JsonFloat | None = optional("of one, root mean square; an upper limit where the reference is unusable")
+    interval: Interval | None = optional("of `error`")
+    bias: JsonFloat | None = optional("error of the mean")
+    doubt: JsonFloat | None = optional("how much of `bias` the noise explains")
+    noise: JsonFloat | None = optional("standard deviation of one")
+    cosine: JsonFloat | None = optional("of a gradient with its reference, mean")
+    value: JsonFloat | None = optional("of a derivative, mean")
+    reference: JsonFloat | None = optional("what `value` should be")
+    reference_error: JsonFloat | None = optional("the reference's own")
+    reference_cosine: JsonFloat | None = optional(
+        "smallest of two converged gradients, of which the reference is the mean"
     )
 
     @property
@@ -364,8 +358,8 @@ class ViewPredictions(Fields):
     answers: list[ClassPrediction] = Field(
         validation_alias=AliasChoices("answers", "predictions"), description="the likeliest first"
     )
-    things: dict[str, ThingSeen] | None = Field(
-        default=None, description="what is seen of `object` and of each thing beside it; absent without any"
+    things: dict[str, ThingSeen] | None = optional(
+        "what is seen of `object` and of each thing beside it; absent without any"
     )
 
 
@@ -382,9 +376,7 @@ class RenderResult(Result):
     command: ClassVar[str] = "render"
 
     out: str = Field(description="the file that was written")
-    answered: str | None = Field(
-        default=None, description="that with boxes and masks drawn in; absent where the task draws none"
-    )
+    answered: str | None = optional("that with boxes and masks drawn in; absent where the task draws none")
     size: tuple[int, int] = Field(description="of the file, [height, width] in pixels")
     object: str
     environment: str
@@ -423,12 +415,13 @@ class VerifiedRate(Fields):
     interval: Interval
     spp: int = Field(description="samples a pixel")
     labels: dict[str, int] = Field(description="predictions of the successes, and how often each was given")
-    margin: JsonFloat = Field(description="mean over these trials, in logits; of a detector in log-odds")
+    margin: JsonFloat = Field(
+        description="mean over these trials, below 0 in a success, in logits; of a detector in log-odds"
+    )
     not_a_number: int = Field(default=0, description="trials whose output is NaN or infinity; absent without")
-    stopped: str | None = Field(
-        default=None,
-        description="why there are no more: `asked for` (as many as were) or `decided` (the verdict stands); absent of "
-        "trials that are no verdict",
+    stopped: str | None = optional(
+        "why there are no more: `asked for` (as many as were) or `decided` (the verdict stands); absent of "
+        "trials that are no verdict"
     )
 
 
@@ -440,7 +433,7 @@ class AverageCase(Fields):
     accuracy: float
     interval: Interval
     margin: JsonFloat = Field(description="the mean, in logits")
-    worst_margin: JsonFloat = Field(description="the largest, in logits")
+    worst_margin: JsonFloat = Field(description="the smallest, in logits")
 
 
 class PredictionError(Fields):
@@ -463,19 +456,16 @@ class LinearTransport(Fields):
     """What predicted the pictures of the searches."""
 
     used: bool
-    way: str | None = Field(
-        default=None, description="by what: `matrix`, `basis pictures` (of a sweep), or `surface light`"
+    way: str | None = optional("by what: `matrix`, `basis pictures` (of a sweep), or `surface light`")
+    reason: str | None = optional(
+        "why pictures were rendered, all or from some evaluation on, or not predicted by surface light"
     )
-    reason: str | None = Field(
-        default=None,
-        description="why pictures were rendered, all or from some evaluation on, or not predicted by surface light",
-    )
-    conditions: BankOfConditions | None = Field(default=None, description="with `over`")
-    entries: int | None = Field(default=None, description="of the matrix")
-    bytes: int | None = Field(default=None, description="of its memory")
-    seconds: float | None = Field(default=None, description="that it and the comparisons took")
-    renewed: int | None = Field(default=None, description="how often it was made again")
-    error: PredictionError | None = Field(default=None, description="of the last comparison")
+    conditions: BankOfConditions | None = optional("with `over`")
+    entries: int | None = optional("of the matrix")
+    bytes: int | None = optional("of its memory")
+    seconds: float | None = optional("that it and the comparisons took")
+    renewed: int | None = optional("how often it was made again")
+    error: PredictionError | None = optional("of the last comparison")
 
 
 class PrintTerms(Fields):
@@ -513,5 +503,7 @@ def kind_of(values: JsonObject) -> type[Result] | None:
     room = rooms.room(str(values.get("command")))
     if room is None:
         return None
-    kind: type[Result] | None = next((kind for name, kind in room.others.items() if name in values), room.result)
+    kind: type[Result] | None = next(
+        (kind for name, kind in (room.others or {}).items() if name in values), room.result
+    )
     return kind

@@ -34,43 +34,18 @@ from advsearch.runs.results import plain
 
 NAME = "results.sqlite"
 
-SYNC_INTERVAL = 1.0
-"""Least seconds between two forced writes to the disk; what a power cut may cost."""
-
-SYNC_SHARE = 0.02
-"""Largest share of the time that forced writes may take."""
+SYNC_INTERVAL = 1.0  # least seconds between two forced writes to the disk; what a power cut may cost
+SYNC_SHARE = 0.02  # largest share of the time that forced writes may take
 
 
 @dataclass(frozen=True)
 class Row:
-    """One evaluated configuration.
+    """One evaluated configuration: a row of `evaluations`, whose columns `files.SCHEMA` describes.
 
-    Attributes:
-        kind: what it was evaluated for: ``"search"``, ``"baseline"``, ``"verification"``, ``"control"``.
-        step: step of the search or number of the trial, from 0.
-        seed: of the render.
-        spp: samples per pixel of the render; None of a search where the picture was predicted.
-        objective: what is maximised, of this picture; stored as None when it is not a number, or nothing is maximised.
-        score: what the run's task says of the prediction: over 0 where it is what is sought; stored as None when it is
-            not a number.
-        success: whether the prediction is what the attack is after; None where nothing is sought, as in a sweep.
-        correct: whether the prediction is right.
-        margin: how wrong it is, by the run's task, over 0 where it is not right; in classification the largest logit of
-            a wrong class minus the largest of a right one; stored as None when it is not a number.
-        label: what the model predicted, in words.
-        label_index: the number of that class; None where there are no classes.
-        probability: the model's probability for it, in [0, 1]; None where it gives none.
-        payload: what the run's task keeps of the prediction beside its words, as JSON values; None where there is
-            nothing.
-        values: parameter to ``{"value": ..., "unit": ...}``.
-        seconds: that the evaluation took.
-        renders: pictures that it took; 0 where they were predicted, None where that was not counted.
-        phase: of a search: ``"search"``, or ``"ranking"`` where a candidate was rendered again at the end; None of
-            trials.
-        metrics: numbers that the run's metrics say of the picture, by name; None where one is not a number.
-        machine: what it was evaluated on, by its name in the note "machines"; None for the machine that wrote the row.
-        time: when it was written, seconds since 1970; set by the store.
-        id: place in the file, from 1; set by the store where it is not given.
+    What is no number is None: it is stored so. `success` is None where nothing is sought, as in a sweep, `renders` 0
+    where pictures were predicted and None where they were not counted, `phase` None of trials. `payload` has JSON
+    values, `values` map a parameter to ``{"value": ..., "unit": ...}``, and `metrics` a name to a number. The store
+    sets `time`, seconds since 1970, and `id`, the place in the file from 1, where it is not given.
     """
 
     kind: str
@@ -118,7 +93,6 @@ _INSERT = (
     f"INSERT INTO evaluations ({', '.join(_COLUMNS)}) VALUES ({', '.join('?' * len(_COLUMNS))}) ON CONFLICT DO NOTHING"
 )
 
-
 _INSERT_TOLD = "INSERT INTO told SELECT id, ?, ?, ?, ?, ?, ?, ? FROM evaluations WHERE kind = ? AND step = ?"
 
 
@@ -154,7 +128,6 @@ class Store:
             self._next_sync = ended + max(SYNC_INTERVAL, (ended - began) / SYNC_SHARE)
 
     def _select(self, what: str, *given: Any) -> Iterator[Any]:
-        """The rows of a query; a FileFormatError where the file is damaged."""
         with readable(self.path):
             cursor = self._db.execute(f"SELECT {what}", given)
             row = cursor.fetchone()
@@ -269,8 +242,7 @@ class Store:
 
 
 _FIELDS = tuple(one.name for one in fields(Row))
-_NAMES = _FIELDS[:-1]  # without the id
-_OTHERS = _NAMES[:-1]  # without the time
+_OTHERS = _FIELDS[:-2]  # without the time and the id
 _SIMPLE = frozenset({str, int, bool, type(None)})
 _JSON = json.JSONEncoder(allow_nan=False)
 
@@ -281,18 +253,14 @@ def _encode(row: Row, stamp: float) -> tuple[Any, ...]:
     for name in _OTHERS:
         value = getattr(row, name)
         if name in _AS_JSON and value is not None:
-            value = _json(value) if value or name != "metrics" else None
+            try:
+                value = _JSON.encode(value) if value or name != "metrics" else None
+            except (TypeError, ValueError):
+                value = _JSON.encode(plain(value))
         elif type(value) not in _SIMPLE and not (type(value) is float and math.isfinite(value)):
             value = plain(value)
         values.append(value)
     return (*values, stamp, row.id)
-
-
-def _json(value: object) -> str:
-    try:
-        return _JSON.encode(value)
-    except (TypeError, ValueError):
-        return json.dumps(plain(value), allow_nan=False)
 
 
 def _column_types() -> dict[str, tuple[type, ...]]:
@@ -305,11 +273,9 @@ def _column_types() -> dict[str, tuple[type, ...]]:
 
 _TYPES = _column_types()
 
-
 _INFINITE = (math.inf, -math.inf)
 
-LARGEST_NUMBER = 1e300
-"""Larger numbers are none in rows: what is reckoned from them would overflow."""
+LARGEST_NUMBER = 1e300  # larger numbers are none in rows: what is reckoned from them would overflow
 
 MOST_STEPS = (1 << 32) - 1
 
@@ -320,11 +286,9 @@ def _decode(values: tuple[Any, ...], path: Path) -> Row:
     if not wrong and not 0 <= given["step"] <= MOST_STEPS:
         wrong = ["step"]
     if not wrong:
-        given["values"] = _values(given["values"])
-        wrong = ["values_json"] if given["values"] is None else []
-    if not wrong:
-        given["metrics"] = {} if given["metrics"] is None else _metrics(given["metrics"])
-        wrong = ["metrics_json"] if given["metrics"] is None else []
+        given["values"] = _named(given["values"], _is_value)
+        given["metrics"] = {} if given["metrics"] is None else _named(given["metrics"], _is_metric)
+        wrong = [f"{name}_json" for name in ("values", "metrics") if given[name] is None]
     if not wrong and given["payload"] is not None:
         try:
             given["payload"] = parse_json(given["payload"], finite=True)
@@ -360,17 +324,16 @@ def _told(values: tuple[Any, ...], path: Path) -> Told:
         raise FileFormatError(f"{path}: expected what a search was told, got something else ({error})") from None
 
 
-def _values(text: str) -> dict[str, Value] | None:
-    """Return the values of a row, None where they are not what `Row` says."""
+def _named(text: str, fits: Callable[[Any], bool]) -> dict[str, Any] | None:
+    """What a JSON object has by name; None where it is none, or something in it does not fit."""
     try:
-        values = json.loads(text)
+        named = json.loads(text)
     except (ValueError, RecursionError):
         return None
-    return values if isinstance(values, dict) and all(map(_is_value, values.values())) else None
+    return named if isinstance(named, dict) and all(map(fits, named.values())) else None
 
 
 def _is_value(told: object) -> bool:
-    """Whether it is a `Value`: a number, a name or several of them, and a unit."""
     if not isinstance(told, dict) or not isinstance(told.get("unit"), str) or "value" not in told:
         return False
     value = told["value"]
@@ -378,17 +341,8 @@ def _is_value(told: object) -> bool:
 
 
 def _is_plain(value: object) -> bool:
-    return value is None or isinstance(value, str) or _is_number(value)
+    return isinstance(value, str) or _is_metric(value)
 
 
-def _is_number(value: object) -> bool:
-    return isinstance(value, (int, float)) and -LARGEST_NUMBER <= value <= LARGEST_NUMBER
-
-
-def _metrics(text: str) -> dict[str, float | None] | None:
-    """Return the metrics of a row, None where they are not numbers by name."""
-    try:
-        found = json.loads(text)
-    except (ValueError, RecursionError):
-        return None
-    return found if isinstance(found, dict) and all(one is None or _is_number(one) for one in found.values()) else None
+def _is_metric(value: object) -> bool:
+    return value is None or (isinstance(value, (int, float)) and -LARGEST_NUMBER <= value <= LARGEST_NUMBER)

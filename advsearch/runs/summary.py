@@ -67,9 +67,8 @@ def stored_result(folder: Path) -> Result:
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
         what = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"[:120]
-        raise other_summary(
-            path, f"one with a part that is missing or of another type ({what}); run it again"
-        ) from None
+        got = f"one with a part that is missing or of another type ({what}); run it again"
+        raise other_summary(path, got) from None
 
 
 def other_summary(path: Path, got: str) -> FileFormatError:
@@ -77,16 +76,13 @@ def other_summary(path: Path, got: str) -> FileFormatError:
 
 
 CONFIGURATION = "adversarial.npy"
-FORMERLY = "answer.npy"
-"""What runs that were made before call it."""
+FORMERLY = "answer.npy"  # what runs that were made before call it
 FOLDER = "artifacts"
 
 LARGEST_CONFIGURATION = 1 << 30
 
-MAGIC = b"\x93NUMPY\x01\x00"
-"""How a file of numpy's begins, of version 1.0."""
-MOST = 1 << 10
-"""Bytes within which a header ends."""
+MAGIC = b"\x93NUMPY\x01\x00"  # how a file of numpy's begins, of version 1.0
+MOST = 1 << 10  # bytes within which a header ends
 HEADER = re.compile(
     re.escape(MAGIC) + rb"..\{'descr': '<f4', 'fortran_order': False, 'shape': \((\d{1,12}),\), \} *\n", re.DOTALL
 )
@@ -106,39 +102,25 @@ def read_configuration(run: Path) -> NDArray[np.float32]:
     path, older = run / FOLDER / CONFIGURATION, run / FOLDER / FORMERLY
     if older.is_file() and not path.exists():
         path = older
+    expected = f"{path}: expected the adversarial configuration of a run, got"
     try:
         data = read_bytes(path, "the adversarial configuration of a run", LARGEST_CONFIGURATION)
     except FileNotFoundError:
-        raise FileFormatError(
-            f"{path}: expected the adversarial configuration of a run, got no such file; did the run end?"
-        ) from None
+        raise FileFormatError(f"{expected} no such file; did the run end?") from None
     except OSError as error:
-        raise FileFormatError(
-            f"{path}: expected the adversarial configuration of a run, got {str(error)[:120]}"
-        ) from None
+        raise FileFormatError(f"{expected} {str(error)[:120]}") from None
     if not data.startswith(MAGIC) or b"\n" not in data[: len(MAGIC) + MOST]:
-        raise FileFormatError(
-            f"{path}: expected the adversarial configuration of a run, got something else, or the beginning of one"
-        )
+        raise FileFormatError(f"{expected} something else, or the beginning of one")
     header = HEADER.match(data)
-    count = -1 if header is None else int(header[1])
-    if header is None or len(data) != header.end() + 4 * count:
-        raise _no_point(path)
-    found: NDArray[np.float32] = np.frombuffer(data, np.float32, count, header.end()).copy()
-    if not bool(((found >= 0.0) & (found <= 1.0)).all()):
-        raise _no_point(path)
-    return found
+    if header is not None and len(data) == header.end() + 4 * int(header[1]):
+        u: NDArray[np.float32] = np.frombuffer(data, np.float32, int(header[1]), header.end()).copy()
+        if bool(((u >= 0.0) & (u <= 1.0)).all()):
+            return u
+    raise FileFormatError(f"{path}: expected numbers (d,) float32 in [0, 1], got something else")
 
 
-def _no_point(path: Path) -> FileFormatError:
-    return FileFormatError(f"{path}: expected numbers (d,) float32 in [0, 1], got something else")
-
-
-MADE_WITH = "made with"
-"""The note: a list, with an entry for each sitting."""
-
-MOST_FILES = 20_000
-"""Files of a folder that a digest is taken of, at most."""
+MADE_WITH = "made with"  # the note: a list, with an entry for each sitting
+MOST_FILES = 20_000  # files of a folder that a digest is taken of, at most
 FOLDERS = {"task": "*/*", "model": "*"}
 """Settings that may name a folder, and which files in it decide: a task's pictures, or what `hf:FOLDER` consists of."""
 
@@ -229,7 +211,6 @@ def _paths(value: object) -> Iterator[str]:
 
 
 def _digest_of_folder(folder: Path, which: str) -> str:
-    """Return the SHA-256 of the names and contents of files in a folder that a pattern names."""
     digest = hashlib.sha256()
     for path in sorted(islice(folder.glob(which), MOST_FILES)):
         if path.is_file():

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from array import array
+import sys
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import fields
 from itertools import islice
@@ -18,8 +17,7 @@ from advsearch.runs.export import as_columns, as_record
 from advsearch.runs.store import NAME, Row, Store
 from advsearch.runs.units import units_of
 
-KIND = "sweep"
-"""Rows of the sweep itself."""
+KIND = "sweep"  # rows of the sweep itself
 
 EDGES = "parts of ranges"
 """The note of a run that says where the range of each drawn parameter is cut: the ends of the parts, by name."""
@@ -27,8 +25,8 @@ EDGES = "parts of ranges"
 SAID = ("id", "step", "correct", "margin", "probability", "seconds", "label")
 """Columns of a sweep's frame before those of its parameters; `unit` is the last one."""
 
-TAKEN = {*(one.name for one in fields(Row)), "unit"}
-"""Names that a parameter cannot have in a frame."""
+AT_ONCE = 10_000  # rows that become numbers and names at once, so that a million rows fit
+TAKEN = {*(one.name for one in fields(Row)), "unit"}  # names that a parameter cannot have in a frame
 
 
 def to_pandas(rows: Iterable[Row]) -> pd.DataFrame:
@@ -69,53 +67,38 @@ def sweep_frame(rows: Iterable[Row], also: Callable[[Row], Mapping[str, float]] 
     parameters that have a name anywhere, are categories in the order in which they come, "none" where a row has
     nothing. ``camera.target[0]`` is one of several numbers; ``attrs["units"]`` has the units of parameters.
     """
-    columns, units, count = {name: _Column() for name in SAID}, dict[str, str](), 0
-    for row in rows:
-        said = row.id or count + 1, row.step, row.correct, row.margin, row.probability, row.seconds
-        label = row.label or ("" if row.correct is None else NOT_A_NUMBER)
-        cells: dict[str, Any] = dict(zip(SAID, (*said, label), strict=True))
-        for name, told in row.values.items():
-            value: Any = told["value"]
-            called = f"parameter {name}" if name in TAKEN else name
-            parts = {called: value}
-            if isinstance(value, list):
-                parts = {f"{called}[{place}]": one for place, one in enumerate(value)}
-            for full in parts:
-                units.setdefault(full, told["unit"])
-            cells |= parts
-        cells |= also(row) if also else {}
-        for name, value in cells.items():
-            columns.setdefault(name, _Column()).put(count, value)
-        count += 1
-    frame = pd.DataFrame({name: column.whole(count) for name, column in columns.items()})
+    units, parts = dict[str, str](), list[pd.DataFrame]()
+    cells = ({**_cells(row, number, units), **(also(row) if also else {})} for number, row in enumerate(rows, 1))
+    while some := list(islice(cells, AT_ONCE)):
+        part = pd.DataFrame(some, dtype=object)
+        parts.append(part.astype({name: float for name in part if not part[name].map(type).eq(str).any()}))
+    frame = pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(dict.fromkeys(SAID, np.zeros(0)))
+    for name in frame.select_dtypes("object"):
+        frame[name] = _names(frame[name])
     frame = frame.astype({"id": np.int64, "step": np.int64})
     frame["unit"] = frame["step"]
     frame.attrs |= {"units": units, "edges": {}}
     return frame
 
 
-class _Column:
-    """Values as they come, 8 bytes a number and 12 a name, so that a million rows fit."""
+def _cells(row: Row, number: int, units: dict[str, str]) -> dict[str, Any]:
+    """What is known of a row, the `number`-th, by column; `units` gets those of its parameters."""
+    said = row.id or number, row.step, row.correct, row.margin, row.probability, row.seconds
+    label = row.label or ("" if row.correct is None else NOT_A_NUMBER)
+    cells: dict[str, Any] = dict(zip(SAID, (*said, label), strict=True))
+    for name, described in row.values.items():
+        value: Any = described["value"]
+        called = f"parameter {name}" if name in TAKEN else name
+        several = isinstance(value, list)
+        for place, number_or_name in enumerate(value if several else [value]):
+            full = f"{called}[{place}]" if several else called
+            units.setdefault(full, described["unit"])
+            cells[full] = sys.intern(number_or_name) if isinstance(number_or_name, str) else number_or_name
+    return cells
 
-    def __init__(self) -> None:
-        self.numbers, self.codes, self.names = array("d"), array("l"), dict[str, int]()
 
-    def put(self, place: int, value: float | str | None) -> None:
-        """Give the row at a place, later than all before it, a value."""
-        number = math.nan if value is None or isinstance(value, str) else float(value)
-        if isinstance(value, str) or self.names:
-            self.codes.extend([-1] * (place - len(self.codes)))
-            self.codes.append(self.names.setdefault(value, len(self.names)) if isinstance(value, str) else -1)
-        self.numbers.extend([math.nan] * (place - len(self.numbers)))
-        self.numbers.append(number)
-
-    def whole(self, count: int) -> Any:
-        """The column of so many rows."""
-        numbers = np.append(np.array(self.numbers), np.full(count - len(self.numbers), np.nan))
-        if not self.names:
-            return numbers
-        codes = np.append(np.array(self.codes), np.full(count - len(self.codes), -1))
-        for place in np.flatnonzero(codes < 0):
-            text = "none" if math.isnan(numbers[place]) else f"{numbers[place]:g}"
-            codes[place] = self.names.setdefault(text, len(self.names))
-        return pd.Categorical.from_codes(codes, list(self.names))
+def _names(column: pd.Series) -> pd.Categorical:
+    """A column that has names as categories, in the order in which they come; numbers among them behind."""
+    texts = [value if isinstance(value, str) else "none" if pd.isna(value) else f"{float(value):g}" for value in column]
+    names = [value for value in column if isinstance(value, str)]
+    return pd.Categorical(texts, categories=list(dict.fromkeys([*names, *texts])))

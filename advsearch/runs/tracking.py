@@ -10,7 +10,7 @@ from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from queue import Full, Queue
-from typing import Any, Protocol
+from typing import Any, NamedTuple
 
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.files import JsonObject
@@ -21,11 +21,8 @@ PACKAGES = {"mlflow": "mlflow", "tensorboard": "tensorboard.summary", "wandb": "
 
 NUMBERS = ("objective", "score", "margin", "correct", "success", "probability")
 
-PATIENCE = 10.0
-"""Seconds that the end of a run waits for what is still to be told."""
-
-WAITING = 10_000
-"""Messages that may wait; further ones are not told."""
+PATIENCE = 10.0  # seconds that the end of a run waits for what is still to be told
+WAITING = 10_000  # messages that may wait; further ones are not told
 
 LONGEST = 250
 
@@ -36,14 +33,11 @@ _LOG = logging.getLogger("advsearch")
 MetricValues = Mapping[str, float]
 
 
-class Backend(Protocol):
-    """One tracker with an open run."""
+class Backend(NamedTuple):
+    """One tracker with an open run: `tell` takes numbers by name, of a step of their kind, and `close` ends the run."""
 
-    def tell(self, numbers: MetricValues, step: int) -> None:
-        """Tell numbers by name, of a step of their kind."""
-
-    def close(self) -> None:
-        """End the run."""
+    tell: Callable[[MetricValues, int], object]
+    close: Callable[[], object]
 
 
 def check_tracker(name: str | None) -> None:
@@ -70,9 +64,7 @@ class Tracker:
         self._right: dict[str, list[int]] = defaultdict(lambda: [0, 0])
         self._waiting: Queue[tuple[MetricValues, int] | None] = Queue(WAITING)
         told = {key: str(value)[:LONGEST] for key, value in settings.items() if value is not None}
-        self._thread = threading.Thread(
-            target=self._work, args=(lambda: OPEN[name](_package(name), folder, told),), name=name, daemon=True
-        )
+        self._thread = threading.Thread(target=self._work, args=(folder, told), name=name, daemon=True)
         self._thread.start()
 
     def rows(self, rows: Sequence[Row]) -> None:
@@ -107,9 +99,9 @@ class Tracker:
         except Full:
             return  # a tracker that is that slow is told less; the run has all of it
 
-    def _work(self, open_backend: Callable[[], Backend]) -> None:
+    def _work(self, folder: Path, settings: Mapping[str, str]) -> None:
         try:
-            backend = open_backend()
+            backend = OPEN[self._name](_package(self._name), folder, settings)
             while (message := self._waiting.get()) is not None:
                 backend.tell(*message)
             backend.close()
@@ -120,49 +112,40 @@ class Tracker:
 # ---- the trackers ---------------------------------------------------------------------------------------------------
 
 
-class _Mlflow:
-    def __init__(self, mlflow: Any, folder: Path, settings: Mapping[str, str]) -> None:
-        self._mlflow = mlflow
-        mlflow.start_run(run_name=folder.name, nested=True)
-        mlflow.log_params(settings)
+def _mlflow(mlflow: Any, folder: Path, settings: Mapping[str, str]) -> Backend:
+    mlflow.start_run(run_name=folder.name, nested=True)
+    mlflow.log_params(settings)
 
-    def tell(self, numbers: MetricValues, step: int) -> None:
-        self._mlflow.log_metrics(dict(numbers), step=step)
+    def tell(numbers: MetricValues, step: int) -> None:
+        mlflow.log_metrics(dict(numbers), step=step)
 
-    def close(self) -> None:
-        self._mlflow.end_run()
+    return Backend(tell, mlflow.end_run)
 
 
-class _Tensorboard:
+def _tensorboard(summary: Any, folder: Path, settings: Mapping[str, str]) -> Backend:
     """Event files in ``artifacts/tensorboard`` of the run; settings are in its run.yaml."""
+    writer = summary.Writer(str(folder / "artifacts" / "tensorboard"))
 
-    def __init__(self, summary: Any, folder: Path, settings: Mapping[str, str]) -> None:
-        self._writer = summary.Writer(str(folder / "artifacts" / "tensorboard"))
-
-    def tell(self, numbers: MetricValues, step: int) -> None:
+    def tell(numbers: MetricValues, step: int) -> None:
         for name, value in numbers.items():
-            self._writer.add_scalar(name, value, step)
+            writer.add_scalar(name, value, step)
 
-    def close(self) -> None:
-        self._writer.close()
+    return Backend(tell, writer.close)
 
 
-class _Wandb:
+def _wandb(wandb: Any, folder: Path, settings: Mapping[str, str]) -> Backend:
     """Each kind has steps of its own, which are told as a number: its one counter only ever goes up."""
+    run = wandb.init(project=PROJECT, name=folder.name, config=dict(settings), reinit="create_new")
 
-    def __init__(self, wandb: Any, folder: Path, settings: Mapping[str, str]) -> None:
-        self._run = wandb.init(project=PROJECT, name=folder.name, config=dict(settings), reinit="create_new")
-
-    def tell(self, numbers: MetricValues, step: int) -> None:
+    def tell(numbers: MetricValues, step: int) -> None:
         kind = next(iter(numbers), "rows/").partition("/")[0]
-        self._run.log({**numbers, f"{kind}/step": step})
+        run.log({**numbers, f"{kind}/step": step})
 
-    def close(self) -> None:
-        self._run.finish()
+    return Backend(tell, run.finish)
 
 
 OPEN: Mapping[str, Callable[[Any, Path, Mapping[str, str]], Backend]] = {
-    "mlflow": _Mlflow,
-    "tensorboard": _Tensorboard,
-    "wandb": _Wandb,
+    "mlflow": _mlflow,
+    "tensorboard": _tensorboard,
+    "wandb": _wandb,
 }

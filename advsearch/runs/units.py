@@ -4,20 +4,24 @@ scene of a run."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import asdict
 from math import prod
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import Field, TypeAdapter, ValidationError
+from pydantic.dataclasses import dataclass
 
 from advsearch.errors import FileFormatError
 from advsearch.runs.store import Store
 
-NOTE = "units"
-"""The note of a run that says it."""
+NOTE = "units"  # the note of a run that says it
 
 Number = TypeVar("Number", int, npt.NDArray[np.int64])
+
+Count = Annotated[int, Field(strict=True, ge=1)]
 
 
 @dataclass(frozen=True)
@@ -32,11 +36,11 @@ class Units:
         again: pictures after which the draws come again; 0 for never.
     """
 
-    sizes: tuple[int, ...] = ()
-    frames: int | None = None
-    samples: int = 1
-    models: int = 1
-    again: int = 0
+    sizes: tuple[Count, ...] = ()
+    frames: Annotated[int, Field(strict=True, ge=0)] | None = None
+    samples: Count = 1
+    models: Count = 1
+    again: Annotated[int, Field(strict=True, ge=0)] = 0
 
     @property
     def size(self) -> int:
@@ -66,25 +70,16 @@ class Units:
     @property
     def noted(self) -> dict[str, Any]:
         """What the note says."""
-        return {**vars(self), "sizes": list(self.sizes)}
+        return asdict(self)
 
 
 def units_of(store: Store) -> Units | None:
     """Return what a run notes of its units; None where it notes nothing."""
     noted = store.noted(NOTE)
-    units = None if noted is None else _read(noted)
-    if noted is not None and units is None:
-        raise FileFormatError(f"{store.path}: expected what units of sampling are, got {str(noted)[:80]}")
-    return units
-
-
-def _read(noted: Any) -> Units | None:
-    """What a note says; None where it is something else."""
-    if not isinstance(noted, dict) or not isinstance(noted.get("sizes"), list):
+    if noted is None:
         return None
-    sizes, frames = noted["sizes"], noted.get("frames")
-    counts = [*sizes, noted.get("samples"), noted.get("models")]
-    known = all(type(one) is int and one >= 1 for one in counts) and type(noted.get("again")) is int
-    if not known or noted["again"] < 0 or not (frames is None or (type(frames) is int and 0 <= frames < len(sizes))):
-        return None
-    return Units(tuple(sizes), frames, noted["samples"], noted["models"], noted["again"])
+    with suppress(ValidationError):
+        units = TypeAdapter(Units).validate_python(noted)
+        if units.frames is None or units.frames < len(units.sizes):
+            return units
+    raise FileFormatError(f"{store.path}: expected what units of sampling are, got {str(noted)[:80]}")

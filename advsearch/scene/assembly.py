@@ -20,7 +20,7 @@ from torch import Tensor
 
 from advsearch.scene.assets import Mesh
 from advsearch.scene.description import OBJECT, SceneDescription
-from advsearch.scene.geometry import camera_to_world, driving, seated
+from advsearch.scene.geometry import camera_to_world, driving, projected, seated
 from advsearch.scene.gradients import DEFAULT_PIXELS, DEFAULT_STEP, STEP_RANGE, Group
 from advsearch.scene.parts import CAMERA, BeamLamp, LampGlass
 
@@ -29,12 +29,8 @@ ON_PICTURE = frozenset({"backdrop.color", "camera.exposure"})
 
 
 class MovingMesh:
-    """One mesh whose vertices and normals follow a pose and a displacement.
-
-    Args:
-        mesh: in its own coordinates.
-        to_world: (4, 4) its base pose.
-    """
+    """One mesh, in its own coordinates, whose vertices and normals follow a pose, (4, 4) `to_world` at first, and a
+    displacement."""
 
     def __init__(self, mesh: Mesh, to_world: np.ndarray) -> None:
         self._mesh = mesh
@@ -43,59 +39,38 @@ class MovingMesh:
         self.to_world = torch.from_numpy(to_world.astype(np.float32))
 
     def place(self, to_world: Tensor | None, offsets: Tensor | None) -> tuple[Tensor, Tensor]:
-        """Return world-space vertices and unit normals, both (V, 3).
-
-        Args:
-            to_world: (4, 4) an invertible affine map, or None for the base pose.
-            offsets: (V, 3) displacement in mesh coordinates, or None.
-        """
-        given = to_world if to_world is not None else offsets
-        device = self.vertices.device if given is None else given.device
+        """Return world-space vertices and unit normals, both (V, 3), under an invertible affine map (4, 4), None for
+        the base pose, and with a displacement (V, 3) in mesh coordinates, or None."""
+        moving = to_world if to_world is not None else offsets
+        device = self.vertices.device if moving is None else moving.device
         matrix = self.to_world.to(device) if to_world is None else to_world
         vertices, normals = self.vertices.to(device), self.normals.to(device)
-        if offsets is not None:
-            vertices = vertices + offsets
-            normals = self._turned(offsets)
+        if offsets is not None:  # the author's normals turn by as much as those that follow from the faces
+            turned = self._area_normals(vertices + offsets) - self._original_area_normals.to(device)
+            vertices, normals = vertices + offsets, normals + turned
         moved = vertices @ matrix[:3, :3].T + matrix[:3, 3]
         turned = normals @ torch.linalg.inv(matrix[:3, :3])
         return moved, turned / turned.norm(dim=1, keepdim=True).clamp_min(1e-12)
 
-    def _turned(self, offsets: Tensor) -> Tensor:
-        """Shading normals of the displaced mesh.
-
-        Area-weighted normals over vertices that share place and normal (so that creases stay creases) are worked out
-        for the displaced and for the original mesh; their difference is added to the author's normals.
-        """
-        device = offsets.device
-        displaced = self._area_normals(self.vertices.to(device) + offsets)
-        return self.normals.to(device) + (displaced - self._original_area_normals.to(device))
-
     def _area_normals(self, vertices: Tensor) -> Tensor:
-        faces, groups = self._faces.to(vertices.device), self._groups.to(vertices.device)
+        """Area-weighted normals over vertices that share place and normal, so that creases stay creases."""
+        faces, groups = (numbers.to(vertices.device) for numbers in self._sharing)
         first, second, third = (vertices.index_select(0, faces[:, corner]) for corner in range(3))
         normals = torch.linalg.cross(second - first, third - first)
-        summed = vertices.new_zeros(self._group_count, 3).index_add(
-            0, groups[faces].T.reshape(-1), normals.repeat(3, 1)
-        )
-        found = summed[groups]
-        return found / (found.square().sum(dim=1, keepdim=True) + 1e-24).sqrt()
+        summed = vertices.new_zeros(int(groups.max()) + 1, 3)
+        summed = summed.index_add(0, groups[faces].T.reshape(-1), normals.repeat(3, 1))[groups]
+        return summed / (summed.square().sum(dim=1, keepdim=True) + 1e-24).sqrt()
 
     @cached_property
     def _original_area_normals(self) -> Tensor:
         return self._area_normals(self.vertices)
 
     @cached_property
-    def _faces(self) -> Tensor:
-        return torch.from_numpy(self._mesh.faces.astype(np.int64))
-
-    @cached_property
-    def _groups(self) -> Tensor:
+    def _sharing(self) -> tuple[Tensor, Tensor]:
+        """Faces (F, 3), and for each vertex the number (V,) of those that share its place and normal."""
         rounded = np.round(np.concatenate([self._mesh.vertices * 1e5, self._mesh.normals * 1e3], axis=1))
-        return torch.from_numpy(np.unique(rounded, axis=0, return_inverse=True)[1].reshape(-1).astype(np.int64))
-
-    @cached_property
-    def _group_count(self) -> int:
-        return int(self._groups.max()) + 1
+        groups = np.unique(rounded, axis=0, return_inverse=True)[1].reshape(-1)
+        return torch.from_numpy(self._mesh.faces.astype(np.int64)), torch.from_numpy(groups.astype(np.int64))
 
 
 AWAY = 1000.0
@@ -103,10 +78,7 @@ AWAY = 1000.0
 
 
 class Assembly:
-    """Turns the inputs of a space into those of `MitsubaScene`.
-
-    Args:
-        description: the scene with all its parts.
+    """Turns the inputs of a space into those of `MitsubaScene`, for a scene with all its parts.
 
     Attributes:
         away: whether the object is put so far away that neither it nor its shadow is in the picture. A scene in which
@@ -116,7 +88,7 @@ class Assembly:
     def __init__(self, description: SceneDescription) -> None:
         self.away = False
         self.meshes = {name: MovingMesh(part.mesh, part.to_world) for name, part in description.meshes.items()}
-        self._carried = [one for one in description.parts if isinstance(one, (BeamLamp, LampGlass))]
+        self._carried = [part for part in description.parts if isinstance(part, (BeamLamp, LampGlass))]
         self._photograph = description.photograph
 
     def __call__(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -126,8 +98,8 @@ class Assembly:
             pose[1, 3] += AWAY
             inputs = {**inputs, f"{OBJECT}.to_world": pose}
         parameters = dict(inputs)
-        for one in self._carried:
-            parameters |= _with_carrier(one, inputs)
+        for part in self._carried:
+            parameters |= _with_carrier(part, inputs)
         for name, mesh in self.meshes.items():
             to_world, offsets = parameters.pop(f"{name}.to_world", None), parameters.pop(f"{name}.offsets", None)
             if to_world is not None or offsets is not None:
@@ -145,31 +117,31 @@ class Assembly:
 
 def _with_carrier(part: BeamLamp | LampGlass, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """The inputs of what a mesh or the camera carries, where that is moved or deformed."""
-    pose, offsets = (inputs.get(f"{part.carrier}.{one}") for one in ("to_world", "offsets"))
-    found: dict[str, Tensor] = {}
+    pose, offsets = (inputs.get(f"{part.carrier}.{what}") for what in ("to_world", "offsets"))
+    carried: dict[str, Tensor] = {}
     if isinstance(part, LampGlass):
         if offsets is not None:
-            found[f"{part.name}.offsets"] = offsets[torch.from_numpy(part.follows).to(offsets.device)]
+            carried[f"{part.name}.offsets"] = offsets[torch.from_numpy(part.follows).to(offsets.device)]
         if pose is not None:
-            found[f"{part.name}.to_world"] = pose
+            carried[f"{part.name}.to_world"] = pose
     elif pose is not None:
         seat = torch.from_numpy(part.seat).to(pose)
-        found[f"{part.name}.to_world"] = seated(driving(pose) if part.carrier == CAMERA else pose, seat)
-    return found
+        carried[f"{part.name}.to_world"] = seated(driving(pose) if part.carrier == CAMERA else pose, seat)
+    return carried
 
 
 Value = Callable[[Tensor], Tensor]
 """From a configuration (d,) to one number, at one seed."""
 
 
-def central(value: Value, group: Group, u: Tensor, found: Tensor) -> None:
-    """Two values for each coordinate of a group, `group.step` to either side."""
+def central(value: Value, group: Group, u: Tensor, derivative: Tensor) -> None:
+    """Put the slopes of a group, each by two values `group.step` to either side, into (d,) `derivative`."""
     for number in range(group.begin, group.begin + group.size):
         step = torch.zeros_like(u)
         step[number] = group.step
         (above, up), (below, down) = moved(u, step, group.periodic), moved(u, -step, group.periodic)
         rise = value(above) - value(below)
-        found[number] = float(rise) / float((up - down)[number])
+        derivative[number] = float(rise) / float((up - down)[number])
 
 
 def moved(u: Tensor, step: Tensor, periodic: bool | Tensor) -> tuple[Tensor, Tensor]:
@@ -178,10 +150,8 @@ def moved(u: Tensor, step: Tensor, periodic: bool | Tensor) -> tuple[Tensor, Ten
     Periodic coordinates wrap around, so that they can go the whole step.
     """
     there = u + step
-    wrapped = torch.remainder(there, 1.0)
-    clipped = there.clamp(0.0, 1.0)
-    cyclic = torch.as_tensor(periodic).expand(u.shape)
-    return torch.where(cyclic, wrapped, clipped), torch.where(cyclic, step, clipped - u)
+    clipped, cyclic = there.clamp(0.0, 1.0), torch.as_tensor(periodic).expand(u.shape)
+    return torch.where(cyclic, torch.remainder(there, 1.0), clipped), torch.where(cyclic, step, clipped - u)
 
 
 POINTS = 400
@@ -197,28 +167,30 @@ FAR = 1e4
 
 
 class Motion:
-    """Projects a scene's vertices, the table's edge or the floor, and what is seen of the environment into the picture.
+    """Projects a scene's vertices, the table's edge or the floor, and what is seen of the environment into the picture,
+    of a resolution (height, width) in pixels; the assembly makes vertices from poses.
 
     A camera that goes around an object hardly moves the object's outline, but all that lies behind it.
-
-    Args:
-        description: the scene with all its parts.
-        resolution: (height, width) in pixels.
-        assembly: makes vertices from poses.
     """
 
     def __init__(self, description: SceneDescription, resolution: tuple[int, int], assembly: Assembly) -> None:
-        height, width = resolution
-        self._size = max(height, width)
-        self._frame = torch.tensor([width, height]) / 2.0
-        self._assembly = assembly
-        self._camera = torch.from_numpy(camera_to_world(description, width / height)).to(torch.float64)
-        self._fov = description.number("camera.fov")
-        self._model = description.camera_model
+        self._description, self._resolution, self._assembly = description, resolution, assembly
+        self._camera = torch.from_numpy(camera_to_world(description, resolution[1] / resolution[0])).double()
         floor = None if description.photograph is None else description.photograph.mesh.vertices
         self._ground = description.number("ground.size") / 2.0 if floor is None else float(floor.max())
-        self._edge = _edge_points(self._ground) if floor is None else torch.from_numpy(floor).double()
-        self._far = _far_points(description.backdrop or description.environment is None)
+        if floor is None:  # a square at height 0
+            along = torch.linspace(-self._ground, self._ground, EDGE if self._ground > 0.0 else 0, dtype=torch.float64)
+            side, zero = torch.full_like(along, self._ground), torch.zeros_like(along)
+            sides = [(along, side), (along, -side), (side, along), (-side, along)]
+            self._edge = torch.cat([torch.stack([x, y, zero], dim=1) for x, y in sides])
+        else:
+            self._edge = torch.from_numpy(floor).double()
+        # Points of the environment, evenly spread (Fibonacci spiral); none where nothing shows them
+        hidden = description.backdrop or description.environment is None
+        number = torch.arange(0 if hidden else DIRECTIONS, dtype=torch.float64)
+        up, turn = 1.0 - (2.0 * number + 1.0) / DIRECTIONS, number * torch.pi * (3.0 - 5.0**0.5)
+        radius = (1.0 - up**2).sqrt()
+        self._far = torch.stack([radius * turn.cos(), radius * turn.sin(), up], dim=1) * FAR
         self._picks = {
             name: torch.from_numpy(np.linspace(0, len(mesh.vertices) - 1, min(POINTS, len(mesh.vertices))).astype(int))
             for name, mesh in assembly.meshes.items()
@@ -227,48 +199,27 @@ class Motion:
     def pixels(self, inputs: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
         """Return where the followed vertices lie, (N, 2) pixels from the middle, and which are in or near the frame."""
         camera = inputs["camera.to_world"].double() if "camera.to_world" in inputs else self._camera
-        found = []
+        points = []
         for name, mesh in self._assembly.meshes.items():
             vertices = inputs.get(f"{name}.vertices")
             if vertices is None:
                 vertices = mesh.place(None, None)[0]
-            found.append(vertices[self._picks[name]].double())
-        found += [self._edge, self._far]
-        relative = (torch.cat(found) - camera[:3, 3]) @ camera[:3, :3]
-        projected, seen = self._projected(relative, inputs)
-        seen[len(seen) - len(self._far) :] &= ~self._behind_ground(camera[:3, 3])
-        for axis, name in enumerate(("camera.shift_x", "camera.shift_y")):
-            if name in inputs:
-                projected[:, axis] += 2.0 * self._frame[axis] * inputs[name].double().reshape(())
-        return projected, seen & (projected.abs() <= 1.2 * self._frame.double()).all(dim=1)
-
-    def _projected(self, points: Tensor, inputs: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
-        """Where points (N, 3) in camera coordinates are seen, in pixels from the middle, and which are before it."""
-        if self._model is not None:
-            model = self._model.with_numbers(inputs["camera.lens"]) if "camera.lens" in inputs else self._model
-            places, seen = model.project(points * torch.tensor([-1.0, -1.0, 1.0]).to(points))
-            return (places - 0.5) * 2.0 * self._frame.double(), seen
-        fov = inputs["camera.fov"].double().reshape(()) if "camera.fov" in inputs else torch.tensor(self._fov)
-        focal = self._size / 2.0 / torch.tan(torch.deg2rad(fov.double()) / 2.0)
-        depth = points[:, 2]
-        return focal * points[:, :2] / depth.clamp_min(1e-3)[:, None], depth > 1e-3
-
-    def _behind_ground(self, eye: Tensor) -> Tensor:
-        """Which of the far points the ground plane hides from a camera at `eye`."""
-        downwards = (self._far - eye)[:, 2]
-        reach = -eye[2] / downwards.clamp_max(-1e-9)
-        hit = eye + reach[:, None] * (self._far - eye)
-        on_it = (hit[:, :2].abs() <= self._ground).all(dim=1)
-        return (downwards < 0.0) & bool(eye[2] > 0.0) & on_it
+            points.append(vertices[self._picks[name]].double())
+        points += [self._edge, self._far]
+        eye = camera[:3, 3]
+        relative = (torch.cat(points) - eye) @ camera[:3, :3]
+        places, seen = projected(self._description, inputs, relative, self._resolution)
+        # Which of the far points the ground plane hides
+        ways = self._far - eye
+        hit = eye + (-eye[2] / ways[:, 2].clamp_max(-1e-9))[:, None] * ways
+        on_ground = (hit[:, :2].abs() <= self._ground).all(dim=1)
+        seen[len(seen) - len(self._far) :] &= ~((ways[:, 2] < 0.0) & bool(eye[2] > 0.0) & on_ground)
+        frame = torch.tensor(self._resolution[::-1], dtype=torch.float64) / 2.0
+        return places, seen & (places.abs() <= 1.2 * frame).all(dim=1)
 
     def speeds(self, inputs: Callable[[Tensor], Mapping[str, Tensor]], u: Tensor, coordinates: list[int]) -> Tensor:
-        """Return the speed of the fastest point in the frame for each coordinate, in pixels per unit of u.
-
-        Args:
-            inputs: from u to assembled inputs.
-            u: (d,) where.
-            coordinates: which; the others get 0.
-        """
+        """Return the speed (d,) of the fastest point in the frame for some coordinates of u (d,), 0 for the others, in
+        pixels per unit of u; `inputs` maps u to assembled inputs."""
         speeds = torch.zeros(len(u))
         with torch.no_grad():
             here, seen = self.pixels(inputs(u))
@@ -282,23 +233,6 @@ class Motion:
                         speeds[number] = float(distances.max()) / size
                         break
         return speeds
-
-
-def _edge_points(half: float) -> Tensor:
-    """(N, 3) points along the edge of the ground plane, a square of half the side `half` at height 0."""
-    along = torch.linspace(-half, half, EDGE if half > 0.0 else 0, dtype=torch.float64)
-    side, zero = torch.full_like(along, half), torch.zeros_like(along)
-    sides = [(along, side), (along, -side), (side, along), (-side, along)]
-    return torch.cat([torch.stack([x, y, zero], dim=1) for x, y in sides])
-
-
-def _far_points(hidden: bool) -> Tensor:
-    """(N, 3) points of the environment, evenly spread (Fibonacci spiral); none where nothing shows them."""
-    number = torch.arange(0 if hidden else DIRECTIONS, dtype=torch.float64)
-    height = 1.0 - (2.0 * number + 1.0) / DIRECTIONS
-    turn = number * torch.pi * (3.0 - 5.0**0.5)
-    radius = (1.0 - height**2).sqrt()
-    return torch.stack([radius * turn.cos(), radius * turn.sin(), height], dim=1) * FAR
 
 
 def steps_for(speeds: Tensor, pixels: float = DEFAULT_PIXELS) -> Tensor:

@@ -24,28 +24,24 @@ Floats = npt.NDArray[np.float32]
 Doubles = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 Bools = npt.NDArray[np.bool_]
-
 SLACK = 1e-3
 """How far texture coordinates of a texture that does not repeat may lie beyond its edges."""
 
 
-class Rig(Protocol):
-    """What moves the vertices of a mesh: joints, shapes of a body, clips.
-
-    Attributes:
-        parameters: what can be asked for, each a number.
-        defaults: what the mesh has where nothing is said, by name.
-        clips: names of its animations.
-    """
+class MeshRig(Protocol):
+    """What moves the vertices of a mesh: joints, shapes of a body, clips."""
 
     @property
-    def parameters(self) -> tuple[Parameter, ...]: ...
+    def parameters(self) -> tuple[Parameter, ...]:
+        """What can be asked for, each a number."""
 
     @property
-    def defaults(self) -> Mapping[str, float]: ...
+    def defaults(self) -> Mapping[str, float]:
+        """What the mesh has where nothing is said, by name."""
 
     @property
-    def clips(self) -> tuple[str, ...]: ...
+    def clips(self) -> tuple[str, ...]:
+        """Names of its animations."""
 
     def offsets(self, values: Mapping[str, Tensor], clip: str | None = None) -> Tensor:
         """Return how far each vertex goes from the mesh's own, (V, 3) in its units; differentiable."""
@@ -56,27 +52,18 @@ class Rig(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """A triangle mesh with one UV chart set.
+    """A triangle mesh with one UV chart set: v = 0 is the BOTTOM row of the texture image (the OBJ convention). UVs are
+    in [0, 1], but for meshes of Mitsuba scenes, whose textures may go on beyond their edges."""
 
-    Attributes:
-        vertices: (V, 3) float32 positions, z up, in the author's units.
-        faces: (F, 3) uint32 vertex indices, counter-clockwise seen from outside.
-        normals: (V, 3) float32 unit shading normals, pointing outwards.
-        uvs: (V, 2) float32; v = 0 is the BOTTOM row of the texture image (the OBJ convention). In [0, 1], but for
-            meshes of Mitsuba scenes, whose textures may go on beyond their edges.
-        attributes: of meshes of Mitsuba scenes, further numbers, (V, n) or (F, n) float32, by Mitsuba's names, which
-            begin with "vertex_" or "face_".
-        materials: the faces (N,) int64 of each material that its file names, by that name; each face is in one at most.
-        rig: what moves its vertices, for the control `body`; None for what has no joints.
-    """
-
-    vertices: Floats
-    faces: npt.NDArray[np.uint32]
-    normals: Floats
-    uvs: Floats
+    vertices: Floats  # (V, 3) positions, z up, in the author's units
+    faces: npt.NDArray[np.uint32]  # (F, 3) vertices, counter-clockwise seen from outside
+    normals: Floats  # (V, 3) unit shading normals, pointing outwards
+    uvs: Floats  # (V, 2)
+    # further numbers of Mitsuba's meshes, (V, n) or (F, n), by its names, which begin with "vertex_" or "face_"
     attributes: Mapping[str, Floats] = field(default_factory=dict)
+    # the faces (N,) of each material that its file names, by that name; each face is in one at most
     materials: Mapping[str, Ints] = field(default_factory=dict)
-    rig: Rig | None = None
+    rig: MeshRig | None = None  # what moves its vertices, for the control `body`; None for what has no joints
 
     @property
     def repeats(self) -> bool:
@@ -113,69 +100,41 @@ class Material:
 
 @dataclass(frozen=True)
 class UpAxis:
-    """The axis of a mesh file that is taken for up.
+    """The axis of a mesh file that is taken for up."""
 
-    Attributes:
-        axis: "y" or "z".
-        reason: why, in one sentence with what to do if it is wrong; empty where the user or the format said it.
-    """
-
-    axis: str
-    reason: str = ""
+    axis: str  # "y" or "z"
+    reason: str = ""  # why, in one sentence with what to do if it is wrong; empty where the user or the format said it
 
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """A mesh and what it looks like. Pictures have row 0 on top, at v = 1.
+    """A mesh and what it looks like. Pictures have row 0 on top, at v = 1. Opacity and normal map are of the principled
+    surface; a normal map is `(n + 1) / 2` of unit normals in the frame of tangent (along u), normal x tangent and
+    normal."""
 
-    Attributes:
-        name: short name, used in paths.
-        mesh: geometry.
-        base_color: (H, W, 3) float32 display-referred sRGB in [0, 1].
-        material: the remaining surface parameters.
-        label: name of the class it belongs to in the reference model, or None when unknown.
-        surface: in place of the principled surface, Mitsuba's dictionary of one, with
-            `advsearch.scene.parts.BASE_COLOR` where the texture goes; None for the principled one.
-        opacity: (H, W) float32 in [0, 1] of the principled surface, the share of the light that does not pass through;
-            None where it is 1.
-        normal_map: (H, W, 3) float32 of the principled surface, `(n + 1) / 2` of unit normals in the frame of tangent
-            (along u), normal x tangent and normal; None where there is none.
-        emission: (H, W, 3) float32 linear radiance of the front of its faces; (1, 1, 3) where it is the same
-            everywhere, None where there is none.
-    """
-
-    name: str
+    name: str  # short, used in paths
     mesh: Mesh
-    base_color: Floats
-    material: Material = field(default_factory=Material)
-    label: str | None = None
+    base_color: Floats  # (H, W, 3) display-referred sRGB in [0, 1]
+    material: Material = field(default_factory=Material)  # the remaining surface parameters
+    label: str | None = None  # the class it belongs to in the reference model, or None when unknown
+    # in place of the principled surface, Mitsuba's dictionary of one, with `parts.BASE_COLOR` where the texture goes
     surface: Mapping[str, object] | None = None
-    opacity: Floats | None = None
-    normal_map: Floats | None = None
-    emission: Floats | None = None
+    opacity: Floats | None = None  # (H, W) in [0, 1], the share of light that does not pass through; None where it is 1
+    normal_map: Floats | None = None  # (H, W, 3)
+    emission: Floats | None = None  # (H, W, 3) linear radiance of its faces' front; (1, 1, 3): the same everywhere
 
 
 @dataclass(frozen=True, eq=False)
 class ObjectAsset(Shape):
-    """The object a model should recognise.
+    """The object a model should recognise. A None is what is not known, or does not come from a file."""
 
-    Attributes:
-        source: where it came from, for messages and logs.
-        warnings: what the importer had to repair or leave out, one sentence each.
-        up: the axis of the file that was taken for up; None for what comes from no file.
-        finishes: of an object of several materials, what each of `mesh.materials` is like beside its base colour; what
-            none of them covers is like `material`.
-        metres: its largest extent in metres, where that is known; then distances of the camera are in metres. None
-            where distances are in object sizes. See `advsearch.scene.sizes`.
-        extent: its largest extent in the coordinates of its file; None for what comes from no file.
-    """
-
-    source: str = ""
-    warnings: tuple[str, ...] = ()
-    up: UpAxis | None = None
+    source: str = ""  # where it came from, for messages and logs
+    warnings: tuple[str, ...] = ()  # what the importer had to repair or leave out, one sentence each
+    up: UpAxis | None = None  # the axis of the file that was taken for up
+    # of several materials, what each of `mesh.materials` is like beside its base colour; `material` covers the rest
     finishes: Mapping[str, Material] = field(default_factory=dict)
-    metres: float | None = None
-    extent: float | None = None
+    metres: float | None = None  # its largest extent, where distances of the camera are in metres (`scene.sizes`)
+    extent: float | None = None  # its largest extent in the coordinates of its file
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -186,30 +145,16 @@ class ObjectAsset(Shape):
 
 @dataclass(frozen=True, eq=False)
 class EnvironmentAsset:
-    """A light from everywhere: an equirectangular map.
+    """A light from everywhere: an equirectangular map. Row 0 looks straight up, and columns run as in a photograph (a
+    file's own order). Raises InputError: a texel is negative, NaN or infinite."""
 
-    Attributes:
-        name: short name, used in paths.
-        radiance: (H, W, 3) float32 linear radiance, finite and at least 0; row 0 looks straight up, and columns run as
-            in a photograph (a file's own order).
-        source: where it came from.
-        warnings: what the importer had to repair or leave out, one sentence each.
-        photographed: it shows the floor of a real place: the ground that things stand on is that floor by itself.
-        ground: the kind of ground that belongs to it by itself (`advsearch.scene.settings.GROUND_KINDS`); None for the
-            usual one.
-        candelas: luminance of a radiance of 1, cd/m2; None where the map's brightness means nothing.
-
-    Raises:
-        InputError: a texel is negative, NaN or infinite.
-    """
-
-    name: str
-    radiance: Floats
-    source: str = ""
-    warnings: tuple[str, ...] = ()
-    photographed: bool = False
-    ground: str | None = None
-    candelas: float | None = None
+    name: str  # short, used in paths
+    radiance: Floats  # (H, W, 3) linear radiance
+    source: str = ""  # where it came from
+    warnings: tuple[str, ...] = ()  # what the importer had to repair or leave out, one sentence each
+    photographed: bool = False  # it shows the floor of a real place: the ground that things stand on is that by itself
+    ground: str | None = None  # the kind of ground (`settings.GROUND_KINDS`) that belongs to it; None for the usual one
+    candelas: float | None = None  # luminance of a radiance of 1, cd/m2; None where its brightness means nothing
 
     def __post_init__(self) -> None:
         bad = ~(np.isfinite(self.radiance) & (self.radiance >= 0.0)).all(axis=2)
@@ -222,43 +167,46 @@ class EnvironmentAsset:
             )
 
 
-def normalised(mesh: Mesh) -> Mesh:
-    """Return the mesh scaled so that its largest extent is 1, standing on z = 0 and centred in x and y.
+def face_vectors(corners: Doubles) -> Doubles:
+    """Return vectors (F, 3) along the normals of triangles (F, 3, 3), as long as twice their areas."""
+    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
-    Raises:
-        InputError: all vertices coincide, so there is no size to normalise.
-    """
+
+def footing(points: Doubles) -> tuple[Doubles, float]:
+    """Return the place (3,) in the middle below some points (N, 3), and their largest extent."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    return np.array([*(low[:2] + high[:2]) / 2.0, low[2]]), float((high - low).max())
+
+
+def grouped(numbers: Ints) -> list[Ints]:
+    """Return, for each number from 0 to the largest of some (N,), the places at which it stands, rising."""
+    return np.split(np.argsort(numbers, kind="stable"), np.cumsum(np.bincount(numbers))[:-1])
+
+
+def normalised(mesh: Mesh) -> Mesh:
+    """Return the mesh scaled so that its largest extent is 1, standing on z = 0 and centred in x and y. Raises
+    InputError: all vertices coincide, so there is no size to normalise."""
     vertices = mesh.vertices.astype(np.float64)
-    low, high = vertices.min(axis=0), vertices.max(axis=0)
-    size = float((high - low).max())
+    origin, size = footing(vertices)
     if not size > 0.0:
         raise InputError("mesh has no extent: all its vertices coincide; export the mesh again")
-    origin = np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]])
     return replace(mesh, vertices=((vertices - origin) / size).astype(np.float32))
 
 
 GRIDS = (384, 256, 192, 128, 96, 64, 48, 32, 24, 16, 12, 8)
 """Cells of the grid along the mesh's largest extent, tried one after the other."""
-
 TEXTURE_CELLS = 32
 """Cells of the texture along each side: vertices of one place that lie in different ones stay apart, as at seams."""
 
 
 @dataclass(frozen=True, eq=False)
 class Simpler:
-    """Which vertices and faces of a mesh are left.
+    """Which vertices and faces of a mesh are left."""
 
-    Attributes:
-        kept: (W,) number of the vertex that each one left has its normal and texture coordinates from.
-        place: (W,) number of the place that each one left stands at.
-        places: (V,) number of the place that each vertex of the mesh goes to.
-        faces: (G, 3) indices of those left.
-    """
-
-    kept: Ints
-    place: Ints
-    places: Ints
-    faces: npt.NDArray[np.uint32]
+    kept: Ints  # (W,) number of the vertex that each one left has its normal and texture coordinates from
+    place: Ints  # (W,) number of the place that each one left stands at
+    places: Ints  # (V,) number of the place that each vertex of the mesh goes to
+    faces: npt.NDArray[np.uint32]  # (G, 3) indices of those left
 
     def of(self, mesh: Mesh) -> Mesh:
         """Return what is left of the mesh, or of one that only stands elsewhere.

@@ -22,14 +22,11 @@ from advsearch.scene.importing.files import shown
 from advsearch.scene.importing.other_formats import CAMERAS
 from advsearch.yaml_text import LARGEST, parse_yaml
 
-LARGEST_JSON = 1 << 25
-"""Bytes of a JSON file, which may hold the pose of every picture."""
-MOST_BINNED = 64
-"""Pixels along a side that a sensor makes into one, at most."""
+LARGEST_JSON = 1 << 25  # bytes of a JSON file, which may hold the pose of every picture
+MOST_BINNED = 64  # pixels along a side that a sensor makes into one, at most
 IN_OPENCV = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tauX", "tauY")
 """OpenCV's order, which ROS has too."""
-LENGTHS = (0, 4, 5, 8, 12, 14)
-"""How many of them there may be."""
+LENGTHS = (0, 4, 5, 8, 12, 14)  # how many of them there may be
 COLMAP: Mapping[str, tuple[str, str]] = {
     "SIMPLE_PINHOLE": (BROWN_CONRADY, "f cx cy"),
     "PINHOLE": (BROWN_CONRADY, "fx fy cx cy"),
@@ -46,22 +43,13 @@ COLMAP: Mapping[str, tuple[str, str]] = {
 }
 """COLMAP's models that are one of ours, with their parameters. FOV, EUCM, the division models and those with a thin
 prism on a fisheye are not."""
+_OF_BROWN = "plumb_bob rational_polynomial thin_prism radtan radial_tangential brown_conrady none".split()
 OF_DISTORTION = {
-    "plumb_bob": BROWN_CONRADY,
-    "rational_polynomial": BROWN_CONRADY,
-    "thin_prism": BROWN_CONRADY,
-    "radtan": BROWN_CONRADY,
-    "radial_tangential": BROWN_CONRADY,
-    "brown_conrady": BROWN_CONRADY,
-    "none": BROWN_CONRADY,
-    "": BROWN_CONRADY,
-    "equidistant": FISHEYE,
-    "fisheye": FISHEYE,
-    "kannala_brandt": FISHEYE,
+    **dict.fromkeys((*_OF_BROWN, ""), BROWN_CONRADY),
+    **dict.fromkeys(("equidistant", "fisheye", "kannala_brandt"), FISHEYE),
     EQUIRECTANGULAR: EQUIRECTANGULAR,
 }
 """The distortion models of ROS, Kalibr and EuRoC that are one of ours."""
-
 MATRIX = ("cameramatrix", "k", "intrinsicmatrix", "mtx", "cameramatrix1", "m1")
 DISTORTION = (
     *("distortioncoefficients", "distcoeffs", "distortioncoeffs", "distcoeff", "distortion", "d", "dist"),
@@ -72,8 +60,7 @@ SIZE = ("imagesize", "resolution")
 GROUPS = ("projection_parameters", "distortion_parameters", "mirror_parameters")
 KANNALA = {"mu": "fx", "mv": "fy", "u0": "cx", "v0": "cy", "k2": "k1", "k3": "k2", "k4": "k3", "k5": "k4"}
 """What camodocal calls the numbers of a fisheye, and OpenCV."""
-ALIKE = 0.01
-"""By what share a focal length may differ from what an angle says."""
+ALIKE = 0.01  # by what share a focal length may differ from what an angle says
 OF_A_FRAME = frozenset(("camera_model", "fl_x", "fl_y", "cx", "cy", "w", "h", *IN_OPENCV))
 """What nerfstudio says of a camera, of all frames or of one."""
 OF_A_SCENE = frozenset(
@@ -85,15 +72,11 @@ OF_A_SCENE = frozenset(
 
 
 def read_camera(spec: str) -> CameraModel:
-    """Read a camera's model.
+    """Read a camera's model from a file; of several cameras in it that which is named, as in ``camchain.yaml#cam1`` and
+    ``cameras.txt#3``.
 
-    Args:
-        spec: path of the file; of several cameras in it with the one that is meant, as in ``camchain.yaml#cam1`` and
-            ``cameras.txt#3``.
-
-    Raises:
-        FileFormatError: the file is missing, is none of these kinds, has a model that is not one of ours, numbers that
-            no camera has, or an entry that makes another picture and is not read.
+    Raises FileFormatError: the file is missing, is none of these kinds, has a model that is not one of ours, numbers
+    that no camera has, or an entry that makes another picture and is not read.
     """
     path, _, which = spec.partition("#")
     ending = Path(path).suffix.lower()
@@ -108,26 +91,39 @@ def read_camera(spec: str) -> CameraModel:
     data = _data(path, text)
     if "frames" in data or "fl_x" in data or "camera_angle_x" in data:
         return _of_nerfstudio(spec, which, data)
-    cameras = {name: one for name, one in data.items() if isinstance(one, dict) and "intrinsics" in one}
+    cameras = {name: entry for name, entry in data.items() if isinstance(entry, dict) and "intrinsics" in entry}
     if cameras:
-        rest = Entries(path, {name: one for name, one in data.items() if name not in cameras})
+        rest = Entries(path, {name: entry for name, entry in data.items() if name not in cameras})
         return _of_kalibr(spec, Entries(path, _chosen(path, which, cameras)), rest.told())
     if which:
-        raise FileFormatError(
-            f"{path}: expected several cameras, as {which!r} is asked for, got one; leave #{which} out"
-        )
+        wanted = f"expected several cameras, as {which!r} is asked for"
+        raise FileFormatError(f"{path}: {wanted}, got one; leave #{which} out")
     if "intrinsics" in data and "camera_model" in data:
         return _of_kalibr(spec, Entries(path, data))
     return _of_opencv(spec, Entries(path, _of_camodocal(data)))
 
 
 def _data(path: str, text: str) -> dict[str, Any]:
-    """The entries of a text in XML, JSON or YAML."""
+    """The entries of a text in XML, JSON or YAML, also as OpenCV writes that: with a directive and tags of its own."""
     if text.lstrip().startswith("<"):
         return _xml(path, text)
-    if not path.lower().endswith(".json"):
-        return _yaml(path, text)
-    return _checked(path, read_json(path, text))
+    if path.lower().endswith(".json"):
+        data = read_json(path, text)
+    else:
+        text = re.sub(r"!!opencv-(nd-)?matrix", "", re.sub(r"\A%YAML[^\n]*\n", "", text))
+        text = re.sub(r"\A\s*---[^\n]*\n", "", text).split("\n---")[0]
+        try:
+            data = parse_yaml(text)
+        except ValueError as error:
+            wanted = "expected YAML, or COLMAP's cameras.txt"
+            raise FileFormatError(f"{path}: {wanted}, got {error}; correct the file") from None
+    if not isinstance(data, dict) or not all(isinstance(name, str) for name in data):
+        got = "an empty file" if data is None else f"a {type(data).__name__}"
+        raise FileFormatError(
+            f"{path}: expected a camera of OpenCV, Kalibr, ROS, COLMAP or nerfstudio, got {got}; docs/cameras.md shows "
+            "one of each"
+        )
+    return data
 
 
 def camera_text(path: str, most: int, what: str = "a camera file") -> str:
@@ -146,28 +142,6 @@ def read_json(path: str, text: str) -> Any:
         raise FileFormatError(f"{path}: expected JSON, got {error}; correct the file") from None
 
 
-def _yaml(path: str, text: str) -> dict[str, Any]:
-    """The mapping of a YAML text, also as OpenCV writes it: with a directive and tags that are not YAML's."""
-    text = re.sub(r"!!opencv-(nd-)?matrix", "", re.sub(r"\A%YAML[^\n]*\n", "", text))
-    text = re.sub(r"\A\s*---[^\n]*\n", "", text).split("\n---")[0]
-    try:
-        return _checked(path, parse_yaml(text))
-    except ValueError as error:
-        raise FileFormatError(
-            f"{path}: expected YAML, or COLMAP's cameras.txt, got {error}; correct the file"
-        ) from None
-
-
-def _checked(path: str, data: object) -> dict[str, Any]:
-    if not isinstance(data, dict) or not all(isinstance(name, str) for name in data):
-        got = "an empty file" if data is None else f"a {type(data).__name__}"
-        raise FileFormatError(
-            f"{path}: expected a camera of OpenCV, Kalibr, ROS, COLMAP or nerfstudio, got {got}; docs/cameras.md shows "
-            "one of each"
-        )
-    return data
-
-
 def _xml(path: str, text: str) -> dict[str, Any]:
     """What OpenCV writes as XML, in the form of its YAML."""
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
@@ -181,30 +155,24 @@ def _xml(path: str, text: str) -> dict[str, Any]:
             f"{path}: expected a camera of OpenCV in <opencv_storage>, got <{root.tag[:40]}>; docs/cameras.md has the "
             "formats that are read"
         )
-    return {one.tag: _of_element(one) for one in root}
-
-
-def _of_element(element: ElementTree.Element) -> object:
-    """The numbers of a matrix, the entries of another element with some inside, or text."""
-    if (data := element.findtext("data")) is not None:
-        return data.split()
-    if len(element):
-        return {one.tag: (one.text or "").strip() for one in element}
-    return (element.text or "").strip()
+    entries = dict[str, Any]()
+    for element in root:
+        inner = {entry.tag: (entry.text or "").strip() for entry in element}
+        matrix = element.findtext("data")
+        entries[element.tag] = (inner or (element.text or "").strip()) if matrix is None else matrix.split()
+    return entries
 
 
 def _chosen(path: str, which: str, cameras: Mapping[str, Any]) -> Any:
     """The camera that is asked for, or the only one."""
     names = list(map(str, cameras))
     listed = ", ".join(names[:8]) + (", ..." if len(names) > 8 else "")
+    first = f"{path}#{names[0]}"
     if which and which not in names:
-        raise FileFormatError(
-            f"{path}: expected one of its cameras {listed}, got {which[:40]!r}; write {path}#{names[0]}"
-        )
+        raise FileFormatError(f"{path}: expected one of its cameras {listed}, got {which[:40]!r}; write {first}")
     if not which and len(names) > 1:
-        raise FileFormatError(
-            f"{path}: has {len(names)} cameras, {listed}: say which one takes the picture, as in {path}#{names[0]}"
-        )
+        what = f"has {len(names)} cameras, {listed}"
+        raise FileFormatError(f"{path}: {what}: say which one takes the picture, as in {first}")
     return cameras[which or names[0]]
 
 
@@ -214,9 +182,8 @@ def _chosen(path: str, which: str, cameras: Mapping[str, Any]) -> Any:
 def _of_colmap(spec: str, path: str, which: str, lines: Sequence[str]) -> CameraModel:
     rows = {words[0]: words for line in lines if (words := line.split())}
     if len(rows) < len(lines):
-        raise FileFormatError(
-            f"{path}: expected each camera once, got one with the same number twice; correct the file"
-        )
+        twice = "expected each camera once, got one with the same number twice"
+        raise FileFormatError(f"{path}: {twice}; correct the file")
     _, name, *rest = _chosen(path, which, rows)
     if name not in COLMAP:
         raise FileFormatError(
@@ -227,23 +194,24 @@ def _of_colmap(spec: str, path: str, which: str, lines: Sequence[str]) -> Camera
     wanted = ["width", "height", *names.split()]
     if len(rest) != len(wanted):
         raise FileFormatError(f"{path}: {name}: expected {' '.join(wanted)}, got {len(rest)} numbers; correct the line")
-    found = {one: number(path, one, value) for one, value in zip(wanted, rest, strict=True)}
-    size = (found.pop("height"), found.pop("width"))
-    if "f" in found:
-        found["fx"] = found["fy"] = found.pop("f")
-    return made(spec, kind, size, found)
+    numbers = {key: number(path, key, value) for key, value in zip(wanted, rest, strict=True)}
+    size = (numbers.pop("height"), numbers.pop("width"))
+    if "f" in numbers:
+        numbers["fx"] = numbers["fy"] = numbers.pop("f")
+    return made(spec, kind, size, numbers)
 
 
 def _of_nerfstudio(spec: str, which: str, data: Mapping[str, Any]) -> CameraModel:
     """A transforms.json of nerfstudio or Instant NGP; of several cameras in its frames the one with that number."""
     path, frames = spec.partition("#")[0], data.get("frames") or []
-    frames = [one for one in frames if isinstance(one, dict)] if isinstance(frames, list) else []
-    own = [{key: one[key] for key in one if key in OF_A_FRAME} for one in frames] or [{}]
-    if which or any(one != own[0] for one in own):
-        own = [_chosen(path, which, {str(count): one for count, one in enumerate(own)})]
-    others = {key: one for frame in frames for key, one in frame.items() if key not in OF_A_FRAME | OF_A_SCENE}
-    entries = Entries(path, {key: one for key, one in data.items() if key not in OF_A_SCENE} | own[0])
-    width, height = (entries.number((side,), side) for side in ("w", "h"))
+    frames = [frame for frame in frames if isinstance(frame, dict)] if isinstance(frames, list) else []
+    lenses = [{key: frame[key] for key in frame if key in OF_A_FRAME} for frame in frames] or [{}]
+    lens = lenses[0]
+    if which or any(other != lens for other in lenses):
+        lens = _chosen(path, which, dict(zip(map(str, range(len(lenses))), lenses, strict=True)))
+    others = {key: value for frame in frames for key, value in frame.items() if key not in OF_A_FRAME | OF_A_SCENE}
+    entries = Entries(path, {key: value for key, value in data.items() if key not in OF_A_SCENE} | lens)
+    width, height = (entries.number(side) for side in ("w", "h"))
     name = str(entries.get("cameramodel") or "PINHOLE").upper()
     if name not in (*COLMAP, "PERSPECTIVE"):
         raise FileFormatError(
@@ -257,15 +225,14 @@ def _of_nerfstudio(spec: str, which: str, data: Mapping[str, Any]) -> CameraMode
         0.0 if angle is None else side / 2.0 / max(math.tan(number(path, "camera_angle", angle) / 2.0), 1e-9)
         for angle, side in zip(angles, (width, height), strict=True)
     ]
-    fx = entries.number(("flx",), "fl_x", lengths[0] or None)
+    fx = entries.number("fl_x", lengths[0] or None)
     if lengths[0] and abs(fx - lengths[0]) > ALIKE * fx:
-        raise FileFormatError(
-            f"{path}: fl_x: expected {lengths[0]:g}, as camera_angle_x says, got {fx:g}; leave one out"
-        )
-    found = {"fx": fx, "fy": entries.number(("fly",), "fl_y", lengths[1] or fx)}
-    found |= {axis: entries.number((axis,), axis, side / 2.0) for axis, side in (("cx", width), ("cy", height))}
-    found |= _coefficients(entries, COEFFICIENTS[:4] if kind == FISHEYE else ("k1", "k2", "k3", "p1", "p2"))
-    model = made(spec, kind, (height, width), found)
+        wanted = f"expected {lengths[0]:g}, as camera_angle_x says"
+        raise FileFormatError(f"{path}: fl_x: {wanted}, got {fx:g}; leave one out")
+    numbers = {"fx": fx, "fy": entries.number("fl_y", lengths[1] or fx)}
+    numbers |= {axis: entries.number(axis, side / 2.0) for axis, side in (("cx", width), ("cy", height))}
+    numbers |= _coefficients(entries, COEFFICIENTS[:4] if kind == FISHEYE else ("k1", "k2", "k3", "p1", "p2"))
+    model = made(spec, kind, (height, width), numbers)
     return with_told(model, [*entries.told(), *Entries(path, others).told("frames.")])
 
 
@@ -281,11 +248,11 @@ def _of_kalibr(spec: str, entries: Entries, beside: Sequence[str] = ()) -> Camer
     kind = _kind(path, entries.get("distortionmodel"))
     focal = entries.numbers("intrinsics", entries.get("intrinsics"), (4,))
     names = ("k1", "k2", "k3", "k4") if kind == FISHEYE else ("k1", "k2", "p1", "p2")
-    width, height = entries.numbers("resolution", entries.there(("resolution",), "resolution"), (2,))
-    found = _distortion(entries, names, (0, 4))
-    _check_none(path, entries.get("distortionmodel"), found)
-    found |= zip(("fx", "fy", "cx", "cy"), focal, strict=True)
-    return with_told(made(spec, kind, (height, width), _from_corner(found)), [*beside, *entries.told()])
+    width, height = entries.numbers("resolution", entries.there("resolution"), (2,))
+    numbers = _distortion(entries, names, (0, 4))
+    _check_none(path, entries.get("distortionmodel"), numbers)
+    numbers |= zip(("fx", "fy", "cx", "cy"), focal, strict=True)
+    return with_told(made(spec, kind, (height, width), _from_corner(numbers)), [*beside, *entries.told()])
 
 
 def _of_opencv(spec: str, entries: Entries) -> CameraModel:
@@ -308,15 +275,15 @@ def _of_opencv(spec: str, entries: Entries) -> CameraModel:
         raise FileFormatError(f"{path}: camera_matrix: expected fx, skew, cx, 0, fy, cy, 0, 0, 1, got other numbers")
     size, fisheye = _size(entries), kind == FISHEYE
     unread = _check_roi(entries, size)
-    found = _distortion(entries, COEFFICIENTS[:4] if fisheye else IN_OPENCV, (0, 4) if fisheye else LENGTHS)
-    _check_none(path, entries.get("distortionmodel"), found)
-    if found.pop("tauX", 0.0) or found.pop("tauY", 0.0):
+    numbers = _distortion(entries, COEFFICIENTS[:4] if fisheye else IN_OPENCV, (0, 4) if fisheye else LENGTHS)
+    _check_none(path, entries.get("distortionmodel"), numbers)
+    if numbers.pop("tauX", 0.0) or numbers.pop("tauY", 0.0):
         raise FileFormatError(
             f"{path}: expected no tilt of the sensor (tauX, tauY), got one; calibrate without CALIB_TILTED_MODEL"
         )
-    found |= {"fx": matrix[0], "skew": matrix[1], "cx": matrix[2], "fy": matrix[4], "cy": matrix[5]}
+    numbers |= {"fx": matrix[0], "skew": matrix[1], "cx": matrix[2], "fy": matrix[4], "cy": matrix[5]}
     (height, width), (down, across) = size, _binning(entries)
-    model = made(spec, kind, (height - height % down, width - width % across), _from_corner(found))
+    model = made(spec, kind, (height - height % down, width - width % across), _from_corner(numbers))
     model = replace(model, size=(int(height // down), int(width // across)))
     rectified = _rectified(entries, matrix)
     return with_told(model, unread + entries.told(), rectified)
@@ -324,19 +291,17 @@ def _of_opencv(spec: str, entries: Entries) -> CameraModel:
 
 def _of_camodocal(data: Mapping[str, Any]) -> dict[str, Any]:
     """Entries without the groups that camodocal (VINS) has, and with OpenCV's names for its fisheye's numbers."""
-    groups = [one for name in GROUPS if isinstance(one := data.get(name), dict)]
-    found = {name: one for name, one in data.items() if not (name in GROUPS and isinstance(one, dict))}
-    for group in groups:
-        found |= {KANNALA.get(str(key), str(key)) if "mu" in group else str(key): one for key, one in group.items()}
-    return found
+    groups = {name: group for name in GROUPS if isinstance(group := data.get(name), dict)}
+    flat = {name: value for name, value in data.items() if name not in groups}
+    for group in groups.values():
+        names = KANNALA if "mu" in group else {}
+        flat |= {names.get(str(key), str(key)): value for key, value in group.items()}
+    return flat
 
 
-def _from_corner(found: dict[str, float]) -> dict[str, float]:
+def _from_corner(numbers: dict[str, float]) -> dict[str, float]:
     """The principal point from the corner of the picture, where it is given from the centre of the first pixel."""
-    return {**found, "cx": found["cx"] + 0.5, "cy": found["cy"] + 0.5}
-
-
-# ---- what they are made of ------------------------------------------------------------------------------------------
+    return {**numbers, "cx": numbers["cx"] + 0.5, "cy": numbers["cy"] + 0.5}
 
 
 def _distortion(entries: Entries, names: Sequence[str], counts: Sequence[int]) -> dict[str, float]:
@@ -357,37 +322,34 @@ def _matrix(entries: Entries) -> list[float]:
     """The camera matrix, row by row, also of its numbers one by one."""
     given = entries.get(*MATRIX)
     if given is None and entries.get("fx") is not None:
-        fx, fy, cx, cy = (entries.number((one,), one) for one in ("fx", "fy", "cx", "cy"))
+        fx, fy, cx, cy = (entries.number(name) for name in ("fx", "fy", "cx", "cy"))
         return [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
-    return entries.numbers("camera_matrix", entries.there(MATRIX, "camera_matrix"), (9,))
+    return entries.numbers("camera_matrix", entries.there("camera_matrix", MATRIX), (9,))
 
 
 def _coefficients(entries: Entries, names: Sequence[str]) -> dict[str, float]:
-    return {name: entries.number((plain(name),), name, 0.0) for name in names}
+    return {name: entries.number(name, 0.0) for name in names}
 
 
 def _rectified(entries: Entries, matrix: Sequence[float]) -> list[str]:
     """What there is about rectified pictures, which the camera's own ones are not; none where that changes nothing."""
     x, skew, cx, y, cy = (matrix[place] for place in (0, 1, 2, 4, 5))
-    same = ([1.0, 0, 0, 0, 1, 0, 0, 0, 1], [x, skew, cx, 0, 0, y, cy, 0, 0, 0, 1, 0])
-    found = []
-    words = ("rectification_matrix", "projection_matrix")
-    for names, shown_as, expected in zip(
-        (("rectificationmatrix", "r"), ("projectionmatrix", "p")), words, same, strict=True
+    other = []
+    for name, short, expected in (
+        ("rectification_matrix", "r", [1.0, 0, 0, 0, 1, 0, 0, 0, 1]),
+        ("projection_matrix", "p", [x, skew, cx, 0, 0, y, cy, 0, 0, 0, 1, 0]),
     ):
-        given = entries.get(*names)
-        if nothing(given):
-            continue
-        told = entries.numbers(shown_as, given, (len(expected),))
-        if any(abs(one - other) > 1e-6 * max(1.0, abs(other)) for one, other in zip(told, expected, strict=True)):
-            found.append(shown_as)
-    return found
+        given = entries.get(plain(name), short)
+        numbers = expected if nothing(given) else entries.numbers(name, given, (len(expected),))
+        if any(abs(a - b) > 1e-6 * max(1.0, abs(b)) for a, b in zip(numbers, expected, strict=True)):
+            other.append(name)
+    return other
 
 
 def _check_roi(entries: Entries, size: tuple[float, float]) -> list[str]:
     """Refuse a part of the picture (0, 0 and its own size are the whole); return what it says that is not read."""
     roi = entries.part("roi")
-    x, y, height, width = (roi.number((plain(one),), one, 0.0) for one in ("x_offset", "y_offset", "height", "width"))
+    x, y, height, width = _coefficients(roi, ("x_offset", "y_offset", "height", "width")).values()
     roi.get("dorectify")
     if (x, y) != (0.0, 0.0) or (height, width) not in ((0.0, 0.0), size):
         raise FileFormatError(
@@ -412,14 +374,15 @@ def _size(entries: Entries) -> tuple[float, float]:
     if (given := entries.get(*SIZE)) is not None:
         width, height = entries.numbers("image_size", given, (2,))
         return height, width
-    width, height = (entries.number(names, one) for names, one in ((WIDTH, "image_width"), (HEIGHT, "image_height")))
-    return height, width
+    width = entries.number("image_width", names=WIDTH)
+    return entries.number("image_height", names=HEIGHT), width
 
 
 def _binning(entries: Entries) -> tuple[float, float]:
     """Pixels, down and across, that ROS says are made into one; its calibration is for those before."""
-    found = {name: entries.number((plain(name),), name, 1.0) or 1.0 for name in ("binning_y", "binning_x")}
-    for name, one in found.items():
-        if one != int(one) or not 1 <= one <= MOST_BINNED:
-            raise FileFormatError(f"{entries.path}: {name}: expected a whole number up to {MOST_BINNED}, got {one:g}")
-    return found["binning_y"], found["binning_x"]
+    down, across = (entries.number(name, 1.0) or 1.0 for name in ("binning_y", "binning_x"))
+    for name, pixels in (("binning_y", down), ("binning_x", across)):
+        if pixels != int(pixels) or not 1 <= pixels <= MOST_BINNED:
+            wanted = f"a whole number up to {MOST_BINNED}"
+            raise FileFormatError(f"{entries.path}: {name}: expected {wanted}, got {pixels:g}")
+    return down, across

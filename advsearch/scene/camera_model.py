@@ -77,7 +77,7 @@ class CameraModel:
 
     def with_numbers(self, numbers: Tensor) -> CameraModel:
         """Return the model with other numbers (17,)."""
-        return replace(self, numbers=tuple(float(one) for one in numbers.double()))
+        return replace(self, numbers=tuple(numbers.double().tolist()))
 
     def check_given(self, given: Iterable[str]) -> None:
         """Check that nobody asks for the field of view of a camera that has focal lengths of its own.
@@ -113,9 +113,9 @@ class CameraModel:
             radius = flat.norm(dim=-1)
             seen = (z > 0.0) & (radius <= self._last)
             bent = self._bent(flat)
-        one = self.values
-        column = one["fx"] * bent[..., 0] + one["skew"] * bent[..., 1] + one["cx"]
-        return torch.stack([column, one["fy"] * bent[..., 1] + one["cy"]], dim=-1), seen
+        fx, fy, cx, cy, skew = self.numbers[: len(LINEAR)]
+        column = fx * bent[..., 0] + skew * bent[..., 1] + cx
+        return torch.stack([column, fy * bent[..., 1] + cy], dim=-1), seen
 
     def rays(self, places: Tensor) -> tuple[Tensor, Tensor]:
         """Return the directions in which places (N, 2) in the picture look, and how far inside the view they are.
@@ -131,13 +131,11 @@ class CameraModel:
         if self.kind == EQUIRECTANGULAR:
             longitude, latitude = (u - 0.5) * (2.0 * torch.pi), (v - 0.5) * torch.pi
             level = latitude.cos()
-            return torch.stack([level * longitude.sin(), latitude.sin(), level * longitude.cos()], -1), torch.ones_like(
-                u
-            )
-        one = self.values
-        y = (v - one["cy"]) / one["fy"]
-        x = (u - one["cx"] - one["skew"] * y) / one["fx"]
-        bent = torch.stack([x, y], dim=-1)
+            directions = torch.stack([level * longitude.sin(), latitude.sin(), level * longitude.cos()], -1)
+            return directions, torch.ones_like(u)
+        fx, fy, cx, cy, skew = self.numbers[: len(LINEAR)]
+        y = (v - cy) / fy
+        bent = torch.stack([(u - cx - skew * y) / fx, y], dim=-1)
         radius = bent.norm(dim=-1)
         axis = bent / radius.clamp_min(1e-300)[..., None]
         high = min(self._last, FAR)
@@ -154,23 +152,29 @@ class CameraModel:
         directions = torch.cat([flat, torch.ones_like(flat[..., :1])], dim=-1)
         return directions, _inside(most - radius, converged)
 
+    def table(self, places: Tensor) -> Tensor:
+        """Return what `rays` says of places (N, 2), for the axes of Mitsuba's cameras: (N, 4) float32, to the left, up
+        and ahead, and over 0 where something is seen."""
+        directions, inside = self.rays(places)
+        return torch.cat([directions * torch.tensor([-1.0, -1.0, 1.0]), inside[:, None]], dim=-1).float()
+
     def _inverted(self, wanted: Tensor, high: float) -> tuple[Tensor, Tensor]:
         """Solve radial(found) = wanted within [0, high], where it grows; and which of them are solved."""
         bound = min(1.0, high)
         while bound < high and float(self._radial(torch.tensor(bound, dtype=torch.float64))) < float(wanted.max()):
             bound = min(2.0 * bound, high)
         low, most = torch.zeros_like(wanted), torch.full_like(wanted, bound)
-        found = torch.minimum(wanted, most)
+        radius = torch.minimum(wanted, most)
         for _ in range(STEPS):
-            there, (slope,) = _with_slopes(lambda radius: self._radial(radius)[..., None], found)
+            there, (slope,) = _with_slopes(lambda at: self._radial(at)[..., None], radius)
             error = there[..., 0] - wanted
             if bool(((error.abs() <= TOLERANCE) | (most - low <= TOLERANCE)).all()):
                 break
-            most, low = torch.where(error > 0.0, found, most), torch.where(error > 0.0, low, found)
-            step = found - error / slope
-            found = torch.where((step > low) & (step < most), step, (low + most) / 2.0)
-        error = (self._radial(found) - wanted).abs()
-        return found, error <= 1e3 * TOLERANCE * (1.0 + wanted)
+            most, low = torch.where(error > 0.0, radius, most), torch.where(error > 0.0, low, radius)
+            step = radius - error / slope
+            radius = torch.where((step > low) & (step < most), step, (low + most) / 2.0)
+        error = (self._radial(radius) - wanted).abs()
+        return radius, error <= 1e3 * TOLERANCE * (1.0 + wanted)
 
     def _newton(self, flat: Tensor, bent: Tensor, high: float) -> tuple[Tensor, Tensor]:
         """Solve bent(found) = bent in two dimensions from (N, 2); and which are solved, before the lens folds."""
@@ -196,11 +200,10 @@ class CameraModel:
     @cached_property
     def _polynomials(self) -> tuple[np.ndarray, np.ndarray]:
         """Numerator and denominator of radial(r) / r in r^2."""
-        one = self.values
+        k = self.numbers[len(LINEAR) :]
         if self.kind == FISHEYE:
-            return np.array([1.0, one["k1"], one["k2"], one["k3"], one["k4"]]), np.ones(1)
-        over, under = ([1.0, *(one[name] for name in names)] for names in (("k1", "k2", "k3"), ("k4", "k5", "k6")))
-        return polynomial.polytrim(over), polynomial.polytrim(under)
+            return np.array([1.0, *k[:4]]), np.ones(1)
+        return polynomial.polytrim([1.0, *k[:3]]), polynomial.polytrim([1.0, *k[3:6]])
 
     @cached_property
     def fold(self) -> float:
@@ -242,10 +245,10 @@ class CameraModel:
 
     def _decentred(self, flat: Tensor) -> Tensor:
         """The part of the distortion that is not radial: of a lens off its centre, and of a thin prism."""
-        one, (x, y) = self.values, flat.unbind(dim=-1)
+        (p1, p2, s1, s2, s3, s4), (x, y) = self.numbers[NUMBERS.index("p1") :], flat.unbind(dim=-1)
         square = x * x + y * y
-        aside = 2.0 * one["p1"] * x * y + one["p2"] * (square + 2.0 * x * x) + square * (one["s1"] + one["s2"] * square)
-        below = one["p1"] * (square + 2.0 * y * y) + 2.0 * one["p2"] * x * y + square * (one["s3"] + one["s4"] * square)
+        aside = 2.0 * p1 * x * y + p2 * (square + 2.0 * x * x) + square * (s1 + s2 * square)
+        below = p1 * (square + 2.0 * y * y) + 2.0 * p2 * x * y + square * (s3 + s4 * square)
         return torch.stack([aside, below], dim=-1)
 
     # ---- what follows from it ---------------------------------------------------------------------------------------
@@ -255,13 +258,9 @@ class CameraModel:
         """Half the sides of a rectangle around the axis, as tangents, that is in the picture as a whole."""
         edges = self._half_widths()
         along = torch.linspace(-1.0, 1.0, 17, dtype=torch.float64)
-        rim = torch.stack(
-            [
-                torch.cat([along, along, torch.ones_like(along), -torch.ones_like(along)]),
-                torch.cat([torch.ones_like(along), -torch.ones_like(along), along, along]),
-            ],
-            dim=-1,
-        ) * torch.tensor(edges, dtype=torch.float64)
+        end = torch.ones_like(along)
+        rim = torch.stack([torch.cat([along, along, end, -end]), torch.cat([end, -end, along, along])], dim=-1)
+        rim = rim * torch.tensor(edges, dtype=torch.float64)
         for share in torch.linspace(1.0, 0.02, 50).tolist():
             points = torch.cat([share * rim, torch.ones_like(rim[:, :1])], dim=-1)
             places, seen = self.project(points)
@@ -297,15 +296,12 @@ class CameraModel:
         """What a user should know of it, in sentences."""
         if self.black == 0.0:
             return self.told
-        name = self.name or "the lens"
+        name, share = self.name or "the lens", f"{100.0 * self.black:.2g} % of the picture"
+        black = f"{name}: {share} lies outside the lens's circle and is black."
         if self.fold < math.radians(self.reach):
-            return (
-                *self.told,
-                f"{name}: the lens folds at {math.degrees(self.fold):.1f} degrees from its axis, and "
-                f"{100.0 * self.black:.2g} % of the picture, which only directions beyond that would fill, is black.",
-            )
-        circle = f"{name}: {100.0 * self.black:.2g} % of the picture lies outside the lens's circle and is black."
-        return (*self.told, circle)
+            folds = f"{name}: the lens folds at {math.degrees(self.fold):.1f} degrees from its axis"
+            black = f"{folds}, and {share}, which only directions beyond that would fill, is black."
+        return (*self.told, black)
 
     def scaling(self, resolution: tuple[int, int]) -> tuple[str, ...]:
         """Return what is to be said of a picture of another size (height, width) than the model is for."""
@@ -321,12 +317,8 @@ class CameraModel:
 
 
 def pinhole(fov: float, aspect: float) -> CameraModel:
-    """Return the model of a camera without distortion.
-
-    Args:
-        fov: field of view along the larger side of the picture, degrees.
-        aspect: width over height of the picture.
-    """
+    """Return the model of a camera without distortion, with a field of view along the larger side, degrees, and an
+    aspect of width over height."""
     focal = 0.5 / math.tan(math.radians(fov) / 2.0)
     linear = (focal * max(1.0, 1.0 / aspect), focal * max(1.0, aspect), 0.5, 0.5, 0.0)
     return CameraModel(BROWN_CONRADY, (*linear, *[0.0] * len(COEFFICIENTS)))
@@ -353,10 +345,10 @@ def _positive_roots(coefficients: np.ndarray) -> np.ndarray:
 
 def _evaluated(coefficients: np.ndarray, at: Tensor) -> Tensor:
     """A polynomial, lowest power first."""
-    found = torch.full_like(at, float(coefficients[-1]))
-    for one in coefficients[-2::-1]:
-        found = found * at + float(one)
-    return found
+    value = torch.full_like(at, float(coefficients[-1]))
+    for coefficient in coefficients[-2::-1]:
+        value = value * at + float(coefficient)
+    return value
 
 
 def _with_slopes(function: Field, at: Tensor) -> tuple[Tensor, list[Tensor]]:
@@ -364,7 +356,7 @@ def _with_slopes(function: Field, at: Tensor) -> tuple[Tensor, list[Tensor]]:
     with torch.enable_grad():
         places = at.detach().requires_grad_()
         values = function(places)
-        slopes = [torch.autograd.grad(one.sum(), places, retain_graph=True)[0] for one in values.unbind(dim=-1)]
+        slopes = [torch.autograd.grad(each.sum(), places, retain_graph=True)[0] for each in values.unbind(dim=-1)]
     return values.detach(), slopes
 
 

@@ -126,13 +126,8 @@ class BlenderError(AdvsearchError):
 
 
 class Cycles:
-    """Renders the configurations of one scene by Cycles.
-
-    Args:
-        description: of the scene.
-        resolution: (height, width) in pixels.
-        max_depth: longest light path in segments.
-        denoise: with Blender's Open Image Denoise.
+    """Renders the configurations of one scene at a resolution (height, width) by Cycles, with light paths of at most so
+    many segments, and with Blender's Open Image Denoise or without.
 
     Raises:
         BlenderError: there is no Blender, or the scene has what is not carried over.
@@ -145,17 +140,16 @@ class Cycles:
             self._command = command("Blender's Cycles has to render it", "leave `ways=blender` out")
         except FileFormatError as error:
             raise BlenderError(str(error)) from None
-        unknown = [one.name for one in description.parts if not isinstance(one, (MeshPart, PointLamp, BallLamp))]
-        unknown += [
-            f"a surface of Mitsuba's own on the {name}" for name, one in description.meshes.items() if one.surface
-        ]
+        unknown = [part.name for part in description.parts if not isinstance(part, (MeshPart, PointLamp, BallLamp))]
+        own = [name for name, mesh in description.meshes.items() if mesh.surface]
+        unknown += [f"a surface of Mitsuba's own on the {name}" for name in own]
         unknown += ["a lens"] if description.thin_lens or description.camera_model else []
         unknown += ["a plain background"] if description.backdrop else []
         if unknown:
             raise BlenderError(f"the scene has {', '.join(unknown[:5])}, which is not carried over to Blender")
         self._description, self._resolution = description, resolution
         self._depth, self._denoise = max_depth, denoise
-        self._held: dict[str, Tensor] | None = None
+        self._held: dict[str, Tensor] = {}
         self._process: _Process | None = None
 
     def radiance(self, inputs: Mapping[str, Tensor], seed: int, spp: int) -> Tensor:
@@ -165,39 +159,36 @@ class Cycles:
             BlenderError: Blender stopped, or took too long.
         """
         held = self._held
-        same = held is not None and held.keys() == inputs.keys()
-        if held is None or not same or not all(torch.equal(held[name], inputs[name]) for name in inputs):
+        same = self._process is not None and held.keys() == inputs.keys()
+        if self._process is None or not (same and all(torch.equal(held[name], inputs[name]) for name in inputs)):
             self._process = None
             self._process = _Process(self._command, *self._told(inputs))
-            self._held = {name: one.detach().clone() for name, one in inputs.items()}
-        assert self._process is not None
+            self._held = {name: value.detach().clone() for name, value in inputs.items()}
         return self._process.picture(seed, spp)
 
     def _told(self, inputs: Mapping[str, Tensor]) -> tuple[dict[str, object], bytes, np.ndarray | None]:
         """What Blender is told beside the meshes, the meshes, and the environment's map."""
         scene, (height, width) = self._description, self._resolution
-        values = {name: one.detach().cpu() for name, one in inputs.items()}
+        values = {name: value.detach().cpu() for name, value in inputs.items()}
         meshes = [posed(part, values) for part in scene.meshes.values()]
         meshes += _ground(scene, values.get("ground.reflectance"))
-        camera = (
-            values.get("camera.to_world", torch.from_numpy(camera_to_world(scene, width / height))).double().numpy()
-        )
+        pose = values.get("camera.to_world", torch.from_numpy(camera_to_world(scene, width / height)))
+        camera = pose.double().numpy()
         fov = float(values.get("camera.fov", torch.tensor([scene.number("camera.fov")]))[0])
         shift = [float(values.get(f"camera.shift_{axis}", torch.zeros(1))[0]) for axis in "xy"]
         lamps: list[dict[str, object]] = []
         for lamp in scene.lamps.values():
-            ball, place = np.eye(4), np.eye(4)
+            ball, place, shape = np.eye(4), np.eye(4), None
             if isinstance(lamp, BallLamp):
                 ball[:3, :3] *= lamp.radius
                 ball[:3, 3] = lamp.place
-                ball = values.get(f"{lamp.name}.ball", torch.from_numpy(ball)).double().numpy()
+                shape = values.get(f"{lamp.name}.ball", torch.from_numpy(ball)).double().tolist()
                 color = values.get(f"{lamp.name}.radiance", torch.tensor(lamp.radiance))
             else:
                 assert isinstance(lamp, PointLamp)  # others are refused before
                 place[:3, 3] = values.get(f"{lamp.name}.position", torch.tensor(lamp.position)).numpy()
                 color = values.get(f"{lamp.name}.intensity", torch.tensor(lamp.intensity))
             if bool((color > 0.0).any()):
-                shape = ball.tolist() if isinstance(lamp, BallLamp) else None
                 lamps.append({"ball": shape, "place": place.tolist(), "color": color.tolist()})
         radiance = None if scene.environment is None else np.asarray(scene.environment.radiance, np.float32)
         if "environment.padded" in values:
@@ -224,17 +215,12 @@ def _ground(scene: SceneDescription, reflectance: Tensor | None) -> list[Shape]:
     if photograph is not None:
         shown = photograph.base if reflectance is None else reflectance
         return [Shape("ground", photograph.mesh, linear_to_srgb(shown.clamp(0.0, 1.0)).numpy(), MATT)]
-    half = scene.number("ground.size") / 2.0
+    half = np.float32(scene.number("ground.size") / 2.0)
     if half <= 0.0 or paved(scene):
         return []
     corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], np.float32)
-    up = np.tile(np.array([[0, 0, 1]], np.float32), (4, 1))
-    mesh = Mesh(
-        corners * np.float32(half),
-        np.array([[0, 1, 2], [0, 2, 3]], np.uint32),
-        up,
-        corners[:, :2] * np.float32(0.5) + np.float32(0.5),
-    )
+    faces, up = np.array([[0, 1, 2], [0, 2, 3]], np.uint32), np.tile(np.array([[0, 0, 1]], np.float32), (4, 1))
+    mesh = Mesh(corners * half, faces, up, corners[:, :2] * np.float32(0.5) + np.float32(0.5))
     return [Shape("ground", mesh, np.full((1, 1, 3), scene.ground_color, np.float32), MATT)]
 
 
@@ -275,19 +261,19 @@ class _Process:
             self._process.stdin.write(f"{seed} {spp} {self._count}\n".encode())
             self._process.stdin.flush()
         except OSError:
-            pass  # it has stopped, which is said below
+            pass  # it has stopped, which is words below
         while not path.is_file():
             if self._process.poll() is not None and not path.is_file():
-                said = last_line(self._said.read_text("utf-8", "replace"))
-                raise BlenderError(f"Blender stopped{said}")
+                words = last_line(self._said.read_text("utf-8", "replace"))
+                raise BlenderError(f"Blender stopped{words}")
             if time.monotonic() > until:
                 raise BlenderError(f"Blender had not rendered it after {files.scaled(LONGEST)} seconds")
             time.sleep(PAUSE)
         with OpenEXR.File(str(path)) as picture:
             pixels = next(iter(picture.channels().values())).pixels
-            found = torch.from_numpy(np.array(pixels[..., :3], dtype=np.float32))
+            radiance = torch.from_numpy(np.array(pixels[..., :3], dtype=np.float32))
         path.unlink()
-        return found
+        return radiance
 
 
 def _end(process: subprocess.Popen[bytes], keeper: tempfile.TemporaryDirectory[str]) -> None:

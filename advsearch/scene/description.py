@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -121,9 +120,10 @@ class SceneDescription:
         Raises:
             InputError: its name is taken.
         """
-        if part.name in (OBJECT, "environment", "ground", "camera", *(one.name for one in self.parts)):
-            plugins = any(one.name == part.name for one in self.parts if isinstance(one, PluginPart))
-            instead = f", or vary what is there: mitsuba:{part.name}.KEY=[low, high]" if plugins else ""
+        taken = {own.name: own for own in self.parts}
+        if part.name in (OBJECT, "environment", "ground", "camera", *taken):
+            plugin = isinstance(taken.get(part.name), PluginPart)
+            instead = f", or vary what is there: mitsuba:{part.name}.KEY=[low, high]" if plugin else ""
             raise InputError(
                 f"`controls` {part.name}: the scene has something of that name already; choose another name, as in "
                 f"light:{part.name}-2{instead}"
@@ -135,11 +135,8 @@ class SceneDescription:
         return replace(self, values={**self.values, **{name.replace("__", "."): v for name, v in given.items()}})
 
     def seen_by(self, camera: str) -> SceneDescription:
-        """Return the scene as one of its cameras sees it, or as the camera around the object does with another lens.
-
-        Args:
-            camera: name of a camera of the scene, a path to a camera file, the name of a bundled camera model, or that
-                of a mounted camera.
+        """Return the scene as one of its cameras sees it, or as the camera around the object does with another lens: by
+        a path to a camera file, the name of a bundled camera model, or that of a mounted camera.
 
         Raises:
             UnknownNameError: it has no such camera.
@@ -166,18 +163,14 @@ class SceneDescription:
                 "its longest side in metres, such as `size=0.1`"
             )
         on_table = self.on_table and self.object.metres <= ON_TABLES
-        height = preset.height - (TABLE if on_table or FLOOR in self.around else 0.0)
-        azimuth = preset.azimuth
-        if azimuth is not None and on_roads(self.object):
-            azimuth += 180.0
         own = {"camera.fov": preset.fov}
         if "camera.elevation" not in self.given:
-            own["camera.height"] = height
-        if azimuth is not None:
-            own["camera.azimuth"] = azimuth
+            own["camera.height"] = preset.height - (TABLE if on_table or FLOOR in self.around else 0.0)
+        if preset.azimuth is not None:
+            own["camera.azimuth"] = preset.azimuth + (180.0 if on_roads(self.object) else 0.0)
         if on_table:
             own["ground.size"] = TABLE_SIDE / self.metres
-        values = {**self.values, **{one: value for one, value in own.items() if one not in self.given}}
+        values = {**self.values, **{setting: value for setting, value in own.items() if setting not in self.given}}
         seen = replace(self, camera=ORBIT_CAMERA, camera_model=None, preset=name, values=values)
         if "camera.distance" in self.given:
             return seen
@@ -187,18 +180,12 @@ class SceneDescription:
 
     def _with_model(self, name: str) -> SceneDescription:
         if is_path(name) and (rig := read_rig(name)):
-            first = rig[0]
-            if first.model is not None:
-                first.model.check_given(self.given)
-            values = {} if first.fov is None else {"camera.fov": first.fov}
-            return replace(
-                self,
-                camera=ORBIT_CAMERA,
-                camera_model=first.model,
-                rig=rig,
-                rig_spec=name,
-                values={**self.values, **values},
-            )
+            model, fov = rig[0].model, rig[0].fov
+            if model is not None:
+                model.check_given(self.given)
+            values = {**self.values, **({} if fov is None else {"camera.fov": fov})}
+            seen = replace(self, camera=ORBIT_CAMERA, camera_model=model, values=values)
+            return replace(seen, rig=rig, rig_spec=name)
         if is_path(name):
             with reading(name.partition("#")[0]):
                 model = read_camera(name)
@@ -214,57 +201,55 @@ class SceneDescription:
     def meshes(self) -> Mapping[str, MeshPart]:
         """Every mesh by name, as the settings have it; the one under test is `OBJECT`."""
         under_test = mesh_part(OBJECT, self.object, object_to_world(self), self.material)
-        found = {OBJECT: under_test, **{name: moved_part(one, self.values) for name, one in self.around.items()}}
-        for name, one in found.items():
-            if isinstance(one, LampGlass):
-                found[name] = replace(one, to_world=found[one.carrier].to_world)
-        return found
+        meshes = {OBJECT: under_test, **{name: moved_part(part, self.values) for name, part in self.around.items()}}
+        glasses = {name: mesh for name, mesh in meshes.items() if isinstance(mesh, LampGlass)}
+        return meshes | {name: replace(one, to_world=meshes[one.carrier].to_world) for name, one in glasses.items()}
 
     @cached_property
     def around(self) -> Mapping[str, MeshPart]:
         """The meshes around the object by name, as they came."""
-        return {one.name: one for one in self.parts if isinstance(one, MeshPart)}
+        return {part.name: part for part in self.parts if isinstance(part, MeshPart)}
 
     @property
     def things(self) -> Mapping[str, ThingPart]:
         """The things beside the object by name, as they came."""
-        return {one.name: one for one in self.parts if isinstance(one, ThingPart)}
+        return {part.name: part for part in self.parts if isinstance(part, ThingPart)}
 
     @property
     def cut_out(self) -> bool:
         """Whether a mesh has cut-outs."""
-        return any(one.opacity is not None for one in self.meshes.values()) or self._has("mask")
+        return any(mesh.opacity is not None for mesh in self.meshes.values()) or self._has("mask")
 
     @property
     def normal_mapped(self) -> bool:
         """Whether a mesh has a normal map."""
-        return any(one.normal_map is not None for one in self.meshes.values()) or self._has("normalmap", "bumpmap")
+        return any(mesh.normal_map is not None for mesh in self.meshes.values()) or self._has("normalmap", "bumpmap")
 
     def _has(self, *kinds: str) -> bool:
         """Whether a surface in Mitsuba's words has a plugin of these."""
-        surfaces = [one.surface for one in self.meshes.values() if one.surface is not None]
+        surfaces = [mesh.surface for mesh in self.meshes.values() if mesh.surface is not None]
         plugins = [part.plugin for part in self.parts if isinstance(part, PluginPart)]
-        return any(one.get("type") in kinds for plugin in (*surfaces, *plugins) for one in plugins_in(plugin))
+        return any(inner.get("type") in kinds for plugin in (*surfaces, *plugins) for inner in plugins_in(plugin))
 
     @property
     def emits(self) -> bool:
         """Whether a mesh emits light."""
-        return any(one.emission is not None for one in self.meshes.values())
+        return any(mesh.emission is not None for mesh in self.meshes.values())
 
     @property
     def lamps(self) -> Mapping[str, Lamp]:
         """Every light beside the environment, by name."""
-        return {one.name: self.placed(one) for one in self.parts if isinstance(one, Lamp)}
+        return {part.name: self.placed(part) for part in self.parts if isinstance(part, Lamp)}
 
     def placed(self, part: ScenePart) -> Any:
         """Return one of the parts as the settings and the camera have it."""
-        if isinstance(part, BeamLamp):
-            if part.carrier == CAMERA:
-                carrier = driving(torch.from_numpy(camera_to_world(self)))
-            else:
-                carrier = torch.from_numpy(self.meshes[part.carrier].to_world)
-            return replace(part, to_world=seated(carrier, torch.from_numpy(part.seat)).numpy())
-        return self.meshes.get(part.name, part)
+        if not isinstance(part, BeamLamp):
+            return self.meshes.get(part.name, part)
+        if part.carrier == CAMERA:
+            carrier = driving(torch.from_numpy(camera_to_world(self)))
+        else:
+            carrier = torch.from_numpy(self.meshes[part.carrier].to_world)
+        return replace(part, to_world=seated(carrier, torch.from_numpy(part.seat)).numpy())
 
     @property
     def lit(self) -> bool:
@@ -331,12 +316,12 @@ class SceneDescription:
     @property
     def given_values(self) -> dict[str, float | str]:
         """The settings that were asked for, as they are written: a choice by its name."""
-        found: dict[str, float | str] = {}
+        asked: dict[str, float | str] = {}
         for name in self.given & self.values.keys():
             value, setting = self.values[name], settings.parameter_of(name)
             if value is not None:
-                found[name] = setting.options[int(value)] if setting is not None and setting.options else value
-        return found
+                asked[name] = setting.options[int(value)] if setting is not None and setting.options else value
+        return asked
 
     @property
     def photograph(self) -> Photograph | None:
@@ -348,21 +333,19 @@ class SceneDescription:
         own, kind = self.environment, self.values.get("ground.kind")
         if own is None or self.number("ground.size") == 0.0:
             return None
-        if kind is None and (
-            not own.photographed or self.backdrop or not self.given.isdisjoint(settings.TABLE_SETTINGS)
-        ):
-            return None
-        if kind is not None and settings.GROUND_KINDS[int(kind)] != settings.PHOTOGRAPH:
-            return None
-        return photograph_of(own, self.capture_height, self.number("environment.rotation"))
+        if kind is not None:
+            shows = settings.GROUND_KINDS[int(kind)] == settings.PHOTOGRAPH
+        else:
+            shows = own.photographed and not self.backdrop and self.given.isdisjoint(settings.TABLE_SETTINGS)
+        return photograph_of(own, self.capture_height, self.number("environment.rotation")) if shows else None
 
     @property
     def capture_height(self) -> float:
         """Height above the floor from which the environment's photograph was taken, object sizes."""
         height = self.values.get("ground.height")
-        if height is None:
-            return settings.PHOTOGRAPHED_FROM if self.object.metres is None else TRIPOD / self.metres
-        return height / self.metres
+        if height is None and self.object.metres is None:
+            return settings.PHOTOGRAPHED_FROM
+        return (TRIPOD if height is None else height) / self.metres
 
     @property
     def on_table(self) -> bool:
@@ -382,20 +365,17 @@ class SceneDescription:
     @property
     def gain(self) -> float:
         """Factor from scene radiance to display-linear values: the metered exposure times `camera.exposure`."""
-        return self._exposure * math.pow(2.0, self.number("camera.exposure"))
-
-    @property
-    def _exposure(self) -> float:
-        """Saturation is at 1.2 2^EV cd/m2 (Lagarde and de Rousiers 2014, Moving Frostbite to PBR, section 5.1)."""
-        stops = self.values.get("camera.ev")
+        stops, unit = self.values.get("camera.ev"), None if self.environment is None else self.environment.candelas
         if stops is None:
-            return metered_gain(self) if self.metered else 1.0
-        if self.environment is None or self.environment.candelas is None:
+            exposure = metered_gain(self) if self.metered else 1.0
+        elif unit is None:
             raise InputError(
                 "`set` camera.ev: the brightness of this environment has no unit; take one of the avenue, or leave "
                 "camera.ev out, and exposure is metered"
             )
-        return self.environment.candelas / (1.2 * math.pow(2.0, stops))
+        else:  # saturation (Lagarde and de Rousiers 2014, Moving Frostbite to PBR, section 5.1)
+            exposure = unit / (1.2 * math.pow(2.0, stops))
+        return exposure * math.pow(2.0, self.number("camera.exposure"))
 
 
 def describe(
@@ -428,42 +408,43 @@ def describe(
     Raises:
         InputError: a name is unknown, a file cannot be used, or a setting is out of range.
     """
-    values = settings.resolve(given or {})
+    given = given or {}
+    values = settings.resolve(given)
     file, node = split_node(object_spec) if isinstance(object_spec, str) else (object_spec, None)
     mitsuba = plugins is not None or (node is not None and str(file).lower().endswith(MITSUBA_FILE))
+    if up is not None and (mitsuba or node is not None):
+        why = "the first camera of a Mitsuba scene says which way is up" if mitsuba else "glTF files have y up"
+        raise InputError(f"up: {why}; leave `up` out")
     if mitsuba:
-        around = _mitsuba(Path(str(file)) if plugins is None else plugins, node or str(object_spec), up)
+        from advsearch.scene.mitsuba_backend.scene_files import import_plugins  # a circle: it takes descriptions
+    if plugins is not None:
+        around = import_plugins(plugins, node or str(object_spec))
+    elif node is None:
+        around = ImportedScene(_object(object_spec, up))
     else:
-        around = ImportedScene(_object(object_spec, up)) if node is None else _scene(Path(str(file)), node, up)
+        with reading(path := Path(str(file))):
+            around = import_plugins(path, node) if mitsuba else import_scene(path, node)
     around = replace(around, object=sized(around.object, size, unit))
     shining = (isinstance(part, Lamp) or (isinstance(part, PluginPart) and part.shines) for part in around.surroundings)
     alone = any(shining) or (mitsuba and around.object.emission is not None)
     lit_by = environment_spec or (NO_MAP if alone else DEFAULT_ENVIRONMENT)
-    check_ground(given or {}, lit_by)
+    check_ground(given, lit_by)
     if lit_by != NO_MAP:
         check_one_environment(around.surroundings, f"`environment={_spec(lit_by)}`")
-    if (node is not None or mitsuba) and not {"ground.size", "ground.kind"} & set(given or {}):
-        values = {**values, "ground.size": 0.0}
-    asked = () if environment_spec is None else (ENVIRONMENT,)
-    orbits = any(name.startswith("camera.") and name != "camera.exposure" for name in given or {})
+    if (node is not None or mitsuba) and not {"ground.size", "ground.kind"} & set(given):
+        values["ground.size"] = 0.0
+    orbits = any(name.startswith("camera.") and name != "camera.exposure" for name in given)
     described = SceneDescription(
-        around.object,
-        _environment(lit_by),
-        values,
-        _spec(object_spec),
-        _spec(lit_by),
-        up,
-        size,
-        unit,
-        given=frozenset((*(given or {}), *asked)),
+        around.object, _environment(lit_by), values, _spec(object_spec), _spec(lit_by), up, size, unit,
+        given=frozenset(given) | (frozenset() if environment_spec is None else {ENVIRONMENT}),
         parts=around.surroundings,
         cameras=around.cameras,
         camera=next(iter(around.cameras), ORBIT_CAMERA) if mitsuba and not orbits else ORBIT_CAMERA,
         metered=not mitsuba,
-    )
+    )  # fmt: skip
     described = with_lamps(with_things(on_its_ground(described), things, lambda spec: _object(spec, None)))
     check_meshes(described, values)
-    idle = [name for name in given or {} if name.startswith("material.")]
+    idle = [name for name in given if name.startswith("material.")]
     if described.object.surface is not None and idle:
         whose = "several materials" if described.object.finishes else "a surface of Mitsuba's own"
         raise InputError(f"`set` {idle[0]}: the object has {whose}, without it; leave it out")
@@ -483,21 +464,18 @@ def check_meshes(scene: SceneDescription, names: Iterable[str]) -> None:
 
 
 def check_one_environment(parts: Iterable[ScenePart], who: str) -> None:
-    """Refuse an environment, or what needs one that is a map of ours, beside one that a Mitsuba scene has of its own.
-
-    Args:
-        parts: of the scene.
-        who: asks for it, as it is written.
+    """Refuse an environment, or what needs one that is a map of ours, asked for by `who`, as it is written, beside one
+    that a Mitsuba scene has of its own among its parts.
 
     Raises:
         InputError: there are two.
     """
-    own = [one for one in parts if isinstance(one, PluginPart) and one.plugin.get("type") in ENVIRONMENTS]
-    if own:
-        raise InputError(
-            f"{who}: the Mitsuba scene has an environment of its own, {own[0].name} (a {own[0].plugin['type']}), and "
-            f"there can be one only; leave {who} out, or take {own[0].name} out of the scene"
-        )
+    for part in parts:
+        if isinstance(part, PluginPart) and part.plugin.get("type") in ENVIRONMENTS:
+            raise InputError(
+                f"{who}: the Mitsuba scene has an environment of its own, {part.name} (a {part.plugin['type']}), and "
+                f"there can be one only; leave {who} out, or take {part.name} out of the scene"
+            )
 
 
 def check_ground(given: settings.Given, lit_by: str | Path | EnvironmentAsset) -> None:
@@ -521,22 +499,6 @@ def check_ground(given: settings.Given, lit_by: str | Path | EnvironmentAsset) -
         )
 
 
-def _mitsuba(scene: Path | Mapping[str, object], shape: str, up: str | None) -> ImportedScene:
-    from advsearch.scene.mitsuba_backend.scene_files import import_plugins  # a circle: it takes descriptions
-
-    if up is not None:
-        raise InputError("up: the first camera of a Mitsuba scene says which way is up; leave `up` out")
-    with reading(scene) if isinstance(scene, Path) else nullcontext():
-        return import_plugins(scene, shape)
-
-
-def _scene(path: Path, node: str, up: str | None) -> ImportedScene:
-    if up is not None:
-        raise InputError("up: glTF files have y up; leave `up` out")
-    with reading(path):
-        return import_scene(path, node)
-
-
 def _spec(spec: str | Path | ObjectAsset | EnvironmentAsset) -> str:
     return spec.name if isinstance(spec, (ObjectAsset, EnvironmentAsset)) else str(spec)
 
@@ -555,10 +517,8 @@ def _object(spec: str | Path | ObjectAsset, up: str | None) -> ObjectAsset:
 
 
 def _environment(spec: str | Path | EnvironmentAsset) -> EnvironmentAsset | None:
-    if isinstance(spec, EnvironmentAsset):
-        return spec
-    if spec == NO_MAP:
-        return None
+    if isinstance(spec, EnvironmentAsset) or spec == NO_MAP:
+        return spec if isinstance(spec, EnvironmentAsset) else None
     if is_path(spec):
         with reading(spec):
             return environments.import_environment(Path(spec))

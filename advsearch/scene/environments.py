@@ -27,13 +27,8 @@ SMALLEST = (4, 8)
 
 @dataclass(frozen=True, eq=False)
 class LightPicture:
-    """A picture in linear radiance.
-
-    Attributes:
-        size: rows and columns.
-        band: returns the rows from the first to before the second of its arguments, (n, W, 3) float32.
-        notes: clauses about what is left out.
-    """
+    """A picture in linear radiance: its size in rows and columns; `band`, which returns the rows from its first
+    argument to before its second, (n, W, 3) float32; and clauses about what is left out."""
 
     size: tuple[int, int]
     band: Callable[[int, int], Floats]
@@ -60,14 +55,11 @@ def read_light(path: Path, what: str = "environment") -> LightPicture:
 
 
 def import_environment(path: str | PathLike[str]) -> EnvironmentAsset:
-    """Read an equirectangular environment map.
+    """Read an equirectangular environment map: a Radiance ``.hdr`` (RGBE), or an ``.exr`` with channels R, G and B, or
+    Y alone (grey), in half or float; see `advsearch.scene.importing.hdr`.
 
     Maps larger than `LARGEST` are averaged down, each texel weighted by the solid angle that it covers, so that the
     light from each direction stays the same in the mean. Row 0 is up; columns stay in the file's order.
-
-    Args:
-        path: a Radiance ``.hdr`` (RGBE), or an ``.exr`` with channels R, G and B, or Y alone (grey), in half or float;
-            see `advsearch.scene.importing.hdr`.
 
     Raises:
         FileFormatError: the file is missing, of another kind, damaged, or lacks channels; the message names it.
@@ -108,12 +100,12 @@ def _sized(band: Callable[[int, int], Floats], size: tuple[int, int]) -> Floats:
     height, width = size
     scale = min(1.0, LARGEST[0] / height, LARGEST[1] / width)
     if scale == 1.0:
-        found = band(0, height)
+        texels = band(0, height)
     else:
         target = max(1, round(height * scale)), max(1, round(width * scale))
         polar = (np.arange(height, dtype=np.float32) + np.float32(0.5)) * np.float32(np.pi / height)
         angle = np.sin(polar)[:, None, None]
         covered = area_average(angle, target[0], 1)
-        found = banded_average(lambda top, end: band(top, end) * angle[top:end], size, target) / covered
-    down, across = (-(-least // extent) for least, extent in zip(SMALLEST, found.shape[:2], strict=True))
-    return np.asarray(found.repeat(down, axis=0).repeat(across, axis=1), dtype=np.float32)
+        texels = banded_average(lambda top, end: band(top, end) * angle[top:end], size, target) / covered
+    down, across = (-(-least // extent) for least, extent in zip(SMALLEST, texels.shape[:2], strict=True))
+    return np.asarray(texels.repeat(down, axis=0).repeat(across, axis=1), dtype=np.float32)

@@ -22,10 +22,10 @@ import numpy as np
 
 from advsearch.scene.assets import Doubles, EnvironmentAsset, Floats, Ints
 from advsearch.scene.color import srgb_to_linear
-from advsearch.scene.geometry import camera_to_world, object_to_world
+from advsearch.scene.geometry import camera_to_world, object_to_world, standing
 from advsearch.scene.grounds import paved
 from advsearch.scene.parts import MeshPart
-from advsearch.scene.raster import looked_up, pixels_in
+from advsearch.scene.raster import doubled_normals, looked_up, pixels_in
 from advsearch.scene.settings import ORBIT_CAMERA, resolve
 from advsearch.scene.silhouettes import NEAREST, Frame
 
@@ -60,17 +60,9 @@ def metered_gain(scene: SceneDescription) -> float:
     """
     default = {name: value for name, value in resolve({}).items() if name.startswith(MOVED)}
     scene = replace(scene, values={**scene.values, **default}, aspect=1.0, camera=ORBIT_CAMERA, camera_model=None)
-    seen = visible_irradiance(scene)
-    metered = float(irradiance(scene, np.array([[0.0, 0.0, 1.0]])).mean()) if seen is None else seen
-    return METERED_WHITE * math.pi / (WHITE * metered) if metered > 0.0 else 1.0
-
-
-def visible_irradiance(scene: SceneDescription) -> float | None:
-    """Return the mean irradiance (mean channel) on what the camera sees of the object; None if it sees nothing."""
     normals = visible_normals(scene)
-    if not len(normals):
-        return None
-    return float(irradiance(scene, normals).mean())
+    metered = float(irradiance(scene, normals if len(normals) else np.array([[0.0, 0.0, 1.0]])).mean())
+    return METERED_WHITE * math.pi / (WHITE * metered) if metered > 0.0 else 1.0
 
 
 def irradiance(scene: SceneDescription, normals: Doubles) -> Doubles:
@@ -114,8 +106,8 @@ def _emitted(part: MeshPart, emission: Floats, place: Doubles) -> tuple[Doubles,
 
     A face is taken for a disk of its mean radiance.
     """
-    corners = (part.mesh.vertices.astype(np.float64) @ part.to_world[:3, :3].T + part.to_world[:3, 3])[part.mesh.faces]
-    area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2.0
+    corners = standing(part)[part.mesh.faces]
+    area = doubled_normals(corners) / 2.0
     way = corners.mean(axis=1) - place
     far = (way * way).sum(axis=1)
     way = way / np.maximum(np.sqrt(far), 1e-12)[:, None]

@@ -38,8 +38,8 @@ class ImageFormation:
     Attributes:
         denoiser: "oidn" (Intel Open Image Denoise with albedo and normals as guides) or "none".
         filter: reconstruction filter, "box" or "gaussian"; a gaussian correlates pixels, so the denoiser refuses it.
-        sampler: how samples are spread over a pixel: "multijitter" (Kensler 2013, Correlated multi-jittered
-            sampling), or "independent", whose noise is more.
+        sampler: how samples are spread over a pixel: "multijitter" (Kensler 2013, Correlated multi-jittered sampling),
+            or "independent", whose noise is more.
         exposure: stops over the metered exposure; kept for the record, `gain` is what is applied.
         resolution: (height, width) in pixels.
         gain: factor from radiance to display-linear values.

@@ -38,21 +38,17 @@ CLEARANCE = 0.02
 """Smallest distance, in object sizes, to the sphere around the object."""
 STEEPEST = math.sin(math.radians(89.0))
 """Sine of the elevation at which a camera stays that is to be higher above the object than it is away."""
+NEAREST = 1e-3
+"""Depth up to which points have no place in the picture."""
 DEFAULT_VIEW = ("camera.azimuth", "camera.elevation", "camera.roll")
 
 
 def framing_distance(description: SceneDescription, fov: Tensor, aspect: float) -> Tensor:
-    """Return the distance of the camera to the object's middle, () float64 in object sizes; differentiable in fov.
-
-    Args:
-        description: the scene; only its object matters.
-        fov: () field of view along the larger side of the picture, degrees.
-        aspect: width over height of the picture.
-    """
-    offsets = torch.from_numpy(description.object.mesh.vertices.astype(np.float64) - middle(description))
+    """Return the distance of the camera to the middle of a scene's object, () float64 in object sizes, for a field of
+    view () along the larger side of the picture, degrees, and an aspect of width over height; differentiable in the
+    first."""
+    offsets, edge = _offsets(description).to(fov.device), _edge(description, fov, aspect)
     azimuth, elevation, roll = (float(SETTINGS[name].default or 0.0) for name in DEFAULT_VIEW)
-    offsets = offsets.to(fov.device)
-    edge = _edge(description, fov, aspect)
     fits = _from_one_side(offsets, camera_axes(azimuth, elevation, roll), edge * FRAME_FILL)
     whole = _from_all_around(offsets, elevation, edge)
     return torch.maximum(fits, whole).clamp_min(float(offsets.norm(dim=1).max()) + CLEARANCE)
@@ -60,20 +56,15 @@ def framing_distance(description: SceneDescription, fov: Tensor, aspect: float) 
 
 def filling_distance(description: SceneDescription) -> float:
     """Return the distance at which the object just fits into a square picture from where this scene's camera looks."""
-    offsets = torch.from_numpy(description.object.mesh.vertices.astype(np.float64) - middle(description))
     edge = _edge(description, torch.tensor(description.number("camera.fov"), dtype=torch.float64), 1.0)
     axes = camera_axes(*(description.number(name) for name in DEFAULT_VIEW))
-    return float(_from_one_side(offsets, axes, edge * FRAME_FILL))
+    return float(_from_one_side(_offsets(description), axes, edge * FRAME_FILL))
 
 
 def camera_axes(azimuth: float, elevation: float, roll: float) -> Doubles:
-    """Return the unit vectors to the left and upwards in the picture and from the object to the camera: rows, (3, 3).
-
-    Args:
-        azimuth: direction of the camera around the object, degrees.
-        elevation: its height above the ground plane, degrees.
-        roll: rotation of the picture, counter-clockwise, degrees.
-    """
+    """Return the unit vectors to the left and upwards in the picture and from the object to the camera: rows, (3, 3);
+    for the camera's direction around the object, its height above the ground plane, and the picture's rotation,
+    counter-clockwise, all in degrees."""
     azimuth, elevation, roll = math.radians(azimuth), math.radians(elevation), math.radians(roll)
     outwards = np.array(
         [math.cos(elevation) * math.cos(azimuth), math.cos(elevation) * math.sin(azimuth), math.sin(elevation)]
@@ -90,16 +81,16 @@ def middle(description: SceneDescription) -> Doubles:
     return np.asarray((vertices.min(axis=0) + vertices.max(axis=0)) / 2.0)
 
 
+def _offsets(description: SceneDescription) -> Tensor:
+    """The object's vertices (V, 3) from there."""
+    return torch.from_numpy(description.object.mesh.vertices.astype(np.float64) - middle(description))
+
+
 def _edge(description: SceneDescription, fov: Tensor, aspect: float) -> Tensor:
     """Tangents of half the picture's width and height, (2,); of a lens, those of what it shows of a rectangle."""
     model = description.camera_model
     if model is not None and model.name:
         return torch.tensor(model.tangents, dtype=torch.float64, device=fov.device)
-    return _tangents(fov, aspect)
-
-
-def _tangents(fov: Tensor, aspect: float) -> Tensor:
-    """Tangents of half the picture's width and height, (2,)."""
     shape = torch.tensor([min(1.0, aspect), min(1.0, 1.0 / aspect)], dtype=torch.float64, device=fov.device)
     return torch.tan(torch.deg2rad(fov.double()) / 2.0) * shape
 
@@ -146,20 +137,18 @@ def object_to_world(description: SceneDescription) -> Doubles:
     "On the ground" means that the lowest vertex is at z = 0 before `pose.z` is added, whatever the rotation.
     """
     vertices = description.object.mesh.vertices.astype(np.float64)
-    return _posed(vertices, 0.0, {one.name: description.number(f"pose.{one.name}") for one in POSE})
+    pose = {parameter.name: description.number(f"pose.{parameter.name}") for parameter in POSE}
+    return _posed(vertices, 0.0, pose)
 
 
 def moved_part(part: MeshPart, values: Mapping[str, float | None]) -> MeshPart:
-    """Return a mesh around the object as the settings have it: posed about its own middle, where it stands.
-
-    Args:
-        part: as it came.
-        values: every setting of the scene; those of the mesh are `pose:NAME.yaw` and so on.
-    """
-    pose = {one.name: value for one in POSE if (value := values.get(f"pose:{part.name}.{one.name}")) is not None}
-    if pose:
+    """Return a mesh around the object, as it came, as the settings have it: posed about its own middle, where it
+    stands, by those that are called `pose:NAME.yaw` and so on."""
+    asked = {parameter.name: values.get(f"pose:{part.name}.{parameter.name}") for parameter in POSE}
+    asked = {name: value for name, value in asked.items() if value is not None}
+    if asked:
         places = standing(part)
-        pose = {**{one.name: float(one.default) for one in POSE}, **pose}
+        pose = {**{parameter.name: float(parameter.default) for parameter in POSE}, **asked}
         part = replace(part, to_world=_posed(places, float(places[:, 2].min()), pose) @ part.to_world)
     return replace(part, material=part.material.with_values(values, f"material:{part.name}."))
 
@@ -170,13 +159,8 @@ def standing(part: MeshPart) -> Doubles:
 
 
 def _posed(places: Doubles, floor: float, pose: Mapping[str, float]) -> Doubles:
-    """Scale and rotate about the middle of the bounding box, put the lowest vertex at `floor`, shift.
-
-    Args:
-        places: (V, 3) before.
-        floor: where the lowest vertex comes to be before `z` is added.
-        pose: parameters of `settings.POSE` by name.
-    """
+    """Scale and rotate places (V, 3) about the middle of their bounding box by parameters of `settings.POSE`, put the
+    lowest at `floor`, and shift; returns (4, 4)."""
     middle = (places.min(axis=0) + places.max(axis=0)) / 2.0
     linear = pose["scale"] * rotation(pose["yaw"], pose["pitch"], pose["roll"])
     lowest = float(((places - middle) @ linear.T)[:, 2].min())
@@ -188,14 +172,11 @@ def _posed(places: Doubles, floor: float, pose: Mapping[str, float]) -> Doubles:
 
 
 def camera_to_world(description: SceneDescription, aspect: float | None = None) -> Doubles:
-    """Return the pose of the camera in use: by default on an orbit around the middle of the object, looking at it.
+    """Return the pose of the camera in use, for a picture of an aspect (width over height; None for the description's):
+    by default on an orbit around the middle of the object, looking at it.
 
     The camera looks along its own +z with +y up and +x to the left, as Mitsuba's sensors do. It frames the object in
     its default pose, so that a shifted or scaled object moves in the picture.
-
-    Args:
-        description: the scene.
-        aspect: width over height of the picture; None takes the description's.
     """
     if description.camera != ORBIT_CAMERA:
         return description.cameras[description.camera].to_world
@@ -214,6 +195,27 @@ def camera_to_world(description: SceneDescription, aspect: float | None = None) 
     matrix[:3, 0], matrix[:3, 1], matrix[:3, 2] = axes[0], axes[1], -axes[2]
     matrix[:3, 3] = middle(description) + distance * axes[2]
     return matrix
+
+
+def projected(
+    description: SceneDescription, inputs: Mapping[str, Tensor], points: Tensor, size: tuple[int, int]
+) -> tuple[Tensor, Tensor]:
+    """Return where points (N, 3) float64 in the camera's coordinates are seen by scene inputs, (N, 2) pixels to the
+    right and down from the middle of a picture of a size (height, width), and which are before the camera, (N,) bool.
+    """
+    sides = torch.tensor(size[::-1], dtype=torch.float64)
+    points = points * torch.tensor([-1.0, -1.0, 1.0]).to(points)  # to the right, down and ahead
+    if (model := description.camera_model) is not None:
+        model = model.with_numbers(inputs["camera.lens"].detach()) if "camera.lens" in inputs else model
+        places, seen = model.project(points)
+        return (places - 0.5) * sides, seen
+    fov = inputs.get("camera.fov", torch.tensor(description.number("camera.fov"))).double().reshape(())
+    focal, depth = max(size) / 2.0 / torch.tan(torch.deg2rad(fov) / 2.0), points[:, 2]
+    places = focal * points[:, :2] / depth.clamp_min(NEAREST)[:, None]
+    for axis, name in enumerate(("camera.shift_x", "camera.shift_y")):
+        if name in inputs:
+            places[:, axis] -= sides[axis] * inputs[name].double().reshape(())
+    return places, depth > NEAREST
 
 
 def seated(carrier: Tensor, seat: Tensor) -> Tensor:
@@ -244,17 +246,6 @@ def real_harmonics(height: int, width: int) -> Tensor:
     y = theta.sin()[:, None] * phi.sin()[None]
     z = theta.cos()[:, None].expand(height, width)
     root3, root15, root5 = math.sqrt(3.0), math.sqrt(15.0), math.sqrt(5.0)
-    return torch.stack(
-        [
-            torch.ones_like(z),
-            root3 * y,
-            root3 * z,
-            root3 * x,
-            root15 * x * y,
-            root15 * y * z,
-            root5 / 2.0 * (3.0 * z * z - 1.0),
-            root15 * x * z,
-            root15 / 2.0 * (x * x - y * y),
-        ],
-        dim=-1,
-    )
+    first = [torch.ones_like(z), root3 * y, root3 * z, root3 * x]
+    second = [root15 * x * y, root15 * y * z, root5 / 2.0 * (3.0 * z * z - 1.0), root15 * x * z]
+    return torch.stack([*first, *second, root15 / 2.0 * (x * x - y * y)], dim=-1)

@@ -12,70 +12,50 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from PIL import Image
 from torch import Tensor
 
+from advsearch.pictures import png_of
 from advsearch.scene.assembly import MovingMesh
 from advsearch.scene.assets import Doubles, Floats, Shape
 from advsearch.scene.color import linear_to_srgb
-from advsearch.scene.glb_buffer import GlbBuffer
+from advsearch.scene.glb_buffer import GlbBuffer, mime_type
 from advsearch.scene.parts import MeshPart
 
-COAT_ROUGHNESS = 0.316
-"""Of Mitsuba's clearcoat, whose alpha is 0.1: the square root of it."""
-PLAIN = 0.5
-"""Specular of a surface whose index of refraction is 1.5."""
+Levels = npt.NDArray[np.uint8]
+COAT_ROUGHNESS = 0.316  # of Mitsuba's clearcoat, whose alpha is 0.1: the square root of it
+PLAIN = 0.5  # specular of a surface whose index of refraction is 1.5
 WEB_SIDE, WEB_QUALITY = 1024, 90
 """Longest side in pixels of a texture in a file for the web, and the quality of its JPEG, from 1 to 95."""
-PNG = b"\x89PNG"
-"""The first bytes of such a file."""
 CAMERA = {"type": "perspective", "perspective": {"yfov": 0.7, "znear": 0.01}}
 """The camera of such a file: its place counts."""
 
 
 def posed(part: MeshPart, inputs: Mapping[str, Tensor]) -> Shape:
-    """Return a mesh of a scene as its inputs have it, in world space, z up.
-
-    Args:
-        part: of the scene.
-        inputs: of `MitsubaScene`, that differ from the base values.
-    """
-    given = {key.partition(".")[2]: value.detach().cpu() for key, value in inputs.items() if _of(key) == part.name}
-    vertices, normals = MovingMesh(part.mesh, part.to_world).place(None, None)
-    vertices, normals = given.get("vertices", vertices), given.get("normals", normals)
-    mesh = replace(part.mesh, vertices=_rows(vertices), normals=_rows(normals))
+    """Return a mesh of a scene as its inputs, those of `MitsubaScene` that differ from the base values, have it: in
+    world space, z up."""
+    begin = f"{part.name}."
+    own = {key.removeprefix(begin): value.detach().cpu() for key, value in inputs.items() if key.startswith(begin)}
+    places = dict(zip(("vertices", "normals"), MovingMesh(part.mesh, part.to_world).place(None, None), strict=True))
+    rows = {name: own.get(name, flat).reshape(-1, 3).to(torch.float32).numpy() for name, flat in places.items()}
     color = part.base_color
-    if "base_color" in given:
-        color = linear_to_srgb(given["base_color"].clamp(0.0, 1.0)).numpy()
-    numbers = {key: float(given[key]) for key in vars(part.material) if key in given}
-    material = replace(part.material, **numbers)
-    return replace(part, mesh=mesh, base_color=color, material=material, to_world=np.eye(4))
-
-
-def _of(key: str) -> str:
-    return key.partition(".")[0]
-
-
-def _rows(flat: Tensor) -> Floats:
-    return flat.reshape(-1, 3).to(torch.float32).numpy()
+    if "base_color" in own:
+        color = linear_to_srgb(own["base_color"].clamp(0.0, 1.0)).numpy()
+    material = replace(part.material, **{key: float(own[key]) for key in vars(part.material) if key in own})
+    return replace(part, mesh=replace(part.mesh, **rows), base_color=color, material=material, to_world=np.eye(4))
 
 
 def glb(meshes: Sequence[Shape]) -> bytes:
     """Return a binary glTF file of some meshes."""
     made = GlbBuffer()
-    return made.file(_described(made, meshes, _png))
+    return made.file(_described(made, meshes, png_of))
 
 
 def web_glb(adversarial: Sequence[Shape], clean: Sequence[Shape], camera: Doubles, note: str = "") -> bytes:
-    """Return a small file with two scenes, the adversarial one and "clean": what is the same in both is there once.
-
-    Args:
-        adversarial: the meshes of the adversarial scene.
-        clean: the same before.
-        camera: (4, 4) pose of the camera that sees that; it looks along its own +z.
-        note: what a reader has to know, in `asset.extras`.
-    """
+    """Return a small file with two scenes, the adversarial one and "clean": what is the same in both is there once;
+    with the camera of pose (4, 4), which looks along its own +z, and a note for readers in `asset.extras`."""
     made, count = GlbBuffer(), len(adversarial)
     header = _described(made, [*adversarial, *clean], _jpeg)
     ours = camera[:3].T.astype(np.float32)  # rows: its axes, then its place
@@ -92,7 +72,7 @@ def web_glb(adversarial: Sequence[Shape], clean: Sequence[Shape], camera: Double
     return made.file(header)
 
 
-def _described(made: GlbBuffer, meshes: Sequence[Shape], picture: Callable[[Floats], bytes]) -> dict[str, Any]:
+def _described(made: GlbBuffer, meshes: Sequence[Shape], picture: Callable[[Levels], bytes]) -> dict[str, Any]:
     """Return the header of a file with some meshes in one scene, and put their bytes into the buffer."""
     header: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": "advsearch"},
@@ -107,9 +87,11 @@ def _described(made: GlbBuffer, meshes: Sequence[Shape], picture: Callable[[Floa
     }
     for number, shape in enumerate(meshes):
         mesh = shape.mesh
+        lengths = np.linalg.norm(mesh.normals, axis=1, keepdims=True)
+        normals = np.where(lengths > 0.0, mesh.normals / np.maximum(lengths, 1e-12), np.eye(3)[2]).astype(np.float32)
         corners = {
             "POSITION": made.accessor(_y_up(mesh.vertices), "VEC3", bounds=True),
-            "NORMAL": made.accessor(_y_up(_unit(mesh.normals)), "VEC3"),
+            "NORMAL": made.accessor(_y_up(normals), "VEC3"),
             "TEXCOORD_0": made.accessor(np.stack([mesh.uvs[:, 0], 1.0 - mesh.uvs[:, 1]], axis=1), "VEC2"),
         }
         whole = np.uint32 if len(mesh.vertices) > np.iinfo(np.uint16).max else np.uint16
@@ -117,55 +99,43 @@ def _described(made: GlbBuffer, meshes: Sequence[Shape], picture: Callable[[Floa
         header["meshes"].append(
             {"name": shape.name, "primitives": [{"attributes": corners, "indices": indices, "material": number}]}
         )
-        encoded = picture(shape.base_color) if shape.opacity is None else _cut_out_png(shape.base_color, shape.opacity)
-        material = _material(shape, _texture(header, made.view(encoded), encoded))
+        levels = _levels(shape.base_color)
+        encoded = picture(levels) if shape.opacity is None else _cut_out_png(levels, _levels(shape.opacity))
+        material = _material(shape, _texture(header, made, encoded))
         if shape.normal_map is not None:
-            encoded = picture(shape.normal_map)
-            material["normalTexture"] = {"index": _texture(header, made.view(encoded), encoded)}
+            material["normalTexture"] = _texture(header, made, picture(_levels(shape.normal_map)))
         if shape.emission is not None:
             most = float(shape.emission.max())
-            share = linear_to_srgb(shape.emission / np.float32(most))
             material["emissiveFactor"] = [1.0, 1.0, 1.0]
-            encoded = picture(share)
-            material["emissiveTexture"] = {"index": _texture(header, made.view(encoded), encoded)}
+            share = linear_to_srgb(shape.emission / np.float32(most))
+            material["emissiveTexture"] = _texture(header, made, picture(_levels(share)))
             material.setdefault("extensions", {})["KHR_materials_emissive_strength"] = {"emissiveStrength": most}
         header["materials"].append(material)
     used = sorted({name for material in header["materials"] for name in material.get("extensions", ())})
     return {**header, "extensionsUsed": used} if used else header
 
 
-def _texture(header: dict[str, Any], view: int, picture: bytes) -> int:
-    """Add a picture in a view of the buffer to the header, and return the number of its texture."""
-    kind = "image/png" if picture.startswith(PNG) else "image/jpeg"
-    header["images"].append({"mimeType": kind, "bufferView": view})
+def _texture(header: dict[str, Any], made: GlbBuffer, picture: bytes) -> dict[str, int]:
+    """Add a picture to the buffer and the header, and return the use of its texture."""
+    header["images"].append({"mimeType": mime_type(picture), "bufferView": made.view(picture)})
     header["textures"].append({"source": len(header["textures"]), "sampler": 0})
-    return len(header["textures"]) - 1
+    return {"index": len(header["textures"]) - 1}
 
 
-def _material(one: Shape, texture: int) -> dict[str, Any]:
-    surface = one.material
+def _material(shape: Shape, texture: dict[str, int]) -> dict[str, Any]:
+    surface = shape.material
+    material: dict[str, Any] = {"name": shape.name, "doubleSided": True}
+    if shape.opacity is not None:
+        material["alphaMode"] = "MASK" if set(np.unique(shape.opacity)) <= {0.0, 1.0} else "BLEND"
+    numbers = {"roughnessFactor": surface.roughness, "metallicFactor": surface.metallic}
+    material["pbrMetallicRoughness"] = {"baseColorTexture": texture, **numbers}
     extensions: dict[str, Any] = {}
     if surface.specular != PLAIN:
         extensions["KHR_materials_specular"] = {"specularFactor": min(1.0, surface.specular / PLAIN)}
     if surface.clearcoat > 0.0:
-        extensions["KHR_materials_clearcoat"] = {
-            "clearcoatFactor": surface.clearcoat,
-            "clearcoatRoughnessFactor": COAT_ROUGHNESS,
-        }
-    cut_out = {}
-    if one.opacity is not None:
-        cut_out = {"alphaMode": "MASK" if set(np.unique(one.opacity)) <= {0.0, 1.0} else "BLEND"}
-    return {
-        "name": one.name,
-        "doubleSided": True,
-        **cut_out,
-        "pbrMetallicRoughness": {
-            "baseColorTexture": {"index": texture},
-            "roughnessFactor": surface.roughness,
-            "metallicFactor": surface.metallic,
-        },
-        **({"extensions": extensions} if extensions else {}),
-    }
+        coat = {"clearcoatFactor": surface.clearcoat, "clearcoatRoughnessFactor": COAT_ROUGHNESS}
+        extensions["KHR_materials_clearcoat"] = coat
+    return {**material, "extensions": extensions} if extensions else material
 
 
 def _y_up(vectors: Floats) -> Floats:
@@ -173,32 +143,20 @@ def _y_up(vectors: Floats) -> Floats:
     return np.stack([vectors[:, 0], vectors[:, 2], -vectors[:, 1]], axis=1).astype(np.float32)
 
 
-def _unit(normals: Floats) -> Floats:
-    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-    found: Floats = np.where(lengths > 0.0, normals / np.maximum(lengths, 1e-12), np.eye(3)[2])
-    return found.astype(np.float32)
+def _levels(color: Floats) -> Levels:
+    return np.uint8(np.clip(color, 0.0, 1.0) * 255.0 + 0.5)
 
 
-def _png(color: Floats) -> bytes:
-    file = io.BytesIO()
-    _rounded(color).save(file, "PNG")
-    return file.getvalue()
-
-
-def _cut_out_png(color: Floats, opacity: Floats) -> bytes:
+def _cut_out_png(color: Levels, opacity: Levels) -> bytes:
     """A picture whose alpha is the opacity, at the size of the colour."""
-    file, picture = io.BytesIO(), _rounded(color)
-    picture.putalpha(_rounded(opacity).resize(picture.size, Image.Resampling.BILINEAR))
+    file, picture = io.BytesIO(), Image.fromarray(color)
+    picture.putalpha(Image.fromarray(opacity).resize(picture.size, Image.Resampling.BILINEAR))
     picture.save(file, "PNG")
     return file.getvalue()
 
 
-def _jpeg(color: Floats) -> bytes:
-    file, picture = io.BytesIO(), _rounded(color)
+def _jpeg(color: Levels) -> bytes:
+    file, picture = io.BytesIO(), Image.fromarray(color)
     picture.thumbnail((WEB_SIDE, WEB_SIDE))
     picture.save(file, "JPEG", quality=WEB_QUALITY, subsampling=0)
     return file.getvalue()
-
-
-def _rounded(color: Floats) -> Image.Image:
-    return Image.fromarray(np.uint8(np.clip(color, 0.0, 1.0) * 255.0 + 0.5))

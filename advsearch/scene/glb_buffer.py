@@ -9,10 +9,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-FLOAT, WHOLE, SHORT = 5126, 5125, 5123
-"""Types of numbers in glTF: float32, uint32 and uint16."""
-CORNERS, INDICES = 34962, 34963
-"""What a part of the buffer is for."""
+FLOAT, WHOLE, SHORT = 5126, 5125, 5123  # types of numbers in glTF: float32, uint32 and uint16
+CORNERS, INDICES = 34962, 34963  # what a part of the buffer is for
+
+
+def mime_type(picture: bytes) -> str:
+    """Return the kind of a PNG or JPEG file, as glTF calls it."""
+    return "image/png" if picture.startswith(b"\x89PNG") else "image/jpeg"
 
 
 class GlbBuffer:
@@ -36,14 +39,9 @@ class GlbBuffer:
 
     def accessor(self, values: npt.NDArray[Any], kind: str, *, bounds: bool = False) -> int:
         """Append an array and return the number of its accessor."""
-        kinds = {np.dtype(np.uint32): WHOLE, np.dtype(np.uint16): SHORT}
-        number = kinds.get(values.dtype, FLOAT)
-        entry: dict[str, Any] = {
-            "bufferView": self.view(np.ascontiguousarray(values).tobytes(), CORNERS if number == FLOAT else INDICES),
-            "componentType": number,
-            "count": len(values),
-            "type": kind,
-        }
+        number = {np.dtype(np.uint32): WHOLE, np.dtype(np.uint16): SHORT}.get(values.dtype, FLOAT)
+        view = self.view(np.ascontiguousarray(values).tobytes(), CORNERS if number == FLOAT else INDICES)
+        entry: dict[str, Any] = {"bufferView": view, "componentType": number, "count": len(values), "type": kind}
         if bounds:
             entry |= {"min": values.min(axis=0).tolist(), "max": values.max(axis=0).tolist()}
         self.accessors.append(entry)

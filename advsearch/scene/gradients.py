@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, wraps
-from typing import Any, TypedDict
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -24,12 +24,8 @@ BY_DIFFERENCES = frozenset({"differences", "secant"})
 
 @dataclass(frozen=True)
 class Budget:
-    """How far a group of u may go from its start, inside the unit box.
-
-    Attributes:
-        norm: "linf" or "l2" for a ball around the start, "box" for the whole range.
-        epsilon: radius of the ball in units of u; None for "box".
-    """
+    """How far a group of u may go from its start, inside the unit box: within a ball of radius `epsilon` in units of u,
+    by the norm "linf" or "l2"; or everywhere, "box", with None."""
 
     norm: str
     epsilon: float | None
@@ -134,36 +130,16 @@ SEARCH_SHARE = 0.4
 things out of sight."""
 
 
-class StoredGroup(TypedDict):
-    """What a run stores of one group of coordinates; see `Group`."""
-
-    control: str
-    parameter: str
-    size: int
-    estimator: str
-    valid: list[str]
-    step: float
-    step_reason: str
-    reason: str
-    variance_x_seconds: dict[str, float]
-
-
-class StoredPlan(TypedDict):
-    """What a run stores of a plan; see `GradientPlan`."""
-
-    renders_per_gradient: int
-    spp: int | None
-    groups: list[StoredGroup]
+STORED = ("control", "parameter", "size", "estimator", "valid", "step", "step_reason", "reason")
+"""What a run stores of one group of coordinates; see `Group`."""
+CHOSEN = ("estimator", "step", "reason")
+"""What of it a plan for the same space takes over."""
 
 
 @dataclass(frozen=True)
 class GradientPlan:
-    """How the gradient of a whole space is obtained.
-
-    Attributes:
-        groups: every group of every control, in the order of u.
-        spp: samples a pixel of differences; None takes the primal's.
-    """
+    """How the gradient of a whole space is obtained: every group of every control, in the order of u, and the samples a
+    pixel of differences; None takes the primal's."""
 
     groups: tuple[Group, ...]
     spp: int | None = None
@@ -181,69 +157,51 @@ class GradientPlan:
     def through(self) -> Tensor:
         """(d,) float32: 1 for coordinates whose derivative runs back through scene inputs or the picture."""
         mask = torch.zeros(sum(group.size for group in self.groups))
-        for group in self.groups:
-            if group.estimator in BY_ADJOINT or group.estimator == "image":
-                mask[group.begin : group.begin + group.size] = 1.0
+        for group in self.having(*BY_ADJOINT, "image"):
+            mask[group.coordinates] = 1.0
         return mask
 
     def with_estimator(self, names: Mapping[str, str], reason: str) -> GradientPlan:
         """Return the plan with the estimators of some groups replaced, by `control.parameter`."""
-        groups = tuple(
-            replace(group, estimator=names[group.name], reason=reason) if group.name in names else group
-            for group in self.groups
+        return self._changed(
+            lambda group: {"estimator": names[group.name], "reason": reason} if group.name in names else {}
         )
-        return replace(self, groups=groups)
 
     def with_steps(self, factor: float) -> GradientPlan:
         """Return the plan with every step multiplied by a factor, within `STEP_RANGE`."""
         low, high = STEP_RANGE
-        scaled = tuple(replace(one, step=min(high, max(low, one.step * factor))) for one in self.groups)
-        return replace(self, groups=scaled)
+        return self._changed(lambda group: {"step": min(high, max(low, group.step * factor))})
 
     def at_a_pixel(self) -> GradientPlan:
         """Return the plan with steps over which outlines move by a pixel: for smooth losses, which bend over more."""
-        return replace(self, groups=tuple(replace(one, step=one.pixel) for one in self.groups))
+        return self._changed(lambda group: {"step": group.pixel})
 
-    def restored(self, stored: StoredPlan) -> GradientPlan:
+    def _changed(self, change: Callable[[Group], dict[str, Any]]) -> GradientPlan:
+        return replace(self, groups=tuple(replace(group, **change(group)) for group in self.groups))
+
+    def restored(self, stored: Mapping[str, Any]) -> GradientPlan:
         """Return the plan with the choices that `to_dict` has stored of a plan for the same space."""
-        chosen = {f"{one['control']}.{one['parameter']}": one for one in stored["groups"]}
-        groups = tuple(
-            replace(
-                group,
-                estimator=chosen[group.name]["estimator"],
-                step=chosen[group.name]["step"],
-                reason=chosen[group.name]["reason"],
-                measured=chosen[group.name]["variance_x_seconds"],
-            )
-            for group in self.groups
-        )
-        return replace(self, groups=groups, spp=stored["spp"])
+        chosen = {f"{group['control']}.{group['parameter']}": group for group in stored["groups"]}
 
-    def to_dict(self) -> StoredPlan:
-        """Return what a run stores of the plan."""
-        return {
-            "renders_per_gradient": self.renders,
-            "spp": self.spp,
-            "groups": [
-                {
-                    "control": one.control,
-                    "parameter": one.parameter,
-                    "size": one.size,
-                    "estimator": one.estimator,
-                    "valid": list(one.valid),
-                    "step": one.step,
-                    "step_reason": one.step_reason,
-                    "reason": one.reason,
-                    "variance_x_seconds": dict(one.measured),
-                }
-                for one in self.groups
-            ],
-        }
+        def choice(group: Group) -> dict[str, Any]:
+            kept = chosen[group.name]
+            return {"measured": kept["variance_x_seconds"], **{name: kept[name] for name in CHOSEN}}
+
+        return replace(self._changed(choice), spp=stored["spp"])
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what a run stores of the plan: its renders, and `STORED` and the measurements of each group."""
+        groups = [
+            {**{name: getattr(group, name) for name in STORED}, "valid": list(group.valid)}
+            | {"variance_x_seconds": dict(group.measured)}
+            for group in self.groups
+        ]
+        return {"renders_per_gradient": self.renders, "spp": self.spp, "groups": groups}
 
 
 def compared(valid: Sequence[str], size: int) -> tuple[str, ...]:
     """Return which of the estimators that are valid for `size` coordinates are worth a measurement."""
-    adjoints = tuple(one for one in valid if one in BY_ADJOINT)
+    adjoints = tuple(estimator for estimator in valid if estimator in BY_ADJOINT)
     return adjoints if adjoints and size > MANY else tuple(valid)
 
 
@@ -267,11 +225,11 @@ def first_plan(
         InputError: an estimator is unknown, or not valid where it was forced by name.
     """
     forced = dict(forced or {})
+    names = {key for group in groups for key in (group.name, group.control)}
     for name, estimator in forced.items():
         if estimator not in ESTIMATORS:
             what = "estimator" if name == "*" else f"estimator for {name}"
             raise UnknownNameError(what, estimator, ESTIMATORS)
-    names = {key for group in groups for key in (group.name, group.control)}
     for name in forced:
         if name != "*" and name not in names:
             raise UnknownNameError("control in `estimators`", name, sorted(names))
@@ -316,11 +274,14 @@ def first_order(backward: Backward) -> Backward:
     @wraps(backward)
     def once(ctx: Any, cotangent: Tensor) -> tuple[Tensor | None, ...]:
         with torch.no_grad():
-            found = backward(ctx, cotangent)
+            derivatives = backward(ctx, cotangent)
         if not torch.is_grad_enabled():
-            return found
+            return derivatives
         of = (cotangent, *ctx.saved_tensors)
-        return tuple(one if one is None or one is cotangent else _Once.apply(one, *of) for one in found)  # type: ignore[no-untyped-call]
+        return tuple(
+            value if value is None or value is cotangent else _Once.apply(value, *of)  # type: ignore[no-untyped-call]
+            for value in derivatives
+        )
 
     return once
 

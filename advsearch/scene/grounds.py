@@ -15,9 +15,9 @@ from torch import Tensor
 from advsearch.scene import settings
 from advsearch.scene.assets import EnvironmentAsset, Floats, Mesh
 from advsearch.scene.parts import MeshPart
-from advsearch.scene.places.avenue import avenue
-from advsearch.scene.places.car_park import car_park
-from advsearch.scene.places.crossing import crossing
+from advsearch.scene.places.avenue import AVENUE, built
+from advsearch.scene.places.car_park import CAR_PARK
+from advsearch.scene.places.crossing import CROSSING
 from advsearch.scene.places.road import LAID, ROAD, road
 from advsearch.scene.places.room import room
 
@@ -87,18 +87,13 @@ class Photograph:
         texels = self._rows - self._first
         row = polar / math.pi * (self._rows - 1) - self._first
         uvs = np.stack([turn, 1.0 - (row + 0.5) / texels], axis=-1)
-        corner = np.arange(RINGS + 1)[:-1, None] * (SECTORS + 1) + np.arange(SECTORS)
-        inner, outer = corner.ravel(), corner.ravel() + SECTORS + 1
-        faces = np.concatenate(
-            [np.stack([outer, inner, outer + 1], axis=1), np.stack([inner, inner + 1, outer + 1], axis=1)[SECTORS:]]
-        )
-        normals = np.broadcast_to(np.array([0.0, 0.0, 1.0]), (vertices.size // 3, 3))
-        return Mesh(
-            vertices=vertices.reshape(-1, 3).astype(np.float32),
-            faces=faces.astype(np.uint32),
-            normals=normals.astype(np.float32),
-            uvs=uvs.reshape(-1, 2).astype(np.float32),
-        )
+        inner = (np.arange(RINGS)[:, None] * (SECTORS + 1) + np.arange(SECTORS)).ravel()
+        outer = inner + SECTORS + 1
+        further = np.stack([inner, inner + 1, outer + 1], axis=1)[SECTORS:]
+        faces = np.concatenate([np.stack([outer, inner, outer + 1], axis=1), further]).astype(np.uint32)
+        normals = np.tile(np.array([0.0, 0.0, 1.0], np.float32), (vertices.size // 3, 1))
+        places, texture = vertices.reshape(-1, 3).astype(np.float32), uvs.reshape(-1, 2).astype(np.float32)
+        return Mesh(places, faces, normals, texture)
 
 
 @lru_cache(maxsize=4)
@@ -127,8 +122,9 @@ def enclosed(scene: SceneDescription) -> bool:
 
 
 PLACES: Mapping[str, Callable[..., tuple[MeshPart, ...]]] = {
-    settings.DRY_AVENUE: avenue, settings.WET_AVENUE: avenue, settings.SNOW_AVENUE: partial(avenue, snow=True),
-    settings.CROSSING: crossing, settings.CAR_PARK: car_park, settings.ROOM: room, settings.LIT_ROOM: room,
+    settings.DRY_AVENUE: partial(built, AVENUE), settings.WET_AVENUE: partial(built, AVENUE),
+    settings.SNOW_AVENUE: partial(built, AVENUE, snow=True), settings.CROSSING: partial(built, CROSSING),
+    settings.CAR_PARK: partial(built, CAR_PARK), settings.ROOM: room, settings.LIT_ROOM: room,
 }  # fmt: skip
 """What makes the meshes of each kind of ground that is a place."""
 
@@ -138,8 +134,12 @@ def on_its_ground(scene: SceneDescription) -> SceneDescription:
     kind = _kind(scene)
     others = tuple(part for part in scene.parts if not (isinstance(part, MeshPart) and part.laid))
     if kind in settings.PLACES:
-        unit = None if scene.environment is None else scene.environment.candelas
-        place = PLACES[kind](scene.metres, unit, wet=kind == settings.WET_AVENUE, dark=_dark(scene, kind))
+        light, dark = scene.environment, kind == settings.LIT_ROOM
+        unit = None if light is None else light.candelas
+        if light is not None and unit is not None and kind not in (settings.ROOM, settings.LIT_ROOM):
+            arriving = irradiance(torch.from_numpy(light.radiance.copy()))
+            dark = unit * float(arriving @ torch.tensor(LUMINANCE)) < DUSK
+        place = PLACES[kind](scene.metres, unit, wet=kind == settings.WET_AVENUE, dark=dark)
         return replace(scene, parts=(*others, *place))
     if kind in settings.ROADS:
         return replace(scene, parts=(*others, road(kind == settings.WET_ROAD, scene.metres)))
@@ -150,17 +150,6 @@ DUSK = 70.0
 """Illuminance of the open sky at which street lamps are switched on, lux."""
 
 
-def _dark(scene: SceneDescription, kind: str) -> bool:
-    """Whether it is so dark that lamps shine."""
-    light = scene.environment
-    if kind in (settings.ROOM, settings.LIT_ROOM):
-        return kind == settings.LIT_ROOM
-    if light is None or light.candelas is None:
-        return False
-    arriving = irradiance(torch.from_numpy(light.radiance.copy()))
-    return light.candelas * float(arriving @ torch.tensor(LUMINANCE)) < DUSK
-
-
 def _kind(scene: SceneDescription) -> str | None:
     """What the object stands on: as was asked, or else what belongs to the environment, unless a table is described."""
     kind = scene.values.get("ground.kind")
@@ -168,6 +157,5 @@ def _kind(scene: SceneDescription) -> str | None:
         return None
     if kind is not None:
         return settings.GROUND_KINDS[int(kind)]
-    if scene.environment is None or not scene.given.isdisjoint(settings.TABLE_SETTINGS):
-        return None
-    return scene.environment.ground
+    described = not scene.given.isdisjoint(settings.TABLE_SETTINGS)
+    return None if scene.environment is None or described else scene.environment.ground

@@ -28,6 +28,7 @@ from advsearch.errors import InputError
 from advsearch.scene.assets import Doubles, Floats, Ints, Material, Mesh
 from advsearch.scene.grounds import LUMINANCE
 from advsearch.scene.parts import CAMERA, BeamLamp, LampGlass, MeshPart, ScenePart
+from advsearch.scene.raster import doubled_normals
 from advsearch.scene.settings import LAMPS
 from advsearch.scene.things import ThingPart, heights_over
 
@@ -40,7 +41,7 @@ SIDES, ROWS, COLUMNS = 1.0, 512, 896
 """Tangent of the table's angle to either side, and its size; up and down it has the same tangent a texel."""
 GLASS, REAR = 250.0, 10.0
 """Candela ahead of the glass of one headlamp, and behind that of one tail lamp."""
-WHITE, RED = (one / (one @ np.array(LUMINANCE)) for one in (np.array([1.0, 0.95, 0.86]), np.array([1.0, 0.0, 0.0])))
+WHITE, RED = (color / (color @ np.array(LUMINANCE)) for color in np.array([[1.0, 0.95, 0.86], [1.0, 0.0, 0.0]]))
 """Linear colours with a luminance of 1."""
 NAMED = {
     "headlamps": re.compile(r"head[ _-]?(light|lamp)", re.IGNORECASE),
@@ -59,13 +60,8 @@ OUT = 0.004
 
 
 def candela(kind: str, h: Doubles, v: Doubles) -> Doubles:
-    """Return the luminous intensity of one headlamp, see above.
-
-    Args:
-        kind: "low" or "high".
-        h: degrees to the side.
-        v: degrees above the horizon.
-    """
+    """Return the luminous intensity of one headlamp, "low" or "high", at degrees to the side and above the horizon; see
+    above."""
     below = CUT_OFF - v
     spot = 14500.0 * np.exp(-((h / 5.0) ** 2) / 2.0 - below.clip(0.0) / 1.5)
     flood = 4000.0 * np.exp(-((h / 16.0) ** 2) / 2.0 - below.clip(0.0) / 5.0)
@@ -138,8 +134,8 @@ def _lamps_of(scene: SceneDescription, carrier: str, kind: str, unit: float, wei
         yield from (front, _glass(part, "taillamps", -1.0, step, REAR / unit * RED))
         vertices, places = front.mesh.vertices, []
         for side in sides:
-            there = side * (vertices[:, 1] - vertices[:, 1].mean()) >= 0.0
-            low, high = vertices[there].min(axis=0), vertices[there].max(axis=0)
+            lamp = vertices[side * (vertices[:, 1] - vertices[:, 1].mean()) >= 0.0]
+            low, high = lamp.min(axis=0), lamp.max(axis=0)
             places.append(np.array([high[0] + 5.0 * OUT * step, *(low + high)[1:] / 2.0]))
     red, green, blue = map(float, WHITE / (unit * scene.metres**2))
     for name, place in zip(("left", "right"), places, strict=True):
@@ -149,16 +145,9 @@ def _lamps_of(scene: SceneDescription, carrier: str, kind: str, unit: float, wei
 
 
 def _glass(part: MeshPart, where: str, ahead: float, step: float, power: Doubles) -> LampGlass:
-    """The glass of a car's two headlamps or tail lamps: the faces of a material that is called so, or else two disks
-    before what is foremost there.
-
-    Args:
-        part: the car.
-        where: a name of `NAMED`.
-        ahead: the side of the x axis that they shine to, 1 or -1.
-        step: a metre in the car's coordinates.
-        power: (3,) that each of the two lamps sends there, radiance times square metres.
-    """
+    """The glass of a car's two headlamps or tail lamps (`where`, of `NAMED`), which shine along its x axis by `ahead`:
+    the faces of a material that is called so, or else two disks before what is foremost there; `step` is a metre in the
+    car's coordinates, `power` (3,) the radiance times square metres that each of the two sends there."""
     mesh = part.mesh
     named = [faces for name, faces in mesh.materials.items() if NAMED[where].search(name) and len(faces)]
     if named:
@@ -172,7 +161,7 @@ def _glass(part: MeshPart, where: str, ahead: float, step: float, power: Doubles
         follows = cKDTree(mesh.vertices).query(vertices)[1]
         lies_on = cKDTree(mesh.vertices[mesh.faces].mean(axis=1)).query(vertices[faces].mean(axis=1))[1]
     corners = vertices[faces] / step
-    across = ahead * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[:, 0] / 2.0
+    across = ahead * doubled_normals(corners)[:, 0] / 2.0
     shape = vertices.astype(np.float32), faces.astype(np.uint32), normals.astype(np.float32), mesh.uvs[follows]
     radiance = 2.0 * power / max(float(across.clip(0.0).sum()), 1e-9)
     return LampGlass(
@@ -201,7 +190,7 @@ def _disks(mesh: Mesh, where: str, ahead: float, step: float) -> tuple[Doubles, 
         disk = np.concatenate([[middle], middle + rim])
         beside = (corners.min(axis=1) > disk.max(axis=0)) | (corners.max(axis=1) < disk.min(axis=0))
         near = corners[~beside[:, 1:].any(axis=1)][:, :, [1, 2, 0]]
-        foremost = max((one for place in disk[:, 1:] for one in heights_over(near, place)), default=high[0])
+        foremost = max((x for place in disk[:, 1:] for x in heights_over(near, place)), default=high[0])
         disk[:, 0] = ahead * (foremost + OUT * step)
         spokes = np.arange(SPOKES)
         faces.append(len(vertices) * len(disk) + np.stack([0 * spokes, 1 + spokes, 1 + (spokes + 1) % SPOKES], axis=1))

@@ -8,7 +8,7 @@ from __future__ import annotations
 import io
 import json
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from importlib import resources
 from typing import TYPE_CHECKING, Any
@@ -17,7 +17,7 @@ import numpy as np
 
 from advsearch.errors import FileFormatError, UnknownNameError
 from advsearch.files import MESHES, either
-from advsearch.scene.assets import EnvironmentAsset, Floats, Ints, Material, Mesh, ObjectAsset
+from advsearch.scene.assets import EnvironmentAsset, Floats, Material, Mesh, ObjectAsset
 from advsearch.scene.parts import BASE_COLOR
 from advsearch.scene.raster import rasterised
 
@@ -26,13 +26,8 @@ SIDE = 256
 
 
 def finished(mesh: Mesh, finishes: Mapping[str, Material], main: Material) -> dict[str, object]:
-    """Return a principled surface, in Mitsuba's words, as `ObjectAsset.surface` has it.
-
-    Args:
-        mesh: with texture coordinates and the faces of each material by name.
-        finishes: what each of these materials is like.
-        main: what all other faces are like; its `specular` holds for all.
-    """
+    """Return a principled surface, in Mitsuba's words, as `ObjectAsset.surface` has it: some materials of the mesh as
+    `finishes` say, and all other faces like `main`, whose `specular` holds for all."""
     faces = np.tile([main.roughness, main.metallic, main.clearcoat], (len(mesh.faces), 1))
     for name, one in finishes.items():
         faces[mesh.materials[name]] = one.roughness, one.metallic, one.clearcoat
@@ -76,12 +71,8 @@ def list_objects() -> tuple[str, ...]:
 
 
 def list_environments(split: str | None = None) -> tuple[str, ...]:
-    """Return the names of the bundled environments, sorted.
-
-    Args:
-        split: "train" or "heldout" to list only that half, "street" for the streets, "place" for other places; None for
-            all.
-    """
+    """Return the names of the bundled environments, sorted: of the half "train" or "heldout", of "street" or of other
+    places ("place"); None for all."""
     facts = _environments().items()
     return tuple(sorted(name for name, fact in facts if split is None or fact["split"] == split))
 
@@ -100,23 +91,29 @@ def load_object(name: str) -> ObjectAsset:
         UnknownNameError: there is no such object.
         FileFormatError: the installation is damaged.
     """
+    import imageio.v3 as iio  # most scenes need no such file
+
     known = list_objects()
     if name not in known:
         raise UnknownNameError("object", name, known, OBJECT_HINT)
     folder = _data() / "objects" / name
     try:
         facts = json.loads((folder / "object.json").read_text("utf-8"))
-        mesh = replace(_mesh((folder / "mesh.ply").read_bytes()), materials=_materials(facts.get("faces", ())))
+        runs = facts.get("faces", ())  # how many faces in a row have which material
+        names = np.repeat([name for name, _ in runs], [count for _, count in runs])
+        materials = {str(name): np.nonzero(names == name)[0] for name in dict.fromkeys(names)}
+        mesh = replace(_mesh((folder / "mesh.ply").read_bytes()), materials=materials)
         if (folder / "body.npz").is_file():
             from advsearch.scene.people import Person, body_data  # torch takes seconds, and most have no body
 
             mesh = replace(mesh, rig=Person(body_data()))
+        levels = np.asarray(iio.imread((folder / "base_color.png").read_bytes(), extension=".png"))[..., :3]
         material = Material(**facts["material"])
-        finishes = {one: Material(**given) for one, given in facts.get("finishes", {}).items()}
+        finishes = {finish: Material(**numbers) for finish, numbers in facts.get("finishes", {}).items()}
         return ObjectAsset(
             name=name,
             mesh=mesh,
-            base_color=_image((folder / "base_color.png").read_bytes()),
+            base_color=levels.astype(np.float32) / np.float32(255.0),
             material=material,
             label=facts["label"],
             source=BUNDLED_OBJECT,
@@ -140,7 +137,11 @@ def load_environment(name: str) -> EnvironmentAsset:
         raise UnknownNameError("environment", name, known, MAP_HINT)
     facts = _environments()[name]
     try:
-        radiance = _exr((_data() / "environments" / f"{facts.get('map', name)}.exr").read_bytes())
+        import OpenEXR  # most scenes need no such file
+
+        content = (_data() / "environments" / f"{facts.get('map', name)}.exr").read_bytes()
+        with OpenEXR.File(io.BytesIO(content)) as file:
+            radiance: Floats = np.ascontiguousarray(file.channels()["RGB"].pixels[..., :3], dtype=np.float32)
     except (OSError, ValueError, KeyError, RuntimeError) as error:
         raise FileFormatError(f"bundled environment {name!r} cannot be read ({error}); reinstall advsearch") from error
     return EnvironmentAsset(
@@ -167,29 +168,3 @@ def _mesh(content: bytes) -> Mesh:
         normals=np.ascontiguousarray(vertices[:, 3:6]),
         uvs=np.ascontiguousarray(vertices[:, 6:]),
     )
-
-
-def _materials(runs: Iterable[tuple[str, int]]) -> dict[str, Ints]:
-    """Return the faces of each material, from how many faces in a row have which."""
-    names = np.repeat([name for name, _ in runs], [count for _, count in runs])
-    return {str(name): np.nonzero(names == name)[0] for name in dict.fromkeys(names)}
-
-
-def _image(content: bytes) -> Floats:
-    """Decode a PNG to (H, W, 3) display-referred sRGB in [0, 1]."""
-    # most scenes need no such file
-    import imageio.v3 as iio
-
-    levels = np.asarray(iio.imread(content, extension=".png"))[..., :3]
-    display: Floats = levels.astype(np.float32) / np.float32(255.0)
-    return display
-
-
-def _exr(content: bytes) -> Floats:
-    """Decode an RGB EXR to (H, W, 3) float32."""
-    # most scenes need no such file
-    import OpenEXR
-
-    with OpenEXR.File(io.BytesIO(content)) as file:
-        pixels: Floats = np.ascontiguousarray(file.channels()["RGB"].pixels[..., :3], dtype=np.float32)
-    return pixels

@@ -8,7 +8,6 @@ those in its own exposure.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -29,29 +28,19 @@ class Later(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Moment:
-    """A part of an exposure.
-
-    Attributes:
-        space: what the scene is then.
-        rows: (H,) its share of each row; those of all moments add up to 1.
-        samples: its share of the samples a pixel.
-    """
+    """A part of an exposure: what the scene is then, its share (H,) of each row, which adds up to 1 over all moments,
+    and its share of the samples a pixel."""
 
     space: Later
     rows: Tensor
     samples: float
-
-    def inputs(self, u: Tensor) -> Mapping[str, Tensor]:
-        """Return the scene inputs of a configuration at this moment."""
-        return self.space.inputs(u)
 
 
 def moments_of(shutter: float, rolling: float, height: int, count: int) -> tuple[Tensor, Tensor, float]:
     """Return when moments are, how much each counts, and the part of a pixel's samples that each takes.
 
     Args:
-        shutter: seconds that each row is exposed, at least 0.
-        rolling: seconds from the first row to the end of the last, at least 0.
+        shutter, rolling: seconds that each row is exposed, and from the first row to the end of the last, at least 0.
         height: rows of the picture.
         count: moments M. With as many as rows and no shutter, each row has the moment of its own.
 

@@ -12,15 +12,13 @@ import torch
 from scipy import ndimage
 from torch import Tensor
 
-from advsearch.scene.assets import Bools, Doubles
+from advsearch.scene.assets import Bools
 from advsearch.scene.camera_model import EQUIRECTANGULAR
 from advsearch.scene.description import SceneDescription
-from advsearch.scene.geometry import camera_to_world
+from advsearch.scene.geometry import camera_to_world, projected
 from advsearch.scene.raster import pixels_in
 from advsearch.scene.renderer import Renderer
 
-NEAREST = 1e-3
-"""Points nearer to the camera plane than this, or behind it, have no place in the picture."""
 RASTER = 2048
 """Most pixels along a side of an outline; of a larger one each stands for several of the picture."""
 WITHIN = 0.98
@@ -32,12 +30,11 @@ class SeenThing:
     """What a picture shows of one mesh.
 
     Attributes:
-        name: of the mesh.
         mask: (H, W) bool, the pixels that it is first seen in.
         share: of its outline that these are, in (0, 1]; None where the outline is not known.
         truncated: whether the outline goes on beyond the picture; None where it is not known.
-        distance: of the nearest point that is seen from the camera, along the ray; in metres, or in object sizes where
-            the object's size is not known.
+        distance: along the ray to its nearest point that is seen, in metres; in object sizes where its size is not
+            known.
     """
 
     name: str
@@ -58,13 +55,13 @@ def seen_things(renderer: Renderer, u: Tensor, names: Collection[str] | None = N
     description, surfaces = renderer.scene.made[0], renderer.surfaces(u)
     with torch.no_grad():
         inputs = renderer.scene.assembly(renderer.space.inputs(u))
-    found = []
+    things = []
     for name in description.meshes if names is None else names:
         mask = surfaces.seen(name).numpy() if name in surfaces.names else np.zeros(surfaces.id.shape, np.bool_)
         if mask.any():
             near = float(surfaces.depth.numpy()[mask].min())
-            found.append(SeenThing(name, mask, *_outline(renderer, description, inputs, name, mask), near))
-    return found
+            things.append(SeenThing(name, mask, *_outline(renderer, description, inputs, name, mask), near))
+    return things
 
 
 def _outline(
@@ -75,14 +72,19 @@ def _outline(
     vertices = inputs.get(f"{name}.vertices")
     if vertices is None:
         vertices = renderer.scene.assembly.meshes[name].place(None, None)[0]
-    places, before = _places(description, inputs, vertices.detach().double().cpu(), (height, width))
-    faces = part.mesh.faces.astype(np.int64)
-    if part.opacity is not None or not before[np.unique(faces)].all():
+    camera = inputs.get("camera.to_world", torch.from_numpy(camera_to_world(description, width / height)))
+    camera = camera.detach().double().cpu()
+    points = (vertices.detach().double().cpu() - camera[:3, 3]) @ camera[:3, :3]
+    inputs = {name: value.detach().cpu() for name, value in inputs.items() if name.startswith("camera.")}
+    places, before = projected(description, inputs, points, (height, width))
+    model, faces = description.camera_model, torch.from_numpy(part.mesh.faces.astype(np.int64))
+    seam = model is not None and model.kind == EQUIRECTANGULAR
+    if part.opacity is not None or seam or not bool(before[faces].all()):
         return None, None  # of a cut-out the mesh is no outline, and what reaches behind the camera has none
-    corners = places[faces]
+    corners = places.numpy()[faces.numpy()] + (width / 2.0, height / 2.0)
     low, high = np.floor(corners.min(axis=(0, 1))), np.ceil(corners.max(axis=(0, 1)))
     step = max(1, math.ceil(float((high - low).max()) / RASTER))
-    columns, rows = (int(one) for one in (high - low) // step + 1)
+    columns, rows = map(int, (high - low) // step + 1)
     _, row, column, _ = pixels_in((corners - low) / step - 0.5, (rows, columns))
     outline = np.zeros((rows, columns), np.bool_)
     outline[row, column] = True
@@ -97,24 +99,3 @@ def _outline(
     if here.mean() < WITHIN:
         return None, None
     return min(1.0, float(mask.sum()) / (len(row) * step**2)), bool((~inside).any())
-
-
-def _places(
-    description: SceneDescription, inputs: Mapping[str, Tensor], vertices: Tensor, size: tuple[int, int]
-) -> tuple[Doubles, Bools]:
-    """Where vertices (V, 3) in world space are seen, (V, 2) column and row in pixels from the top left corner, and
-    which are before the camera."""
-    height, width = size
-    camera = inputs.get("camera.to_world", torch.from_numpy(camera_to_world(description, width / height)))
-    camera = camera.detach().double().cpu()
-    points = (vertices - camera[:3, 3]) @ camera[:3, :3] * torch.tensor([-1.0, -1.0, 1.0])  # right, down, forward
-    sides = torch.tensor([width, height]).double()
-    if (model := description.camera_model) is not None:
-        model = model.with_numbers(inputs["camera.lens"].detach().cpu()) if "camera.lens" in inputs else model
-        places, seen = model.project(points)
-        return (places * sides).numpy(), (seen & (model.kind != EQUIRECTANGULAR)).numpy()  # a panorama has a seam
-    fov = float(inputs["camera.fov"]) if "camera.fov" in inputs else description.number("camera.fov")
-    focal, depth = max(size) / 2.0 / math.tan(math.radians(fov) / 2.0), points[:, 2:]
-    shift = [float(inputs[f"camera.shift_{one}"]) if f"camera.shift_{one}" in inputs else 0.0 for one in "xy"]
-    places = focal * points[:, :2] / depth.clamp_min(NEAREST) + sides * (0.5 - torch.tensor(shift).double())
-    return places.numpy(), (depth[:, 0] > NEAREST).numpy()

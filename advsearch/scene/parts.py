@@ -31,15 +31,10 @@ def plugins_in(plugin: Mapping[str, object]) -> Iterator[Mapping[str, object]]:
 
 @dataclass(frozen=True, eq=False)
 class ScenePart:
-    """Something in a scene.
+    """Something in a scene."""
 
-    Attributes:
-        name: unique in the scene; begins the names of its inputs.
-        volumetric: needs an integrator that handles media.
-    """
-
-    name: str
-    volumetric: ClassVar[bool] = False
+    name: str  # unique in the scene; begins the names of its inputs
+    volumetric: ClassVar[bool] = False  # needs an integrator that handles media
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,25 +45,16 @@ class MeshPart(Shape, ScenePart):
     row 0 at v = 1, and `NAME.roughness`, `.metallic`, `.specular`, `.clearcoat` (1,) in [0, 1], but for what a
     `surface` lacks of these; where it emits light, `NAME.radiance`, linear, (3,) or (h, w, 3). `NAME.to_world` (4, 4)
     and `NAME.offsets` (V, 3) are turned into vertices and normals by `advsearch.scene.assembly`.
-
-    Attributes:
-        to_world: (4, 4) its base pose.
-        laid: it belongs to the ground that the scene has by itself, and goes with it.
     """
 
-    to_world: Doubles = field(default_factory=lambda: np.eye(4))
-    laid: bool = False
+    to_world: Doubles = field(default_factory=lambda: np.eye(4))  # (4, 4) its base pose
+    laid: bool = False  # it belongs to the ground that the scene has by itself, and goes with it
 
 
 @dataclass(frozen=True, eq=False)
 class LampGlass(MeshPart):
-    """The glass of a car's lamps, which shines; it stands in the car's own coordinates, and belongs to it.
-
-    Attributes:
-        carrier: the mesh of the car.
-        follows: (V,) the car's vertices that its vertices go with.
-        lies_on: (F,) the car's faces that its faces lie on.
-    """
+    """The glass of a car's lamps, which shines; it stands in the car's own coordinates, and belongs to it: to the mesh
+    that carries it, with whose vertices (V,) its own go, and on whose faces (F,) its own lie."""
 
     carrier: str = ""
     follows: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
@@ -77,27 +63,17 @@ class LampGlass(MeshPart):
 
 def mesh_part(name: str, shape: Shape, to_world: Doubles, material: Material) -> MeshPart:
     """Return a shape with another name and material under a pose (4, 4)."""
-    looks = {one.name: getattr(shape, one.name) for one in fields(Shape)}
+    looks = {look.name: getattr(shape, look.name) for look in fields(Shape)}
     return MeshPart(**{**looks, "name": name, "material": material}, to_world=to_world)
 
 
 @dataclass(frozen=True, eq=False)
-class PointLamp(ScenePart):
-    """A point that shines equally in all directions; the camera does not see it.
+class _Point(ScenePart):
+    """A lamp without size, which the camera does not see."""
 
-    Takes `NAME.position` (3,) in object sizes and `NAME.intensity` (3,) linear radiant intensity. The interior adjoint
-    is right for the intensity; for a position Mitsuba raises.
-
-    Attributes:
-        name: of the lamp.
-        dark: its intensity stays 0.
-        position: base value, object sizes.
-        intensity: base value, linear radiant intensity for each colour channel.
-    """
-
-    dark: bool = False
-    position: Triple = (0.0, 0.0, 2.0)
-    intensity: Triple = (0.0, 0.0, 0.0)
+    dark: bool = False  # its intensity stays 0
+    position: Triple = (0.0, 0.0, 2.0)  # base value, object sizes
+    intensity: Triple = (0.0, 0.0, 0.0)  # base value, linear radiant intensity for each colour channel
 
     def lighting(self, place: Doubles) -> tuple[Doubles, Doubles]:
         """Return the way from a place (3,) to the lamp, and the irradiance (3,) where that is faced; base values."""
@@ -105,35 +81,30 @@ class PointLamp(ScenePart):
         return way, np.array(self.intensity) / max(float(way @ way), 1e-12)
 
 
-WIDEST, NARROWEST = 89.9, 0.1
-"""Angles of a spot's edge, degrees."""
-SOFTEST = 0.99
-"""Largest share of that angle at which the light begins to fall off."""
+class PointLamp(_Point):
+    """A point that shines equally in all directions.
+
+    Takes `NAME.position` (3,) in object sizes and `NAME.intensity` (3,) linear radiant intensity. The interior adjoint
+    is right for the intensity; for a position Mitsuba raises.
+    """
+
+
+WIDEST, NARROWEST = 89.9, 0.1  # angles of a spot's edge, degrees
+SOFTEST = 0.99  # largest share of that angle at which the light begins to fall off
 
 
 @dataclass(frozen=True, eq=False)
-class SpotLamp(ScenePart):
-    """A point that shines in a cone, as Mitsuba's `spot`; the camera does not see it.
+class SpotLamp(_Point):
+    """A point that shines in a cone, as Mitsuba's `spot`.
 
-    Up to `beam` from its axis it shines evenly, and from there to `cutoff` its intensity falls off linearly with the
-    angle. Takes `NAME.intensity` (3,) linear radiant intensity, for which the interior adjoint is right.
-
-    Attributes:
-        name: of the lamp.
-        dark: its intensity stays 0.
-        position: object sizes.
-        direction: unit vector along its axis; z down where that is 0.
-        intensity: base value on the axis, linear radiant intensity for each colour channel.
-        cutoff: angle from the axis beyond which it is dark, degrees; taken to `NARROWEST` to `WIDEST`.
-        beam: angle up to which it shines fully, degrees; taken to at most `SOFTEST` of the other one.
+    Up to `beam` from its axis it shines evenly, and from there to `cutoff` its intensity, which is that on the axis,
+    falls off linearly with the angle. Takes `NAME.intensity` (3,) linear radiant intensity, for which the interior
+    adjoint is right.
     """
 
-    dark: bool = False
-    position: Triple = (0.0, 0.0, 2.0)
-    direction: Triple = (0.0, 0.0, -1.0)
-    intensity: Triple = (0.0, 0.0, 0.0)
-    cutoff: float = 45.0
-    beam: float = 0.0
+    direction: Triple = (0.0, 0.0, -1.0)  # unit vector along its axis; z down where that is 0
+    cutoff: float = 45.0  # angle from the axis beyond which it is dark, degrees; taken to `NARROWEST` to `WIDEST`
+    beam: float = 0.0  # angle up to which it shines fully, degrees; taken to at most `SOFTEST` of the other one
 
     @property
     def cone(self) -> tuple[float, float]:
@@ -153,7 +124,7 @@ class SpotLamp(ScenePart):
 
     def lighting(self, place: Doubles) -> tuple[Doubles, Doubles]:
         """As of a point, within its cone."""
-        way, faced = PointLamp(self.name, position=self.position, intensity=self.intensity).lighting(place)
+        way, faced = super().lighting(place)
         cutoff, beam = self.cone
         along = -way @ self.to_world[:3, 2] / max(float(np.linalg.norm(way)), 1e-12)
         angle = math.degrees(math.acos(min(max(float(along), -1.0), 1.0)))
@@ -169,51 +140,34 @@ class BallLamp(ScenePart):
 
     Takes `NAME.ball` (4, 4), the pose of the unit ball (a shift and one scale for all axes), and `NAME.radiance` (3,)
     linear radiance. The interior adjoint is right for the radiance; for the pose it is silently 0.
-
-    Attributes:
-        name: of the lamp.
-        dark: its radiance stays 0.
-        place: base value of the ball's middle, object sizes.
-        radius: base value, object sizes.
-        radiance: base value, linear, for each colour channel.
     """
 
-    dark: bool = False
-    place: Triple = (0.0, 0.0, 2.0)
-    radius: float = 0.1
-    radiance: Triple = (0.0, 0.0, 0.0)
+    dark: bool = False  # its radiance stays 0
+    place: Triple = (0.0, 0.0, 2.0)  # base value of the ball's middle, object sizes
+    radius: float = 0.1  # base value, object sizes
+    radiance: Triple = (0.0, 0.0, 0.0)  # base value, linear, for each colour channel
 
     def lighting(self, place: Doubles) -> tuple[Doubles, Doubles]:
         """As of a point; the irradiance of a uniform ball is `pi L r^2 / d^2` (see the `light` control)."""
-        intensity = tuple(math.pi * self.radius**2 * one for one in self.radiance)
-        return PointLamp(self.name, position=self.place, intensity=intensity).lighting(place)  # type: ignore[arg-type]
+        red, green, blue = (math.pi * self.radius**2 * channel for channel in self.radiance)
+        return PointLamp(self.name, position=self.place, intensity=(red, green, blue)).lighting(place)
 
 
-CAMERA = "camera"
-"""What carries the lamps of the car that the camera is in."""
+CAMERA = "camera"  # what carries the lamps of the car that the camera is in
 
 
 @dataclass(frozen=True, eq=False)
 class BeamLamp(ScenePart):
     """A point on a mesh, or before the camera, that shines by a table, such as a headlamp; the camera does not see it.
 
-    Takes `NAME.to_world` (4, 4), its pose; its brightness stays.
-
-    Attributes:
-        name: of the lamp.
-        carrier: the mesh that carries it, or `CAMERA`.
-        seat: (4, 4) its pose in what carries it (`geometry.seated`): it shines along its +z and has +y up.
-        table: (h, w) intensities on a plane before it, row 0 on top, as far as tangents of 1 to either side.
-        tint: radiant intensity for each colour channel where the table has 1.
-        weight: how often its light is sampled, where that of the environment has 1.
-        to_world: (4, 4) its base pose in the scene, once what carries it stands there.
+    Takes `NAME.to_world` (4, 4), its pose, which it has once what carries it stands there; its brightness stays.
     """
 
-    carrier: str
-    seat: Doubles
-    table: Floats
-    tint: Triple
-    weight: float = 1.0
+    carrier: str  # the mesh that carries it, or `CAMERA`
+    seat: Doubles  # (4, 4) its pose in what carries it (`geometry.seated`): it shines along its +z and has +y up
+    table: Floats  # (h, w) intensities on a plane before it, row 0 on top, as far as tangents of 1 to either side
+    tint: Triple  # radiant intensity for each colour channel where the table has 1
+    weight: float = 1.0  # how often its light is sampled, where that of the environment has 1
     to_world: Doubles = field(default_factory=lambda: np.eye(4))
     dark: ClassVar[bool] = False
 
@@ -230,8 +184,6 @@ class BeamLamp(ScenePart):
 
 
 Lamp = PointLamp | SpotLamp | BallLamp | BeamLamp
-
-
 PATTERN = ".pattern"
 """What the name of an input ends in that is the picture of a projector."""
 
@@ -242,15 +194,10 @@ class ProjectorPart(ScenePart):
 
     Takes `NAME.pose` (4, 4), as a camera's, and `NAME.pattern` (h, w, 3): what a white matt screen shows that faces it
     at distance 1, linear radiance. The interior adjoint is right for the pattern.
-
-    Attributes:
-        name: of the projector.
-        fov: angle of the picture's width, degrees.
-        sides: rows and columns of the picture.
     """
 
-    fov: float = 30.0
-    sides: tuple[int, int] = (2, 2)
+    fov: float = 30.0  # angle of the picture's width, degrees
+    sides: tuple[int, int] = (2, 2)  # rows and columns of the picture
 
     @property
     def aspect(self) -> float:
@@ -265,17 +212,11 @@ class ProjectorPart(ScenePart):
 
 @dataclass(frozen=True, eq=False)
 class PlacedCamera:
-    """A camera with a pose of its own.
+    """A camera with a pose of its own."""
 
-    Attributes:
-        to_world: (4, 4) its pose: it looks along its own +z with +y up and +x to the left.
-        fov: field of view along the larger side of the picture, or if `upright` along its height, degrees.
-        upright: whether it is the height that it is along, whatever the picture's shape.
-    """
-
-    to_world: Doubles
-    fov: float
-    upright: bool = False
+    to_world: Doubles  # (4, 4) its pose: it looks along its own +z with +y up and +x to the left
+    fov: float  # field of view along the larger side of the picture, or if `upright` along its height, degrees
+    upright: bool = False  # whether it is the height that it is along, whatever the picture's shape
 
     def larger_fov(self, aspect: float) -> float:
         """Return the field of view, degrees, along the larger side of a picture of width / height `aspect`."""
@@ -291,36 +232,23 @@ class HazePart(ScenePart):
 
     Takes `NAME.density` (1,), the extinction per object size, and `NAME.albedo` (3,), the share of the light that is
     scattered and not absorbed.
-
-    Attributes:
-        name: of the haze.
-        radius: of the ball that it fills, object sizes.
-        density, albedo: what it has by itself; none by default, for a control to fill.
     """
 
-    radius: float
-    density: float = 0.0
+    radius: float  # of the ball that it fills, object sizes
+    density: float = 0.0  # by itself; none by default, for a control to fill
     albedo: tuple[float, float, float] = (1.0, 1.0, 1.0)
     volumetric: ClassVar[bool] = True
 
 
 @dataclass(frozen=True)
 class PluginNumber:
-    """A number or a colour in Mitsuba, by Mitsuba's own name.
+    """A number or a colour in Mitsuba, by Mitsuba's own name."""
 
-    Attributes:
-        key: that name: "red.reflectance.value".
-        values: its one or three numbers in the scene as it is.
-        input: the scene input that sets it.
-        valid: the valid ways to differentiate it, preferred first.
-        plain: Mitsuba has it as a plain number, which light paths are traced anew for.
-    """
-
-    key: str
-    values: tuple[float, ...]
-    input: str
-    valid: tuple[str, ...] = ("differences",)
-    plain: bool = False
+    key: str  # that name: "red.reflectance.value"
+    values: tuple[float, ...]  # its one or three numbers in the scene as it is
+    input: str  # the scene input that sets it
+    valid: tuple[str, ...] = ("differences",)  # the valid ways to differentiate it, preferred first
+    plain: bool = False  # Mitsuba has it as a plain number, which light paths are traced anew for
 
 
 @dataclass(frozen=True, eq=False)
@@ -328,25 +256,17 @@ class PluginNumbers(ScenePart):
     """Numbers and colours of what is in the scene already.
 
     Takes the inputs of its numbers that begin with `NAME.`, (1,) or (3,) each.
-
-    Attributes:
-        numbers: some of the scene.
     """
 
-    numbers: tuple[PluginNumber, ...] = ()
+    numbers: tuple[PluginNumber, ...] = ()  # some of the scene
 
 
 @dataclass(frozen=True, eq=False)
 class PluginPart(ScenePart):
-    """A shape, light or material of a Mitsuba scene as it is.
+    """A shape, light or material of a Mitsuba scene as it is."""
 
-    Attributes:
-        plugin: its dictionary; transforms are (4, 4) arrays, pictures (H, W, C) ones.
-        shines: it sends out light.
-    """
-
-    plugin: Mapping[str, object] = field(default_factory=dict)
-    shines: bool = False
+    plugin: Mapping[str, object] = field(default_factory=dict)  # transforms are (4, 4) arrays, pictures (H, W, C) ones
+    shines: bool = False  # it sends out light
 
 
 @dataclass(frozen=True, eq=False)

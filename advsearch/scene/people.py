@@ -26,8 +26,7 @@ from torch import Tensor
 from advsearch.described import Value
 from advsearch.scene.settings import GEOMETRIC, Parameter, moving
 
-AGES = (10.0, 25.0, 90.0)
-"""Years of MakeHuman's child, young and old."""
+AGES = (10.0, 25.0, 90.0)  # years of MakeHuman's child, young and old
 _of_body = partial(moving, GEOMETRIC)
 
 
@@ -64,18 +63,13 @@ LIMBS = (
     ("ankle", -35.0, 20.0, "foot, its toes up"),
 )
 """Joints that are there twice, with their limits in degrees."""
-PARAMETERS = (
-    *PHENOTYPE,
-    *WALK,
-    *SPINE,
-    *(
-        _angle(f"{side}_{name}", low, high, f"{side.capitalize()} {text}.")
-        for side in ("left", "right")
-        for name, low, high, text in LIMBS
-    ),
+_JOINTS = (
+    _angle(f"{side}_{name}", low, high, f"{side.capitalize()} {text}.")
+    for side in ("left", "right")
+    for name, low, high, text in LIMBS
 )
+PARAMETERS = (*PHENOTYPE, *WALK, *SPINE, *_JOINTS)
 """Everything that a person can be asked for."""
-
 GAIT = {
     "hip": (30, 24, 16, 6, -3, -10, -6, 10, 25, 31),
     "knee": (4, 16, 15, 8, 4, 10, 36, 60, 50, 15),
@@ -92,12 +86,9 @@ STRAIGHT = {
 
 
 class Person:
-    """A dressed body, as `scenes/person.py` has sewn it.
+    """A dressed body, as `scenes/person.py` has sewn it: a `MeshRig`.
 
     Attributes:
-        parameters: what can be asked for.
-        defaults: what this one has where nothing is said.
-        clips: none.
         size: its largest extent in metres at its defaults.
         data: the arrays of body.npz.
     """
@@ -106,7 +97,8 @@ class Person:
     clips = ()
 
     def __init__(self, data: Mapping[str, np.ndarray], defaults: Mapping[str, float] = MappingProxyType({})) -> None:
-        self.data, self.defaults = data, {one.name: float(one.default) for one in PARAMETERS} | dict(defaults)
+        usual = {parameter.name: float(parameter.default) for parameter in PARAMETERS}
+        self.data, self.defaults = data, usual | dict(defaults)
         self._bones = [str(bone) for bone in data["bones"]]
         self._parents = [int(parent) for parent in data["parents"]]
         self._held = {
@@ -124,11 +116,8 @@ class Person:
         return (posed - self.standing.to(posed.device)) / self.size
 
     def posed(self, values: Mapping[str, Tensor]) -> Tensor:
-        """Return the vertices (V, 3) in metres, the pelvis above the origin and the lowest on z = 0.
-
-        Args:
-            values: numbers by the names of `PARAMETERS`, without dimensions; its own default where one is missing.
-        """
+        """Return the vertices (V, 3) in metres, the pelvis above the origin and the lowest on z = 0, of numbers without
+        dimensions by the names of `PARAMETERS`; its own default where one is missing."""
         number = self._numbers(values)
         device = number["height"].device
         mixed, factor = self._phenotype(number)
@@ -182,13 +171,13 @@ class Person:
 
     def _straightened(self, joints: Tensor) -> dict[str, Tensor]:
         """The turn of each bone that has a direction where all angles are 0."""
-        found = {}
+        turns = {}
         for side, sign in (("l", 1.0), ("r", -1.0)):
             for bone, (end, (x, y, z)) in STRAIGHT.items():
-                begin, stop = (joints[self._bones.index(f"{one}_{side}")] for one in (bone, end))
-                found[f"{bone}_{side}"] = least_turn(stop - begin, joints.new_tensor([x, sign * y, z]))
-            found[f"hand_{side}"] = about("z", joints.new_tensor(sign * 60.0)) @ found[f"lowerarm_{side}"]
-        return found
+                begin, stop = (joints[self._bones.index(f"{name}_{side}")] for name in (bone, end))
+                turns[f"{bone}_{side}"] = least_turn(stop - begin, joints.new_tensor([x, sign * y, z]))
+            turns[f"hand_{side}"] = about("z", joints.new_tensor(sign * 60.0)) @ turns[f"lowerarm_{side}"]
+        return turns
 
 
 @lru_cache(maxsize=1)
@@ -205,8 +194,7 @@ def hats(value: Tensor, at: Tensor) -> Tensor:
     share = (value - at[:-1]) / (at[1:] - at[:-1])
     within = (share >= 0.0) & (share < 1.0)  # at a place the derivative is that of one side, not the sum of both
     share = torch.where(within, share, (share >= 1.0).to(share.dtype))
-    one = torch.ones_like(share[:1])
-    return torch.cat([one, share]) - torch.cat([share, torch.zeros_like(one)])
+    return torch.cat([torch.ones_like(share[:1]), share]) - torch.cat([share, torch.zeros_like(share[:1])])
 
 
 def walked(number: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -222,7 +210,9 @@ def walked(number: Mapping[str, Tensor]) -> dict[str, Tensor]:
                 swing = swing + 2.0 * (float(wave.real) * torch.cos(at) - float(wave.imag) * torch.sin(at))
             angle[f"{side}_{joint}"] = angle[f"{side}_{joint}"] + stride * swing
     angle["spine_turn"] = angle["spine_turn"] + stride * 5.0 * torch.cos(phase)
-    limits = {one.name: (one.low, one.high) for one in PARAMETERS if one.unit == "degrees" and not one.periodic}
+    limits = {
+        angle.name: (angle.low, angle.high) for angle in PARAMETERS if angle.unit == "degrees" and not angle.periodic
+    }
     return {name: value.clamp(*limits[name]) if name in limits else value for name, value in angle.items()}
 
 
@@ -231,17 +221,17 @@ def turned(angle: Mapping[str, Tensor]) -> dict[str, Tensor]:
     spine, side, turn = (angle[name] / 3.0 for name in ("spine", "spine_side", "spine_turn"))
     bend = about("y", spine) @ about("x", -side) @ about("z", turn)
     nod = about("z", angle["neck_turn"] / 2.0) @ about("y", angle["neck"] / 2.0)
-    found = {"spine_01": bend, "spine_02": bend, "spine_03": bend, "neck_01": nod, "head": nod}
+    turns = {"spine_01": bend, "spine_02": bend, "spine_03": bend, "neck_01": nod, "head": nod}
     for name, left in (("left", 1.0), ("right", -1.0)):
-        one = {joint: angle[f"{name}_{joint}"] for joint, *_ in LIMBS}
+        limb = {joint: angle[f"{name}_{joint}"] for joint, *_ in LIMBS}
         end = name[0]
-        raised = about("x", left * one["shoulder_out"]) @ about("y", -one["shoulder"])
-        found[f"upperarm_{end}"] = raised @ about("z", -left * one["shoulder_turn"])
-        found[f"lowerarm_{end}"] = about("y", -one["elbow"])
-        found[f"thigh_{end}"] = about("x", left * one["hip_out"]) @ about("y", -one["hip"])
-        found[f"calf_{end}"] = about("y", one["knee"])
-        found[f"foot_{end}"] = about("y", -one["ankle"])
-    return found
+        raised = about("x", left * limb["shoulder_out"]) @ about("y", -limb["shoulder"])
+        turns[f"upperarm_{end}"] = raised @ about("z", -left * limb["shoulder_turn"])
+        turns[f"lowerarm_{end}"] = about("y", -limb["elbow"])
+        turns[f"thigh_{end}"] = about("x", left * limb["hip_out"]) @ about("y", -limb["hip"])
+        turns[f"calf_{end}"] = about("y", limb["knee"])
+        turns[f"foot_{end}"] = about("y", -limb["ankle"])
+    return turns
 
 
 def about(axis: str, degrees: Tensor) -> Tensor:
@@ -262,5 +252,4 @@ def least_turn(begin: Tensor, end: Tensor) -> Tensor:
     x, y, z = torch.linalg.cross(a, b)
     zero = torch.zeros_like(x)
     skew = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
-    rotation: Tensor = torch.eye(3).to(a) + skew + skew @ skew / (1.0 + a @ b)
-    return rotation
+    return torch.eye(3).to(a) + skew + skew @ skew / (1.0 + a @ b)

@@ -13,19 +13,15 @@ from advsearch.scene.renderer import Renderer
 
 NOISE = "noise is part of the picture without the denoiser"
 """A reason against predictions that stands alone: with the denoiser, the same pictures could be predicted."""
+BETWEEN = (0.02, 0.29, 0.61, 0.97)
+"""Places in the range of a continuous parameter at which its effect on the inputs is looked up."""
 MOST_BYTES = 2**30
 """Memory of what one predictor keeps, times `ADVSEARCH_LIMITS`."""
 
 
 class Predictor(ABC):
-    """Predicts the pictures of a renderer's space, without noise; differentiable.
-
-    Args:
-        traced: the renderer of the space, which traces paths.
-
-    Attributes:
-        non_finite: values that were not finite while it was made, and were set to zero.
-    """
+    """Predicts the pictures of the space of a renderer, which traces paths, without noise; differentiable. `non_finite`
+    values were not finite while it was made, and were set to zero."""
 
     non_finite: int = 0
 

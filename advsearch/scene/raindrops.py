@@ -48,14 +48,8 @@ class Raindrops:
 
 
 def raindrops(count: int, size: float, seed: int, tangent: float) -> Raindrops:
-    """Return some drops.
-
-    Args:
-        count: how many.
-        size: median of their radii, millimetres.
-        seed: where they are, and how large.
-        tangent: of half the camera's field of view along the larger side.
-    """
+    """Return `count` drops, with a median radius of `size` millimetres, for a camera with the tangent of half its field
+    of view along the larger side; the seed says where they are, and how large."""
     random, half = np.random.default_rng(seed), BEYOND * DISTANCE * tangent
     places = random.uniform(-half, half, (count, 2))
     radii = size * np.exp(SPREAD * random.standard_normal(count).clip(-2.5, 2.5))

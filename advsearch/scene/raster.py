@@ -30,11 +30,10 @@ MISS = 1e-4
 def pixels_in(
     corners: Doubles, shape: tuple[int, int], tolerance: float = TOLERANCE
 ) -> tuple[Ints, Ints, Ints, Doubles]:
-    """List the pixels whose centres lie in each of many triangles, triangle by triangle.
+    """List the pixels of a raster (height, width) whose centres lie in each of many triangles, triangle by triangle.
 
     Args:
         corners: (F, 3, 2) column and row; integers are pixel centres. Triangles without area cover nothing.
-        shape: (height, width) of the raster.
         tolerance: barycentric weight by which a centre may miss its triangle.
 
     Returns:
@@ -47,28 +46,17 @@ def pixels_in(
 
 
 def pixels_near(corners: Doubles, shape: tuple[int, int], miss: float = MISS) -> tuple[Ints, Ints, Ints]:
-    """List the pixels whose centres lie in each of many triangles, or next to it; also in flat ones.
-
-    Args:
-        corners: as in `pixels_in`.
-        shape: as in `pixels_in`.
-        miss: pixels by which a centre may miss its triangle, along its row or its column.
-
-    Returns:
-        For every such pixel: its triangle, row and column (N,).
-    """
+    """List the pixels whose centres lie in each of many triangles, or miss it by so many pixels along their row or
+    column; also in flat ones. Arguments as of `pixels_in`; returns for every such pixel its triangle, row and column
+    (N,)."""
     face, row = _ranges(corners[..., 1].min(axis=1), corners[..., 1].max(axis=1), shape[0], miss)
     span, column = _ranges(*_crossing(corners[face], row, miss), shape[1], miss)
     return face[span], row[span], column
 
 
 def texels_read(corners: Doubles, shape: tuple[int, int]) -> Bools:
-    """Return the texels (h, w) that bilinear lookups anywhere in some triangles read; lookups repeat at the border.
-
-    Args:
-        corners: (F, 3, 2) column and row, as in `pixels_in`, at most half a texel outside of the texture.
-        shape: height and width of the texture.
-    """
+    """Return the texels (h, w) that bilinear lookups anywhere in triangles (F, 3, 2), as of `pixels_in` and at most
+    half a texel outside of the texture, read; lookups repeat at the border."""
     moved = corners + 1.0  # a lookup between two texels is in the cell of the first; -1 is the last one again
     low, high = np.floor(moved[..., 1].min(axis=1) - MISS), np.floor(moved[..., 1].max(axis=1) + MISS)
     face, row = _ranges(low, high, shape[0] + 1, 0.0)
@@ -102,6 +90,12 @@ def doubled_areas(corners: Doubles) -> Doubles:
     """Return twice the signed area (F,) of flat triangles (F, 3, 2)."""
     a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     return np.asarray(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+
+
+def doubled_normals(corners: Doubles) -> Doubles:
+    """Return vectors (F, 3) along the sides from which triangles (F, 3, 3) are wound counter-clockwise, twice as long
+    as their areas."""
+    return np.asarray(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
 
 
 def _ranges(low: Doubles, high: Doubles, size: int, miss: float) -> tuple[Ints, Ints]:
@@ -171,18 +165,15 @@ class Charts:
     def areas(self) -> Floats:
         """Return the surface area (h, w) that each texel stands for, in squared mesh units; 0 where no chart is."""
         places = self.mesh.vertices[self.mesh.faces].astype(np.float64)
-        surface = np.linalg.norm(np.cross(places[:, 1] - places[:, 0], places[:, 2] - places[:, 0]), axis=1)
+        surface = np.linalg.norm(doubled_normals(places), axis=1)
         texels = np.abs(doubled_areas(_in_texels(self.mesh, self.covered.shape)))
         share = np.where(texels > 0.0, surface / np.maximum(texels, 1e-12), 0.0)
         return np.where(self.covered, share[self.face], 0.0).astype(np.float32)
 
 
 def texel_positions(mesh: Mesh, resolution: int) -> tuple[Floats, Floats, Bools]:
-    """Return where each texel of a square texture lies on a mesh, and the surface's normal there.
-
-    Args:
-        mesh: with texture coordinates.
-        resolution: side of the texture in texels.
+    """Return where each texel of a square texture lies on a mesh with texture coordinates, and the surface's normal
+    there.
 
     Returns:
         (h, w, 3) positions in mesh coordinates and (h, w, 3) unit shading normals, row 0 at v = 1, both filled in
@@ -197,14 +188,8 @@ def texel_positions(mesh: Mesh, resolution: int) -> tuple[Floats, Floats, Bools]
 
 
 def texels_of_faces(mesh: Mesh, faces: Ints, shape: tuple[int, int]) -> tuple[Bools, float]:
-    """Return the texels (h, w) that bilinear lookups on some faces read and lookups on all others do not, and their
-    share of those that lookups on these faces read.
-
-    Args:
-        mesh: with texture coordinates.
-        faces: (N,) numbers of faces.
-        shape: height and width of the texture in texels.
-    """
+    """Return the texels (h, w) that bilinear lookups on some faces, by their numbers (N,), read and lookups on all
+    others do not, and their share of those that lookups on these faces read."""
     corners, ours = _in_texels(mesh, shape), np.isin(np.arange(len(mesh.faces)), faces)
     read = texels_read(corners[ours], shape)
     alone = read & ~texels_read(corners[~ours], shape)
@@ -217,13 +202,8 @@ def texel_area(mesh: Mesh, resolution: int | tuple[int, int]) -> Floats:
 
 
 def rasterised(mesh: Mesh, resolution: int | tuple[int, int]) -> Charts:
-    """Find the face and the barycentric weights behind every texel centre.
-
-    Where charts overlap, one of their faces wins.
-
-    Args:
-        mesh: with texture coordinates.
-        resolution: height and width of the texture in texels; one number for both.
+    """Find the face and the barycentric weights behind every texel centre of a texture, square where its resolution is
+    one number. Where charts overlap, one of their faces wins.
 
     Raises:
         InputError: the texture coordinates cover no texel.
@@ -231,30 +211,28 @@ def rasterised(mesh: Mesh, resolution: int | tuple[int, int]) -> Charts:
     shape = (resolution, resolution) if isinstance(resolution, int) else resolution
     corners = _in_texels(mesh, shape)
     face, row, column = pixels_near(corners, shape)
-    weights = _barycentric(corners[face], np.stack([column, row], axis=1))
     if len(face) == 0:
         raise InputError(
             f"mesh texture coordinates: none of the {shape[0]} x {shape[1]} texels lies in a triangle; unwrap the mesh "
             "again"
         )
-    face_map = np.zeros(shape, dtype=np.int64)
-    weight_map = np.zeros((*shape, 3))
-    covered = np.zeros(shape, dtype=np.bool_)
+    corners, points = corners[face], np.stack([column, row], axis=1)
+    whole, parts = doubled_areas(corners), []
+    for begin, end in ((1, 2), (2, 0), (0, 1)):  # barycentric weights, clipped to the triangle
+        a, b = corners[:, begin] - points, corners[:, end] - points
+        parts.append((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / np.where(whole == 0.0, 1.0, whole))
+    weights = np.maximum(np.stack(parts, axis=1), 0.0)
+    total = weights.sum(axis=1, keepdims=True)
+    weights = np.where(total > 0.0, weights / np.maximum(total, 1e-12), 1.0 / 3.0)
+    face_map, weight_map, covered = np.zeros(shape, np.int64), np.zeros((*shape, 3)), np.zeros(shape, np.bool_)
     face_map[row, column], weight_map[row, column], covered[row, column] = face, weights, True
     distance, nearest = ndimage.distance_transform_edt(~covered, return_indices=True)
     return Charts(mesh, face_map[tuple(nearest)], weight_map[tuple(nearest)], covered, distance)
 
 
 def looked_up(texels: Floats, x: npt.NDArray[np.floating], y: npt.NDArray[np.floating]) -> Floats:
-    """Look a repeating texture up with bilinear interpolation of its values.
-
-    Args:
-        texels: (H, W, C) float32.
-        x, y: (...) column and row, any number of textures away; integers are texel centres.
-
-    Returns:
-        (..., C) float32.
-    """
+    """Look a repeating texture (H, W, C) up with bilinear interpolation of its values at columns and rows (...), any
+    number of textures away, where integers are texel centres: (..., C) float32."""
     height, width = texels.shape[:2]
     left, top = np.floor(x), np.floor(y)
     fx, fy = (x - left).astype(np.float32)[..., None], (y - top).astype(np.float32)[..., None]
@@ -266,27 +244,23 @@ def looked_up(texels: Floats, x: npt.NDArray[np.floating], y: npt.NDArray[np.flo
 
 
 class MeshSurface:
-    """The faces of a mesh, ready for rays and for neighbourhoods.
-
-    Args:
-        mesh: the mesh.
-    """
+    """The faces of a mesh, ready for rays and for neighbourhoods."""
 
     def __init__(self, mesh: Mesh) -> None:
         self._corners = mesh.vertices[mesh.faces].astype(np.float64)
         self.normals = _face_normals(mesh)
         self._low, self._high = self._corners.min(axis=1), self._corners.max(axis=1)
-        self._neighbours = _face_neighbours(mesh)
+        # Pairs (E, 2) of faces with an edge in common, across UV seams too
+        places = welded(mesh)[0][mesh.faces]
+        edges = np.sort(np.concatenate([places[:, [0, 1]], places[:, [1, 2]], places[:, [2, 0]]]), axis=1)
+        order = np.lexsort((edges[:, 1], edges[:, 0]))
+        same, owner = (edges[order][1:] == edges[order][:-1]).all(axis=1), order % len(mesh.faces)
+        self._neighbours = np.stack([owner[:-1][same], owner[1:][same]], axis=1)
 
     def hit(self, origin: Doubles, direction: Doubles) -> tuple[int, Doubles]:
-        """Return the first face that a ray meets, from either side, and the point (3,) where it does.
-
-        If it meets none: the face with the corner nearest to the ray's line, and that corner.
-
-        Args:
-            origin: (3,) outside the mesh.
-            direction: (3,) unit vector.
-        """
+        """Return the first face that a ray from (3,) outside the mesh in a unit direction (3,) meets, from either side,
+        and the point (3,) where it does. If it meets none: the face with the corner nearest to the ray's line, and that
+        corner."""
         a, b, c = self._corners[:, 0], self._corners[:, 1], self._corners[:, 2]
         # Moeller and Trumbore 1997, all faces at once
         across = np.cross(direction, c - a)
@@ -308,16 +282,9 @@ class MeshSurface:
         return int(face), self._corners[face, corner]
 
     def region(self, face: int, point: Doubles, normal: Doubles, radius: float) -> Bools:
-        """Return which faces (F,) lie within a radius of a point, face a direction, and are reached from one face.
-
-        Reached means: over edges between such faces. The other wall of a cup, or the next slat of a chair, are not.
-
-        Args:
-            face: where to begin; always in the region.
-            point: (3,) middle of the ball.
-            normal: (3,) the direction.
-            radius: of the ball.
-        """
+        """Return which faces (F,) lie within a radius of a point (3,), face a direction (3,), and are reached from one
+        face, which always counts, over edges between such faces. The other wall of a cup, or the next slat of a chair,
+        are not."""
         gap = np.maximum(np.maximum(self._low - point, point - self._high), 0.0)
         inside = (np.linalg.norm(gap, axis=1) <= radius) & (self.normals @ normal > 0.0)
         inside[face] = True
@@ -335,18 +302,8 @@ def welded(mesh: Mesh) -> tuple[Ints, int]:
     """
     extent = float(np.ptp(mesh.vertices, axis=0).max())
     rounded = np.round(mesh.vertices.astype(np.float64) / max(extent, 1e-12) * 1e5)
-    found = np.unique(rounded, axis=0, return_inverse=True)[1].reshape(-1).astype(np.int64)
-    return found, int(found.max()) + 1
-
-
-def _face_neighbours(mesh: Mesh) -> Ints:
-    """Pairs (E, 2) of faces with an edge in common, across UV seams too."""
-    places = welded(mesh)[0][mesh.faces]
-    edges = np.sort(np.concatenate([places[:, [0, 1]], places[:, [1, 2]], places[:, [2, 0]]]), axis=1)
-    owner = np.tile(np.arange(len(mesh.faces)), 3)
-    order = np.lexsort((edges[:, 1], edges[:, 0]))
-    same = (edges[order][1:] == edges[order][:-1]).all(axis=1)
-    return np.stack([owner[order][:-1][same], owner[order][1:][same]], axis=1)
+    place = np.unique(rounded, axis=0, return_inverse=True)[1].reshape(-1).astype(np.int64)
+    return place, int(place.max()) + 1
 
 
 def _in_texels(mesh: Mesh, shape: tuple[int, int]) -> Doubles:
@@ -360,20 +317,7 @@ def _in_texels(mesh: Mesh, shape: tuple[int, int]) -> Doubles:
     return np.stack([uvs[..., 0] * shape[1] - 0.5, (1.0 - uvs[..., 1]) * shape[0] - 0.5], axis=-1)
 
 
-def _barycentric(corners: Doubles, points: Ints) -> Doubles:
-    """Weights (N, 3) of the corners (N, 3, 2) of flat triangles at points (N, 2), clipped to the triangle."""
-    whole = doubled_areas(corners)
-    parts = []
-    for begin, end in ((1, 2), (2, 0), (0, 1)):
-        a, b = corners[:, begin] - points, corners[:, end] - points
-        parts.append((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / np.where(whole == 0.0, 1.0, whole))
-    weights = np.maximum(np.stack(parts, axis=1), 0.0)
-    total = weights.sum(axis=1, keepdims=True)
-    return np.where(total > 0.0, weights / np.maximum(total, 1e-12), 1.0 / 3.0)
-
-
 def _face_normals(mesh: Mesh) -> Doubles:
     """Unit normals (F, 3) of the flat faces; zero for a face without area."""
-    places = mesh.vertices[mesh.faces].astype(np.float64)
-    normals = np.cross(places[:, 1] - places[:, 0], places[:, 2] - places[:, 0])
+    normals = doubled_normals(mesh.vertices[mesh.faces].astype(np.float64))
     return np.asarray(normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20))

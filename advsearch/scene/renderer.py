@@ -15,7 +15,7 @@ import copy
 import io
 import math
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any, Protocol
@@ -52,7 +52,7 @@ Predict = Callable[[Mapping[str, Tensor]], Tensor]
 """
 
 
-class InputSpace(Protocol):
+class InputSpace(Later, Protocol):
     """What the renderer and a loop of one's own ask of a space: its start, its groups, what a configuration does."""
 
     @property
@@ -62,9 +62,6 @@ class InputSpace(Protocol):
     @property
     def groups(self) -> tuple[Group, ...]:
         """Every group of coordinates with its valid estimators."""
-
-    def inputs(self, u: Tensor) -> dict[str, Tensor]:
-        """Map u to scene inputs by torch operations; differentiable."""
 
     def later(self, seconds: float) -> Later:
         """Return what maps u to scene inputs so many seconds later."""
@@ -79,6 +76,8 @@ class InputSpace(Protocol):
         """Return the numbers of the configuration, in their units, by name; differentiable."""
 
 
+MOST_MEASURED = 64
+"""Coordinates of a group up to which it is measured how far they move outlines."""
 SMALL_PART = 0.0625
 """Part of noise that is taken through the tone curve, which is straight over so little; see `Renderer.halves`."""
 
@@ -116,17 +115,12 @@ class Renderer:
         estimators: Mapping[str, str] | None = None,
         moments: Sequence[Moment] = (),
     ) -> None:
-        self.moments = tuple(moments)
-        self.scene = scene
-        self.space = space
-        self.formation = formation
+        self.scene, self.space, self.formation, self.moments = scene, space, formation, tuple(moments)
         self.root_seed = root_seed
         self._shape = space.start.shape
         self._source: Source | None = None
         self._predict: Predict | None = None
-        self.renders = 0
-        self.gradients = 0
-        self.non_finite = 0
+        self.renders = self.gradients = self.non_finite = 0
         self._left_out: frozenset[str] = frozenset()
         groups = space.groups
         self.plan = first_plan(groups, self._steps(groups, motion), estimators, across=max(formation.resolution))
@@ -196,14 +190,14 @@ class Renderer:
             compares it with differences that are wide enough.
 
         Raises:
-            InputError: u has another shape, or values outside [0, 1], or spp is out of range; or u requires a
-                gradient and was made in `torch.inference_mode`.
+            InputError: u has another shape, or values outside [0, 1], or spp is out of range; or u requires a gradient
+                and was made in `torch.inference_mode`.
         """
         u = u if isinstance(u, Tensor) else _tensor(u)
         if u.ndim == 2 and len(u):
-            return torch.stack([self(one, seed, spp) for one in u])
+            return torch.stack([self(row, seed, spp) for row in u])
         u, through = self._given(u, spp)
-        with torch.inference_mode(False) if torch.is_inference_mode_enabled() else nullcontext():
+        with _no_inference():
             image = self._picture(through, seed, spp)
             if through is not u and torch.is_grad_enabled() and self._differenced():
                 image = _Differences.apply(self, seed, spp, u, image)  # type: ignore[no-untyped-call]
@@ -215,7 +209,7 @@ class Renderer:
         Exposure and backdrop of the configuration are in it; what controls do to the finished picture is not.
         """
         _, through = self._given(u, spp)
-        with torch.inference_mode(False) if torch.is_inference_mode_enabled() else nullcontext():
+        with _no_inference():
             return self._picture(through, seed, spp, display=False)
 
     def halves(self, u: Tensor, seed: int, spp: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -231,15 +225,15 @@ class Renderer:
             traced = {name: value for name, value in inputs.items() if name not in ON_PICTURE}
             undenoised = self.like(denoiser="none")
             numbers = [seeds.stream(seed, "traced", half) for half in range(2)]
-            one, other = (undenoised.rendered(traced, number, spp, hide) for number in numbers)
-            both = (one + other) / 2.0
+            halves = [undenoised.rendered(traced, number, spp, hide) for number in numbers]
+            both = (halves[0] + halves[1]) / 2.0
             noise = seeds.stream(self.root_seed, "guides", numbers[0])
             clean = denoise(both[..., :3].contiguous(), *self.scene.guides(traced, noise, spp))
             both = torch.cat([clean, both[..., 3:]], dim=-1)
-            *noisy, clean = (self.finished(picture, inputs, u, display=False) for picture in (one, other, both))
+            *noisy, clean = (self.finished(picture, inputs, u, display=False) for picture in (*halves, both))
             there = self.formation.display(clean)
-            moved = (self.formation.display(torch.lerp(clean, one, SMALL_PART)) for one in noisy)
-            first, second = (self.space.picture(u, there + (one - there) / SMALL_PART) for one in moved)
+            moved = (self.formation.display(torch.lerp(clean, half, SMALL_PART)) for half in noisy)
+            first, second = (self.space.picture(u, there + (half - there) / SMALL_PART) for half in moved)
             return first, second, self.space.picture(u, there)
 
     def mask(self, u: Configuration) -> Tensor:
@@ -250,19 +244,14 @@ class Renderer:
         return self.surfaces(u).seen(OBJECT)
 
     def surfaces(self, u: Configuration, fineness: int = 1, camera: int = 0) -> Surfaces:
-        """Return what the camera sees first through the middle of each pixel; as of `mask`.
-
-        Args:
-            u: (d,) in [0, 1].
-            fineness: into how many parts each side of a pixel is cut, to be looked at each.
-            camera: number of the camera of a rig; 0 is the first, or the only one.
-        """
+        """Return what the camera sees first through the middle of each pixel of u (d,), or of each of `fineness` by
+        `fineness` parts of it; as of `mask`. The cameras of a rig have numbers, of which 0 is the first, or the only
+        one."""
         u, _ = self._given(u, 1)
         with torch.no_grad():
             rig = self.scene.made[0].rig
             mount = rig[camera] if rig else None
-            inputs = self._seen(mount, self.scene.assembly(self._then(mount).inputs(u)))
-        seen = self.scene.surfaces(_traced(inputs), fineness)
+            seen = self.scene.surfaces(_traced(self._seen(mount, self._then(mount), u)), fineness)
         metres = self.scene.made[0].metres
         return replace(seen, depth=seen.depth * metres, z_depth=seen.z_depth * metres)
 
@@ -275,9 +264,7 @@ class Renderer:
 
         Args:
             loss: from (H, W, 3) sRGB to a number.
-            u: (d,) in [0, 1].
-            seed: as in a call.
-            spp: as in a call.
+            u, seed, spp: (d,) in [0, 1]; as in a call.
             free: leave out what takes primal renders of its own; zero for coordinates that use differences.
 
         Returns:
@@ -288,27 +275,22 @@ class Renderer:
             with torch.inference_mode(False), torch.enable_grad():
                 at = u.detach().clone().requires_grad_()
                 value = loss(self(at, seed, spp))
-            found = torch.autograd.grad(value, at, allow_unused=True)[0] if value.requires_grad else None
+            slope = torch.autograd.grad(value, at, allow_unused=True)[0] if value.requires_grad else None
         finally:
             self._left_out = frozenset()
-        derivative = torch.zeros_like(at) if found is None else found
+        derivative = torch.zeros_like(at) if slope is None else slope
         secants = [group for group in self.plan.groups if group.estimator == "secant" and not free]
-        if secants:
-            noise, count = seeds.stream(self.root_seed, "differences", seed), self.plan.spp or spp
-            with torch.no_grad():
-                for group in secants:
-                    central(lambda at: loss(self._picture(at, noise, count)), group, u.detach(), derivative)
+        noise, count = seeds.stream(self.root_seed, "differences", seed), self.plan.spp or spp
+        with torch.no_grad():
+            for group in secants:
+                central(lambda at: loss(self._picture(at, noise, count)), group, u.detach(), derivative)
         return value.detach(), derivative
 
     # ---- from u to the picture --------------------------------------------------------------------------------------
 
     def _given(self, u: Configuration, spp: int) -> tuple[Tensor, Tensor]:
         """Return a configuration as float32, and with a graph only where the derivative runs back through scene inputs
-        or the picture.
-
-        Raises:
-            InputError: see `__call__`.
-        """
+        or the picture; raises as `__call__`."""
         u = u.float() if isinstance(u, Tensor) else _tensor(u)
         if u.shape != self._shape:
             raise InputError(f"render: expected u of shape {tuple(self._shape)}, got {tuple(u.shape)}")
@@ -322,7 +304,7 @@ class Renderer:
                 "render: u was made in `torch.inference_mode()`, so that nothing can be differentiated with respect to "
                 "it; make it outside, or pass `u.detach()` for the picture alone"
             )
-        with torch.inference_mode(False) if torch.is_inference_mode_enabled() else nullcontext():
+        with _no_inference():
             u = u.clone() if u.is_inference() else u
             if self._predict is not None or not u.requires_grad or bool((mask := self.plan.through).all()):
                 return u, u
@@ -335,24 +317,27 @@ class Renderer:
         if not rig:
             return self._view(None, u, seed, spp, display=display)
         renders, seeds_of = self.renders, [seed, *(seeds.stream(seed, "camera", k) for k in range(1, len(rig)))]
-        each = [self._view(one, u, noise, spp, display=display) for one, noise in zip(rig, seeds_of, strict=True)]
+        views = [self._view(mount, u, noise, spp, display=display) for mount, noise in zip(rig, seeds_of, strict=True)]
         self.renders = renders + 1  # one configuration, as budgets count it
-        return torch.cat(each, dim=1)
+        return torch.cat(views, dim=1)
 
     def _view(self, mount: Mount | None, u: Tensor, seed: int, spp: int, *, display: bool) -> Tensor:
         """The picture of one camera of a rig, or of the only one; as of `_picture`."""
-        inputs = self._seen(mount, self.scene.assembly(self._then(mount).inputs(u)))
+        inputs = self._seen(mount, self._then(mount), u)
         hide = "backdrop.color" in inputs
         if self.moments:
-            return self.finished(self._exposed(mount, u, seed, spp, hide), inputs, u, display=display)
-        return self.finished(self.rendered(_traced(inputs), seed, spp, hide), inputs, u, display=display)
+            rendered = self._exposed(mount, u, seed, spp, hide)
+        else:
+            rendered = self.rendered(_traced(inputs), seed, spp, hide)
+        return self.finished(rendered, inputs, u, display=display)
 
     def _then(self, mount: Mount | None) -> Later:
         """The space when a camera of a rig takes its picture."""
         return self.space.later(mount.later) if mount is not None and mount.later else self.space
 
-    def _seen(self, mount: Mount | None, inputs: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Scene inputs as a camera of a rig sees them."""
+    def _seen(self, mount: Mount | None, space: Later, u: Tensor) -> dict[str, Tensor]:
+        """Scene inputs of u as a camera of a rig, or the only one, sees them."""
+        inputs = self.scene.assembly(space.inputs(u))
         if mount is None:
             return inputs
         description = self.scene.made[0]
@@ -362,7 +347,7 @@ class Renderer:
         """The mean radiance of the moments of u, denoised once; as of `rendered`, and it counts as one render."""
         renders, exposed, guides = self.renders, torch.zeros(()), torch.zeros(())
         for number, moment in enumerate(self.moments):
-            inputs = _traced(self._seen(mount, self.scene.assembly(moment.inputs(u))))
+            inputs = _traced(self._seen(mount, moment.space, u))
             noise = seeds.stream(seed, "moment", number)
             rows, samples = moment.rows[:, None, None], max(1, math.ceil(spp * moment.samples))
             exposed = exposed + rows * self.rendered(inputs, noise, samples, hide, denoised=False)
@@ -399,8 +384,8 @@ class Renderer:
         if self._predict is not None:
             return self._predict(inputs)
         called = self, tuple(inputs), seed, spp, hide, denoised, *inputs.values()
-        found: Tensor = _Radiance.apply(*called)  # type: ignore[no-untyped-call]
-        return found
+        radiance: Tensor = _Radiance.apply(*called)  # type: ignore[no-untyped-call]
+        return radiance
 
     def finite(self, values: Tensor) -> Tensor:
         """Replace NaN and infinite entries by zero and count them."""
@@ -423,30 +408,22 @@ class Renderer:
         """
         noise = seeds.stream(self.root_seed, "differences", seed)
         spp = self.plan.spp or spp
-        found = torch.zeros_like(u)
-
-        def value(at: Tensor) -> Tensor:
-            return (cotangent * self._picture(at, noise, spp)).sum()
-
+        derivative = torch.zeros_like(u)
         for group in self._differenced():
-            central(value, group, u, found)
-        return self.finite(found)
+            central(lambda at: (cotangent * self._picture(at, noise, spp)).sum(), group, u, derivative)
+        return self.finite(derivative)
 
     # ---- set-up -----------------------------------------------------------------------------------------------------
 
     def _steps(self, groups: tuple[Group, ...], motion: Motion | None) -> Tensor:
-        moving = [
-            number
-            for group in groups
-            if set(group.valid) - {"adjoint", "image"} and group.size <= 64
-            for number in range(group.begin, group.begin + group.size)
-        ]
-        still = torch.zeros(len(self.start))
-        speeds = (
-            still
-            if motion is None or not moving
-            else motion.speeds(lambda u: self.scene.assembly(self.space.inputs(u)), self.start, moving)
-        )
+        """Half-widths (d,) of differences over which outlines move by a pixel."""
+        speeds = torch.zeros(len(self.start))
+        moving: list[int] = []
+        for group in groups:
+            if set(group.valid) - {"adjoint", "image"} and group.size <= MOST_MEASURED:
+                moving += range(group.begin, group.begin + group.size)
+        if motion is not None and moving:
+            speeds = motion.speeds(lambda u: self.scene.assembly(self.space.inputs(u)), self.start, moving)
         steps = steps_for(speeds)
         for group in groups:
             if group.periodic and not bool(speeds[group.coordinates].any()):
@@ -471,7 +448,7 @@ class Renderer:
                 for group in groups:
                     if reached is not None and bool(reached[group.coordinates].any()):
                         routes[group.name].add(name)
-        return {name: frozenset(found) for name, found in routes.items()}
+        return {group: frozenset(inputs) for group, inputs in routes.items()}
 
 
 @lru_cache(maxsize=4)
@@ -484,6 +461,11 @@ def _standing(description: SceneDescription) -> tuple[Tensor, Tensor]:  # which 
 def _traced(inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """The inputs that Mitsuba takes."""
     return {name: value for name, value in inputs.items() if name not in ON_PICTURE}
+
+
+def _no_inference() -> AbstractContextManager[object]:
+    """Ordinary mode inside of torch's inference mode; setting it where it is set already would cost time."""
+    return torch.inference_mode(False) if torch.is_inference_mode_enabled() else nullcontext()
 
 
 def _tensor(u: Configuration) -> Tensor:
@@ -538,7 +520,7 @@ class _Radiance(torch.autograd.Function):
         inputs = dict(zip(ctx.names, ctx.saved_tensors, strict=True))
         noise = seeds.stream(renderer.root_seed, "gradient", ctx.seed)
         cotangent = renderer.finite(cotangent[..., :3])
-        found, left = dict[str, Tensor](), list(inputs)
+        by_input, left = dict[str, Tensor](), list(inputs)
         for estimator in ("material", "adjoint"):  # what two reach goes to the more general one
             groups = [group for group in renderer.plan.groups if group.estimator == estimator]
             reached = set[str]().union(*(renderer.routes.get(group.name, ()) for group in groups))
@@ -555,9 +537,8 @@ class _Radiance(torch.autograd.Function):
                 method = "hidden" if ctx.hide else "path"
                 gradients = renderer.scene.adjoint(inputs, cotangent, noise, ctx.spp, wrt=wrt, method=method)
             renderer.gradients += 1
-            for name, gradient in gradients.items():
-                found[name] = renderer.finite(gradient)
-        return None, None, None, None, None, None, *(found.get(name) for name in ctx.names)
+            by_input |= {name: renderer.finite(gradient) for name, gradient in gradients.items()}
+        return None, None, None, None, None, None, *(by_input.get(name) for name in ctx.names)
 
 
 class _Differences(torch.autograd.Function):
@@ -572,6 +553,5 @@ class _Differences(torch.autograd.Function):
     @staticmethod
     @first_order
     def backward(ctx: Any, cotangent: Tensor) -> tuple[Tensor | None, ...]:
-        (u,) = ctx.saved_tensors
-        found = ctx.renderer.differences(u, cotangent, ctx.seed, ctx.spp)
-        return None, None, None, found, cotangent
+        derivative = ctx.renderer.differences(*ctx.saved_tensors, cotangent, ctx.seed, ctx.spp)
+        return None, None, None, derivative, cotangent

@@ -38,62 +38,49 @@ FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 COLMAPS = "images.txt"
 MOST_BYTES = 1 << 26
 """Of COLMAP's images, whose lines of points are skipped."""
-STEP = "T_cn_cnm1"
-"""Kalibr's: from points of the camera before to points of this one."""
+STEP = "T_cn_cnm1"  # Kalibr's: from points of the camera before to points of this one
 
 
 @dataclass(frozen=True, eq=False)
 class Mount:
-    """One camera of a rig.
-
-    Attributes:
-        name: of the camera.
-        pose: (4, 4) from its coordinates to those of the first: x to the right, y down, z ahead; in metres where the
-            object's size is known, else in object sizes.
-        around: degrees that it stands further around the object than the first, counter-clockwise from above.
-        fov: degrees along the larger side; None for the first's.
-        model: intrinsics and distortion; None for the first's.
-        later: seconds after the first that it takes its picture, along the path of a control.
-    """
+    """One camera of a rig."""
 
     name: str
-    pose: Doubles
-    around: float = 0.0
-    fov: float | None = None
-    model: CameraModel | None = None
-    later: float = 0.0
+    pose: Doubles  # (4, 4) from its axes, x to the right, y down, z ahead, to the first's; metres, or object sizes
+    around: float = 0.0  # degrees that it stands further around the object, counter-clockwise from above
+    fov: float | None = None  # degrees along the larger side; None for the first's
+    model: CameraModel | None = None  # intrinsics and distortion; None for the first's
+    later: float = 0.0  # seconds after the first that it takes its picture, along the path of a control
 
     def seen(self, inputs: Mapping[str, Tensor], first: Tensor, middle: Tensor, metres: float) -> dict[str, Tensor]:
         """Return scene inputs as this camera sees them.
 
         Args:
             inputs: as the first camera does.
-            first: (4, 4) pose of the first camera where the inputs have none.
+            first: (4, 4) pose of that where the inputs have none.
             middle: (3,) of the object, as the scene was described.
             metres: that a unit of the scene is long; 1 where that is not known.
         """
-        own = torch.from_numpy(AXES @ self.pose @ AXES).float()
-        own[:3, 3] /= metres
+        pose = torch.from_numpy(AXES @ self.pose @ AXES).float()
+        pose[:3, 3] /= metres
         angle = math.radians(self.around)
         turn = torch.eye(4)
         turn[:2, :2] = torch.tensor([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
         turn[:3, 3] = middle - turn[:3, :3] @ middle
-        found = {**inputs, "camera.to_world": turn @ inputs.get("camera.to_world", first) @ own}
+        seen = {**inputs, "camera.to_world": turn @ inputs.get("camera.to_world", first) @ pose}
         if self.fov is not None:
-            found["camera.fov"] = torch.tensor([self.fov])
+            seen["camera.fov"] = torch.tensor([self.fov])
         if self.model is not None:
-            found["camera.lens"] = torch.tensor(self.model.numbers, dtype=torch.float32)
-        return found
+            seen["camera.lens"] = torch.tensor(self.model.numbers, dtype=torch.float32)
+        return seen
 
 
 def read_rig(spec: str) -> tuple[Mount, ...]:
     """Read the cameras of a rig; empty where a file has one camera, or one of its cameras is named (``#cam1``).
 
     Of a transforms.json, frames are named by their number, the first one first: ``transforms.json#0,4,8``. Of an
-    images.txt all images are cameras, or those named by their IMAGE_ID: ``images.txt#3,7``.
-
-    Raises:
-        FileFormatError: more than `MOST_CAMERAS`, numbers that no camera has, or models of different kinds.
+    images.txt all images are cameras, or those named by their IMAGE_ID: ``images.txt#3,7``. Raises FileFormatError:
+    more than `MOST_CAMERAS`, numbers that no camera has, or models of different kinds.
     """
     path, _, which = spec.partition("#")
     if Path(path).name == COLMAPS:
@@ -112,12 +99,12 @@ def read_rig(spec: str) -> tuple[Mount, ...]:
     if isinstance(listed, list):
         if set(data) != {"cameras"}:
             raise FileFormatError(f"{spec}: expected `cameras` alone, got {', '.join(map(str, data))[:80]}")
-        mounts = tuple(_of_entry(spec, number, one) for number, one in enumerate(listed))
+        mounts = tuple(_of_entry(spec, number, camera) for number, camera in enumerate(listed))
     else:
         mounts = _of_camchain(spec, data)
     if mounts and not 2 <= len(mounts) <= MOST_CAMERAS:
         raise FileFormatError(f"{spec}: expected 2 to {MOST_CAMERAS} cameras, got {len(mounts)}")
-    if len({one.name for one in mounts}) < len(mounts):
+    if len({mount.name for mount in mounts}) < len(mounts):
         raise FileFormatError(f"{spec}: expected a name of its own for each camera")
     if mounts and (not np.allclose(mounts[0].pose, np.eye(4)) or mounts[0].around or mounts[0].later):
         raise FileFormatError(f"{spec}: the first camera is the scene's own; it takes no place, turn, around or later")
@@ -131,28 +118,25 @@ def _of_entry(spec: str, number: int, given: Any) -> Mount:
     name = given.get("name", f"camera {number + 1}")
     if not isinstance(name, str) or not 0 < len(name) <= 40:
         raise FileFormatError(f"{where}: name: expected a short text, got {str(name)[:80]!r}")
-    yaw, pitch, roll = (math.radians(one) for one in _numbers(where, given, "turn", 3, 3600.0))
+    yaw, pitch, roll = map(math.radians, _numbers(where, "turn", given.get("turn", [0.0] * 3), 3, 3600.0))
     pose = np.eye(4)
     pose[:3, :3] = _about(1, yaw) @ _about(0, pitch) @ _about(2, roll)
-    pose[:3, 3] = _numbers(where, given, "place", 3, FARTHEST)
-    (around,) = _numbers(where, {"around": [given.get("around", 0.0)]}, "around", 1, 3600.0)
-    fov = None
-    if "fov" in given:
-        (fov,) = _numbers(where, {"fov": [given["fov"]]}, "fov", 1, 170.0)
-        if fov < 1.0:
-            raise FileFormatError(f"{where}: fov: expected 1 to 170 degrees, got {fov:g}")
-    (later,) = _numbers(where, {"later": [given.get("later", 0.0)]}, "later", 1, LATEST)
+    pose[:3, 3] = _numbers(where, "place", given.get("place", [0.0] * 3), 3, FARTHEST)
+    (around,) = _numbers(where, "around", [given.get("around", 0.0)], 1, 3600.0)
+    fov = _numbers(where, "fov", [given["fov"]], 1, 170.0)[0] if "fov" in given else None
+    if fov is not None and fov < 1.0:
+        raise FileFormatError(f"{where}: fov: expected 1 to 170 degrees, got {fov:g}")
+    (later,) = _numbers(where, "later", [given.get("later", 0.0)], 1, LATEST)
     if later < 0.0:
         raise FileFormatError(f"{where}: later: expected 0 to {LATEST:g} seconds, got {later:g}")
     return Mount(name, pose, around, fov, later=later)
 
 
-def _numbers(where: str, given: Mapping[str, Any], key: str, count: int, most: float) -> list[float]:
-    found = given.get(key, [0.0] * count)
-    fits = isinstance(found, list) and len(found) == count
-    if not fits or not all(type(one) in (int, float) and math.isfinite(one) and abs(one) <= most for one in found):
-        raise FileFormatError(f"{where}: {key}: expected {count} numbers up to {most:g}, got {str(found)[:80]!r}")
-    return [float(one) for one in found]
+def _numbers(where: str, key: str, given: Any, count: int, most: float) -> list[float]:
+    fits = isinstance(given, list) and len(given) == count
+    if not fits or not all(type(x) in (int, float) and math.isfinite(x) and abs(x) <= most for x in given):
+        raise FileFormatError(f"{where}: {key}: expected {count} numbers up to {most:g}, got {str(given)[:80]!r}")
+    return list(map(float, given))
 
 
 def _about(axis: int, angle: float) -> Doubles:
@@ -166,7 +150,7 @@ def _about(axis: int, angle: float) -> Doubles:
 
 def _of_camchain(spec: str, data: Mapping[str, Any]) -> tuple[Mount, ...]:
     """Kalibr's cameras, each with a step from the one before; empty where it is no such file."""
-    cameras = {name: one for name, one in data.items() if isinstance(one, dict) and "intrinsics" in one}
+    cameras = {name: camera for name, camera in data.items() if isinstance(camera, dict) and "intrinsics" in camera}
     names = sorted(cameras, key=lambda name: (len(str(name)), str(name)))
     if len(names) < 2 or len(names) > MOST_CAMERAS or not all(STEP in cameras[name] for name in names[1:]):
         return ()
@@ -180,17 +164,18 @@ def _of_transforms(path: str, which: str) -> tuple[Mount, ...]:
     """Frames of nerfstudio's transforms.json by their numbers; `transform_matrix` is from the camera to the world."""
     data = read_json(path, camera_text(path, LARGEST_JSON))
     frames = data.get("frames") if isinstance(data, dict) else None
-    if not isinstance(frames, list) or not all(isinstance(one, dict) for one in frames):
+    if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
         raise FileFormatError(f"{path}: expected `frames`, a list with a camera each, as nerfstudio writes it")
     names = _named(path, which, [str(number) for number in range(len(frames))])
+    chosen = {name: frames[int(name)] for name in names}
     poses = [
-        _rigid(f"{path}: frame {name}", "transform_matrix", frames[int(name)].get("transform_matrix")) @ FROM_OPENGL
-        for name in names
+        _rigid(f"{path}: frame {name}", "transform_matrix", frame.get("transform_matrix")) @ FROM_OPENGL
+        for name, frame in chosen.items()
     ]
-    own = [{key: one for key, one in frames[int(name)].items() if key in OF_A_FRAME} for name in names]
+    lenses = {name: {key: frame[key] for key in frame if key in OF_A_FRAME} for name, frame in chosen.items()}
     first = read_camera(f"{path}#{names[0]}")
-    models = [first if lens == own[0] else read_camera(f"{path}#{name}") for name, lens in zip(names, own, strict=True)]
-    return _mounted(path, names, poses, models)
+    same = {name: lens == lenses[names[0]] for name, lens in lenses.items()}
+    return _mounted(path, names, poses, [first if same[name] else read_camera(f"{path}#{name}") for name in names])
 
 
 def _of_colmap(path: str, which: str) -> tuple[Mount, ...]:
@@ -213,19 +198,17 @@ def _of_colmap(path: str, which: str) -> tuple[Mount, ...]:
                 "points, perhaps an empty one, stands between two images"
             )
         try:
-            numbers = [float(one) for one in words[1:8]]
+            numbers = list(map(float, words[1:8]))
         except ValueError:
             numbers = []
-        w, x, y, z, *shift = _numbers(where, {"pose": numbers}, "pose", 7, FARTHEST)
+        w, x, y, z, *shift = _numbers(where, "pose", numbers, 7, FARTHEST)
         if not 0.99 < (length := math.sqrt(w * w + x * x + y * y + z * z)) < 1.01:
             raise FileFormatError(f"{where}: expected a quaternion of length 1, got one of {length:.3g}")
-        w, x, y, z = (one / length for one in (w, x, y, z))
         seen = np.eye(4)
-        seen[:3, :3] = np.reshape(entries_of_turn(x, y, z, w), (3, 3))
+        seen[:3, :3] = np.reshape(entries_of_turn(x / length, y / length, z / length, w / length), (3, 3))
         seen[:3, 3] = shift
         poses.append(np.asarray(np.linalg.inv(seen), np.float64))
-        cameras = Path(path).with_name("cameras.txt")
-        models.append(read_camera(f"{cameras}#{words[8]}"))
+        models.append(read_camera(f"{Path(path).with_name('cameras.txt')}#{words[8]}"))
     return _mounted(path, names, poses, models)
 
 
@@ -233,7 +216,7 @@ def _named(path: str, which: str, known: Sequence[str]) -> list[str]:
     names = list(map(str.strip, which.split(",")))
     if not 2 <= len(names) <= MOST_CAMERAS or len(set(names)) < len(names):
         raise FileFormatError(f"{path}: expected 2 to {MOST_CAMERAS} different cameras, got {len(names)}")
-    if unknown := [one for one in names if one not in known]:
+    if unknown := [name for name in names if name not in known]:
         listed = ", ".join(known[:8]) + (", ..." if len(known) > 8 else "")
         raise FileFormatError(f"{path}: expected some of its cameras {listed}, got {unknown[0][:40]!r}")
     return names
@@ -243,7 +226,7 @@ def _mounted(
     spec: str, names: Sequence[object], poses: Sequence[Doubles], models: Sequence[CameraModel]
 ) -> tuple[Mount, ...]:
     """Cameras whose poses go from their coordinates (x to the right, y down, z ahead) to common ones."""
-    if len(kinds := sorted({one.kind for one in models})) > 1:
+    if len(kinds := sorted({model.kind for model in models})) > 1:
         raise FileFormatError(f"{spec}: expected cameras of one model, got {' and '.join(kinds)}")
     each = zip(names, poses, models, strict=True)
     return tuple(Mount(str(name), np.linalg.inv(poses[0]) @ pose, model=model) for name, pose, model in each)
@@ -251,14 +234,10 @@ def _mounted(
 
 def _rigid(where: str, key: str, given: Any) -> Doubles:
     """A rotation and a shift, (4, 4), from four rows."""
-    rows = [one for row in given for one in row] if isinstance(given, list) and all(map(_listed, given)) else []
-    step = np.array(_numbers(where, {key: rows}, key, 16, FARTHEST)).reshape(4, 4)
+    rows = given if isinstance(given, list) and all(isinstance(row, list) for row in given) else []
+    step = np.array(_numbers(where, key, [number for row in rows for number in row], 16, FARTHEST)).reshape(4, 4)
     turn, last = step[:3, :3], step[3]
     turns = np.allclose(turn @ turn.T, np.eye(3), atol=1e-3) and np.linalg.det(turn) > 0.0
     if not turns or not np.allclose(last, [0.0, 0.0, 0.0, 1.0]):
         raise FileFormatError(f"{where}: {key}: expected a rotation and a shift, got another map")
     return step
-
-
-def _listed(given: Any) -> bool:
-    return isinstance(given, list)

@@ -22,7 +22,7 @@ from advsearch.errors import InputError
 from advsearch.scene.assets import Doubles, Ints
 from advsearch.scene.people import about
 from advsearch.scene.settings import GEOMETRIC, Parameter, moving
-from advsearch.scene.skeleton import Clip, Movable, Track, entries_of_turn
+from advsearch.scene.skeleton import Clip, Movable, Track, entries_of_turn, with_above
 
 AXES = ("x", "y", "z")
 WEIGHT = "weight"
@@ -55,8 +55,7 @@ class SkeletonRig:
     def __init__(self, parts: Sequence[Movable], vertices: Ints, to_mesh: Doubles) -> None:
         self.skeleton = parts[0].skeleton
         self._to_mesh = torch.from_numpy(to_mesh)
-        size = to_mesh / np.cbrt(np.linalg.det(to_mesh))
-        self._upright = torch.from_numpy(size)
+        self._upright = torch.from_numpy(to_mesh / np.cbrt(np.linalg.det(to_mesh)))
         self._gather(parts, vertices)
         self._order()
         self._rest = self.posed({})
@@ -91,19 +90,16 @@ class SkeletonRig:
     def _order(self) -> None:
         """Sort the nodes by their depth, so that all of one depth are placed at once."""
         skeleton = self.skeleton
-        depth = np.zeros(len(skeleton.parents), np.int64)
         level, self._levels = np.flatnonzero(skeleton.parents < 0), list[tuple[Tensor, Tensor]]()
-        row = np.zeros(len(depth), np.int64)
+        row = np.zeros(len(skeleton.parents), np.int64)
         while len(level):
             self._levels.append((torch.from_numpy(level), torch.from_numpy(row[skeleton.parents[level]])))
             row[level] = np.arange(len(level))
             level = np.flatnonzero(np.isin(skeleton.parents, level))
-        order = torch.cat([one for one, _ in self._levels])
-        self._back = torch.argsort(order)
+        self._back = torch.argsort(torch.cat([nodes for nodes, _ in self._levels]))
         self._places = torch.from_numpy(skeleton.places)
-        self._resting = self._world(self._places)
         # the nearest rotation to each node's place in the scene: what scale and shear leave of its axes
-        left, _, right = np.linalg.svd(self._resting[:, :3, :3].numpy())
+        left, _, right = np.linalg.svd(self._world(self._places)[:, :3, :3].numpy())
         self._axes = torch.from_numpy(left @ right)
 
     # ---- what can be asked for ---------------------------------------------------------------------------------------
@@ -111,16 +107,13 @@ class SkeletonRig:
     @property
     def clips(self) -> tuple[str, ...]:
         """Names of the animations."""
-        return tuple(one.name for one in self.skeleton.clips)
+        return tuple(clip.name for clip in self.skeleton.clips)
 
     @cached_property
     def joints(self) -> dict[str, int]:
         """The nodes that move something, by name."""
-        found, level = set[int](), {int(node) for node in self._nodes}
-        while level:
-            found |= level
-            level = {int(self.skeleton.parents[node]) for node in level} - {-1} - found
-        return {self.skeleton.names[node]: node for node in sorted(found)}
+        moving = with_above(self.skeleton.parents, [int(node) for node in self._nodes])
+        return {self.skeleton.names[node]: node for node in sorted(moving)}
 
     @property
     def targets(self) -> tuple[str, ...]:
@@ -130,18 +123,15 @@ class SkeletonRig:
     @property
     def defaults(self) -> Mapping[str, float]:
         """Every number at rest."""
+        time = {TIME.name: 0.0} if self.clips else {}
         turns = {f"{name}.{axis}": 0.0 for name in self.joints for axis in AXES}
-        return {
-            **({TIME.name: 0.0} if self.clips else {}),
-            **turns,
-            **{f"{name}.{WEIGHT}": rest for name, _, _, rest, _, _ in reversed(self._targets)},
-        }
+        return time | turns | {f"{name}.{WEIGHT}": rest for name, _, _, rest, _, _ in reversed(self._targets)}
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
         """Time of a clip, turns of joints and weights of morph targets."""
         named = (TIME if name == TIME.name else part_of_a_rig(name) for name in self.defaults)
-        return tuple(one for one in named if one is not None)
+        return tuple(parameter for parameter in named if parameter is not None)
 
     def measured(self, values: Mapping[str, Tensor], clip: str | None = None) -> Mapping[str, Value]:
         """Return the seconds of a clip."""
@@ -152,15 +142,9 @@ class SkeletonRig:
     # ---- where the vertices are --------------------------------------------------------------------------------------
 
     def offsets(self, values: Mapping[str, Tensor], clip: str | None = None) -> Tensor:
-        """Return how far each vertex goes from the mesh at rest, (V, 3) float32 in its unit; differentiable.
-
-        Args:
-            values: numbers by the names of `parameters`; those of the clip, and else at rest, where one is missing.
-            clip: name of the animation that `time` is of; None for none.
-
-        Raises:
-            InputError: a vertex is nowhere, because the file's numbers are too large.
-        """
+        """Return how far each vertex goes from the mesh at rest, (V, 3) float32 in its unit; differentiable. Numbers,
+        by the names of `parameters`, are those of the clip of that name, and else at rest, where one is missing. Raises
+        InputError: a vertex is nowhere, because the file's numbers are too large."""
         posed = self.posed(values, clip)
         moved = (posed - self._rest.to(posed.device)) @ self._to_mesh.to(posed.device).T
         if not bool(torch.isfinite(moved.detach()).all()):
@@ -185,7 +169,7 @@ class SkeletonRig:
         return torch.einsum("vij,vj->vi", moves[:, :, :3], points) + moves[:, :, 3]
 
     def _clip(self, name: str) -> Clip:
-        return next(one for one in self.skeleton.clips if one.name == name)
+        return next(clip for clip in self.skeleton.clips if clip.name == name)
 
     def _seconds(self, clip: Clip, values: Mapping[str, Tensor]) -> Tensor:
         time = values.get(TIME.name, torch.zeros(())).double()
@@ -194,19 +178,19 @@ class SkeletonRig:
     def _played(self, clip: Clip, seconds: Tensor) -> tuple[Tensor, dict[int, Tensor]]:
         """Places (N, 4, 4) of all nodes at a time of a clip, and weights of morph targets by node."""
         skeleton, device = self.skeleton, seconds.device
-        made = {"translation": skeleton.translations, "rotation": skeleton.rotations, "scale": skeleton.scales}
-        parts = {path: torch.from_numpy(values).to(device) for path, values in made.items()}
-        for path in made:
+        rest = {"translation": skeleton.translations, "rotation": skeleton.rotations, "scale": skeleton.scales}
+        parts = {path: torch.from_numpy(values).to(device) for path, values in rest.items()}
+        for path in rest:
             mine = [track for track in clip.tracks if track.path == path]
             if mine:
                 nodes = torch.tensor([track.node for track in mine], device=device)
-                parts[path] = parts[path].index_copy(0, nodes, torch.stack([sampled(one, seconds) for one in mine]))
+                parts[path] = parts[path].index_copy(0, nodes, torch.stack([sampled(track, seconds) for track in mine]))
         turns = rotation(parts["rotation"]) * parts["scale"][:, None, :]
         last = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64, device=device).expand(len(turns), 1, 4)
-        made_of = torch.cat([torch.cat([turns, parts["translation"][:, :, None]], dim=2), last], dim=1)
+        composed = torch.cat([torch.cat([turns, parts["translation"][:, :, None]], dim=2), last], dim=1)
         fixed = torch.from_numpy(skeleton.fixed).to(device)
-        places = torch.where(fixed[:, None, None], self._places.to(device), made_of)
-        return places, {one.node: sampled(one, seconds) for one in clip.tracks if one.path == "weights"}
+        places = torch.where(fixed[:, None, None], self._places.to(device), composed)
+        return places, {track.node: sampled(track, seconds) for track in clip.tracks if track.path == "weights"}
 
     def _turned(self, places: Tensor, number: Mapping[str, Tensor]) -> Tensor:
         """Places (N, 4, 4) of all nodes, joints turned on top."""
@@ -227,12 +211,11 @@ class SkeletonRig:
 
     def _world(self, places: Tensor) -> Tensor:
         """(N, 4, 4) from each node to the scene."""
-        above, found = None, list[Tensor]()
+        levels = list[Tensor]()
         for level, parents in self._levels:
             here = places[level.to(places.device)]
-            above = here if above is None else above[parents.to(places.device)] @ here
-            found.append(above)
-        return torch.cat(found)[self._back.to(places.device)]
+            levels.append(levels[-1][parents.to(places.device)] @ here if levels else here)
+        return torch.cat(levels)[self._back.to(places.device)]
 
     def _morphed(self, number: Mapping[str, Tensor], weights: Mapping[int, Tensor], device: torch.device) -> Tensor:
         """The vertices (V, 3) in their meshes' coordinates, morph targets added."""
@@ -260,13 +243,13 @@ def sampled(track: Track, seconds: Tensor) -> Tensor:
     first, second = values[before, middle], values[after, middle]
     if track.interpolation == "CUBICSPLINE":
         square, cube = share**2, share**3
-        found = (
+        spline = (
             (2.0 * cube - 3.0 * square + 1.0) * first
             + span * (cube - 2.0 * square + share) * values[before, 2]
             + (3.0 * square - 2.0 * cube) * second
             + span * (cube - square) * values[after, 0]
         )
-        return found / found.norm().clamp_min(1e-12) if track.path == "rotation" else found
+        return spline / spline.norm().clamp_min(1e-12) if track.path == "rotation" else spline
     return slerp(first, second, share) if track.path == "rotation" else first + share * (second - first)
 
 
@@ -276,8 +259,8 @@ def slerp(first: Tensor, second: Tensor, share: Tensor) -> Tensor:
     cosine = first @ second
     second, cosine = torch.where(cosine < 0.0, -second, second), cosine.abs()
     if float(cosine) > NEARLY_ONE:
-        found: Tensor = first + share * (second - first)
-        return found.div(found.norm())
+        chord: Tensor = first + share * (second - first)
+        return chord.div(chord.norm())
     angle = torch.arccos(cosine)
     arc: Tensor = torch.sin((1.0 - share) * angle) * first + torch.sin(share * angle) * second
     return arc / torch.sin(angle)

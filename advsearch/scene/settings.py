@@ -61,18 +61,9 @@ LIT = ("adjoint", "differences")
 
 
 def moving(
-    estimators: tuple[str, ...],
-    name: str,
-    unit: str,
-    low: float,
-    high: float,
-    default: float | str,
-    text: str,
-    search: tuple[float, float] | None = None,
-    *,
-    periodic: bool = False,
-    log: bool = False,
-) -> Parameter:
+    estimators: tuple[str, ...], name: str, unit: str, low: float, high: float, default: float | str, text: str,
+    search: tuple[float, float] | None = None, *, periodic: bool = False, log: bool = False,
+) -> Parameter:  # fmt: skip
     """Return a number that moves outlines."""
     return Parameter(name, (), unit, low, high, default, text, periodic, True, search, log, estimators=estimators)
 
@@ -86,11 +77,10 @@ def colors(
     estimators: tuple[str, ...] = LIT,
 ) -> tuple[Parameter, ...]:
     """Return the three numbers of a colour, display-referred sRGB; the text goes on behind "Red", "Green", "Blue"."""
+    texts = [f"{name.capitalize()} {text}" for name in CHANNELS]
     return tuple(
-        Parameter(
-            name, (), "sRGB", low, 1.0, default, f"{name.capitalize()} {text}", search=search, estimators=estimators
-        )
-        for name, default in zip(CHANNELS, defaults, strict=True)
+        Parameter(name, (), "sRGB", low, 1.0, default, words, search=search, estimators=estimators)
+        for name, default, words in zip(CHANNELS, defaults, texts, strict=True)
     )
 
 
@@ -113,67 +103,30 @@ ORBIT_CAMERA = "orbit"
 """The camera that the settings `camera.*` describe: on a sphere around the object, looking at it."""
 
 CAMERA = (
-    _camera(
-        "azimuth",
-        "degrees",
-        -3600.0,
-        3600.0,
-        40.0,
-        "Direction of the camera around the object.",
-        (0.0, 360.0),
-        periodic=True,
-    ),
+    _camera("azimuth", "degrees", -3600.0, 3600.0, 40.0, "Direction of the camera around the object.", (0.0, 360.0),
+            periodic=True),
     _camera("elevation", "degrees", -89.0, 89.0, 25.0, "Height of the camera above the ground plane.", (5.0, 60.0)),
-    _camera(
-        "roll",
-        "degrees",
-        -360.0,
-        360.0,
-        0.0,
-        "Rotation of the picture, counter-clockwise.",
-        (-15.0, 15.0),
-        periodic=True,
-    ),
-    _camera(
-        "distance",
-        "metres",
-        1e-4,
-        1e5,
-        "fits the object",
-        "Distance to the object's middle; in object sizes where its size in metres is not known.",
-        (0.8, 1.5),
-        log=True,
-    ),
-    _camera(
-        "height",
-        "metres",
-        -1e4,
-        1e5,
-        "as the elevation says",
-        "Height of the lens above the ground, in place of `elevation`; in object sizes as `distance`.",
-    ),
+    _camera("roll", "degrees", -360.0, 360.0, 0.0, "Rotation of the picture, counter-clockwise.", (-15.0, 15.0),
+            periodic=True),
+    _camera("distance", "metres", 1e-4, 1e5, "fits the object",
+            "Distance to the object's middle; in object sizes where its size in metres is not known.", (0.8, 1.5),
+            log=True),
+    _camera("height", "metres", -1e4, 1e5, "as the elevation says",
+            "Height of the lens above the ground, in place of `elevation`; in object sizes as `distance`."),
     _camera("fov", "degrees", 1.0, 170.0, 35.0, "Field of view along the larger side of the picture."),
-    Parameter(
-        "exposure", (), "stops", -10.0, 10.0, 0.0, "Brightness over the metered exposure.", estimators=("image",)
-    ),
-)
+    Parameter("exposure", (), "stops", -10.0, 10.0, 0.0, "Brightness over the metered exposure.",
+              estimators=("image",)),
+)  # fmt: skip
 EV = Parameter(
-    "ev",
-    (),
-    "EV at ISO 100",
-    -10.0,
-    24.0,
-    "metered",
-    "Absolute exposure in place of the metered one, in the avenue: 14 is for sun, 5 for lit streets.",
-    estimators=(),
-)
+    "ev", (), "EV at ISO 100", -10.0, 24.0, "metered",
+    "Absolute exposure in place of the metered one, in the avenue: 14 is for sun, 5 for lit streets.", estimators=(),
+)  # fmt: skip
 DROPS = (
-    Parameter(
-        "drops", (), "1", 0.0, 2000.0, 0.0, "Raindrops on a sheet of glass 6 cm before the camera.", estimators=()
-    ),
+    Parameter("drops", (), "1", 0.0, 2000.0, 0.0, "Raindrops on a sheet of glass 6 cm before the camera.",
+              estimators=()),
     Parameter("drop_size", (), "mm", 0.2, 10.0, 1.5, "Median of the radii of these drops.", estimators=()),
     Parameter("drop_seed", (), "1", 0.0, 1e6, 0.0, "Where they are, and how large: a whole number.", estimators=()),
-)
+)  # fmt: skip
 LAMPS = ("off", "low", "high")
 """What the lamps of a car may be: with either beam its tail lamps shine too."""
 
@@ -184,22 +137,11 @@ def _lamps(whose: str) -> Parameter:
 
 
 ENVIRONMENT = (
-    Parameter(
-        "rotation",
-        (),
-        "degrees",
-        -3600.0,
-        3600.0,
-        0.0,
-        "Rotation about the vertical.",
-        periodic=True,
-        search=(0.0, 360.0),
-        estimators=LIT,
-    ),
-    Parameter(
-        "exposure", (), "stops", -10.0, 10.0, 0.0, "Brightness, after metering.", search=(-1.0, 1.0), estimators=LIT
-    ),
-)
+    Parameter("rotation", (), "degrees", -3600.0, 3600.0, 0.0, "Rotation about the vertical.", periodic=True,
+              search=(0.0, 360.0), estimators=LIT),
+    Parameter("exposure", (), "stops", -10.0, 10.0, 0.0, "Brightness, after metering.", search=(-1.0, 1.0),
+              estimators=LIT),
+)  # fmt: skip
 GROUND_KINDS = (
     TABLE, PHOTOGRAPH, DRY_ROAD, WET_ROAD, DRY_AVENUE, WET_AVENUE, CROSSING, CAR_PARK, ROOM, LIT_ROOM, SNOW_AVENUE,
 ) = (
@@ -212,38 +154,18 @@ PHOTOGRAPHED_FROM = 3.0
 TABLE_SETTINGS = ("ground.size", *(f"ground.{channel}" for channel in CHANNELS))
 """Settings that only a table has."""
 GROUND = (
-    Parameter(
-        "kind",
-        (),
-        "name",
-        0.0,
-        len(GROUND_KINDS) - 1.0,
-        "what the environment has: photograph where the map is a file, a road in a street, else table",
-        "What the object stands on: a square table, the floor that the environment's photograph shows, a road, or a "
-        "place with all that stands in it: an avenue, a crossing, a car park or a room.",
-        options=GROUND_KINDS,
-    ),
+    Parameter("kind", (), "name", 0.0, len(GROUND_KINDS) - 1.0,
+              "what the environment has: photograph where the map is a file, a road in a street, else table",
+              "What the object stands on: a square table, the floor that the environment's photograph shows, a road, "
+              "or a place with all that stands in it: an avenue, a crossing, a car park or a room.",
+              options=GROUND_KINDS),
     Parameter("size", (), "object sizes", 0.0, 1000.0, 3.0, "Side of the table; 0 leaves the ground out."),
     *colors("of the table.", defaults=(0.55, 0.45, 0.37), estimators=("differences",)),
-    Parameter(
-        "height",
-        (),
-        "metres",
-        1e-3,
-        1000.0,
-        f"1.6, or {PHOTOGRAPHED_FROM:g} object sizes",
-        "Height above the floor from which the photograph was taken; in object sizes as `camera.distance`.",
-    ),
-    Parameter(
-        "radius",
-        (),
-        "metres",
-        1e-3,
-        1e5,
-        "5 heights",
-        "How far from the photograph's camera its floor is empty; in object sizes as `camera.distance`.",
-    ),
-)
+    Parameter("height", (), "metres", 1e-3, 1000.0, f"1.6, or {PHOTOGRAPHED_FROM:g} object sizes",
+              "Height above the floor from which the photograph was taken; in object sizes as `camera.distance`."),
+    Parameter("radius", (), "metres", 1e-3, 1e5, "5 heights",
+              "How far from the photograph's camera its floor is empty; in object sizes as `camera.distance`."),
+)  # fmt: skip
 MATERIAL = (
     _surface("roughness", "Roughness of the surface: 0 is polished, 1 is matt.", (0.1, 1.0)),
     _surface("metallic", "How metallic it is: 0 is paint, wood or glaze, 1 is bare metal.", (0.0, 1.0)),
@@ -256,7 +178,7 @@ FAMILIES = {
 }  # fmt: skip
 
 SETTINGS: Mapping[str, Parameter] = {
-    f"{family}.{one.name}": one for family, parameters in FAMILIES.items() for one in parameters
+    f"{family}.{setting.name}": setting for family, parameters in FAMILIES.items() for setting in parameters
 }
 """Every setting by `family.parameter`; of no other control's parameters."""
 

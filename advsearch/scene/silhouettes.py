@@ -42,14 +42,9 @@ class Frame:
 
     @staticmethod
     def of(fov: float, aspect: float = 1.0, shift: tuple[float, float] = (0.0, 0.0)) -> Frame:
-        """Return the frame of a camera.
-
-        Args:
-            fov: field of view along the larger side, degrees.
-            aspect: width over height.
-            shift: of the picture to the right in its widths and downwards in its heights; what it shows moves the
-                other way.
-        """
+        """Return the frame of a camera with a field of view along the larger side, degrees, an aspect of width over
+        height, and a shift of the picture to the right in its widths and downwards in its heights: what it shows moves
+        the other way."""
         larger = math.tan(math.radians(fov) / 2.0)
         x, y = larger * min(1.0, aspect), larger * min(1.0, 1.0 / aspect)
         right, down = 2.0 * x * shift[0], 2.0 * y * shift[1]
@@ -67,12 +62,7 @@ class Frame:
 
 @dataclass(frozen=True, eq=False)
 class Silhouette:
-    """Which directions a thing is seen in: a mask over a window of tangents.
-
-    Attributes:
-        mask: (h, w) row 0 at the low end of the window.
-        window: tangents that the mask spans.
-    """
+    """Which directions a thing is seen in: a mask (h, w) over a window of tangents, row 0 at its low end."""
 
     mask: Bools
     window: Frame
@@ -84,13 +74,10 @@ class Silhouette:
         whole columns at a time.
         """
         row, column = np.nonzero(self.mask)
-        height, width = self.mask.shape
+        (height, width), window = self.mask.shape, self.window
         number = np.arange(len(row))
-        x = (
-            self.window.left
-            + (column + (0.5 + 0.7548777 * number) % 1.0) * (self.window.right - self.window.left) / width
-        )
-        y = self.window.low + (row + (0.5 + 0.5698403 * number) % 1.0) * (self.window.high - self.window.low) / height
+        x = window.left + (column + (0.5 + 0.7548777 * number) % 1.0) * (window.right - window.left) / width
+        y = window.low + (row + (0.5 + 0.5698403 * number) % 1.0) * (window.high - window.low) / height
         return _unit(np.stack([x, y, np.ones_like(x)], axis=-1))
 
     def contains(self, x: Doubles, y: Doubles, forwards: Doubles) -> Bools:
@@ -100,21 +87,13 @@ class Silhouette:
         column = np.floor((x / depth - self.window.left) / (self.window.right - self.window.left) * width)
         row = np.floor((y / depth - self.window.low) / (self.window.high - self.window.low) * height)
         inside = (forwards > NEAREST) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
-        found = self.mask[np.where(inside, row, 0).astype(np.int64), np.where(inside, column, 0).astype(np.int64)]
-        return np.asarray(inside & found)
+        row, column = (np.where(inside, at, 0).astype(np.int64) for at in (row, column))
+        return np.asarray(inside & self.mask[row, column])
 
 
 def silhouette(points: Doubles, faces: npt.NDArray[np.uint32], frame: Frame | None = None) -> Silhouette | None:
-    """Rasterise a mesh as the camera sees it.
-
-    Args:
-        points: (V, 3) vertices in camera coordinates.
-        faces: (F, 3) vertex indices; those that reach behind the camera are left out.
-        frame: what the picture shows; None looks everywhere in front.
-
-    Returns:
-        The silhouette within the frame, or None if nothing is seen of it.
-    """
+    """Rasterise a mesh with vertices (V, 3) in camera coordinates as the camera sees it within a frame, None for all in
+    front; faces (F, 3) that reach behind the camera are left out. None if nothing is seen of it."""
     corners = points[faces.astype(np.int64)]
     corners = corners[(corners[..., 2] > NEAREST).all(axis=1)]
     if len(corners) == 0:
@@ -142,7 +121,7 @@ class Passage:
     Attributes:
         hidden: directions (N, 3) in which what is to be hidden is seen.
         cover: silhouette of the moving thing, straight ahead of the camera.
-        axes: (3, 3) rows: where the moving thing's right, up and forward point when it is in the middle of the other.
+        axes: (3, 3) rows: where its right, up and forward point when it is in the middle of the other.
         direction: from which side it comes: degrees, 0 from the right of the picture, 90 from above.
     """
 
@@ -199,15 +178,8 @@ def middle_axes(hidden: Doubles) -> Doubles:
 
 
 def angle_outside(shown: Doubles, rim: Doubles, cover: Silhouette, axes: Doubles, direction: float) -> float:
-    """Return the angle in radians beyond which the moving thing is out of the picture on its side.
-
-    Args:
-        shown: unit directions (N, 3) spread over the whole picture.
-        rim: (M, 3) those at its edge.
-        cover: silhouette of the moving thing, straight ahead.
-        axes: see `Passage`.
-        direction: from which side it comes, degrees.
-    """
+    """Return the angle in radians beyond which a thing that comes from a direction, degrees, is out of the picture on
+    its side: of directions (N, 3) spread over the whole picture and (M, 3) at its edge; the others as of `Passage`."""
     radius = float(np.arccos(np.clip(cover.window.corners()[:, 2], -1.0, 1.0)).max())
     reach = float(np.arccos(np.clip(rim @ axes[2], -1.0, 1.0)).max())
     angles = np.linspace(min(reach + radius + 0.02, 0.9 * math.pi), 0.0, 2 * SCAN)

@@ -13,12 +13,9 @@ from advsearch.described import rounded
 from advsearch.errors import InputError
 from advsearch.scene.assets import ObjectAsset
 
-UNITS = {"mm": 0.001, "cm": 0.01, "m": 1.0, "in": 0.0254}
-"""Metres of the units that a mesh may be in."""
-TRIPOD = 1.6
-"""Metres above the floor from which photographed environments are taken, where nobody says it."""
-SMALLEST, LARGEST = 1e-4, 1e4
-"""Metres of an object's longest side."""
+UNITS = {"mm": 0.001, "cm": 0.01, "m": 1.0, "in": 0.0254}  # metres of the units that a mesh may be in
+TRIPOD = 1.6  # metres above the floor from which photographed environments are taken, where nobody says it
+SMALLEST, LARGEST = 1e-4, 1e4  # metres of an object's longest side
 USUAL = {
     "airplane": (6.0, 75.0), "apple": (0.05, 0.12), "backpack": (0.3, 0.8), "ball": (0.03, 0.4),
     "banana": (0.12, 0.3), "bed": (1.6, 2.4), "bench": (1.0, 2.5), "bicycle": (1.3, 2.0), "bike": (1.3, 2.3),
@@ -33,7 +30,6 @@ USUAL = {
 }  # fmt: skip
 """Metres that the longest side of a thing lies between, by the word for it in the name of a file: wide, to tell one
 unit from another."""
-
 ROAD_VEHICLES = frozenset("bicycle bike bus car lorry motorcycle pickup sedan suv tractor truck van vehicle".split())
 """Words for what is seen from the height of other road users, in the name or the label of an object."""
 
@@ -45,16 +41,9 @@ def on_roads(asset: ObjectAsset) -> bool:
 
 
 def sized(asset: ObjectAsset, size: float | None, unit: str | None) -> ObjectAsset:
-    """Return an object with its size in metres, where it is told: by `size`, by `unit`, or by itself.
-
-    Args:
-        asset: as it was read.
-        size: of its longest side, metres.
-        unit: of its file's coordinates, one of `UNITS`.
-
-    Raises:
-        InputError: both are given, `size` is out of range, or the object comes from no file that could have a unit.
-    """
+    """Return an object with its size in metres, where it is told: by `size`, of its longest side in metres, by `unit`,
+    one of `UNITS`, of its file, or by itself. Raises InputError: both are given, `size` is out of range, or the object
+    comes from no file that could have a unit."""
     if size is None and unit is None:
         return asset
     if size is not None and unit is not None:
@@ -74,13 +63,8 @@ def sized(asset: ObjectAsset, size: float | None, unit: str | None) -> ObjectAss
 
 
 def doubts(asset: ObjectAsset, *, asked: bool, laid: bool) -> tuple[str, ...]:
-    """Return what is said where an object's size is unlike that of a thing of its name, or is not known.
-
-    Args:
-        asset: the object.
-        asked: its size was given, so that its user knows it.
-        laid: something in the scene has a size in metres, such as the road.
-    """
+    """Return what is said where an object's size is unlike that of a thing of its name, or is not known: `asked` tells
+    that its user gave its size, `laid` that something in the scene has one in metres, such as the road."""
     kind = next((word for word in reversed(re.split(r"[^a-z]+", asset.name.lower())) if word in USUAL), None)
     low, high = (0.005, 100.0) if kind is None else USUAL[kind]
     strange = asset.metres is not None and not low <= asset.metres <= high

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,21 +13,13 @@ from advsearch.scene.assets import Doubles, Ints
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """What a clip makes of one property of a node.
+    """What a clip makes of one property of a node."""
 
-    Attributes:
-        node: number of the node.
-        path: "translation", "rotation" (x, y, z, w), "scale" or "weights" (of morph targets).
-        interpolation: "LINEAR", "STEP" or "CUBICSPLINE".
-        times: (K,) seconds that rise.
-        values: (K, 1, W); of a cubic spline (K, 3, W): the tangent before, the value, the tangent after.
-    """
-
-    node: int
-    path: str
-    interpolation: str
-    times: Doubles
-    values: Doubles
+    node: int  # number of the node
+    path: str  # "translation", "rotation" (x, y, z, w), "scale" or "weights" (of morph targets)
+    interpolation: str  # "LINEAR", "STEP" or "CUBICSPLINE"
+    times: Doubles  # (K,) seconds that rise
+    values: Doubles  # (K, 1, W); of a cubic spline (K, 3, W): the tangent before, the value, the tangent after
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,36 +32,26 @@ class Clip:
     @property
     def begin(self) -> float:
         """Seconds of the first key."""
-        return float(min(one.times[0] for one in self.tracks))
+        return float(min(track.times[0] for track in self.tracks))
 
     @property
     def end(self) -> float:
         """Seconds of the last one."""
-        return float(max(one.times[-1] for one in self.tracks))
+        return float(max(track.times[-1] for track in self.tracks))
 
 
 @dataclass(frozen=True, eq=False)
 class Skeleton:
-    """The nodes of a file at rest, and what moves them.
+    """The nodes of a file at rest, and what moves them."""
 
-    Attributes:
-        source: name of the file, for messages.
-        names: of the nodes, all different.
-        parents: (N,) their numbers; -1 of a root.
-        places: (N, 4, 4) from each node to its parent.
-        translations, rotations, scales: (N, 3), (N, 4) and (N, 3) of which `places` is made.
-        fixed: (N,) whether `places` is a matrix instead.
-        clips: animations.
-    """
-
-    source: str
-    names: tuple[str, ...]
-    parents: Ints
-    places: Doubles
-    translations: Doubles
-    rotations: Doubles
-    scales: Doubles
-    fixed: np.ndarray
+    source: str  # name of the file, for messages
+    names: tuple[str, ...]  # of the nodes, all different
+    parents: Ints  # (N,) their numbers; -1 of a root
+    places: Doubles  # (N, 4, 4) from each node to its parent
+    translations: Doubles  # (N, 3), of which, with the two below, `places` is made
+    rotations: Doubles  # (N, 4)
+    scales: Doubles  # (N, 3)
+    fixed: np.ndarray  # (N,) whether `places` is a matrix instead
     clips: tuple[Clip, ...]
 
 
@@ -83,29 +66,26 @@ class Target:
 
 @dataclass(frozen=True, eq=False)
 class Movable:
-    """A part as it is stored, and what moves it.
+    """A part as it is stored, and what moves it."""
 
-    Attributes:
-        skeleton: of its file.
-        node: number of the node that draws it.
-        vertices: (V, 3) in the coordinates of its mesh.
-        nodes: (J,) numbers of the joints; where no skin moves it, its own node.
-        inverse: (J, 4, 4) inverse bind matrices.
-        joints: (V, n) indices into `nodes`.
-        weights: (V, n) of each; they add up to 1.
-        targets: morph targets.
-        rest: (T,) their weights at rest.
-    """
+    skeleton: Skeleton  # of its file
+    node: int  # number of the node that draws it
+    vertices: Doubles  # (V, 3) in the coordinates of its mesh
+    nodes: Ints  # (J,) numbers of the joints; where no skin moves it, its own node
+    inverse: Doubles  # (J, 4, 4) inverse bind matrices
+    joints: Ints  # (V, n) indices into `nodes`
+    weights: Doubles  # (V, n) of each; they add up to 1
+    targets: tuple[Target, ...]  # morph targets
+    rest: Doubles  # (T,) their weights at rest
 
-    skeleton: Skeleton
-    node: int
-    vertices: Doubles
-    nodes: Ints
-    inverse: Doubles
-    joints: Ints
-    weights: Doubles
-    targets: tuple[Target, ...]
-    rest: Doubles
+
+def with_above(parents: Sequence[int] | Ints, nodes: Collection[int]) -> set[int]:
+    """Return nodes, and all on which they hang; `parents` are (N,) their numbers, -1 of a root."""
+    reached, level = set[int](), set(nodes)
+    while level:
+        reached |= level
+        level = {int(parents[node]) for node in level} - {-1} - reached
+    return reached
 
 
 def entries_of_turn(x: Any, y: Any, z: Any, w: Any) -> list[Any]:

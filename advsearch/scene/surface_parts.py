@@ -12,14 +12,13 @@ import numpy as np
 import xatlas
 from scipy.sparse import coo_array
 
-from advsearch.scene.assets import Doubles, Ints, Mesh
+from advsearch.scene.assets import Doubles, Ints, Mesh, face_vectors, grouped
 from advsearch.scene.importing.geometry import Soup, connected, neighbours, unit_vectors
 from advsearch.scene.raster import doubled_areas, pixels_in, rasterised, weights_at
 
 ATLAS_SIZE = 512
 ATLAS_PADDING = 4
 """Charts are kept so many texels apart in an atlas of about `ATLAS_SIZE`: two texels in a texture of half that size."""
-
 _SCALE = 100.0  # xatlas takes faces under about 1e-7 square units for empty
 _FLUSH = 1.0 - 1.5e-4  # xatlas takes neighbours whose normals have a product over 1 - 1e-4 for one plane
 _PLANE = np.cos(np.radians(10.0))  # how far the normals of what it takes for a plane may stray before it matters
@@ -31,20 +30,17 @@ _SMOOTHING = 10  # rounds of averaging normals, so that noise does not fray the 
 
 
 def unwrapped(soup: Soup, apart: Ints | None = None) -> Soup:
-    """Return the soup with UVs from xatlas: charts that do not overlap, inside the unit square; deterministic.
+    """Return the soup with UVs from xatlas: charts that do not overlap, inside the unit square; deterministic. Faces
+    with different numbers in `apart` (F,) get charts of their own.
 
     The faces of a mesh in very many pieces become triangles of one size, side by side in a grid.
-
-    Args:
-        soup: the mesh.
-        apart: (F,) numbers; faces with different ones get charts of their own.
     """
     patch = _patches(soup)
     if apart is not None:
         patch = np.unique(patch * (int(apart.max()) + 1) + apart, return_inverse=True)[1].reshape(-1)
     if int(patch.max()) >= _MOST_PATCHES:
         return replace(soup, uvs=_side_by_side(len(soup.faces)))
-    groups = np.split(np.argsort(patch, kind="stable"), np.cumsum(np.bincount(patch))[:-1])
+    groups = grouped(patch)
     for size in (ATLAS_SIZE, 0):  # 0: one atlas, however large
         atlas = xatlas.Atlas()
         for group in groups:
@@ -71,8 +67,7 @@ def _side_by_side(count: int) -> Doubles:
     corner = np.stack([cell % columns, cell // columns], axis=1)[:, None, :]
     half = np.array([[0.05, 0.05], [0.85, 0.05], [0.05, 0.85]])
     inside = np.where((np.arange(count) % 2 == 0)[:, None, None], half, 1.0 - half)
-    uvs: Doubles = (corner + inside) / columns
-    return uvs
+    return np.asarray((corner + inside) / columns)
 
 
 def _patches(soup: Soup) -> Ints:
@@ -106,14 +101,9 @@ def _patches(soup: Soup) -> Ints:
 
 
 def _cells(middles: Doubles, patch: Ints) -> Ints:
-    """Halve patches until they are small; return the cell (F,) of each face.
-
-    Args:
-        middles: (F, 3) of faces.
-        patch: (F,) of each face.
-    """
+    """Halve patches (F,) until they are small; return the cell (F,) of each face, whose middles are (F, 3)."""
     cell, count = np.zeros(len(patch), dtype=np.int64), 0
-    left = np.split(np.argsort(patch, kind="stable"), np.cumsum(np.bincount(patch))[:-1])
+    left = grouped(patch)
     while left:
         group = left.pop()
         if len(group) > _PIECE:
@@ -127,56 +117,52 @@ def _cells(middles: Doubles, patch: Ints) -> Ints:
 
 def _smoothed(unit: Doubles, f: Ints, g: Ints) -> Doubles:
     """Average the normals (F, 3) of faces with their neighbours', a few times."""
-    count = len(unit)
-    links = np.concatenate([f, g, np.arange(count)]), np.concatenate([g, f, np.arange(count)])
-    average = coo_array((np.ones(len(links[0])), links), shape=(count, count)).tocsr()
+    own = np.arange(len(unit))
+    links = np.concatenate([f, g, own]), np.concatenate([g, f, own])
+    average = coo_array((np.ones(len(links[0])), links), shape=(len(unit), len(unit))).tocsr()
     for _ in range(_SMOOTHING):
         unit = np.nan_to_num(unit_vectors(average @ unit))
     return unit
 
 
-CELLS = 64
-"""Cells along each side of the map."""
-
+CELLS = 64  # cells along each side of the map
 MOST_FACES = 20_000
 """Faces of a mesh that are counted one by one; those of a larger one are smaller than what a picture shows apart."""
-
-DOUBLED = 0.01
-"""Share of the map that charts may cover twice before the mesh is unwrapped anew."""
-
-FLAT = 0.05
-"""Share of the surface that may have no area on the map, likewise."""
-
-COVERED = 0.02
-"""Share of the unit square that charts have to cover, likewise."""
-
+DOUBLED = 0.01  # share of the map that charts may cover twice before the mesh is unwrapped anew
+FLAT = 0.05  # share of the surface that may have no area on the map, likewise
+COVERED = 0.02  # share of the unit square that charts have to cover, likewise
 _FINE = 256  # side of the raster in which charts are looked at
 
 
 class SurfaceParts:
-    """The cells and the faces of a mesh.
-
-    Args:
-        mesh: with texture coordinates of whatever kind.
+    """The cells and the faces of a mesh with texture coordinates of whatever kind.
 
     Attributes:
-        mesh: the mesh.
         unwrapped: whether the map is another one than that of its own texture coordinates.
         corners: (F, 3, 2) where each face lies on the map, in [0, 1]; v = 0 is the bottom.
         by_face: whether the faces are parts too: there are at most `MOST_FACES`.
         count: number of parts: `CELLS` * `CELLS` cells, row by row from v = 1, and then the faces.
         covered: (CELLS, CELLS) whether the middle of a cell lies in a chart.
         face: (count,) the face in the middle of each part; of a cell beside all charts, the nearest one.
-        place: (count, 3) the middle of each part, in the mesh's coordinates.
-        at: (count, 2) u and v of it.
+        place, at: (count, 3) the middle of each part, in the mesh's coordinates, and (count, 2) its u and v.
     """
 
     def __init__(self, mesh: Mesh) -> None:
         self.mesh = mesh
         self._own = mesh.uvs[mesh.faces].astype(np.float64)
         self.unwrapped = not _tells_apart(mesh, self._own)
-        self.corners = _unwrapped(mesh) if self.unwrapped else self._own
-        charts = rasterised(_split(mesh, self.corners), CELLS)
+        self.corners = self._own
+        if self.unwrapped:
+            low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+            points = (mesh.vertices - low).astype(np.float64) / max(float((high - low).max()), 1e-12)
+            welded, number = np.unique(points, axis=0, return_inverse=True)
+            corners = number.reshape(-1)[mesh.faces.astype(np.int64)]
+            unknown = np.full((len(corners), 3, 3), np.nan)
+            part = np.zeros(len(corners), np.int64)
+            self.corners = unwrapped(Soup(welded, corners, part, unknown, unknown[..., :2], np.ones_like(unknown))).uvs
+        own = mesh.faces.reshape(-1)
+        apart, uvs = np.arange(len(own), dtype=np.uint32).reshape(-1, 3), self.corners.reshape(-1, 2).astype(np.float32)
+        charts = rasterised(Mesh(mesh.vertices[own], apart, mesh.normals[own], uvs), CELLS)
         self.by_face = len(mesh.faces) <= MOST_FACES
         faces = np.arange(len(mesh.faces) if self.by_face else 0)
         self.count = CELLS * CELLS + len(faces)
@@ -195,50 +181,25 @@ class SurfaceParts:
         return {**cells, "face": slice(CELLS * CELLS, self.count)} if self.by_face else cells
 
     def cells(self, face: Ints, uv: Doubles) -> Ints:
-        """Return the cells (n,) of places on the surface.
-
-        Args:
-            face: (n,) numbers of faces.
-            uv: (n, 2) the mesh's own texture coordinates there.
-        """
+        """Return the cells (n,) of places on the surface: on faces (n,), at the mesh's own texture coordinates (n,
+        2)."""
         if self.unwrapped:
             weights = weights_at(self._own[face], uv[:, 1], uv[:, 0])  # rows run along v here
             weights = np.clip(np.nan_to_num(weights, nan=1 / 3, posinf=1 / 3, neginf=1 / 3), 0.0, 1.0)
             weights /= np.maximum(weights.sum(axis=1, keepdims=True), 1e-12)
             uv = np.einsum("nk,nkc->nc", weights, self.corners[face])
-        column, row = (
-            np.clip(np.floor(one * CELLS), 0, CELLS - 1).astype(np.int64) for one in (uv[:, 0], 1 - uv[:, 1])
-        )
-        return row * CELLS + column
+        cells = np.floor(np.stack([uv[:, 0], 1 - uv[:, 1]]) * CELLS)
+        column, row = np.clip(cells, 0, CELLS - 1).astype(np.int64)
+        return np.asarray(row * CELLS + column)
 
 
 def _tells_apart(mesh: Mesh, uvs: Doubles) -> bool:
     """Whether texture coordinates (F, 3, 2) give each place of a surface one of its own."""
     if uvs.min() < 0.0 or uvs.max() > 1.0:
         return False
-    places = mesh.vertices[mesh.faces].astype(np.float64)
-    surface = np.linalg.norm(np.cross(places[:, 1] - places[:, 0], places[:, 2] - places[:, 0]), axis=1)
+    surface = np.linalg.norm(face_vectors(mesh.vertices[mesh.faces].astype(np.float64)), axis=1)
     if surface[np.abs(doubled_areas(uvs)) < 1e-12].sum() > FLAT * surface.sum():
         return False
     _, row, column, _ = pixels_in(uvs * _FINE - 0.5, (_FINE, _FINE), tolerance=-1e-6)
     covered = len(np.unique(row * _FINE + column))
     return covered >= COVERED * _FINE**2 and len(row) - covered <= DOUBLED * covered
-
-
-def _unwrapped(mesh: Mesh) -> Doubles:
-    """New texture coordinates (F, 3, 2) that lie beside each other."""
-    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
-    points = (mesh.vertices - low).astype(np.float64) / max(float((high - low).max()), 1e-12)
-    welded, number = np.unique(points, axis=0, return_inverse=True)
-    faces = number.reshape(-1)[mesh.faces.astype(np.int64)]
-    unknown = np.full((len(faces), 3, 3), np.nan)
-    soup = Soup(welded, faces, np.zeros(len(faces), np.int64), unknown, unknown[..., :2], np.ones_like(unknown))
-    return unwrapped(soup).uvs
-
-
-def _split(mesh: Mesh, corners: Doubles) -> Mesh:
-    """The mesh with other texture coordinates (F, 3, 2), its faces apart."""
-    own = mesh.faces.reshape(-1)
-    faces = np.arange(len(own), dtype=np.uint32).reshape(-1, 3)
-    uvs = corners.reshape(-1, 2).astype(np.float32)
-    return replace(mesh, vertices=mesh.vertices[own], faces=faces, normals=mesh.normals[own], uvs=uvs)

@@ -64,18 +64,14 @@ class Surfaces:
         return self.id == self.names.index(name) + 1
 
     def layers(self, aovs: Sequence[str], mask: str) -> dict[str, Tensor]:
-        """Return the channels (H, W) of a picture with these layers, such as ``normal.X``.
-
-        Args:
-            aovs: names of `AOVS`.
-            mask: the shape of the layer `mask`.
-        """
-        found: dict[str, Tensor] = {}
+        """Return the channels (H, W) of a picture with layers of `AOVS`, such as ``normal.X``; `mask` names the shape
+        of that layer."""
+        channels: dict[str, Tensor] = {}
         for name in aovs:
             value = self.seen(mask).float() if name == "mask" else getattr(self, name)
             planes = value[..., None] if value.ndim == 2 else value
-            found |= {f"{name}.{channel}": planes[..., number] for number, channel in enumerate(CHANNELS[name])}
-        return found
+            channels |= {f"{name}.{channel}": planes[..., number] for number, channel in enumerate(CHANNELS[name])}
+        return channels
 
     def notes(self, aovs: Sequence[str]) -> dict[str, str]:
         """Return what the values of the layers mean, by name."""

@@ -19,7 +19,7 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.scene.assets import Doubles, ObjectAsset
+from advsearch.scene.assets import Doubles, ObjectAsset, footing
 from advsearch.scene.geometry import middle, rotation, standing
 from advsearch.scene.importing.files import safe_name
 from advsearch.scene.parts import MeshPart, mesh_part
@@ -30,81 +30,59 @@ from advsearch.scene.sizes import LARGEST, SMALLEST, doubts, sized
 if TYPE_CHECKING:
     from advsearch.scene.description import SceneDescription
 
-FARTHEST = 1000.0
-"""How far from the object a thing may stand, metres."""
-MOST = 64
-"""Things beside an object."""
+FARTHEST = 1000.0  # how far from the object a thing may stand, metres
+MOST = 64  # things beside an object
 OPTIONS = ("heading", "size", "name", "label", "lamps")
 ALL = "all"
 """What stands for the object and every thing beside it."""
-TAKEN = ("object", "environment", "ground", "camera", *LAID, ALL)
-"""What a thing can't be called."""
+TAKEN = ("object", "environment", "ground", "camera", *LAID, ALL)  # what a thing can't be called
 
 
 @dataclass(frozen=True)
 class AskedThing:
-    """A thing as it is asked for.
+    """A thing as it is asked for."""
 
-    Attributes:
-        what: a bundled object, or a mesh file.
-        x, y: where it stands, metres.
-        heading: degrees.
-        size: its longest side in metres; None for its own.
-        name: what it is called in the scene.
-        label: what a model should call it; None for what the object of that name is called.
-        lamps: one of `settings.LAMPS`, of a car.
-    """
-
-    what: str
-    x: float
+    what: str  # a bundled object, or a mesh file
+    x: float  # metres
     y: float
-    heading: float = 0.0
-    size: float | None = None
-    name: str = ""
-    label: str | None = None
-    lamps: str = LAMPS[0]
+    heading: float = 0.0  # degrees
+    size: float | None = None  # its longest side in metres; None for its own
+    name: str = ""  # what it is called in the scene
+    label: str | None = None  # what a model should call it; None for what the object of that name is called
+    lamps: str = LAMPS[0]  # one of `settings.LAMPS`, of a car
 
 
 @dataclass(frozen=True, eq=False)
 class ThingPart(MeshPart):
-    """A thing beside the object.
+    """A thing beside the object."""
 
-    Attributes:
-        metres: its longest side.
-        lamps: which it has on.
-    """
-
-    metres: float = 1.0
-    lamps: str = LAMPS[0]
+    metres: float = 1.0  # its longest side
+    lamps: str = LAMPS[0]  # which it has on
 
 
 def asked_things(text: str | None) -> tuple[AskedThing, ...]:
-    """Read things that are asked for in one text, see above.
-
-    Raises:
-        InputError: it says something else.
-    """
-    found: list[AskedThing] = []
+    """Read things that are asked for in one text, see above. Raises InputError: it says something else."""
+    things: list[AskedThing] = []
     for part in filter(None, map(str.strip, (text or "").split(";"))):
-        one = _asked(part)
-        taken = [*TAKEN, *(other.name for other in found)]
-        if one.name in taken and "name=" in part:
-            raise InputError(f"things: {part}: another thing of the scene is called {one.name}; choose another name")
+        thing = _asked(part)
+        taken = [*TAKEN, *(other.name for other in things)]
+        if thing.name in taken and "name=" in part:
+            raise InputError(f"things: {part}: another thing of the scene is called {thing.name}; choose another name")
         number = 2
-        while one.name in taken:
-            one = replace(one, name=f"{one.name.removesuffix(f'-{number - 1}')}-{number}")
+        while thing.name in taken:
+            thing = replace(thing, name=f"{thing.name.removesuffix(f'-{number - 1}')}-{number}")
             number += 1
-        found.append(one)
-    if len(found) > MOST:
-        raise InputError(f"things: expected at most {MOST}, got {len(found)}")
-    return tuple(found)
+        things.append(thing)
+    if len(things) > MOST:
+        raise InputError(f"things: expected at most {MOST}, got {len(things)}")
+    return tuple(things)
 
 
 def _asked(part: str) -> AskedThing:
     what, at, rest = part.rpartition("@")
-    words = [one.strip() for one in rest.split(",")]
-    options = dict(one.partition("=")[::2] for one in words[2:])
-    if not at or not what.strip() or len(words) < 2 or any("=" not in one for one in words[2:]):
+    words = [word.strip() for word in rest.split(",")]
+    options = dict(word.partition("=")[::2] for word in words[2:])
+    if not at or not what.strip() or len(words) < 2 or any("=" not in word for word in words[2:]):
         raise InputError(f"things: expected WHAT@X,Y in metres, such as car@12,3.5,heading=180, got {part!r}")
     for name in options:
         if name not in OPTIONS:
@@ -112,7 +90,7 @@ def _asked(part: str) -> AskedThing:
     lamps = options.get("lamps", LAMPS[0])
     if lamps not in LAMPS:
         raise UnknownNameError(f"lamps of things {part!r}:", lamps, LAMPS)
-    x, y = (_number(part, name, one, -FARTHEST, FARTHEST) for name, one in zip("xy", words, strict=False))
+    x, y = (_number(part, name, word, -FARTHEST, FARTHEST) for name, word in zip("xy", words, strict=False))
     heading = _number(part, "heading", options["heading"], -3600.0, 3600.0) if "heading" in options else 0.0
     size = _number(part, "size", options["size"], SMALLEST, LARGEST) if "size" in options else None
     name = safe_name(Path(options.get("name") or what.strip().partition("#")[0]))
@@ -130,17 +108,9 @@ def _number(part: str, name: str, text: str, low: float, high: float) -> float:
 
 
 def with_things(scene: SceneDescription, text: str | None, load: Callable[[str], ObjectAsset]) -> SceneDescription:
-    """Return the scene with things beside its object; what stands in another one is said in its remarks.
-
-    Args:
-        scene: with its object.
-        text: what is asked for.
-        load: from the name or the file of an object to the object.
-
-    Raises:
-        UnknownNameError: there is no such object.
-        InputError: the text says something else, a name is taken, or sizes in metres are not known.
-    """
+    """Return the scene with the things beside its object that a text asks for, each loaded by its name or file; what
+    stands in another one is said in its remarks. Raises UnknownNameError: there is no such object. Raises InputError:
+    the text says something else, a name is taken, or sizes in metres are not known."""
     asked = asked_things(text)
     if not asked:
         return scene
@@ -150,29 +120,33 @@ def with_things(scene: SceneDescription, text: str | None, load: Callable[[str],
             "longest side, such as `size=0.1`"
         )
     parts, remarks = list[ThingPart](), list[str]()
-    for one in asked:
-        asset = sized(load(one.what), one.size, None)
+    for thing in asked:
+        what, name = thing.what, thing.name
+        asset = sized(load(what), thing.size, None)
         if asset.metres is None:
-            raise InputError(
-                f"things: the size of {one.what} in metres is not known; say it: "
-                f"{one.what}@{one.x:g},{one.y:g},size=METRES"
-            )
-        if one.name in {part.name for part in scene.parts}:
-            raise InputError(f"things: something of the scene is called {one.name} already; add name=NAME to it")
-        part = mesh_part(one.name, asset, _pose(scene, asset, one, asset.metres), asset.material)
-        parts.append(
-            ThingPart(**{**vars(part), "label": one.label or asset.label}, metres=asset.metres, lamps=one.lamps)
-        )
-        remarks += [*asset.notes, *doubts(asset, asked=one.size is not None, laid=True)]
+            example = f"{what}@{thing.x:g},{thing.y:g},size=METRES"
+            raise InputError(f"things: the size of {what} in metres is not known; say it: {example}")
+        if name in {part.name for part in scene.parts}:
+            raise InputError(f"things: something of the scene is called {name} already; add name=NAME to it")
+        part = mesh_part(name, asset, _pose(scene, asset, thing, asset.metres), asset.material)
+        looks = {**vars(part), "label": thing.label or asset.label}
+        parts.append(ThingPart(**looks, metres=asset.metres, lamps=thing.lamps))
+        remarks += [*asset.notes, *doubts(asset, asked=thing.size is not None, laid=True)]
     scene = replace(scene, parts=(*scene.parts, *parts), things_spec=text or "")
-    return replace(scene, remarks=(*scene.remarks, *remarks, *_meeting(scene)))
+    places = {"the object": footprint(scene.base_vertices)} | {
+        name: footprint(standing(part)) for name, part in scene.meshes.items() if isinstance(part, ThingPart)
+    }
+    remarks += [
+        f"{first[0].upper()}{first[1:]} and {other} stand in each other: their outlines on the ground overlap."
+        for first, other in combinations(places, 2)
+        if overlapping(places[first], places[other])
+    ]
+    return replace(scene, remarks=(*scene.remarks, *remarks))
 
 
 def _pose(scene: SceneDescription, asset: ObjectAsset, asked: AskedThing, metres: float) -> Doubles:
-    vertices = asset.mesh.vertices.astype(np.float64)
-    low, high = vertices.min(axis=0), vertices.max(axis=0)
-    linear = metres / scene.metres / float((high - low).max()) * rotation(asked.heading, 0.0, 0.0)
-    foot = np.array([*(low[:2] + high[:2]) / 2.0, low[2]])
+    foot, extent = footing(asset.mesh.vertices.astype(np.float64))
+    linear = metres / scene.metres / extent * rotation(asked.heading, 0.0, 0.0)
     matrix = np.eye(4)
     matrix[:3, :3] = linear
     place = middle(scene)[:2] + np.array([asked.x, asked.y]) / scene.metres
@@ -183,10 +157,9 @@ def _pose(scene: SceneDescription, asset: ObjectAsset, asked: AskedThing, metres
 def ground_height(scene: SceneDescription, place: Doubles) -> float:
     """Return how high the ground lies at a place (2,), object sizes: that of the road, with its pavements, of a room's
     table or floor, or 0."""
-    heights = list[float]()
-    for part in (one for name, one in scene.around.items() if name in LAID):
-        heights += heights_over(standing(part)[part.mesh.faces.astype(np.int64)], place)
-    return max(heights, default=0.0)
+    laid = (part for name, part in scene.around.items() if name in LAID)
+    triangles = (standing(part)[part.mesh.faces.astype(np.int64)] for part in laid)
+    return max((height for corners in triangles for height in heights_over(corners, place)), default=0.0)
 
 
 def heights_over(corners: Doubles, place: Doubles) -> list[float]:
@@ -201,18 +174,6 @@ def heights_over(corners: Doubles, place: Doubles) -> list[float]:
     under = (shares >= 0.0).all(axis=0)
     heights: list[float] = (shares * [a[:, 2], b[:, 2], c[:, 2]]).sum(axis=0)[under].tolist()
     return heights
-
-
-def _meeting(scene: SceneDescription) -> list[str]:
-    """Sentences about things that stand in each other: convex outlines on the ground that overlap."""
-    places = {"the object": footprint(scene.base_vertices)} | {
-        name: footprint(standing(part)) for name, part in scene.meshes.items() if isinstance(part, ThingPart)
-    }
-    return [
-        f"{one[0].upper()}{one[1:]} and {other} stand in each other: their outlines on the ground overlap."
-        for one, other in combinations(places, 2)
-        if overlapping(places[one], places[other])
-    ]
 
 
 class Footprint(NamedTuple):

@@ -29,35 +29,26 @@ from advsearch.scene.places.road import EDGES, EYE, FRONTS, LENGTH, STREET_ENDS
 if TYPE_CHECKING:
     from advsearch.scene.description import SceneDescription
 
-FACTOR = 2.0
-"""How much too large, or too high, what stands around may be."""
+FACTOR = 2.0  # how much too large, or too high, what stands around may be
 RADIUS = 5.0
 """How far from a photograph's camera its floor is empty, in heights of it, where `ground.radius` is not given."""
 TURNED = 2.0
 """Degrees that a street's map may be turned by: its houses then stand beside its road as far as that is laid."""
-
 Box = tuple[float, float, float, float]
 """From and to in x, from and to in y, metres or object sizes, with the object at (0, 0)."""
 
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What is known of the place in an environment's picture, in the lengths of the camera's distance.
+    """What is known of the place in an environment's picture, in the lengths of the camera's distance."""
 
-    Attributes:
-        height: above the ground from which it was taken; infinite where nothing near is shown.
-        stands: how far away what stands around is.
-        laid: how far the ground reaches that is laid under the object.
-        turned: degrees that the picture is turned by against the ground.
-    """
-
-    height: float
-    stands: Box | float
-    laid: Box | float
-    turned: float = 0.0
+    height: float  # above the ground from which it was taken; infinite where nothing near is shown
+    stands: Box | float  # how far away what stands around is
+    laid: Box | float  # how far the ground reaches that is laid under the object
+    turned: float = 0.0  # degrees that the picture is turned by against the ground
 
 
-class View(NamedTuple):
+class CameraView(NamedTuple):
     """How a camera looks: its place around the object and where it looks to, degrees of azimuth; its horizontal
     distance and its height above the ground; and how far below the horizon its picture ends, degrees."""
 
@@ -68,17 +59,10 @@ class View(NamedTuple):
     lowest: float
 
 
-def valid(environment: Surroundings, camera: View) -> tuple[float, float]:
+def valid(environment: Surroundings, camera: CameraView) -> tuple[float, float]:
     """Return up to which horizontal distance from the object, and up to which height above the ground, an environment's
-    picture fits a camera that looks as this one does; see the top of this file.
-
-    Args:
-        environment: what is known of the place.
-        camera: the view; its own distance does not count.
-
-    Returns:
-        Distance and height in the lengths of `environment`; infinite without a bound, 0 where it fits nowhere.
-    """
+    picture fits a camera that looks as this one does (its own distance does not count): in the lengths of
+    `environment`, infinite without a bound, 0 where it fits nowhere. See the top of this file."""
     if abs((environment.turned + 180.0) % 360.0 - 180.0) > TURNED:
         return 0.0, 0.0
     behind = (FACTOR - 1.0) * _reach(environment.stands, camera.towards)
@@ -110,7 +94,7 @@ def surroundings_of(scene: SceneDescription) -> Surroundings | None:
     return Surroundings(math.inf, math.inf, laid) if paved(scene) else None
 
 
-def view_of(scene: SceneDescription, to_world: Doubles | None = None, fov: float | None = None) -> View:
+def view_of(scene: SceneDescription, to_world: Doubles | None = None, fov: float | None = None) -> CameraView:
     """Return how a scene is looked at: by its own camera, or by one with another pose (4, 4) or field of view."""
     pose = camera_to_world(scene) if to_world is None else to_world
     x, y, z = pose[:3, 3] * scene.metres
@@ -123,17 +107,12 @@ def view_of(scene: SceneDescription, to_world: Doubles | None = None, fov: float
     level = math.hypot(ahead[0], ahead[1])
     towards = math.degrees(math.atan2(ahead[1], ahead[0])) if level > 1e-6 else azimuth + 180.0
     lowest = below - math.degrees(math.asin(float(np.clip(ahead[2], -1.0, 1.0))))
-    return View(azimuth, towards, math.hypot(x, y), float(z), lowest)
+    return CameraView(azimuth, towards, math.hypot(x, y), float(z), lowest)
 
 
-def past(scene: SceneDescription, views: Sequence[View], *, turns: bool = False) -> tuple[str, ...]:
-    """Return what is said where views of a scene go past what its environment's picture is valid for.
-
-    Args:
-        scene: with all its parts.
-        views: all those of a search, or some that stand for them; at least one.
-        turns: the environment is turned from view to view.
-    """
+def past(scene: SceneDescription, views: Sequence[CameraView], *, turns: bool = False) -> tuple[str, ...]:
+    """Return what is said where views of a scene, at least one, go past what its environment's picture is valid for;
+    `turns`: that is turned from view to view."""
     around = surroundings_of(scene)
     if around is None:
         return ()
@@ -143,14 +122,16 @@ def past(scene: SceneDescription, views: Sequence[View], *, turns: bool = False)
             f"{name}: its houses are a picture, which `environment.rotation` turns against the road: they then stand "
             "across it; leave the rotation out",
         )
-    limits = [valid(around, one) for one in views]
-    beyond = [one for one, (far, high) in zip(views, limits, strict=True) if one.distance > far or one.height > high]
+    limits = [valid(around, view) for view in views]
+    beyond = [
+        view for view, (far, high) in zip(views, limits, strict=True) if view.distance > far or view.height > high
+    ]
     if not beyond:
         return ()
     near, far = min(limits)[0], max(limits)[0]
     which = f"{near:.3g} {unit}" if far < 1.05 * near else f"{near:.3g} to {far:.3g} {unit} (by where it looks)"
     high = f" and {limits[0][1]:.3g} {unit} high" if math.isfinite(limits[0][1]) else ""
-    reach, top = max(one.distance for one in beyond), max(one.height for one in beyond)
+    reach, top = max(view.distance for view in beyond), max(view.height for view in beyond)
     share = len(beyond) / len(views)
     there = "the camera is" if len(views) == 1 else f"{100.0 * share:.0f} % of the views are past that, up to"
     return (

@@ -88,24 +88,8 @@ class Clash(NamedTuple):
 
 @dataclass(frozen=True)
 class Setting:
-    """What the help and the docs say about one setting.
-
-    Attributes:
-        field: attribute of the configuration.
-        name: its name in YAML.
-        flag: its flag on the command line.
-        group: the heading it stands under: scene, model, search, verification or run.
-        description: what it is.
-        expects: the values it takes, with their range.
-        unit: the unit of the value; may be empty.
-        default: the default; None when there is none.
-        otherwise: what a default of None comes to; may be empty.
-        required: whether it must be given.
-        metavar: what stands for its value in the help.
-        form: how it is written on a command line.
-        switched: what its flag does, where that is the opposite of the description; may be empty.
-        power: says what a value does beyond the run.
-    """
+    """What the help and the docs say about one setting: all of `setting`, worked out where nothing was said (a default
+    of None is also that of one that is `required`), its `field` of the configuration, and its `name` in YAML."""
 
     field: str
     name: str
@@ -140,37 +124,30 @@ def settings(config: type[Config]) -> tuple[Setting, ...]:
     for field, info in config.model_fields.items():
         if field in config.without:
             continue
-        notes: Any = info.json_schema_extra
-        declared.append(
-            Setting(
-                field=field,
-                name=info.alias or field,
-                flag=notes["flag"] or "--" + field.replace("_", "-"),
-                group=notes["group"],
-                description=info.description or "",
-                expects=notes["expects"] or _expected(info),
-                unit=notes["unit"],
-                default=None if info.is_required() else info.get_default(call_default_factory=True),
-                otherwise=notes["otherwise"],
-                required=info.is_required(),
-                metavar=notes["metavar"] or field.rpartition("_")[2].upper(),
-                form="switch" if info.annotation is bool else notes["form"],
-                switched=notes["switched"],
-                power=notes["power"],
-            )
-        )
+        extra: Any = info.json_schema_extra
+        notes: Any = {name: note for name, note in extra.items() if name != "declared"}
+        notes["flag"] = notes["flag"] or "--" + field.replace("_", "-")
+        notes["expects"] = notes["expects"] or _expected(info)
+        notes["metavar"] = notes["metavar"] or field.rpartition("_")[2].upper()
+        notes["form"] = "switch" if info.annotation is bool else notes["form"]
+        required, text = info.is_required(), info.description or ""
+        default = None if required else info.get_default(call_default_factory=True)
+        name = info.alias or field
+        declared.append(Setting(field, name, description=text, default=default, required=required, **notes))
     return tuple(declared)
 
 
 def _expected(info: FieldInfo) -> str:
     """What type and constraints of a field say of its values."""
-    kinds = [one for one in get_args(info.annotation) or (info.annotation,) if one is not type(None)]
+    kinds = [kind for kind in get_args(info.annotation) or (info.annotation,) if kind is not type(None)]
     if kinds == [bool]:
         return "true or false"
     if get_origin(info.annotation) is Literal or get_origin(kinds[0]) is Literal:
         *first, last = kinds if get_origin(info.annotation) is Literal else get_args(kinds[0])
         return f"{', '.join(first)} or {last}"
-    limits = {name: getattr(one, name) for one in info.metadata for name in ("ge", "gt", "le") if hasattr(one, name)}
+    limits = {
+        name: getattr(limit, name) for limit in info.metadata for name in ("ge", "gt", "le") if hasattr(limit, name)
+    }
     number = "a whole number" if kinds == [int] else "a number"
     most = limits["le"] if kinds == [int] else f"{limits['le']:g}".replace("e+0", "e")
     if "gt" in limits:
@@ -190,7 +167,7 @@ def as_flags(setting: Setting, value: Any) -> list[str]:
         return words + [word for name in tuned for word in (setting.flag, f"{name}={_flow(value[name])}")]
     if setting.field == "epsilon" and isinstance(value, (dict, tuple)):
         pairs = [f"{name}={_number(given)}" for name, given in value.items()] if isinstance(value, dict) else value
-        return [setting.flag, ",".join(str(one) for one in pairs)]
+        return [setting.flag, ",".join(map(str, pairs))]
     if setting.field in written.NAMED and isinstance(value, dict):
         options = {name: given for name, given in value.items() if name != "name"}
         return [setting.flag, f"{value['name']}={_flow(options)}"]
@@ -222,8 +199,7 @@ FILES = (
 
 
 class SettingsError(InputError):
-    """One or more settings have values that are not allowed: `problems` are pairs of a setting's name and what is wrong
-    with it."""
+    """One or more settings have values that are not allowed: `problems` are pairs of a name and what is wrong."""
 
     def __init__(self, problems: tuple[tuple[str, str], ...], file: str | Path = "") -> None:
         where = f"{file}: " if file else ""
@@ -281,7 +257,7 @@ class Config(BaseModel):
     @model_validator(mode="after")
     def _without_clashes(self) -> Self:
         """Refuse what would be ignored, and settings that exclude each other."""
-        defaults = {one.field: one.default for one in settings(type(self))}
+        defaults = {setting.field: setting.default for setting in settings(type(self))}
         for name in self.without:
             if getattr(self, name) != type(self).model_fields[name].get_default(call_default_factory=True):
                 raise InputError(f"{name}: `advsearch {self.command}` has no such setting; leave it out")
@@ -293,27 +269,20 @@ class Config(BaseModel):
 
     @classmethod
     def from_yaml(cls, path: str | Path, overrides: Mapping[str, object] | None = None) -> Self:
-        """Return the configuration that the YAML file at `path` describes, with `overrides` put over it.
+        """Return the configuration that a YAML file describes, with `overrides` put over it: settings which a person
+        has asked for, by name; a dotted one reaches inside: ``set.camera.azimuth``, ``controls.pose.yaw``.
 
-        What the file alone asks for and has power over more than the run is `left_out`, as if it did not stand there.
-
-        Args:
-            path: a file with one mapping from settings to values; `schema`, `command` and `base` may stand beside
-                them (see `read_yaml`).
-            overrides: setting to value, which a person has asked for; a dotted name reaches inside:
-                ``set.camera.azimuth``, ``controls.pose.yaw``.
-
-        Raises:
-            FileFormatError: the file is missing, empty or not such a mapping.
-            InputError: as for the class; the message names the file.
+        The file has one mapping from settings to values; `schema`, `command` and `base` may stand beside them (see
+        `read_yaml`). What it alone asks for and has power over more than the run is `left_out`, as if it did not stand
+        there. Raises FileFormatError, or InputError as for the class; the message names the file.
         """
         data = {name: value for name, value in written.read_yaml(path).items() if name != "command"}
         schema = data.pop("schema", written.SCHEMA)
         for name, value in (overrides or {}).items():
             written.put(data, name, value)
         try:
-            left = [one for one in cls(**data).powers if one.name not in (overrides or {})]
-            without = [name for one in left for name in (one.name, one.field)]
+            left = [power for power in cls(**data).powers if power.name not in (overrides or {})]
+            without = [name for power in left for name in (power.name, power.field)]
             made = cls(**{name: value for name, value in data.items() if name not in without})
         except SettingsError as error:
             raise SettingsError(error.problems, path) from None
@@ -328,10 +297,12 @@ class Config(BaseModel):
     @property
     def powers(self) -> tuple[LeftOut, ...]:
         """The settings that have power over more than the run."""
-        given = ((one, getattr(self, one.field)) for one in settings(type(self)))
-        return tuple(
-            LeftOut(one.name, one.field, value, does, one.default) for one, value in given if (does := one.power(value))
-        )
+        found = []
+        for setting in settings(type(self)):
+            value = getattr(self, setting.field)
+            if does := setting.power(value):
+                found.append(LeftOut(setting.name, setting.field, value, does, setting.default))
+        return tuple(found)
 
     @property
     def left_out(self) -> tuple[LeftOut, ...]:
@@ -343,15 +314,16 @@ class Config(BaseModel):
         """The settings that may have such power and decide no number, by name: a part of a run has them from this
         sitting, not from its own file."""
         return {
-            one.name: getattr(self, one.field)
-            for one in settings(type(self))
-            if one.power is not power.none and one.name in self.free and one.name not in PLACE
+            setting.name: getattr(self, setting.field)
+            for setting in settings(type(self))
+            if setting.power is not power.none and setting.name in self.free and setting.name not in PLACE
         }
 
     def check_powers(self, where: str) -> None:
         """Refuse, by an InputError, settings with power over more than the run: `where` is a file that has them."""
-        for one in self.powers:
-            raise InputError(f"{where}: {one.name}: {one.does}, which such a file can't ask for; leave it out")
+        for left_out in self.powers:
+            name, does = left_out.name, left_out.does
+            raise InputError(f"{where}: {name}: {does}, which such a file can't ask for; leave it out")
 
     @classmethod
     def shared(cls, other: Config) -> dict[str, object]:
@@ -359,7 +331,7 @@ class Config(BaseModel):
 
         Who shares the work is part of that place.
         """
-        both = next(one for one in cls.__mro__ if issubclass(one, Config) and isinstance(other, one))
+        both = next(base for base in cls.__mro__ if issubclass(base, Config) and isinstance(other, base))
         apart = (*PLACE, "workers", "cluster", *cls.without, *other.without)
         return {name: getattr(other, name) for name in both.model_fields if name not in apart}
 
@@ -412,7 +384,7 @@ class Config(BaseModel):
         for name in FILES:
             if isinstance(value := given.get(name), str):
                 given[name] = ",".join(
-                    "+".join(Path(one).name for one in split_paths(part)) for part in written.split_names(value)
+                    "+".join(Path(path).name for path in split_paths(part)) for part in written.split_names(value)
                 )
         return given
 
@@ -440,12 +412,12 @@ class Config(BaseModel):
 def _settings_error(config: type[Config], errors: Sequence[Any]) -> AdvsearchError:
     """Return pydantic's findings (`ValidationError.errors`) as one error of ours: one problem a setting."""
     declared = settings(config)
-    known = {one.name: one for one in declared} | {one.field: one for one in declared}
+    known = {each.name: each for each in declared} | {each.field: each for each in declared}
     problems: dict[str, str] = {}
     for error in errors:
         name = str(error["loc"][0])
         if name not in known:
-            return UnknownNameError("setting", name, {one.name for one in declared})
+            return UnknownNameError("setting", name, {each.name for each in declared})
         got = "nothing" if error["type"] == "missing" else written.shown(error["input"])
         if known[name].form in ("assignments", "controls") and len(error["loc"]) > 1:
             got = f"{error['loc'][1]}={got}"

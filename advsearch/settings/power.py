@@ -72,6 +72,6 @@ class LeftOut(NamedTuple):
     @property
     def ask(self) -> str:
         """How a person asks for it, and how to do without, as both are typed behind a file or a run."""
-        plain, without = (str(one).lower() if isinstance(one, bool) else one for one in (self.value, self.default))
+        plain, without = (str(v).lower() if isinstance(v, bool) else v for v in (self.value, self.default))
         asked = shlex.quote(f"{self.name}={plain}")
         return f"{asked} if you want that, or {self.name}={'null' if without is None else without} to do without"

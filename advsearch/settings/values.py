@@ -18,8 +18,7 @@ from advsearch.errors import FileFormatError, InputError
 from advsearch.files import read_text
 from advsearch.yaml_text import LARGEST, parse_yaml
 
-DEEPEST = 16
-"""Lists and mappings inside one another that a setting may have."""
+DEEPEST = 16  # lists and mappings inside one another that a setting may have
 
 LARGEST_WHOLE = 2**63 - 1
 
@@ -27,7 +26,7 @@ LARGEST_WHOLE = 2**63 - 1
 def is_shallow(value: Any, levels: int = DEEPEST) -> bool:
     """Return whether lists and mappings are nested at most so deep in `value`."""
     inner = value.values() if isinstance(value, Mapping) else value if isinstance(value, (list, tuple)) else ()
-    return levels >= 0 and all(is_shallow(one, levels - 1) for one in inner)
+    return levels >= 0 and all(is_shallow(part, levels - 1) for part in inner)
 
 
 def as_python(value: Any) -> Any:
@@ -37,7 +36,7 @@ def as_python(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {as_python(name): as_python(inner) for name, inner in value.items()}
     if isinstance(value, (list, tuple)):
-        inner = [as_python(one) for one in value]
+        inner = [as_python(part) for part in value]
         return inner if isinstance(value, list) else tuple(inner)
     return value.tolist() if hasattr(value, "tolist") and hasattr(value, "dtype") else value
 
@@ -46,7 +45,7 @@ def as_text(value: Any, *, several: bool = False) -> Any:
     """Return what names something as a text: a path, a number, or a list of such where there may be several. Raises
     ValueError where it can't be a name, or there are several where one is expected."""
     parts = value if isinstance(value, (list, tuple)) else [value]
-    if not parts or not all(isinstance(one, (str, Path, int)) and not isinstance(one, bool) for one in parts):
+    if not parts or not all(isinstance(part, (str, Path, int)) and not isinstance(part, bool) for part in parts):
         return value
     if len(parts) > 1 and not several:
         raise ValueError("several")
@@ -148,6 +147,11 @@ def split_names(text: str) -> tuple[str, ...]:
     return tuple(part.strip() for part in text.split(",") if part.strip())
 
 
+def names_together(texts: Iterable[str]) -> str:
+    """Return the parts of several such texts as one, each once."""
+    return ",".join(dict.fromkeys(name for text in texts for name in split_names(text)))
+
+
 def is_file(name: str) -> bool:
     try:
         return Path(name).is_file()
@@ -171,17 +175,13 @@ def shown(value: Any) -> str:
     return text if len(text) <= 80 else text[:77] + "..."
 
 
-SCHEMA, OLDEST = 2, 1
-"""Version of the YAML form, and the oldest that is read."""
+SCHEMA, OLDEST = 2, 1  # version of the YAML form, and the oldest that is read
 
 HEADER = "# A run of advsearch. To repeat it: advsearch run FILE\n"
 """First line of every `run.yaml` that advsearch writes; a run directory is recognised by it."""
 
-MOST_BASES = 4
-"""Most files that a `base` names, and most that are one another's base."""
-
-NAMED = ("policy", "task")
-"""The settings that are a name, or a `name` with options."""
+MOST_BASES = 4  # most files that a `base` names, and most that are one another's base
+NAMED = ("policy", "task")  # the settings that are a name, or a `name` with options
 
 
 def read_yaml(path: str | Path, above: tuple[Path, ...] = ()) -> dict[str, object]:
@@ -215,7 +215,7 @@ def _with_base(data: dict[str, object], path: Path, above: tuple[Path, ...]) -> 
     """Lay the settings over those of the files that their `base` names, relative to the file itself."""
     bases = data.pop("base", None) or []
     bases = [bases] if isinstance(bases, str) else bases
-    if not isinstance(bases, list) or not all(isinstance(one, str) for one in bases):
+    if not isinstance(bases, list) or not all(isinstance(base, str) for base in bases):
         raise FileFormatError(f"{path}: base: expected a file or a list of files, got {shown(bases)}")
     here = path.resolve()
     if len(above) >= MOST_BASES or len(bases) > MOST_BASES:

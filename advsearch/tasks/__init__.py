@@ -50,7 +50,7 @@ class OwnTask(Task):
     def truth(self, facts: Facts) -> Facts:
         return facts
 
-    def margin(self, output: Any, truth: Facts) -> Tensor:
+    def loss(self, output: Any, truth: Facts) -> Tensor:
         """Return what the function says, (N,). Raises InputError where it returns something else."""
         found, count = self.function(copied(output), truth), len(output)
         if isinstance(found, Tensor) and found.is_floating_point() and found.numel() == count:

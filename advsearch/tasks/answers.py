@@ -48,9 +48,9 @@ class FreeAnswer(Task):
 
     The truth is those words. The text alone says whether an answer is right; how nearly, the logits say. Let p be the
     sigmoid of the lead that tokens which begin such a word have over all others, at the step where it is greatest: the
-    margin is log(1 - p) of a right answer and -log(p) of a wrong one.
+    loss is log(1 - p) of a right answer and -log(p) of a wrong one.
 
-    Of a model that gives no logits (`Texts`) the margin is 1 - 2 s, where s is the share of right answers among those
+    Of a model that gives no logits (`Texts`) the loss is 1 - 2 s, where s is the share of right answers among those
     of one picture: it is right where at least half of them are.
 
     Args:
@@ -109,8 +109,8 @@ class FreeAnswer(Task):
     def truth_names(self, truth: Words) -> Words:
         return truth
 
-    def margin(self, output: Sequence[Utterance | Texts], truth: Words) -> Tensor:
-        return torch.stack([_margin(one, truth) for one in output])
+    def loss(self, output: Sequence[Utterance | Texts], truth: Words) -> Tensor:
+        return torch.stack([_loss(one, truth) for one in output])
 
     def predictions(self, output: Sequence[Utterance | Texts], count: int = 1) -> list[tuple[Prediction, ...]]:
         """Return the text of each picture, the most frequent first, in one line without signs that steer a terminal."""
@@ -122,7 +122,7 @@ class FreeAnswer(Task):
         found = list[Said]()
         for one, margin in zip(output, margins, strict=True):
             texts = _texts(one)
-            deciding = [text for text in texts if has_word(text, truth) == (margin <= 0.0)] or texts
+            deciding = [text for text in texts if has_word(text, truth) == (margin >= 0.0)] or texts
             kept: JsonValue = {"texts": [*texts]} if len(texts) > 1 else None
             found.append((_said(Counter(deciding).most_common(1)[0][0]), kept))
         return found
@@ -150,7 +150,7 @@ def has_word(text: str, words: Words) -> bool:
     return any(re.search(rf"(?<!\w){re.escape(word)}(?!\w)", text) for word in words)
 
 
-def _margin(one: Utterance | Texts, words: Words) -> Tensor:
+def _loss(one: Utterance | Texts, words: Words) -> Tensor:
     if "texts" in one:
         return 1.0 - 2.0 * torch.tensor([float(has_word(text, words)) for text in _texts(one)]).mean()
     logits, begin = one["logits"], sorted({number for word in words for number in one["begins"](word)})

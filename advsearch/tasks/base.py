@@ -35,7 +35,7 @@ Own = TypeVar("Own", bound="Task")
 
 FORMERLY = {
     "answers": "predictions", "answerable": "as_logits", "looks": "calibrates", "seeing": "after_calibration",
-    "unsaid": "ambiguities",
+    "unsaid": "ambiguities", "margin": "loss",
 }  # fmt: skip
 """What parts of a task were called before."""
 
@@ -61,7 +61,8 @@ class Judgement:
 
     Attributes:
         score: over 0 where it is a success, which is what is sought. NaN is none.
-        margin: how wrong the prediction is, whatever is sought: over 0 exactly where it is not right.
+        margin: the task's loss with its sign turned, whatever is sought: below 0 exactly where the prediction is not
+            right.
         right: whether the prediction is right. NaN is not right.
         prediction: what the model says.
         payload: what else is kept of it in the run's rows, as JSON values (boxes, masks); None where there is nothing.
@@ -83,7 +84,7 @@ class Judgement:
         """Return the judgement of an output; where its margin is NaN or infinite, that it is not a number."""
         if not math.isfinite(margin):
             return cls(math.nan, math.nan, right=False, prediction=Prediction(NOT_A_NUMBER))
-        return cls(score, margin, margin <= 0.0, prediction, payload)
+        return cls(score, margin, margin >= 0.0, prediction, payload)
 
     @property
     def success(self) -> bool:
@@ -267,7 +268,7 @@ class Task(ABC):
         for old in FORMERLY.keys() & vars(cls).keys():
             raise InputError(f"task {cls.__name__}: `{old}` is called `{FORMERLY[old]}` now; rename it")
         asked = (
-            "margin",
+            "loss",
             "score",
             "predictions",
             "payloads",
@@ -299,7 +300,7 @@ class Task(ABC):
         """
 
     @abstractmethod
-    def margin(self, output: Output, truth: Truth) -> Tensor:
+    def loss(self, output: Output, truth: Truth) -> Tensor:
         """Return how wrong each of N outputs is, (N,): over 0 exactly where it is not right; differentiable.
 
         It is maximised where no other objective is asked for, so it should rise towards a wrong prediction from afar.
@@ -388,9 +389,9 @@ class Task(ABC):
     def score(self, output: Output, truth: Truth) -> Tensor:
         """Return (N,): over 0 exactly where an output is a success; differentiable."""
         if self.target is not None:
-            return -self.margin(output, self.target)
-        margin = self.margin(output, truth)
-        return -margin if self.minimise else margin
+            return -self.loss(output, self.target)
+        loss = self.loss(output, truth)
+        return -loss if self.minimise else loss
 
     def as_logits(self, output: Output, truth: Truth) -> Output:
         """Return the output as objectives of logits take it: without what is no prediction."""
@@ -432,7 +433,7 @@ class Task(ABC):
     def judge(self, output: Output, truth: Truth) -> list[Judgement]:
         """Return what is to be said of each of N outputs."""
         with torch.no_grad():
-            scores, margins = self.score(output, truth).tolist(), self.margin(output, truth).tolist()
+            scores, margins = self.score(output, truth).tolist(), (0.0 - self.loss(output, truth)).tolist()
             each = zip(scores, margins, self.said(output, truth, margins), strict=True)
             return [Judgement.of(score, margin, *said) for score, margin, said in each]
 

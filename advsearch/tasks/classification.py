@@ -139,7 +139,7 @@ class Classification(ClassTask):
             return output
         return output.index_fill(1, torch.tensor(sorted(nothing), device=output.device), -math.inf)
 
-    def margin(self, output: Tensor, truth: Labels) -> Tensor:
+    def loss(self, output: Tensor, truth: Labels) -> Tensor:
         return wrong_lead(self.as_logits(output, truth), truth)
 
     def score(self, output: Tensor, truth: Labels) -> Tensor:
@@ -166,12 +166,12 @@ class Classification(ClassTask):
 
     def judge(self, output: Tensor, truth: Labels) -> list[Judgement]:
         logits, own = self.as_logits(output, truth), type(self)
-        margins = wrong_lead(logits, truth) if own.margin is Classification.margin else self.margin(output, truth)
+        losses = wrong_lead(logits, truth) if own.loss is Classification.loss else self.loss(output, truth)
         if own.score is not Classification.score or self.target is not None:
             scores = self.score(output, truth)
         else:
-            scores = -margins if self.minimise else margins
-        rows = zip(scores.tolist(), margins.tolist(), self._likeliest(logits, 1), strict=True)
+            scores = -losses if self.minimise else losses
+        rows = zip(scores.tolist(), (0.0 - losses).tolist(), self._likeliest(logits, 1), strict=True)
         return [Judgement.of(score, margin, first) for score, margin, (first,) in rows]
 
     def truth_names(self, truth: Sequence[int]) -> tuple[str, ...]:

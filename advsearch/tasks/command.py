@@ -39,7 +39,7 @@ class Command(Task):
     """A policy commands about the action that it commands in the clean scene: open loop, one picture, one action.
 
     The output is actions (N, A), in whatever units the policy has. The truth is the clean action c (A,), from one
-    picture of the clean scene. Let e be the envelope: the margin is max |a - c| / e over the elements, less 1. With a
+    picture of the clean scene. Let e be the envelope: the loss is max |a - c| / e over the elements, less 1. With a
     target t, a success is max |a - t| / e of at most 1.
 
     Args:
@@ -146,7 +146,7 @@ class Command(Task):
         if self.target is not None:
             if len(self.target) != len(clean):
                 raise InputError(f"target: expected an action of {len(clean)} elements, got {len(self.target)}")
-            if float(self.margin(clean[None], self.target)) <= 1.0:  # an action would be right, and what is sought
+            if float(self.loss(clean[None], self.target)) <= 1.0:  # an action would be right, and what is sought
                 raise InputError(
                     "target: expected an action more than two envelopes from the clean one, which is "
                     f"{self._said(clean.tolist())}"
@@ -185,7 +185,7 @@ class Command(Task):
         known = centre.to(output).where(~centre.isnan().to(output.device), output.detach())
         return (output - known) / output.new_tensor(self.envelope)
 
-    def margin(self, output: Tensor, truth: Tensor | None) -> Tensor:
+    def loss(self, output: Tensor, truth: Tensor | None) -> Tensor:
         return self._off(output, truth).abs().amax(dim=1) - 1.0
 
     def predictions(self, output: Tensor, count: int = 1) -> list[tuple[Prediction, ...]]:
@@ -196,13 +196,13 @@ class Command(Task):
         action and the clean one, also in words, and how many envelopes lie between them."""
         assert truth is not None
         found: list[Said] = []
-        reached = [False] * len(output) if self.target is None else self.margin(output, self.target) <= 0.0
+        reached = [False] * len(output) if self.target is None else self.loss(output, self.target) <= 0.0
         for off, action, margin, hit in zip(self._off(output, truth), output.tolist(), margins, reached, strict=True):
             furthest = int(off.abs().argmax())
             side = f"{self._name(furthest)} {'above' if off[furthest] > 0.0 else 'below'} it"
-            label = REACHED if hit else INSIDE if margin <= 0.0 else f"action outside its envelope ({side})"
+            label = REACHED if hit else INSIDE if margin >= 0.0 else f"action outside its envelope ({side})"
             text = f"{self._said(action)}, clean {self._said(truth.tolist(), named=False)}"
-            kept = {"action": action, "clean": truth.tolist(), "envelopes": margin + 1.0, "text": text}
+            kept = {"action": action, "clean": truth.tolist(), "envelopes": 1.0 - margin, "text": text}
             found.append((Prediction(label), kept if math.isfinite(margin) else None))
         return found
 

@@ -258,7 +258,7 @@ class Depth(Task):
 
     # ---- scores -----------------------------------------------------------------------------------------------------
 
-    def margin(self, output: Sequence[Map], truth: Distances) -> Tensor:
+    def loss(self, output: Sequence[Map], truth: Distances) -> Tensor:
         """Return by how much more than the tolerance the object's distance is off, (N,).
 
         That is the mean over its pixels of |log(judged / true)|, less log(1 + tolerance).
@@ -268,12 +268,12 @@ class Depth(Task):
     def score(self, output: Sequence[Map], truth: Distances) -> Tensor:
         """Return how near each of N outputs is to what is sought, (N,): over 0 where it is a success.
 
-        "nearer" and "farther" take the mean over pixels with its sign. "gone" is the lesser of the margin, and of how
+        "nearer" and "farther" take the mean over pixels with its sign. "gone" is the lesser of the loss, and of how
         far the share of the object's relief that is left lies under a half; see `_relief`.
         """
         if self.minimise or not self.seek:
-            margin = self.margin(output, truth)
-            return -margin if self.minimise else margin
+            loss = self.loss(output, truth)
+            return -loss if self.minimise else loss
         if self.seek == "gone":
             return self._each(
                 output, truth, lambda f: torch.minimum(f.abs().mean() - self._bar, 0.5 - self._relief(f, truth))
@@ -344,7 +344,7 @@ class Depth(Task):
         """See `Task.said`; the payload has the factor by which the distance is off, what is left of the relief, and
         where scale and shift were found."""
         each = zip(output, margins, strict=True)
-        return [self._said(one, truth, right=margin <= 0.0) for one, margin in each]
+        return [self._said(one, truth, right=margin >= 0.0) for one, margin in each]
 
     def _said(self, one: Map, truth: Distances, *, right: bool) -> Said:
         if not truth.seen:

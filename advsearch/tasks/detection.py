@@ -264,7 +264,7 @@ class Detection(ClassTask):
 
     # ---- scores -----------------------------------------------------------------------------------------------------
 
-    def margin(self, output: Sequence[Detections], truth: Place) -> Tensor:
+    def loss(self, output: Sequence[Detections], truth: Place) -> Tensor:
         """Return how far the best right box stays below `confidence`, in log-odds, (N,).
 
         Of `create`: how far the best box where nothing is stands above it.
@@ -275,7 +275,7 @@ class Detection(ClassTask):
     def score(self, output: Sequence[Detections], truth: Place) -> Tensor:
         """Return how near each of N outputs is to what is sought, (N,), in log-odds: over 0 where it is a success."""
         if self.minimise:
-            return -self.margin(output, truth)
+            return -self.loss(output, truth)
         reach: Callable[[Detections, Place], Tensor] = getattr(self, f"_{self.seek}")
         return self._each(output, truth, lambda one: reach(one, truth))
 

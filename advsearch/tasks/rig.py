@@ -16,20 +16,18 @@ from advsearch.models.all_at_once import AllAtOnce
 from advsearch.options import FROM_RUN
 from advsearch.tasks.base import Facts, Judgement, Mark, Prediction, Task, Truth
 from advsearch.tasks.command import Command
+from advsearch.tasks.together import Outputs, all_said
 
 RULES = ("any", "all", "mean", "vote")
-"""When the rig is right: in any picture, in all, on average of the margins, or in more than half."""
-
-Outputs = tuple[Any, ...]
-"""What the model returns for each picture of one configuration."""
+"""When the rig is right: in any picture, in all, on average of the losses, or in more than half."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Rig(Task):
     """Several cameras take pictures of one configuration, and one prediction is made of what a model says of each.
 
-    Each picture has a truth of its own, such as the box in it. The margin of the rig is the least, the largest or the
-    mean of its pictures' margins, or for `vote` the one that more than half of them are at or below.
+    Each picture has a truth of its own, such as the box in it. The loss of the rig is the least, the largest or the
+    mean of its pictures' losses, or for `vote` the one that more than half of them are at or below.
 
     Args:
         task: of each picture: a name, or a mapping with a `name` and options.
@@ -105,8 +103,8 @@ class Rig(Task):
     def target_names(self) -> tuple[str, ...]:
         return tuple(self.part.target_names)
 
-    def margin(self, output: Sequence[Outputs], truth: tuple[Truth, ...]) -> Tensor:
-        return self._ruled(self._each("margin", output, truth))
+    def loss(self, output: Sequence[Outputs], truth: tuple[Truth, ...]) -> Tensor:
+        return self._ruled(self._each("loss", output, truth))
 
     def score(self, output: Sequence[Outputs], truth: tuple[Truth, ...]) -> Tensor:
         """See `Task.score`: a target is reached, and a right prediction made, by the rule."""
@@ -126,12 +124,12 @@ class Rig(Task):
         return wrong.sort(dim=1).values[:, place]
 
     def predictions(self, output: Sequence[Outputs], count: int = 1) -> list[tuple[Prediction, ...]]:
-        return [(_joined([self.part.predictions(one)[0][0] for one in each]),) for each in output]
+        return [(all_said([self.part.predictions(one)[0][0] for one in each]),) for each in output]
 
     def judge(self, output: Sequence[Outputs], truth: tuple[Truth, ...]) -> list[Judgement]:
         found = []
         with torch.no_grad():
-            margins, scores = self.margin(output, truth).tolist(), self.score(output, truth).tolist()
+            margins, scores = (0.0 - self.loss(output, truth)).tolist(), self.score(output, truth).tolist()
         for each, margin, score in zip(output, margins, scores, strict=True):
             said = [self.part.judge(one, true)[0] for one, true in zip(each, truth, strict=True)]
             lost = any(one.not_a_number for one in said)
@@ -140,7 +138,7 @@ class Rig(Task):
                     {"prediction": one.prediction.label, "right": one.right, "payload": one.payload} for one in said
                 ]
             }
-            prediction = _joined([one.prediction for one in said])
+            prediction = all_said([one.prediction for one in said])
             found.append(Judgement.of(score, math.nan if lost else margin, prediction, payload))
         return found
 
@@ -154,7 +152,3 @@ class Rig(Task):
 
     def _wide(self, mask: Tensor | None) -> Tensor | None:
         return None if mask is None else torch.cat([mask, *[torch.zeros_like(mask)] * (self.cameras - 1)], dim=-1)
-
-
-def _joined(predictions: Sequence[Prediction]) -> Prediction:
-    return Prediction("; ".join(one.label for one in predictions))

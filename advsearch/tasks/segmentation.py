@@ -91,7 +91,7 @@ class Segmentation(ClassTask):
     def truth_names(self, truth: Region) -> tuple[str, ...]:
         return self.names(truth.labels)
 
-    def margin(self, output: Tensor, truth: Region) -> Tensor:
+    def loss(self, output: Tensor, truth: Region) -> Tensor:
         """Return, in logits (N,), the wrong classes' lead at the pixel that decides: over 0 where too few are right.
 
         Of the object's pixels in the order of that lead it is the one at which `accuracy` of them is reached.
@@ -101,14 +101,14 @@ class Segmentation(ClassTask):
     def score(self, output: Tensor, truth: Region) -> Tensor:
         """See `Task.score`; with a target, enough of the object's pixels have to be given that."""
         if self.target is None:
-            margin = self.margin(output, truth)
-            return -margin if self.minimise else margin
+            loss = self.loss(output, truth)
+            return -loss if self.minimise else loss
         return -self._deciding(output, truth, lambda logits, labels: -target_lead(logits, labels), self.target)
 
     def pixel_margin(self, output: Tensor, truth: Region) -> Tensor:
         """Return the mean over the object's pixels of what is sought: the lead of wrong classes, or of the target's.
 
-        In logits, (N,). Every pixel has a derivative, and not the deciding one alone as in `margin`.
+        In logits, (N,). Every pixel has a derivative, and not the deciding one alone as in `loss`.
         """
         pixels = self._pixels(output, truth)
         if pixels is None:
@@ -157,7 +157,7 @@ class Segmentation(ClassTask):
         where most of these are background. Its probability is the share of the object's pixels that are right.
         """
         each = zip(output, margins, strict=True)
-        return [self._said(one, truth, right=margin <= 0.0) for one, margin in each]
+        return [self._said(one, truth, right=margin >= 0.0) for one, margin in each]
 
     def _said(self, logits: Tensor, truth: Region, *, right: bool) -> Said:
         """The prediction of one picture, and what else is kept: shares of the object's pixels by class, and the

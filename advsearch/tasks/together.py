@@ -17,7 +17,7 @@ from advsearch.options import FROM_RUN, JOINED
 from advsearch.tasks.base import Facts, Judgement, Mark, Prediction, Task, Truth
 
 Outputs = tuple[Any, ...]
-"""What each of several models returns for one picture."""
+"""What each of several models returns for one picture, or one model for each picture of a rig."""
 
 
 @final
@@ -63,8 +63,8 @@ Truths = tuple[Truth, ...]
 class Together(Task):
     """Several models, each of which judges by a task and labels of its own.
 
-    A prediction is right where all models are right, and a success where it is one for every model. So the margin is
-    the largest of the models' margins, and the score the least of their scores.
+    A prediction is right where all models are right, and a success where it is one for every model. So the loss is
+    the largest of the models' losses, and the score the least of their scores.
 
     Args:
         parts: the task of each model, in the order of the outputs of `advsearch.tasks.together.together`.
@@ -145,23 +145,23 @@ class Together(Task):
     def target_names(self) -> tuple[str, ...]:
         return tuple(dict.fromkeys(name for one in self.tasks for name in one.target_names))
 
-    def margin(self, output: Sequence[Outputs], truth: Truths) -> Tensor:
-        return torch.stack([one.margin(*own) for one, *own in self._each(output, truth)]).amax(dim=0)
+    def loss(self, output: Sequence[Outputs], truth: Truths) -> Tensor:
+        return torch.stack([one.loss(*own) for one, *own in self._each(output, truth)]).amax(dim=0)
 
     def score(self, output: Sequence[Outputs], truth: Truths) -> Tensor:
         return torch.stack([one.score(*own) for one, *own in self._each(output, truth)]).amin(dim=0)
 
     def predictions(self, output: Sequence[Outputs], count: int = 1) -> list[tuple[Prediction, ...]]:
         said = [one.predictions(own) for one, own in zip(self.tasks, of_each(output), strict=True)]
-        return [(_joined([first for first, *_ in each]),) for each in zip(*said, strict=True)]
+        return [(all_said([first for first, *_ in each]),) for each in zip(*said, strict=True)]
 
     def judge(self, output: Sequence[Outputs], truth: Truths) -> list[Judgement]:
         found = []
         for each in zip(*(one.judge(*own) for one, *own in self._each(output, truth)), strict=True):
             payloads = {model.name: one.payload for model, one in zip(self.models, each, strict=True)}
             payload = payloads if any(one is not None for one in payloads.values()) else None
-            margin = math.nan if any(one.not_a_number for one in each) else max(one.margin for one in each)
-            prediction = _joined([one.prediction for one in each])
+            margin = math.nan if any(one.not_a_number for one in each) else min(one.margin for one in each)
+            prediction = all_said([one.prediction for one in each])
             found.append(Judgement.of(min(one.score for one in each), margin, prediction, payload))
         return found
 
@@ -179,5 +179,6 @@ class Together(Task):
         return list(zip(self.tasks, of_each(output), truth, strict=True))
 
 
-def _joined(predictions: Sequence[Prediction]) -> Prediction:
+def all_said(predictions: Sequence[Prediction]) -> Prediction:
+    """Return several predictions as one, in words."""
     return Prediction("; ".join(one.label for one in predictions))

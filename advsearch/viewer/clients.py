@@ -28,24 +28,16 @@ from typing import Any
 
 from advsearch.errors import InputError
 
-WORKERS = 16
-"""Requests that are answered at once; others wait."""
+WORKERS = 16  # requests that are answered at once; others wait
 
 WAITING = 128
 """Connections that may be open beside those that are served. More wait in the operating system, without a file open
 here."""
 
-PATIENCE = 10.0
-"""Seconds in which a client has to have said what it asks for."""
-
-SLOWEST = 50_000
-"""Bytes a second at which it has to take the answer at least, beyond as long as `PATIENCE`."""
-
-GRACE = 1.0
-"""Seconds that a slow client has where others wait."""
-
-TICK = 0.05
-"""Seconds between two looks at the clock."""
+PATIENCE = 10.0  # seconds in which a client has to have said what it asks for
+SLOWEST = 50_000  # bytes a second at which it has to take the answer at least, beyond as long as `PATIENCE`
+GRACE = 1.0  # seconds that a slow client has where others wait
+TICK = 0.05  # seconds between two looks at the clock
 
 
 class Refused(Exception):
@@ -56,14 +48,9 @@ class Refused(Exception):
         self.status = status
 
 
-LARGEST_SENT = 16 << 20
-"""Bytes of what is sent, at most."""
-
-NO_QR = "pip install segno"
-"""What to type where there is nothing to draw a code with."""
-
-DAYS = 7
-"""For which a certificate is good."""
+LARGEST_SENT = 16 << 20  # bytes of what is sent, at most
+NO_QR = "pip install segno"  # what to type where there is nothing to draw a code with
+DAYS = 7  # for which a certificate is good
 
 
 def https_context(hosts: Sequence[str]) -> tuple[ssl.SSLContext, str]:
@@ -151,8 +138,13 @@ class Clients:
     def serve(self) -> None:
         """Accept clients until `close`."""
         self._ended.clear()
+
+        def work() -> None:
+            while (job := self._ready.get()) is not None:
+                self.serve_one(*job)
+
         for _ in range(WORKERS):
-            threading.Thread(target=self._work, daemon=True).start()
+            threading.Thread(target=work, daemon=True).start()
         try:
             with selectors.DefaultSelector() as selector:
                 self._watch(selector)
@@ -240,16 +232,12 @@ class Clients:
                 socket.socket.shutdown(connection, socket.SHUT_WR)
             connection.close()
 
-    def _work(self) -> None:
-        while (job := self._ready.get()) is not None:
-            self.serve_one(*job)
-
 
 def qr_text(address: str) -> str | None:
     """Return an address as a QR code for a terminal; None where segno is not installed."""
-    made, text = qr_code(address), io.StringIO()
-    if made is not None:
-        made.terminal(out=text, compact=True)
+    code, text = qr_code(address), io.StringIO()
+    if code is not None:
+        code.terminal(out=text, compact=True)
     return text.getvalue() or None
 
 

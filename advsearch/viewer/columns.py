@@ -22,36 +22,24 @@ from advsearch.runs.store import NAME, Row
 if TYPE_CHECKING:
     import pandas as pd
 
-MOST_LEVELS = 65535
-"""Different names of one axis, or predictions, that are told apart; further ones are one: "others"."""
-
-UNKNOWN = 2
-"""`right` of a row whose prediction was not judged."""
+MOST_LEVELS = 65535  # different names of one axis, or predictions, that are told apart; further ones are one: "others"
+UNKNOWN = 2  # `right` of a row whose prediction was not judged
 
 NO_PROBABILITY = 65535
 
-BOX_STEPS = 8
-"""Of a pixel, in which the corners of boxes are counted."""
+BOX_STEPS = 8  # of a pixel, in which the corners of boxes are counted
 
 NO_BOX = 65535
 
-OTHERS = "boxes"
-"""Where a frame keeps the boxes of its rows, in its `attrs`."""
-
-OF_A_BOX = 6
-"""Numbers of a box among `Boxes`: its corners, the place of its name, its score."""
+OTHERS = "boxes"  # where a frame keeps the boxes of its rows, in its `attrs`
+OF_A_BOX = 6  # numbers of a box among `Boxes`: its corners, the place of its name, its score
 
 
 @dataclass
 class Boxes:
-    """All boxes of a detector's predictions, true ones too: one list, as rows have from none to many.
-
-    Attributes:
-        numbers: `OF_A_BOX` numbers a box: corners in `BOX_STEPS` of a pixel, place of the name, score in 1/10000
-            (`NO_PROBABILITY` of what is true).
-        ends: how many boxes there are up to and with each row.
-        names: of classes and things.
-    """
+    """All boxes of a detector's predictions, true ones too, as rows have from none to many: `OF_A_BOX` numbers a box,
+    corners in `BOX_STEPS` of a pixel, place of the name, score in 1/10000 (`NO_PROBABILITY` of what is true); how many
+    boxes there are up to and with each row; and names of classes and things."""
 
     numbers: array[int] = field(default_factory=lambda: array("H"))
     ends: array[int] = field(default_factory=lambda: array("L"))
@@ -116,8 +104,7 @@ def packed(rows: pd.DataFrame, *, more: bool = False, running: bool = False) -> 
     The head has the count, names, and where each column begins behind it; whether there are `more` rows behind these,
     and whether further ones are still being made. All is little-endian; columns of four bytes a number come first, so
     that each begins at a multiple of its size. Boxes are (n, 8) uint16 in `BOX_STEPS` of a pixel, `NO_BOX` where there
-    is none. `others` are all `Boxes`, up to each row's
-    `others end`.
+    is none. `others` are all `Boxes`, up to each row's `others end`.
     """
     predictions, labels = _levels(rows["label"])
     share = 10_000 * rows["probability"].clip(0.0, 1.0).to_numpy()

@@ -24,8 +24,7 @@ from advsearch.report.markup import Html, element, join_html
 from advsearch.report.wording import is_command
 from advsearch.runs.directory import CONFIG, PARTS, REPORT
 
-MOST_NOTES = 3
-"""Notes on files that are not folded."""
+MOST_NOTES = 3  # notes on files that are not folded
 
 _OF_A_FILE = re.compile(
     rf"[^:]{{1,200}}\.({'|'.join(one[1:] for one in (*MESHES, '.hdr', '.exr', '.xml'))})[: ]|The clean scene has ",
@@ -33,8 +32,7 @@ _OF_A_FILE = re.compile(
 )
 """How what is said of the reading of a file begins, and of a value that a control leaves out."""
 
-LONG = 32
-"""Letters of a cell above which its text is broken into lines."""
+LONG = 32  # letters of a cell above which its text is broken into lines
 
 SCRIPTS = (
     ("sweep.js",),
@@ -64,7 +62,7 @@ def document(
         connects: whether it asks its server for rows and pictures; else it cannot ask anybody.
         footer: a sentence at its end.
     """
-    code = _code(tuple(scripts))
+    code = _code(scripts)
     policy = _policy([_digest(code.encode())] if code else [], connects=connects)
     head = element(
         "head",
@@ -82,9 +80,9 @@ def document(
     return f"<!doctype html>\n{page}\n"
 
 
-def _code(scripts: tuple[str, ...]) -> str:
-    if scripts and scripts not in SCRIPTS:
-        raise ValueError(f"scripts: expected one of SCRIPTS, got {scripts}; name it there")
+def _code(scripts: Sequence[str]) -> str:
+    if scripts and tuple(scripts) not in SCRIPTS:
+        raise ValueError(f"scripts: expected one of SCRIPTS, got {tuple(scripts)}; name it there")
     return "\n".join(map(asset, scripts))
 
 
@@ -197,9 +195,8 @@ def subject_html(*parts: tuple[str, str]) -> Html:
 
 def facts_table(facts: Mapping[str, str]) -> Html:
     """Return names with their values; those that are empty are left out."""
-    lines = [
-        element("tr", element("th", name, scope="row"), element("td", value)) for name, value in facts.items() if value
-    ]
+    known = {name: value for name, value in facts.items() if value}.items()
+    lines = (element("tr", element("th", name, scope="row"), element("td", value)) for name, value in known)
     return element("table", element("tbody", *lines), class_="facts")
 
 
@@ -216,13 +213,17 @@ def study_table(
     for number, (first, *cells) in enumerate(rows):
         link = links[number] if number < len(links) else ""
         name = element("a", first, href=link) if link else first
-        shown = [_cell(text, (shares or {}).get((number, at))) for at, text in enumerate(cells, 1)]
+        shown = []
+        for at, text in enumerate(cells, 1):
+            css, share = "number" if len(text) <= LONG else "long", (shares or {}).get((number, at))
+            shown.append(
+                element("td", text, class_=css if share is None else f"number share share-{round(10 * share)}")
+            )
         drawn = [element("td", _bar(bars[number]), class_="hide-small")] if bars else []
         lines.append(element("tr", element("th", name, scope="row"), *shown, *drawn))
     beside = element("td", class_="hide-small") if bars else None
     head = element("tr", *(element("th", text, scope="col") for text in heads), beside)
-    made = element("table", element("thead", head), element("tbody", *lines))
-    return scrolled(made)
+    return scrolled(element("table", element("thead", head), element("tbody", *lines)))
 
 
 def _bar(bar: tuple[float, float, float] | None) -> Html | None:
@@ -236,20 +237,11 @@ def _bar(bar: tuple[float, float, float] | None) -> Html | None:
     return element("div", *spans, class_="interval", aria_hidden="true")
 
 
-def _cell(text: str, share: float | None) -> Html:
-    if share is None:
-        return element("td", text, class_="number" if len(text) <= LONG else "long")
-    return element("td", text, class_=f"number share share-{round(10 * share)}")
-
-
 def part_links(run: Path, parts: Sequence[str | None]) -> list[str]:
     """Return where the pages of a run's parts are, seen from its own; empty of those that have none."""
-    found = []
-    for part in parts:
-        name = "" if part is None else Path(part).name
-        there = name and (run / PARTS / name / REPORT).is_file()
-        found.append(f"{PARTS}/{in_address(name)}/{REPORT}" if there else "")
-    return found
+    names = ["" if part is None else Path(part).name for part in parts]
+    there = [name and (run / PARTS / name / REPORT).is_file() for name in names]
+    return [f"{PARTS}/{in_address(name)}/{REPORT}" if has else "" for name, has in zip(names, there, strict=True)]
 
 
 def again(run: Path, command_line: str, *, goes_on: bool) -> Html:

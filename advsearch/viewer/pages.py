@@ -8,7 +8,7 @@ from __future__ import annotations
 import base64
 import json
 import struct
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TypeVar
 
@@ -24,20 +24,14 @@ from advsearch.runs.results import Result
 from advsearch.runs.summary import read_result
 from advsearch.viewer import document
 
-LARGEST_FIGURE = 2_000_000
-"""Bytes of a figure or a picture that the page takes along."""
-
-LARGEST_PNG = 50_000_000
-"""Bytes of a picture that is read to be made smaller."""
+LARGEST_FIGURE = 2_000_000  # bytes of a figure or a picture that the page takes along
+LARGEST_PNG = 50_000_000  # bytes of a picture that is read to be made smaller
 
 LARGE_PICTURE = 1_000_000
 """Bytes above which a PNG is put into the page at a smaller size; the file itself stays as it is."""
 
-SMALLER_SIDE = 640
-"""Longest side in pixels of such a smaller picture."""
-
-KINDS = {".png": "image/png", ".jpg": "image/jpeg", ".jpeg": "image/jpeg"}
-"""Media types of pictures."""
+SMALLER_SIDE = 640  # longest side in pixels of such a smaller picture
+KINDS = {".png": "image/png", ".jpg": "image/jpeg", ".jpeg": "image/jpeg"}  # media types of pictures
 
 
 def kept(run: Path, name: str | Path, largest: int = LARGEST_FIGURE) -> Path | None:
@@ -53,11 +47,9 @@ def part_html(run: Path, one: ResultPart, said: str) -> Html:
     if one.draw is not None:
         words = " ".join([f"{one.title}.", *(one.text or [said])])
         chart = element("div", *(study_chart(one.draw, words, width, one.height) for width in (WIDE, NARROW)))
-    table = (
-        document.study_table(one.heads, one.rows, document.part_links(run, one.parts), one.shares, one.bars)
-        if one.heads
-        else None
-    )
+    table = None
+    if one.heads:
+        table = document.study_table(one.heads, one.rows, document.part_links(run, one.parts), one.shares, one.bars)
     inside = join_html(
         *(element("p", text) for text in one.text if text and one.draw is None),
         chart or _figure(run, one.figure, " ".join(one.text) or one.title),
@@ -74,7 +66,6 @@ def part_html(run: Path, one: ResultPart, said: str) -> Html:
 
 
 def _pictures(run: Path, group: Iterable[Picture], layout: str) -> Html | None:
-    """Pictures side by side, of those that are there."""
     figures = []
     for one in group:
         png = one.file.lower().endswith(".png")
@@ -90,25 +81,12 @@ def _pictures(run: Path, group: Iterable[Picture], layout: str) -> Html | None:
     return element("div", *figures, class_=f"pictures {layout}".strip()) if figures else None
 
 
-def figures_of(run: Path, said: str) -> Iterator[Html]:
-    """The figures among the images of a run whose question names none."""
-    for file in sorted((run / IMAGES).glob("*.png")):
-        name = file.stem.replace("-", " ").replace("_", " ").capitalize()
-        yield _figure(run, f"{IMAGES}/{file.name}", f"{name}: {said}") or Html()
-
-
 def _figure(run: Path, name: str, alt: str) -> Html | None:
     file = kept(run, name) if name else None
     if file is None:
         return None
     picture = element("img", src=document.data_url(file.read_bytes(), "image/png"), alt=alt)
     return element("figure", document.scrolled(picture, "wide"), class_="wide")
-
-
-def links_html(run: Path, parts: list[str]) -> Html:
-    linked = zip(parts, document.part_links(run, parts), strict=True)
-    lines = [element("li", element("a", name, href=link) if link else name) for name, link in linked]
-    return element("details", element("summary", f"The runs ({len(parts)})"), element("ul", *lines))
 
 
 def end_html(run: Path, result: Result, given: ShownResult) -> Html:
@@ -120,8 +98,7 @@ def end_html(run: Path, result: Result, given: ShownResult) -> Html:
 
 AnyResult = TypeVar("AnyResult", bound=Result)
 
-LARGEST = 2_700_000
-"""Bytes of an object that a page takes along."""
+LARGEST = 2_700_000  # bytes of an object that a page takes along
 
 _WORDS = "Drag it, or choose it and press the arrow keys. It is lit evenly here, not by the scene's light."
 
@@ -159,10 +136,10 @@ def _header(data: bytes) -> dict[str, dict[str, object]]:
     return head if isinstance(head, dict) and isinstance(head.get("asset"), dict) else {}
 
 
-def write_page(run: Path, result: Result) -> Path:
-    """Write `report.html` into the folder of a run and return its path. Raises FileFormatError where other results of
-    the run are damaged, StorageError where the page cannot be written."""
-    return write_text(run / REPORT, page_of(run, result), durable=False)
+def write_page(run: Path, result: Result | None = None) -> Path:
+    """Write `report.html` of a result, by default the one that is there, into the folder of a run and return its path.
+    Raises FileFormatError where results of the run are damaged, StorageError where the page cannot be written."""
+    return write_text(run / REPORT, page_of(run, result or read_result(run)), durable=False)
 
 
 def page_of(run: Path, result: Result) -> str:
@@ -185,28 +162,23 @@ def shown_page(
 ) -> str:
     """Return what is shown of a result as the page of the run in the folder `run`; data and scripts fill the parts
     that are `live`."""
+    inside = list[Html | None]()
+    if not any(part.draw or part.figure or part.pictures for part in given.sections):  # its question names none
+        for file in sorted((run / IMAGES).glob("*.png")):
+            name = file.stem.replace("-", " ").replace("_", " ").capitalize()
+            inside.append(_figure(run, f"{IMAGES}/{file.name}", f"{name}: {given.said}"))
+    inside += [
+        part_html(run, part, given.said) for part in given.sections if part.only in ("", "page") and not part.empty
+    ]
     parts = list(getattr(result, "parts", ()))
-    drawn = any(one.draw or one.figure or one.pictures for one in given.sections)
-    main = element(
-        "main",
-        *([] if drawn else figures_of(run, given.said)),
-        *(part_html(run, one, given.said) for one in given.sections if one.only in ("", "page") and not one.empty),
-        links_html(run, parts) if parts and all(isinstance(one, str) for one in parts) else None,
-        end_html(run, result, given),
-    )
+    if parts and all(isinstance(part, str) for part in parts):
+        linked = zip(parts, document.part_links(run, parts), strict=True)
+        lines = [element("li", element("a", name, href=link) if link else name) for name, link in linked]
+        inside.append(element("details", element("summary", f"The runs ({len(parts)})"), element("ul", *lines)))
+    main = element("main", *inside, end_html(run, result, given))
     subject = subject_of(result, given)
     what = join_html(result.command, "; " if subject else None, document.subject_html(*(("", one) for one in subject)))
     header = document.heading(what, given.said, remarks_of(result, given))
     footer = f"run {run.name}. This page needs no other file."
     title = f"{run.name}, {result.command}"
     return document.document(title, header, main, data=data, scripts=scripts, footer=footer)
-
-
-def renewed(run: Path) -> Path:
-    """Write the page of a run anew and return its path.
-
-    Raises:
-        FileFormatError: its results are damaged.
-        StorageError: it cannot be written.
-    """
-    return write_page(run, read_result(run))

@@ -53,19 +53,13 @@ LOOPBACK = "127.0.0.1"
 FIRST_PART, PART = 4_000, 50_000
 """Rows of a sweep that goes on that are sent at once; reading more takes longer than somebody waits for the first."""
 
-LARGEST, LARGEST_PAGE = 1 << 30, 1 << 28
-"""Most bytes of a sweep's columns, and of a page that lies in a run."""
-
-SENDING = 60.0
-"""Seconds in which a photograph has to have come."""
+LARGEST, LARGEST_PAGE = 1 << 30, 1 << 28  # most bytes of a sweep's columns, and of a page that lies in a run
+SENDING = 60.0  # seconds in which a photograph has to have come
 
 FAULT = "this page could not be made, which is a fault of advsearch"
 
-BACKLOG = 4096
-"""Connections that may wait in the operating system."""
-
-LONGEST = 4096
-"""Characters of an address."""
+BACKLOG = 4096  # connections that may wait in the operating system
+LONGEST = 4096  # characters of an address
 
 COOKIE = "advsearch"
 
@@ -114,8 +108,7 @@ class Dashboard(HTTPServer):
         self._host, self.fingerprint = host, None
         self._context: ssl.SSLContext | None = None
         if https or self.token:
-            names = (reachable(host), "localhost", LOOPBACK)
-            self._context, self.fingerprint = https_context(names)
+            self._context, self.fingerprint = https_context((reachable(host), "localhost", LOOPBACK))
         super().__init__((host, port), _Handler, bind_and_activate=False)
         self.clients = Clients(self.socket, self.finish_request, self._context)
         try:
@@ -147,12 +140,7 @@ class Dashboard(HTTPServer):
         return self._given or {path.name: path for path in found}
 
     def run(self, name: str) -> Path:
-        """Return the folder of one of them.
-
-        Raises:
-            Refused: there is none of that name.
-            FileFormatError: it has links in it.
-        """
+        """Return the folder of one of them. Raises Refused where there is none, FileFormatError where it has links."""
         path = self._given.get(name)
         if not self._given and name not in ("", ".", "..") and not set("/\0") & set(name) and is_run(HOME / name):
             path = HOME / name
@@ -200,38 +188,30 @@ class _Handler(BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.0"
     server_version, sys_version = "advsearch", ""
 
-    def do_GET(self) -> None:
-        self._answer(body=True)
-
-    def do_HEAD(self) -> None:
-        self._answer(body=False)
-
-    def do_POST(self) -> None:
-        self._answer(body=True)
-
     def log_message(self, format: str, *args: Any) -> None:
         """Say nothing."""
 
-    def _answer(self, *, body: bool) -> None:
+    def do_GET(self) -> None:
         headers: dict[str, str] = {}
         status = HTTPStatus.OK
         self.server.clients.wait_for(None)
         try:
             self._check()
-            found, headers = self._found(_POSTED if self.command == "POST" else _ROUTES)
-        except Refused as refused:
-            status, found = refused.status, _text(str(refused))
-        except AdvsearchError as error:
-            status, found = HTTPStatus.INTERNAL_SERVER_ERROR, _text(str(error))
-        except OSError:
-            status, found = HTTPStatus.NOT_FOUND, _text("it is not there any more")
+            served, headers = self._served()
         except Exception as error:  # one page must not take others along
-            status, found = HTTPStatus.INTERNAL_SERVER_ERROR, _text(f"{FAULT}: {type(error).__name__}")
+            status, text = HTTPStatus.INTERNAL_SERVER_ERROR, f"{FAULT}: {type(error).__name__}"
+            if isinstance(error, Refused):
+                status, text = error.status, str(error)
+            elif isinstance(error, AdvsearchError):
+                text = str(error)
+            elif isinstance(error, OSError):
+                status, text = HTTPStatus.NOT_FOUND, "it is not there any more"
+            served = Served("text/plain; charset=utf-8", f"{text}\n".encode("utf-8", "replace"))
         self.send_response(status)
         for name, value in {
-            "Content-Type": found.kind,
-            "Content-Length": str(len(found.data)),
-            "Content-Security-Policy": found.policy,
+            "Content-Type": served.kind,
+            "Content-Length": str(len(served.data)),
+            "Content-Security-Policy": served.policy,
             "Cache-Control": "no-store",
             "X-Content-Type-Options": "nosniff",
             "X-Frame-Options": "DENY",
@@ -241,10 +221,12 @@ class _Handler(BaseHTTPRequestHandler):
             **headers,
         }.items():
             self.send_header(name, value)
-        self.server.clients.wait_for(PATIENCE + len(found.data) / SLOWEST)
+        self.server.clients.wait_for(PATIENCE + len(served.data) / SLOWEST)
         self.end_headers()
-        if body:
-            self.wfile.write(found.data)
+        if self.command != "HEAD":
+            self.wfile.write(served.data)
+
+    do_HEAD = do_POST = do_GET
 
     # ---- who may ask -------------------------------------------------------------------------------------------------
 
@@ -260,9 +242,14 @@ class _Handler(BaseHTTPRequestHandler):
         if self.headers.get("Sec-Fetch-Site", "none") not in ("none", "same-origin"):
             if self.headers.get("Sec-Fetch-Mode") != "navigate" or self.command == "POST":
                 raise Refused(HTTPStatus.FORBIDDEN, "a page of another site asks")
-        token = self.server.token
-        if token is not None and not any(hmac.compare_digest(token, one) for one in self._tokens()):
-            raise Refused(HTTPStatus.UNAUTHORIZED, "the token is missing; open the address that was printed")
+        if (token := self.server.token) is not None:
+            given = parse_qs(urlsplit(self.path).query).get("token", [])
+            for part in self.headers.get("Cookie", "").split(";"):
+                name, _, value = part.strip().partition("=")
+                if name == f"{COOKIE}-{self.server.server_port}":
+                    given.append(value)
+            if not any(hmac.compare_digest(token, one) for one in given if one.isascii()):
+                raise Refused(HTTPStatus.UNAUTHORIZED, "the token is missing; open the address that was printed")
 
     def _is_own(self, host: str) -> bool:
         """Whether a request's Host is an address of this server: a name would need a name server to lead here."""
@@ -273,17 +260,9 @@ class _Handler(BaseHTTPRequestHandler):
             return name in ("localhost", LOOPBACK, "[::1]")
         return name in ("localhost", self.server._host) or is_address(name.removeprefix("[").removesuffix("]"))
 
-    def _tokens(self) -> list[str]:
-        given = parse_qs(urlsplit(self.path).query).get("token", [])
-        for part in self.headers.get("Cookie", "").split(";"):
-            name, _, value = part.strip().partition("=")
-            if name == f"{COOKIE}-{self.server.server_port}":
-                given.append(value)
-        return [one for one in given if one.isascii()]
-
     # ---- what is answered --------------------------------------------------------------------------------------------
 
-    def _found(self, routes: Routes) -> tuple[Served, dict[str, str]]:
+    def _served(self) -> tuple[Served, dict[str, str]]:
         if not self.path.startswith("/"):
             raise Refused(HTTPStatus.BAD_REQUEST, "this server is no proxy")
         address = urlsplit(self.path)
@@ -293,11 +272,10 @@ class _Handler(BaseHTTPRequestHandler):
             # Lax: a link on the page of a run, which has an origin of its own, leads back to the list
             cookie = f"{COOKIE}-{self.server.server_port}={self.server.token}"
             headers["Set-Cookie"] = f"{cookie}; HttpOnly; Secure; SameSite=Lax; Path=/"
-        for pattern, found in routes:
-            match = re.fullmatch(pattern, address.path)
-            if match:
-                names = (unquote(one, errors="surrogateescape") for one in match.groups())
-                return Served(*found(self, query, *names)), headers
+        for pattern, answer in _POSTED if self.command == "POST" else _ROUTES:
+            if match := re.fullmatch(pattern, address.path):
+                names = (unquote(name, errors="surrogateescape") for name in match.groups())
+                return Served(*answer(self, query, *names)), headers
         raise Refused(HTTPStatus.NOT_FOUND, "there is no such page")
 
     def _page(self, _query: Query, name: str) -> Served:
@@ -310,16 +288,15 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _part(self, _query: Query, name: str, part: str) -> Served:
         """The page of one of the attacks that a study consists of, where the study's page links to it."""
-        found = next((one for one in (self.server.run(name) / PARTS).iterdir() if one.name == part), None)
-        if found is None or not (found / REPORT).is_file():
+        run = next((path for path in (self.server.run(name) / PARTS).iterdir() if path.name == part), None)
+        if run is None or not (run / REPORT).is_file():
             raise Refused(HTTPStatus.NOT_FOUND, "there is no such attack")
-        return _kept(found, "../../../../", ("../../", name))
+        return _kept(run, "../../../../", ("../../", name))
 
     def _compare(self, query: Query) -> Served:
-        names = list(dict.fromkeys(query.get("run", [])))
-        if not names:
+        runs = [(name, self.server.run(name)) for name in dict.fromkeys(query.get("run", []))]
+        if not runs:
             raise Refused(HTTPStatus.BAD_REQUEST, "choose at least one sweep")
-        runs = [(name, self.server.run(name)) for name in names]
         other = [name for name, run in runs if listing.listed_run(run, counts=False).command != "sweep"]
         if other:
             raise Refused(HTTPStatus.BAD_REQUEST, f"only sweeps can be shown side by side; {', '.join(other)} is none")
@@ -328,17 +305,16 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _rows(self, query: Query, name: str) -> Served:
         run = self.server.run(name)
-        after = _after(query, 0)
+        after = _after(query)
         if not after and (run / COLUMNS).is_file() and listing.finished(run):
             return Served("application/octet-stream", read_bytes(run / COLUMNS, "columns of a sweep", LARGEST))
         part = PART if after else FIRST_PART
         running = files.is_held(run)  # before the rows are read: what comes later is asked for again
         columns = read_columns(run, after, part)
-        more = len(columns) == part
-        return Served("application/octet-stream", packed(columns, more=more, running=running))
+        return Served("application/octet-stream", packed(columns, more=len(columns) == part, running=running))
 
     def _progress(self, query: Query, name: str) -> Served:
-        return Served("application/json", progress_json(self.server.run(name), _after(query, START)))
+        return Served("application/json", progress_json(self.server.run(name), _after(query)))
 
     def _cover(self, _query: Query, name: str) -> Served:
         return Served("image/jpeg", cover(self.server.run(name)))
@@ -349,11 +325,9 @@ class _Handler(BaseHTTPRequestHandler):
     # ---- photographs -------------------------------------------------------------------------------------------------
 
     def _align(self, _query: Query, name: str) -> Served:
-        path = f"/runs/{in_address(name)}/align/"
-        elsewhere = self.server.address_of(path) if self.server.token else None
-        page = photos.photographs_html(
-            self.server.photographs, self.server.run(name), name, self.server.key(name), elsewhere
-        )
+        server, run, key = self.server, self.server.run(name), self.server.key(name)
+        elsewhere = server.address_of(f"/runs/{in_address(name)}/align/") if server.token else None
+        page = photos.photographs_html(server.photographs, run, name, key, elsewhere)
         return _own(page, "../../../", ("../", name))
 
     def _take(self, _query: Query, name: str, rendering: str) -> Served:
@@ -398,12 +372,11 @@ _ROUTES: Routes = (
     ("/runs/([^/]+)/align/photos/([^/]+)", _Handler._photo),
 )
 
-_POSTED: Routes = (("/runs/([^/]+)/align/renderings/([^/]+)", _Handler._take),)
-"""What is sent, not asked for."""
+_POSTED: Routes = (("/runs/([^/]+)/align/renderings/([^/]+)", _Handler._take),)  # what is sent, not asked for
 
 
-def _after(query: Mapping[str, list[str]], otherwise: int) -> int:
-    after = query.get("after", [str(otherwise)])[0]
+def _after(query: Query) -> int:
+    after = query.get("after", [str(START)])[0]
     if not re.fullmatch(r"[0-9]{1,15}", after):
         raise Refused(HTTPStatus.BAD_REQUEST, "after: expected the id of a row")
     return int(after)
@@ -415,10 +388,6 @@ def _source(name: str, run: Path, base: str) -> SweepSource:
 
 
 HTML = "text/html; charset=utf-8"
-
-
-def _text(words: str) -> Served:
-    return Served("text/plain; charset=utf-8", f"{words}\n".encode("utf-8", "replace"))
 
 
 def _own(page: str, home: str | None = None, above: tuple[str, str] | None = None) -> Served:

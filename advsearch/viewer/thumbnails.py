@@ -26,23 +26,12 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
-A_FOLDER = 1000
-"""Pictures in each folder."""
-
-SIDE = 128
-"""Longest side of a thumbnail, pixels."""
-
-QUALITY = 85
-"""Of the JPEG files, from 1 to 95."""
-
-LARGEST_COVER = 50_000_000
-"""Pixels of a picture that a list shows small."""
-
-LARGEST = 1 << 24
-"""Most bytes of the file of a thumbnail."""
-
-BYTES = 5000
-"""What a thumbnail of `SIDE` takes, about; measured on pictures of the bundled objects."""
+A_FOLDER = 1000  # pictures in each folder
+SIDE = 128  # longest side of a thumbnail, pixels
+QUALITY = 85  # of the JPEG files, from 1 to 95
+LARGEST_COVER = 50_000_000  # pixels of a picture that a list shows small
+LARGEST = 1 << 24  # most bytes of the file of a thumbnail
+BYTES = 5000  # what a thumbnail of `SIDE` takes, about; measured on pictures of the bundled objects
 
 
 def thumbnail(picture: object) -> bytes:
@@ -99,13 +88,12 @@ def keep(run: Path, number: int, data: bytes) -> None:
 
 @dataclass(frozen=True)
 class Kept:
-    """The thumbnails that a run has, as files with a suffix, each of `models` configurations in a row; only of some of
-    the pictures, if it says so."""
+    """The thumbnails that a run has, each of `models` configurations in a row; only of some of the pictures, if it says
+    so."""
 
     run: Path
     models: int
     some: bool
-    suffix: str = "jpg"
 
     @cached_property
     def numbers(self) -> tuple[int, ...]:
@@ -130,7 +118,7 @@ class Kept:
     def embedded(self, rows: pd.DataFrame, most: int) -> Iterator[tuple[str, str]]:
         """Yield number and data address of thumbnails, of the worst margins first, up to `most` bytes."""
         steps, margins = rows["step"].to_numpy(), rows["margin"].to_numpy()
-        order = np.argsort(-np.nan_to_num(margins, nan=-np.inf), kind="stable")
+        order = np.argsort(np.nan_to_num(margins, nan=np.inf), kind="stable")
         there, spent = set(self.numbers), 0
         for step in steps[order]:
             number = int(step) // self.models

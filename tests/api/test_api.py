@@ -176,7 +176,7 @@ def test_a_target_and_the_average_are_in_the_summary(scene: advsearch.Scene, lev
     average = summary.average
     assert average is not None and average.configurations == 5 and 0 <= average.correct <= 5
     assert average.accuracy == average.correct / 5 and len(average.interval) == 2
-    assert average.margin <= average.worst_margin
+    assert average.margin >= average.worst_margin
 
 
 def test_the_smallest_epsilon_is_bracketed_and_verified(scene: advsearch.Scene, level: float) -> None:
@@ -284,9 +284,9 @@ def test_rows_keep_what_is_right_apart_from_what_the_attack_wants(
     assert {row.kind for row in rows} >= {"search", "control"}
     for row in rows:
         assert row.margin is not None and row.objective is not None
-        assert row.correct == (row.label == "mug") == (row.margin <= 0.0)
-        assert row.success == (row.margin < 0.0), "an attack that minimises wants right answers"
-        assert row.kind.startswith("search") or row.objective == -row.margin
+        assert row.correct == (row.label == "mug") == (row.margin >= 0.0)
+        assert row.success == (row.margin > 0.0), "an attack that minimises wants right answers"
+        assert row.kind.startswith("search") or row.objective == row.margin
 
 
 def test_mistakes_are_explained_and_leave_nothing(scene: advsearch.Scene, level: float, tmp_path: Path) -> None:

@@ -258,7 +258,7 @@ def test_a_metric_gets_a_picture_of_its_own_and_a_label_as_losses_do(scene: advs
     swept = advsearch.sweep(scene, unsure, {"pose.yaw": [0, 90]}, metrics=metrics, trials=0, **PICTURE)
     for row in swept.rows():
         loss, seen = row.metrics["loss"], row.metrics["light"]
-        assert row.margin is not None and loss == pytest.approx(np.log1p(np.exp(row.margin)), rel=1e-4, abs=1e-6)
+        assert row.margin is not None and loss == pytest.approx(np.log1p(np.exp(-row.margin)), rel=1e-4, abs=1e-6)
         assert seen is not None and seen > 0.1
 
 

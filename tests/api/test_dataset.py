@@ -82,7 +82,7 @@ def test_a_sweep_is_what_its_model_saw(swept: Path, tmp_path: Path) -> None:
         picture = torch.from_numpy(read_png(tmp_path / "out" / "images" / image["file_name"]))
         assert picture.shape[:2] == (image["height"], image["width"]) == (32, 32)
         mug, vase = model(picture)[0].tolist()
-        assert vase - mug == pytest.approx(row.margin, abs=1e-4)
+        assert mug - vase == pytest.approx(row.margin, abs=1e-4)
         assert image["advsearch"]["right"] is row.correct
         assert image["advsearch"]["configuration"]["camera.azimuth"] == row.values["camera.azimuth"]
     for one in found["annotations"]:

@@ -135,11 +135,11 @@ def test_a_function_that_says_yes_or_no_is_no_task() -> None:
     with pytest.raises(
         InputError, match=r"task <lambda>: expected how wrong .* 2 floating-point numbers.* got torch.bool"
     ):
-        task.margin(torch.zeros(2, 1), Facts("mug"))
+        task.loss(torch.zeros(2, 1), Facts("mug"))
     with pytest.raises(InputError, match="got float"):
-        make_task(lambda output, truth: output.sum().item()).margin(torch.zeros(2, 1), Facts("mug"))
+        make_task(lambda output, truth: output.sum().item()).loss(torch.zeros(2, 1), Facts("mug"))
     whole = make_task(lambda output, truth: output.sum())
-    assert whole.judge(torch.tensor([[3.0, 1.0]]), Facts("mug", "cup"))[0].margin == 4.0
+    assert whole.judge(torch.tensor([[3.0, 1.0]]), Facts("mug", "cup"))[0].margin == -4.0
     assert whole.predictions(torch.tensor([[3.0, 1.0]]))[0][0].label == "3, 1"
     assert whole.predictions(torch.zeros(1, 4, 4))[0][0].label == "4 x 4 numbers, mean 0"
     assert whole.truth_names(Facts("mug", None, "cup")) == ("cup",)

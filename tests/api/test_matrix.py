@@ -201,4 +201,4 @@ def test_a_prediction_counts_where_it_does_for_each_model(logits: list[list[floa
     (judged,) = task.judge(output, ((0,), (0,)))
     assert (judged.score, judged.right, judged.success) == (score, right, score > 0.0)
     assert float(task.score(output, ((0,), (0,)))[0]) == score
-    assert (judged.margin <= 0.0) == right
+    assert (judged.margin >= 0.0) == right

@@ -178,7 +178,9 @@ def test_what_a_search_claims_of_random_predictions_is_never_verified(rate: floa
         def trial(query: Query, run: int = run) -> Evaluation:
             # the picture decides, so another configuration gives another answer
             value = margin(seeds.stream(run, f"trial {query.u.tolist()}", query.seed))
-            return Evaluation.of(Judgement(value, value, value <= 0.0, Prediction("wrong" if value > 0.0 else "right")))
+            return Evaluation.of(
+                Judgement(value, -value, value <= 0.0, Prediction("wrong" if value > 0.0 else "right"))
+            )
 
         result = found(noisy, domain, "random", seed=run, noise=run)
         checked = verify(partial(map, trial), domain, result.best_u, spp=1, seed=run, claim=result.ending)

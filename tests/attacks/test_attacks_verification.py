@@ -54,7 +54,7 @@ WORST = DOMAIN.start + 0.1
 
 def judged(margin: float) -> Evaluation:
     """The answer with so large a margin, which is what is sought."""
-    return Evaluation(margin, None, margin > 0.0, judgement=Judgement(margin, margin, margin <= 0.0, Prediction("")))
+    return Evaluation(margin, None, margin > 0.0, judgement=Judgement(margin, -margin, margin <= 0.0, Prediction("")))
 
 
 def noisy(clean: float, adversarial: float, noise: float) -> Evaluate:

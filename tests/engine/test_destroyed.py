@@ -54,8 +54,8 @@ class Vandal(Classification):
 
     name = "vandal"
 
-    def margin(self, output: Tensor, truth: Any) -> Tensor:
-        found = super().margin(output, truth).clone()
+    def loss(self, output: Tensor, truth: Any) -> Tensor:
+        found = super().loss(output, truth).clone()
         destroy([output, truth])
         return found
 
@@ -76,7 +76,7 @@ def test_a_loss_that_masks_logits_in_place_changes_no_verdict() -> None:
     images, kept = PICTURES.clone(), u.clone()
     values = get_objective(masks, TASK)(output, images, (0,), {"u": u}.__getitem__)
     (slope,) = torch.autograd.grad(values.sum(), output)
-    assert torch.equal(values, TASK.margin(LOGITS, (0,)))
+    assert torch.equal(values, TASK.loss(LOGITS, (0,)))
     assert torch.equal(slope, torch.tensor([[-1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]]))
     assert torch.equal(output, LOGITS) and torch.equal(images, PICTURES) and torch.equal(u, kept)
 
@@ -159,7 +159,7 @@ def test_a_task_from_a_function_and_the_facts_that_it_gets() -> None:
         "mug", describe=lambda: {"pose.yaw": 1.0}, look=lambda: Sight(mask, torch.ones(2, 2), torch.ones(2, 2))
     )
     task, output = make_task(judge), LOGITS.clone()
-    assert [one.margin for one in task.judge(output, facts)] == [-1.0, -3.5]
+    assert [one.margin for one in task.judge(output, facts)] == [1.0, 3.5]
     assert torch.equal(output, LOGITS) and mask.all() and facts.depth.eq(1).all() and facts.z_depth.eq(1).all()
     with pytest.raises(TypeError):
         facts.numbers["pose.yaw"] = 2.0  # type: ignore[index]

@@ -22,10 +22,9 @@ from advsearch.errors import InputError
 from advsearch.progress import NullProgress
 from advsearch.questions.sweep import job as swept_scene
 from advsearch.questions.sweep.carry_out import job_of
-from advsearch.questions.sweep.display import claims
-from advsearch.questions.sweep.display import over_drives as told_over
+from advsearch.questions.sweep.display import claims, rate_text
 from advsearch.questions.sweep.drives import longest, over_drives
-from advsearch.questions.sweep.job import Scenes
+from advsearch.questions.sweep.job import OpenScenes
 from advsearch.questions.sweep.loop import Sweep
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.questions.sweep.summary import DriveRates
@@ -105,7 +104,7 @@ def test_frames_of_a_drive_of_both_have_their_distances_and_workers_have_the_sam
         set_={"camera.elevation": 0.0, "camera.distance": 2.0}, resolution=16, spp=1, trials=0, batch=2,
     )  # fmt: skip
     job = job_of(config)
-    executor = Disorder(worker_call(Scenes(job).named), seed=1) if workers else None
+    executor = Disorder(worker_call(OpenScenes(job).named), seed=1) if workers else None
     with RunDirectory.create(tmp_path / "run") as run:
         Sweep(job, run, NullProgress(), executor).carry_out()
         away = {row.values["path.time"]["value"]: row.values["path.distance"]["value"] for row in run.store.rows()}
@@ -131,7 +130,7 @@ def test_the_worst_of_several_drives_is_the_one_that_is_kept(tmp_path: Path, mon
     ]
     shares = ([5, 2, 4, 4], [5] * 4)
     assert result.summary.interval == pytest.approx(share_interval(*shares)), "over drives, not over 20 frames"
-    assert result.summary.units == 4 and told_over(result.summary) == ", over drives"
+    assert result.summary.units == 4 and rate_text(result.summary).endswith(", over drives")
     times = [row for row in result.summary.axes if row.axis == "path.time"]
     assert times[0].interval == clopper_pearson(times[0].correct, 4), "at one time each drive has one frame"
     (yaw, *_) = [row for row in result.summary.axes if row.axis == "pose.yaw"]
@@ -196,7 +195,7 @@ def test_resumed_and_shared_drives_are_those_of_one_who_did_it_alone(tmp_path: P
     for resumed in (False, True):
         job = job_of(CONFIG)
         with RunDirectory.resume(path) if resumed else RunDirectory.create(path) as run:
-            executor = Disorder(worker_call(Scenes(job).named), seed=3, stop=None if resumed else 4)
+            executor = Disorder(worker_call(OpenScenes(job).named), seed=3, stop=None if resumed else 4)
             found = Sweep(job, run, NullProgress(), executor).carry_out()
     assert rows(path) == rows(tmp_path / "alone") and len(rows(path)) == 2 * 3 * 3 * 2
     assert summary(found) == summary(alone) and alone.summary.drives is not None

@@ -53,7 +53,7 @@ def test_rows_have_the_truth_of_each_thing_and_tasks_judge_what_is_asked(judge: 
     assert things["stop-sign"]["distance"] == pytest.approx(7.0, abs=0.8)
     if judge == "all":
         assert things["object"]["right"] is things["stop-sign"]["right"] is True
-        assert payload["worst"] in things and payload["mean_margin"] < 0.0
+        assert payload["worst"] in things and payload["mean_margin"] > 0.0
     assert all(row.correct for row in rows)
 
 
@@ -87,8 +87,8 @@ def test_all_things_have_to_be_right() -> None:
     wrong[0, :, 0, 3] = torch.tensor([1.0, 0.0])
     said = own.judge(torch.cat([right, wrong]), truth)
     assert [one.right for one in said] == [True, False]
-    assert [one.margin for one in said] == pytest.approx([-2.0, 1.0])
+    assert [one.margin for one in said] == pytest.approx([2.0, -1.0])
     assert own.score(torch.cat([right, wrong]), truth).tolist() == pytest.approx([-2.0, 1.0])
     assert said[1].payload["worst"] == "sign"  # type: ignore[index, call-overload]
-    assert said[1].payload["mean_margin"] == pytest.approx((-3.0 + 1.0) / 2)  # type: ignore[index, call-overload]
+    assert said[1].payload["mean_margin"] == pytest.approx((3.0 - 1.0) / 2)  # type: ignore[index, call-overload]
     assert own.truth_names(truth) == ("car", "sign") and len(own.marks(right, truth)[0]) == 3

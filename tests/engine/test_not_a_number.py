@@ -36,7 +36,7 @@ def test_a_row_has_no_name_and_comes_back_as_what_it_was() -> None:
 def test_trials_without_a_number_are_counted_and_means_are_of_the_others() -> None:
     trials = [NOTHING, WRONG, RIGHT, NOTHING]
     rate = rate_of(Trials(1, 4, 16), trials, [WRONG])
-    assert (rate.not_a_number, rate.margin, rate.labels) == (2, 1.0, {"vase": 1})
+    assert (rate.not_a_number, rate.margin, rate.labels) == (2, -1.0, {"vase": 1})
     control = control_group(trials, 16)
     assert (control.correct, control.trials, control.not_a_number) == (1, 4, 2)
     assert math.isnan(rate_of(Trials(0, 2, 16), [NOTHING, NOTHING], []).margin)

@@ -48,7 +48,7 @@ def test_predictions_are_nearer_to_ink() -> None:
     assert priced is not None and priced.steps == 30 and priced.verified.trials == 6
     ours, plainly = with_terms.summary.verified, without.summary.verified
     assert ours is not None and plainly is not None and priced.margin_with == ours.margin
-    assert priced.cost == pytest.approx(priced.margin_without - priced.margin_with) and priced.cost > 0.0
+    assert priced.cost == pytest.approx(priced.margin_with - priced.margin_without) and priced.cost > 0.0
     assert priced.margin_without == pytest.approx(plainly.margin, rel=0.1), "as of an attack without"
     assert priced.terms.variation + priced.terms.off_print > found.answer.variation + found.answer.off_print
     spent, plain_spent = with_terms.summary.renders, without.summary.renders

@@ -536,7 +536,7 @@ def test_counts_are_those_of_the_rows(tmp_path: Path) -> None:
     summary = result.summary
     rows = list(result.rows())
     assert len(rows) == summary.configurations == summary.planned == 6 * 3 * 10
-    right = [row for row in rows if row.margin is not None and row.margin <= 0.0]
+    right = [row for row in rows if row.margin is not None and row.margin >= 0.0]
     assert [row.correct for row in rows] == [row in right for row in rows]
     assert all(row.success is None for row in rows)
     assert 0 < len(right) < len(rows)
@@ -562,13 +562,13 @@ def test_counts_are_those_of_the_rows(tmp_path: Path) -> None:
     assert json.loads((tmp_path / "run" / "summary.json").read_text("utf-8")) == summary.to_dict()
 
 
-def test_the_worst_is_the_largest_margin_and_is_rendered_again(tmp_path: Path) -> None:
+def test_the_worst_is_the_smallest_margin_and_is_rendered_again(tmp_path: Path) -> None:
     result = advsearch.sweep("mug", model(), GRID, run=tmp_path / "run", trials=7, verify_spp=36)
     rows = list(result.rows())
     worst = result.summary.worst
     assert worst is not None and worst.verified is not None
     best = max(rows, key=lambda row: row.score or -math.inf)
-    assert worst.configuration == best.step and worst.claimed.margin == best.score
+    assert worst.configuration == best.step and worst.claimed.margin == -(best.score or 0.0)
     assert plain(worst.values) == best.values and worst.seed == best.seed and worst.claimed.label == "vase"
     checked = worst.verified
     assert (checked.successes, checked.trials, checked.spp) == (7, 7, 36) and checked.labels == {"vase": 7}
@@ -625,7 +625,7 @@ def test_a_grid_is_drawn_as_a_map_of_its_cells(tmp_path: Path) -> None:
         assert cells.correct[up][across] == row.correct and cells.margin[up][across] == row.margin
     drawn = (tmp_path / "run" / "images" / "sweep.svg").read_text("utf-8")
     assert (tmp_path / "run" / "images" / "sweep.png").read_bytes().startswith(b"\x89PNG")
-    for text in ("pose.yaw [degrees]", "camera.elevation [degrees]", "330", "23.33", "margin [logits]; above 0: wrong"):
+    for text in ("pose.yaw [degrees]", "camera.elevation [degrees]", "330", "23.33", "margin [logits]; below 0: wrong"):
         assert f">{text}</text>" in drawn
 
 
@@ -962,7 +962,7 @@ def test_ctrl_c_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys:
     status, out, _ = command(capsys, "--grid", "pose.yaw=0:360:40")
     assert status == 130 and "Interrupted after 16 of 40 configurations" in out and "not verified" in out
     assert "How often it is right at each value" in out
-    assert "margin (how far the wrong prediction leads the right one, in logits)" in out
+    assert "margin (how far the right prediction leads the wrong one, in logits)" in out
     assert out.rstrip().splitlines()[-1].startswith("Go on with: advsearch resume ")
 
 

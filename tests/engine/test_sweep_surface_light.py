@@ -20,7 +20,7 @@ from advsearch.engine.journal import worker_call
 from advsearch.progress import NullProgress
 from advsearch.questions.sweep import predicting
 from advsearch.questions.sweep.carry_out import job_of
-from advsearch.questions.sweep.job import Scenes, SweptScene
+from advsearch.questions.sweep.job import OpenScenes, SweptScene
 from advsearch.questions.sweep.loop import Sweep
 from advsearch.questions.sweep.predicting import Groups
 from advsearch.questions.sweep.settings import SweepConfig
@@ -106,7 +106,7 @@ class Two:
     facts = Workforce(most=2)
 
     def __init__(self, job: Any) -> None:
-        self.scenes = [Scenes(job), Scenes(job)]
+        self.scenes = [OpenScenes(job), OpenScenes(job)]
 
     def results(self, batches: Iterable[Sequence[Any]]) -> Iterator[Done]:
         pieces = list(batches)

@@ -22,7 +22,7 @@ from advsearch.errors import InputError
 from advsearch.progress import NullProgress
 from advsearch.questions.sweep import job as swept_scene
 from advsearch.questions.sweep.carry_out import job_of
-from advsearch.questions.sweep.job import Scenes
+from advsearch.questions.sweep.job import OpenScenes
 from advsearch.questions.sweep.loop import Sweep
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.runs.directory import RunDirectory
@@ -78,7 +78,7 @@ def summary(result: Any) -> dict[str, Any]:
 def shared(path: Path, resumed: bool = False, **given: Any) -> Any:
     job = job_of(CONFIG)
     with RunDirectory.resume(path) if resumed else RunDirectory.create(path) as run:
-        executor = Disorder(worker_call(Scenes(job).named), **given)
+        executor = Disorder(worker_call(OpenScenes(job).named), **given)
         return Sweep(job, run, NullProgress(), executor).carry_out()
 
 
@@ -121,7 +121,7 @@ def test_rows_of_another_machine_name_it_and_the_run_says_what_it_is(tmp_path: P
     job = job_of(CONFIG)
     facts = Workforce(machines={"ab12": {"processor": "another", "LLVM": "19.1"}})
     with RunDirectory.create(tmp_path / "run") as run:
-        executor = Two(worker_call(Scenes(job).named), facts=facts)
+        executor = Two(worker_call(OpenScenes(job).named), facts=facts)
         result = Sweep(job, run, NullProgress(), executor).carry_out()
         assert run.store.noted("machines") == {"ab12": {"processor": "another", "LLVM": "19.1"}}
     assert [row.machine for row in result.rows()] == ["ab12"] * 4 + [None] * 8

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 import advsearch
 from advsearch.models import ModelWarning
-from advsearch.questions.sweep.tracks import ConstantVelocity, Frame, overlaps, tracked
+from advsearch.questions.sweep.tracks import ConstantVelocity, DetectedFrame, overlaps, tracked
 
 Doubles = npt.NDArray[np.float64]
 NEAR: dict[str, Any] = {"path": "approach", "reach": 1.3}
@@ -27,13 +27,13 @@ def moving(frame: int, speed: float = 4.0) -> Doubles:
     return np.array([10.0, 10.0, 30.0, 40.0]) + speed * frame * np.array([1.0, 0.0, 1.0, 0.0])
 
 
-def drive(scores: Sequence[float], others: Sequence[Doubles] = ()) -> list[Frame]:
+def drive(scores: Sequence[float], others: Sequence[Doubles] = ()) -> list[DetectedFrame]:
     """The true box in each frame with a score; none where that is 0."""
     frames = []
     for number, score in enumerate(scores):
         boxes = [moving(number)] * (score > 0.0) + list(others)
         sure = [score] * (score > 0.0) + [0.9] * len(others)
-        frames.append(Frame(moving(number), np.array(boxes).reshape(-1, 4), np.array(sure)))
+        frames.append(DetectedFrame(moving(number), np.array(boxes).reshape(-1, 4), np.array(sure)))
     return frames
 
 

@@ -245,9 +245,9 @@ def load_threedb(path: Path) -> None:
     from advsearch.questions.sweep.result import read_picture
     from advsearch.runs.export import read_threedb
 
-    for one in read_threedb(path.parent):
-        if one.picture is not None:
-            read_picture(one.picture)
+    for _, picture in read_threedb(path.parent):
+        if picture is not None:
+            read_picture(picture)
 
 
 def misbehave(path: Path) -> None:

@@ -133,7 +133,7 @@ def test_what_is_sent_is_the_picture_as_rendered_and_the_question(server: Server
     task = make_task("answer").on(model)
     assert not server.came, "nothing is asked before there is a picture"
     (judged,) = task.judge(model(picture), ("mug",))
-    assert judged.right and judged.margin == -1.0 and judged.prediction.label == "A Mug."
+    assert judged.right and judged.margin == 1.0 and judged.prediction.label == "A Mug."
     ((path, headers, asked),) = server.came
     assert path == "/" and asked["prompt"] == "Is it a mug?" and "Authorization" not in headers
     levels = np.asarray(Image.open(io.BytesIO(base64.b64decode(asked["image"]))))
@@ -161,7 +161,7 @@ def test_answers_that_vary_have_a_share(server: Server) -> None:
     server.say = lambda asked: {"text": next(said)}
     model = advsearch.load_model(server.url, task={"name": "answer", "times": 5})
     (judged,) = make_task("answer").on(model).judge(model(torch.zeros((8, 8, 3))), ("mug",))
-    assert judged.margin == pytest.approx(0.2) and judged.success and judged.prediction.label == "a bowl"
+    assert judged.margin == pytest.approx(-0.2) and judged.success and judged.prediction.label == "a bowl"
     payload: Any = judged.payload  # a server may answer in any order
     assert sorted(payload["texts"]) == ["a bowl", "a bowl", "a mug", "a vase", "mug"]
     (other,) = make_task("answer").on(model).judge(model(torch.zeros((8, 8, 3))), ("mug", "vase"))

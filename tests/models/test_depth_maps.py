@@ -122,7 +122,7 @@ def test_the_gradient_of_a_network_agrees_with_differences(tmp_path: Path) -> No
     at = PICTURE.permute(2, 0, 1)[None].double().requires_grad_()
 
     def value(x: Tensor) -> Tensor:
-        return task.margin([{kind: one[0]} for kind, one in network(x).items()], truth).sum()
+        return task.loss([{kind: one[0]} for kind, one in network(x).items()], truth).sum()
 
     (slope,) = torch.autograd.grad(value(at), at)
     with torch.no_grad():

@@ -332,14 +332,14 @@ def test_the_margin_of_a_free_answer_has_the_gradient_of_differences(tmp_path: P
     model = advsearch.load_model(published(tmp_path, llava()), task="answer", prompt=QUESTION)
     image = torch.linspace(0.3, 0.7, 16 * 16 * 3).reshape(16, 16, 3).requires_grad_()
     task = FreeAnswer()
-    margin = task.margin(model(image), (word,))
+    margin = task.loss(model(image), (word,))
     assert (float(margin.detach()) <= 0.0) is right
     (gradient,) = torch.autograd.grad(margin.sum(), image)
     way = torch.randn(image.shape, generator=torch.Generator().manual_seed(1))
     with torch.no_grad():
         ends = [model(image + size * way) for size in (5e-4, -5e-4)]
     assert ends[0][0]["text"] == ends[1][0]["text"], "the margin jumps where another text is said"
-    seen = float(task.margin(ends[0], (word,)) - task.margin(ends[1], (word,))) / 1e-3
+    seen = float(task.loss(ends[0], (word,)) - task.loss(ends[1], (word,))) / 1e-3
     assert seen == pytest.approx(float((gradient * way).sum()), rel=0.02)
 
 

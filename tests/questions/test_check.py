@@ -17,6 +17,7 @@ import pytest
 
 import advsearch
 from advsearch.cli.main import main
+from advsearch.engine import planning
 from advsearch.engine.planning import cosine_samples, cosines
 from advsearch.engine.record import OutOfTime, Results
 from advsearch.errors import InputError
@@ -201,16 +202,15 @@ class Stop(NullProgress):
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Few samples: what is measured says little, but it is measured by the same means."""
     for function in (cosines, cosine_samples):
-        monkeypatch.setattr(checking, function.__name__, partial(function, counts=(2,)))
+        monkeypatch.setattr(planning, function.__name__, partial(function, counts=(2,)))
     for name, value in {"FACTORS": (1.0, 3.0), "CONVERGED": 2, "AGAIN": 2}.items():
-        monkeypatch.setattr(f"advsearch.engine.planning.{name}", value)
-    monkeypatch.setattr(checking, "CONVERGED", 2)
+        monkeypatch.setattr(planning, name, value)
     monkeypatch.setattr(INTERRUPTS, "count", 0)
     row = {"item": "tracing", "what": "tracing", "time_gain": 2.0, "seconds": 1.0, "safe": True}
     gain = GainRow.of({**row, "picture_difference": 0.0, "gradient_difference": 0.0})
     monkeypatch.setattr(checking, "measured_gains", lambda *_, **__: [gain])
     length = PathLength(depth=3, full=6, cuts=[], configurations=1, reason="few")
-    monkeypatch.setattr(checking, "bounces_of", lambda *_, **__: length)
+    monkeypatch.setattr(planning, "bounces_of", lambda *_, **__: length)
 
 
 def timeless(result: CheckResult) -> dict[str, Any]:

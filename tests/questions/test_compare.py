@@ -88,7 +88,7 @@ def stored(
                     }
                     rows.append(
                         Row("sweep", place * len(models) + model, correct=is_right, values=values, seconds=0.25,
-                            margin=-1.0 if is_right else 1 + luck, label="mug" if is_right else "bowl")
+                            margin=1.0 if is_right else -1 - luck, label="mug" if is_right else "bowl")
                     )  # fmt: skip
         run.record(*rows, Row("verification", 0, correct=False, label="bowl"))
         right_ones = sum(bool(one.correct) for one in rows)

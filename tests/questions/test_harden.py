@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +32,7 @@ from advsearch.questions.harden import training
 from advsearch.questions.harden.lessons import Lesson, RenderedLesson, TextureLesson
 from advsearch.questions.harden.result import QUICK, HardenConfig
 from advsearch.questions.harden.rounds import ROUNDS, Rounds, Score
-from advsearch.questions.harden.scenes import FURTHER, TRAINING, VALIDATION, Drawing, SceneWork
+from advsearch.questions.harden.scenes import FURTHER, TRAINING, VALIDATION, SceneWork, Wanted
 from advsearch.questions.harden.training import ClassifierCourse
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.summary import read_result
@@ -105,6 +106,11 @@ def test_a_run_trains_measures_and_goes_on(
     )
 
 
+def drawing(number: int, control: str, plain: int = 0, beside: tuple[str, ...] = ()) -> Wanted:
+    how: dict[str, Any] = {"controls": (control,), "views": 1, "plain": plain, "beside": beside}
+    return partial(SceneWork.drawn, side=TRAINING, number=number, **how)
+
+
 def course_of(config: HardenConfig, net: torch.nn.Module | None = None) -> ClassifierCourse:
     """The training of a small network in the place of the reference model."""
     work = SceneWork(config, load(), harden_scenes.splits_of(config, load()))
@@ -137,7 +143,7 @@ def test_in_half_of_the_scenes_with_a_texture_what_is_rendered_varies_too(
     for share, which in ((training.SHARED, 0), (training.MOVED, 1)):
         for part in (drawn[::2], drawn[1::2]):  # objects take turns, and each has as many
             assert abs(sum(one[which] for one in part) / 200 - share) < 0.08
-    seen = course.work([Drawing(TRAINING, 0, ("texture",), 1, 0, beside=beside) for beside in ((), ("pose",))])
+    seen = course.work([drawing(0, "texture", beside=beside) for beside in ((), ("pose",))])
     one, other = (some[0] for some in seen)
     assert isinstance(one, TextureLesson) and isinstance(other, TextureLesson)
     assert len(other.numbers) == len(one.numbers) + 6 and not torch.equal(one.plain, other.plain)
@@ -156,23 +162,21 @@ def test_a_measurement_over_viewpoints_may_be_predicted() -> None:
 @pytest.mark.slow
 def test_workers_do_what_this_process_does(attacks: list[tuple[str, int | None]]) -> None:
     config = HardenConfig(**{**SMALL, "model": "reference", "controls": "texture,pose", "epsilon": {"texture": 0.03}})
-    wanted: list[harden_scenes.Wanted] = [
-        Drawing(TRAINING, 1, ("texture",), 1, 1),
-        Drawing(TRAINING, 0, ("pose",), 1, 0),
-        harden_scenes.Looking(0, safetensors.save(copied_network(load()).state_dict())),
-    ]
+    weights = safetensors.save(copied_network(load()).state_dict())
+    looking = partial(SceneWork.looked_at, number=0, weights=weights)
+    wanted = [drawing(1, "texture", plain=1), drawing(0, "pose"), looking]
     here = SceneWork(config, load(), harden_scenes.splits_of(config, load()))(wanted)
     shared = config.model_copy(update={"workers": 1})
     with executor_for(shared, "advsearch.questions.harden.scenes:scenes_of", NullProgress()) as pool:
         assert pool is not None
         there = {wanted.index(done.items[0]): done.value[0] for done in pool.results([one] for one in wanted)}
-    assert there.pop(2) == here.pop() == (2, 2)
+    assert there.pop(2) == here.pop() == {"before": [True] * 2, "after": [True] * 2}
     for place, lessons in enumerate(here):
         assert isinstance(lessons, list) and len(lessons) == len(there[place])
         for one, other in zip(lessons, there[place], strict=True):
             assert type(one) is type(other) and torch.equal(one.plain, other.plain)
             if isinstance(one, TextureLesson) and isinstance(other, TextureLesson):
-                torch.testing.assert_close(one.picture(one.texture.u), other.picture(other.texture.u))
+                torch.testing.assert_close(one.picture(one.texture), other.picture(other.texture))
 
 
 def test_the_weights_that_are_kept_are_within_the_clean_loss(attacks: list[tuple[str, int | None]]) -> None:

@@ -16,7 +16,7 @@ from advsearch.models.reference import trainable
 from advsearch.questions.harden.detectors import Example
 from advsearch.questions.harden.result import HardenConfig
 from advsearch.questions.harden.scenes import SceneWork
-from advsearch.questions.harden.segmenters import PixelLoss, SegmenterCourse
+from advsearch.questions.harden.segmenters import SegmenterCourse, pixel_loss
 from advsearch.tasks import make_task
 from advsearch.tasks.segmentation import Region, Segmentation
 
@@ -94,10 +94,10 @@ def test_the_loss_is_transformers_or_the_callers_or_that_of_the_pixels() -> None
 
     published = Published()
     vars(published)["config"] = SimpleNamespace()
-    assert float(PixelLoss(task)(published, torch.zeros(1, 3, 4, 4), target)) == 7.0
+    assert float(pixel_loss(task, published, torch.zeros(1, 3, 4, 4), target)) == 7.0
     assert (seen[0]["labels"] == classes).all()
     expected = 0.5 * -float(torch.log_softmax(torch.tensor([2.0, 0.0, 0.0]), 0)[0])
-    given = PixelLoss(task)(ByColour(), torch.zeros(1, 3, 4, 4), target)
+    given = pixel_loss(task, ByColour(), torch.zeros(1, 3, 4, 4), target)
     assert given.item() == pytest.approx(expected)
     own = course_of(loss=lambda network, x, targets: torch.tensor(1.0))
     assert own.loss(own.student.net, torch.zeros(1), target) == 1.0

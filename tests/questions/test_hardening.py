@@ -28,7 +28,6 @@ from advsearch.models.reference import Trainable, trainable
 from advsearch.questions.attack.carry_out import problem_of
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.harden.lessons import (
-    Disguise,
     Lesson,
     RenderedLesson,
     TextureLesson,
@@ -43,8 +42,8 @@ from advsearch.questions.harden.rounds import Rounds, Score
 from advsearch.questions.harden.scenes import (
     HELD_OUT,
     TRAINING,
+    SceneSide,
     SceneWork,
-    Split,
     check_disjoint,
     check_unmeasured,
     fingerprint,
@@ -151,17 +150,17 @@ def test_an_epoch_looks_six_times_at_a_scene_with_a_texture() -> None:
 
 def test_scenes_repeat_and_splits_share_nothing(tmp_path: Path) -> None:
     bundled = Path(str(resources.files("advsearch.bundled")))
-    training = Split(TRAINING, ("ball", "book"), ("noon", "studio"), 1)
-    held = Split(HELD_OUT, ("ball", "book"), ("gallery",), 2)
+    training = SceneSide(TRAINING, ("ball", "book"), ("noon", "studio"), 1)
+    held = SceneSide(HELD_OUT, ("ball", "book"), ("gallery",), 2)
     name, scene = training.scene(1)
     assert (name, scene.description.object.label) == ("book", "book")
     assert repr(training.scene(1)[1]) == repr(scene)
     assert training.scene(1, {"camera.fov": 30.0})[1].description.number("camera.fov") == 30.0
     file = shutil.copy(bundled / "data" / "objects" / "ball" / "mesh.ply", tmp_path / "tennis-ball.ply")
-    mine = Split(TRAINING, (str(file),), ("noon",), 1).scene(0)[1]
+    mine = SceneSide(TRAINING, (str(file),), ("noon",), 1).scene(0)[1]
     assert mine.description.object.label == "tennis ball"
     check_disjoint(held, [training])
-    again = Split(TRAINING, held.objects, ("noon",), 2)
+    again = SceneSide(TRAINING, held.objects, ("noon",), 2)
     own, other = (one.scene(0)[1].description.object for one in (held, again))
     assert (
         fingerprint(next(again.assets(1)))
@@ -172,12 +171,12 @@ def test_scenes_repeat_and_splits_share_nothing(tmp_path: Path) -> None:
     check_unmeasured(other, {fingerprint(own)})  # seeds of splits differ by name
     with pytest.raises(InputError, match="held_out: ball is an object of the training too"):
         check_unmeasured(own, {fingerprint(own)})
-    files = [Split(name, (str(file),), (lit,), 1) for name, lit in ((HELD_OUT, "gallery"), (TRAINING, "noon"))]
+    files = [SceneSide(name, (str(file),), (lit,), 1) for name, lit in ((HELD_OUT, "gallery"), (TRAINING, "noon"))]
     assert len(list(files[0].assets(5))) == 1
     with pytest.raises(InputError, match="held_out: tennis-ball is an object of the training too"):
         check_disjoint(files[0], files[1:])
     with pytest.raises(InputError, match="held_out_environment: noon is an environment of the training too"):
-        check_disjoint(Split(HELD_OUT, ("ball",), ("noon",), 2), [training])
+        check_disjoint(SceneSide(HELD_OUT, ("ball",), ("noon",), 2), [training])
 
 
 def test_light_of_some_scenes_is_as_warm_as_a_lamp_or_as_cold_as_a_sky() -> None:
@@ -335,7 +334,7 @@ class Tinted(TextureLesson):
 def tinted(number: int) -> TextureLesson:
     nothing: Any = None
     domain, levels = Domain(torch.full((3,), 0.5), (Block(3),)), levels_of(coloured(number % 3, 0.3, number))
-    return Tinted((number % 3,), levels, nothing, domain, nothing, nothing, Disguise(torch.full((3,), 0.5)))
+    return Tinted((number % 3,), levels, nothing, domain, nothing, nothing, torch.full((3,), 0.5))
 
 
 def test_worst_textures_are_trained_on_as_their_search_saw_them(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -349,7 +348,7 @@ def test_worst_textures_are_trained_on_as_their_search_saw_them(monkeypatch: pyt
             number
             for image in images.detach()
             for number, one in enumerate(textured)
-            if torch.equal(image, one.picture(one.texture.u).detach() if images.requires_grad else one.worst)
+            if torch.equal(image, one.picture(one.texture).detach() if images.requires_grad else one.worst)
         ]
         if len(owners) == len(images):
             seen.append((owners, seed, images.requires_grad))

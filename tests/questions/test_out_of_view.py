@@ -23,11 +23,11 @@ pytestmark = pytest.mark.usefixtures("two_threads")
 def test_the_worst_is_a_picture_that_shows_it() -> None:
     found = Predictions(4)
     for number, (label, margin) in enumerate([("car", -3.0), ("out of view", -1.0), ("no car", 2.0)]):
-        found.add(number, Judgement.of(margin, margin, Prediction(label)))
+        found.add(number, Judgement.of(margin, -margin, Prediction(label)))
     assert found.hidden.tolist() == [False, True, False, False] and found.worst == 2
     found = Predictions(2)
     for number, (label, margin) in enumerate([("car", -3.0), ("out of view", -1.0)]):
-        found.add(number, Judgement.of(margin, margin, Prediction(label)))
+        found.add(number, Judgement.of(margin, -margin, Prediction(label)))
     assert found.worst == 0
 
 

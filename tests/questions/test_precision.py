@@ -46,7 +46,7 @@ from advsearch.questions.precision.result import (
 from advsearch.questions.precision.rule import (
     FURTHEST,
     ReferenceValue,
-    Setting,
+    SampleSetting,
     confirmed,
     exactly,
     fit_line,
@@ -88,8 +88,8 @@ def noisy(count: int, seed: int, bias: float = 0.0, power: float = -0.5) -> np.n
     return found
 
 
-def setting(count: int, estimator: str = "independent") -> Setting:
-    return Setting("picture", estimator, count, float(count), family="none")
+def setting(count: int, estimator: str = "independent") -> SampleSetting:
+    return SampleSetting("picture", estimator, count, float(count), family="none")
 
 
 def measured(
@@ -356,11 +356,11 @@ def test_the_cheapest_that_is_good_enough_is_taken_as_it_is() -> None:
 # ---- rounds and budgets ---------------------------------------------------------------------------------------------
 
 
-def timed(clock: Clock, rate: float = 1e-3, cold: float = 0.0) -> Callable[[Setting, int], tuple[int, float]]:
+def timed(clock: Clock, rate: float = 1e-3, cold: float = 0.0) -> Callable[[SampleSetting, int], tuple[int, float]]:
     """Takes `rate` seconds for each unit of cost, and `cold` more at the first call of a setting."""
-    seen: set[Setting] = set()
+    seen: set[SampleSetting] = set()
 
-    def measure(one: Setting, seed: int) -> tuple[int, float]:
+    def measure(one: SampleSetting, seed: int) -> tuple[int, float]:
         seconds = rate * one.cost + (0.0 if one in seen else cold)
         seen.add(one)
         clock.now += seconds

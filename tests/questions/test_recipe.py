@@ -571,7 +571,7 @@ def test_where_a_mixture_has_one_prediction_it_is_shown_how_far_that_leads() -> 
     shares = [(a / 20, b / 20, (20 - a - b) / 20) for a in range(21) for b in range(21 - a) if a + b > 7]
     answered = [
         Answered(
-            "a", {"object": "mug", "w": w, "m": m, "c": c}, {}, "mug", True, 0.0, -(1.0 if m > 0.5 else 5.0) - c / 9
+            "a", {"object": "mug", "w": w, "m": m, "c": c}, {}, "mug", True, 0.0, (1.0 if m > 0.5 else 5.0) + c / 9
         )
         for w, m, c in shares
     ]
@@ -585,7 +585,7 @@ def test_where_a_mixture_has_one_prediction_it_is_shown_how_far_that_leads() -> 
     assert "The difference is shown" in made.text[1]
     assert made.text[2] == "No picture was drawn in 1 of 16 parts of the diagram, which are hatched."
     assert files_of(made)["png"]
-    same = figure({"figure": "ternary", "shares": ["w", "m", "c"]}, [replace(one, margin=-3.0) for one in answered])
+    same = figure({"figure": "ternary", "shares": ["w", "m", "c"]}, [replace(one, margin=3.0) for one in answered])
     assert "No difference is shown" in same.text[1]
     unknown = figure({"figure": "ternary", "shares": ["w", "m", "c"]}, [replace(one, margin=None) for one in answered])
     assert unknown.text[0] == (

@@ -79,7 +79,7 @@ def test_no_rule_is_told_where_there_is_none(seed: int) -> None:
 def test_predictions_that_are_all_the_same_have_no_rule() -> None:
     found = planted("none")
     same = found.assign(correct=True)
-    assert find_rules(*halves(same, 0), seed=0).told == [] and find_importance(same) == ()
+    assert find_rules(*halves(same, 0), seed=0).told == [] and find_importance(same) == []
 
 
 def around(law: str, seed: int, rows: int = 2000) -> pd.DataFrame:
@@ -170,11 +170,11 @@ def test_the_rows_that_the_page_names_tell_a_rule(right: float, elsewhere: float
 
 def test_what_decides_and_what_does_only_together() -> None:
     found = find_importance(planted("either but not both", rows=4000))
-    alone = {one.factors: one for one in found if len(one.factors) == 1}
+    alone = {one.parameters[0]: one for one in found if len(one.parameters) == 1}
     assert len(alone) == 5 and all(one.interval[0] <= 0.005 and one.interval[1] < 0.02 for one in alone.values())
-    (pair,) = (one for one in found if len(one.factors) == 2)
+    (pair,) = (one for one in found if len(one.parameters) == 2)
     assert (
-        pair.factors == ("pose.yaw", "camera.distance")
+        pair.parameters == ["pose.yaw", "camera.distance"]
         and pair.interval[0] > 0.5
         and pair.share == pytest.approx(0.75, abs=0.05)
     )
@@ -197,10 +197,10 @@ def test_intervals_of_what_decides_hold(accuracy: tuple[float, ...], rows: int) 
         x, which = generator.random(rows), generator.integers(0, len(steps), rows)
         right = generator.random(rows) < steps[which]
         for one in find_importance(seen({"x": x, "which": names[which]}, right)):
-            if len(one.factors) == 1:
-                at, place = (0.0, 0) if one.factors == ("x",) else (true, 1)
+            if len(one.parameters) == 1:
+                at, place = (0.0, 0) if one.parameters == ["x"] else (true, 1)
                 covered_true[place] += one.interval[0] <= at <= one.interval[1]
-            if one.factors == ("x",):
+            if one.parameters == ["x"]:
                 chance.append((one.share, (one.parts - 1) / rows))
     assert (covered_true >= 0.93 * samples).all(), covered_true / samples
     share, added = np.mean(chance, axis=0)
@@ -209,10 +209,10 @@ def test_intervals_of_what_decides_hold(accuracy: tuple[float, ...], rows: int) 
 
 def test_the_envelope_leaves_out_what_fails_and_little_else() -> None:
     box = find_envelope(*halves(planted("red"), 0), accuracy=0.9)
-    assert box is not None and box.held and interval_of(box.inside)[0] >= 0.9
-    assert [one.row.text for one in box.conditions] == ["colour blue or green"]
+    assert box is not None and box.held and box.interval[0] >= 0.9
+    assert [one.text for one in box.conditions] == ["colour blue or green"]
     whole = find_envelope(*halves(planted("none"), 0), accuracy=0.9)
-    assert whole is not None and whole.held and whole.conditions == ()
+    assert whole is not None and whole.held and whole.conditions == []
     assert find_envelope(*halves(planted("red"), 0), accuracy=0.99) is None
 
 
@@ -242,7 +242,7 @@ def test_where_drives_differ_by_themselves_nothing_is_told(twice: bool) -> None:
     found = [of_drives(seed, *((120, 2) if twice else (40, 10)), twice=twice) for seed in range(40)]
     rules = [find_rules(*halves(one, seed), seed=seed).told for seed, one in enumerate(found[:10])]
     assert sum(map(bool, rules)) <= 1
-    decides = [one.interval[0] > 0.0 for each in found for one in find_importance(each) if len(one.factors) == 1]
+    decides = [one.interval[0] > 0.0 for each in found for one in find_importance(each) if len(one.parameters) == 1]
     assert np.mean(decides) < 0.08  # 2.5 % each
     assert all(find_envelope(*halves(one, 0), accuracy=0.95) is None for one in found[:10])
 

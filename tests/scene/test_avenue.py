@@ -12,7 +12,7 @@ from advsearch.scene.description import SceneDescription, describe
 from advsearch.scene.grounds import LUMINANCE, enclosed, paved
 from advsearch.scene.places.avenue import AVENUE, END, KERB, LAMP_HEIGHT, lamp_places
 from advsearch.scene.places.paint import FRONTS
-from advsearch.scene.places.quads import SHOWN, Frame, Quads
+from advsearch.scene.places.quads import SHOWN, Quads, Wall
 from advsearch.scene.places.road import KERBS, ROAD
 
 
@@ -72,7 +72,7 @@ def test_snow_lies_on_what_faces_up_and_on_nothing_else() -> None:
 
 
 def test_boxes_at_a_wall_face_outwards() -> None:
-    frame, quads = Frame((1.0, 2.0, 0.0), (-1.0, 0.0, 0.0)), Quads()
+    frame, quads = Wall((1.0, 2.0, 0.0), (-1.0, 0.0, 0.0)), Quads()
     quads.boxes(frame, np.array([[0.0, 2.0, 0.0, 0.5, 1.0, 1.3]]), np.array([[0.0, 1.0, 0.0, 1.0]]), SHOWN)
     mesh = quads.mesh(1.0)
     middle = mesh.vertices.mean(axis=0)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 
@@ -48,7 +47,7 @@ def test_a_lens_bends_the_outline() -> None:
 
 
 def test_an_outline_that_is_elsewhere_is_not_believed(monkeypatch: pytest.MonkeyPatch) -> None:
-    places = outlines._places
+    places = outlines.projected
     one = renderer({"pose": {}}, 60.0, SIDE)
     assert seen(one).share == pytest.approx(1.0, abs=0.01)
 
@@ -56,8 +55,12 @@ def test_an_outline_that_is_elsewhere_is_not_believed(monkeypatch: pytest.Monkey
         where, before = places(*given)
         return where + 4.0, before
 
-    monkeypatch.setattr(outlines, "_places", beside)
+    monkeypatch.setattr(outlines, "projected", beside)
     assert seen(one).share is None
-    monkeypatch.setattr(outlines, "_places", lambda *given: (places(*given)[0], np.zeros(len(given[2]), np.bool_)))
+
+    def behind(*given: Any) -> Any:
+        return places(*given)[0], torch.zeros(len(given[2]), dtype=torch.bool)
+
+    monkeypatch.setattr(outlines, "projected", behind)
     assert (seen(one).share, seen(one).truncated) == (None, None)
     assert torch.equal(torch.from_numpy(seen(one).mask), one.surfaces(one.start).seen("object"))

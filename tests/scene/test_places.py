@@ -12,7 +12,7 @@ from advsearch.scene.description import SceneDescription, describe
 from advsearch.scene.geometry import standing
 from advsearch.scene.grounds import LUMINANCE, enclosed, paved
 from advsearch.scene.places import car_park, crossing, room
-from advsearch.scene.places.avenue import KERB, Plan, lamp_places
+from advsearch.scene.places.avenue import KERB, Place, lamp_places
 from advsearch.scene.places.road import FLOOR, ROAD
 from advsearch.scene.things import footprint, overlapping
 
@@ -71,7 +71,7 @@ def test_below_the_horizon_there_is_ground_all_around(place: str) -> None:
 
 
 @pytest.mark.parametrize("plan", [crossing.CROSSING, car_park.CAR_PARK])
-def test_posts_and_trees_stand_on_pavements_or_between_bays(plan: Plan) -> None:
+def test_posts_and_trees_stand_on_pavements_or_between_bays(plan: Place) -> None:
     lamps = lamp_places(plan.posts)
     assert (np.hypot(lamps[:, 0], lamps[:, 1]) > 4.0).all()
     if plan is crossing.CROSSING:

@@ -14,7 +14,7 @@ from advsearch.scene.assets import EnvironmentAsset
 from advsearch.scene.description import SceneDescription, describe
 from advsearch.scene.library import load_environment, load_object
 from advsearch.scene.places.road import EDGES, EYE, LENGTH
-from advsearch.scene.validity import Surroundings, View, past, surroundings_of, valid, view_of
+from advsearch.scene.validity import CameraView, Surroundings, past, surroundings_of, valid, view_of
 
 SIDE = 96
 FAR_SIDE = 90.0
@@ -135,7 +135,7 @@ def test_what_has_no_ground_to_fit_has_no_bound() -> None:
         assert surroundings_of(scene) is None
     noon = describe("car", "noon", given={"ground.kind": "road"})
     assert valid(surroundings_of(noon), view_of(noon))[1] == math.inf  # type: ignore[arg-type]
-    assert valid(Surroundings(1.5, 12.0, math.inf), View(0.0, 180.0, 0.0, 1.0, -3.0)) == (12.0, 3.0)
+    assert valid(Surroundings(1.5, 12.0, math.inf), CameraView(0.0, 180.0, 0.0, 1.0, -3.0)) == (12.0, 3.0)
 
 
 @pytest.mark.parametrize(

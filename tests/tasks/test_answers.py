@@ -59,12 +59,12 @@ def test_the_text_alone_says_what_is_right() -> None:
     task = FreeAnswer()
     logits = torch.tensor([[0.0, 1.5, 0.5, 1.0, -1.0], [2.0, 0.0, 0.0, 0.0, 0.0]])  # cup: -1 at first, -2 then
     near = torch.sigmoid(torch.tensor(-1.0))
-    right, wrong = task.margin([said("cup", logits), said("bowl", logits)], ("cup",))
+    right, wrong = task.loss([said("cup", logits), said("bowl", logits)], ("cup",))
     assert float(right) == pytest.approx(float(torch.log(1 - near)))
     assert float(wrong) == pytest.approx(float(-torch.log(near)))
     leaf = logits.clone().requires_grad_()
     for text in ("cup", "bowl"):
-        (gradient,) = torch.autograd.grad(task.margin([said(text, leaf)], ("cup",)).sum(), leaf)
+        (gradient,) = torch.autograd.grad(task.loss([said(text, leaf)], ("cup",)).sum(), leaf)
         assert gradient[0, 2] < 0 < gradient[0, 1] and not gradient[1].any()
     first, second = task.judge([said("cup", logits), said(" \n", logits)], ("cup",))
     assert first.right and not first.success and second.success and not second.right

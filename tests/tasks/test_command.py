@@ -90,7 +90,7 @@ def judged(**options: Any) -> Command:
 def test_the_margin_is_the_largest_difference_in_envelopes_less_one() -> None:
     task, clean = judged(), torch.tensor([0.1, -0.2])
     output = torch.tensor([[0.1, -0.2], [0.35, -0.2], [0.1, -0.45], [-0.9, -0.15]], requires_grad=True)
-    margins = task.margin(output, clean)
+    margins = task.loss(output, clean)
     torch.testing.assert_close(margins, torch.tensor([-1.0, -0.5, 1.5, 1.0]))
     (slope,) = torch.autograd.grad(margins[2], output)
     torch.testing.assert_close(slope[2], torch.tensor([0.0, -10.0]))

@@ -59,7 +59,7 @@ def test_a_factor_of_the_tolerance_is_what_decides(kind: str, factor: float, rig
     """By whatever scale and shift the model speaks: what is beside the object says them."""
     (found,) = TASK.judge(said(moved(factor), kind), TRUTH)
     assert (found.right, found.prediction.label, found.success) == (right, answer, not right)
-    assert found.margin == pytest.approx(abs(math.log(factor)) - math.log(1.25), abs=1e-4)
+    assert found.margin == pytest.approx(math.log(1.25) - abs(math.log(factor)), abs=1e-4)
     payload: Any = found.payload
     assert payload["factor"] == pytest.approx(max(factor, 1.0 / factor), abs=1e-3)
     assert payload["judged"] == pytest.approx(factor / 1.2, abs=1e-3)
@@ -164,11 +164,9 @@ def test_what_has_to_be_said_is_said() -> None:
         "The model's numbers are read as metric depth: the distance in metres.",
     )
     (half,) = said(INVERSE, METRIC, size=0.5)
-    assert float(plain.margin([half], sized)) > 0.0 > float(TASK.margin([half], TRUTH)), (
-        "of metres, and of half a metre"
-    )
-    assert float(plain.margin(said(INVERSE, METRIC, size=1.0), sized)) < 0.0
-    assert float(Depth(size=1.0).margin([half], sized)) < 0.0, "half as far as in a scene of two metres"
+    assert float(plain.loss([half], sized)) > 0.0 > float(TASK.loss([half], TRUTH)), "of metres, and of half a metre"
+    assert float(plain.loss(said(INVERSE, METRIC, size=1.0), sized)) < 0.0
+    assert float(Depth(size=1.0).loss([half], sized)) < 0.0, "half as far as in a scene of two metres"
     (remark,) = Depth(kind=RELATIVE).after_calibration([{"": INVERSE}], TRUTH).remarks
     assert remark.startswith("The model's numbers are read as relative depth: the distance, up to a scale and a shift")
     with pytest.raises(InputError, match="label: task depth has no classes"):
@@ -304,7 +302,7 @@ def test_the_bundled_ground_says_the_scale() -> None:
     seen = render.surfaces(render.start)
     truth = Distances(seen.seen("object"), seen.z_depth)
     assert truth.anchored and int(truth.beside.sum()) > 100
-    margins = [float(TASK.margin(said(one.reciprocal()), truth)) for one in (seen.z_depth, seen.depth)]
+    margins = [float(TASK.loss(said(one.reciprocal()), truth)) for one in (seen.z_depth, seen.depth)]
     assert margins[0] == pytest.approx(-math.log(1.25), abs=1e-5) and margins[1] > margins[0] + 1e-3
 
 

@@ -41,7 +41,7 @@ def sparse(*rows: tuple[list[float], int, float]) -> list[dict[str, Tensor]]:
 def judged(task: Detection, output: list[dict[str, Tensor]], truth: Place = TRUTH) -> Judgement:
     (found,) = task.judge(output, truth)
     assert found.score == pytest.approx(float(task.score(output, truth)))
-    assert found.margin == pytest.approx(float(task.margin(output, truth)))
+    assert found.margin == pytest.approx(-float(task.loss(output, truth)))
     return found
 
 
@@ -169,7 +169,7 @@ def test_a_box_that_suppression_drops_is_no_success(seek: str) -> None:
 def test_what_is_left_has_a_derivative_and_what_is_dropped_has_none() -> None:
     scores = torch.tensor([[0.7, 0.0, 0.0], [0.9, 0.0, 0.0]], requires_grad=True)
     output = [{"boxes": torch.tensor([NEAR, HERE]), "scores": scores}]
-    TASK.margin(output, TRUTH).sum().backward()
+    TASK.loss(output, TRUTH).sum().backward()
     assert scores.grad is not None and scores.grad[0].tolist() == [0.0, 0.0, 0.0] and float(scores.grad[1, 0]) < 0.0
 
 
@@ -208,9 +208,9 @@ def test_the_object_is_found_by_a_right_box_with_a_right_name(
 
 
 def test_the_margin_is_in_log_odds_of_the_score_that_counts() -> None:
-    assert judged(TASK, FOUND).margin == pytest.approx(-math.log(4.0), abs=1e-5)
+    assert judged(TASK, FOUND).margin == pytest.approx(math.log(4.0), abs=1e-5)
     strict = replace(TASK, confidence=0.9)
-    assert judged(strict, FOUND).margin == pytest.approx(math.log(9.0) - math.log(4.0), abs=1e-5)
+    assert judged(strict, FOUND).margin == pytest.approx(math.log(4.0) - math.log(9.0), abs=1e-5)
     assert not judged(replace(TASK, iou=0.7), dense((NEAR, [0.9, 0.0, 0.0]))).right
     assert judged(replace(TASK, iou=0.55), dense((NEAR, [0.9, 0.0, 0.0]))).right
 

@@ -44,7 +44,7 @@ class Edge(Task):
         assert facts.box is not None and facts.mask[:, facts.box[0]].any() and not facts.mask[:, : facts.box[0]].any()
         return float(facts.box[0])
 
-    def margin(self, output: Tensor, truth: float) -> Tensor:
+    def loss(self, output: Tensor, truth: float) -> Tensor:
         return (output[:, 0] - truth).abs() - self.tolerance
 
     def predictions(self, output: Tensor, count: int = 1) -> list[tuple[Prediction, ...]]:
@@ -186,6 +186,7 @@ def test_a_depth_is_judged_by_the_one_of_each_configuration(tmp_path: Path) -> N
     surfaces = [renderer.surfaces(torch.tensor([u])) for u in (0.0, 1.0)]
     offs = [(2.0 / one.depth[one.seen("object")]).log() for one in surfaces]
     expected = [float((off - off.mean()).abs().mean()) - math.log(1.05) for off in offs]
+    expected = [-loss for loss in expected]
     assert [row.margin for row in rows] == pytest.approx(expected, abs=1e-4) and expected[0] != expected[1]
     distances = torch.cat([one.depth[one.seen("object")] for one in surfaces])
     assert 0.1 < float(distances.min()) < float(distances.max()) < 1.0, "metres"

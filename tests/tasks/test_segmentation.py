@@ -48,7 +48,7 @@ def test_enough_of_the_objects_pixels_have_to_be_right(
 ) -> None:
     task = replace(TASK, accuracy=accuracy)
     (found,) = task.judge(output, TRUTH)
-    assert found.right is right and (found.margin <= 0.0) is right and found.success is not right
+    assert found.right is right and (found.margin >= 0.0) is right and found.success is not right
     assert (found.prediction.index, found.prediction.probability) == (
         answer.index,
         answer.probability,
@@ -75,7 +75,7 @@ def test_the_objective_has_a_derivative_at_every_pixel_of_the_object() -> None:
     assert output.grad is not None and output.grad[0].abs().amax(dim=0).gt(0.0).equal(MASK)
     assert TASK.objective == "pixel_margin"
     assert float(get_objective("pixel_margin", replace(TASK, minimise=True))(ALL, ALL, TRUTH)) == 2.0
-    (deciding,) = torch.autograd.grad(TASK.margin(output, TRUTH).sum(), output)
+    (deciding,) = torch.autograd.grad(TASK.loss(output, TRUTH).sum(), output)
     assert int(deciding[0].abs().amax(dim=0).gt(0.0).sum()) == 1
 
 

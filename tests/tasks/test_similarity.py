@@ -249,7 +249,7 @@ def test_objectives_of_logits_have_a_true_gradient(
         value = float(found(model(picture), picture[None], (0,)))
     assert ends[0] - ends[1] == pytest.approx(2.0 * 2e-3 * float(gradient.norm()), rel=0.02)
     if objective == "margin":
-        assert value == pytest.approx(task.judge(model(picture.detach()), (0,))[0].margin)
+        assert value == pytest.approx(-task.judge(model(picture.detach()), (0,))[0].margin)
 
 
 # ---- the clean picture ----------------------------------------------------------------------------------------------
@@ -265,7 +265,7 @@ def test_a_threshold_compares_with_the_clean_picture(model: Model) -> None:
     assert not task.calibrates and task.after_calibration(model(other), (0,)) is task
     same, different = task.judge(model(torch.stack([clean, other])), (0,))
     assert same.right and same.prediction.label == ITSELF and same.payload == {"cosine": 1.0}
-    assert same.margin == pytest.approx((0.8 - 1.0) / TEMPERATURE, rel=1e-3)
+    assert same.margin == pytest.approx((1.0 - 0.8) / TEMPERATURE, rel=1e-3)
     assert not different.right and different.prediction.label == ELSE
 
 

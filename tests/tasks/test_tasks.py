@@ -47,7 +47,8 @@ def test_a_score_over_zero_is_a_success(task: Classification, scores: list[float
     assert [one.score for one in found[:4]] == scores and task.score(LOGITS, (0,))[:4].tolist() == scores
     assert [one.success for one in found] == [score > 0.0 for score in scores] + [False]
     assert [one.right for one in found] == [True, False, False, True, False]
-    assert [one.margin for one in found[:4]] == [-2.0, 2.0, 4.0, 0.0], "whatever is sought"
+    assert [one.margin for one in found[:4]] == [2.0, -2.0, -4.0, 0.0], "whatever is sought"
+    assert math.copysign(1.0, found[3].margin) == 1.0, "no -0.0"
     assert task.goal == goal
 
 
@@ -55,8 +56,8 @@ def test_a_score_over_zero_is_a_success(task: Classification, scores: list[float
 class Doubled(Classification):
     """Says a lead of its own."""
 
-    def margin(self, output: Tensor, truth: tuple[int, ...]) -> Tensor:
-        return 2.0 * super().margin(output, truth)
+    def loss(self, output: Tensor, truth: tuple[int, ...]) -> Tensor:
+        return 2.0 * super().loss(output, truth)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,10 +68,10 @@ class Shifted(Classification):
         return super().score(output, truth) + 1.0
 
 
-def test_a_task_with_a_margin_or_a_score_of_its_own_judges_by_it() -> None:
+def test_a_task_with_a_loss_or_a_score_of_its_own_judges_by_it() -> None:
     doubled, shifted = Doubled(labels=NAMED.labels), Shifted(labels=NAMED.labels)
-    assert [(one.score, one.margin) for one in doubled.judge(LOGITS[:2], (0,))] == [(-4.0, -4.0), (4.0, 4.0)]
-    assert [(one.score, one.margin) for one in shifted.judge(LOGITS[:2], (0,))] == [(-1.0, -2.0), (3.0, 2.0)]
+    assert [(one.score, one.margin) for one in doubled.judge(LOGITS[:2], (0,))] == [(-4.0, 4.0), (4.0, -4.0)]
+    assert [(one.score, one.margin) for one in shifted.judge(LOGITS[:2], (0,))] == [(-1.0, 2.0), (3.0, -2.0)]
 
 
 def test_a_prediction_is_the_largest_logit_in_words_with_its_probability() -> None:
@@ -102,7 +103,7 @@ def test_background_is_no_rival_of_a_class_and_no_prediction(place: int) -> None
     task, output = Classification(labels=tuple(labels)), torch.tensor([logits])
     right = (labels.index("mug"),)
     (found,) = task.judge(output, right)
-    assert found.right and found.margin == -0.5 and found.prediction.label == "mug"
+    assert found.right and found.margin == 0.5 and found.prediction.label == "mug"
     assert found.prediction.probability < 0.7  # type: ignore[operator]
     assert [one.label for one in task.predictions(output, 5)[0]] == ["mug", "bowl"]
     for name, kind in OBJECTIVE_KINDS.items():
@@ -136,7 +137,7 @@ def test_what_is_right_is_what_was_said_or_else_the_objects_own_label() -> None:
 
 def test_the_typical_prediction_is_the_most_frequent_one() -> None:
     def said(margin: float, index: int, probability: float) -> Judgement:
-        return Judgement(margin, margin, margin <= 0.0, Prediction(f"class {index}", index, probability))
+        return Judgement(-margin, margin, margin >= 0.0, Prediction(f"class {index}", index, probability))
 
     answer = typical((said(1.0, 7, 0.5), said(3.0, 7, 0.7), said(2.0, 3, 0.99)))
     assert answer.prediction.index == 7
@@ -158,7 +159,7 @@ class Yaw(Task):
     def truth(self, facts: Facts) -> float:
         return facts.number("pose.yaw")
 
-    def margin(self, output: Tensor, truth: float) -> Tensor:
+    def loss(self, output: Tensor, truth: float) -> Tensor:
         return (output[:, 0] - truth).abs() - self.tolerance
 
     def predictions(self, output: Tensor, count: int = 1) -> list[tuple[Prediction, ...]]:

@@ -139,10 +139,10 @@ def test_each_is_judged_by_its_own_rule() -> None:
     task = task.after_calibration(output, truth)
     assert task.calibrates and not task.ambiguities and len(task.remarks) == 1
     own = list(zip(task.tasks, output[0], truth, strict=True))
-    margins = [float(one.margin(said, true)) for one, said, true in own]
+    margins = [-float(one.loss(said, true)) for one, said, true in own]
     scores = [float(one.score(said, true)) for one, said, true in own]
     (judged,) = task.judge(output, truth)
-    assert judged.margin == max(margins) and judged.score == min(scores) and judged.right is (max(margins) <= 0.0)
+    assert judged.margin == min(margins) and judged.score == min(scores) and judged.right is (min(margins) >= 0.0)
     objective, _ = objective_for("each", task, model, None, 0)  # type: ignore[arg-type]
     values = [float(parts[0].pixel_margin(output[0][0], truth[0])), scores[1]]
     assert float(objective(output, torch.zeros(1), truth)) == pytest.approx(min(values))

@@ -102,7 +102,7 @@ def test_the_page_says_it_all(tmp_path: Path) -> None:
         "adversarial wrong in 20 of 20 83-100 % vase 91 %",
         "random search wrong in 1 of 20 0.1-25 % 40 pictures",
         "64 samples per pixel",
-        "margin [logits]",
+        "margin loss [logits]",
         "pgd, 40 steps",
         "texture within 0.1 (linf)",
         "40 of the search, 40 gradients, 21 of the verification",
@@ -198,7 +198,8 @@ def test_numbers_have_the_digits_that_mean_something(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", [*OBJECTIVE_KINDS, "one of my own"])
 def test_an_objective_has_its_unit(name: str) -> None:
     unit = OBJECTIVE_KINDS[name].unit.partition(" (")[0] if name in OBJECTIVE_KINDS else "none"
-    told = name if unit in ("none", "that of the task") else f"{name} [{unit}]"
+    shown = {"margin": "margin loss", "pixel_margin": "margin loss of the pixels"}.get(name, name)
+    told = shown if unit in ("none", "that of the task") else f"{shown} [{unit}]"
     assert objective_label(name) == told
 
 
@@ -562,7 +563,7 @@ METHOD: dict[str, Any] = {
 def test_the_page_says_how_the_search_worked(tmp_path: Path) -> None:
     text = page_of(make_run(tmp_path / "run", attack(**METHOD))).text
     for said in (
-        "The search's claim margin 4.5 in the render that won, 3.25 when rendered again",
+        "The search's claim margin loss 4.5 in the render that won, 3.25 when rendered again",
         "Sample count 64 a pixel in the verification; that more would not change it is not shown",
         "Light transport a matrix predicted 37 pictures; at the last comparison with a traced one it was off by 0.812 "
         "of 255 levels of the picture's change (root mean square) and an unknown amount of the objective; made anew 1 "

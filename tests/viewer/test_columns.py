@@ -44,7 +44,7 @@ def test_a_page_embeds_the_pictures_of_the_worst_margins(tmp_path: Path) -> None
     assert kept is not None
     wrong = [step for step, right in zip(columns["step"], columns["correct"], strict=True) if not right]
     first = [number for number, _ in kept.embedded(columns, most=1 << 20)][: len(wrong)]
-    assert first == [str(step) for step in sorted(wrong, reverse=True)]  # the margin of a wrong one grows with its step
+    assert first == [str(step) for step in sorted(wrong, reverse=True)]  # the margin of a wrong one falls with its step
     size = len(path_of(run, max(wrong)).read_bytes()) * 4 // 3
     assert [number for number, _ in kept.embedded(columns, most=size)] == first[:1]
 

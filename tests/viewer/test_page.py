@@ -15,7 +15,7 @@ from advsearch.cli.main import main
 from advsearch.errors import InputError
 from advsearch.questions.sweep.page import write_bundle
 from advsearch.viewer.document import asset
-from advsearch.viewer.pages import renewed
+from advsearch.viewer.pages import write_page
 
 
 def test_the_page_needs_nothing_else(tmp_path: Path) -> None:
@@ -32,12 +32,12 @@ def test_a_file_says_what_it_leaves_out(tmp_path: Path, monkeypatch: pytest.Monk
     run = make_sweep(tmp_path / "run", keep="all")
     assert "pictures that were kept" not in (run / "report.html").read_text()
     monkeypatch.setattr(sweep_page, "MOST_EMBEDDED", 2000)
-    page = renewed(run).read_text()
+    page = write_page(run).read_text()
     taken = page.count("data:image/jpeg")
     assert f"This file has {taken} of the 24 pictures that were kept" in page
     assert 0 < taken < 24
     monkeypatch.setattr(sweep_page, "MOST_ROWS", 23)
-    page = renewed(run).read_text()
+    page = write_page(run).read_text()
     assert "This file leaves out the 24 rows" in page
     assert f"<code>advsearch dashboard {run}</code>" in page
     assert "data:image/jpeg" not in page
@@ -87,7 +87,7 @@ def test_the_page_is_made_anew(tmp_path: Path, capsys: pytest.CaptureFixture[str
     before = (run / "report.html").read_text()
     shutil.rmtree(run / "images", ignore_errors=True)
     (run / "report.html").unlink()
-    assert renewed(run).read_text() == before
+    assert write_page(run).read_text() == before
     assert main(["view", str(run)]) == 0
     assert capsys.readouterr().out.strip() == str(run / "report.html")
 

@@ -18,15 +18,14 @@ from advsearch.errors import InputError, UnknownNameError
 from advsearch.options import check_options
 from advsearch.registry import Registry
 
-INSIDE = ("choices", "stay")
-"""Policies that only the search asks for."""
+INSIDE = ("choices", "stay")  # policies that only the search asks for
 
 
 def _own() -> dict[str, type[Policy[Any]]]:
-    modules = [import_module(f"{__name__}.{one.name}") for one in iter_modules(__path__)]
+    modules = [import_module(f"{__name__}.{module.name}") for module in iter_modules(__path__)]
     classes = [entry for module in modules for entry in vars(module).values() if isinstance(entry, type)]
-    found = {entry.name: entry for entry in classes if issubclass(entry, Policy) and "name" in vars(entry)}
-    return {name: entry for name, entry in sorted(found.items()) if name not in INSIDE}
+    named = {entry.name: entry for entry in classes if issubclass(entry, Policy) and "name" in vars(entry)}
+    return {name: entry for name, entry in sorted(named.items()) if name not in INSIDE}
 
 
 POLICIES: Registry[type[Policy[Any]]] = Registry(
@@ -62,10 +61,9 @@ def make_policy(name: str, **options: Any) -> Policy[Any]:
     if "policy" in options:
         options["policy"] = _nested(options["policy"], f"policy of {name}")
     if "policies" in options:
-        given = options["policies"]
-        if not isinstance(given, (list, tuple)):
-            given = [given]
-        options["policies"] = tuple(_nested(one, f"policies of {name}") for one in given)
+        specs = options["policies"]
+        specs = specs if isinstance(specs, (list, tuple)) else [specs]
+        options["policies"] = tuple(_nested(spec, f"policies of {name}") for spec in specs)
     return policy(**options)
 
 

@@ -19,39 +19,21 @@ from advsearch.attacks.policies.surrogate import MOST_OWN, Coordinates, Observed
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.seeds import stream
 
-MOST = 10_000
-"""More numbers are refused: every cell keeps a whole configuration."""
-
-MOST_CELLS = 1_000_000
-"""An archive has no more."""
-
-MOST_SPANNED = 4
-"""Parameters that an archive is spanned by at most; with more, nearly every configuration has a cell of its own."""
-
-ANEW = 0.1
-"""Share of the configurations, and of the discrete choices, that are drawn anew."""
-
-TOURNAMENT = 4
-"""So many kept configurations are drawn, and the one with the largest objective is changed."""
+MOST = 10_000  # more numbers are refused: every cell keeps a whole configuration
+MOST_CELLS = 1_000_000  # an archive has no more
+MOST_SPANNED = 4  # parameters that span it; with more, nearly every configuration has a cell of its own
+ANEW = 0.1  # share of the configurations, and of the discrete choices, that are drawn anew
+TOURNAMENT = 4  # so many kept configurations are drawn, and the one with the largest objective is changed
 
 SIGMA, LINE = 0.1, 0.3
 """Standard deviations of a step, in half of each number's range, and of one along the line through two configurations,
 in their distance."""
 
-WIDER = 4.0
-"""How much larger steps are in the parameters that span the archive: that is where there are cells to fill."""
-
-CANDIDATES = 300
-"""Configurations that the surrogate chooses a generation from."""
-
-ELSEWHERE = 0.5
-"""Share of these whose parameters of the archive are drawn anew."""
-
-BETTER = 0.1
-"""What a larger objective in a cell that fails already counts for, beside a failure in another."""
-
-MEMORY = 300
-"""The surrogate is made from so many of the best configurations and so many of the latest."""
+WIDER = 4.0  # how much larger steps are in the parameters that span the archive: that is where there are cells to fill
+CANDIDATES = 300  # configurations that the surrogate chooses a generation from
+ELSEWHERE = 0.5  # share of these whose parameters of the archive are drawn anew
+BETTER = 0.1  # what a larger objective in a cell that fails already counts for, beside a failure in another
+MEMORY = 300  # the surrogate is made from so many of the best configurations and so many of the latest
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,10 +136,6 @@ class MapElites(Policy[ArchiveState]):
             "camera.target.0"); empty for the first two.
         cells: how many parts each number's range has in the archive, 2 to 1,000; a discrete choice has its options.
         population: configurations a generation, at least 2.
-
-    Raises:
-        InputError: ribs is not installed, or a value is outside what is said here; at the start, no parameter has the
-            name, or the domain has more than 10,000 numbers or the archive more than a million cells.
     """
 
     over: str = ""
@@ -180,8 +158,7 @@ class MapElites(Policy[ArchiveState]):
         if domain.dim > MOST:
             raise InputError(f"policy 'archive': expected at most {MOST} numbers, got {domain.dim}; use pgd or auto")
         seed, spanned = draw_seed(generator), self._spanned(domain)
-        sizes = [block.options or self.cells for block, part in domain.parts() for _ in range(block.size)]
-        dims = [sizes[place] for place in spanned.tolist()]
+        dims = [options or self.cells for options in domain.options[spanned].tolist()]
         if math.prod(dims) > MOST_CELLS:
             raise InputError(f"cells: expected at most {MOST_CELLS} in all, got {math.prod(dims)}; set `cells` lower")
         from ribs import archives  # an extra, and it takes seconds
@@ -206,30 +183,25 @@ class MapElites(Policy[ArchiveState]):
         return tuple(Proposal(u) for u in state.points[len(state.values) :][:n]), state
 
     def update(self, state: ArchiveState, evaluated: Evaluated) -> ArchiveState:
-        values = tuple(evaluation.objective for _, evaluation in evaluated)
-        wrong = tuple(evaluation.success for _, evaluation in evaluated)
+        values = (*state.values, *(evaluation.objective for _, evaluation in evaluated))
+        wrong = (*state.wrong, *(evaluation.success for _, evaluation in evaluated))
         seen = None if state.seen is None else state.seen.extended(evaluated)
-        state = replace(state, values=(*state.values, *values), wrong=(*state.wrong, *wrong), seen=seen)
-        return state if len(state.values) < len(state.points) else self._next(state.kept())
+        state = replace(state, values=values, wrong=wrong, seen=seen)
+        return state if len(values) < len(state.points) else self._next(state.kept())
 
     def failures(self, state: ArchiveState) -> Failures:
         """Return the cells whose configuration is a success; those of a generation that is not whole yet count."""
-        archive = state.kept().archive
+        archive, over = state.kept().archive, tuple(state.spanned.tolist())
         kept = archive.data()
         wrong = np.flatnonzero(kept["wrong"])
-        at = archive.int_to_grid_index(kept["index"][wrong])
-        discrete = torch.cat([torch.full((block.size,), block.options > 0) for block in state.domain.blocks])
-        objectives = kept["objective"][wrong].tolist()
-        picked = most_different(
-            torch.from_numpy(at / archive.dims), objectives, wraps(state.domain)[state.spanned], discrete[state.spanned]
-        )
+        at, objectives = archive.int_to_grid_index(kept["index"][wrong]), kept["objective"][wrong].tolist()
+        around, discrete = wraps(state.domain)[state.spanned], state.domain.options[state.spanned] > 0
         listed = []
-        for number in picked:
-            ends = zip(archive.boundaries, at[number], strict=True)
-            ranges = [(float(edges[k]), float(edges[k + 1])) for edges, k in ends]
+        for number in most_different(torch.from_numpy(at / archive.dims), objectives, around, discrete):
+            ends = zip(over, archive.boundaries, at[number], strict=True)
+            ranges = {place: (float(edges[k]), float(edges[k + 1])) for place, edges, k in ends}
             u = torch.from_numpy(kept["solution"][wrong[number]].copy())
-            listed.append(FoundFailure(u, objectives[number], dict(zip(state.spanned.tolist(), ranges, strict=True))))
-        over = tuple(state.spanned.tolist())
+            listed.append(FoundFailure(u, objectives[number], ranges))
         return Failures(tuple(listed), over, len(wrong), len(kept["objective"]), int(archive.cells))
 
     def _next(self, state: ArchiveState) -> ArchiveState:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
@@ -28,11 +28,8 @@ from advsearch.attacks.policies.pgd import PGD, Ascent
 from advsearch.attacks.policies.surrogate import Coordinates, Observed, box_coordinates
 from advsearch.errors import InputError
 
-SCREEN, SCREEN_MIXED = 0.5, 0.25
-"""Share of the renders that the screen takes, in a box alone and beside a norm ball."""
-
-UNTIL, UNTIL_MIXED = 0.75, 0.5
-"""Share of the renders after which an ascent takes over, if there is one."""
+SCREEN, SCREEN_MIXED = 0.5, 0.25  # share of the renders that the screen takes, in a box alone and beside a norm ball
+UNTIL, UNTIL_MIXED = 0.75, 0.5  # share of the renders after which an ascent takes over, if there is one
 
 LOW = 10
 """Up to so many box coordinates are worth the whole screen. Of more it sees less and less, so if gradients cost nothing
@@ -42,8 +39,7 @@ PAYS = 4
 """Beside no norm ball, a gradient is worth its renders if it brings so many numbers for each, and so many gradients fit
 into the ascent. One by differences never is: half a number for each, and the surrogate was better on average."""
 
-REACH = 0.1
-"""Length of the ascent's whole step in a box, as a share of half the diagonal: the screen has been everywhere else."""
+REACH = 0.1  # the ascent's whole step in a box, as a share of half the diagonal: the screen has been everywhere else
 
 MOMENTUM, MOMENTUM_DRAWN = 0.75, 0.95
 """Weight of past gradients where none has noise and all point the same way, and where each sees other conditions; with
@@ -53,16 +49,12 @@ CURIOSITY = 2.0
 """How many standard deviations of the surrogate a candidate gets on top of its mean. One does as well without noise;
 with a noise as large as all differences it settles too soon on a lucky point."""
 
-NEAR, FAR, CENTRES = 256, 128, 4
-"""Candidates near the best points, candidates anywhere, and the number of best points."""
-
-
-NEVER = 1 << 30
-"""Renders of a gradient that no search can pay."""
+NEAR, FAR, CENTRES = 256, 128, 4  # candidates near the best points, candidates anywhere, and the number of best points
+NEVER = 1 << 30  # renders of a gradient that no search can pay
 
 
 @dataclass(frozen=True)
-class Plan:
+class Budget:
     """What the renders are for: the screen; the ascent, which asks for `gradient`, begins after `until`, or never at
     `steps`."""
 
@@ -72,20 +64,20 @@ class Plan:
     gradient: WhichGradient
 
 
-def make_plan(domain: Domain, box: Coordinates, steps: int) -> Plan:
+def make_plan(domain: Domain, box: Coordinates, steps: int) -> Budget:
     """Return what `steps` renders are for."""
     if box.count == 0:
-        return Plan(steps, 0, 0, True)
+        return Budget(steps, 0, 0, True)
     if box.count < domain.dim:
         screen, until = math.ceil(SCREEN_MIXED * steps), math.ceil(UNTIL_MIXED * steps)
-        return Plan(steps, screen, until, "free" if domain.gradient_cost and domain.partial_gradients else True)
+        return Budget(steps, screen, until, "free" if domain.gradient_cost and domain.partial_gradients else True)
     ways = int((box.options == 0).sum())
     screen = math.ceil(SCREEN * steps * min(1.0, LOW / max(ways, 1)))
     until = math.ceil(UNTIL * steps) if ways <= LOW else screen
     cost = domain.gradient_cost
     if ways and PAYS * cost <= ways and PAYS * (1 + cost) <= steps - until:
-        return Plan(steps, screen, until, True)
-    return Plan(steps, math.ceil(SCREEN * steps), steps, True)
+        return Budget(steps, screen, until, True)
+    return Budget(steps, math.ceil(SCREEN * steps), steps, True)
 
 
 def _pgd(domain: Domain) -> PGD:
@@ -94,8 +86,7 @@ def _pgd(domain: Domain) -> PGD:
     return PGD(momentum=MOMENTUM) if domain.exact else PGD()
 
 
-@dataclass(frozen=True, eq=False)
-class Tried:
+class Tried(NamedTuple):
     """A random move of the box coordinates during an ascent: where they stood, and the objective there."""
 
     x: Tensor
@@ -110,7 +101,7 @@ class AutoState:
 
     domain: Domain
     seen: Observed
-    plan: Plan
+    plan: Budget
     seed: int
     screen: Tensor
     spent: int = 0
@@ -166,10 +157,9 @@ class Auto(Policy[AutoState]):
             with one_thread():
                 state = self._begin_ascent(state)
         if state.ascent is not None:
-            steps, _ = _pgd(state.domain).propose(state.ascent, n)
+            steps, ascent = _pgd(state.domain).propose(state.ascent, n)
             if steps:
-                proposal, state = self._climb(state, state.ascent, steps[0])
-                return (proposal,), state
+                return self._climb(replace(state, climbing=True), ascent, steps[0])
             if state.box.count < state.domain.dim:
                 return (), state
         done = len(state.seen.values)
@@ -216,25 +206,25 @@ class Auto(Policy[AutoState]):
 
     def _begin_ascent(self, state: AutoState) -> AutoState:
         """Let PGD go on from the best of the points seen so far, with small steps in the box."""
-        x = state.box.take(state.domain.begin)
+        x, blocks = state.box.take(state.domain.begin), state.domain.blocks
         if state.seen.finite:
             surrogate, seen = state.seen.surrogate()
             state = replace(state, seen=seen)
             x = surrogate.x[int(surrogate.predict(surrogate.x)[0].argmax())]
-        blocks = (replace(one, reach=REACH * one.radius) if one.norm == "box" else one for one in state.domain.blocks)
-        domain = replace(state.domain, blocks=tuple(blocks))
+        shortened = (replace(block, reach=REACH * block.radius if block.norm == "box" else None) for block in blocks)
+        domain = replace(state.domain, blocks=tuple(shortened))
         ascent = _pgd(domain).start(domain, seeded(state.seed, 0), max(1, state.plan.steps - state.spent))
         return replace(state, ascent=replace(ascent, u=state.at(x)))
 
-    def _climb(self, state: AutoState, ascent: Ascent, proposal: Proposal) -> tuple[Proposal, AutoState]:
+    def _climb(self, state: AutoState, ascent: Ascent, proposal: Proposal) -> tuple[tuple[Proposal, ...], AutoState]:
         """Return the ascent's proposal; every second one moves in the box too, where only the balls have a gradient."""
-        state, gradient = replace(state, climbing=True), state.plan.gradient
-        if gradient is True or ascent.count % 2 == 0:
-            return replace(proposal, gradient=gradient), state
+        proposal = replace(proposal, gradient=state.plan.gradient)
+        if proposal.gradient is True or ascent.count % 2 == 0:
+            return (proposal,), state
         x = state.box.take(proposal.u)
         moved = state.box.moves(x[None], seeded(state.seed, state.plan.steps + ascent.count))[0]
         u = state.domain.project(state.box.put(proposal.u, moved))
-        return replace(proposal, u=u, gradient=gradient), replace(state, trial=Tried(x, state.last))
+        return (replace(proposal, u=u),), replace(state, trial=Tried(x, state.last))
 
 
 @dataclass(frozen=True)
@@ -251,7 +241,7 @@ class WithoutAscent(Auto):
 
 
 @dataclass(frozen=True)
-class Restarts(Raced):
+class Restarts(Raced[Race]):
     """Lets a policy search `times` times, each with an equal share of the renders; they take turns, step by step.
 
     The first begins where the policy would begin by itself, the others at samples of the domain (`Domain.sample`); the
@@ -262,9 +252,6 @@ class Restarts(Raced):
     Attributes:
         policy: what searches; in `make_policy` a name, or a mapping with a name and options.
         times: at least 1; fewer if the renders do not suffice for one evaluation each.
-
-    Raises:
-        InputError: a value is outside what is said here.
     """
 
     policy: Policy[Any] = field(default_factory=PGD)
@@ -291,22 +278,18 @@ class Restarts(Raced):
 
 
 @dataclass(frozen=True)
-class Portfolio(Raced):
+class Portfolio(Raced[Race]):
     """Lets several policies search side by side and goes on with those that reached more.
 
     With n policies there are 1 + ceil(log2 n) rounds of equally many renders, see `choices`. Within a round every
-    policy that is still in has an equal share; after it the better half goes on, by the largest objective so far. So
-    of two policies each has a quarter of the renders, and the better one the other half. Each plans for what it gets
-    if it stays in.
+    policy that is still in has an equal share; after it the better half goes on, by the largest objective so far. So of
+    two policies each has a quarter of the renders, and the better one the other half.
 
     A policy that cannot search the domain (it says so with an InputError: a grid over a texture) is left out; if none
     can, the first one's error is passed on.
 
     Attributes:
         policies: at least one; in `make_policy` a list of names, or of mappings with a name and options.
-
-    Raises:
-        InputError: there is no policy.
     """
 
     policies: tuple[Policy[Any], ...] = (Auto(), CMAES())

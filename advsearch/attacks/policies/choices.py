@@ -10,23 +10,14 @@ from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from heapq import heapify, heappop, heappush
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import torch
 from torch import Tensor
 
 from advsearch.attacks.candidates import Failures
 from advsearch.attacks.domain import Block, Distribution, Domain, centre_of_option
-from advsearch.attacks.evaluation import (
-    NO_COUNTS,
-    Counts,
-    Evaluated,
-    Policy,
-    Proposal,
-    affordable,
-    draw_seed,
-    seeded,
-)
+from advsearch.attacks.evaluation import NO_COUNTS, Counts, Evaluated, Policy, Proposal, affordable, draw_seed, seeded
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +31,9 @@ class Runner:
     left: int = 0
     best: float = -math.inf
     over: bool = False
+
+
+Racing = TypeVar("Racing", bound="Race")
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,60 +54,14 @@ class Race:
         """The number of the search that has met the largest objective so far, the first of equals."""
         return max(range(len(self.runners)), key=lambda k: self.runners[k].best)
 
-    def propose(self, n: int) -> tuple[tuple[Proposal, ...], Race]:
-        """Return the next proposals of this round, up to n; of the next round where this one is done."""
-        race = self
-        while True:
-            batch, race = race._asking(n)
-            if batch or all(runner.over for runner in race.runners):
-                return batch, race
-            race = race._next_round()
-
-    def update(self, evaluated: Evaluated) -> Race:
-        """Tell each search what came of its proposals, or of the first of them; every u and its evaluation are as its
-        own domain has them."""
-        by_runner = defaultdict[int, list[Any]](list)
-        for number, (u, evaluation) in zip(self.asked, evaluated, strict=False):
-            by_runner[number].append((u, evaluation))
-        runners = list(self.runners)
-        for number, own in by_runner.items():
-            runner, reached = runners[number], max(evaluation.objective for _, evaluation in own)
-            state = runner.policy.update(runner.state, own)
-            runners[number] = replace(runner, state=state, best=max(runner.best, reached))
-        spent = self.spent + sum(evaluation.cost for _, evaluation in evaluated)
-        return replace(self, runners=tuple(runners), spent=spent, asked=())
-
-    def distribution(self) -> Distribution | None:
-        """Return the leader's distribution, if it has one."""
-        runner = self.runners[self.leader]
-        return runner.policy.distribution(runner.state)
-
-    def failures(self) -> Failures | None:
-        """Return the different failures of the search that has met the most; None where none looks for such."""
-        found = (runner.policy.failures(runner.state) for runner in self.runners)
-        return max((one for one in found if one is not None), key=lambda one: one.found, default=None)
-
-    def counts(self) -> Counts:
-        """Return the sum over all searches."""
-        return sum((runner.policy.counts(runner.state) for runner in self.runners), NO_COUNTS)
-
-    def begun(self, field: Iterable[int], number: int) -> Race:
+    def begun(self: Racing, field: Iterable[int], number: int) -> Racing:
         """Return the race at the beginning of a round, with equal shares for those that are in it."""
         field = tuple(field)
         share = max(1, (self.steps - self.spent) // (self.rounds - number) // len(field))
         runners = [replace(runner, left=share if k in field else 0) for k, runner in enumerate(self.runners)]
         return replace(self, runners=tuple(runners), field=field, round=number)
 
-    def _next_round(self) -> Race:
-        runners = self.runners
-        ranked = sorted(self.field, key=lambda k: runners[k].best, reverse=True)
-        able = [k for k in ranked[: -(-len(ranked) // 2)] if not runners[k].over]
-        if self.round + 1 >= self.rounds or not able:  # nobody left who can go on: the renders are for whoever can
-            left = (k for k, runner in enumerate(runners) if not runner.over)
-            able = sorted(left, key=lambda k: -runners[k].best)[:1]
-        return self.begun(able, min(self.round + 1, self.rounds - 1))
-
-    def _asking(self, n: int) -> tuple[tuple[Proposal, ...], Race]:
+    def asking(self: Racing, n: int) -> tuple[tuple[Proposal, ...], Racing]:
         """Return up to n proposals of this round that do not wait for each other; none where it is done."""
         runners, field = list(self.runners), self.field
         queue = _queue(runners, field)
@@ -191,23 +139,48 @@ def line_up(
     return Race(runners, steps, rounds).begun(range(len(runners)), 0)
 
 
-class Raced(Policy[Race]):
+class Raced(Policy[Racing]):
     """A policy that is a race; its `start` lines it up."""
 
-    def propose(self, state: Race, n: int) -> tuple[tuple[Proposal, ...], Race]:
-        return state.propose(n)
+    def propose(self, state: Racing, n: int) -> tuple[tuple[Proposal, ...], Racing]:
+        """Return the next proposals of this round, up to n; of the next round where this one is done."""
+        while True:
+            batch, state = state.asking(n)
+            runners = state.runners
+            if batch or all(runner.over for runner in runners):
+                return batch, state
+            ranked = sorted(state.field, key=lambda k: runners[k].best, reverse=True)
+            able = [k for k in ranked[: -(-len(ranked) // 2)] if not runners[k].over]
+            if state.round + 1 >= state.rounds or not able:  # nobody left who can go on: the rest is for whoever can
+                left = (k for k, runner in enumerate(runners) if not runner.over)
+                able = sorted(left, key=lambda k: -runners[k].best)[:1]
+            state = state.begun(able, min(state.round + 1, state.rounds - 1))
 
-    def update(self, state: Race, evaluated: Evaluated) -> Race:
-        return state.update(evaluated)
+    def update(self, state: Racing, evaluated: Evaluated) -> Racing:
+        """Tell each search what came of its proposals, or of the first of them; both as its own domain has them."""
+        by_runner = defaultdict[int, list[Any]](list)
+        for number, (u, evaluation) in zip(state.asked, evaluated, strict=False):
+            by_runner[number].append((u, evaluation))
+        runners = list(state.runners)
+        for number, own in by_runner.items():
+            runner, best = runners[number], max(evaluation.objective for _, evaluation in own)
+            told = runner.policy.update(runner.state, own)
+            runners[number] = replace(runner, state=told, best=max(runner.best, best))
+        spent = state.spent + sum(evaluation.cost for _, evaluation in evaluated)
+        return replace(state, runners=tuple(runners), spent=spent, asked=())
 
-    def distribution(self, state: Race) -> Distribution | None:
-        return state.distribution()
+    def distribution(self, state: Racing) -> Distribution | None:
+        """Return the leader's distribution, if it has one."""
+        runner = state.runners[state.leader]
+        return runner.policy.distribution(runner.state)
 
-    def failures(self, state: Race) -> Failures | None:
-        return state.failures()
+    def failures(self, state: Racing) -> Failures | None:
+        """Return the different failures of the search that has met the most; None where none looks for such."""
+        known = [runner.policy.failures(runner.state) for runner in state.runners]
+        return max(filter(None, known), key=lambda failures: failures.found, default=None)
 
-    def counts(self, state: Race) -> Counts:
-        return state.counts()
+    def counts(self, state: Racing) -> Counts:
+        return sum((runner.policy.counts(runner.state) for runner in state.runners), NO_COUNTS)
 
 
 @dataclass(frozen=True)
@@ -228,23 +201,19 @@ class Stay(Policy[Tensor]):
         return state
 
 
-MOST = 256
-"""No more combinations than this take part."""
-
-MOST_NUMBERS = 2**24
-"""And no more, but two, than have so many numbers together: each search keeps some vectors of that size."""
+MOST = 256  # no more combinations than this take part
+MOST_NUMBERS = 2**24  # nor more, but two, that have so many numbers together: each search keeps some such vectors
 
 
-@dataclass(frozen=True, eq=False)
-class ChoicesState:
-    """Where the search stands: positions in u of numbers (k,) and choices (c,), the choices' elements (n, c) of each
-    search in the race, which goes over the numbers alone."""
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ChoicesState(Race):
+    """Where the search stands: a race over the numbers alone, positions in u of numbers (k,) and choices (c,), and the
+    choices' elements (n, c) of each search in it."""
 
     domain: Domain
     numbers: Tensor
     choices: Tensor
     combinations: Tensor
-    race: Race
 
     def whole(self, numbers: Tensor, combination: int) -> Tensor:
         """Return the configuration (d,) of these numbers, beside a combination of options."""
@@ -255,17 +224,12 @@ class ChoicesState:
 
 
 @dataclass(frozen=True)
-class Choices(Policy[ChoicesState]):
+class Choices(Raced[ChoicesState]):
     """Searches combinations of options outside and, with another policy, the numbers inside.
 
-    Every combination of options has a search of its own over the numbers, and the combinations race. If
-    there are more combinations than can have a whole evaluation in every round, a random choice of them takes part, the
-    start's among them always.
-
-    `search` puts this around every policy whose `handles_choices` is false, a user's own included.
-
-    Attributes:
-        policy: what searches the numbers.
+    Every combination of options has a search of its own over the numbers, and the combinations race. If there are more
+    combinations than can have a whole evaluation in every round, a random choice of them takes part, the start's among
+    them always. `search` puts this around every policy whose `handles_choices` is false, a user's own included.
     """
 
     policy: Policy[Any]
@@ -281,43 +245,45 @@ class Choices(Policy[ChoicesState]):
         return self.policy.takes_differences(domain, steps)
 
     def start(self, domain: Domain, generator: torch.Generator, steps: int) -> ChoicesState:
-        seed = draw_seed(generator)
-        discrete = torch.cat([torch.full((block.size,), block.options > 0) for block in domain.blocks])
-        numbers, choices = (~discrete).nonzero().flatten(), discrete.nonzero().flatten()
-        inner = _without(domain, numbers)
-        policy: Policy[Any] = Stay() if inner is None else self.policy
+        seed, options = draw_seed(generator), domain.options
+        numbers, choices = (options == 0).nonzero().flatten(), options.nonzero().flatten()
+        policy, inner = self.policy, _EMPTY
+        if len(numbers):
+            first = None if domain.first is None else domain.first[numbers]
+            blocks = tuple(block for block in domain.blocks if not block.options)
+            inner = replace(domain, start=domain.start[numbers], blocks=blocks, first=first)
+        else:
+            policy = Stay()
+        counts = options[choices].tolist()
         each = 1 + (domain.gradient_cost if policy.uses_gradient else 0)
-        counts = [block.options for block in domain.blocks if block.options]
         limit = min(MOST, math.prod(counts), max(2, MOST_NUMBERS // domain.dim))
         most = most_runners(steps, each, limit)
         combinations = _combinations(counts, domain.begin[choices], most, seeded(seed, 0))
-        search = (policy, _EMPTY if inner is None else inner)
-        race = line_up([search] * len(combinations), steps, seed)
-        return ChoicesState(domain, numbers, choices, combinations, race)
+        race = line_up([(policy, inner)] * len(combinations), steps, seed)
+        return ChoicesState(**vars(race), domain=domain, numbers=numbers, choices=choices, combinations=combinations)
 
     def propose(self, state: ChoicesState, n: int) -> tuple[tuple[Proposal, ...], ChoicesState]:
-        proposals, race = state.race.propose(n)
-        asked = zip(proposals, race.asked, strict=True)
-        us = tuple(replace(proposal, u=state.whole(proposal.u, number)) for proposal, number in asked)
-        return us, replace(state, race=race)
+        proposals, state = super().propose(state, n)
+        asked = zip(proposals, state.asked, strict=True)
+        return tuple(replace(proposal, u=state.whole(proposal.u, number)) for proposal, number in asked), state
 
     def update(self, state: ChoicesState, evaluated: Evaluated) -> ChoicesState:
         inner, numbers = [], state.numbers
-        for u, one in evaluated:
-            gradient = None if one.gradient is None else one.gradient[numbers]
-            inner.append((u[numbers], replace(one, gradient=gradient)))
-        return replace(state, race=state.race.update(inner))
-
-    def counts(self, state: ChoicesState) -> Counts:
-        return state.race.counts()
+        for u, evaluation in evaluated:
+            gradient = None if evaluation.gradient is None else evaluation.gradient[numbers]
+            inner.append((u[numbers], replace(evaluation, gradient=gradient)))
+        return super().update(state, inner)
 
     def distribution(self, state: ChoicesState) -> Distribution | None:
-        inner = state.race.distribution()
+        inner = super().distribution(state)
         if inner is None:
             return None
         deviation = torch.zeros_like(state.domain.start)
         deviation[state.numbers] = inner.deviation
-        return Distribution(state.whole(inner.mean, state.race.leader), deviation)
+        return Distribution(state.whole(inner.mean, state.leader), deviation)
+
+    def failures(self, state: ChoicesState) -> None:
+        """None: those of a search are without their choices."""
 
 
 def with_choices(policy: Policy[Any], domain: Domain) -> Policy[Any]:
@@ -326,33 +292,23 @@ def with_choices(policy: Policy[Any], domain: Domain) -> Policy[Any]:
     return Choices(policy) if discrete and not policy.handles_choices else policy
 
 
-_EMPTY = Domain(torch.zeros(1), (Block(1),))
-"""Stands in where nothing but choices may vary; its one number is dropped."""
-
-
-def _without(domain: Domain, numbers: Tensor) -> Domain | None:
-    """Return the domain of the numbers alone; None if there are none."""
-    blocks = tuple(block for block in domain.blocks if not block.options)
-    if not blocks:
-        return None
-    first = None if domain.first is None else domain.first[numbers]
-    return replace(domain, start=domain.start[numbers], blocks=blocks, first=first)
+_EMPTY = Domain(torch.zeros(1), (Block(1),))  # stands in where nothing but choices may vary; its one number is dropped
 
 
 def _combinations(counts: list[int], begin: Tensor, most: int, generator: torch.Generator) -> Tensor:
     """Return (n, c) elements of u, n at most `most`, that of the start first and unchanged: all combinations in a
     random order, or so many distinct ones."""
-    sizes = torch.tensor(counts)
-    total = math.prod(counts)
+    sizes, total = torch.tensor(counts), math.prod(counts)
     start = torch.floor(begin * sizes).long().clamp(max=sizes - 1)
     if total <= max(1024, 4 * most):
         every = torch.cartesian_prod(*(torch.arange(count) for count in counts)).reshape(total, len(counts))
         every = every[torch.randperm(total, generator=generator)]
         picked = every[~(every == start).all(dim=1)][: most - 1]
     else:
-        seen = {tuple(start.tolist())}
+        first = tuple(start.tolist())
+        seen = {first}
         while len(seen) < most:
             seen.add(tuple(int(torch.randint(count, (1,), generator=generator)) for count in counts))
-        picked = torch.tensor(sorted(seen - {tuple(start.tolist())})).reshape(-1, len(counts))
+        picked = torch.tensor(sorted(seen - {first})).reshape(-1, len(counts))
     middles = centre_of_option((picked + 0.5) / sizes, sizes)
     return torch.cat([begin[None], middles.to(begin.dtype)])

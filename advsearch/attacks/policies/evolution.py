@@ -25,9 +25,7 @@ FULL = 80
 """Up to so many numbers have a full covariance matrix; more have its diagonal (Ros and Hansen 2008). Also about the
 size from which the linear algebra would use several threads, whose last bits may differ."""
 
-MOST = 10_000
-"""More numbers are refused: a generation would take longer than renders, and the ascent along a gradient is far ahead
-long before."""
+MOST = 10_000  # more numbers are refused: a generation would take longer than renders, and an ascent is far ahead
 
 WIDEST, NARROWEST = 10.0, 1e-3
 """In half ranges: the step size grows no further (it does where all objectives are equal), and a run is over when its
@@ -57,7 +55,6 @@ class NESState:
     domain: Domain
     seed: int
     scale: Tensor
-    wraps: Tensor
     mean: Tensor
     deviation: Tensor
     population: int
@@ -94,9 +91,6 @@ class NES(Policy[NESState]):
         sigma: first standard deviation in units of half of each number's range (half of what the ball leaves), over 0,
             at most 2.
         population: samples a generation, even, at least 4; 0 for 4 + 3 ln d, rounded up to even.
-
-    Raises:
-        InputError: a value is outside what is said here.
     """
 
     sigma: float = 0.3
@@ -113,15 +107,8 @@ class NES(Policy[NESState]):
 
     def start(self, domain: Domain, generator: torch.Generator, steps: int) -> NESState:
         default = 4 + int(3 * math.log(domain.dim))
-        return NESState(
-            domain=domain,
-            seed=draw_seed(generator),
-            scale=half_widths(domain),
-            wraps=wraps(domain),
-            mean=domain.begin,
-            deviation=torch.full_like(domain.start, self.sigma),
-            population=self.population or default + default % 2,
-        )
+        population, deviation = self.population or default + default % 2, torch.full_like(domain.start, self.sigma)
+        return NESState(domain, draw_seed(generator), half_widths(domain), domain.begin, deviation, population)
 
     def propose(self, state: NESState, n: int) -> tuple[tuple[Proposal, ...], NESState]:
         numbers = range(len(state.values), min(len(state.values) + n, state.population))
@@ -148,8 +135,7 @@ class NES(Policy[NESState]):
 
 
 def _normal(*shape: int) -> Doubles:
-    """Standard normal numbers from numpy's global generator. A copy of pycma's default, a method of that generator,
-    would carry a generator of its own along."""
+    """Standard normal numbers from numpy's global generator. (A copy of pycma's default carries its own along.)"""
     return np.random.standard_normal(shape)  # noqa: NPY002
 
 
@@ -213,9 +199,8 @@ class CMAESState:
 
     def tell(self) -> CMAESState:
         """Let a copy of the strategy learn from a whole generation."""
-        values = np.array(self.values)
+        values, spread = np.array(self.values), 0.0
         finite = np.isfinite(values)
-        spread = 0.0
         if finite.any():
             low, high = np.percentile(values[finite], (25, 75))
             spread = float(high - low)
@@ -242,8 +227,7 @@ class CMAES(Policy[CMAESState]):
 
         spread * ||x - P(x)||^2 / (d sigma^2),
 
-    spread the distance between the quartiles of the generation, so that the mean does not drift away outside. Angles
-    wrap and cost nothing.
+    spread the distance between the quartiles of the generation, so that the mean does not drift outside. Angles wrap.
 
     A run whose largest deviation has fallen under a thousandth of half a range has nothing more to find. The next one
     begins at a sample of the domain with twice the population (Auger and Hansen 2005, "A restart CMA evolution strategy
@@ -256,9 +240,6 @@ class CMAES(Policy[CMAESState]):
         sigma: first standard deviation in units of half of each number's range (half of what the ball leaves), over 0,
             at most 2.
         population: points a generation, at least 2; 0 for 4 + 3 ln d.
-
-    Raises:
-        InputError: a value is outside what is said here; at the start, the domain has more than 10,000 numbers.
     """
 
     sigma: float = 0.3
@@ -295,7 +276,15 @@ class CMAES(Policy[CMAESState]):
         if len(state.values) < len(state.points):
             return state
         state = state.tell()
-        return (state if float(state.deviations.max()) > NARROWEST else self._anew(state)).ask()
+        if float(state.deviations.max()) > NARROWEST:
+            return state.ask()
+        # another run elsewhere, with twice the population; the better one of those that are over is remembered
+        before = state.before
+        if before is None or state.best > before[0]:
+            before = (state.best, state.distribution)
+        strategy = self._strategy(state.domain.dim, 2 * len(state.points), state.seed)
+        origin = state.domain.sample(seeded(state.seed, state.generation))[0]
+        return replace(state, origin=origin, strategy=strategy, best=-math.inf, before=before).ask()
 
     def distribution(self, state: CMAESState) -> Distribution:
         if state.before is not None and state.before[0] > state.best:
@@ -304,26 +293,10 @@ class CMAES(Policy[CMAESState]):
 
     def _strategy(self, d: int, population: int, seed: int) -> Any:
         """Return pycma's object for a run, before its first generation."""
-        options = {
-            "CMA_diagonal": d > FULL,
-            "popsize": population,
-            "randn": _normal,
-            "seed": math.nan,
-            "signals_filename": "",
-            "verbose": -9,
-            "verb_log": 0,
-        }
+        options = {"CMA_diagonal": d > FULL, "popsize": population, "randn": _normal, "seed": math.nan}
+        options |= {"signals_filename": "", "verbose": -9, "verb_log": 0}
         with _own_random(seed, 0):
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 import cma  # takes most of a second, and complains where there is no matplotlib
             return cma.CMAEvolutionStrategy(np.zeros(d), self.sigma, options)
-
-    def _anew(self, state: CMAESState) -> CMAESState:
-        """Begin another run elsewhere with twice the population, and remember the better one of those that are over."""
-        before = state.before
-        if before is None or state.best > before[0]:
-            before = (state.best, state.distribution)
-        strategy = self._strategy(state.domain.dim, 2 * len(state.points), state.seed)
-        origin = state.domain.sample(seeded(state.seed, state.generation))[0]
-        return replace(state, origin=origin, strategy=strategy, best=-math.inf, before=before)

@@ -14,8 +14,7 @@ from advsearch.attacks.domain import Domain, centre_of_option, wraps
 from advsearch.attacks.evaluation import Evaluated, Policy, Proposal, draw_seed, one_thread, seeded
 from advsearch.errors import InputError
 
-MOST = 50
-"""More numbers are refused: there would never be enough draws to learn from."""
+MOST = 50  # more numbers are refused: there would never be enough draws to learn from
 
 WINDOW = 1000
 
@@ -28,8 +27,7 @@ EVEN, PRIOR = 12**-0.5, 3.0
 """Deviation of the even distribution in shares of a range; it counts for so many draws of each component, so that what
 does not matter stays wide."""
 
-NARROWEST, FLAT = 0.02, 10.0
-"""Deviations of a number, in shares of its range, at least and at most."""
+NARROWEST, FLAT = 0.02, 10.0  # deviations of a number, in shares of its range, at least and at most
 
 TELLING = 0.5
 """A number tells a component apart where its deviation is under so much of the even one's; an option, where it has more
@@ -134,13 +132,13 @@ class MixtureState:
         lower, width = self.domain.lower.double(), (self.domain.upper - self.domain.lower).double()
         ranges: dict[int, tuple[float, float]] = {}
         for place, count in enumerate(self.ranges.counts.tolist()):
-            mean, reach = float(mixture.means[k, place]), 2.0 * float(mixture.deviations[k, place])
-            ends = (max(0.0, mean - reach), min(1.0, mean + reach))
             if count:
                 likeliest = int(mixture.options[k, place].argmax())
                 ends = (likeliest / count, (likeliest + 1) / count)
                 telling = float(mixture.options[k, place, likeliest]) > TELLING
             else:
+                mean, reach = float(mixture.means[k, place]), 2.0 * float(mixture.deviations[k, place])
+                ends = (max(0.0, mean - reach), min(1.0, mean + reach))
                 across = bool(self.ranges.around[place]) and (mean - reach < 0.0 or mean + reach > 1.0)
                 telling = reach < 2.0 * TELLING * EVEN and not across
             if telling:
@@ -161,17 +159,13 @@ class Mixture(Policy[MixtureState]):
     maximisation to the draws that failed (as long as these are few, to those with the largest objectives), weighed by
     the even density over the mean density that they came from (the balance heuristic of Veach and Guibas 1995).
 
-    Its result is a failure for each component, and with the share of all configurations that fail: see
-    `failure_share`. That share is of single renders with the search's samples. In an l2 ball the draws are projected,
-    and no share is told.
+    Its result is a failure for each component, and with the share of all configurations that fail: see `failure_share`.
+    That share is of single renders with the search's samples. In an l2 ball no share is told.
 
     Attributes:
         components: of the mixture, 1 to 20.
         even: share of the draws that is even, 0.05 to 1; weights are 1 / even at most.
         population: draws a generation, at least 2.
-
-    Raises:
-        InputError: a value is outside what is said here; at the start, the domain has more than 50 numbers.
     """
 
     components: int = 4
@@ -193,8 +187,7 @@ class Mixture(Policy[MixtureState]):
     def start(self, domain: Domain, generator: torch.Generator, steps: int) -> MixtureState:
         if domain.dim > MOST:
             raise InputError(f"policy 'mixture': expected at most {MOST} numbers, got {domain.dim}; use pgd or auto")
-        counts = torch.tensor([block.options for block in domain.blocks for _ in range(block.size)])
-        ranges, nothing = Ranges(counts, wraps(domain)), torch.empty(0, domain.dim, dtype=torch.float64)
+        ranges, nothing = Ranges(domain.options, wraps(domain)), torch.empty(0, domain.dim, dtype=torch.float64)
         log = torch.empty(0, 5, dtype=torch.float64)
         state = MixtureState(domain, draw_seed(generator), ranges, 0, (), nothing, nothing, log)
         return self._drawn(state, None)
@@ -203,36 +196,32 @@ class Mixture(Policy[MixtureState]):
         return tuple(Proposal(state.configuration(x)) for x in state.points[state.told :][:n]), state
 
     def update(self, state: MixtureState, evaluated: Evaluated) -> MixtureState:
-        points = state.points[state.told :][: len(evaluated)]
-        current = state.learnt[-1]
+        points, current = state.points[state.told :][: len(evaluated)], state.learnt[-1]
         with one_thread():
-            weights = 1.0 / self._density(current, points, state.ranges)
+            weights = (1.0 / self._density(current, points, state.ranges)).tolist()
         bound = 1.0 if current is None else 1.0 / self.even
         rows = [
-            (found.objective, float(found.success), float(not math.isfinite(found.objective)), float(weight), bound)
-            for (_, found), weight in zip(evaluated, weights, strict=True)
+            (evaluation.objective, evaluation.success, not math.isfinite(evaluation.objective), weight, bound)
+            for (_, evaluation), weight in zip(evaluated, weights, strict=True)
         ]
         log = torch.cat([state.log, torch.tensor(rows, dtype=torch.float64)])
-        seen = torch.cat([state.seen, points])
-        state = replace(state, log=log, seen=seen, told=state.told + len(evaluated))
+        state = replace(state, log=log, seen=torch.cat([state.seen, points]), told=state.told + len(evaluated))
         return state if state.told < self.population else self._drawn(state, self._fitted(state))
 
     def failures(self, state: MixtureState) -> Failures:
         """Return a failure for each component that has some, and the share of all that fail."""
         log, current = state.log[-len(state.seen) :], state.learnt[-1]
         failed = log[:, 1].bool() & ~log[:, 2].bool()
-        listed = []
-        if current is not None and bool(failed.any()):
-            points, objectives = state.seen[failed], log[failed, 0]
-            nearest = current.logs(points, state.ranges).argmax(dim=1)
-            for k in sorted(set(nearest.tolist()), key=lambda k: -float(current.weights[k])):
-                members = (nearest == k).nonzero().flatten()
-                worst = int(members[objectives[members].argmax()])
-                u = state.configuration(points[worst])
-                listed.append(FoundFailure(u, float(objectives[worst]), state.telling(current, k)))
-        elif bool(failed.any()):
-            worst = int(torch.where(failed, log[:, 0], -math.inf).argmax())
-            listed.append(FoundFailure(state.configuration(state.seen[worst]), float(log[worst, 0]), {}))
+        points, objectives, listed = state.seen[failed], log[failed, 0], []
+        nearest, order = torch.zeros(len(points)), [0] if len(points) else []
+        if current is not None and len(points):
+            weights, nearest = current.weights, current.logs(points, state.ranges).argmax(dim=1)
+            order = sorted(set(nearest.tolist()), key=lambda k: -float(weights[k]))
+        for k in order:
+            members = (nearest == k).nonzero().flatten()
+            worst = int(members[objectives[members].argmax()])
+            ranges = {} if current is None else state.telling(current, k)
+            listed.append(FoundFailure(state.configuration(points[worst]), float(objectives[worst]), ranges))
         whole = all(block.norm != "l2" for block in state.domain.blocks)
         with one_thread():
             share = failure_share(state.log[:, 3], state.log[:, 4], state.log[:, 1] > 0, state.log[:, 2] > 0)
@@ -272,7 +261,7 @@ class Mixture(Policy[MixtureState]):
         if not len(x):
             return None
         with one_thread():
-            density = torch.stack([self._density(one, x, ranges) for one in state.learnt]).mean(dim=0)
+            density = torch.stack([self._density(mixture, x, ranges) for mixture in state.learnt]).mean(dim=0)
             weights = 1.0 / density
             weights *= weights.sum() / weights.square().sum()  # they add up to what they are worth
             picked = most_different(x, objectives.tolist(), ranges.around, ranges.counts > 0, self.components)

@@ -7,7 +7,7 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from dataclasses import dataclass, field, replace
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
@@ -16,81 +16,50 @@ from advsearch.attacks.domain import Domain, half_widths
 from advsearch.attacks.evaluation import NO_COUNTS, Counts, Evaluated, Policy, Proposal, draw_seed, seeded
 from advsearch.errors import InputError
 
-CLIP = 3.0
-"""What exceeds the median so many times is out of the usual."""
-
-MEMORY = 15
-"""Latest gradients whose lengths say what is usual."""
-
-CLIP_L2 = 10.0
-"""The same of single numbers in an l2 block, whose true gradient may well be uneven: its direction is at stake."""
-
-FEWEST_NUMBERS = 8
-"""Fewer numbers than this have no median to speak of."""
+CLIP = 3.0  # what exceeds the median so many times is out of the usual
+MEMORY = 15  # latest gradients whose lengths say what is usual
+CLIP_L2 = 10.0  # the same of numbers in an l2 block, whose true gradient may be uneven: its direction is at stake
+FEWEST_NUMBERS = 8  # fewer numbers than this have no median to speak of
 
 
 def clipped(domain: Domain, gradient: Tensor, lengths: tuple[float, ...]) -> tuple[Tensor, tuple[float, ...], Counts]:
-    """Return a gradient without outliers, the lengths of the latest gradients, and what was an outlier.
+    """Return a gradient (d,), finite, without outliers, the lengths of the latest ones, and what was an outlier.
 
     - In a ball of at least `FEWEST_NUMBERS`, each is cut to so many medians of those that are not zero: `CLIP` in an
       l-infinity ball, where the step follows the signs, so that this changes how gradients are averaged and no single
       step; `CLIP_L2` in an l2 ball.
     - A gradient that is longer than `CLIP` times the median of the last `MEMORY` is shortened to that.
     - In a domain that is `exact` or `drawn` nothing is an outlier.
-
-    Args:
-        gradient: (d,) float32, finite.
-        lengths: of the gradients before, the latest last.
     """
     if domain.exact or domain.drawn:
         return gradient, lengths, NO_COUNTS
-    out, cut, shortened = gradient, False, False
+    out, cut = gradient.clone(), False
     for block, part in domain.parts():
-        if block.norm != "box" and block.size >= FEWEST_NUMBERS:
+        if block.norm != "box" and block.size >= FEWEST_NUMBERS and bool(out[part].any()):
             sizes = out[part].abs()
-            some = sizes[sizes > 0]
-            if some.numel():
-                limit = (CLIP if block.norm == "linf" else CLIP_L2) * float(some.median())
-                if float(sizes.amax()) > limit:
-                    out, cut = out.clone() if out is gradient else out, True
-                    out[part] = out[part].clamp(-limit, limit)
+            limit = (CLIP if block.norm == "linf" else CLIP_L2) * float(sizes[sizes > 0].median())
+            if float(sizes.amax()) > limit:
+                cut, out[part] = True, out[part].clamp(-limit, limit)
     length = float(torch.linalg.vector_norm(out))
     lengths = (*lengths, length)[-MEMORY:]
     usual = sorted(lengths)[len(lengths) // 2]
-    if length > CLIP * usual > 0.0:
-        shortened = True
-        out = out * (CLIP * usual / length)
-    return out, lengths, Counts(int(cut), int(shortened))
+    shortened = length > CLIP * usual > 0.0
+    return out * (CLIP * usual / length) if shortened else out, lengths, Counts(int(cut), int(shortened))
 
 
 FIRST_WINDOW, SHORTEN, SHORTEST = 0.22, 0.03, 0.06
-"""Length of the first window, how much each next one is shorter, and the shortest, as fractions of the steps (Auto-
-PGD)."""
+"""Length of the first window, how much each next one is shorter, and the shortest, as fractions of the steps."""
 
-FEWEST = 3
-"""No window is shorter than this: two noisy values say nothing about a trend."""
-
-IMPROVING = 0.75
-"""Fraction of a window's steps that must improve the objective for the step size to be kept (Auto-PGD's rho)."""
-
-SLOWEST = 0.05
-"""What is left of the step size at the end of a search without noise, as a fraction of the first."""
-
-FEWEST_EXACT = 5
-"""The same as `FEWEST` without noise, where all windows have the shortest length."""
-
-GAIN = 1e-3
-"""Without noise, what a window must add to the best of the one before, as a fraction of what the search has gained."""
-
-ENOUGH = 3
-"""Windows in a row that add less, after which there is nothing to gain."""
-
-PATIENCE = 5
-"""Evaluations in a row without any gradient after which there is nothing to follow."""
+FEWEST = 3  # no window is shorter than this: two noisy values say nothing about a trend
+IMPROVING = 0.75  # fraction of a window's steps that must improve the objective to keep the step size (Auto-PGD's rho)
+SLOWEST = 0.05  # what is left of the step size at the end of a search without noise, as a fraction of the first
+FEWEST_EXACT = 5  # the same as `FEWEST` without noise, where all windows have the shortest length
+GAIN = 1e-3  # without noise, what a window must add to the best of the one before, as a fraction of all that was gained
+ENOUGH = 3  # windows in a row that add less, after which there is nothing to gain
+PATIENCE = 5  # evaluations in a row without any gradient after which there is nothing to follow
 
 
-@dataclass(frozen=True, eq=False)
-class Peak:
+class Peak(NamedTuple):
     """The best evaluation so far by its raw objective, and the direction in which the search stood to go on there."""
 
     objective: float
@@ -127,8 +96,7 @@ class Window:
         return best > mean + 2.0 * spread
 
     def next(self, steps: int, best: float, halved: bool) -> Window:
-        shorter = self.length - max(1, round(SHORTEN * steps))
-        length = max(FEWEST, round(SHORTEST * steps), shorter)
+        length = max(FEWEST, round(SHORTEST * steps), self.length - max(1, round(SHORTEN * steps)))
         return Window(length, (), self.values[-1], 0, best, halved)
 
 
@@ -209,6 +177,9 @@ class Climbing(Policy[Ascent]):
     def step(self, state: Ascent, u: Tensor, objective: float) -> Ascent:
         """Return the state with the next configuration, after u with its objective."""
 
+    def refused(self, field: str, expected: str, example: float) -> InputError:
+        return InputError(f"{field}: expected a number in {expected}, got {getattr(self, field)}; try {example}")
+
 
 @dataclass(frozen=True)
 class PGD(Climbing):
@@ -243,9 +214,6 @@ class PGD(Climbing):
             most 2.
         momentum: weight of the past, in [0, 1).
         random_start: start from a uniform sample of the domain, not from where it begins.
-
-    Raises:
-        InputError: a value is outside what is said here.
     """
 
     step_size: float = 0.5
@@ -256,11 +224,9 @@ class PGD(Climbing):
 
     def __post_init__(self) -> None:
         if not 0.0 < self.step_size <= 2.0:
-            raise InputError(
-                f"step_size: expected a number in (0, 2], a fraction of epsilon, got {self.step_size}; try 0.5"
-            )
+            raise self.refused("step_size", "(0, 2], a fraction of epsilon", 0.5)
         if not 0.0 <= self.momentum < 1.0:
-            raise InputError(f"momentum: expected a number in [0, 1), got {self.momentum}; try 0.5")
+            raise self.refused("momentum", "[0, 1)", 0.5)
 
     def start(self, domain: Domain, generator: torch.Generator, steps: int) -> Ascent:
         seed = draw_seed(generator)
@@ -306,16 +272,14 @@ class PGD(Climbing):
         return self._moved(replace(state, window=window.next(state.steps, best, stalled)), u)
 
     def _slower(self, state: Ascent, u: Tensor) -> Ascent:
-        """Without noise: halve the step size where the window added nothing to the one before.
-
-        Windows are compared and not the best of all, which may stem from another matrix of light transport.
-        """
-        window = state.window
-        best = max(window.values)
+        """Without noise: halve the step size where the window added nothing to the one before. (The best of all may
+        stem from another matrix of light transport.)"""
+        window, best = state.window, max(state.window.values)
         idle = best - window.best <= GAIN * (best - state.first)
-        step_size = state.step_size / 2 if idle else state.step_size
-        state = replace(state, step_size=step_size, idle=state.idle + 1 if idle else 0)
-        return self._moved(replace(state, window=Window(window.length, best=best)), u)
+        if idle:
+            state = replace(state, step_size=state.step_size / 2)
+        window = Window(window.length, best=best)
+        return self._moved(replace(state, idle=state.idle + 1 if idle else 0, window=window), u)
 
     def _moved(self, state: Ascent, u: Tensor) -> Ascent:
         """Move from u along the accumulated gradient, or at random where there is none."""
@@ -345,9 +309,6 @@ class Adam(Climbing):
     Attributes:
         step_size: the first rate, over 0, at most 2.
         beta1, beta2: in [0, 1).
-
-    Raises:
-        InputError: a value is outside what is said here.
     """
 
     step_size: float = 0.3
@@ -358,12 +319,10 @@ class Adam(Climbing):
 
     def __post_init__(self) -> None:
         if not 0.0 < self.step_size <= 2.0:
-            raise InputError(
-                f"step_size: expected a number in (0, 2], a share of half the range, got {self.step_size}; try 0.3"
-            )
-        for name, value in (("beta1", self.beta1), ("beta2", self.beta2)):
-            if not 0.0 <= value < 1.0:
-                raise InputError(f"{name}: expected a number in [0, 1), got {value}; try 0.9")
+            raise self.refused("step_size", "(0, 2], a share of half the range", 0.3)
+        for beta in ("beta1", "beta2"):
+            if not 0.0 <= getattr(self, beta) < 1.0:
+                raise self.refused(beta, "[0, 1)", 0.9)
 
     def start(self, domain: Domain, generator: torch.Generator, steps: int) -> Ascent:
         steps = max(1, steps // (1 + domain.gradient_cost))

@@ -4,7 +4,8 @@ which fill the domain more evenly; and a grid, as fine as the renders allow."""
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import torch
@@ -14,11 +15,11 @@ from advsearch.attacks.domain import Block, Domain, centre_of_option
 from advsearch.attacks.evaluation import Evaluated, Policy, Proposal, draw_seed, seeded
 from advsearch.errors import InputError
 
-MOST = 21_201
-"""Scipy has direction numbers for so many dimensions (Joe and Kuo 2008)."""
+MOST = 21_201  # Scipy has direction numbers for so many dimensions (Joe and Kuo 2008)
+CHUNK = 2**20  # numbers of a Sobol sequence that are drawn and kept at once, at most, and one point at least
 
-CHUNK = 2**20
-"""So many numbers at most of a Sobol sequence are drawn and kept at once, as long as that is one point at least."""
+
+NONE = torch.empty(0, 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,8 +29,12 @@ class PointsState:
 
     domain: Domain
     seed: int = 0
-    points: Tensor = field(default_factory=lambda: torch.empty(0, 0))
+    points: Tensor = NONE
     done: int = 0
+
+    def proposing(self, us: Iterable[Tensor]) -> tuple[tuple[Proposal, ...], PointsState]:
+        proposals = tuple(map(Proposal, us))
+        return proposals, replace(self, done=self.done + len(proposals))
 
 
 class Unlearning(Policy[PointsState]):
@@ -58,8 +63,7 @@ class Random(Unlearning):
 
     def propose(self, state: PointsState, n: int) -> tuple[tuple[Proposal, ...], PointsState]:
         numbers = range(state.done, state.done + n)
-        us = (state.domain.sample(seeded(state.seed, k), extreme=k % 2 == 0)[0] for k in numbers)
-        return tuple(map(Proposal, us)), replace(state, done=state.done + n)
+        return state.proposing(state.domain.sample(seeded(state.seed, k), extreme=k % 2 == 0)[0] for k in numbers)
 
 
 @dataclass(frozen=True)
@@ -73,9 +77,6 @@ class Sobol(Unlearning):
 
     In a few dimensions it finds what `random` finds in fewer renders; the advantage is gone after a dozen. The points
     of one sequence do not depend on what they are worth, so they are a fair sample of the domain's average too.
-
-    Raises:
-        InputError: at the start, the domain has more dimensions than there are direction numbers.
     """
 
     name: ClassVar[str] = "sobol"
@@ -86,8 +87,7 @@ class Sobol(Unlearning):
             raise InputError(
                 f"policy 'sobol': expected at most {MOST} dimensions, got {size}; use policy random, nes, pgd or auto"
             )
-        seed = draw_seed(generator)
-        most = max(1, CHUNK // size)
+        seed, most = draw_seed(generator), max(1, CHUNK // size)
         count = 2 ** max(0, min(steps - 1, most - 1).bit_length())
         return PointsState(domain, seed, draw(size, seed, 0, count))
 
@@ -95,9 +95,7 @@ class Sobol(Unlearning):
         count, size = state.points.shape
         if state.done and state.done % count == 0:
             state = replace(state, points=draw(size, state.seed, state.done, count))
-        points = state.points[state.done % count :][:n]
-        us = (to_domain(state.domain, x) for x in points)
-        return tuple(map(Proposal, us)), replace(state, done=state.done + len(points))
+        return state.proposing(to_domain(state.domain, x) for x in state.points[state.done % count :][:n])
 
 
 def draw(size: int, seed: int, begin: int, count: int) -> Tensor:
@@ -140,10 +138,6 @@ class Grid(Unlearning):
 
     Attributes:
         points: values for each number, at least 2; 0 for as many as fit.
-
-    Raises:
-        InputError: a value is outside what is said here; at the start, the grid (with two values for each number, if
-            none are given) does not fit into the renders.
     """
 
     points: int = 0
@@ -155,22 +149,29 @@ class Grid(Unlearning):
             raise InputError(f"points: expected at least 2, or 0 for as many as fit, got {self.points}")
 
     def start(self, domain: Domain, generator: torch.Generator, steps: int) -> PointsState:
-        counts = _counts(domain, steps, self.points)
-        low, high = _bounds(domain)
+        counts, low, high = _counts(domain, steps, self.points), domain.lower.clone(), domain.upper.clone()
+        for block, part in domain.parts():
+            if block.norm == "l2" and block.epsilon is not None:  # the cube around the ball
+                low[part] = low[part].maximum(domain.start[part] - block.epsilon)
+                high[part] = high[part].minimum(domain.start[part] + block.epsilon)
         blocks = [block for block in domain.blocks for _ in range(block.size)]
         axes = map(_axis, blocks, counts, low.tolist(), high.tolist())
         points = torch.cartesian_prod(*axes).reshape(-1, domain.dim)
-        return PointsState(domain, points=points[_coarse_to_fine(blocks, counts)])
+        # coarse to fine: by the largest, then the sum of the levels of a point, whose last axis runs fastest
+        largest = total = torch.zeros(1, dtype=torch.long)
+        for level in map(_levels, blocks, counts):
+            largest = torch.maximum(largest[:, None], level).flatten()
+            total = (total[:, None] + level).flatten()
+        order = (largest * (int(total.max()) + 1) + total).argsort(stable=True)
+        return PointsState(domain, points=points[order])
 
     def propose(self, state: PointsState, n: int) -> tuple[tuple[Proposal, ...], PointsState]:
-        points = state.points[state.done : state.done + n]
-        us = map(state.domain.project, points)
-        return tuple(map(Proposal, us)), replace(state, done=state.done + len(points))
+        return state.proposing(map(state.domain.project, state.points[state.done : state.done + n]))
 
 
 def _counts(domain: Domain, steps: int, points: int) -> list[int]:
     """Return how many values each element of u takes."""
-    options = [block.options for block in domain.blocks for _ in range(block.size)]
+    options = domain.options.tolist()
     numbers, combinations = options.count(0), math.prod(n for n in options if n)
     least = combinations * (points or 2) ** min(numbers, 64)
     if least > steps:
@@ -182,26 +183,14 @@ def _counts(domain: Domain, steps: int, points: int) -> list[int]:
         )
     each = points or max(2, int((steps // combinations) ** (1.0 / max(numbers, 1)) * (1 - 1e-9)))
     counts = [n or each for n in options]
-    if points:
-        return counts
-    total, grew = math.prod(counts), True
-    while grew and numbers:
+    total, grew = math.prod(counts), not points
+    while grew:
         grew = False
         for j, fixed in enumerate(options):
             if not fixed and total // counts[j] * (counts[j] + 1) <= steps:
                 total, grew = total // counts[j] * (counts[j] + 1), True
                 counts[j] += 1
     return counts
-
-
-def _bounds(domain: Domain) -> tuple[Tensor, Tensor]:
-    """Return (d,) lower and upper ends of the axes: the domain's, and for an l2 ball the cube around it, cut."""
-    low, high = domain.lower.clone(), domain.upper.clone()
-    for block, part in domain.parts():
-        if block.norm == "l2" and block.epsilon is not None:
-            low[part] = low[part].maximum(domain.start[part] - block.epsilon)
-            high[part] = high[part].minimum(domain.start[part] + block.epsilon)
-    return low, high
 
 
 def _axis(block: Block, count: int, low: float, high: float) -> Tensor:
@@ -211,16 +200,6 @@ def _axis(block: Block, count: int, low: float, high: float) -> Tensor:
     if block.periodic:
         return low + (high - low) * torch.arange(count) / count
     return torch.linspace(low, high, count)
-
-
-def _coarse_to_fine(blocks: list[Block], counts: list[int]) -> Tensor:
-    """Return (n,) numbers of all points (the last axis runs fastest), by the largest, then the sum of their levels."""
-    largest, total = torch.zeros(1, dtype=torch.long), torch.zeros(1, dtype=torch.long)
-    for block, count in zip(blocks, counts, strict=True):
-        level = _levels(block, count)
-        largest = torch.maximum(largest[:, None], level).flatten()
-        total = (total[:, None] + level).flatten()
-    return (largest * (int(total.max()) + 1) + total).argsort(stable=True)
 
 
 def _levels(block: Block, count: int) -> Tensor:

@@ -13,17 +13,10 @@ from torch import Tensor
 from advsearch.attacks.domain import Domain, centre_of_option
 from advsearch.attacks.evaluation import Evaluated, seeded
 
-MOST_SOBOL = 1000
-"""More coordinates than this are screened with independent points; Sobol's advantage is long gone."""
-
-MOVED = 4
-"""About so many coordinates change in one local move; all, where there are no more."""
-
-ANOTHER = 0.3
-"""Share of moved choices that are drawn anew."""
-
-NEAREST, FARTHEST = 0.01, 0.3
-"""Standard deviations of local moves, in units of a coordinate's whole range; between them log-uniform."""
+MOST_SOBOL = 1000  # more coordinates than this are screened with independent points; Sobol's advantage is long gone
+MOVED = 4  # about so many coordinates change in one local move; all, where there are no more
+ANOTHER = 0.3  # share of moved choices that are drawn anew
+NEAREST, FARTHEST = 0.01, 0.3  # deviations of local moves, in a coordinate's whole range; between them log-uniform
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,42 +91,28 @@ class Coordinates:
 
 def box_coordinates(domain: Domain) -> Coordinates:
     """Return the coordinates of a domain that belong to no norm ball; there may be none."""
-    boxes = [(block, part) for block, part in domain.parts() if block.norm == "box"]
-    sizes = torch.tensor([block.size for block, _ in boxes], dtype=torch.long)
-    where = [torch.arange(part.start, part.stop) for _, part in boxes]
-    low = torch.tensor([block.low for block, _ in boxes])
+    whole = [(block, part) for block, part in domain.parts() if block.norm == "box"]
+    boxes = [(block, place) for block, part in whole for place in range(part.start, part.stop)]
+    low, high = (torch.tensor([getattr(block, name) for block, _ in boxes]) for name in ("low", "high"))
     return Coordinates(
-        where=torch.cat(where) if where else torch.empty(0, dtype=torch.long),
-        low=low.repeat_interleave(sizes),
-        width=(torch.tensor([block.high for block, _ in boxes]) - low).repeat_interleave(sizes),
-        periodic=torch.tensor([block.periodic for block, _ in boxes], dtype=torch.bool).repeat_interleave(sizes),
-        options=torch.tensor([block.options for block, _ in boxes], dtype=torch.long).repeat_interleave(sizes),
+        where=torch.tensor([place for _, place in boxes], dtype=torch.long),
+        low=low,
+        width=high - low,
+        periodic=torch.tensor([block.periodic for block, _ in boxes], dtype=torch.bool),
+        options=torch.tensor([block.options for block, _ in boxes], dtype=torch.long),
     )
 
 
 LENGTHS = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6)
 """Candidate lengths, times the square root of the number of coordinates (as distances between points grow)."""
 
-NOISES = (1e-4, 1e-2, 0.1, 0.5, 2.0)
-"""Candidate variances of the noise, as shares of the signal's."""
-
-STRETCHES = (0.5, 2.0, 4.0)
-"""By how much one coordinate's length is changed on trial."""
-
-LONGEST = 8.0
-"""No length is more than this many times the square root of the number of coordinates: it no longer matters then."""
-
-EVIDENCE = 1.0
-"""Gain in log-likelihood that a coordinate's own length must bring; less would fit the noise."""
-
-REFIT = 5
-"""Lengths and noise are fitted again after so many new points, or a tenth of all if that is more."""
-
-MEMORY = 100
-"""So many of the best points and so many of the latest count, unless more are asked for."""
-
-MOST_OWN = 16
-"""Up to so many coordinates have lengths of their own; more share one."""
+NOISES = (1e-4, 1e-2, 0.1, 0.5, 2.0)  # candidate variances of the noise, as shares of the signal's
+STRETCHES = (0.5, 2.0, 4.0)  # by how much one coordinate's length is changed on trial
+LONGEST = 8.0  # no length is more than this many times the root of the number of coordinates: it no longer matters then
+EVIDENCE = 1.0  # gain in log-likelihood that a coordinate's own length must bring; less would fit the noise
+REFIT = 5  # lengths and noise are fitted again after so many new points, or a tenth of all if that is more
+MEMORY = 100  # so many of the best points and so many of the latest count, unless more are asked for
+MOST_OWN = 16  # up to so many coordinates have lengths of their own; more share one
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,7 +126,7 @@ class Scales:
 @dataclass(frozen=True, eq=False)
 class Surrogate:
     """A fitted process at points (n, k) of the unit box: the Cholesky factor (n, n) of the kernel matrix with noise, of
-    signal variance 1; its inverse times the centred values (n,); mean and variance of the signal."""
+    signal variance 1; its inverse times the centred values (n,); mean and variance of the signal; log-likelihood."""
 
     space: Coordinates
     x: Tensor
@@ -156,6 +135,7 @@ class Surrogate:
     weights: Tensor
     mean: float
     variance: float
+    likelihood: float
 
     def predict(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Return mean and standard deviation (m,) of the noise-free objective at points (m, k)."""
@@ -201,8 +181,8 @@ class Observed:
             kept = _best_and_latest(values, MEMORY)
             scales, fitted = _best_scales(self.space, self.points[kept], values[kept]), n
         kept = _best_and_latest(values, self.memory)
-        found = fit(self.space, self.points[kept], values[kept], scales)
-        return found, replace(self, scales=scales, fitted=fitted)
+        surrogate = fit(self.space, self.points[kept], values[kept], scales)
+        return surrogate, replace(self, scales=scales, fitted=fitted)
 
 
 def _best_and_latest(values: Tensor, memory: int) -> Tensor:
@@ -221,40 +201,10 @@ def kernel(a: Tensor, b: Tensor) -> Tensor:
 
 
 def fit(space: Coordinates, x: Tensor, y: Tensor, scales: Scales | None = None) -> Surrogate:
-    """Return the process given values (n,) at points (n, k); the scales too are fitted unless they are given."""
+    """Return the process given values (n,) at points (n, k), mean and variance at their best; the scales too are fitted
+    unless they are given."""
     scales = scales or _best_scales(space, x, y)
-    factor, weights, mean, variance, _ = _solve(space, x, y, scales)
-    return Surrogate(space, x, scales, factor, weights, mean, variance)
-
-
-def _best_scales(space: Coordinates, x: Tensor, y: Tensor) -> Scales:
-    """The most likely common length and noise, then length by length what the evidence asks for."""
-    k = x.shape[1]
-    unit = math.sqrt(k)
-    tried = [Scales(torch.full((k,), unit * length).double(), noise) for length in LENGTHS for noise in NOISES]
-    best, score = _most_likely(space, x, y, tried)
-    for j in range(k if 1 < k <= MOST_OWN else 0):
-        changed = []
-        for stretch in STRETCHES:
-            lengths = best.lengths.clone()
-            lengths[j] = min(unit * LONGEST, float(lengths[j]) * stretch)
-            changed.append(Scales(lengths, best.noise))
-        other, higher = _most_likely(space, x, y, changed)
-        if higher > score + EVIDENCE:
-            best, score = other, higher
-    return best
-
-
-def _most_likely(space: Coordinates, x: Tensor, y: Tensor, tried: list[Scales]) -> tuple[Scales, float]:
-    scores = [_solve(space, x, y, scales)[4] for scales in tried]
-    best = max(range(len(tried)), key=scores.__getitem__)
-    return tried[best], scores[best]
-
-
-def _solve(space: Coordinates, x: Tensor, y: Tensor, scales: Scales) -> tuple[Tensor, Tensor, float, float, float]:
-    """Return the Cholesky factor, weights, mean, variance and log-likelihood, mean and variance at their best."""
-    points = space.embed(x, scales.lengths)
-    n = len(points)
+    points, n = space.embed(x, scales.lengths), len(x)
     matrix = kernel(points, points) + (scales.noise + 1e-8) * torch.eye(n, dtype=torch.float64)
     factor = torch.linalg.cholesky(matrix)
     both = torch.cholesky_solve(torch.stack([y.double(), torch.ones(n, dtype=torch.float64)], dim=1), factor)
@@ -262,4 +212,27 @@ def _solve(space: Coordinates, x: Tensor, y: Tensor, scales: Scales) -> tuple[Te
     weights = both[:, 0] - mean * both[:, 1]
     variance = max(float(weights @ (y.double() - mean)) / n, 1e-30)
     likelihood = -0.5 * n * math.log(variance) - float(factor.diagonal().log().sum())
-    return factor, weights, mean, variance, likelihood
+    return Surrogate(space, x, scales, factor, weights, mean, variance, likelihood)
+
+
+def _best_scales(space: Coordinates, x: Tensor, y: Tensor) -> Scales:
+    """The most likely common length and noise, then length by length what the evidence asks for."""
+    k = x.shape[1]
+    unit = math.sqrt(k)
+
+    def most_likely(tried: list[Scales]) -> Surrogate:
+        return max((fit(space, x, y, scales) for scales in tried), key=lambda fitted: fitted.likelihood)
+
+    best = most_likely(
+        [Scales(torch.full((k,), unit * length).double(), noise) for length in LENGTHS for noise in NOISES]
+    )
+    for j in range(k if 1 < k <= MOST_OWN else 0):
+        changed = []
+        for stretch in STRETCHES:
+            lengths = best.scales.lengths.clone()
+            lengths[j] = min(unit * LONGEST, float(lengths[j]) * stretch)
+            changed.append(Scales(lengths, best.scales.noise))
+        other = most_likely(changed)
+        if other.likelihood > best.likelihood + EVIDENCE:
+            best = other
+    return best.scales

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from advsearch.scene.assets import Material, ObjectAsset, Rig
+from advsearch.scene.assets import Material, MeshRig, ObjectAsset
 from advsearch.scene.library import BUNDLED_OBJECT, finished
 
 from .atlas import SIZE, joined, pack, painted
@@ -34,7 +34,7 @@ class Instance:
     material: Material
     detail: Mapping[str, float] = field(default_factory=dict)
     finishes: Mapping[str, Material] = field(default_factory=dict)
-    rig: Rig | None = None
+    rig: MeshRig | None = None
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import partial
+from itertools import permutations
 from typing import Any
 
 import numpy as np
@@ -20,30 +21,22 @@ import torch
 from torch import Tensor, nn
 
 from advsearch.errors import InputError, ModelError
-from advsearch.models.model import ModelWarning
-from advsearch.models.probe import first_line
+from advsearch.models.model import warn
+from advsearch.models.probe import foreign
 from advsearch.models.source import Purpose, Source, source_of
-from advsearch.models.zoo.library import Loaded, Measured, measured
+from advsearch.models.zoo.library import Loaded, Measured, measured, nearly
 from advsearch.models.zoo.zero_shot import spoken
 
-QUESTION = "What is this? Answer with its name only."
-"""What is asked where nothing else is said."""
+QUESTION = "What is this? Answer with its name only."  # what is asked where nothing else is said
 
 SIDE = 448
 """Side in pixels of pictures for networks that take any size: a multiple of 28 and of 32, the cells of Qwen's."""
 
-TOLERANCE = 1e-4
-"""What a log-likelihood may be off from the network's own for the whole text, as a share of itself or of 1."""
-
 LEVELS = 0.05
 """What values of pixels may be off from the processor's for 8-bit pictures, as a share of the largest: it rounds."""
 
-
-CHECKED = "a coffee mug"
-"""What is read after the prompt to see that a network which answers freely goes on as it reads."""
-
-LARGE = 500_000_000
-"""Weights from which on a run says how many there are, and how long an answer takes."""
+CHECKED = "a coffee mug"  # what is read after the prompt to see that a network which answers freely goes on as it reads
+LARGE = 500_000_000  # weights from which on a run says how many there are, and how long an answer takes
 
 
 def speaks(architecture: str, network: Any) -> bool:
@@ -72,24 +65,28 @@ def source(loaded: Loaded) -> Source:
 
 def _asked(loaded: Loaded, processor: Any, purpose: Purpose) -> Source:
     purpose.check(loaded.name, "goes on in words", "classification", "answer")
-    free, names = purpose.task == "answer", purpose.names
-    if free and names is not None:
-        raise InputError("labels: task answer has no classes; leave them out, and say the right words with `label`")
+    free, names = purpose.is_free(), purpose.names
     if not free and (names is None or len(names) < 2):
         raise InputError(
             f"labels: expected two names at least, such as mug,cup,bowl, of which model {loaded.name} chooses one, got "
             f"{'none' if names is None else repr(names[0])}; with `task=answer` it answers freely"
         )
-    if len(purpose.prompts or ()) > 1:
-        raise InputError(f"prompt: expected one question for model {loaded.name}, got {len(purpose.prompts or ())}")
-    try:
-        text = _written(processor, (purpose.prompts or (QUESTION,))[0])
+    question = purpose.one_prompt(loaded.name) or QUESTION
+    kind = type(loaded.network).__name__
+    with foreign(f"model {loaded.spec}: is a {kind}, which can't be asked about a picture as LLaVA can"):
+        text = _written(processor, question)
         pixels, described = _pictures(loaded, processor, text)
         reader = _Reader(loaded.network, partial(_inputs, processor, text), pixels)
         side = described.get("input_size", (SIDE, SIDE))
         prompt = reader.prompt(side)["input_ids"][0].tolist()
         tokens = _tokens(processor, text, prompt, names or (CHECKED,), side)
-        _check_length(loaded, len(prompt) + max(purpose.tokens if free else 0, *map(len, tokens)))
+        most = getattr(loaded.network.config.get_text_config(), "max_position_embeddings", None)
+        length = len(prompt) + max(purpose.tokens if free else 0, *map(len, tokens))
+        if isinstance(most, int) and length > most:
+            raise InputError(
+                f"prompt: expected picture, prompt and name to have at most {most} tokens for model {loaded.name}, "
+                f"got {length}"
+            )
         named = _Named(reader, tokens)
         module = _Free(reader, processor.tokenizer, _ends(loaded.network), purpose.tokens) if free else named
         with torch.no_grad():
@@ -97,23 +94,14 @@ def _asked(loaded: Loaded, processor: Any, purpose: Purpose) -> Source:
             begun = time.perf_counter()
             module(torch.zeros((1, 3, *side)))
             seconds = time.perf_counter() - begun
-    except (InputError, ModelError):
-        raise
-    except Exception as error:  # any network may raise anything
-        raise ModelError(
-            f"model {loaded.spec}: is a {type(loaded.network).__name__}, which can't be asked about a picture as LLaVA "
-            f"can ({first_line(error)})"
-        ) from error
     if names is not None:
         _say_what_begins_another(tokens, names, loaded.name)
     weights = list(loaded.network.parameters())
-    if (count := sum(one.numel() for one in weights)) >= LARGE:
-        size = sum(one.nbytes for one in weights)
-        warnings.warn(
+    if (count := sum(tensor.numel() for tensor in weights)) >= LARGE:
+        size = sum(tensor.nbytes for tensor in weights)
+        warn(
             f"model {loaded.name} has {count / 1e9:.3g} billion weights, {size / 1e9:.3g} GB, and took {seconds:.2g} s "
-            "to answer one picture here; a gradient takes longer",
-            ModelWarning,
-            stacklevel=4,
+            "to answer one picture here; a gradient takes longer"
         )
     return source_of(module, loaded.name, labels=names, batch_limits=(1, 1), **described)
 
@@ -142,11 +130,9 @@ Pixels = Callable[[Tensor], Tensor]
 
 
 def _pictures(loaded: Loaded, processor: Any, text: str) -> tuple[Pixels, Measured]:
-    """Return what makes ``pixel_values`` of a picture (3, H, W), and what `Preprocessing` does before.
-
-    An affine map is measured and left to that. What cuts a picture into patches or tiles is called itself, which is
-    differentiable where the processor works with torchvision.
-    """
+    """Return what makes ``pixel_values`` of a picture (3, H, W), and what `Preprocessing` does before. An affine map is
+    measured and left to that. What cuts a picture into patches or tiles is called itself, which is differentiable where
+    the processor works with torchvision."""
     side = getattr(getattr(loaded.network.config, "vision_config", None), "image_size", None) or SIDE
     side = (int(side[0]), int(side[1])) if isinstance(side, (list, tuple)) else (int(side), int(side))
     described = Measured()
@@ -195,50 +181,37 @@ def _check_pixels(loaded: Loaded, processor: Any, text: str, pixels: Pixels, des
 def _tokens(
     processor: Any, text: str, prompt: Sequence[int], names: Sequence[str], side: tuple[int, int]
 ) -> list[list[int]]:
-    """Return the tokens of each name where it follows the prompt, with a blank between them unless one is there.
-
-    They are those that the whole text has more than the prompt; where it does not begin with the prompt's, as a
-    processor may end a text with a line's end, those of the name alone.
-    """
+    """Return the tokens of each name where it follows the prompt, with a blank between them unless one is there. They
+    are those that the whole text has more than the prompt; where it does not begin with the prompt's, as a processor
+    may end a text with a line's end, those of the name alone."""
     tokenizer = processor.tokenizer
     gap = "" if text[-1:].isspace() or prompt[-1] in tokenizer.all_special_ids else " "
     grey = np.full((*side, 3), 128, np.uint8)
     begun = tokenizer(text, verbose=False)["input_ids"]
-    found: list[list[int]] = []
-    for name in spoken(names):
+    words = spoken(names)
+    # whether what the processor adds stands before or behind
+    processed = _inputs(processor, f"{text}{gap}{words[0]}", grey)["input_ids"][0].tolist()
+    joined = processed[: len(prompt)] == list(prompt)
+    each: list[list[int]] = []
+    for name in words:
         whole = tokenizer(f"{text}{gap}{name}", verbose=False)["input_ids"]
-        if not found:  # whether what the processor adds stands before or behind
-            asked = _inputs(processor, f"{text}{gap}{name}", grey)["input_ids"][0].tolist()
-            joined = asked[: len(prompt)] == list(prompt)
         follows = joined and whole[: len(begun)] == begun
         tokens = whole[len(begun) :] if follows else tokenizer(name, add_special_tokens=False)["input_ids"]
         if not tokens:
             raise InputError(f"labels: expected names that the network has tokens for, got {name!r}")
-        found.append(tokens)
-    return found
-
-
-def _check_length(loaded: Loaded, count: int) -> None:
-    most = getattr(loaded.network.config.get_text_config(), "max_position_embeddings", None)
-    if isinstance(most, int) and count > most:
-        raise InputError(
-            f"prompt: expected picture, prompt and name to have at most {most} tokens for model {loaded.name}, "
-            f"got {count}"
-        )
+        each.append(tokens)
+    return each
 
 
 def _say_what_begins_another(tokens: Sequence[Sequence[int]], names: Sequence[str], name: str) -> None:
     """Warn of a name whose tokens begin another's: its likelihood is that of both."""
-    for first, short in enumerate(tokens):
-        for second, long in enumerate(tokens):
-            if first != second and list(long[: len(short)]) == list(short):
-                warnings.warn(
-                    f"model {name} reads {names[first]!r} (#{first}) as the beginning of {names[second]!r} "
-                    f"(#{second}): whoever says the second has said the first",
-                    ModelWarning,
-                    stacklevel=5,
-                )
-                return
+    for (first, short), (second, long) in permutations(enumerate(tokens), 2):
+        if list(long[: len(short)]) == list(short):
+            warn(
+                f"model {name} reads {names[first]!r} (#{first}) as the beginning of {names[second]!r} "
+                f"(#{second}): whoever says the second has said the first"
+            )
+            return
 
 
 # ---- the network ----------------------------------------------------------------------------------------------------
@@ -289,32 +262,28 @@ class _Reader(nn.Module):
 
 
 class _Named(nn.Module):
-    """Logits (N, names): the log-likelihood of each name after picture and prompt, summed over its tokens.
-
-    Picture and prompt are read once. What begins a name (all of its tokens but the last) is read after it, once for all
-    names that begin so, and all such beginnings at once: names of one token need nothing more.
-    """
+    """Logits (N, names): the log-likelihood of each name after picture and prompt, summed over its tokens. Picture and
+    prompt are read once. What begins a name (all of its tokens but the last) is read after it, once for all names that
+    begin so, and all such beginnings at once: names of one token need nothing more."""
 
     def __init__(self, reader: _Reader, tokens: Sequence[Sequence[int]]) -> None:
         super().__init__()
-        self.reader, self.tokens = reader, [list(one) for one in tokens]
-        begun = {tuple(one[:-1]) for one in tokens if len(one) > 1}
-        stems = sorted(one for one in begun if not any(other[: len(one)] == one for other in begun - {one}))
+        self.reader, self.tokens = reader, [list(name) for name in tokens]
+        begun = {tuple(name[:-1]) for name in tokens if len(name) > 1}
+        stems = sorted(stem for stem in begun if not any(other[: len(stem)] == stem for other in begun - {stem}))
         length, most = max(map(len, stems), default=0), max(map(len, tokens))
-        self.register_buffer("stems", torch.tensor([[*one, *[0] * (length - len(one))] for one in stems]).long())
         rows = torch.zeros((len(tokens), most), dtype=torch.long)
         columns, counts = torch.zeros_like(rows), torch.zeros_like(rows)
-        for number, one in enumerate(tokens):
-            stem = next((k for k, stem in enumerate(stems) if stem[: len(one) - 1] == tuple(one[:-1])), 0)
-            for place, token in enumerate(one):
+        for number, name in enumerate(tokens):
+            stem = next((k for k, stem in enumerate(stems) if stem[: len(name) - 1] == tuple(name[:-1])), 0)
+            for place, token in enumerate(name):
                 rows[number, place] = 1 + stem * length + place - 1 if place else 0
                 columns[number, place], counts[number, place] = token, 1
-        for key, value in (("rows", rows), ("columns", columns), ("counts", counts)):
-            self.register_buffer(key, value)
+        padded = torch.tensor([[*stem, *[0] * (length - len(stem))] for stem in stems]).long()
+        self._places = padded, rows, columns, counts
 
     def forward(self, images: Tensor) -> Tensor:
-        kept = (self.get_buffer(key).to(images.device) for key in ("stems", "rows", "columns", "counts"))
-        stems, rows, columns, counts = kept
+        stems, rows, columns, counts = (numbers.to(images.device) for numbers in self._places)
         scores = []
         for image in images:
             first, past = self.reader.begin(image)
@@ -346,11 +315,11 @@ class _Free(nn.Module):
 
     def begins(self, word: str) -> list[int]:
         """Return the tokens that begin a word, in small letters or with a capital, after a blank or without one."""
-        found: set[int] = set()
+        first: set[int] = set()
         for form in {word, word.capitalize(), f" {word}", f" {word.capitalize()}"}:
-            numbers = self.tokenizer(form, add_special_tokens=False)["input_ids"]
-            found.update([one for one in numbers if self.tokenizer.decode([one]).strip()][:1])
-        return sorted(found - {self.tokenizer.unk_token_id})
+            tokens = self.tokenizer(form, add_special_tokens=False)["input_ids"]
+            first.update([token for token in tokens if self.tokenizer.decode([token]).strip()][:1])
+        return sorted(first - {self.tokenizer.unk_token_id})
 
 
 def _ends(network: Any) -> frozenset[int]:
@@ -360,9 +329,9 @@ def _ends(network: Any) -> frozenset[int]:
 
 def _check(loaded: Loaded, module: _Named, side: tuple[int, int]) -> None:
     """Raise a ModelError where the network itself finds the longest name otherwise likely, read with the prompt."""
-    reader, number = module.reader, max(range(len(module.tokens)), key=lambda one: len(module.tokens[one]))
+    number, longest = max(enumerate(module.tokens), key=lambda numbered: len(numbered[1]))
     image = torch.rand((3, *side), generator=torch.Generator().manual_seed(0))
-    given, name = reader.given(image), torch.tensor(module.tokens[number], device=loaded.network.device)
+    given, name = module.reader.given(image), torch.tensor(longest, device=loaded.network.device)
     whole = {**given, "input_ids": torch.cat([given["input_ids"], name[None]], dim=1)}
     for key, value in given.items():
         if key in ("attention_mask", "mm_token_type_ids", "token_type_ids"):
@@ -373,9 +342,8 @@ def _check(loaded: Loaded, module: _Named, side: tuple[int, int]) -> None:
     if logits.shape[1] != whole["input_ids"].shape[1]:
         raise _another(loaded, "returns logits of another length than the text has")
     likely = logits[0, -len(name) - 1 : -1].float().log_softmax(dim=-1)
-    own, ours = float(likely.gather(1, name[:, None]).sum()), float(module(image[None])[0, number])
-    size = max(TOLERANCE, 8.0 * torch.finfo(loaded.network.dtype).eps) * max(1.0, abs(own))
-    if not abs(own - ours) <= size:
+    own, ours = likely.gather(1, name[:, None]).sum().double(), module(image[None])[0, number].double()
+    if not nearly(own, ours, max(1.0, abs(float(own))), loaded.network.dtype):
         raise _another(loaded, f"goes on otherwise after what it has kept ({ours:.6g} for {own:.6g})")
 
 

@@ -10,6 +10,7 @@ import contextlib
 import importlib
 import logging
 import os
+import re
 import socket
 import threading
 import warnings
@@ -24,10 +25,10 @@ import torch
 from torch import Tensor, nn
 
 from advsearch.errors import ModelError
-from advsearch.models.model import ModelWarning, Triple
+from advsearch.models.model import Triple, warn
 from advsearch.models.probe import first_line
 from advsearch.models.source import Purpose, Source, source_of
-from advsearch.registry import may_fetch
+from advsearch.registry import how_to_allow, may_fetch
 
 
 def library(name: str, spec: str, extra: str) -> Any:
@@ -49,19 +50,20 @@ def library(name: str, spec: str, extra: str) -> Any:
 @contextlib.contextmanager
 def without_unpickling() -> Iterator[None]:
     """Hold `torch.load` to tensors and plain containers, whoever calls it and whatever it asks for."""
-    changed = {"TORCH_FORCE_WEIGHTS_ONLY_LOAD": "1", "TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD": None}
-    before = {key: os.environ.get(key) for key in changed}
-    _set_environment(changed)
+    switches = ("TORCH_FORCE_WEIGHTS_ONLY_LOAD", "TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD")
+    before = {key: os.environ.pop(key) for key in switches if key in os.environ}
+    os.environ[switches[0]] = "1"
     try:
         yield
     finally:
-        _set_environment(before)
+        for key in switches:
+            os.environ.pop(key, None)
+        os.environ.update(before)
 
 
 @contextlib.contextmanager
 def connecting(allowed: bool, tries: list[object]) -> Iterator[None]:
-    """Let this thread connect to nobody inside the block, unless that is allowed: what a library has in its cache is
-    read all the same. Each try is noted in `tries`."""
+    """Let this thread connect to nobody inside the block, unless that is allowed; each try is noted in `tries`."""
     if allowed:
         yield
         return
@@ -102,8 +104,8 @@ def reading(spec: str, advice: str) -> Iterator[None]:
     except Exception as error:  # a library raises nearly anything for what is not there or damaged
         if tries:
             raise ModelError(
-                f"a file names the model {spec}, which is not on this machine and would be fetched; if you trust it, "
-                f"allow it yourself: in Python with advsearch.allow_code({spec!r}), or with `code={spec}`"
+                f"a file names the model {spec}, which is not on this machine and would be fetched; "
+                f"{how_to_allow(spec)}"
             ) from error
         raise ModelError(
             f"model {spec}: cannot be fetched or read ({first_line(error)}). Weights come from the library's cache on "
@@ -113,24 +115,12 @@ def reading(spec: str, advice: str) -> Iterator[None]:
         logging.disable(disabled)
 
 
-def _set_environment(values: dict[str, str | None]) -> None:
-    for key, value in values.items():
-        if value is None:
-            os.environ.pop(key, None)
-        else:
-            os.environ[key] = value
-
-
 Array = npt.NDArray[np.float64]
 
-SIDES = (96, 160)
-"""Sides in pixels of the square pictures that a processor is shown."""
-
-TOLERANCE = 1e-3
-"""Of the range of a processor's outputs: what it may be off from an affine map."""
-
-FILES = ("preprocessor_config.json", "processor_config.json")
-"""Where a repository keeps its processor."""
+SIDES = (96, 160)  # in pixels, of the square pictures that a processor is shown
+TOLERANCE = 1e-3  # of the range of a processor's outputs: what it may be off from an affine map
+ROUNDING = 1e-4  # what scores that are worked out of a network's parts may be off from its own, as a share
+FILES = ("preprocessor_config.json", "processor_config.json")  # where a repository keeps its processor
 
 
 class Measured(TypedDict, total=False):
@@ -145,13 +135,15 @@ class Measured(TypedDict, total=False):
 
 def processor_of(transformers: Any, name: str, where: Mapping[str, Any]) -> Any:
     """Return the image processor of a repository or a folder; None where it has none. It never runs code of its own."""
-    there = (
-        transformers.utils.cached_file(name, file, _raise_exceptions_for_missing_entries=False, **where)
-        for file in FILES
-    )
-    if not any(there):
+    if not any(cached_file(transformers, name, file, where) for file in FILES):
         return None
     return transformers.AutoImageProcessor.from_pretrained(name, trust_remote_code=False, **where)
+
+
+def cached_file(transformers: Any, name: str, file: str, where: Mapping[str, Any]) -> str | None:
+    """Return the path of a file of a repository or a folder; None where it has none."""
+    path: str | None = transformers.utils.cached_file(name, file, _raise_exceptions_for_missing_entries=False, **where)
+    return path
 
 
 def measured(processor: Any, spec: str) -> Measured:
@@ -168,23 +160,22 @@ def measured(processor: Any, spec: str) -> Measured:
         return _processed(processor, np.full((side, side, 3), colour, np.uint8), spec)
 
     black = shown((0, 0, 0))
-    found = Measured()
+    size = Measured()
     if black.shape == shown((0, 0, 0), SIDES[1]).shape:  # and not just as large as what it was shown
-        found["input_size"] = (black.shape[1], black.shape[2])
+        size["input_size"] = (black.shape[1], black.shape[2])
     offset = black.mean(axis=(1, 2))
-    slopes = [shown(one).mean(axis=(1, 2)) - offset for one in ((255, 0, 0), (0, 255, 0), (0, 0, 255))]
+    slopes = [shown(colour).mean(axis=(1, 2)) - offset for colour in ((255, 0, 0), (0, 255, 0), (0, 0, 255))]
     gains: Array = np.stack(slopes, axis=1)  # what goes in across, what comes out down
-    size = max(float(np.abs(gains).max()), 1e-12)
+    tolerance = TOLERANCE * max(float(np.abs(gains).max()), 1e-12)
     for level in (51, 128, 255):
-        seen = shown((level, level, level))
-        asked = offset + gains.sum(axis=1) * (level / 255.0)
-        if np.abs(seen - asked[:, None, None]).max() > TOLERANCE * size:
-            return _called(processor, spec, found, "changes pixels by something else than a gain and an offset")
+        affine = offset + gains.sum(axis=1) * (level / 255.0)
+        if np.abs(shown((level, level, level)) - affine[:, None, None]).max() > tolerance:
+            return _called(processor, spec, size, "changes pixels by something else than a gain and an offset")
     orders = {"RGB": gains, "BGR": gains[:, ::-1]}
-    own = [name for name, one in orders.items() if np.abs(one - np.diag(np.diag(one))).max() <= TOLERANCE * size]
-    if len(own) != 1 or (gain := np.diag(orders[own[0]])).min() <= 0.0:
-        return _called(processor, spec, found, "mixes the channels of a picture, or turns it into its negative")
-    return Measured(mean=_triple(-offset / gain), std=_triple(1.0 / gain), channels=own[0], **found)
+    diagonal = [name for name, gain in orders.items() if np.abs(gain - np.diag(np.diag(gain))).max() <= tolerance]
+    if len(diagonal) != 1 or (gain := np.diag(orders[diagonal[0]])).min() <= 0.0:
+        return _called(processor, spec, size, "mixes the channels of a picture, or turns it into its negative")
+    return Measured(mean=_triple(-offset / gain), std=_triple(1.0 / gain), channels=diagonal[0], **size)
 
 
 def _processed(processor: Any, picture: Any, spec: str) -> Array:
@@ -196,14 +187,14 @@ def _processed(processor: Any, picture: Any, spec: str) -> Array:
     return picked
 
 
-def _called(processor: Any, spec: str, found: Measured, what: str) -> Measured:
-    """Return what was found, with the processor to be called on a picture of that size."""
-    height, width = found.get("input_size", (SIDES[0], SIDES[0]))
+def _called(processor: Any, spec: str, size: Measured, what: str) -> Measured:
+    """Return the size that was found, with the processor to be called on a picture of it."""
+    height, width = size.get("input_size", (SIDES[0], SIDES[0]))
     ends = [_processed(processor, np.full((SIDES[0], SIDES[0], 3), level, np.uint8), spec) for level in (0, 255)]
     if (ends[0] == ends[1]).all(axis=0).any():
         raise _other(spec, processor, "pads a square picture, or leaves some of its pixels out")
     levels = np.random.default_rng(0).integers(0, 256, (height, width, 3), np.uint8)
-    asked = _processed(partial(processor, **_as_it_is(processor)), levels, spec)
+    expected = _processed(partial(processor, **_as_it_is(processor)), levels, spec)
     picture = (torch.from_numpy(levels).float() / 255.0).movedim(2, 0)[None].requires_grad_()
     call = partial(_process, processor)
     try:
@@ -214,16 +205,16 @@ def _called(processor: Any, spec: str, found: Measured, what: str) -> Measured:
         pil = getattr(processor, "backend", None) == "pil"
         advice = "; with torchvision installed, transformers takes one that may" if pil else ""
         raise _other(spec, processor, f"{what}, and lets no gradient through ({first_line(error)}){advice}") from error
-    off = np.abs(seen.detach().double().numpy() - asked).max() if seen.shape == (1, *asked.shape) else np.inf
-    if not reaches or not off <= TOLERANCE * np.ptp(asked):
+    off = np.abs(seen.detach().double().numpy() - expected).max() if seen.shape == (1, *expected.shape) else np.inf
+    if not reaches or not off <= TOLERANCE * np.ptp(expected):
         raise _other(spec, processor, f"{what}, and rounds or does otherwise where a gradient goes through it")
-    return Measured(processor=call, **found)
+    return Measured(processor=call, **size)
 
 
 def _process(processor: Any, images: Tensor) -> Tensor:
     """Return what a processor returns for pictures (N, 3, H, W) in [0, 1]: it is shown numbers up to 255, unrounded."""
     does = partial(processor, return_tensors="pt", **_as_it_is(processor))
-    return torch.cat([does(images=255.0 * one)["pixel_values"] for one in images]).to(images)
+    return torch.cat([does(images=255.0 * image)["pixel_values"] for image in images]).to(images)
 
 
 def _as_it_is(processor: Any) -> dict[str, bool]:
@@ -244,10 +235,18 @@ def _other(spec: str, processor: Any, what: str) -> ModelError:
     )
 
 
-UNPREPARED = (
-    "model {spec} comes without an image processor: pictures are given as they are, RGB in [0, 1]. Say `mean`, `std` "
-    "and `input_size` of load_model if it wants them otherwise"
-)
+Ask = Callable[[Any, Tensor], Any]  # what asks a network about pictures (N, 3, H, W)
+
+
+class Adapted(nn.Module):
+    """A network of a library, asked as that one's are; `boxes` says that its boxes are corners in pixels."""
+
+    def __init__(self, network: nn.Module, ask: Ask, *, boxes: bool = False) -> None:
+        super().__init__()
+        self.network, self.ask, self.boxes_are_corners_in_pixels = network, ask, boxes
+
+    def forward(self, images: Tensor) -> Any:
+        return self.ask(self.network, images)
 
 
 @dataclass(frozen=True, eq=False)
@@ -270,32 +269,46 @@ class Loaded:
 
     @cached_property
     def described(self) -> Measured:
-        """What is done to pictures.
-
-        Raises:
-            ModelError: see `measured`.
-
-        Warns:
-            ModelWarning: it has no image processor.
-        """
+        """What is done to pictures. Raises ModelError as `measured`; warns where there is no image processor."""
         if self.processor is None:
-            warnings.warn(UNPREPARED.format(spec=self.spec), ModelWarning, stacklevel=4)
+            warn(
+                f"model {self.spec} comes without an image processor: pictures are given as they are, RGB in [0, 1]. "
+                "Say `mean`, `std` and `input_size` of load_model if it wants them otherwise"
+            )
             return Measured()
         return measured(self.processor, self.spec)
 
-    def source(self, module: nn.Module, **fields: Any) -> Source:
-        """Return the source of a module that is given pictures as the network wants them; `fields` go to `Source`."""
-        return source_of(module, self.name, **{**self.described, **fields})
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of its classes, as its ``config`` has them; none where transformers only numbers them."""
+        labels = getattr(self.network.config, "id2label", None) or {}
+        names = tuple(str(labels[key]) for key in sorted(labels, key=int))
+        return () if all(re.fullmatch(r"LABEL_\d+", name) for name in names) else names
+
+    def sized(self, config: Any) -> Measured:
+        """Return what is done to pictures, of the size in a part of the network's ``config`` if no other is known."""
+        side = getattr(config, "image_size", None)
+        sides = (side, side) if isinstance(side, int) else tuple(side or ())
+        return Measured(**{**({"input_size": sides} if sides else {}), **self.described})  # type: ignore[typeddict-item]
+
+    def source(self, ask: Ask, *, boxes: bool = False, **fields: Any) -> Source:
+        """Return the source of the network as `Adapted` asks it, given pictures as it wants them; `fields` go to
+        `Source`."""
+        return source_of(Adapted(self.network, ask, boxes=boxes), self.name, **{**self.described, **fields})
 
     def when_named(self, named: Callable[[Any, Any, str, Measured, Purpose], Source]) -> Source:
         """Return the source of a network that reads texts, which is built when the user's names are there: of the
         network, its tokenizer, its name, what is done to pictures, and the purpose."""
-        tokenizer, described = self.part("AutoTokenizer"), self.described
-        side = getattr(getattr(self.network.config, "vision_config", None), "image_size", None)
-        if "input_size" not in described and isinstance(side, int):
-            described = Measured(**{**described, "input_size": (side, side)})
+        tokenizer = self.part("AutoTokenizer")
+        described = self.sized(getattr(self.network.config, "vision_config", None))
         finish = partial(named, self.network, tokenizer, self.name, described)
         return Source(self.network, self.name, finish=finish, reads_text=True)
+
+
+def nearly(own: Tensor, ours: Tensor, size: float, dtype: torch.dtype) -> bool:
+    """Whether a network's own scores, and those that we work out of its parts in its type, are the same but for
+    rounding, as a share of a size."""
+    return bool((own - ours).abs().max() <= max(ROUNDING, 8.0 * torch.finfo(dtype).eps) * size)
 
 
 def in_pixels(boxes: Tensor, images: Tensor) -> Tensor:

@@ -9,30 +9,26 @@ from __future__ import annotations
 import inspect
 import math
 import re
-import warnings
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional
 
 from advsearch.errors import InputError, ModelError
-from advsearch.models.model import SMALLEST_PROBABILITY, Model, ModelWarning
+from advsearch.models.model import SMALLEST_PROBABILITY, Model, warn
 from advsearch.models.source import Purpose, Source
 from advsearch.models.zoo import zero_shot
-from advsearch.models.zoo.library import Loaded, Measured
+from advsearch.models.zoo.library import Loaded
 
-TASK = "similarity"
-"""The task that compares features."""
+TASK = "similarity"  # the task that compares features
 
 ENDINGS = ("Model", "ModelWithProjection")
-PARTS = ("image_embeds", "pooler_output", "last_hidden_state")
-"""What holds the features in outputs of transformers, the best first."""
-
-TOKENS = ("cls_token", "class_embedding", "class_token")
-"""How weights of a first token are called that stands for the whole picture."""
+PARTS = ("image_embeds", "pooler_output", "last_hidden_state")  # of outputs that hold the features, the best first
+TOKENS = ("cls_token", "class_embedding", "class_token")  # weights of a first token that stands for the whole picture
 
 
 def gives_features(architecture: str, network: Any) -> bool:
@@ -44,18 +40,13 @@ def gives_features(architecture: str, network: Any) -> bool:
     return getattr(network, "main_input_name", None) == "pixel_values" and not finds
 
 
-def source(loaded: Loaded) -> Source:
-    """Return the source of a network that has nothing but features."""
-    return Source(loaded.network, loaded.name, finish=partial(_finished, loaded, None))
+Make = Callable[[Loaded], Source]
 
 
-def also(plain: Callable[[Loaded], Source], *, reads_text: bool = False) -> Callable[[Loaded], Source]:
-    """Return what makes the source of a network: that of its features where these are compared, else `plain`'s."""
-
-    def made(loaded: Loaded) -> Source:
-        return Source(loaded.network, loaded.name, finish=partial(_finished, loaded, plain), reads_text=reads_text)
-
-    return made
+def source(loaded: Loaded, plain: Make | None = None, *, reads_text: bool = False) -> Source:
+    """Return the source of a network that has features: of these where they are compared, else `plain`'s, if it has
+    anything else."""
+    return Source(loaded.network, loaded.name, finish=partial(_finished, loaded, plain), reads_text=reads_text)
 
 
 def no_classes(name: str, what: str) -> ModelError:
@@ -67,27 +58,25 @@ def no_classes(name: str, what: str) -> ModelError:
     )
 
 
-def _finished(loaded: Loaded, plain: Callable[[Loaded], Source] | None, purpose: Purpose) -> Source | Model:
-    if purpose.task == TASK:
-        if purpose.prompts is not None:
-            raise InputError(f"prompt: task {TASK} compares pictures and reads no text; leave `prompt` out")
-        network = loaded.network
-        part, config = network, network.config
-        if zero_shot.compares(network):
-            zero_shot.check_takes_pictures(network, loaded.spec)
-            config = getattr(config, "vision_config", config)
-        elif "ForImageClassification" in type(network).__name__:
-            part = network.base_model if network.base_model is not network else getattr(network, "vision_model", None)
-            if part is None:
-                raise ModelError(f"model {loaded.spec}: has no part before its head; give its network without one")
-        described, side = loaded.described, getattr(config, "image_size", None)
-        if "input_size" not in described and isinstance(side, int):
-            described = Measured(**{**described, "input_size": (side, side)})
-        return loaded.source(_Features(part), **described)
-    if plain is None:
-        raise no_classes(loaded.name, f"is a {type(loaded.network).__name__}")
-    found = plain(loaded)
-    return found if found.finish is None else found.finish(purpose)
+def _finished(loaded: Loaded, plain: Make | None, purpose: Purpose) -> Source | Model:
+    network = loaded.network
+    if purpose.task != TASK:
+        if plain is None:
+            raise no_classes(loaded.name, f"is a {type(network).__name__}")
+        made = plain(loaded)
+        return made if made.finish is None else made.finish(purpose)
+    if purpose.prompts is not None:
+        raise InputError(f"prompt: task {TASK} compares pictures and reads no text; leave `prompt` out")
+    part, config = network, network.config
+    if zero_shot.compares(network):
+        zero_shot.check_takes_pictures(network, loaded.spec)
+        config = getattr(config, "vision_config", config)
+    elif "ForImageClassification" in type(network).__name__:
+        part = network.base_model if network.base_model is not network else getattr(network, "vision_model", None)
+        if part is None:
+            raise ModelError(f"model {loaded.spec}: has no part before its head; give its network without one")
+    token = any(word in name for name, _ in part.named_parameters() for word in TOKENS)
+    return replace(loaded, network=part).source(partial(_features, token=token), **loaded.sized(config))
 
 
 def pooled(returned: Any, *, token: bool) -> Tensor | None:
@@ -103,20 +92,10 @@ def pooled(returned: Any, *, token: bool) -> Tensor | None:
     return returned if isinstance(returned, Tensor) else None
 
 
-class _Features(nn.Module):
-    """Features (N, D): those that the network gives, else the first token where that stands for the picture, else the
-    mean over positions."""
-
-    def __init__(self, network: Any) -> None:
-        super().__init__()
-        self.network, self.compares = network, zero_shot.compares(network)
-        self.has_token = any(one in name for name, _ in network.named_parameters() for one in TOKENS)
-
-    def forward(self, images: Tensor) -> Tensor:
-        asked = self.network.get_image_features if self.compares else self.network
-        returned = asked(pixel_values=images)
-        found = pooled(returned, token=self.has_token)
-        return returned if found is None else found
+def _features(network: Any, images: Tensor, *, token: bool) -> Any:
+    returned = (network.get_image_features if zero_shot.compares(network) else network)(pixel_values=images)
+    features = pooled(returned, token=token)
+    return returned if features is None else features
 
 
 DISPARITY, METRIC = "relative disparity", "metric depth"
@@ -127,43 +106,33 @@ BY_FAMILY = {"dpt": DISPARITY, "depth_pro": DISPARITY, "zoedepth": METRIC, "glpn
 
 
 def depth_source(loaded: Loaded) -> Source:
-    """Return the source of a network that returns how far each pixel is."""
-    return loaded.source(_DepthMap(loaded.network, bool(getattr(loaded.processor, "do_pad", False))))
+    """Return the source of a network that returns how far each pixel is: a mapping with numbers (N, h, w) under what
+    they are."""
+    config = loaded.network.config
+    said = {"relative": DISPARITY, "metric": METRIC}.get(getattr(config, "depth_estimation_type", ""), "")
+    kind = said or BY_FAMILY.get(config.model_type, "predicted_depth")
+    framed = bool(getattr(loaded.processor, "do_pad", False)) and config.model_type == "zoedepth"
+    return loaded.source(partial(_depth, kind=kind, framed=framed))
 
 
-class _DepthMap(nn.Module):
-    """A mapping with numbers (N, h, w) under what they are.
-
-    ZoeDepth is shown pictures with a mirrored border, which its processor adds (`padded`) and its post-processing
-    removes.
-    """
-
-    def __init__(self, network: Any, padded: bool) -> None:
-        super().__init__()
-        said = {"relative": DISPARITY, "metric": METRIC}.get(getattr(network.config, "depth_estimation_type", ""), "")
-        self.network, self.kind = network, (said or BY_FAMILY.get(network.config.model_type, "predicted_depth"))
-        self.padded = padded and network.config.model_type == "zoedepth"
-
-    def forward(self, images: Tensor) -> dict[str, Tensor]:
-        if not self.padded:
-            return {self.kind: self.network(pixel_values=images).predicted_depth}
-        height, width = images.shape[2:]
-        down, across = (int(math.sqrt(side / 2.0) * 3.0) for side in (height, width))
-        framed = functional.pad(images, (across, across, down, down), mode="reflect")
-        shown = functional.interpolate(framed, size=(height, width), mode="bilinear", align_corners=True)
-        found = self.network(pixel_values=shown).predicted_depth[:, None]
-        found = functional.interpolate(found, size=framed.shape[2:], mode="bicubic")
-        return {self.kind: found[:, 0, down : down + height, across : across + width]}
+def _depth(network: Any, images: Tensor, *, kind: str, framed: bool) -> dict[str, Tensor]:
+    """ZoeDepth is shown pictures with a mirrored border, which its processor adds and its post-processing removes."""
+    if not framed:
+        return {kind: network(pixel_values=images).predicted_depth}
+    height, width = images.shape[2:]
+    down, across = (int(math.sqrt(side / 2.0) * 3.0) for side in (height, width))
+    wide = functional.pad(images, (across, across, down, down), mode="reflect")
+    shown = functional.interpolate(wide, size=(height, width), mode="bilinear", align_corners=True)
+    depth = network(pixel_values=shown).predicted_depth[:, None]
+    depth = functional.interpolate(depth, size=wide.shape[2:], mode="bicubic")
+    return {kind: depth[:, 0, down : down + height, across : across + width]}
 
 
 OURS = re.compile(r"(Mask2Former|OneFormer|Eomt\w*)ForUniversalSegmentation|MaskFormerForInstanceSegmentation")
-"""The architectures, by name."""
+"""The architectures that return masks and their classes, by name."""
 
-FINE = (384, 384)
-"""Height and width to which transformers brings the masks of every Mask2Former before it adds them up."""
-
-SENTENCE = "the task is semantic"
-"""What OneFormer is told to do."""
+FINE = (384, 384)  # height and width to which transformers brings the masks of every Mask2Former before it adds them up
+SENTENCE = "the task is semantic"  # what OneFormer is told to do
 
 
 def is_ours(architecture: str, network: Any) -> bool:
@@ -171,52 +140,36 @@ def is_ours(architecture: str, network: Any) -> bool:
     return OURS.fullmatch(architecture) is not None
 
 
-def mask_source(loaded: Loaded, labels: tuple[str, ...] | None) -> Source:
+def mask_source(loaded: Loaded) -> Source:
     """Return the source of a network that returns masks and their classes. Warns what its scores are
     (ModelWarning)."""
-    warnings.warn(
+    warn(
         f"model {loaded.name} gives a pixel a score of each class, summed over its masks, which is no logit: its "
-        "logarithm is used, so that margins are logarithms of a ratio of scores",
-        ModelWarning,
-        stacklevel=3,
+        "logarithm is used, so that margins are logarithms of a ratio of scores"
     )
-    told = None
-    if loaded.network.config.model_type == "oneformer":
-        told = _told(loaded.part("AutoTokenizer"), loaded.network.config.task_seq_len)
-    return loaded.source(_MaskQueries(loaded.network, told), labels=labels)
+    sentence, config = None, loaded.network.config
+    if config.model_type == "oneformer":  # numbers of tokens (1, L), filled up with 0
+        fill = {"padding": "max_length", "max_length": config.task_seq_len, "truncation": True}
+        tokens = loaded.part("AutoTokenizer")([SENTENCE], return_tensors="pt", **fill)
+        sentence = torch.as_tensor(tokens["input_ids"] * tokens["attention_mask"])
+    return loaded.source(partial(_by_pixel, sentence=sentence), labels=loaded.names or None)
 
 
-def _told(tokenizer: Any, length: int) -> Tensor:
-    """Return `SENTENCE` as OneFormer reads it, (1, length): numbers of tokens, filled up with 0."""
-    given = tokenizer([SENTENCE], padding="max_length", max_length=length, truncation=True, return_tensors="pt")
-    return torch.as_tensor(given["input_ids"] * given["attention_mask"])
-
-
-class _MaskQueries(nn.Module):
-    """Logarithms of scores (N, classes, H, W) of each pixel of the input.
+def _by_pixel(network: Any, images: Tensor, *, sentence: Tensor | None) -> Tensor:
+    """Return logarithms of scores (N, classes, H, W) of each pixel of the input.
 
     The score of a class is the sum over queries of the probability that it is a query's, times the probability that the
     pixel is in that one's mask (Cheng et al. 2021, arXiv 2107.06278, section 3.4, "semantic inference"). Sizes are
-    changed where `post_process_semantic_segmentation` of each family changes them. A network of several tasks is told
-    its own in tokens (1, L).
+    changed where `post_process_semantic_segmentation` of each family changes them.
     """
-
-    told: Tensor | None
-
-    def __init__(self, network: Any, told: Tensor | None) -> None:
-        super().__init__()
-        self.network, self.family = network, str(network.config.model_type)
-        self.register_buffer("told", told)
-
-    def forward(self, images: Tensor) -> Tensor:
-        size = (images.shape[2], images.shape[3])
-        tokens = {} if self.told is None else {"task_inputs": self.told.expand(len(images), -1)}
-        returned = self.network(pixel_values=images, **tokens)
-        masks, classes = returned.masks_queries_logits, returned.class_queries_logits.softmax(dim=-1)[..., :-1]
-        if self.family == "mask2former":
-            masks = functional.interpolate(masks, size=FINE, mode="bilinear")
-        elif self.family.startswith("eomt"):
-            masks = functional.interpolate(masks, size=size, mode="bilinear")
-        scores = torch.einsum("bqc,bqhw->bchw", classes, masks.sigmoid())
-        scores = functional.interpolate(scores, size=size, mode="bilinear")
-        return scores.float().clamp_min(SMALLEST_PROBABILITY).log()
+    size, family = (images.shape[2], images.shape[3]), str(network.config.model_type)
+    tokens = {} if sentence is None else {"task_inputs": sentence.to(images.device).expand(len(images), -1)}
+    returned = network(pixel_values=images, **tokens)
+    masks, classes = returned.masks_queries_logits, returned.class_queries_logits.softmax(dim=-1)[..., :-1]
+    if family == "mask2former":
+        masks = functional.interpolate(masks, size=FINE, mode="bilinear")
+    elif family.startswith("eomt"):
+        masks = functional.interpolate(masks, size=size, mode="bilinear")
+    scores = torch.einsum("bqc,bqhw->bchw", classes, masks.sigmoid())
+    scores = functional.interpolate(scores, size=size, mode="bilinear")
+    return scores.float().clamp_min(SMALLEST_PROBABILITY).log()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -14,14 +13,14 @@ from pathlib import Path
 from typing import Any
 
 from torch import Tensor, nn
-from torch.nn import functional
+from torch.nn.functional import interpolate
 
 from advsearch.errors import ModelError, resembling
 from advsearch.models.all_at_once import AllAtOnce
 from advsearch.models.probe import first_line
-from advsearch.models.source import Source
+from advsearch.models.source import Source, source_of
 from advsearch.models.zoo import language, named, outputs, zero_shot
-from advsearch.models.zoo.library import Loaded, in_pixels, library, processor_of, reading
+from advsearch.models.zoo.library import Adapted, Ask, Loaded, cached_file, in_pixels, library, processor_of, reading
 
 
 @dataclass(frozen=True)
@@ -35,8 +34,9 @@ class Family:
     source: Callable[[Loaded], Source]
 
 
-def _called(part: str) -> Callable[[str, Any], bool]:
-    return lambda architecture, network: part in architecture
+def _called(part: str, source: Callable[[Loaded], Source], loader: str = "") -> Family:
+    """Networks whose architecture has a part in its name, which the class of that name builds."""
+    return Family(lambda architecture, network: part in architecture, loader or f"AutoModel{part}", source)
 
 
 PATIENCE = 5.0
@@ -48,18 +48,14 @@ ADVICE = "Give a folder that save_pretrained(..., safe_serialization=True) has m
 def load(spec: str) -> Source:
     """Return ``hf:REPOSITORY[@REVISION]`` or ``hf:FOLDER``: a network of one of `NETWORKS`.
 
-    One that reads texts gets its classes from its user (`zero_shot`, `open_vocabulary`, `language`).
-
-    Its labels are those that it was published with; size, order of channels and normalisation are measured on its
-    image processor (`library.measured`). Code in a repository is never run, and weights are read from safetensors
-    alone. A repository that timm has saved goes to timm.
+    One that reads texts gets its classes from its user (`zero_shot`, `language`). Labels of others are those that they
+    were published with; size, order of channels and normalisation are measured on the image processor
+    (`library.measured`), and where there is none a ModelWarning says so. Code in a repository is never run, and weights
+    are read from safetensors alone. A repository that timm has saved goes to timm.
 
     Raises:
         ModelError: transformers is missing, the repository cannot be had or lacks weights, its network is of another
             kind or larger than the memory, or its processor does what `Preprocessing` can't.
-
-    Warns:
-        ModelWarning: it has no image processor.
     """
     name, _, revision = spec.partition(":")[2].strip().partition("@")
     transformers = library("transformers", spec, "hf")
@@ -75,30 +71,26 @@ def load(spec: str) -> Source:
     with reading(spec, ADVICE):
         if not Path(name).is_dir() and _out_of_reach(name):
             where["local_files_only"] = True
-        told = _config(transformers, name, spec, where)
-        if told.get("model_type") == "timm_wrapper" and "architectures" not in told:  # which timm itself has saved
+        saved = _config(transformers, name, spec, where)
+        if saved.get("model_type") == "timm_wrapper" and "architectures" not in saved:  # which timm itself has saved
             return named.timm_repository(spec, name, revision)
         config = transformers.AutoConfig.from_pretrained(name, trust_remote_code=False, **where)
         architecture = str((getattr(config, "architectures", None) or ["none"])[0])
         kind = _kind(architecture, getattr(transformers, architecture, None), spec)
         check_fits(transformers, name, where, spec)
-        network, found = getattr(transformers, kind.loader or architecture).from_pretrained(
+        network, report = getattr(transformers, kind.loader or architecture).from_pretrained(
             name, use_safetensors=True, trust_remote_code=False, output_loading_info=True, **where
         )
-        _check_whole(network, found, spec)
+        _check_whole(network, report, spec)
         processor = processor_of(transformers, name, where)
     part = partial(_part, transformers, spec, name, where)
     return kind.source(Loaded(network, name.rstrip("/").rpartition("/")[2], spec, processor, part))
 
 
 def of_network(network: nn.Module) -> Source | None:
-    """Return the source of a network of transformers that is there already; None of any other.
-
-    Names come from its ``config``, and what is done to pictures from the repository or folder that it was loaded from.
-
-    Warns:
-        ModelWarning: that has no image processor, or can't be read any more.
-    """
+    """Return the source of a network of transformers that is there already; None of any other. Names come from its
+    ``config``, and what is done to pictures from the repository or folder that it was loaded from; a ModelWarning says
+    where that has no image processor, or can't be read any more."""
     transformers: Any = sys.modules.get("transformers")
     if transformers is None or not isinstance(network, transformers.PreTrainedModel):
         return None
@@ -125,32 +117,31 @@ def _kind(architecture: str, network: Any, spec: str) -> Family:
             return kind
     raise ModelError(
         f"model {spec}: is a {architecture}; expected one whose name has ForImageClassification, "
-        "ForVideoClassification, "
-        "ForSemanticSegmentation, ForUniversalSegmentation, ForObjectDetection or ForDepthEstimation in it, one that "
-        "compares pictures with texts, as CLIPModel, one that goes on in words, as LlavaForConditionalGeneration, or "
-        "one that has features, as Dinov2Model. Wrap another in an nn.Module whose output a task can judge, your own "
-        "too, and give that from Python"
+        "ForVideoClassification, ForSemanticSegmentation, ForUniversalSegmentation, ForObjectDetection or "
+        "ForDepthEstimation in it, one that compares pictures with texts, as CLIPModel, one that goes on in words, as "
+        "LlavaForConditionalGeneration, or one that has features, as Dinov2Model. Wrap another in an nn.Module whose "
+        "output a task can judge, your own too, and give that from Python"
     )
 
 
 def _config(transformers: Any, name: str, spec: str, where: Mapping[str, Any]) -> Mapping[str, Any]:
     """Return what is in the config.json of a repository or a folder."""
-    has = partial(transformers.utils.cached_file, name, _raise_exceptions_for_missing_entries=False, **where)
+    has = partial(cached_file, transformers, name, where=where)
     try:
         if not has("config.json") and has("open_clip_config.json"):
             raise ModelError(
                 f"model {spec}: is a repository of open_clip, which transformers can't read; give the network as "
                 "transformers has it, such as hf:openai/clip-vit-base-patch32 or hf:google/siglip-base-patch16-224"
             )
-        told: Mapping[str, Any] = transformers.PretrainedConfig.get_config_dict(name, **where)[0]
-        return told
+        config: Mapping[str, Any] = transformers.PretrainedConfig.get_config_dict(name, **where)[0]
+        return config
     except OSError as error:
         if Path(name).is_dir():
             raise
         raise ModelError(
             f"model {spec}: {name} is no folder here{_near_folders(name)}, and no repository of that name is in the "
-            f"cache{_meant(resembling(name, _cached()))} or can be had ({first_line(error)}). Check the name and the "
-            "network, or give a folder"
+            f"cache{_near_cached(name)} or can be had ({first_line(error)}). Check the name and the network, or give a "
+            "folder"
         ) from error
 
 
@@ -164,31 +155,28 @@ def _out_of_reach(name: str) -> bool:
     return False
 
 
-def _cached() -> list[str]:
+def _near_cached(name: str) -> str:
     cache = Path(import_module("huggingface_hub").constants.HF_HUB_CACHE)
-    return [one.name.partition("--")[2].replace("--", "/") for one in cache.glob("models--*")]
+    return _meant(resembling(name, [f.name.partition("--")[2].replace("--", "/") for f in cache.glob("models--*")]))
 
 
 def _near_folders(name: str) -> str:
-    """Return the question whether a folder with nearly that name is meant; "" if there is none."""
     place = Path(name).expanduser()
-    there = [one.name for one in place.parent.iterdir() if one.is_dir()] if place.parent.is_dir() else []
-    return _meant([str(place.parent / one) for one in resembling(place.name, there)])
+    there = [folder.name for folder in place.parent.iterdir() if folder.is_dir()] if place.parent.is_dir() else []
+    return _meant([str(place.parent / near) for near in resembling(place.name, there)])
 
 
 def _meant(names: Sequence[str]) -> str:
     """Return the question whether one of these folders or repositories is meant; "" if there is none."""
-    specs = [f"'hf:{one}'" for one in names[:3]]
+    specs = [f"'hf:{name}'" for name in names[:3]]
     return f" (did you mean {' or '.join(specs)}?)" if specs else ""
 
 
-def _check_whole(network: Any, told: Any, spec: str) -> None:
-    """Raise a ModelError where weights are not in the file: they would be random, and others at each load.
-
-    A pooler that was never trained is left out: what it would read is the first token, and that is taken then.
-    """
-    lacking = sorted({*told.get("missing_keys", ()), *(key for key, *_ in told.get("mismatched_keys", ()))})
-    if lacking and getattr(network, "pooler", None) and all(str(one).startswith("pooler.") for one in lacking):
+def _check_whole(network: Any, report: Any, spec: str) -> None:
+    """Raise a ModelError where weights are not in the file: they would be random, and others at each load. A pooler
+    that was never trained is left out: what it would read is the first token, and that is taken then."""
+    lacking = sorted({*report.get("missing_keys", ()), *(key for key, *_ in report.get("mismatched_keys", ()))})
+    if lacking and getattr(network, "pooler", None) and all(str(key).startswith("pooler.") for key in lacking):
         network.pooler = None
     elif lacking:
         shown = ", ".join(map(str, lacking[:3])) + (", ..." if len(lacking) > 3 else "")
@@ -198,56 +186,31 @@ def _check_whole(network: Any, told: Any, spec: str) -> None:
         )
 
 
-def names_of(config: Any) -> tuple[str, ...]:
-    """Return the names of the classes in a network's ``config``; none where transformers only numbers them."""
-    labels = getattr(config, "id2label", None) or {}
-    names = tuple(str(labels[key]) for key in sorted(labels, key=int))
-    return () if all(re.fullmatch(r"LABEL_\d+", one) for one in names) else names
+def _logits(network: Any, images: Tensor) -> Tensor:
+    """(N, classes)."""
+    logits: Tensor = network(pixel_values=images).logits
+    return logits
 
 
-class _Classifier(nn.Module):
-    """Logits (N, classes)."""
-
-    def __init__(self, network: nn.Module) -> None:
-        super().__init__()
-        self.network = network
-
-    def forward(self, images: Tensor) -> Tensor:
-        logits: Tensor = self.network(pixel_values=images).logits
-        return logits
+def _logits_by_pixel(network: Any, images: Tensor) -> Tensor:
+    """(N, classes, H, W), of each pixel of the input."""
+    return interpolate(_logits(network, images), size=images.shape[2:], mode="bilinear")
 
 
-class _Segmenter(_Classifier):
-    """Logits (N, classes, H, W) of each pixel of the input."""
-
-    def forward(self, images: Tensor) -> Tensor:
-        return functional.interpolate(super().forward(images), size=images.shape[2:], mode="bilinear")
-
-
-class _Detector(nn.Module):
+def _boxes(network: Any, images: Tensor) -> tuple[Tensor, Tensor]:
     """Boxes (N, queries, 4) in pixels, x0 y0 x1 y1, and scores (N, queries, classes) in [0, 1], overlapping ones too.
-
     Networks whose last class stands for "nothing" choose one class for each box (Carion et al. 2020); the others judge
-    each class by itself.
-    """
-
-    boxes_are_corners_in_pixels = True
-
-    def __init__(self, network: Any) -> None:
-        super().__init__()
-        self.network, self.classes = network, len(network.config.id2label)
-
-    def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
-        returned = self.network(pixel_values=images)
-        boxes = in_pixels(returned.pred_boxes, images)
-        if returned.logits.shape[-1] > self.classes:
-            return boxes, returned.logits.softmax(dim=-1)[..., :-1]
-        return boxes, returned.logits.sigmoid()
+    each class by itself."""
+    returned = network(pixel_values=images)
+    boxes = in_pixels(returned.pred_boxes, images)
+    if returned.logits.shape[-1] > len(network.config.id2label):
+        return boxes, returned.logits.softmax(dim=-1)[..., :-1]
+    return boxes, returned.logits.sigmoid()
 
 
-def _with_names(make: Callable[[Any], nn.Module]) -> Callable[[Loaded], Source]:
+def _with_names(ask: Ask, *, boxes: bool = False) -> Callable[[Loaded], Source]:
     """Return what makes the source of a network whose ``config`` has the names of its classes."""
-    return lambda loaded: loaded.source(make(loaded.network), labels=names_of(loaded.network.config) or None)
+    return lambda loaded: loaded.source(ask, boxes=boxes, labels=loaded.names or None)
 
 
 class _OfFrames:
@@ -265,58 +228,43 @@ class _OfFrames:
 
 def _of_clips(loaded: Loaded) -> Source:
     """The source of a network that takes (N, T, 3, H, W): T frames are the pictures of a rig."""
-    config, processor = loaded.network.config, loaded.processor and _OfFrames(loaded.processor)
-    module = AllAtOnce(_Classifier(loaded.network), int(config.num_frames))
-    loaded = replace(loaded, processor=processor)
-    side = config.image_size
-    size = {} if "input_size" in loaded.described else {"input_size": (side, side) if isinstance(side, int) else side}
-    return loaded.source(module, labels=names_of(config) or None, **size)
+    config = loaded.network.config
+    loaded = replace(loaded, processor=loaded.processor and _OfFrames(loaded.processor))
+    module = AllAtOnce(Adapted(loaded.network, _logits), int(config.num_frames))
+    return source_of(module, loaded.name, labels=loaded.names or None, **loaded.sized(config))
 
 
 NETWORKS = (
-    Family(_called("ForVideoClassification"), "AutoModelForVideoClassification", _of_clips),
-    Family(
-        _called("TimmWrapperForImageClassification"),
-        "AutoModelForImageClassification",
-        lambda loaded: named.wrapped_timm(loaded, names_of(loaded.network.config)),
-    ),
-    Family(
-        _called("ForImageClassification"), "AutoModelForImageClassification", outputs.also(_with_names(_Classifier))
-    ),
-    Family(_called("ForSemanticSegmentation"), "AutoModelForSemanticSegmentation", _with_names(_Segmenter)),
-    Family(
-        outputs.is_ours,
-        "AutoModelForUniversalSegmentation",
-        lambda loaded: outputs.mask_source(loaded, names_of(loaded.network.config) or None),
-    ),
-    Family(
-        lambda architecture, network: zero_shot.finds(architecture),
-        "AutoModelForZeroShotObjectDetection",
-        zero_shot.detector_source,
-    ),
-    Family(_called("ForObjectDetection"), "AutoModelForObjectDetection", _with_names(_Detector)),
+    _called("ForVideoClassification", _of_clips),
+    _called("TimmWrapperForImageClassification", named.wrapped_timm, "AutoModelForImageClassification"),
+    _called("ForImageClassification", partial(outputs.source, plain=_with_names(_logits))),
+    _called("ForSemanticSegmentation", _with_names(_logits_by_pixel)),
+    Family(outputs.is_ours, "AutoModelForUniversalSegmentation", outputs.mask_source),
+    Family(zero_shot.finds, "AutoModelForZeroShotObjectDetection", zero_shot.detector_source),
+    _called("ForObjectDetection", _with_names(_boxes, boxes=True)),
     Family(language.speaks, "AutoModelForImageTextToText", language.source),
-    Family(_called("ForDepthEstimation"), "AutoModelForDepthEstimation", outputs.depth_source),
+    _called("ForDepthEstimation", outputs.depth_source),
     Family(
         lambda architecture, network: zero_shot.compares(network),
         "AutoModel",
-        outputs.also(zero_shot.source, reads_text=True),
+        partial(outputs.source, plain=zero_shot.source, reads_text=True),
     ),
     Family(outputs.gives_features, "", outputs.source),
 )
 """Every kind that is read, the particular ones first."""
 
 
-MEMORY = Path("/proc/meminfo")
-"""Where Linux says what is free."""
+MEMORY = Path("/proc/meminfo")  # where Linux says what is free
 
 
 def check_fits(transformers: Any, name: str, where: Mapping[str, Any], spec: str) -> None:
-    """Raise a ModelError where the weights of a repository or a folder are larger than the memory that is free.
-
-    They are kept in the type in which they are stored. Nothing is checked where the system does not say what is free.
-    """
-    size, free = _stored(transformers, name, where), free_bytes()
+    """Raise a ModelError where the weights of a repository or a folder are larger than the memory that is free. They
+    are kept in the type in which they are stored. Nothing is checked where the system does not say what is free."""
+    size, free = 0, free_bytes()
+    if index := cached_file(transformers, name, "model.safetensors.index.json", where):  # of several files
+        size = int(json.loads(Path(index).read_text(encoding="utf-8")).get("metadata", {}).get("total_size", 0))
+    elif weights := cached_file(transformers, name, "model.safetensors", where):
+        size = Path(weights).stat().st_size
     if free is not None and size > free:
         raise ModelError(
             f"model {spec}: its weights take {size / 1e9:.3g} GB, and {free / 1e9:.3g} GB of memory are free. Give a "
@@ -324,28 +272,11 @@ def check_fits(transformers: Any, name: str, where: Mapping[str, Any], spec: str
         )
 
 
-def free_bytes(told: Path | None = None) -> int | None:
+def free_bytes() -> int | None:
     """Return the bytes that can be had without anything else being ended, swap included; None where nobody says."""
     try:
-        lines = (told or MEMORY).read_text(encoding="ascii").splitlines()
+        lines = MEMORY.read_text(encoding="ascii").splitlines()
         kilobytes = {line.partition(":")[0]: int(line.split()[1]) for line in lines if len(line.split()) > 1}
         return 1024 * (kilobytes["MemAvailable"] + kilobytes.get("SwapFree", 0))
     except (OSError, ValueError, KeyError):
         return None
-
-
-def _stored(transformers: Any, name: str, where: Mapping[str, Any]) -> int:
-    """Return the bytes of the weights: as the index of several files says, or the size of one; 0 of none."""
-
-    def kept(file: str) -> str | None:
-        found: str | None = transformers.utils.cached_file(
-            name, file, _raise_exceptions_for_missing_entries=False, **where
-        )
-        return found
-
-    index = kept("model.safetensors.index.json")
-    if index:
-        told = json.loads(Path(index).read_text(encoding="utf-8")).get("metadata", {}).get("total_size", 0)
-        return int(told)
-    one = kept("model.safetensors")
-    return Path(one).stat().st_size if one else 0

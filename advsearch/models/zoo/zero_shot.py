@@ -6,8 +6,8 @@ Detectors, as OWL-ViT and Grounding DINO are, find whatever they are told to by 
 from __future__ import annotations
 
 import inspect
-import warnings
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import torch
@@ -16,16 +16,12 @@ from torch.nn import functional
 
 from advsearch.errors import InputError, ModelError
 from advsearch.models.labels import patterns
-from advsearch.models.model import ModelWarning
-from advsearch.models.probe import first_line
+from advsearch.models.model import warn
+from advsearch.models.probe import foreign
 from advsearch.models.source import Purpose, Source, sharing_copy, source_of
-from advsearch.models.zoo.library import Loaded, Measured, in_pixels
+from advsearch.models.zoo.library import Adapted, Ask, Loaded, Measured, in_pixels, nearly
 
-TEXTS = 64
-"""Texts that are embedded at once."""
-
-TOLERANCE = 1e-4
-"""What a score may be off from the network's own, as a share of the largest or of the scale."""
+TEXTS = 64  # texts that are embedded at once
 
 
 def compares(network: Any) -> bool:
@@ -55,34 +51,28 @@ def _named(network: Any, tokenizer: Any, name: str, described: Measured, purpose
     if len(names) < 2:
         raise InputError(f"labels: expected two names at least, of which model {name} chooses one, got {names[0]!r}")
     words, alone = spoken(names), hasattr(network, "logit_bias")
-    try:
-        with torch.no_grad():
-            network = sharing_copy(network).eval()
-            scale = network.temperature.reciprocal() if hasattr(network, "temperature") else network.logit_scale.exp()
-            rows = averaged(network, tokenizer, words, prompts)
-            head = nn.Linear(rows.shape[1], len(names))
-            head.weight.copy_(scale.float() * rows)
-            head.bias.copy_(network.logit_bias.float() if alone else torch.zeros(()))
-            compared = _Compared(network, head.to(network.device))
-            _check(network, compared, tokenizer, prompts[0].replace("{}", words[0]), described, name)
-    except (InputError, ModelError):
-        raise
-    except Exception as error:  # any network may raise anything
-        raise ModelError(f"model {name}: cannot embed the names of `labels` ({first_line(error)})") from error
-    say_what_is_one(tokenizer, [prompts[0].replace("{}", word) for word in words], names, name)
+    texts = [prompts[0].replace("{}", word) for word in words]
+    with foreign(f"model {name}: cannot embed the names of `labels`"), torch.no_grad():
+        network = sharing_copy(network).eval()
+        scale = network.temperature.reciprocal() if hasattr(network, "temperature") else network.logit_scale.exp()
+        rows = averaged(network, tokenizer, words, prompts)
+        head = nn.Linear(rows.shape[1], len(names))
+        head.weight.copy_(scale.float() * rows)
+        head.bias.copy_(network.logit_bias.float() if alone else torch.zeros(()))
+        compared = _Compared(network, head.to(network.device))
+        _check(network, compared, tokenizer, texts[0], described, name)
+    say_what_is_one(tokenizer, texts, names, name)
     if alone:
-        warnings.warn(
+        warn(
             f"model {name} judges each name by itself, with a sigmoid of its logit: the scores that are shown are a "
-            f"softmax over the {len(names)} names, and margins are differences of logits",
-            ModelWarning,
-            stacklevel=4,
+            f"softmax over the {len(names)} names, and margins are differences of logits"
         )
     return source_of(compared, name, labels=names, dtype=network.dtype, **described)
 
 
 def spoken(names: Sequence[str]) -> list[str]:
     """Return what stands for each name in a text: of synonyms with commas between them the first, if that is one's."""
-    first = [one.partition(",")[0].strip() or one for one in names]
+    first = [name.partition(",")[0].strip() or name for name in names]
     return [short if first.count(short) == 1 else name for short, name in zip(first, names, strict=True)]
 
 
@@ -99,11 +89,9 @@ def _encoded(network: Any, tokenizer: Any, texts: Sequence[str]) -> Mapping[str,
 
 
 def averaged(network: Any, tokenizer: Any, words: Sequence[str], prompts: Sequence[str]) -> Tensor:
-    """Return one row (words, features) of length 1 for each word: its text in each prompt, embedded and averaged.
-
-    They are normalised before and after (Radford et al. 2021, arXiv 2103.00020, section 3.1.4).
-    """
-    each = [_embedded(network, tokenizer, [one.replace("{}", word) for word in words]) for one in prompts]
+    """Return one row (words, features) of length 1 for each word: its text in each prompt, embedded and averaged. They
+    are normalised before and after (Radford et al. 2021, arXiv 2103.00020, section 3.1.4)."""
+    each = [_embedded(network, tokenizer, [prompt.replace("{}", word) for word in words]) for prompt in prompts]
     return functional.normalize(torch.stack(each).mean(dim=0), dim=-1)
 
 
@@ -124,17 +112,17 @@ class _Compared(nn.Module):
 
     def __init__(self, network: nn.Module, head: nn.Linear) -> None:
         super().__init__()
-        self.network = sharing_copy(network)
+        self.network: Any = sharing_copy(network)
         for part in [part for part, _ in self.network.named_children() if part.startswith("text")]:
             setattr(self.network, part, None)
         self.head = head
 
-    def forward(self, images: Tensor) -> Tensor:
-        return self.score(images, self.head)
+    def seen(self, images: Tensor) -> Tensor:
+        """Features (N, D) of length 1."""
+        return functional.normalize(_pooled(self.network.get_image_features(pixel_values=images)), dim=-1)
 
-    def score(self, images: Tensor, head: nn.Module) -> Tensor:
-        features: Any = self.network.get_image_features(pixel_values=images)  # type: ignore[operator]
-        scores: Tensor = head(functional.normalize(_pooled(features), dim=-1))
+    def forward(self, images: Tensor) -> Tensor:
+        scores: Tensor = self.head(self.seen(images))
         return scores
 
 
@@ -145,9 +133,8 @@ def _check(network: Any, compared: _Compared, tokenizer: Any, text: str, describ
     own = network(**_encoded(network, tokenizer, [text]), pixel_values=noise).logits_per_image.float()
     scale = compared.head.weight.norm(dim=-1).max()
     row = scale * _embedded(network, tokenizer, [text])
-    ours = compared.score(noise, lambda seen: seen @ row.T + compared.head.bias[0])  # type: ignore[arg-type]
-    size = max(TOLERANCE, 8.0 * torch.finfo(network.dtype).eps) * max(float(scale), float(own.abs().max()))
-    if own.shape != ours.shape or not float((own - ours).abs().max()) <= size:
+    ours = compared.seen(noise) @ row.T + compared.head.bias[0]
+    if own.shape != ours.shape or not nearly(own, ours, max(float(scale), float(own.abs().max())), network.dtype):
         raise ModelError(
             f"model {name}: is a {type(network).__name__}, whose scores are no scaled cosine of a picture and a text; "
             "expected one such as CLIPModel or SiglipModel"
@@ -160,23 +147,19 @@ def say_what_is_one(tokenizer: Any, texts: Sequence[str], names: Sequence[str], 
     for number, tokens in enumerate(tokenizer(list(texts), verbose=False)["input_ids"]):
         first = seen.setdefault(tuple(tokens), number)
         if first != number:
-            warnings.warn(
+            warn(
                 f"model {name} reads {names[first]!r} (#{first}) and {names[number]!r} (#{number}) as the same text: "
-                "it cannot tell one from the other",
-                ModelWarning,
-                stacklevel=5,
+                "it cannot tell one from the other"
             )
             return
 
 
-BARE = ("{}",)
-"""The text of a name in a list of names."""
-
-Build = Callable[[Any, Any, Sequence[str], tuple[str, ...] | None, str], nn.Module]
-"""Makes a detector of a network, its tokenizer, the words for each name, the prompts that were given, and its name."""
+Build = Callable[[Any, Any, Sequence[str], tuple[str, ...] | None, str], Ask]
+"""Makes what asks a detector, of the network, its tokenizer, the words for each name, the prompts that were given, and
+its name: for boxes (N, K, 4) in pixels, x0 y0 x1 y1, and scores (N, K, names) in [0, 1] of each name by itself."""
 
 
-def finds(architecture: str) -> bool:
+def finds(architecture: str, network: Any) -> bool:
     """Whether networks of this architecture, by name, are read here."""
     return architecture in DETECTORS
 
@@ -188,82 +171,42 @@ def detector_source(loaded: Loaded) -> Source:
 
 def _detector(network: Any, tokenizer: Any, name: str, described: Measured, purpose: Purpose) -> Source:
     names = purpose.named(name, "finds what it is told to", "detection")
-    try:
-        with torch.no_grad():
-            network = sharing_copy(network).eval()
-            build = DETECTORS[type(network).__name__]
-            detector = build(network, tokenizer, spoken(names), purpose.prompts, name)
-    except (InputError, ModelError):
-        raise
-    except Exception as error:  # any network may raise anything
-        raise ModelError(f"model {name}: cannot read the names of `labels` ({first_line(error)})") from error
+    with foreign(f"model {name}: cannot read the names of `labels`"), torch.no_grad():
+        network = sharing_copy(network).eval()
+        ask = DETECTORS[type(network).__name__](network, tokenizer, spoken(names), purpose.prompts, name)
     say_what_is_one(tokenizer, spoken(names), names, name)
+    detector = Adapted(network, ask, boxes=True)
     return source_of(detector, name, labels=names, dtype=network.dtype, **described)
 
 
-class _Owl(nn.Module):
-    """Boxes (N, patches, 4) in pixels, x0 y0 x1 y1, and scores (N, patches, names) in [0, 1] of each name by itself.
-
-    Minderer et al. 2022 (arXiv 2205.06230), section 3: each patch of the picture is one box, compared with the text of
-    each name, whose features are the rows. The half of OWL for texts is left out.
-    """
-
-    rows: Tensor
-    boxes_are_corners_in_pixels = True
-
-    def __init__(self, network: Any, rows: Tensor) -> None:
-        super().__init__()
-        self.network = network
-        self.register_buffer("rows", rows)
-        half = _half(network)
-        half.text_model = half.text_projection = None
-
-    def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
-        features = self.network.image_embedder(pixel_values=images)[0]
-        patches = features.flatten(1, 2)
-        logits, _ = self.network.class_predictor(patches, self.rows.expand(len(images), -1, -1))
-        boxes = self.network.box_predictor(patches, features)
-        return in_pixels(boxes, images), logits.sigmoid()
+def _owl(network: Any, tokenizer: Any, words: Sequence[str], prompts: tuple[str, ...] | None, name: str) -> Ask:
+    """The texts of a name are averaged as CLIP's are. The half of OWL for texts is left out then."""
+    half = getattr(network, network.base_model_prefix)
+    rows = averaged(half, tokenizer, words, patterns(prompts)).to(network.dtype)
+    half.text_model = half.text_projection = None
+    return partial(_ask_owl, rows=rows)
 
 
-def _half(network: Any) -> Any:
-    return getattr(network, network.base_model_prefix)
+def _ask_owl(network: Any, images: Tensor, *, rows: Tensor) -> tuple[Tensor, Tensor]:
+    """Each patch of the picture is one box, compared with the text of each name, whose features are the rows (Minderer
+    et al. 2022, arXiv 2205.06230, section 3)."""
+    features = network.image_embedder(pixel_values=images)[0]
+    patches = features.flatten(1, 2)
+    logits, _ = network.class_predictor(patches, rows.to(patches).expand(len(images), -1, -1))
+    return in_pixels(network.box_predictor(patches, features), images), logits.sigmoid()
 
 
-def _owl(network: Any, tokenizer: Any, words: Sequence[str], prompts: tuple[str, ...] | None, name: str) -> nn.Module:
-    """Return the detector; the texts of a name are averaged as CLIP's are."""
-    return _Owl(network, averaged(_half(network), tokenizer, words, patterns(prompts)).to(network.dtype))
+def _ask_grounded(network: Any, images: Tensor, *, text: Tensor, places: Tensor) -> tuple[Tensor, Tensor]:
+    """All names are one text (1, L) of tokens, and a box has a score of each of its tokens (Liu et al. 2023, arXiv
+    2303.05499, section 3). A name's is the largest of its own, which are at `places` (names, most); a shorter one's
+    first is there again."""
+    returned = network(pixel_values=images, input_ids=text.expand(len(images), -1))
+    return in_pixels(returned.pred_boxes, images), returned.logits[..., places].amax(dim=-1).sigmoid()
 
 
-class _Grounded(nn.Module):
-    """Boxes (N, queries, 4) in pixels, x0 y0 x1 y1, and scores (N, queries, names) in [0, 1] of each name by itself.
-
-    Liu et al. 2023 (arXiv 2303.05499), section 3: all names are one text (1, L) of tokens, and a box has a score of
-    each of its tokens. A name's is the largest of its own, which are at `places` (names, most); a shorter one's first
-    is there again.
-    """
-
-    text: Tensor
-    places: Tensor
-    boxes_are_corners_in_pixels = True
-
-    def __init__(self, network: Any, text: Tensor, places: Tensor) -> None:
-        super().__init__()
-        self.network = network
-        self.register_buffer("text", text)
-        self.register_buffer("places", places)
-
-    def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
-        returned = self.network(pixel_values=images, input_ids=self.text.expand(len(images), -1))
-        scores = returned.logits[..., self.places].amax(dim=-1).sigmoid()
-        return in_pixels(returned.pred_boxes, images), scores
-
-
-def _grounded(
-    network: Any, tokenizer: Any, words: Sequence[str], prompts: tuple[str, ...] | None, name: str
-) -> nn.Module:
-    """Return the detector of one text, ``mug. cup. bowl.``, as its processor writes it."""
-    prompt, *others = patterns(prompts or BARE)
+def _grounded(network: Any, tokenizer: Any, words: Sequence[str], prompts: tuple[str, ...] | None, name: str) -> Ask:
+    """The text is ``mug. cup. bowl.``, as its processor writes it."""
+    prompt, *others = patterns(prompts or ("{}",))
     if others:
         raise InputError(
             f"prompt: model {name} reads all names in one text, in which several prompts can't be averaged; give one, "
@@ -286,7 +229,7 @@ def _grounded(
         )
     longest = max(map(len, own))
     places = torch.stack([torch.cat([run, run[:1].expand(longest - len(run))]) for run in own])
-    return _Grounded(network, tokens[None], places)
+    return partial(_ask_grounded, text=tokens[None], places=places)
 
 
 DETECTORS: dict[str, Build] = {

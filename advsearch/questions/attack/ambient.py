@@ -15,8 +15,7 @@ from advsearch.engine.journal import Shared
 from advsearch.engine.problem import Problem
 from advsearch.engine.verifier import Verifier
 
-BRIGHTEST = 1e5
-"""Lux of direct sun: nothing is tried beyond."""
+BRIGHTEST = 1e5  # Lux of direct sun: nothing is tried beyond
 IN_LIGHT = "ambient x "
 """What the names of problems for workers begin with, before how many times the ambient light they have."""
 HALVED = 2
@@ -67,7 +66,7 @@ def find_ambient(verifier: Verifier, u: Tensor) -> None:
 
 def ambient_of(problem: Problem) -> float | None:
     """Return the lux beside the first projector that is searched; None without, or where they are searched too."""
-    projectors = [one for one in problem.searched_space.controls if isinstance(one, ProjectorControl)]
+    projectors = [bound for bound in problem.searched_space.controls if isinstance(bound, ProjectorControl)]
     return projectors[0].ambient if projectors else None
 
 

@@ -64,7 +64,6 @@ from advsearch.tasks.together import Together, together
 
 LOADING, PREPARING = "loading the scene and the model", "preparing the scene for rendering"
 """What a person who waits is told before the first picture."""
-
 SEARCHED_WITH = ("the objective", "the policy", "the metric")
 """How the parts of a run begin that say nothing of whether its result is right."""
 
@@ -89,12 +88,8 @@ def attack_once(
 
 
 def attack_on(config: AttackConfig, scene: Scene, model: Model) -> AttackResult:
-    """Attack a model on a scene that are there, in place of those that the configuration names; nothing is kept.
-
-    Raises:
-        InputError: as for `attack`.
-    """
-    return carry_out(parts_given(config, scene, model), NullProgress())
+    """Attack a model on a scene that are there, in place of those that the configuration names; nothing is kept."""
+    return carry_out(parts_of(config, scene, model), NullProgress())
 
 
 def carry_out(job: AttackParts, progress: Progress, resumed: str | Path | None = None) -> AttackResult:
@@ -111,7 +106,7 @@ def carry_out(job: AttackParts, progress: Progress, resumed: str | Path | None =
         if kept is None and job.keep:
             kept = stack.enter_context(RunDirectory.of(job.config))
         if kept is not None:
-            functions = {f"metric {name}": one for name, one in job.metrics.items()}
+            functions = {f"metric {name}": metric for name, metric in job.metrics.items()}
             objective = {"objective": job.objective} if callable(job.objective) else {}
             check_made_of(kept, [job.loaded[0]], {**functions, **objective, "task": function_of(job.task)})
         with executor_for(job.config, "advsearch.questions.attack.carry_out:attack_worker", progress) as executor:
@@ -137,8 +132,7 @@ def attack_worker(settings: JsonObject) -> Call:
 
 
 def _policy(job: AttackParts, problem: Problem) -> Policy[Any]:
-    """The policy. Where a model lets no gradient through, `auto` climbs by differences of whole pictures. A model
-    behind an address has none, so that `auto` climbs nowhere else, and others that climb are refused."""
+    """Where a model lets no gradient through, `auto` climbs by differences; behind an address it climbs nowhere."""
     config, norms = job.config, {block.norm for block in problem.domain.blocks}
     policy = make_policy(job.policy, **config.policy_options) if isinstance(job.policy, str) else job.policy
     if isinstance(problem.model.module, Asked):
@@ -180,32 +174,27 @@ class AttackParts:
     clean: CleanMatrix = field(default_factory=CleanMatrix)
 
 
-def parts_of(config: AttackConfig) -> AttackParts:
-    """Find and load everything that a configuration names; nothing is rendered."""
-    if len(config.objects) > 1:
+def parts_of(config: AttackConfig, scene: Scene | None = None, model: Model | None = None) -> AttackParts:
+    """Find and load everything that a configuration names, or all but a scene and a model, with which nothing is kept;
+    nothing is rendered."""
+    if scene is None and len(config.objects) > 1:
         raise one_only("object", config.objects)
     searched, drawn = controls_given(config, config.controls, config.over)
     task, objective = task_and_objective(config, config.task, config.objective)
     policy = make_policy(config.policy_name, **config.policy_options)
+    if scene is not None and model is not None:
+        return AttackParts(config, scene, (model, []), task, searched, drawn, objective, policy, False)
     scene = lent(SCENE, config.object) or scene_of(config)
-    model = models_as_one(config.model, config, task)
+    loaded = models_as_one(config.model, config, task)
     metrics = load_metrics(config.metrics)
-    return AttackParts(config, scene, model, task, searched, drawn, objective, policy, True, metrics)
+    return AttackParts(config, scene, loaded, task, searched, drawn, objective, policy, True, metrics)
 
 
 def parts_in(run: Path) -> AttackParts:
     """Find and load everything that the run of an attack was asked with, as its result is judged."""
-    if needed := [one for one in only_python_has(run) if not one.startswith(SEARCHED_WITH)]:
+    if needed := [part for part in only_python_has(run) if not part.startswith(SEARCHED_WITH)]:
         raise InputError(f"{run}: {', '.join(needed)}: only the Python session that asked has what judges its result")
     return parts_of(judged_alone(AttackConfig.from_yaml(run / CONFIG)))
-
-
-def parts_given(config: AttackConfig, scene: Scene, model: Model) -> AttackParts:
-    """Find what a configuration names besides its scene and its model."""
-    searched, drawn = controls_given(config, config.controls, config.over)
-    task, objective = task_and_objective(config, config.task, config.objective)
-    policy = make_policy(config.policy_name, **config.policy_options)
-    return AttackParts(config, scene, (model, []), task, searched, drawn, objective, policy, False)
 
 
 def controls_given(
@@ -214,16 +203,15 @@ def controls_given(
     """The controls that are searched and those that vary by chance, with the run's settings; only a search has a
     budget."""
     check_run_settings(config)
-    without_budget = config.model_copy(update={"epsilon": None})
     searched_controls = given_to(config, searched)
     for control in searched_controls:
-        likely = [name for name, spec in getattr(control, "specs", {}).items() if by_distribution(spec)]
-        if likely:
-            raise InputError(
-                f"`controls` {control.name}.{likely[0]}: expected values to search, which are all as good, got how "
-                "likely each is; give a range, or put it into `over`, under which it varies by chance"
-            )
-    return searched_controls, given_to(without_budget, drawn)
+        for name, spec in getattr(control, "specs", {}).items():
+            if by_distribution(spec):
+                raise InputError(
+                    f"`controls` {control.name}.{name}: expected values to search, which are all as good, got how "
+                    "likely each is; give a range, or put it into `over`, under which it varies by chance"
+                )
+    return searched_controls, given_to(config.model_copy(update={"epsilon": None}), drawn)
 
 
 def task_and_objective(
@@ -260,26 +248,24 @@ def problem_of_parts(parts: AttackParts, **changes: object) -> tuple[Problem, li
     """Return the problem that an attack was asked with, other settings in `changes` (of another `model`, its name), and
     warnings on the way."""
     config = parts.config.model_copy(update=changes)
-    model = (
-        models_as_one(config.model, config, parts.task) if "model" in changes else (parts.loaded[0], [*parts.loaded[1]])
-    )
-    job = replace(parts, config=config, loaded=model)
-    problem = problem_on(job)
-    return problem, [*job.loaded[1], *sentences(problem.space.moved)]
+    loaded = parts.loaded[0], [*parts.loaded[1]]
+    if "model" in changes:
+        loaded = models_as_one(config.model, config, parts.task)
+    problem = problem_on(replace(parts, config=config, loaded=loaded))
+    return problem, [*loaded[1], *sentences(problem.space.moved)]
 
 
 def problem_of(config: AttackConfig, scene: Scene, model: Model, *, differentiated: bool = True) -> Problem:
     """Return the problem of a configuration on a scene and a model that are there, in place of those that it names."""
-    return problem_on(parts_given(config, scene, model), differentiated=differentiated)
+    return problem_on(parts_of(config, scene, model), differentiated=differentiated)
 
 
 def problem_on(job: AttackParts, *, differentiated: bool = True) -> Problem:
     """Return the problem that parts make; `differentiated` as for `problem_of`."""
-    config, (model, _) = job.config, job.loaded
-    description = job.scene.description
+    config, (model, warnings) = job.config, job.loaded
     task, facts = _task(job)
     resolution = config.resolution or model.input_size
-    description = framed(description, resolution)
+    description = framed(job.scene.description, resolution)
     space = make_space((*job.controls, *job.over), description)
     renderer = make_renderer(
         description,
@@ -294,8 +280,7 @@ def problem_on(job: AttackParts, *, differentiated: bool = True) -> Problem:
     )
     features_seed = seeds.stream(config.seed, "clean features")
     objective, note = objective_for(job.objective, task, model, renderer, features_seed, config.ensemble)
-    if note:
-        job.loaded[1].append(note)
+    warnings += [note] if note else []
     if config.printable:
         searched = make_space(job.controls, description)
         print_terms(searched, searched.start)  # refuses where nothing can be printed
@@ -319,28 +304,24 @@ def problem_on(job: AttackParts, *, differentiated: bool = True) -> Problem:
 
 
 def _task(job: AttackParts, *, shows: bool = True) -> tuple[Task, Callable[[Described, Looked], Facts]]:
-    """The task on the model, and what gives it facts; refuses what cannot be judged.
-
-    With `shows`, the task is shown a clean picture where it asks for one.
-    """
-    config, (model, _) = job.config, job.loaded
+    """The task on the model, which with `shows` sees a clean picture where it asks for one, and what gives it facts."""
+    config, (model, warnings) = job.config, job.loaded
     asked = job.task.seeking(job.objective) if isinstance(job.objective, str) else job.task
     task = task_for(asked, model).on(model, target=config.target, minimise=config.minimise)
     facts = partial(facts_of, job.scene, config.object, config)
-    alone = zip(task.tasks, task.models, strict=True) if isinstance(task, Together) else [(task, model)]
+    several = task if isinstance(task, Together) else None
     tasks = list[Task]()
-    for one, network in alone:
-        known = task.told(one, facts(dict)) if isinstance(task, Together) else facts(dict)
-        check_truth(one, network, job.scene, known, config)
-        tasks.append(shown(one, network, [job.scene], config) if shows else one)
-        job.loaded[1].extend(remark for remark in tasks[-1].remarks if remark not in job.loaded[1])
-    task = replace(task, tasks=tuple(tasks)) if isinstance(task, Together) else tasks[0]
+    for part, network in zip(several.tasks, several.models, strict=True) if several else [(task, model)]:
+        known = several.told(part, facts(dict)) if several else facts(dict)
+        check_truth(part, network, job.scene, known, config)
+        tasks.append(shown(part, network, [job.scene], config) if shows else part)
+        warnings += [remark for remark in tasks[-1].remarks if remark not in warnings]
+    task = replace(several, tasks=tuple(tasks)) if several else tasks[0]
     return each_thing(task) if config.judge == ALL else task, facts
 
 
 def search_size(config: AttackConfig, problem: Problem) -> tuple[int, int]:
-    """Return the steps of a search, and how many conditions each looks at: what was asked for, or what is right for
-    one picture, or for many conditions: predicted, rendered, or rendered where only a few numbers are searched."""
+    """Return the steps of a search, and how many conditions each looks at, where neither was asked for."""
     if problem.conditions is None:
         return config.steps or STEPS, 1
     usual = OVER_ONE if problem.conditions.dim == 1 else OVER_PREDICTED

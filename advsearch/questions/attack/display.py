@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -13,8 +14,6 @@ from advsearch.questions.attack.summary import (
     DifferentFailure,
     DifferentFailures,
     EpsilonBudget,
-    FailingShare,
-    MatrixCell,
     MatrixResult,
 )
 from advsearch.report.figures import BLUE
@@ -24,12 +23,12 @@ from advsearch.report.shown import (
     WHY,
     Claim,
     Column,
-    Extent,
     ResultPart,
     ShownResult,
     average_claim,
     case_claim,
     claim,
+    counted,
     extent_of,
     nothing_claimed,
     searches_text,
@@ -49,18 +48,20 @@ from advsearch.report.wording import (
 )
 from advsearch.runs.results import ControlGroup, VerifiedRate
 
-NOT_VERIFIED = ("not verified", "")
-"""Cells of what was not rendered afresh."""
+NOT_VERIFIED = ("not verified", "")  # Cells of what was not rendered afresh
 
 
-def shown(result: AttackSummary | CurveResult | MatrixResult) -> ShownResult:
+AttackResults = AttackSummary | CurveResult | MatrixResult
+
+
+def shown(result: AttackResults) -> ShownResult:
     """Return the verdict, the rates and the cost; of a curve or a matrix, its tables and its figure."""
     if isinstance(result, CurveResult):
         return _shown_curve(result)
     return _shown_matrix(result) if isinstance(result, MatrixResult) else _shown_attack(result)
 
 
-def claims(result: AttackSummary | CurveResult | MatrixResult) -> Iterator[Claim]:
+def claims(result: AttackResults) -> Iterator[Claim]:
     """Yield what the run stands for."""
     if isinstance(result, CurveResult):
         return _claims_of_curve(result)
@@ -71,44 +72,12 @@ def claims(result: AttackSummary | CurveResult | MatrixResult) -> Iterator[Claim
 
 
 def _shown_attack(summary: AttackSummary) -> ShownResult:
-    number = "action" if summary.task == COMMAND else "probability"
-    heads = ("", "prediction", number, "rate", "95 % interval")
-    sections = [ResultPart(heads=heads, rows=_rates(summary))]
+    sections = [_rates(summary)]
     if summary.failures and summary.failures.tried:
         sections.append(failures_part(summary.failures, tried=True))
     sections += ambient_part(summary)
     cautions = [text for text in wording.remarks(summary) if text not in summary.warnings]
-    return ShownResult(wording.attack_verdict(summary), sections, _facts(summary), cautions=cautions)
-
-
-def _rates(summary: AttackSummary) -> list[list[str]]:
-    clean, success, average = summary.clean, wording.success(summary), summary.average
-    control = clean.control
-    rated = _rate("right", control.correct, control) if control else NOT_VERIFIED
-    rows = [["clean", *prediction_cells(summary.task, clean), *rated]]
-    if summary.adversarial:
-        said = prediction_cells(summary.task, summary.adversarial)
-        rows.append(["adversarial", *said, *_verified(success, summary.verified)])
-    if summary.baseline:
-        pictures = f"{summary.baseline.renders} pictures"
-        rows.append(["random search", pictures, "", *_verified(success, summary.baseline.verified)])
-    if average:
-        rate = [tally("right", average.correct, average.configurations), interval_text(average.interval)]
-        rows.append(["average case", count(average.configurations, "configuration"), "", *rate])
-    return rows
-
-
-def _verified(what: str, rated: VerifiedRate | None) -> Sequence[str]:
-    return NOT_VERIFIED if rated is None else _rate(what, rated.successes, rated)
-
-
-def _rate(what: str, number: int, rated: VerifiedRate | ControlGroup) -> Sequence[str]:
-    return [tally(what, number, rated.trials, rated.not_a_number), interval_text(rated.interval)]
-
-
-def _facts(summary: AttackSummary) -> dict[str, str]:
-    """What was asked and done; the page has environment and seed."""
-    return {
+    facts = {
         "wanted": wording.goal_text(summary),
         "changed": wording.changed_text(summary),
         "objective": wording.objective_text(summary),
@@ -119,9 +88,32 @@ def _facts(summary: AttackSummary) -> dict[str, str]:
         "failures": failures_text(summary.failures) if summary.failures else "",
         "search": f"{summary.policy}, {count(summary.steps, 'step')}: {summary.ending}",
         "renders": wording.renders_text(summary),
-        "environment": "",
+        "environment": "",  # the page has it, and the seed
         "seed": "",
     }
+    return ShownResult(wording.attack_verdict(summary), sections, facts, cautions=cautions)
+
+
+def _rates(summary: AttackSummary) -> ResultPart:
+    def rate(what: str, rated: VerifiedRate | ControlGroup | None) -> Sequence[str]:
+        if rated is None:
+            return NOT_VERIFIED
+        number = rated.correct if isinstance(rated, ControlGroup) else rated.successes
+        return tally(what, number, rated.trials, rated.not_a_number), interval_text(rated.interval)
+
+    clean, baseline, average, success = summary.clean, summary.baseline, summary.average, wording.success(summary)
+    rows = [["clean", *prediction_cells(summary.task, clean), *rate("right", clean.control)]]
+    if summary.adversarial:
+        cells = prediction_cells(summary.task, summary.adversarial)
+        rows.append(["adversarial", *cells, *rate(success, summary.verified)])
+    if baseline:
+        rows.append(["random search", f"{baseline.renders} pictures", "", *rate(success, baseline.verified)])
+    if average:
+        right = tally("right", average.correct, average.configurations)
+        drawn = count(average.configurations, "configuration")
+        rows.append(["average case", drawn, "", right, interval_text(average.interval)])
+    number = "action" if summary.task == COMMAND else "probability"
+    return ResultPart(heads=("", "prediction", number, "rate", "95 % interval"), rows=rows)
 
 
 def ambient_part(summary: AttackSummary) -> list[ResultPart]:
@@ -147,41 +139,40 @@ def failures_text(known: DifferentFailures) -> str:
     where = f"{known.found} of {count(known.seen, 'draw')}"
     if known.places is not None:
         where = f"{known.found} of {known.places} cells over {' and '.join(known.over)} ({known.seen} were seen)"
-    share = "" if known.share is None else f"; {failing_share_text(known.share)}"
+    if (share := known.share) is not None:
+        where += f"; of all configurations {interval_text(share.interval)} fail in one render (95 % interval)"
+        where += "" if share.estimate is None else f", {percent(share.estimate)} by the estimate"
     if not known.tried:
-        return f"claimed in {where}{share}; none of these was tried with fresh renders"
-    return f"claimed in {where}{share}; with fresh renders {known.held} of the {known.tried} that were tried hold"
-
-
-def failing_share_text(share: FailingShare) -> str:
-    """Return how large a part of all configurations fails."""
-    interval = f"of all configurations {interval_text(share.interval)} fail in one render (95 % interval)"
-    return interval if share.estimate is None else f"{interval}, {percent(share.estimate)} by the estimate"
+        return f"claimed in {where}; none of these was tried with fresh renders"
+    return f"claimed in {where}; with fresh renders {known.held} of the {known.tried} that were tried hold"
 
 
 def failures_part(known: DifferentFailures, *, tried: bool = False) -> ResultPart:
     """Return a table of the failures that are listed, or of those that were tried."""
+
+    def held(failure: DifferentFailure) -> str:
+        if (rate := failure.verified) is None:
+            return "not tried"
+        return f"{'yes' if failure.holds else 'no'}, {rate.successes} of {count(rate.trials, 'render')}"
+
     columns: Mapping[str, Column] = {
         "failures": range_text,
         "most often predicted": most_predicted,
-        "holds in fresh renders": _held,
+        "holds in fresh renders": held,
         "objective": lambda failure: number_text(failure.objective),
     }
     return ResultPart.table((failure for failure in known.listed if not tried or failure.verified is not None), columns)
 
 
-def range_text(one: DifferentFailure) -> str:
+def range_text(failure: DifferentFailure) -> str:
     """Return where a failure lies: ``pose.yaw 36 to 72 degrees, material.kind brass``."""
-    return ", ".join(f"{name} {_ends(one, name)}" for name in one.ranges) or "anywhere"
-
-
-def _ends(failure: DifferentFailure, name: str) -> str:
-    ends = failure.ranges[name]
-    if isinstance(ends, str):
-        return ends
-    value = failure.configuration.get(name)
-    unit = "" if value is None or value.unit in ("", "1") else f" {value.unit}"
-    return f"{number_text(ends[0])} to {number_text(ends[1])}{unit}"
+    texts = []
+    for name, ends in failure.ranges.items():
+        value = failure.configuration.get(name)
+        unit = "" if value is None or value.unit in ("", "1") else f" {value.unit}"
+        lies = ends if isinstance(ends, str) else f"{number_text(ends[0])} to {number_text(ends[1])}{unit}"
+        texts.append(f"{name} {lies}")
+    return ", ".join(texts) or "anywhere"
 
 
 def most_predicted(failure: DifferentFailure) -> str:
@@ -189,24 +180,17 @@ def most_predicted(failure: DifferentFailure) -> str:
     return next(iter(failure.verified.labels), "") if failure.verified else ""
 
 
-def _held(failure: DifferentFailure) -> str:
-    if failure.verified is None:
-        return "not tried"
-    rated = f"{failure.verified.successes} of {count(failure.verified.trials, 'render')}"
-    return f"yes, {rated}" if failure.holds else f"no, {rated}"
-
-
 def _claims_of_attack(result: AttackSummary) -> Iterator[Claim]:
-    rate, spent = result.verified, searches_text(result.renders, result.policy, result.baseline is not None)
-    said = wording.attack_verdict(result)
+    rate, verdict = result.verified, wording.attack_verdict(result)
     extent = extent_of("fresh renders that count as a success", rate)
     if result.ending == "found" and rate is not None and rate.successes:
-        yield claim("found", f"{said} How many such configurations there are is not known.", extent)
+        yield claim("found", f"{verdict} How many such configurations there are is not known.", extent)
     elif result.ending in ENDED and rate is not None:
-        yield claim("not found", f"{said} Searched were {spent}. {NO_PROOF}", extent)
+        spent = searches_text(result.renders, result.policy, result.baseline is not None)
+        yield claim("not found", f"{verdict} Searched were {spent}. {NO_PROOF}", extent)
     else:
         why = WHY.get(result.ending, f"the search ended as {result.ending!r} without trials that carry a claim")
-        yield nothing_claimed(why, said)
+        yield nothing_claimed(why, verdict)
     if result.average is not None:
         yield average_claim(result.average, wording.budget_text(result))
 
@@ -250,34 +234,30 @@ def _shown_curve(result: CurveResult) -> ShownResult:
     objects = ResultPart.table(result.table, by_object, title="The objects, at the last epsilon tried", parts=runs)
     meaning = ResultPart(text=[f"Margin: {margin_text(result.task)}, in the trials of the worst case."])
     sections = [*([chart] if points else []), *([curve] if known else []), objects, meaning]
-    return ShownResult(_said_of_curve(result), sections, {"model": result.model, "policy": result.policy})
+    return ShownResult(_curve_text(result, known), sections, {"model": result.model, "policy": result.policy})
 
 
-def _said_of_curve(result: CurveResult) -> str:
-    known = [point for point in result.curve if point.accuracy is not None]
-    if not known:
+def _curve_text(result: CurveResult, known: Sequence[CurvePoint]) -> str:
+    def at(epsilon: float | None) -> str:
+        return "" if epsilon is None else f" at epsilon {epsilon:g}"
+
+    row = result.table[0] if result.table else None
+    if not known or row is None:
         return "No object was attacked to the end."
-    said = [f"{point.robust} of {point.objects}" + _at(point.epsilon) for point in (known[:1] + known[1:][-1:])]
-    return f"Still recognised: {' and '.join(said)}." if len(result.objects) > 1 else _of_one(result)
-
-
-def _of_one(result: CurveResult) -> str:
-    row = result.table[0]
+    if len(result.objects) > 1:
+        ends = [f"{point.robust} of {point.objects}{at(point.epsilon)}" for point in (*known[:1], *known[1:][-1:])]
+        return f"Still recognised: {' and '.join(ends)}."
     if row.ending == "already wrong":
         return f"The model is wrong about {row.object} as it is."
     if row.flips_at is None:
-        return f"{row.object} is recognised{_at(row.tried)}."
+        return f"{row.object} is recognised{at(row.tried)}."
     return f"{row.object} is first got wrong at epsilon {plain_epsilon(row.flips_at)}."
-
-
-def _at(epsilon: float | None) -> str:
-    return "" if epsilon is None else f" at epsilon {epsilon:g}"
 
 
 def plain_epsilon(value: EpsilonBudget) -> str:
     """Return an epsilon as text, by control where there are more; empty of none."""
     if isinstance(value, dict):
-        return ",".join(f"{name}={plain_epsilon(one)}" for name, one in value.items())
+        return ",".join(f"{name}={plain_epsilon(epsilon)}" for name, epsilon in value.items())
     return "" if value is None else number_text(value)
 
 
@@ -298,18 +278,15 @@ def _points(result: CurveResult) -> list[CurvePoint]:
 
 
 def _claims_of_curve(result: CurveResult) -> Iterator[Claim]:
-    each = [row.renders for row in result.table if row.renders]
-    total = {
-        kind: sum(renders.get(kind, 0) for renders in each) for kind in {kind for renders in each for kind in renders}
-    }
-    searched = searches_text(total, result.policy, bool(total.get("baseline")))
+    total: Counter[str] = Counter()
+    for row in result.table:
+        total.update(row.renders or {})
+    searched = searches_text(total, result.policy, bool(total["baseline"]))
     spent = f"Searched were, of all objects and epsilons together, {searched}. "
     for point in result.curve:
         if point.accuracy is None:
             continue
-        extent = Extent(
-            what="objects without a failure", count=point.robust, total=point.objects, interval=point.interval
-        )
+        extent = counted("objects without a failure", point.robust, point.objects, point.interval)
         where = "the controls' own budget" if point.epsilon is None else f"epsilon {point.epsilon:g}"
         text = (
             f"Within {where} the policy {result.policy} found no failure of {share_text(extent)} objects; "
@@ -323,18 +300,19 @@ def _claims_of_curve(result: CurveResult) -> Iterator[Claim]:
 
 def _shown_matrix(result: MatrixResult) -> ShownResult:
     """The matrix, with a row for the clean scene; the stronger a cell's colour, the more successes."""
+
+    def rate(number: int, rated: VerifiedRate | ControlGroup) -> str:
+        return f"{number}/{rated.trials}{no_numbers(rated.not_a_number)}, {interval_text(rated.interval)}"
+
+    marks = {"found": " *", "already wrong": " (wrong already)"}
     heads = ["attacked on", "ending", *(f"tested on {short_name(tried.model)}" for tried in result.tested)]
-    clean = [tried.clean for tried in result.tested]
-    counts = [f"right {control.correct}/{control.trials}{no_numbers(control.not_a_number)}" for control in clean]
-    right = [f"{text}, {interval_text(control.interval)}" for text, control in zip(counts, clean, strict=True)]
-    rows = [["clean scene", "", *right]] if clean else []
-    before = len(rows)
-    rows += [[short_name(row.attacked), row.ending, *map(_cell, row.tested)] for row in result.table]
-    shares = {
-        (before + up, 2 + across): cell.verified.rate
-        for up, row in enumerate(result.table)
-        for across, cell in enumerate(row.tested)
-    }
+    right = [f"right {rate(tried.clean.correct, tried.clean)}" for tried in result.tested]
+    rows = [["clean scene", "", *right]] if right else []
+    before, shares = len(rows), dict[tuple[int, int], float]()
+    for up, row in enumerate(result.table, before):
+        cells = [rate(cell.verified.successes, cell.verified) + marks.get(cell.ending, "") for cell in row.tested]
+        rows.append([short_name(row.attacked), row.ending, *cells])
+        shares |= {(up, across): cell.verified.rate for across, cell in enumerate(row.tested, 2)}
     spp = f", {result.tested[0].spp} samples per pixel" if result.tested else ""
     note = (
         "Successes of the trials, in which the model is wrong on the adversarial scene and right on the clean scene "
@@ -351,30 +329,18 @@ def _shown_matrix(result: MatrixResult) -> ShownResult:
         "ensemble": result.ensemble or "",
         "policy": result.policy,
     }
-    return ShownResult(_said_of_matrix(result), [table, *([figure] if tried else [])], facts)
-
-
-def _said_of_matrix(result: MatrixResult) -> str:
-    pairs = [(row, cell) for row in result.table for cell in row.tested]
-    if not pairs:
-        return "No adversarial scene was tried on any model."
-    if result.ensemble is not None:
-        held = sum(cell.ending == "found" for _, cell in pairs)
-        return f"One scene against all models together misleads {held} of {len(pairs)}."
-    at_home = [cell for row, cell in pairs if cell.model == row.attacked]
-    others = [cell for row, cell in pairs if cell.model != row.attacked]
-    held, passed = (sum(cell.ending == "found" for cell in cells) for cells in (at_home, others))
-    return (
+    at_home = [cell.ending for row in result.table for cell in row.tested if cell.model == row.attacked]
+    others = [cell.ending for row in result.table for cell in row.tested if cell.model != row.attacked]
+    held, passed, pairs = at_home.count("found"), others.count("found"), len(at_home) + len(others)
+    text = (
         f"{held} of {len(at_home)} answers hold on the model that they were searched on; "
         f"{passed} of {len(others)} on another one."
     )
-
-
-def _cell(cell: MatrixCell) -> str:
-    rated = cell.verified
-    mark = " *" if cell.ending == "found" else " (wrong already)" if cell.ending == "already wrong" else ""
-    rate = f"{rated.successes}/{rated.trials}{no_numbers(rated.not_a_number)}"
-    return f"{rate}, {interval_text(rated.interval)}{mark}"
+    if not pairs:
+        text = "No adversarial scene was tried on any model."
+    elif result.ensemble is not None:
+        text = f"One scene against all models together misleads {held + passed} of {pairs}."
+    return ShownResult(text, [table, *([figure] if tried else [])], facts)
 
 
 def _draw_matrix(result: MatrixResult, axes: Any) -> None:
@@ -383,9 +349,10 @@ def _draw_matrix(result: MatrixResult, axes: Any) -> None:
     axes.imshow(rates, cmap="Reds", vmin=0.0, vmax=1.0, aspect="auto")
     for up, row in enumerate(rows):
         for across, cell in enumerate(row.tested):
-            rated = cell.verified
-            colour = "white" if rated.rate > 0.6 else "black"
-            text = f"{rated.successes}/{rated.trials}"
+            text, colour = (
+                f"{cell.verified.successes}/{cell.verified.trials}",
+                "white" if rates[up][across] > 0.6 else "black",
+            )
             axes.text(across, up, text, ha="center", va="center", color=colour)
     names = [short_name(tried.model) for tried in result.tested]
     axes.set_xticks(range(len(names)), names, rotation=20 if max(map(len, names)) > 12 else 0)
@@ -397,7 +364,6 @@ def _draw_matrix(result: MatrixResult, axes: Any) -> None:
 def _claims_of_matrix(result: MatrixResult) -> Iterator[Claim]:
     for row in result.table:
         for cell in row.tested:
+            spent = searches_text(row.renders, result.policy, False) if cell.model == row.attacked else None
             name = f"searched on {row.attacked}, tried on {cell.model}"
-            at_home = cell.model == row.attacked
-            spent = searches_text(row.renders, result.policy, False) if at_home else None
             yield case_claim(name, cell.ending, cell.verified, spent)

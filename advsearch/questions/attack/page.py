@@ -24,7 +24,7 @@ from advsearch.questions.attack.display import (
     range_text,
     shown,
 )
-from advsearch.questions.attack.summary import AttackSummary, FoundValue, PicturedPrediction
+from advsearch.questions.attack.summary import AttackSummary, FoundValue
 from advsearch.report.figures import search_axes
 from advsearch.report.shown import Picture, ResultPart
 from advsearch.report.wording import (
@@ -41,33 +41,23 @@ from advsearch.runs.results import Result
 from advsearch.viewer.document import data_script, data_url
 from advsearch.viewer.pages import object_data, object_part, read_object, shown_page
 
-FRAME_QUALITY = 85
-"""Of the JPEG frames of the search, from 1 to 95."""
-
-MOST_TRIALS = 24
-"""Pictures of the verification that the page shows."""
-
-AT_THE_END = 1e-6
-"""Of a range: as near as that to one of its ends a value was stopped by it."""
-
-
+FRAME_QUALITY = 85  # Of the JPEG frames of the search, from 1 to 95
+MOST_TRIALS = 24  # Pictures of the verification that the page shows
+AT_THE_END = 1e-6  # Of a range: as near as that to one of its ends a value was stopped by it
 MARKED, FORMERLY_MARKED = "-prediction.png", "-answer.png"
 """How files with marks end, and how those of runs that were made before do."""
 
 
 def page(run: Path, result: Result) -> str | None:
-    """Return the page of an attack in the folder `run`; None of several, which are shown as all results are.
-
-    Raises:
-        FileFormatError: the results are damaged.
-    """
-    return attack_page(run, result) if isinstance(result, AttackSummary) else None
-
-
-def attack_page(run: Path, result: AttackSummary) -> str:
-    """See `page`."""
+    """Return the page of an attack in the folder `run`; None of several, which are shown as all results are. Raises
+    FileFormatError where the rows are damaged."""
+    if not isinstance(result, AttackSummary):
+        return None
     given, thing = shown(result), read_object(run)
-    frames, curves = _read_frames(run / directory.IMAGES / "search.gif"), _read_curves(run / store.NAME)
+    frames, curves = _read_frames(run / directory.IMAGES / "search.gif"), {}
+    if (run / store.NAME).is_file():
+        with store.Store(run / store.NAME, read_only=True) as stored:
+            curves = {kind: [value for _, value in stored.curve(kind)] for kind in ("search", "baseline")}
     worked = [[name, text] for name, text in wording.method_facts(result).items() if text]
     sections = [
         *_pictures(run, result, animated=bool(frames)),
@@ -81,44 +71,55 @@ def attack_page(run: Path, result: AttackSummary) -> str:
         ResultPart("How the search worked", rows=worked, folded=True),
         ResultPart(wording.plan_text(result), heads=wording.PLAN_HEADS, rows=wording.plan_rows(result), folded=True),
     ]
-    seconds = result.seconds
-    parts = ", ".join(f"{name} {seconds_text(value)}" for name, value in seconds.items() if name != "total")
+    parts = ", ".join(f"{name} {seconds_text(value)}" for name, value in result.seconds.items() if name != "total")
     facts = {
         **given.facts,
-        "time": seconds_text(seconds["total"]) + (f" ({parts})" if parts else ""),
+        "time": seconds_text(result.seconds["total"]) + (f" ({parts})" if parts else ""),
         "image formation": formation_text(result.image_formation),
         "environment": result.environment,
         "seed": str(result.seed),
     }
     about = [wording.budget_text(result), result.object, result.environment, result.model]
-    data = [data_script(_animation(frames, curves.get("search", [])), "frames")] if frames else []
+    data = object_data(thing)
+    if frames:  # with the steps that they are of, where each step has one; the last is the adversarial one
+        searched = curves.get("search", [])
+        steps = [round(number) for number in np.linspace(0, max(len(searched) - 1, 0), len(frames) - 1)]
+        objectives = [searched[step] if step < len(searched) else None for step in steps]
+        data = [data_script({"pictures": frames, "steps": steps, "objectives": objectives}, "frames"), *data]
+    scripts = ["make.js", "attack.js", *(["object.js"] if thing else [])]
     return shown_page(
-        run,
-        result,
-        replace(given, sections=sections, facts=facts, about=about),
-        data=[*data, *object_data(thing)],
-        scripts=["make.js", "attack.js", *(["object.js"] if thing else [])],
+        run, result, replace(given, sections=sections, facts=facts, about=about), data=data, scripts=scripts
     )
 
 
 def _pictures(run: Path, summary: AttackSummary, *, animated: bool) -> Iterator[ResultPart]:
     """What the model sees, and what it predicts; trials of the verification, the search, and frames along a drive."""
-    said = [("clean", "Clean", _prediction(summary, summary.clean))]
-    said.append(("adversarial", "Adversarial", _prediction(summary, summary.adversarial)))
-    seen = [Picture(f"images/{file}.png", text, name) for file, name, text in said]
+    predictions = {
+        name: "no prediction recorded" if predicted is None else prediction_text(summary.task, predicted)
+        for name, predicted in (("clean", summary.clean), ("adversarial", summary.adversarial))
+    }
+
+    def pair(ending: str) -> list[Picture]:
+        return [Picture(f"images/{name}{ending}", text, name.capitalize()) for name, text in predictions.items()]
+
+    trial, where, note = summary.clean.trial, " and ".join(summary.over), ""
+    if where and trial is None:
+        note = f"Both with the {where} that the scene comes with."
+    elif where:
+        others = "in other trials they, and what the model says, are others."
+        note = f"Both of trial {trial}, with the same {where}; {others}"
     gain = f"{images.DIFFERENCE_GAIN:g} times magnified, grey where nothing changed"
-    seen.append(Picture("images/difference.png", gain, "Difference"))
-    yield ResultPart("What the model sees", pictures=[seen], note=_same_conditions(summary))
+    seen = [*pair(".png"), Picture("images/difference.png", gain, "Difference")]
+    yield ResultPart("What the model sees", pictures=[seen], note=note)
     yield ResultPart(live="compare")
-    ends = MARKED if (run / directory.IMAGES / f"clean{MARKED}").is_file() else FORMERLY_MARKED
-    marked = [Picture(f"images/{file}{ends}", text, name) for file, name, text in said]
-    if (run / marked[0].file).is_file():
-        marks = marks_text(summary.task)
-        yield ResultPart("What it predicts", pictures=[marked], layout="large", note=marks)
-    trials = sorted(file.name for file in (run / directory.IMAGES).glob("verification*.png"))
+    kept = run / directory.IMAGES
+    ends = MARKED if (kept / f"clean{MARKED}").is_file() else FORMERLY_MARKED
+    if (kept / f"clean{ends}").is_file():
+        yield ResultPart("What it predicts", pictures=[pair(ends)], layout="large", note=marks_text(summary.task))
+    trials = sorted(file.name for file in kept.glob("verification*.png"))
     trials = ([name for name in trials if name.endswith(ends)] or trials)[:MOST_TRIALS]
     numbers = [name.removesuffix(ends).removeprefix("verification").removesuffix(".png").strip("-_") for name in trials]
-    small = [Picture(f"images/{name}", f"trial {one}") for name, one in zip(trials, numbers, strict=True)]
+    small = [Picture(f"images/{name}", f"trial {number}") for name, number in zip(trials, numbers, strict=True)]
     if small:
         yield ResultPart("Pictures of the verification", pictures=[small], layout="small", folded=True)
     if animated:
@@ -130,64 +131,37 @@ def _pictures(run: Path, summary: AttackSummary, *, animated: bool) -> Iterator[
         yield ResultPart("Along the drive", pictures=[strips], layout="rows", note=note)
 
 
-def _prediction(summary: AttackSummary, prediction: PicturedPrediction | None) -> str:
-    return "no prediction recorded" if prediction is None else prediction_text(summary.task, prediction)
-
-
-def _same_conditions(summary: AttackSummary) -> str:
-    """Which of many conditions the pictures show."""
-    trial, where = summary.clean.trial, " and ".join(summary.over)
-    if not summary.over:
-        return ""
-    if trial is None:
-        return f"Both with the {where} that the scene comes with."
-    return f"Both of trial {trial}, with the same {where}; in other trials they, and what the model says, are others."
-
-
 def _changes(summary: AttackSummary) -> ResultPart:
-    """The adversarial configuration in a few values, each beside its range where it has one, from the clean value to
-    the one found."""
-    found = summary.configuration or {}
-    rows = [
-        [name, "" if value.clean is None else number_text(value.clean), _value_text(value), _range_text(value)]
-        for name, value in found.items()
-    ]
+    """The adversarial configuration in a few values, each beside its range where it has one."""
+    rows, bars = [], []
+    for name, changed in (summary.configuration or {}).items():
+        clean = "" if changed.clean is None else number_text(changed.clean)
+        values = changed.value if isinstance(changed.value, list) else [changed.value]
+        unit = "" if changed.unit in ("", "1", "name") else f" {changed.unit}"
+        within, bar = _in_range(changed)
+        rows.append([name, clean, ", ".join(map(number_text, values)) + unit, within])
+        bars.append(bar)
     heads = ("parameter", "clean", "adversarial", "in its range")
     kept = [at for at in range(len(heads)) if any(row[at] for row in rows)]
     return ResultPart(
         "What was changed" if rows else "",
         heads=[heads[at] for at in kept],
         rows=[[row[at] for at in kept] for row in rows],
-        bars=[_place(value) for value in found.values()] if len(kept) == len(heads) else (),
+        bars=bars if len(kept) == len(heads) else (),
     )
 
 
-def _value_text(changed: FoundValue) -> str:
-    values = changed.value if isinstance(changed.value, list) else [changed.value]
-    unit = "" if changed.unit in ("", "1", "name") else f" {changed.unit}"
-    return ", ".join(map(number_text, values)) + unit
-
-
-def _range_text(changed: FoundValue) -> str:
-    if changed.low is None or changed.high is None or not isinstance(changed.value, (int, float)):
-        return ""
-    stopped = min(changed.value - changed.low, changed.high - changed.value) <= AT_THE_END * (
-        changed.high - changed.low
+def _in_range(changed: FoundValue) -> tuple[str, tuple[float, float, float] | None]:
+    low, high, value = changed.low, changed.high, changed.value
+    if low is None or high is None or not isinstance(value, (int, float)):
+        return "", None
+    stopped = min(value - low, high - value) <= AT_THE_END * (high - low)
+    text = f"{number_text(low)} to {number_text(high)}{', at its end' if stopped else ''}"
+    clean = changed.clean if isinstance(changed.clean, (int, float)) else value
+    begin, end, mark = (
+        min(max((at - low) / (high - low), 0.0), 1.0) for at in (min(clean, value), max(clean, value), value)
     )
-    said = f"{number_text(changed.low)} to {number_text(changed.high)}"
-    return f"{said}, at its end" if stopped else said
-
-
-def _place(changed: FoundValue) -> tuple[float, float, float] | None:
-    """Where the clean and the found value lie between the ends of the range."""
-    if changed.low is None or changed.high is None or not isinstance(changed.value, (int, float)):
-        return None
-    begin = changed.clean if isinstance(changed.clean, (int, float)) else changed.value
-    low, high, mark = (
-        min(max((value - changed.low) / (changed.high - changed.low), 0.0), 1.0)
-        for value in (min(begin, changed.value), max(begin, changed.value), changed.value)
-    )
-    return low, high, mark
+    return text, (begin, end, mark)
 
 
 def _textures(run: Path) -> ResultPart:
@@ -204,8 +178,7 @@ def _textures(run: Path) -> ResultPart:
 
 
 def _failures(summary: AttackSummary) -> Iterator[ResultPart]:
-    known = summary.failures
-    if known is None:
+    if (known := summary.failures) is None:
         return
     pictures = [
         Picture(
@@ -216,13 +189,12 @@ def _failures(summary: AttackSummary) -> Iterator[ResultPart]:
         for failure in known.listed
         if failure.picture and failure.holds
     ]
-    said = [f"Failures are {failures_text(known)}."]
-    yield replace(failures_part(known), title="Different failures", text=said, pictures=[pictures] if pictures else [])
+    text = [f"Failures are {failures_text(known)}."]
+    yield replace(failures_part(known), title="Different failures", text=text, pictures=[pictures] if pictures else [])
 
 
 def _rates(summary: AttackSummary, table: ResultPart) -> ResultPart:
-    """The table of rates, these first, for a phone cuts what is on the right, with a bar for each; empty where nothing
-    was rated."""
+    """The table of rates with bars, rates first, as a phone cuts what is on the right; empty if nothing was rated."""
     baseline, average = summary.baseline, summary.average
     rated = [summary.clean.control, *([summary.verified] if summary.adversarial else [])]
     rated += [baseline.verified] if baseline else []
@@ -238,28 +210,21 @@ def _rates(summary: AttackSummary, table: ResultPart) -> ResultPart:
 
 def _curve(summary: AttackSummary, curves: dict[str, list[float | None]]) -> ResultPart:
     named = {summary.policy: curves.get("search", []), "random search": curves.get("baseline", [])}
-    known = {name: values for name, values in named.items() if any(value is not None for value in values)}
-    if not known:
+    numbers = {name: [value for value in values if value is not None] for name, values in named.items()}
+    numbers = {name: values for name, values in numbers.items() if values}
+    if not numbers:
         return ResultPart()
     above = "right" if summary.minimises else wording.success(summary)
     zero = f"above: {above}" if summary.objective in SUCCESS_ABOVE_ZERO else ""
-    ends = {name: [one for one in values if one is not None] for name, values in known.items()}
-    listed = "; ".join(f"{name}: from {one[0]:.3g} to {max(one):.3g}" for name, one in ends.items())
+    listed = "; ".join(f"{name}: from {values[0]:.3g} to {max(values):.3g}" for name, values in numbers.items())
     label = objective_label(summary.objective)
     return ResultPart(
         "The search",
         [f"{label} over evaluations. {listed}"],
-        draw=partial(search_axes, known, label, zero_means=zero),
+        draw=partial(search_axes, {name: named[name] for name in numbers}, label, zero_means=zero),
         note="Lines: the best so far. Dots: each evaluation. These are the search's claims; the table above is "
         "verified.",
     )
-
-
-def _animation(frames: list[str], searched: list[float | None]) -> dict[str, object]:
-    """The frames of the search with the steps they are of, where each step has one; the last is the adversarial one."""
-    steps = [round(number) for number in np.linspace(0, max(len(searched) - 1, 0), len(frames) - 1)]
-    objectives = [searched[step] if step < len(searched) else None for step in steps]
-    return {"pictures": frames, "steps": steps, "objectives": objectives}
 
 
 def _read_frames(file: Path) -> list[str]:
@@ -274,10 +239,3 @@ def _read_frames(file: Path) -> list[str]:
     except images.BAD_PICTURE:
         return []
     return frames if len(frames) > 1 else []
-
-
-def _read_curves(path: Path) -> dict[str, list[float | None]]:
-    if not path.is_file():
-        return {}
-    with store.Store(path, read_only=True) as results:
-        return {kind: [value for _, value in results.curve(kind)] for kind in ("search", "baseline")}

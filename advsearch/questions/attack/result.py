@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import io
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from statistics import mode
 from typing import TYPE_CHECKING, Any, TypedDict
 
 import numpy as np
@@ -108,7 +108,7 @@ class AttackResult:
     def values(self) -> dict[str, Any]:
         """The adversarial configuration by name, such as `pose.yaw`, without units; of a texture, numbers that
         describe it. Empty where nothing was searched; `summary.configuration` has the units."""
-        return {name: one.value for name, one in (self.summary.configuration or {}).items()}
+        return {name: found.value for name, found in (self.summary.configuration or {}).items()}
 
     @property
     def images(self) -> dict[str, Tensor]:
@@ -213,22 +213,15 @@ class AttackResult:
         return f"AttackResult({summary.object!r}, {controls!r}, {summary.ending!r}{verified}, run={run!r})"
 
     def _repr_html_(self) -> str:
-        pictures = {"clean": self.clean.numpy(), "adversarial": self.adversarial.numpy()}
-        return result_html(shown(self.summary), pictures)
+        return result_html(shown(self.summary), self.images)
 
     def _repr_png_(self) -> bytes:
-        return side_by_side([self.clean.numpy(), self.adversarial.numpy()])
+        return side_by_side([*self.images.values()])
 
 
-MOST_FACES = 30_000
-"""Faces of the meshes that are kept to turn; of more, as many are shown."""
-
-NEAR = 2.0
-"""How far from the object's middle another mesh may be to be shown with it, in the object's extent."""
-
-
-PICTURE_SPP = 16
-"""Samples a pixel of the pictures that are kept where nothing was tried."""
+MOST_FACES = 30_000  # Faces of the meshes that are kept to turn; of more, as many are shown
+NEAR = 2.0  # How far from the object's middle another mesh may be to be shown with it, in the object's extent
+PICTURE_SPP = 16  # Samples a pixel of the pictures that are kept where nothing was tried
 
 
 @dataclass(frozen=True, eq=False)
@@ -261,37 +254,30 @@ def trial_to_show(findings: Findings) -> int | None:
     It is the first with the most frequent prediction among the successes (else among the trials that count), if there
     is one beside which the clean scene has its own most frequent prediction. None where nothing was tried.
     """
+
+    def labels(trials: Sequence[Judgement]) -> list[str]:
+        return [trial.prediction.label for trial in trials]
+
     checked = findings.verification
-    clean = _labels(findings.clean if checked is None else checked.clean_trials)
+    clean = labels(findings.clean if checked is None else checked.clean_trials)
     if checked is None:
-        return clean.index(_usual(clean)) if clean else None
-    labels = _labels(checked.adversarial_trials)
-    usual, usual_clean = _usual(_labels(checked.successes or checked.counting)), _usual(clean)
+        return clean.index(mode(clean)) if clean else None
+    usual, usual_clean = mode(labels(checked.successes or checked.counting)), mode(clean)
     ranks = [
         (label == usual and outcome is bool(checked.successes), label == usual, beside == usual_clean)
-        for label, outcome, beside in zip(labels, checked.outcomes, clean, strict=False)
+        for label, outcome, beside in zip(labels(checked.adversarial_trials), checked.outcomes, clean, strict=False)
     ]
     return checked.begin + ranks.index(max(ranks))
 
 
-def _labels(trials: Sequence[Judgement]) -> list[str]:
-    return [trial.prediction.label for trial in trials]
-
-
-def _usual(labels: Sequence[str]) -> str:
-    """The most frequent label; the first of equals."""
-    return Counter(labels).most_common(1)[0][0]
-
-
 def write_pictures(run: RunDirectory, problem: Problem, findings: Findings, shown: Mapping[str, KeptPicture]) -> None:
     """Write the pictures of the clean and the adversarial scene, of their difference, of trials and of the search."""
-    gain = problem.renderer.formation.gain
-    for name, one in shown.items():
-        run.save_image(name, one.picture)
-        run.save_exr(name, one.radiance * gain)
-        save_marked(run, name, one.picture, problem.marks(one.picture, one.whole))
+    for name, kept in shown.items():
+        run.save_image(name, kept.picture)
+        run.save_exr(name, kept.radiance * problem.renderer.formation.gain)
+        save_marked(run, name, kept.picture, problem.marks(kept.picture, kept.whole))
         if problem.aovs:
-            surfaces, file = problem.renderer.surfaces(one.whole), run.path / IMAGES / f"{name}.aov.exr"
+            surfaces, file = problem.renderer.surfaces(kept.whole), run.path / IMAGES / f"{name}.aov.exr"
             images.write_layers(file, surfaces.layers(problem.aovs, OBJECT), surfaces.notes(problem.aovs))
     run.save_image("difference", images.difference(shown["clean"].picture, shown["adversarial"].picture))
     checked = findings.verification
@@ -322,13 +308,6 @@ def save_marked(run: RunDirectory, name: str, picture: Tensor, marks: list[Mark]
         run.save_image(f"{name}-prediction", marked(picture.numpy(), marks))
 
 
-def write_artifacts(run: RunDirectory, artifacts: dict[str, Tensor]) -> None:
-    """Keep what the controls hand over: an 8-bit PNG, and an EXR of the same display-referred values in float32."""
-    for name, picture in artifacts.items():
-        run.save_image(name, picture, folder="artifacts")
-        run.save_exr(name, picture, folder="artifacts")
-
-
 def write_object(run: RunDirectory, problem: Problem, u: Tensor) -> None:
     """Keep the object, and the meshes beside it that controls move or paint, to turn in a browser."""
     scene, assembly = problem.space.scene, problem.renderer.scene.assembly
@@ -336,18 +315,15 @@ def write_object(run: RunDirectory, problem: Problem, u: Tensor) -> None:
         return
     with torch.no_grad():
         after, before = (assembly(problem.space.inputs(problem.whole(at))) for at in (u, problem.domain.start))
-    parts = [
-        part
-        for name, part in scene.meshes.items()
-        if name == OBJECT or any(key.partition(".")[0] == name for key in after)
-    ]
+    moved = {OBJECT, *(key.partition(".")[0] for key in after)}
+    parts = [part for name, part in scene.meshes.items() if name in moved]
     fewer = {part.name: simpler(part.mesh, MOST_FACES // len(parts)) for part in parts}
 
     def shown(inputs: Mapping[str, Tensor]) -> list[Shape]:
-        found = [posed(part, inputs) for part in parts]
-        thing = next(one for one in found if one.name == OBJECT).mesh.vertices
-        middle, reach = thing.mean(axis=0), NEAR * float(np.ptp(thing, axis=0).max())
-        near = [one for one in found if np.abs(one.mesh.vertices.mean(axis=0) - middle).max() < reach]
+        shapes = {part.name: posed(part, inputs) for part in parts}
+        vertices = shapes[OBJECT].mesh.vertices
+        middle, reach = vertices.mean(axis=0), NEAR * float(np.ptp(vertices, axis=0).max())
+        near = [one for one in shapes.values() if np.abs(one.mesh.vertices.mean(axis=0) - middle).max() < reach]
         return [replace(one, mesh=left.of(one.mesh)) if (left := fewer[one.name]) else one for one in near]
 
     camera = after.get("camera.to_world")
@@ -358,12 +334,8 @@ def write_object(run: RunDirectory, problem: Problem, u: Tensor) -> None:
 
 
 FRAMES = 24
-
-STRIP, SIDE = 8, 160
-"""Pictures of a strip at most, and the height of each in pixels."""
-
-FASTEST = 40
-"""Milliseconds that a frame of an animation is shown at least."""
+STRIP, SIDE = 8, 160  # Pictures of a strip at most, and the height of each in pixels
+FASTEST = 40  # Milliseconds that a frame of an animation is shown at least
 
 Frames = list[npt.NDArray[np.float32]]
 
@@ -371,15 +343,21 @@ Frames = list[npt.NDArray[np.float32]]
 def along_drive(problem: Problem, u: Tensor | None, spp: int, run: RunDirectory | None) -> AlongDrive | None:
     """Look at an adversarial scene, and at the clean scene, at evenly spaced times of each path that varies by chance;
     None where none does. What varies beside it is as the scene comes."""
-    along = _path_of(problem)
-    if along is None:
+    searched = problem.space.controls[: problem.searched]
+    place, path = sum(len(bound.start) for bound in searched), None
+    for control in problem.space.controls[len(searched) :]:
+        if isinstance(control, PathControl) and any(
+            slot.parameter.name == "time" and slot.width for slot in control.slots
+        ):
+            path = control
+            break
+        place += len(control.start)
+    if path is None:
         return None
-    path, place = along
     start = problem.whole(problem.domain.start)
-    drawn = next(
-        (one.spec.values for one in path.slots if one.parameter.name == WAY and isinstance(one.spec, OneOf)), ()
-    )
-    ways = list(dict.fromkeys(drawn))
+    specs = [slot.spec for slot in path.slots if slot.parameter.name == WAY]
+    drawn = next((spec.values for spec in specs if isinstance(spec, OneOf)), ())
+    ways = list(dict.fromkeys(drawn))  # which one is drawn is the coordinate behind the time
     each = start.repeat(max(1, len(ways)), FRAMES, 1)
     each[..., place] = torch.linspace(0.0, 1.0, FRAMES)
     for number, way in enumerate(ways):
@@ -404,39 +382,23 @@ def along_drive(problem: Problem, u: Tensor | None, spp: int, run: RunDirectory 
     return AlongDrive(
         frames=len(times),
         seconds=seconds,
-        paths=[str(one) for one in ways],
+        paths=[str(way) for way in ways],
         clean=counts["drive-clean"],
         answer=counts.get("drive"),
         spp=spp,
     )
 
 
-def _path_of(problem: Problem) -> tuple[PathControl, int] | None:
-    """The path among what varies by chance, and the coordinate of the whole space that is its time; where one of
-    several paths is drawn, which one is the next coordinate."""
-    begin = 0
-    for number, bound in enumerate(problem.space.controls):
-        chance = problem.searched is not None and number >= problem.searched
-        if (
-            chance
-            and isinstance(bound, PathControl)
-            and any(one.parameter.name == "time" and one.width for one in bound.slots)
-        ):
-            return bound, begin
-        begin += len(bound.start)
-    return None
-
-
 def write_drive(run: RunDirectory, name: str, pictures: Sequence[npt.NDArray[np.float32]], seconds: float) -> None:
     """Write frames (h, w, 3) in sRGB as an animation, NAME.webp, and some side by side, NAME.png, into a run."""
-    frames = [Image.fromarray((one * 255.0).round().clip(0, 255).astype(np.uint8)) for one in pictures]
+    frames = [Image.fromarray((picture * 255.0).round().clip(0, 255).astype(np.uint8)) for picture in pictures]
     file = io.BytesIO()
     pause = max(FASTEST, round(1000.0 * seconds / len(frames)))
     frames[0].save(file, "WEBP", save_all=True, append_images=frames[1:], duration=pause, loop=0, quality=80)
     write_bytes(run.path / IMAGES / f"{name}.webp", file.getvalue())
     size = max(1, round(frames[0].width * SIDE / frames[0].height)), SIDE
     small = [frames[number].resize(size, Image.Resampling.LANCZOS) for number in evenly(len(frames), STRIP)]
-    run.save_image(name, np.concatenate([np.asarray(one, dtype=np.float32) / 255.0 for one in small], axis=1))
+    run.save_image(name, np.concatenate([np.asarray(frame, dtype=np.float32) / 255.0 for frame in small], axis=1))
 
 
 def evenly(count: int, most: int) -> npt.NDArray[np.int64]:

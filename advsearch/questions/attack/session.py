@@ -124,7 +124,7 @@ def attack(
             "model: expected one, got several; add `ensemble`, which attacks them together, or attack each by itself"
         )
     if config.epsilons:
-        listed = ", ".join(f"{one:g}" for one in config.epsilons)
+        listed = ", ".join(f"{epsilon:g}" for epsilon in config.epsilons)
         raise InputError(
             f"epsilon: expected one, got {listed}; attack with each, or have `advsearch attack` draw the curve"
         )
@@ -154,17 +154,16 @@ def _policy_of(setting: str | Mapping[str, Any]) -> Policy[Any]:
 
 
 def _scene(scene: Scene | str | Path | Mapping[str, Any], object: str | None, settings: Mapping[str, Any]) -> Scene:
-    """The scene as it was given, or the one that a name and the settings describe."""
     if isinstance(scene, Scene):
         check_not_of_scene({**settings, "object": object})
         return scene
-    said = SceneConfig(**{"object": "mug", **{name: one for name, one in settings.items() if name in OF_SCENE}})
-    given = told_of_scene(said)
+    config = SceneConfig(**{"object": "mug", **{name: settings[name] for name in OF_SCENE if name in settings}})
+    more = told_of_scene(config)
     if object is not None:
-        return load_scene(object, said.environment, scene=scene, **given)
+        return load_scene(object, config.environment, scene=scene, **more)
     if isinstance(scene, Mapping):
         raise InputError("object: which shape of the scene is it? Give its id")
-    return load_scene(scene, said.environment, **given)
+    return load_scene(scene, config.environment, **more)
 
 
 def _set_by(scene: Scene, exposure: float | None) -> dict[str, float | str]:

@@ -11,17 +11,12 @@ from advsearch.config import ControlsByName, DerivativeConfig, RenderConfig, Sce
 from advsearch.files import JsonObject
 from advsearch.settings import Clash, power, setting, setting_as_in, split_names
 
-TRIALS, TRIALS_OVER = 20, 200
-"""Fresh renders that check what a search found, and what holds for many conditions."""
-
-STEPS = 40
-"""Of a search about one picture."""
-
+TRIALS, TRIALS_OVER = 20, 200  # Fresh renders that check what a search found, and what holds for many conditions
+STEPS = 40  # Of a search about one picture
 OVER_PREDICTED, OVER_ONE, OVER_RENDERED, OVER_NUMBERS = (300, 8), (100, 4), (150, 4), (STEPS, 4)
 """Steps, and conditions that each looks at, of a search for many conditions: where a bank of light transport predicts
 pictures (`benchmarks/bank.py`), where that is so and conditions are one number (docs/drives.md), where each is
 rendered, and where only a few numbers are searched (a pose)."""
-
 FEWEST_TRIALS = 6
 """With fewer, nothing can be called found: `attacks.verification.Rule.fewest`, which a test holds this to."""
 
@@ -37,49 +32,49 @@ class AttackConfig(DerivativeConfig):
     clashes: ClassVar[tuple[Clash, ...]] = (
         *DerivativeConfig.clashes,
         Clash(
-            "smallest", lambda one: one.epsilons,
+            "smallest", lambda asked: asked.epsilons,
             "finds one epsilon by itself; give one `epsilon` as the largest, or none",
         ),
         Clash(
-            "smallest", lambda one: one.is_study,
+            "smallest", lambda asked: asked.is_study,
             "is about one object and one model; name one `object`, one `model`, and one `epsilon` as the largest",
         ),
         Clash(
-            "model", lambda one: one.is_matrix and one.is_curve,
+            "model", lambda asked: asked.is_matrix and asked.is_curve,
             "several make a matrix, of one object and one epsilon; name one `object` and one `epsilon`, or one `model`",
         ),
         Clash(
-            "ensemble", lambda one: len(split_names(one.model)) < 2,
+            "ensemble", lambda asked: len(split_names(asked.model)) < 2,
             "is of several models; name them in `model`, separated by commas, or leave `ensemble` out",
         ),
         Clash(
-            "smallest", lambda one: one.seconds is not None,
+            "smallest", lambda asked: asked.seconds is not None,
             "takes several searches; give `steps` for each, and leave `seconds` out",
         ),
-        Clash("smallest", lambda one: one.over, "cannot be combined with `over` yet; leave one of them out"),
-        Clash("smallest", lambda one: one.printable, "cannot be combined with `printable`; leave one of them out"),
-        Clash("minimise", lambda one: one.is_curve, "has no robust accuracy; name one `object` and one `epsilon`"),
-        Clash("minimise", lambda one: one.target, "makes the right answer easier to give; leave `target` out"),
-        Clash("minimise", lambda one: one.smallest, "has no smallest change; leave `smallest` out"),
+        Clash("smallest", lambda asked: asked.over, "cannot be combined with `over` yet; leave one of them out"),
+        Clash("smallest", lambda asked: asked.printable, "cannot be combined with `printable`; leave one of them out"),
+        Clash("minimise", lambda asked: asked.is_curve, "has no robust accuracy; name one `object` and one `epsilon`"),
+        Clash("minimise", lambda asked: asked.target, "makes the right answer easier to give; leave `target` out"),
+        Clash("minimise", lambda asked: asked.smallest, "has no smallest change; leave `smallest` out"),
         Clash(
-            "over", lambda one: {*map(instance, one.over)} & {*map(instance, one.controls)},
+            "over", lambda asked: {*map(instance, asked.over)} & {*map(instance, asked.controls)},
             "names a control that is searched already; leave it out of one of the two",
         ),
         Clash(
             "draws",
-            lambda one: not one.over and one.draws != OVER_RENDERED[1],  # which run.yaml of older versions always say
+            lambda asked: not asked.over and asked.draws != OVER_RENDERED[1],  # which older run.yaml always say
             "is how many conditions of `over` a step looks at, and there are none; add `over`, or leave `draws` out",
         ),
         Clash(
             "estimators",
-            lambda one: (
-                {name.partition(".")[0] for name in one.estimators}
-                & {part for name in map(instance, one.over) for part in (name, name.rpartition(":")[2])}
+            lambda asked: (
+                {name.partition(".")[0] for name in asked.estimators}
+                & {part for name in map(instance, asked.over) for part in (name, name.rpartition(":")[2])}
             ),
             "names a control that varies by chance, whose derivative nobody asks for; leave it out",
         ),
         Clash(
-            "average", lambda one: one.command == "attack" and one.is_curve,
+            "average", lambda asked: asked.command == "attack" and asked.is_curve,
             "is not part of a curve; `advsearch gap` compares with the average, or name one `object` and one `epsilon`",
         ),
     )
@@ -245,5 +240,5 @@ class AttackConfig(DerivativeConfig):
 
 def instance(asked: str) -> str:
     """A control as it is asked for, without its parameter: `light:key`, or `camera` of `camera.azimuth`."""
-    kind, colon, own = asked.partition(":")
-    return kind.partition(".")[0] + colon + own.partition(".")[0]
+    kind, colon, name = asked.partition(":")
+    return kind.partition(".")[0] + colon + name.partition(".")[0]

@@ -47,14 +47,10 @@ from advsearch.scene.transport.matrix import TransportTooLargeError
 from advsearch.tasks import Judgement
 
 MOST_FRAMES = 60
-
 UNPRINTED = "search without print terms"
 """The kind of the search beside one with print terms: what these cost is told by its result."""
-
-
 LOOK, LOOKED_AT = "first look", ("score", "margin", "objective")
 """The note of what the model and the objective said of the first look, and of what it consists for each picture."""
-
 FIRST_LOOK = 4
 """Renders of the clean configuration before the search; wrong in all of them, it goes through the full trials first."""
 
@@ -74,11 +70,10 @@ class Attack:
     def __post_init__(self) -> None:
         self.problem: Problem = self.journal.problem
         self._asked_spp = self.problem.spp  # a preparation may choose another one for the search
-        ladder = ladder_of(self.config)
-        asked = self.config.trials is not None or self.config.smallest
-        unasked = TRIAL_LOOKS if self.problem.conditions is None else OVER_LOOKS
-        looks = (self.config.trial_count,) if asked else unasked
-        self._verifier = Verifier(self.journal, ladder, self.stages, self.findings, looks)
+        looks = TRIAL_LOOKS if self.problem.conditions is None else OVER_LOOKS
+        if self.config.trials is not None or self.config.smallest:
+            looks = (self.config.trial_count,)
+        self._verifier = Verifier(self.journal, ladder_of(self.config), self.stages, self.findings, looks)
 
     def carry_out(self) -> Findings:
         if self.config.smallest:
@@ -104,114 +99,88 @@ class Attack:
 
     def plan(self) -> None:
         """Measure the gradient plan, or take the one that the run was begun with."""
-        problem, stored = self.problem, self.journal.note(PLAN)
-        if stored is None:
-            self._cut_paths()
-            self._measure()
-            chosen = {"plan": problem.plan.to_dict(), "spp": problem.spp, "search_depth": problem.search_depth}
-            self.journal.set_note(PLAN, chosen)
+        problem, config, stored = self.problem, self.config, self.journal.note(PLAN)
+        if stored is not None:
+            problem.plan = problem.plan.restored(stored["plan"])
+            problem.spp, problem.search_depth = stored["spp"], stored.get("search_depth")
             return
-        problem.plan = problem.plan.restored(stored["plan"])
-        problem.spp, problem.search_depth = stored["spp"], stored.get("search_depth")
-
-    def _cut_paths(self) -> None:
-        """Leave bounces of light out of the search's renders, where it is long enough for that to pay."""
-        problem, config = self.problem, self.config
         worth = config.specialise and (config.measure == "full" or problem.steps >= planning.WORTH_BOUNCES)
         if worth and self.against_surface_light() is not None:  # else no step will be rendered
-            self.stages.begin(
-                "setup",
-                "finding how many bounces of light the search needs",
-                planning.most_pictures(problem),
-                hint="few samples each; `specialise=false` leaves it out",
-                at_most=True,
-            )
-            problem.search_depth = planning.bounces_of(problem, problem.seed, tick=self._advance).depth
+            title, most = "finding how many bounces of light the search needs", planning.most_pictures(problem)
+            hint = "few samples each; `specialise=false` leaves it out"
+            self.stages.begin("setup", title, most, hint=hint, at_most=True)
+            tick = self.stages.progress.advance
+            problem.search_depth = planning.bounces_of(problem, problem.seed, tick=tick).depth
+        self._measure()
+        chosen = {"plan": problem.plan.to_dict(), "spp": problem.spp, "search_depth": problem.search_depth}
+        self.journal.set_note(PLAN, chosen)
 
     def _measure(self) -> None:
         """Replace the first gradient plan by a measured one, as far as the preparation wants that."""
-        problem, config = self.problem, self.config
+        problem, config, tick = self.problem, self.config, self.stages.progress.advance
         full = config.measure == "full"
         if config.measure == "no" or not self.policy.uses_gradient:
             return
         if not full and reason_against(problem, problem.steps, config.specialise) is None:
             return  # derivatives will come from what predicts the pictures
-        renderer = problem.renderer
+        renderer, counted = problem.renderer, not full or config.deterministic
         u, seed = inside(renderer), seeds.stream(problem.seed, "measure")
         gradients = planning.plan_gradients(renderer.plan, every=full)
         if gradients:
-            self.stages.begin(
-                "setup",
-                "measuring which gradients are best here",
-                gradients,
-                hint=f"{gradients} gradients of {count(problem.spp, 'sample')} a pixel; `measure=no` leaves it out",
-            )
+            hint = f"{gradients} gradients of {count(problem.spp, 'sample')} a pixel; `measure=no` leaves it out"
+            self.stages.begin("setup", "measuring which gradients are best here", gradients, hint=hint)
         problem.plan = planning.measured_plan(
-            renderer,
-            problem.loss,
-            u,
-            seed=seed,
-            spp=problem.spp,
-            every=full,
-            counted=not full or config.deterministic,
-            tick=self._advance,
+            renderer, problem.loss, u, seed=seed, spp=problem.spp, every=full, counted=counted, tick=tick
         )
         if full:
-            self.stages.begin(
-                "setup",
-                "choosing step and samples of gradients",
+            samples, hint = (
                 planning.cosine_samples(problem.plan),
-                hint="counted in samples a pixel; `measure=quick` leaves it out",
-                at_most=True,
+                "counted in samples a pixel; `measure=quick` leaves it out",
             )
-            table = list(planning.cosines(renderer, problem.loss, u, seed=seed, tick=self._advance))
-            plan, spp = planning.tuned(problem.plan, table)
-            problem.plan = plan
+            self.stages.begin("setup", "choosing step and samples of gradients", samples, hint=hint, at_most=True)
+            table = list(planning.cosines(renderer, problem.loss, u, seed=seed, tick=tick))
+            problem.plan, spp = planning.tuned(problem.plan, table)
             problem.spp = spp if config.spp is None and spp is not None else problem.spp
 
     def worth_attacking(self) -> bool:
         """Look at the clean configuration; one that is wrong in every look goes through the full trials at once, as
         does one whose smallest change is wanted."""
         problem, config, findings = self.problem, self.config, self.findings
-        seed, start = seeds.stream(problem.seed, "first look"), problem.domain.start
-        self.stages.begin(
-            "setup", "looking at the clean scene", FIRST_LOOK, hint="the first picture compiles the renderer's code"
-        )
+        spp, seed, start = self._asked_spp, seeds.stream(problem.seed, "first look"), problem.domain.start
+        hint = "the first picture compiles the renderer's code"
+        self.stages.begin("setup", "looking at the clean scene", FIRST_LOOK, hint=hint)
 
         def look(query: Query) -> Evaluation:
             evaluation = problem.evaluate(query)
-            self._advance()
+            self.stages.progress.advance(1)
             return evaluation
 
-        spp = self._asked_spp
         findings.first_look = run_trials(partial(map, look), start, spp=spp, seed=seed, trials=FIRST_LOOK)
         self._check_look(start)
         looks_right = any(trial.right for trial in findings.first_look)
-        if not self.problem.rule.control or (looks_right and not config.smallest):
+        if not problem.rule.control or (looks_right and not config.smallest):
             return True
         self._verifier.choose_spp({"clean": start})
         self._verifier.begin("checking the clean scene with fresh renders", self._verifier.looks[0])
         self._verifier.try_clean()
-        return not self.problem.rule.already_wrong(count_right(findings.clean, findings.spp))
+        return not problem.rule.already_wrong(count_right(findings.clean, findings.spp))
 
     def _check_look(self, start: Tensor) -> None:
-        """Note what was seen, or refuse to go on with a model or an objective that says something else of the same
-        pictures than it did. One that says something else each time can't be told by it."""
-        now = [_values(trial) for trial in self.findings.first_look]
-        before = self.journal.note(LOOK)
+        """Note what was seen, or refuse a model or an objective that says something else of the same pictures now; one
+        that does so each time can't be told by it."""
+
+        def values(trial: Judgement) -> list[float | None]:
+            return [finite(getattr(trial, name)) for name in LOOKED_AT]
+
+        now, before = [values(trial) for trial in self.findings.first_look], self.journal.note(LOOK)
         if before is None:
             self.journal.set_note(LOOK, now)
-            return
-        if all(map(same, before, now)):
-            return
-        seed = seeds.stream(seeds.stream(self.problem.seed, "first look"), "verification", 0)
-        again = self.problem.evaluate(Query(start, seed, spp=self._asked_spp))
-        if same(_values(again.said), now[0]):
-            values = dict(zip(LOOKED_AT, zip(before[0], now[0], strict=True), strict=True))
-            raise other_numbers(self.journal.run, values)
-
-    def _advance(self, steps: int = 1) -> None:
-        self.stages.progress.advance(steps)
+        elif not all(map(same, before, now)):
+            seed = seeds.stream(seeds.stream(self.problem.seed, "first look"), "verification", 0)
+            again = self.problem.evaluate(Query(start, seed, spp=self._asked_spp))
+            if same(values(again.said), now[0]):
+                both = zip(before[0], now[0], strict=True)
+                raise other_numbers(self.journal.run, dict(zip(LOOKED_AT, both, strict=True)))
 
     # ---- verification -----------------------------------------------------------------------------------------------
 
@@ -222,56 +191,51 @@ class Attack:
         The smallest change lies at the decision, where no sample count settles the margin: it is tried with that of the
         clean configuration, as on the way to it.
         """
-        findings, problem = self.findings, self.problem
+        findings, problem, verifier = self.findings, self.problem, self._verifier
         answered, baseline, unprinted = findings.search, findings.baseline, findings.unprinted
         if answered is None:
             raise RuntimeError("nothing was searched, so there is nothing to verify")
         adversarial = problem.domain.project(answered.best_u)
+        searched = [result for result in (answered, baseline, unprinted) if result is not None]
         if not self.config.smallest or findings.sample_count is None:
-            searched = [result for result in (answered, baseline, unprinted) if result is not None]
             pictures = sum((result.renders + result.gradients) * problem.draws for result in searched)
             candidates = {"adversarial": adversarial, "clean": problem.domain.start}
-            self._verifier.choose_spp(candidates, searched=pictures * problem.spp)
-        groups = 1 + (baseline is not None) + (unprinted is not None) + (not self._verifier.clean_tried)
-        self._verifier.begin("checking what was found with fresh renders", groups * self._verifier.count, at_most=True)
-        self._verifier.try_clean()
-        findings.verification = self._verifier.verified("verification", answered)
+            verifier.choose_spp(candidates, searched=pictures * problem.spp)
+        groups = len(searched) + (not verifier.clean_tried)
+        verifier.begin("checking what was found with fresh renders", groups * verifier.count, at_most=True)
+        verifier.try_clean()
+        findings.verification = verifier.verified("verification", answered)
         if findings.verification.ending is Ending.ALREADY_WRONG:
             findings.smallest = None  # seen with other samples than before: no change at all flips the prediction
         if unprinted is not None:
-            findings.unprinted_verification = self._verifier.verified("unprinted verification", unprinted)
+            findings.unprinted_verification = verifier.verified("unprinted verification", unprinted)
         if baseline is not None:
             decided = findings.verification.ending is Ending.FOUND
-            findings.baseline_verification = self._verifier.verified(
-                "baseline verification", baseline, curtailed=decided
-            )
+            findings.baseline_verification = verifier.verified("baseline verification", baseline, curtailed=decided)
             self._take_the_worse(answered, baseline)
         if not self.config.smallest:
-            check_failures(self._verifier, answered)
+            check_failures(verifier, answered)
         if findings.verification.ending is Ending.FOUND:
-            find_ambient(self._verifier, findings.verification.u)
+            find_ambient(verifier, findings.verification.u)
 
     def _take_the_worse(self, result: SearchResult, baseline: SearchResult) -> None:
         """Let what the random search found be the run's if it is found and the worse one for the model, and remember
         that. It is chosen by its trials, so these are no evidence: it has to be the worse one in fresh ones, too."""
         findings = self.findings
-        own, other = findings.verification, findings.baseline_verification
-        if own is None or other is None or other.ending is not Ending.FOUND or _rank(other) <= _rank(own):
+        by_policy, by_chance = findings.verification, findings.baseline_verification
+        if by_policy is None or by_chance is None or by_chance.ending is not Ending.FOUND:
+            return
+        if _rank(by_chance) <= _rank(by_policy):
             return
         title = "checking what the random search found again"
         self._verifier.begin(title, 2 * self._verifier.count, at_most=True)
-        other = findings.baseline_verification = self._verifier.verified("baseline verification", baseline, again=True)
-        if _rank(other) <= _rank(own):
-            return
-        findings.beaten, findings.verification = own, other
-        findings.search = replace(
-            result,
-            best_u=baseline.best_u,
-            best_objective=baseline.best_objective,
-            claimed_objective=baseline.claimed_objective,
-            success_rate=baseline.success_rate,
-            distribution=None,
-        )
+        by_chance = self._verifier.verified("baseline verification", baseline, again=True)
+        findings.baseline_verification = by_chance
+        if _rank(by_chance) > _rank(by_policy):
+            findings.beaten, findings.verification = by_policy, by_chance
+            names = ("best_u", "best_objective", "claimed_objective", "success_rate")
+            taken = {name: getattr(baseline, name) for name in names}
+            findings.search = replace(result, **taken, distribution=None)
 
     # ---- searches ---------------------------------------------------------------------------------------------------
 
@@ -315,8 +279,8 @@ class Attack:
     def _renders_because(self, reason: str) -> None:
         """Keep why the search renders, and say so where that needn't be."""
         self.findings.rendered_because = reason
-        if told := remark(reason):
-            self.stages.progress.message(told)
+        if text := remark(reason):
+            self.stages.progress.message(text)
 
     def search_all(self) -> None:
         """The search, the same without print terms where it has them, and the random one, each with as many renders."""
@@ -346,12 +310,8 @@ class Attack:
         domain: Domain | None = None,
         ranked: bool = True,
     ) -> SearchResult:
-        """Search, reading back what is stored already; `ranked` renders the best configurations again.
-
-        Raises:
-            KeyboardInterrupt: the search was interrupted; the result of an interrupted main search is kept before.
-        """
-
+        """Search, reading back what is stored already; `ranked` renders the best configurations again. Raises
+        KeyboardInterrupt where it was interrupted; the result of an interrupted main search is kept before."""
         before, every = 0, max(1, -(-steps // MOST_FRAMES))
 
         def on_step(record: StepRecord, u: Tensor, evaluation: Evaluation) -> None:
@@ -363,16 +323,17 @@ class Attack:
 
         def evaluations(queries: Sequence[Query]) -> Iterator[Evaluation]:
             if frames is not None:
-                queries = [replace(one, keep=one.phase == "search" and one.number % every == 0) for one in queries]
-            passed = (lambda query: None) if self.findings.transport is None else self.findings.transport.passed
+                queries = [
+                    replace(query, keep=query.phase == "search" and query.number % every == 0) for query in queries
+                ]
+            passed = (lambda query: None) if transport is None else transport.passed
             return self.journal.evaluate_all(queries, self._evaluated, passed)
 
-        domain = self.problem.domain if domain is None else domain
         transport = self.findings.transport
         exact, drawn = (transport.exact, transport.drawn) if transport is not None else (False, False)
-        found = search(
+        result = search(
             evaluations,
-            replace(domain, exact=exact, drawn=drawn and policy.uses_gradient),
+            replace(domain or self.problem.domain, exact=exact, drawn=drawn and policy.uses_gradient),
             policy,
             steps=steps,
             seed=seed,
@@ -383,18 +344,15 @@ class Attack:
             kind=kind,
             noise=self.problem.seed,
         )
-        if found.ending is Ending.INTERRUPTED:
-            self.findings.search = self.findings.search or found
+        if result.ending is Ending.INTERRUPTED:
+            self.findings.search = self.findings.search or result
             raise KeyboardInterrupt
-        return found
+        return result
 
     def _evaluated(self, queries: Sequence[Query]) -> Iterator[Evaluation]:
-        """Evaluate queries of one search: predicted where something predicts, and traced otherwise."""
         transport, traced = self.findings.transport, self.journal.traced
-        predicted = transport is not None and bool(queries) and queries[0].phase == "search"
-        evaluations = (
-            transport.evaluate_all(queries, traced) if transport is not None and predicted else traced(queries)
-        )
+        predicts = transport if queries and queries[0].phase == "search" else None
+        evaluations = traced(queries) if predicts is None else predicts.evaluate_all(queries, traced)
         for query, evaluation in zip(queries, evaluations, strict=True):
             printed = self.config.printable and query.kind != UNPRINTED
             yield penalised(evaluation, self.problem.searched_space, query.u) if printed else evaluation
@@ -407,8 +365,7 @@ class Attack:
         self.stages.begin(name, title, renders, hint=hint, at_most=True)
 
 
-CONFIRMED = 40
-"""Trials in a row that the upper end of a smallest epsilon has to pass, or as many checks as have them."""
+CONFIRMED = 40  # Trials in a row that the upper end of a smallest epsilon has to pass, or as many checks as have them
 
 
 def find_smallest(attack: Attack, verifier: Verifier) -> None:
@@ -421,10 +378,9 @@ def find_smallest(attack: Attack, verifier: Verifier) -> None:
     results: list[SearchResult] = []
     transport = findings.transport if isinstance(findings.transport, Transport) else None
 
-    def found(inside: Domain, number: int) -> Tensor:
-        attack.begin(
-            "search", f"search {number + 1} of at most {ROUNDS}", problem.steps, "`steps` shortens each search"
-        )
+    def searched(inside: Domain, number: int) -> Tensor:
+        title = f"search {number + 1} of at most {ROUNDS}"
+        attack.begin("search", title, problem.steps, "`steps` shortens each search")
         kind, seed = f"search {number}" if number else "search", seeds.stream(problem.seed, "smallest", number)
         ranked = transport is None  # what is predicted has no noise
         results.append(attack.search(kind, attack.policy, problem.steps, seed, domain=inside, ranked=ranked))
@@ -449,42 +405,32 @@ def find_smallest(attack: Attack, verifier: Verifier) -> None:
         return passes(u, check, problem.rule.fewest)
 
     times = -(-CONFIRMED // trials)
-    bracket = smallest(found, seems, problem.domain, likely=None if transport is None else transport.likely)
+    bracket = smallest(searched, seems, problem.domain, likely=None if transport is None else transport.likely)
     if bracket.u is not None:
-        most = ATTEMPTS * times * trials
-        verifier.begin("checking the smallest change", most, at_most=True)
-    bracket = confirmed(bracket, passes, problem.domain, times=times)
-    renders, gradients = sum(one.renders for one in results), sum(one.gradients for one in results)
-    adversarial = results[0].best_u if bracket.u is None else bracket.u
-    ending = results[0].ending if bracket.u is None else Ending.FOUND
-    findings.smallest = bracket
-    winner = results[0 if bracket.u is None else bracket.found_by]
-    findings.search = replace(winner, best_u=adversarial, ending=ending, renders=renders, gradients=gradients)
-
-
-def _values(trial: Judgement) -> list[float | None]:
-    return [finite(getattr(trial, name)) for name in LOOKED_AT]
+        verifier.begin("checking the smallest change", ATTEMPTS * times * trials, at_most=True)
+    findings.smallest = bracket = confirmed(bracket, passes, problem.domain, times=times)
+    winner = results[0]
+    if bracket.u is not None:
+        winner = replace(results[bracket.found_by], best_u=bracket.u, ending=Ending.FOUND)
+    renders, gradients = (sum(getattr(result, name) for result in results) for name in ("renders", "gradients"))
+    findings.search = replace(winner, renders=renders, gradients=gradients)
 
 
 def _rank(verification: Verification) -> tuple[bool, float, float]:
     """How bad a configuration is for the model: found, then the rate of successes, then the mean margin."""
     scores = [trial.score for trial in verification.counting]
     mean = sum(scores) / len(scores)
-    mean = mean if mean == mean else -math.inf
-    return verification.ending is Ending.FOUND, verification.adversarial.rate, mean
+    return verification.ending is Ending.FOUND, verification.adversarial.rate, mean if mean == mean else -math.inf
 
 
-TRIED = 8
-"""Different failures that are tried, at most: the first of the list."""
+TRIED = 8  # Different failures that are tried, at most: the first of the list
 
 
 def check_failures(verifier: Verifier, result: SearchResult) -> None:
-    """Verify the first of the different failures that a search found, each for itself.
+    """Verify the first of the different failures that a search found, each for itself: by the trials of the adversarial
+    configuration, with the seeds that the control group had, up to the first that decides against it.
 
-    Each goes through the trials of the adversarial configuration, with the seeds that the control group had, up to the
-    first that decides
-    against it: what holds is found by its rule. Over conditions that vary one of them takes hundreds of
-    trials, and nothing is tried here.
+    Over conditions that vary one of them takes hundreds of trials, and nothing is tried here.
     """
     problem, findings = verifier.problem, verifier.findings
     known, rule = result.failures, problem.rule

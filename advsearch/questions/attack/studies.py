@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import tempfile
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -25,7 +25,6 @@ from advsearch.config import CONFIGS
 from advsearch.engine.journal import worker_call
 from advsearch.engine.judging import one_label_for_several
 from advsearch.engine.naming import check_run_settings, different, load_models, settings_alone
-from advsearch.engine.problem import Problem
 from advsearch.engine.record import control_group, verified_rate
 from advsearch.engine.transport import CleanMatrix
 from advsearch.engine.verifier import RetrialCondition, Retrials
@@ -73,18 +72,10 @@ def carry_out_part(path: Path, config: Config, progress: Progress, ask: Callable
     return ask(type(config).from_yaml(path / CONFIG, config.asked), progress=progress, resumed=path)
 
 
-LONGEST = 6 * 3600.0
-"""Seconds that one attack may take on a worker before it counts as hanging."""
-
-TEXTS = (".json", ".html", ".yaml")
-"""Files that may say where the run is."""
-
-
-SETTLED = ("found", "already wrong")
-"""Endings after which an object is not attacked with a larger epsilon."""
-
-ALL = "all"
-"""What an ensemble is called among the models that were attacked."""
+LONGEST = 6 * 3600.0  # Seconds that one attack may take on a worker before it counts as hanging
+TEXTS = (".json", ".html", ".yaml")  # Files that may say where the run is
+SETTLED = ("found", "already wrong")  # Endings after which an object is not attacked with a larger epsilon
+ALL = "all"  # What an ensemble is called among the models that were attacked
 
 
 @dataclass(frozen=True)
@@ -103,52 +94,39 @@ class StudyAttack:
         return self.config.object + ("" if self.of == self.config.object else f" with {self.of}")
 
 
-Chain = list[StudyAttack]
-"""Attacks that follow one another, until one finds something."""
+Chain = list[StudyAttack]  # Attacks that follow one another, until one finds something
 
 
 def chains_of(config: AttackConfig) -> list[Chain]:
-    """Return the attacks of a study: of a gap, a matrix or a curve.
-
-    Raises:
-        InputError: a setting that none of the controls takes, or a name comes twice.
-    """
-    if config.command == "gap":
-        return _controls_of(config)
-    if not config.is_matrix:
-        return _objects_of(config)
-    names = different(config.models, "model")
-    attacked = [(ALL, {})] if config.ensemble else [(name, {"model": name}) for name in names]
-    return [
-        [StudyAttack(AttackConfig.of(config, **more), f"{place:02d}-" + default_name(name, []), name)]
-        for place, (name, more) in enumerate(attacked)
-    ]
-
-
-def _controls_of(config: AttackConfig) -> list[Chain]:
-    check_run_settings(config)
-    attacks = []
-    for place, name in enumerate(different(config.objects, "object")):
-        for number, (control, settings) in enumerate(config.controls.items()):
-            settings_of_it = settings_alone(config, control, settings)
-            changed = AttackConfig.of(config, object=name, controls={control: settings}, **settings_of_it)
-            attacks.append(
-                [StudyAttack(changed, f"{place:02d}-{number:02d}-" + default_name(name, [control]), control)]
-            )
-    return attacks
-
-
-def _objects_of(config: AttackConfig) -> list[Chain]:
-    """Every object with every epsilon, from the smallest."""
+    """Return the attacks of a study: of a gap, a matrix or a curve. Raises InputError where none of the controls takes
+    a setting, or a name comes twice."""
     chains: list[Chain] = []
+    if config.command != "gap" and config.is_matrix:
+        names = different(config.models, "model")
+        for place, name in enumerate([ALL] if config.ensemble else names):
+            alone = AttackConfig.of(config, **({} if config.ensemble else {"model": name}))
+            chains.append([StudyAttack(alone, f"{place:02d}-" + default_name(name, []), name)])
+        return chains
+    if config.command == "gap":
+        check_run_settings(config)
     for place, name in enumerate(different(config.objects, "object")):
+        if config.command == "gap":
+            for number, (control, settings) in enumerate(config.controls.items()):
+                changes = {"controls": {control: settings}, **settings_alone(config, control, settings)}
+                folder = f"{place:02d}-{number:02d}-" + default_name(name, [control])
+                chains.append([StudyAttack(AttackConfig.of(config, object=name, **changes), folder, control)])
+            continue
         chains.append([])
-        epsilons: list[float | None] = [*sorted(config.epsilons)] or [None]
-        for epsilon in epsilons:
+        for epsilon in _epsilons(config):
             words = [] if epsilon is None else [f"epsilon {epsilon:g}".replace(".", "_")]
             changed = AttackConfig.of(config, object=name, epsilon=config.epsilon if epsilon is None else epsilon)
             chains[-1].append(StudyAttack(changed, f"{place:02d}-" + default_name(name, words), name, epsilon))
     return chains
+
+
+def _epsilons(config: AttackConfig) -> list[float | None]:
+    """The epsilons of a curve, from the smallest; None is the own of each control."""
+    return [*sorted(config.epsilons)] or [None]
 
 
 def attacks_of(settings: JsonObject) -> Call:
@@ -158,7 +136,7 @@ def attacks_of(settings: JsonObject) -> Call:
     chains = chains_of(config)
 
     def call(numbers: Sequence[int]) -> list[tuple[str, str, dict[str, bytes]]]:
-        found, clean = [], CleanMatrix()
+        carried_out, clean = [], CleanMatrix()
         with tempfile.TemporaryDirectory(prefix="advsearch-part-") as folder:
             for part in chains[numbers[0]]:
                 path = Path(folder) / part.name
@@ -166,10 +144,10 @@ def attacks_of(settings: JsonObject) -> Call:
                 ending = attack_once(config_there, clean=clean).summary.ending
                 kept = (file for file in path.rglob("*") if file.is_file() and file.name != files.NAME)
                 read = {file.relative_to(path).as_posix(): file.read_bytes() for file in kept}
-                found.append((part.name, str(path), read))
+                carried_out.append((part.name, str(path), read))
                 if ending in SETTLED:
                     break
-        return found
+        return carried_out
 
     return call
 
@@ -177,7 +155,7 @@ def attacks_of(settings: JsonObject) -> Call:
 def share(config: AttackConfig, chains: Sequence[Chain], run: Path, progress: Progress) -> None:
     """Have the attacks of a study that are not begun carried out by workers into its folder, where some were asked for.
     Raises ClusterError: every worker died of an attack, or there are none."""
-    left = [number for number, chain in enumerate(chains) if not any(is_run(run / PARTS / one.name) for one in chain)]
+    left = [number for number, chain in enumerate(chains) if not any(is_run(run / PARTS / part.name) for part in chain)]
     plain = config.to_repeat().model_copy(update={"workers": None, "cluster": None}).plain()
     settings, threads = {"command": config.command, **plain}, config.used_threads or 1
     work = Work("advsearch.questions.attack.studies:attacks_of", settings, FILES, threads, seconds=LONGEST)
@@ -190,35 +168,20 @@ def share(config: AttackConfig, chains: Sequence[Chain], run: Path, progress: Pr
             if done.lost:
                 title = chains[done.items[0]][0].title
                 raise ClusterError(f"{title}: {done.lost}; leave it out, or go on without it")
-            for name, place, files in done.value:
-                _place(run / PARTS, name, place, files)
+            for name, before, files_there in done.value:
+                path, part = run / PARTS / name, run / PARTS / f"{PART}{name}"
+                with storage_errors(path):  # whole or not at all
+                    for relative, data in files_there.items():
+                        if relative.endswith(TEXTS):
+                            data = data.replace(before.encode(), str(path).encode())
+                        (part / relative).parent.mkdir(parents=True, exist_ok=True)
+                        write_bytes(part / relative, data)
+                    part.rename(path)
             facts = executor.facts
             progress.advance(1, **({} if facts is None else {"workers": facts.workers}))
 
 
-def _place(folder: Path, name: str, before: str, files: Mapping[str, bytes]) -> None:
-    """Write the files of an attack that was carried out in another folder, whole or not at all."""
-    path, part = folder / name, folder / f"{PART}{name}"
-    with storage_errors(path):
-        for relative, data in files.items():
-            if relative.endswith(TEXTS):
-                data = data.replace(before.encode(), str(path).encode())
-            (part / relative).parent.mkdir(parents=True, exist_ok=True)
-            write_bytes(part / relative, data)
-        part.rename(path)
-
-
 # ---- one study ------------------------------------------------------------------------------------------------------
-
-
-def _label_for_all(config: AttackConfig) -> list[str]:
-    """What there is to say where several bundled objects have one label."""
-    if config.label is None or len(config.objects) < 2:
-        return []
-    bundled = list_objects()
-    labels = {name: load_object(name).label if name in bundled else None for name in config.objects}
-    models, _ = load_models([config.model], make_task(config.task), config)
-    return one_label_for_several(models, config.label, labels)
 
 
 class StudyRun:
@@ -229,14 +192,19 @@ class StudyRun:
     """
 
     def __init__(self, asked: Asked[AttackConfig]) -> None:
-        self.asked, self.run, self.progress = asked, asked.run, asked.progress
-        self.warnings = _label_for_all(asked.config)
+        self.asked, self.run, self.progress, config = asked, asked.run, asked.progress, asked.config
+        self.warnings: list[str] = []
+        if config.label is not None and len(config.objects) > 1:
+            bundled = list_objects()
+            labels = {name: load_object(name).label if name in bundled else None for name in config.objects}
+            models, _ = load_models([config.model], make_task(config.task), config)
+            self.warnings = one_label_for_several(models, config.label, labels)
         for text in self.warnings:
             self.progress.message(text)
-        self.chains = chains_of(asked.config)
+        self.chains = chains_of(config)
         self.names: list[str] = []
         with asked.until_interrupted():
-            share(asked.config, self.chains, self.run.path, self.progress)
+            share(config, self.chains, self.run.path, self.progress)
 
     @property
     def interrupted(self) -> bool:
@@ -278,47 +246,37 @@ def curve(asked: Asked[AttackConfig]) -> CurveResult:
     for chain in study.chains:
         row, clean = ObjectRow(object=chain[0].of, clean=None, flips_at=None), CleanMatrix()
         renders: Counter[str] = Counter()
-        for one in chain:
-            summary = study.attack(one, clean)
+        for part in chain:
+            summary = study.attack(part, clean)
             if summary is None:
                 break
             renders.update(summary.renders)
-            row = _seen(one.of, summary, one.epsilon).model_copy(update={"renders": dict(renders)})
+            epsilon = summary.epsilon if part.epsilon is None else part.epsilon
+            row = ObjectRow(
+                object=part.of,
+                clean=summary.clean.control,
+                ending=summary.ending,
+                epsilon=epsilon,
+                flips_at=epsilon if summary.ending == "found" else None,
+                verified=summary.verified,
+                margin=summary.verified.margin if summary.verified else None,
+                run=summary.run,
+                tried=part.epsilon,
+                renders=dict(renders),
+            )
             if row.ending in SETTLED:
                 break
         rows.append(row)
-    epsilons: Sequence[float | None] = sorted(asked.config.epsilons) or [None]
+    epsilons = _epsilons(asked.config)
+    points = [_accuracy(rows, epsilon) for epsilon in epsilons]
     return asked.result(
-        CurveResult,
-        epsilons=list(epsilons),
-        table=rows,
-        curve=[_accuracy(rows, epsilon) for epsilon in epsilons],
-        parts=study.names,
-        warnings=study.warnings,
-    )
-
-
-def _seen(name: str, summary: AttackSummary, tried: float | None) -> ObjectRow:
-    epsilon = summary.epsilon if tried is None else tried
-    return ObjectRow(
-        object=name,
-        clean=summary.clean.control,
-        ending=summary.ending,
-        epsilon=epsilon,
-        flips_at=epsilon if summary.ending == "found" else None,
-        verified=summary.verified,
-        margin=summary.verified.margin if summary.verified else None,
-        run=summary.run,
-        tried=tried,
+        CurveResult, epsilons=epsilons, table=rows, curve=points, parts=study.names, warnings=study.warnings
     )
 
 
 def _known(row: ObjectRow, epsilon: float | None) -> bool:
-    """Whether a row says anything about an epsilon: it was tried there, or had flipped before.
-
-    What ended without a number says nothing, and neither does an object that its own noise makes wrong too often for
-    any scene to be verified.
-    """
+    """Whether a row says anything about an epsilon: it was tried there, or had flipped before. What ended without a
+    number does not, nor an object whose own noise makes it wrong too often for any scene to be verified."""
     if row.ending in (None, "non-finite objective"):
         return False
     if row.ending in SETTLED:
@@ -328,13 +286,10 @@ def _known(row: ObjectRow, epsilon: float | None) -> bool:
 
 
 def _accuracy(rows: Sequence[ObjectRow], epsilon: float | None) -> CurvePoint:
-    """How many objects are still recognised at an epsilon."""
     known = [row for row in rows if _known(row, epsilon)]
     wrong = sum(row.ending == "already wrong" for row in known)
-    flipped = [row.flips_at for row in known if row.ending == "found"]
-    found = sum(
-        epsilon is None or (isinstance(epsilon_there, float) and epsilon_there <= epsilon) for epsilon_there in flipped
-    )
+    flips = [row.flips_at for row in known if row.ending == "found"]
+    found = sum(epsilon is None or (isinstance(flips_at, float) and flips_at <= epsilon) for flips_at in flips)
     robust = len(known) - wrong - found
     return CurvePoint(
         epsilon=epsilon,
@@ -347,8 +302,7 @@ def _accuracy(rows: Sequence[ObjectRow], epsilon: float | None) -> CurvePoint:
     )
 
 
-LEAST_SPP = 64
-"""Samples a pixel of the trials, where none of the attacks needed more and nothing was asked for."""
+LEAST_SPP = 64  # Samples a pixel of the trials, where none of the attacks needed more and nothing was asked for
 
 
 def matrix(asked: Asked[AttackConfig]) -> MatrixResult:
@@ -364,26 +318,27 @@ def matrix(asked: Asked[AttackConfig]) -> MatrixResult:
         check_from_config(_alone(config, name))
 
     study = StudyRun(asked)
-    attacked: list[tuple[str, AttackSummary]] = []
-    for (one,) in study.chains:
-        summary = study.attack(one)
-        if summary is not None:
-            attacked.append((one.of, summary))
+    summaries = {part.of: study.attack(part) for (part,) in study.chains}
+    attacked = {name: summary for name, summary in summaries.items() if summary is not None}
     models: list[MatrixModel] = []
     cells: dict[str, list[MatrixCell]] = {}
-    found = {  # of those in which something was searched
+    configurations = {  # of those in which something was searched
         name: torch.from_numpy(read_configuration(Path(summary.run)))
-        for name, summary in attacked
+        for name, summary in attacked.items()
         if summary.adversarial is not None and summary.run is not None
     }
-    if found and not study.interrupted:
-        spp = config.verify_spp or max([LEAST_SPP, *(s.sample_count.spp for _, s in attacked if s.sample_count)])
+    if configurations and not study.interrupted:
+        counts = [summary.sample_count.spp for summary in attacked.values() if summary.sample_count]
+        spp = config.verify_spp or max([LEAST_SPP, *counts])
         with asked.until_interrupted():
             study.progress.stage("loading the models to try the scenes on")
             problems = {name: problem_from_config(_alone(config, name))[0] for name in names}
             seed, trials = seeds.stream(config.seed, "matrix"), config.trial_count
             with executor_for(config, "advsearch.questions.attack.studies:models_worker", study.progress) as executor:
-                conditions = [RetrialCondition(name, one, spp, _size(one)) for name, one in problems.items()]
+                conditions = [
+                    RetrialCondition(name, problem, spp, problem.renderer.formation.resolution)
+                    for name, problem in problems.items()
+                ]
                 retrials = Retrials(conditions, study.run, study.progress, trials=trials, seed=seed, executor=executor)
                 each = trials * len(names)
                 hint = f"{each} predictions; `trials` or `verify_spp` shorten it"
@@ -392,22 +347,22 @@ def matrix(asked: Asked[AttackConfig]) -> MatrixResult:
                     MatrixModel(
                         model=condition.name,
                         labels=list(condition.problem.task.truth_names(condition.problem.truth())),
-                        input_size=_size(condition.problem),
+                        input_size=condition.problem.renderer.formation.resolution,
                         spp=condition.spp,
                         clean=control_group(retrials.clean(condition), condition.spp),
                     )
                     for condition in conditions
                 ]
-                for name, u in found.items():
+                for name, u in configurations.items():
                     study.progress.stage(f"trying the scene against {name} on every model", each, hint=hint)
-                    checked = [(condition.name, retrials.adversarial(name, u, condition)) for condition in conditions]
+                    checked = {condition.name: retrials.adversarial(name, u, condition) for condition in conditions}
                     cells[name] = [
-                        MatrixCell(model=model, ending=one.ending.value, verified=verified_rate(one))
-                        for model, one in checked
+                        MatrixCell(model=model, ending=tried.ending.value, verified=verified_rate(tried))
+                        for model, tried in checked.items()
                     ]
     rows = [
-        MatrixRow(attacked=name, ending=one.ending, run=one.run, renders=one.renders, tested=cells.get(name, []))
-        for name, one in attacked
+        MatrixRow(attacked=name, ending=by.ending, run=by.run, renders=by.renders, tested=cells.get(name, []))
+        for name, by in attacked.items()
     ]
     return asked.result(
         MatrixResult,
@@ -427,9 +382,4 @@ def models_worker(settings: JsonObject) -> Call:
 
 
 def _alone(config: AttackConfig, name: str) -> AttackConfig:
-    """What a scene is tried on one model with; nothing is searched."""
     return AttackConfig.of(config, model=name, ensemble=None)
-
-
-def _size(problem: Problem) -> tuple[int, int]:
-    return problem.renderer.formation.resolution

@@ -191,14 +191,14 @@ class NotFinite(Fields):
 class PrintCost(Fields):
     """What the terms of `printable` cost in margin: beside a search without them, of as many steps.
 
-    Margins are means over trials with the same seeds, of what is sought: the larger, the worse for the model. Each is
+    Margins are means over trials with the same seeds, of what is sought: the smaller, the worse for the model. Each is
     of one search, so that a cost below 0 says that the search without terms ended in a worse place.
     """
 
     steps: int = Field(description="evaluations of the search without the terms")
     margin_with: JsonFloat = Field(description="of the run's adversarial scene, in logits")
     margin_without: JsonFloat = Field(description="of what was found by the search without the terms, in logits")
-    cost: JsonFloat = Field(description="the second less the first, in logits")
+    cost: JsonFloat = Field(description="the first less the second, in logits")
     verified: VerifiedRate = Field(description="trials of what was found by the search without the terms")
     terms: PrintTerms = Field(description="of that scene")
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import PurePath
-from typing import Any
 
 from advsearch.questions.attack.summary import AttackSummary
 from advsearch.report.wording import (
@@ -17,6 +16,7 @@ from advsearch.report.wording import (
     count,
     margin_text,
     number_text,
+    objective_name,
     rate_text,
     seconds_text,
     wanted,
@@ -24,13 +24,9 @@ from advsearch.report.wording import (
 )
 from advsearch.runs.results import PrintTerms, VerifiedRate
 
-PATH = "path"
-"""The control whose conditions are moments."""
-
-
+PATH = "path"  # The control whose conditions are moments
 NORMS = {"linf": "the largest change of any value", "l2": "the root of the sum of all squared changes"}
 """What these words mean, said where they are first used."""
-
 
 _REASONS = {
     "budget spent": "The budget is spent.",
@@ -43,72 +39,63 @@ _REASONS = {
 def attack_verdict(summary: AttackSummary) -> str:
     """Return what the run found, in one sentence that holds on its own."""
     ending, verified = summary.ending, summary.verified
-    thing = f"this {noun(summary)}"
+    thing, after = f"this {noun(summary)}", f"after {count(summary.steps, 'step')}"
     if ending == "already wrong":
         wrong = calls(summary.task, thing, summary.clean.label)
         return f"The model already {wrong}: nothing was changed and nothing counts as found."
     if verified is None and ending == "interrupted" and summary.adversarial:
         says = calls(summary.task, thing, summary.adversarial.label)
-        return (
-            f"Interrupted after {count(summary.steps, 'step')}. What was found so far is not verified: the model "
-            f"{says}."
-        )
+        return f"Interrupted {after}. What was found so far is not verified: the model {says}."
     if verified is None:
-        return f"{ending[:1].upper()}{ending[1:]} after {count(summary.steps, 'step')}; nothing is verified."
-    rate = rate_text(verified) + another_text(summary.over, several_paths(summary))
-    claim = _claim(summary, thing)
+        return f"{ending[:1].upper()}{ending[1:]} {after}; nothing is verified."
+    several_paths = summary.drive is not None and len(summary.drive.paths) > 1
+    rate = rate_text(verified) + another_text(summary.over, several_paths)
+    claim, sought = _clauses(summary, thing)
     if ending == "found":
-        return f"{_how_it_errs(summary, verified, thing)} in {rate}.{_as_random(summary)}"
+        random = summary.baseline.verified if summary.baseline else None
+        more = " Random search finds as much." if random is not None and random.rate >= verified.rate > 0 else ""
+        if summary.answer_from == "random":
+            more = " Random search found it, and the policy nothing as bad."
+        return f"{_how_it_errs(summary, verified, thing, claim)} in {rate}.{more}"
     if ending == "interrupted":
         return f"Interrupted; so far {claim} in {rate}."
     if ending == "not verified":
         return f"The search claims a wrong prediction that is not confirmed: {claim} in {rate}."
     why = _REASONS.get(ending, f"The search ended: {ending}.")
-    return f"No change of {budget_text(summary)} was found that {_wanted(summary, thing)}: {claim} in {rate}. {why}"
-
-
-def _as_random(summary: AttackSummary) -> str:
-    """Return that the search did nothing that random search does not do, as a sentence; nothing where it did."""
-    ours, random = summary.verified, summary.baseline.verified if summary.baseline else None
-    if summary.answer_from == "random":
-        return " Random search found it, and the policy nothing as bad."
-    alike = ours is not None and random is not None and random.rate >= ours.rate > 0
-    return " Random search finds as much." if alike else ""
-
-
-def several_paths(summary: AttackSummary) -> bool:
-    """Whether each trial draws one of several paths."""
-    return summary.drive is not None and len(summary.drive.paths) > 1
+    return f"No change of {budget_text(summary)} was found that {sought}: {claim} in {rate}. {why}"
 
 
 def another_text(over: Sequence[str], paths: bool = False) -> str:
     """Return what is another one in each trial: ``, each with another camera``; of a path it is the moment, and where
     there are several `paths`, which one it is."""
     others = [name for name in over if name != PATH]
-    said = [f"with another {' and '.join(others)}"] if others else []
+    parts = [f"with another {' and '.join(others)}"] if others else []
     if PATH in over:
-        said.append("on one of several paths, at another moment" if paths else "at another moment of the path")
-    return f", each {' and '.join(said)}" if said else ""
+        parts.append("on one of several paths, at another moment" if paths else "at another moment of the path")
+    return f", each {' and '.join(parts)}" if parts else ""
 
 
 def remarks(summary: AttackSummary) -> list[str]:
     """Return what has to be known beside the verdict: the control group, the random search, the run's warnings."""
-    said = []
-    control, own = summary.clean.control, summary.policy_verified
+    texts = []
+    control, verified, beaten = summary.clean.control, summary.verified, summary.policy_verified
+    random = summary.baseline.verified if summary.baseline else None
     missed = control.trials - control.correct if control else 0
     if control and missed and summary.ending != "already wrong" and not summary.minimises:
         apart = " They do not count." if summary.over else ""
         nothing = f"; in {control.not_a_number} the output is not a number" if control.not_a_number else ""
-        said.append(f"The clean scene itself fails {missed} of its {control.trials} trials{nothing}.{apart}")
-    if summary.answer_from == "random" and own:
-        said.append(
-            "The random search beside it found a worse configuration than the policy did "
-            f"({own.successes} of {own.trials} with a margin of {own.margin:.2f}); that of the random search is the "
-            f"scene. The margin is {margin_text(summary.task)}."
+        texts.append(f"The clean scene itself fails {missed} of its {control.trials} trials{nothing}.{apart}")
+    if summary.answer_from == "random" and beaten:
+        tally = f"{beaten.successes} of {beaten.trials} with a margin of {beaten.margin:.2f}"
+        texts.append(
+            f"The random search beside it found a worse configuration than the policy did ({tally}); that of the "
+            f"random search is the scene. The margin is {margin_text(summary.task)}."
         )
-    else:
-        said += _against_random(summary)
-    return said + summary.warnings
+    elif verified is not None and random is not None and random.rate >= verified.rate and random.rate > 0:
+        tally, better = f"{random.successes} of {random.trials}", random.rate > verified.rate
+        does = f"better: {tally}." if better else f"as well: {tally}. The policy adds nothing here."
+        texts.append(f"Random search with as many renders does {does}")
+    return texts + summary.warnings
 
 
 def noun(summary: AttackSummary) -> str:
@@ -117,11 +104,6 @@ def noun(summary: AttackSummary) -> str:
     called = PurePath(summary.object).stem if summary.judge in ("object", "all") else summary.judge
     every = " or a thing beside it" if summary.judge == "all" else ""
     return called.replace("-", " ").replace("_", " ") + every
-
-
-def title(summary: AttackSummary) -> str:
-    """Return a short name for the run: ``mug, texture``."""
-    return ", ".join([noun(summary), *summary.controls])
 
 
 def success(summary: AttackSummary) -> str:
@@ -143,9 +125,9 @@ def objective_text(summary: AttackSummary) -> str:
     if tried is None or summary.objective in SUCCESS_ABOVE_ZERO:
         return ""
     parts = [
-        f"{name} {one.mean:.3g} (from {one.low:.3g} to {one.high:.3g})"
-        for name, one in (("clean", tried.clean), ("adversarial", tried.answer))
-        if one is not None
+        f"{name} {values.mean:.3g} (from {values.low:.3g} to {values.high:.3g})"
+        for name, values in (("clean", tried.clean), ("adversarial", tried.answer))
+        if values is not None
     ]
     return f"{summary.objective} in the trials: {', '.join(parts)}" if parts else ""
 
@@ -170,12 +152,18 @@ def smallest_text(summary: AttackSummary) -> str:
     bracket = summary.smallest
     if bracket is None:
         return ""
-    found, below = _epsilons(bracket.epsilon), _epsilons(bracket.not_found_at)
-    if not found:
+
+    def epsilons(by_control: Mapping[str, float] | None) -> str:
+        """``0.0123`` of one control; ``texture 0.01, geometry 0.002`` of several."""
+        texts = {name: f"{value:.3g}" for name, value in (by_control or {}).items()}
+        return ", ".join(texts.values() if len(texts) == 1 else map(" ".join, texts.items()))
+
+    smallest, below = epsilons(bracket.epsilon), epsilons(bracket.not_found_at)
+    if not smallest:
         return f"none found up to {below}"
     floor = f"no search found one at {below}" if below else "no search failed, so it may be smaller still"
     still = "" if bracket.closed or not below else "; the searches did not suffice to bring the two together"
-    return f"{found}; {floor}{still}"
+    return f"{smallest}; {floor}{still}"
 
 
 def changed_text(summary: AttackSummary) -> str:
@@ -188,55 +176,47 @@ def changed_text(summary: AttackSummary) -> str:
 
 def budget_text(summary: AttackSummary) -> str:
     """Return what could change and how far: ``texture within 0.1 (linf)``."""
+
+    def within(name: str, epsilon: object, norm: object) -> str:
+        if not isinstance(epsilon, (int, float)):
+            return name
+        return f"{name} within {number_text(epsilon)}" + (f" ({norm})" if norm else "")
+
     epsilon, norm = summary.epsilon, summary.norm
     if isinstance(epsilon, dict) or isinstance(norm, dict):
-        epsilons, norms = (one if isinstance(one, dict) else {} for one in (epsilon, norm))
-        return " and ".join(_within(name, epsilons.get(name), norms.get(name)) for name in summary.controls)
-    return _within(" and ".join(summary.controls) or "nothing", epsilon, norm)
-
-
-def _within(name: str, epsilon: Any, norm: Any) -> str:
-    if not isinstance(epsilon, (int, float)):
-        return name
-    return f"{name} within {number_text(epsilon)}" + (f" ({norm})" if norm else "")
-
-
-def _epsilons(by_control: Mapping[str, float] | None) -> str:
-    """``0.0123`` of one control; ``texture 0.01, geometry 0.002`` of several."""
-    if not by_control:
-        return ""
-    if len(by_control) == 1:
-        return f"{next(iter(by_control.values())):.3g}"
-    return ", ".join(f"{name} {value:.3g}" for name, value in by_control.items())
+        epsilons, norms = (by_control if isinstance(by_control, dict) else {} for by_control in (epsilon, norm))
+        return " and ".join(within(name, epsilons.get(name), norms.get(name)) for name in summary.controls)
+    return within(" and ".join(summary.controls) or "nothing", epsilon, norm)
 
 
 def renders_text(summary: AttackSummary) -> str:
     """Return ``40 of the search, 40 gradients, 21 of the verification``."""
-    known = {"search": "of the search", "gradient": "gradients", "verification": "of the verification"}
-    known |= {"baseline": "of the random search", "unprinted": "of the search without print terms"}
-    known |= {"products": "predicted"}
+    known = {
+        "search": "of the search", "gradient": "gradients", "verification": "of the verification",
+        "baseline": "of the random search", "unprinted": "of the search without print terms", "products": "predicted",
+    }  # fmt: skip
     spent = [f"{number} {known.get(name, f'of {name}')}" for name, number in summary.renders.items() if number]
     return ", ".join(spent) or "none"
 
 
 def print_cost_text(summary: AttackSummary) -> str:
-    """Return ``margin 4.1 with the print terms, 6.3 without (200 steps): they cost 2.2 logits``; empty: not known."""
+    """Return ``margin -4.1 with the print terms, -6.3 without (200 steps): they cost 2.2 logits``; empty: not known."""
     cost = None if summary.printability is None else summary.printability.cost
-    if cost is None or cost.cost is None or cost.margin_with is None or cost.margin_without is None:
+    if cost is None:
         return ""
-    said = f"they cost {cost.cost:.3g} logits" if cost.cost > 0 else "they cost nothing that shows here"
+    costs = f"they cost {cost.cost:.3g} logits" if cost.cost > 0 else "they cost nothing that shows here"
     margins = f"margin {cost.margin_with:.3g} with the print terms, {cost.margin_without:.3g} without"
-    return f"{margins} (another search of {count(cost.steps, 'step')}, {cost.verified.trials} trials each): {said}"
+    return f"{margins} (another search of {count(cost.steps, 'step')}, {cost.verified.trials} trials each): {costs}"
 
 
-def _how_it_errs(summary: AttackSummary, verified: VerifiedRate, thing: str) -> str:
+def _how_it_errs(summary: AttackSummary, verified: VerifiedRate, thing: str, claim: str) -> str:
     """Return "The model calls this mug a vase" where that is known of every trial, a weaker clause otherwise."""
-    if summary.minimises:
-        return f"The model recognises {thing}, more surely than in the clean scene,"
     labels = verified.labels
-    if summary.task == COMMAND:
-        where = ", ".join(labels).replace("action outside its envelope ", "") if len(labels) == 1 else ""
-        return f"The commanded action {_left(summary)}{'' if summary.target or not where else f' {where}'}"
+    if summary.task == COMMAND and not summary.target and not summary.minimises and len(labels) == 1:
+        where = next(iter(labels)).replace("action outside its envelope ", "")
+        claim += f" {where}" if where else ""
+    if summary.minimises or summary.task == COMMAND:
+        return claim[:1].upper() + claim[1:]
     if len(labels) == 1:
         return f"The model {calls(summary.task, thing, next(iter(labels)))}"
     if labels:
@@ -249,47 +229,26 @@ def _how_it_errs(summary: AttackSummary, verified: VerifiedRate, thing: str) -> 
     return f"The model takes {thing} for something else ({called})"
 
 
-def _claim(summary: AttackSummary, thing: str) -> str:
-    """Return what a trial counts as, as a clause: "the model is wrong about this mug"."""
+def _clauses(summary: AttackSummary, thing: str) -> tuple[str, str]:
+    """Return what a trial counts as, and what was looked for: "the model is wrong about this mug", "makes the model
+    miss this mug". Of a commanded action no more is said: nothing has moved."""
+    target = summary.target or []
+    names, called = " or ".join(target), " or ".join(map(with_article, target))
     if summary.minimises:
-        return f"the model recognises {thing}, more surely than in the clean scene,"
+        return (
+            f"the model recognises {thing}, more surely than in the clean scene,",
+            f"makes {thing} easier to recognise",
+        )
     if summary.task == COMMAND:
-        return f"the commanded action {_left(summary)}"
-    if summary.target and summary.task == CLASSIFICATION:
-        return f"the model calls {thing} {_a_target(summary)}"
-    if summary.target:
-        return f"the model predicts {' or '.join(summary.target)}"
-    return "it is wrong" if summary.ending in _REASONS else f"the model is wrong about {thing}"
-
-
-def _wanted(summary: AttackSummary, thing: str) -> str:
-    """Return what was looked for, as a clause: "makes the model miss this mug"."""
-    if summary.minimises:
-        return f"makes {thing} easier to recognise"
-    if summary.task == COMMAND:
-        return f"makes the commanded action {_left(summary, 'leave', 'reach')}"
-    return f"makes the model call {thing} {_a_target(summary)}" if summary.target else wanted(summary.objective, thing)
-
-
-def _left(summary: AttackSummary, left: str = "left", reached: str = "reached") -> str:
-    """Return what a commanded action did that counts, and no more than that: nothing has moved."""
-    return f"{reached} the envelope of {' or '.join(summary.target)}" if summary.target else f"{left} its envelope"
-
-
-def _a_target(summary: AttackSummary) -> str:
-    return " or ".join(with_article(name) for name in summary.target or ())
-
-
-def _against_random(summary: AttackSummary) -> list[str]:
-    ours, random = summary.verified, summary.baseline.verified if summary.baseline else None
-    if ours is None or random is None:
-        return []
-    tally = f"{random.successes} of {random.trials}"
-    if random.rate > ours.rate:
-        return [f"Random search with as many renders does better: {tally}."]
-    if random.rate == ours.rate > 0:
-        return [f"Random search with as many renders does as well: {tally}. The policy adds nothing here."]
-    return []
+        verbs, envelope = ("reached", "reach"), f"the envelope of {names}"
+        if not target:
+            verbs, envelope = ("left", "leave"), "its envelope"
+        return f"the commanded action {verbs[0]} {envelope}", f"makes the commanded action {verbs[1]} {envelope}"
+    if target:
+        claim = f"calls {thing} {called}" if summary.task == CLASSIFICATION else f"predicts {names}"
+        return f"the model {claim}", f"makes the model call {thing} {called}"
+    claim = "it is wrong" if summary.ending in _REASONS else f"the model is wrong about {thing}"
+    return claim, wanted(summary.objective, thing)
 
 
 # ---- how it came to its result ---------------------------------------------------------------------------------------
@@ -299,22 +258,55 @@ PLAN_HEADS = ("parameter", "numbers", "derivative", "why", "step")
 
 def method_facts(summary: AttackSummary) -> dict[str, str]:
     """Return what is known of the search's work by name; texts of what is not known are empty."""
-    segments = summary.light_path_segments
+    claimed, chosen, seen = summary.claimed, summary.sample_count, summary.gradients
+    segments, nothing, terms = summary.light_path_segments, summary.non_finite, summary.printability
+    claim = samples = gradients = cut = not_finite = printed = ""
+    if claimed is not None:
+        claim = f"{objective_name(summary.objective)} {_short(claimed.objective)} in the render that won"
+        if math.isfinite(claimed.re_evaluated):
+            claim += f", {_short(claimed.re_evaluated)} when rendered again"
+    if chosen is not None:
+        enough = "more would leave the " + ("rate about where it is" if summary.over else "margin on its side")
+        samples = f"{chosen.spp} a pixel in the verification; "
+        samples += enough if chosen.converged else "that more would not change it is not shown"
+    if seen is not None and seen.count:
+        gradients = f"{seen.count} of the search" + (f", {seen.zero} of them zero" if seen.zero else "")
+        cosine = seen.cosine_with_the_one_before
+        if cosine is not None and math.isfinite(cosine):
+            gradients += f", median cosine with the one before {cosine:.2f}"
+    if seen is not None and (seen.count or seen.rejected):  # what the policy did about outliers and failed steps
+        cut = f"{count(seen.cut, 'gradient')} with single outliers cut, {seen.shortened} shortened as a whole, "
+        cut += f"{count(seen.rejected, 'step')} taken back"
+    if nothing.objectives or nothing.gradient_elements:
+        not_finite = (
+            f"{count(nothing.objectives, 'objective')}, {count(nothing.gradient_elements, 'number')} of gradients"
+        )
+    if terms is not None:
+        printed = f"clean: {_terms_text(terms.clean)}"
+        printed += "" if terms.answer is None else f"; answer: {_terms_text(terms.answer)} (sRGB)"
     return {
-        "The search's claim": _search_claim(summary),
-        "Sample count": _sample_count(summary),
+        "The search's claim": claim,
+        "Sample count": samples,
         "Light transport": transport_text(summary),
-        "Gradients": _gradients(summary),
-        "Cut or taken back": _cut(summary),
-        "Not finite": _not_finite(summary),
+        "Gradients": gradients,
+        "Cut or taken back": cut,
+        "Not finite": not_finite,
         "Light paths": f"at most {segments.search} segments in the search, {segments.verification} in the verification",
-        "Printability": _printability(summary),
+        "Printability": printed,
         "Cost of printability": print_cost_text(summary),
         "Moved before": ", ".join(
-            f"{one.parameter} from {number_text(one.scene)} to {number_text(one.used)} {one.unit}".rstrip()
-            for one in summary.clean.moved
+            f"{moved.parameter} from {number_text(moved.scene)} to {number_text(moved.used)} {moved.unit}".rstrip()
+            for moved in summary.clean.moved
         ),
     }
+
+
+def _terms_text(terms: PrintTerms) -> str:
+    return f"step between neighbours {terms.variation:.3g}, distance from printable colours {terms.off_print:.3g}"
+
+
+def _short(value: float) -> str:
+    return f"{value:.3g}" if math.isfinite(value) else "an unknown amount"
 
 
 def transport_text(summary: AttackSummary) -> str:
@@ -351,69 +343,8 @@ def plan_rows(summary: AttackSummary) -> list[list[str]]:
     """Return a row for each parameter of the gradient plan."""
     rows = []
     for group in summary.gradient_plan.groups:
-        by_step = group.step_reason != ""
         unit = "" if group.unit in ("", "1") else f" {group.unit}"
         wide = f"{group.step:.3g} of its range" if group.step_in_unit is None else f"{group.step_in_unit:.3g}{unit}"
-        step = f"{wide}: {group.step_reason}" if by_step else ""
+        step = f"{wide}: {group.step_reason}" if group.step_reason else ""
         rows.append([group.name, str(group.size), group.estimator, group.reason, step])
     return rows
-
-
-def _short(value: float) -> str:
-    return f"{value:.3g}" if math.isfinite(value) else "an unknown amount"
-
-
-def _search_claim(summary: AttackSummary) -> str:
-    claim = summary.claimed
-    if claim is None:
-        return ""
-    again = f"{_short(claim.re_evaluated)} when rendered again" if math.isfinite(claim.re_evaluated) else ""
-    return ", ".join(filter(None, (f"{summary.objective} {_short(claim.objective)} in the render that won", again)))
-
-
-def _sample_count(summary: AttackSummary) -> str:
-    chosen = summary.sample_count
-    if chosen is None:
-        return ""
-    enough = "more would leave the " + ("rate about where it is" if summary.over else "margin on its side")
-    unknown = "that more would not change it is not shown"
-    still = enough if chosen.converged else unknown
-    return f"{chosen.spp} a pixel in the verification; {still}"
-
-
-def _gradients(summary: AttackSummary) -> str:
-    seen = summary.gradients
-    if seen is None or not seen.count:
-        return ""
-    cosine = seen.cosine_with_the_one_before
-    parts = [f"{seen.count} of the search", f"{seen.zero} of them zero" if seen.zero else ""]
-    if cosine is not None and math.isfinite(cosine):
-        parts.append(f"median cosine with the one before {cosine:.2f}")
-    return ", ".join(filter(None, parts))
-
-
-def _cut(summary: AttackSummary) -> str:
-    """What the policy did about outliers and about steps that failed."""
-    seen = summary.gradients
-    if seen is None or not (seen.count or seen.rejected):
-        return ""
-    cut = count(seen.cut, "gradient") + " with single outliers cut"
-    return f"{cut}, {seen.shortened} shortened as a whole, {count(seen.rejected, 'step')} taken back"
-
-
-def _not_finite(summary: AttackSummary) -> str:
-    numbers = summary.non_finite
-    if not numbers.objectives and not numbers.gradient_elements:
-        return ""
-    return f"{count(numbers.objectives, 'objective')}, {count(numbers.gradient_elements, 'number')} of gradients"
-
-
-def _printability(summary: AttackSummary) -> str:
-    terms = summary.printability
-    if terms is None:
-        return ""
-
-    def told(one: PrintTerms) -> str:
-        return f"step between neighbours {one.variation:.3g}, distance from printable colours {one.off_print:.3g}"
-
-    return f"clean: {told(terms.clean)}" + ("" if terms.answer is None else f"; answer: {told(terms.answer)} (sRGB)")

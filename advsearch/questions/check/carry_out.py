@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import statistics
 import time
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,19 +17,9 @@ from torch import Tensor
 
 from advsearch import seeds
 from advsearch.controls import CONTROLS
+from advsearch.engine import planning
 from advsearch.engine.gradients import FACTORS, Loss, attempts, derivatives, inside, smooth_loss
 from advsearch.engine.naming import settings_alone
-from advsearch.engine.planning import (
-    CONVERGED,
-    COUNTS,
-    bounces_of,
-    cosine_samples,
-    cosines,
-    measured_plan,
-    most_pictures,
-    plan_gradients,
-    tuned,
-)
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Results, kept_rows
 from advsearch.progress import NullProgress, Progress
@@ -43,16 +34,12 @@ from advsearch.scene.gradients import BY_ADJOINT, BY_DIFFERENCES
 from advsearch.scene.mitsuba_backend.material_adjoint import LIMITS
 from advsearch.scene.renderer import Renderer
 
-SCENES = (("mug", "studio"), ("bowl", "kitchen"), ("bottle", "noon"))
-"""Bundled scenes that `check --all` goes through."""
-RAW_SPP = 16
-"""Samples a pixel of a working gradient of the linear loss, which is taken without denoiser."""
-MOST = 256
-"""Samples a pixel of the dearest gradient of the model's loss that is tried."""
+SCENES = (("mug", "studio"), ("bowl", "kitchen"), ("bottle", "noon"))  # bundled scenes that `check --all` goes through
+RAW_SPP = 16  # samples a pixel of a working gradient of the linear loss, which is taken without denoiser
+MOST = 256  # samples a pixel of the dearest gradient of the model's loss that is tried
 REFERENCE_SPP, SEEDS = 64, (6, 16)
 """Samples a pixel of a reference render, and how many seeds it gets: until its noise is small."""
-FEW_SEEDS = (3, 6)
-"""Seeds of a reference of the model's loss, whose renders have more samples."""
+FEW_SEEDS = (3, 6)  # seeds of a reference of the model's loss, whose renders have more samples
 HINT = "`resolution` or fewer controls shorten it, `seconds` ends it"
 
 Finding = CheckedRow | SearchPlan | PathLength | GainRow | TexelRow
@@ -62,11 +49,8 @@ FINDINGS: TypeAdapter[list[Finding]] = TypeAdapter(list[Finding])
 def check_from_config(
     config: CheckConfig, *, progress: Progress | None = None, resumed: Path | None = None
 ) -> CheckResult:
-    """Do what a configuration describes, or go on with it, and keep it in a run directory; see `check`.
-
-    What is measured is stored at once, so that a check that was stopped, by Ctrl-C, by a kill or because its `seconds`
-    were over, goes on where it was and ends with the same rows; only times differ.
-    """
+    """Do what a configuration describes, or go on with it, and keep it in a run directory. What is measured is stored
+    at once, so that a check that was stopped goes on where it was and ends with the same rows; only times differ."""
     progress, begun = progress or NullProgress(), time.perf_counter()
     progress.stage(LOADING)
     parts = parts_of(config)
@@ -80,23 +64,20 @@ def check_from_config(
                 measured += 1
 
         def result(taken: Sequence[Finding], ending: str) -> CheckResult:
+            configs = [part.config for part in parts]
+
+            def those(kind: type[Any]) -> list[Any]:
+                return [row for row in taken if isinstance(row, kind)]
+
             return CheckResult(
-                run=str(run.path),
-                object=",".join(dict.fromkeys(part.config.object for part in parts)),
-                environment=",".join(dict.fromkeys(part.config.lit_by for part in parts)),
-                controls=list(dict.fromkeys(name for part in parts for name in part.config.controls)),
-                ending=ending,
-                measured=measured,
-                planned=len(parts),
-                rows=[row for row in taken if isinstance(row, CheckedRow)],
-                plan=next((row for row in taken if isinstance(row, SearchPlan)), None),
-                bounces=next((row for row in taken if isinstance(row, PathLength)), None),
-                gains=[row for row in taken if isinstance(row, GainRow)],
-                texels=[row for row in taken if isinstance(row, TexelRow)],
-                seconds={"total": time.perf_counter() - begun},
-                seed=config.seed,
-                command_line=config.command_line(),
-            )
+                run=str(run.path), object=",".join(dict.fromkeys(config.object for config in configs)),
+                environment=",".join(dict.fromkeys(config.lit_by for config in configs)),
+                controls=list(dict.fromkeys(name for config in configs for name in config.controls)),
+                ending=ending, measured=measured, planned=len(parts), rows=those(CheckedRow),
+                plan=next(iter(those(SearchPlan)), None), bounces=next(iter(those(PathLength)), None),
+                gains=those(GainRow), texels=those(TexelRow), seconds={"total": time.perf_counter() - begun},
+                seed=config.seed, command_line=config.command_line(),
+            )  # fmt: skip
 
         return kept_rows(run, results, findings(), result)
 
@@ -111,17 +92,14 @@ class CheckedPart:
 
     @property
     def key(self) -> str:
-        """Under which its results are stored."""
         return f"check {self.number}"
 
     def row(self, measured: Measured, **more: Any) -> CheckedRow:
-        """Return what was measured in this part."""
         place = {"object": self.config.object, "environment": self.config.lit_by, "loss": self.loss}
         return CheckedRow(**{**vars(measured), **place, **more})
 
 
 def parts_of(config: CheckConfig) -> list[CheckedPart]:
-    """Return what is checked one after the other."""
     configs = []
     for object, environment in SCENES if config.all else ():
         own = environment == DEFAULT_ENVIRONMENT
@@ -173,35 +151,32 @@ def _model(part: CheckedPart, title: str, results: Results, progress: Progress) 
     config = part.config
     problem, _ = problem_from_config(config)
     renderer, u = problem.renderer, inside(problem.renderer)
-    counts = tuple(count for count in (*COUNTS, MOST) if count >= problem.spp) or (problem.spp,)
+    counts = tuple(count for count in (*planning.COUNTS, MOST) if count >= problem.spp) or (problem.spp,)
 
     def keep(name: str, measure: Any) -> Any:
         return results.get(f"{part.key} {name}", measure)
 
-    progress.stage(f"{title}: comparing ways to differentiate", plan_gradients(renderer.plan), hint=HINT)
-    renderer.plan = measured_plan(
-        renderer,
-        problem.loss,
-        u,
-        seed=seeds.stream(config.seed, "measure"),
-        spp=problem.spp,
-        counted=True,
-        tick=lambda: progress.advance(1),
-        keep=keep,
+    def tick() -> None:
+        progress.advance(1)
+
+    progress.stage(f"{title}: comparing ways to differentiate", planning.plan_gradients(renderer.plan), hint=HINT)
+    seed = seeds.stream(config.seed, "measure")
+    renderer.plan = planning.measured_plan(
+        renderer, problem.loss, u, seed=seed, spp=problem.spp, counted=True, tick=tick, keep=keep
     )
     steps = {group.name: group.step for group in renderer.plan.groups}
-    most = cosine_samples(renderer.plan, counts=counts)
+    most = planning.cosine_samples(renderer.plan, counts=counts)
     progress.stage(f"{title}: the model's gradients", most, hint=f"counted in samples a pixel; {HINT}", at_most=True)
-    table: list[Measured] = []
-    tick = progress.advance
-    for row in cosines(renderer, problem.loss, u, seed=config.seed, counts=counts, tick=tick, keep=keep):
+    table, samples = list[Measured](), progress.advance
+    for row in planning.cosines(renderer, problem.loss, u, seed=config.seed, counts=counts, tick=samples, keep=keep):
         table.append(row)
         yield part.row(row)
-    renderer.plan, spp = tuned(renderer.plan, table)
+    renderer.plan, spp = planning.tuned(renderer.plan, table)
     if not config.all:
         yield from _planned(problem, part, spp or problem.spp, results, progress)
     wider = {group.name: group.step / steps[group.name] for group in renderer.plan.groups if steps[group.name]}
-    how = {"loss": problem.loss, "spp": spp or problem.spp, "reference_spp": CONVERGED, "seeds_of_reference": FEW_SEEDS}
+    how = {"loss": problem.loss, "spp": spp or problem.spp}
+    how |= {"reference_spp": planning.CONVERGED, "seeds_of_reference": FEW_SEEDS}
     for row in _derivatives(problem, part, title, results, progress, **how):
         group = f"{row.control}.{row.parameter.partition('.')[0]}"  # coordinates of one have a number behind it
         yield part.row(row, factor=wider.get(group, 1.0))
@@ -211,15 +186,11 @@ def _derivatives(
     problem: Problem, part: CheckedPart, title: str, results: Results, progress: Progress, *, loss: Any, **how: Any
 ) -> Iterator[Measured]:
     return derivatives(
-        problem.renderer,
-        loss,
-        inside(problem.renderer),
-        seed=seeds.stream(part.config.seed, "check"),
+        problem.renderer, loss, inside(problem.renderer), seed=seeds.stream(part.config.seed, "check"),
         value=lambda name, kind, measure: results.value(f"{part.key} {name}", kind, measure),
         stage=lambda name, most: progress.stage(f"{title}: {name}", most, hint=HINT, at_most=True),
-        tick=lambda: progress.advance(1),
-        **how,
-    )
+        tick=lambda: progress.advance(1), **how,
+    )  # fmt: skip
 
 
 def _planned(problem: Problem, part: CheckedPart, spp: int, results: Results, progress: Progress) -> Iterator[Finding]:
@@ -231,7 +202,7 @@ def _planned(problem: Problem, part: CheckedPart, spp: int, results: Results, pr
         "adjoint renders: no coordinate needs one": not used & BY_ADJOINT,
         "renders for differences: every derivative is an adjoint or of the picture itself": not used & BY_DIFFERENCES,
         "the volumetric integrator: there is no medium": not renderer.scene.volumetric,
-        **{f"by the material form: {limit.what}": "material" in used for limit in LIMITS},
+        **{f"by the material form: {limit}": "material" in used for limit in LIMITS},
     }
     left_out = [text for text, true in not_computed.items() if true]
     yield SearchPlan(
@@ -245,8 +216,9 @@ def _planned(problem: Problem, part: CheckedPart, spp: int, results: Results, pr
         progress.advance(1)
 
     def lengths() -> PathLength:
-        progress.stage("finding how many bounces of light matter", most_pictures(problem), hint=hint, at_most=True)
-        return bounces_of(problem, config.seed, tick=tick)
+        most = planning.most_pictures(problem)
+        progress.stage("finding how many bounces of light matter", most, hint=hint, at_most=True)
+        return planning.bounces_of(problem, config.seed, tick=tick)
 
     def gains() -> list[GainRow]:
         progress.stage("measuring what leaving things out saves", MOST_GRADIENTS, hint=hint, at_most=True)
@@ -263,43 +235,22 @@ def _planned(problem: Problem, part: CheckedPart, spp: int, results: Results, pr
 
 ALL, BOUNCES = "everything above", "bounces"
 """Names of the rows in which all items are put back together, and in which paths have their full length."""
-WHAT = {
-    **ITEMS,
-    BOUNCES: "bounces of light beyond the search's longest path",
-    ALL: "all of these",
-}
+WHAT = {**ITEMS, BOUNCES: "bounces of light beyond the search's longest path", ALL: "all of these"}
 """What is left out, in words, for each row."""
 AGREES = 1.2
 """Difference, as a share of what another seed changes, up to which two pictures or gradients agree: 1 is expected where
 the random numbers are others."""
-REPEATS = 3
-"""Timed gradients of each."""
+REPEATS = 3  # timed gradients of each
 MOST_GRADIENTS = (2 + REPEATS) * (len(ITEMS) + 3)
 """That `measured_gains` takes: with every item put back, with all, with all bounces and with none."""
 PER_PIXEL = 2.0
 """Texels a pixel that `TexelRow.enough` keeps: two samples a period (Nyquist), with room for oblique views."""
 
 
-@dataclass
-class Samples:
-    """Pictures and gradients of two seeds, and the seconds of a gradient."""
-
-    pictures: list[Tensor]
-    gradients: list[Tensor]
-    seconds: float = 0.0
-
-
 def measured_gains(
-    renderer: Renderer,
-    loss: Loss,
-    u: Tensor,
-    *,
-    seed: int,
-    spp: int,
-    repeats: int = REPEATS,
-    depth: int | None = None,
-    tick: Callable[[], None] = lambda: None,
-) -> list[GainRow]:
+    renderer: Renderer, loss: Loss, u: Tensor, *, seed: int, spp: int, repeats: int = REPEATS,
+    depth: int | None = None, tick: Callable[[], None] = lambda: None,
+) -> list[GainRow]:  # fmt: skip
     """Put back what a renderer leaves out, item by item and all at once, and measure a gradient of a loss at u (d,).
 
     `depth` is the longest light path of the search, where it is shorter than the scene's; `tick` is called after each
@@ -313,44 +264,38 @@ def measured_gains(
     if depth < scene.max_depth:
         renderers[BOUNCES] = renderer
     renderers[ALL] = renderer.like(scene.like(leave_out=NOTHING))
-    both = seed, seeds.stream(seed, "another")
-    samples = {item: Samples([], []) for item in renderers}
-    for noise in both:  # the first compiles
+    pictures, gradients = defaultdict[str, list[Tensor]](list), defaultdict[str, list[Tensor]](list)
+    times = defaultdict[str, list[float]](list)
+    for noise in (seed, seeds.stream(seed, "another")):  # the first compiles
         for item, each in renderers.items():
             with torch.no_grad():
-                samples[item].pictures.append(each(u, noise, spp))
-            samples[item].gradients.append(each.gradient(loss, u, noise, spp)[1])
+                pictures[item].append(each(u, noise, spp))
+            gradients[item].append(each.gradient(loss, u, noise, spp)[1])
             tick()
-    times: dict[str, list[float]] = {item: [] for item in renderers}
     for number in range(repeats):
         for item, each in renderers.items():
             begun = time.perf_counter()
             each.gradient(loss, u, seeds.stream(seed, "round", number), spp)
             times[item].append(time.perf_counter() - begun)
             tick()
-    for item, taken in times.items():
-        samples[item].seconds = statistics.median(taken)
-    lean = samples.pop("")
-    return [_gain(item, lean, having) for item, having in samples.items()]
-
-
-def _gain(item: str, without: Samples, having: Samples) -> GainRow:
-    picture, gradient = _share(without.pictures, having.pictures), _share(without.gradients, having.gradients)
-    noise, lean_noise = (float((each.pictures[1] - each.pictures[0]).norm()) for each in (having, without))
-    return GainRow(
-        item=item,
-        what=WHAT[item],
-        time_gain=((noise / lean_noise) ** 2 if lean_noise > 0.0 else 1.0) * having.seconds / without.seconds,
-        picture_difference=picture,
-        gradient_difference=gradient,
-        safe=max(picture, gradient) <= AGREES,
-        seconds=having.seconds,
-    )
+    rows = []
+    for item in list(renderers)[1:]:
+        picture, gradient = (_share(values[""], values[item]) for values in (pictures, gradients))
+        noise_with, noise_without = (float((other - first).norm()) for first, other in (pictures[item], pictures[""]))
+        seconds, seconds_without = statistics.median(times[item]), statistics.median(times[""])
+        variance = (noise_with / noise_without) ** 2 if noise_without > 0.0 else 1.0
+        rows.append(
+            GainRow(
+                item=item, what=WHAT[item], time_gain=variance * seconds / seconds_without, picture_difference=picture,
+                gradient_difference=gradient, safe=max(picture, gradient) <= AGREES, seconds=seconds,
+            )
+        )  # fmt: skip
+    return rows
 
 
 def _share(without: list[Tensor], having: list[Tensor]) -> float:
     """The difference at one seed over the root mean square of those that another seed makes."""
-    size = math.sqrt(statistics.fmean(float((one - other).norm()) ** 2 for one, other in (without, having)))
+    size = math.sqrt(statistics.fmean(float((first - other).norm()) ** 2 for first, other in (without, having)))
     difference = float((having[0] - without[0]).norm())
     return difference / size if size > 0.0 else difference
 

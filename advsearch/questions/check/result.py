@@ -32,37 +32,30 @@ class CheckConfig(DerivativeConfig):
     command: ClassVar[str] = "check"
     free: ClassVar[tuple[str, ...]] = (*DerivativeConfig.free, "seconds")
 
+    # fmt: off
     clashes: ClassVar[tuple[Clash, ...]] = (
         *DerivativeConfig.clashes,
-        Clash(
-            "all",
-            lambda one: any(getattr(one, name) != value for name, value in OF_ALL.items()),
-            "takes scenes and controls of its own; leave `object`, `environment`, `controls` and `set` out",
-        ),
-        Clash(
-            "objective",
-            lambda one: one.loss == "linear",
-            "is of the model's loss, which `loss=linear` leaves out; leave one of the two out",
-        ),
+        Clash("all", lambda config: any(getattr(config, name) != value for name, value in OF_ALL.items()),
+              "takes scenes and controls of its own; leave `object`, `environment`, `controls` and `set` out"),
+        Clash("objective", lambda config: config.loss == "linear",
+              "is of the model's loss, which `loss=linear` leaves out; leave one of the two out"),
     )
 
     all: bool = setting(False, "check", "every control, on three bundled scenes; takes hours")
     loss: Literal["linear", "model", "both"] = setting(
-        "both",
-        "check",
+        "both", "check",
         "what is differentiated: a smooth linear loss of the raw picture, the model's own, or both in turn",
     )
+    # fmt: on
     seconds: float | None = setting_as_in(TimedConfig, "seconds")
     run: str | None = setting_as_in(SceneConfig, "run", otherwise="runs/OBJECT-check-NNN")
 
     @property
     def title(self) -> tuple[str, ...]:
-        """The object, or that it is of all, and what is asked of it."""
         return "all" if self.all else self.object, self.command
 
     @property
     def losses(self) -> tuple[str, ...]:
-        """What is differentiated, in turn."""
         return ("linear", "model") if self.loss == "both" else (self.loss,)
 
 
@@ -123,7 +116,6 @@ class CheckResult(InNotebook, RunResult):
 
     @property
     def brief(self) -> str:
-        """How far it has come."""
         return f"{self.measured} of {self.planned} parts"
 
 

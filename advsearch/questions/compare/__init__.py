@@ -17,7 +17,7 @@ from advsearch.questions.compare.result import shown as shown
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.runs.directory import PARTS, find_run
 from advsearch.runs.results import INTERRUPTED
-from advsearch.settings import each_once, setting, setting_as_in, settings, split_names, texts
+from advsearch.settings import each_once, names_together, setting, setting_as_in, settings, split_names, texts
 
 if TYPE_CHECKING:
     from advsearch.questions.compare.pairs import Side
@@ -35,27 +35,21 @@ class CompareConfig(SweepConfig):
         *("rolling", "fps", "must_change", "must_not_change"),
     )
 
+    # fmt: off
     compared: str = setting(
-        ...,
-        "compare",
+        ..., "compare",
         "what is compared, separated by commas: sweeps that are stored (one of several models, or several of the same "
-        "draws), or models, where `object` says what they are shown",
-        "names or folders of runs of sweep, or models",
+        "draws), or models, where `object` says what they are shown", "names or folders of runs of sweep, or models",
     )
     pictures: int = setting(
-        6,
-        "compare",
-        "pictures of what one side alone gets right that are shown, for each side; 0 for none",
-        unit="pictures",
-        ge=0,
-        le=1000,
+        6, "compare", "pictures of what one side alone gets right that are shown, for each side; 0 for none",
+        unit="pictures", ge=0, le=1000,
     )
     object: str = setting_as_in(
-        SweepConfig,
-        "object",
-        default="",
+        SweepConfig, "object", default="",
         description="the object that models are shown, where models are compared; several, separated by commas",
     )
+    # fmt: on
     keep_pictures: Literal["all", "wrong", "none"] = setting_as_in(SweepConfig, "keep_pictures", default="wrong")
     run: str | None = setting_as_in(SceneConfig, "run", otherwise="runs/WHAT-compare-NNN")
 
@@ -72,10 +66,10 @@ class CompareConfig(SweepConfig):
     def _of_stored_or_made(self) -> CompareConfig:
         """Refuse what says how pictures are made where stored ones are compared, and a single model."""
         if not self.object:
-            for one in settings(type(self)):
-                if one.field not in ALWAYS and getattr(self, one.field) != one.default:
+            for asked in settings(type(self)):
+                if asked.field not in ALWAYS and getattr(self, asked.field) != asked.default:
                     raise InputError(
-                        f"{one.name}: says how models are shown pictures, and no `object` is named; add `object`, or "
+                        f"{asked.name}: says how models are shown pictures, and no `object` is named; add `object`, or "
                         "leave it out to compare stored sweeps"
                     )
         elif len(split_names(self.compared)) < 2:
@@ -112,7 +106,7 @@ def compare(asked: Asked[CompareConfig]) -> CompareResult:
     """
     # these import torch and pandas
     from advsearch.questions.attack.studies import carry_out_part
-    from advsearch.questions.compare.pairs import Pictures, compared, differing, read_sides
+    from advsearch.questions.compare.pairs import PairPictures, compared, differing, read_sides
     from advsearch.rules import interval_of
 
     config, progress, renders = asked.config, asked.progress, 0
@@ -125,7 +119,7 @@ def compare(asked: Asked[CompareConfig]) -> CompareResult:
         progress.stage("reading rows")
         sides = read_sides([find_run(name) for name in split_names(config.compared)])
     differ = differing(sides) if sides else []
-    pictures, pairs, warnings = Pictures(asked), list[ComparedPair](), _cautions(sides, differ)
+    pictures, pairs, warnings = PairPictures(asked), list[ComparedPair](), _cautions(sides, differ)
     for number, other in enumerate(sides[1:], start=1):
         progress.stage("counting pairs")
         try:
@@ -136,30 +130,26 @@ def compare(asked: Asked[CompareConfig]) -> CompareResult:
         pairs.append(pair.model_copy(update={"shown": list(pictures.of(sides[0], other, number))}))
     if not sides:
         asked.ending = INTERRUPTED
-
-    def together(names: list[str]) -> str:
-        return ",".join(dict.fromkeys(one for name in names for one in split_names(name)))
-
     return asked.result(
         CompareResult,
-        environment=together([one.summary.environment for one in sides]) or config.lit_by,
+        environment=names_together(side.summary.environment for side in sides) or config.lit_by,
         controls=sides[0].summary.controls if sides else list(config.controls),
-        object=together([one.named["object"] for one in sides]) or config.object,
-        model=together([one.named["model"] for one in sides]) or config.compared,
+        object=names_together(side.named["object"] for side in sides) or config.object,
+        model=names_together(side.named["model"] for side in sides) or config.compared,
         task=sides[0].summary.task if sides else config.task_name,
         differ=differ,
         sides=[
             ComparedSide(
-                name=one.name,
-                run=str(one.folder),
-                **one.named,
-                configurations=len(one.rows),
-                correct=int(one.right.sum()),
-                accuracy=float(one.right.mean()),
-                interval=interval_of(one.rows),
-                seconds=float(one.rows["seconds"].mean()),
+                name=side.name,
+                run=str(side.folder),
+                **side.named,
+                configurations=len(side.rows),
+                correct=int(side.right.sum()),
+                accuracy=float(side.right.mean()),
+                interval=interval_of(side.rows),
+                seconds=float(side.rows["seconds"].mean()),
             )
-            for one in sides
+            for side in sides
         ],
         pairs=pairs,
         renders=renders + pictures.rendered,
@@ -168,16 +158,15 @@ def compare(asked: Asked[CompareConfig]) -> CompareResult:
 
 
 def _cautions(sides: Sequence[Side], names: Sequence[str]) -> list[str]:
-    """What a reader has to know of the sweeps, which differ in some settings."""
     if not sides:
         return []
-    found = [text for side in sides for text in side.summary.warnings]
+    cautions = [text for side in sides for text in side.summary.warnings]
     if len(names) > 1:
         listed = f"{', '.join(names[:-1])} and {names[-1]}"
-        found.append(f"The sweeps differ in {listed}: what is told here is of all of that together.")
+        cautions.append(f"The sweeps differ in {listed}: what is told here is of all of that together.")
     if not names:
-        found.append("The sweeps have the same settings: what differs is in files, in versions, or in the machine.")
+        cautions.append("The sweeps have the same settings: what differs is in files, in versions, or in the machine.")
     tasks = {side.summary.task for side in sides}
     if len(tasks) > 1:
-        found.append(f"What counts as right is judged by different tasks: {', '.join(sorted(tasks))}.")
-    return found
+        cautions.append(f"What counts as right is judged by different tasks: {', '.join(sorted(tasks))}.")
+    return cautions

@@ -24,7 +24,7 @@ from advsearch.errors import FileFormatError, InputError, ModelError
 from advsearch.question import Asked
 from advsearch.questions.compare.result import ComparedPair, CountOf, PairPart, PairPicture, PairRule
 from advsearch.questions.sweep.carry_out import scenes_of
-from advsearch.questions.sweep.job import Scenes
+from advsearch.questions.sweep.job import OpenScenes
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.questions.sweep.summary import SweepSummary
 from advsearch.report.wording import short_names
@@ -35,23 +35,15 @@ from advsearch.runs.summary import read_result
 from advsearch.runs.tables import read_sweep
 from advsearch.viewer import thumbnails
 
-DRAWS = ("grid", "controls", "samples", "sampler", "seed")
-"""The settings that decide what is drawn."""
-
-OF_THE_SIDE = ("object", "model", "answer")
-"""What may tell sides apart, as rows have it."""
-
+DRAWS = ("grid", "controls", "samples", "sampler", "seed")  # The settings that decide what is drawn
+OF_THE_SIDE = ("object", "model", "answer")  # What may tell sides apart, as rows have it
 FOLLOWS = (
     *(*DRAWS, "label", "labels", "prompt", "up", "size", "unit", "batch", "keep_pictures", "trials", "verify_spp"),
     "specialise",
 )
 """Settings that do not tell sweeps apart: of draws, along with object and model, or of no adversarial scene."""
-
-TOLERANCE = 1e-4
-"""Of a value, relative to the largest in its column: values come from single precision."""
-
-MOST_VALUES = 64
-"""Different numbers of a parameter, beyond which it has no table unless the sweep says how it is cut."""
+TOLERANCE = 1e-4  # Of a value, relative to the largest in its column: values come from single precision
+MOST_VALUES = 64  # Different numbers of a parameter, beyond which it has no table unless the sweep says how it is cut
 
 Mask = npt.NDArray[np.bool_]
 
@@ -85,11 +77,8 @@ def read_sides(folders: Sequence[Path]) -> list[Side]:
     """Return what the sweeps in some folders compare, each side with a name of its own.
 
     A sweep has a side for each of its models. The sweep of an adversarial scene has these without it and with it;
-    beside other sweeps, only with it.
-
-    Raises:
-        FileFormatError: a folder has another run, or a sweep that has not ended.
-        InputError: there is nothing to compare, or sweeps are of other draws.
+    beside other sweeps, only with it. Raises FileFormatError where a folder has another run, or a sweep that has not
+    ended, and InputError where there is nothing to compare, or sweeps are of other draws.
     """
     sides = [side for folder in folders for side in _sides_of(folder, alone=len(folders) == 1)]
     if len(sides) < 2:
@@ -108,8 +97,10 @@ def read_sides(folders: Sequence[Path]) -> list[Side]:
     shown = np.logical_and.reduce([is_shown(side.rows) for side in sides])
     if not shown.any():
         raise InputError(f"compared: expected pictures with the object in them, got none in {folders[0]}")
-    rows = [side.rows[shown].reset_index(drop=True) for side in sides]
-    return [replace(side, name=name, rows=own) for side, name, own in zip(sides, names, rows, strict=True)]
+    return [
+        replace(side, name=name, rows=side.rows[shown].reset_index(drop=True))
+        for side, name in zip(sides, names, strict=True)
+    ]
 
 
 def _sides_of(folder: Path, *, alone: bool) -> Iterator[Side]:
@@ -130,10 +121,10 @@ def _sides_of(folder: Path, *, alone: bool) -> Iterator[Side]:
     rows = rows.sort_values("step", ignore_index=True)
     rows["correct"] = rows["correct"] == 1
     rows["number"], model_of = rows["step"] // models, rows["step"] % models
-    with_adversarial = rows["number"] >= summary.planned // models // 2
-    halves_of = (
-        [~with_adversarial, with_adversarial][0 if alone else 1 :] if config.adversarial_of else [rows["number"] >= 0]
-    )
+    halves_of = [rows["number"] >= 0]
+    if config.adversarial_of:
+        with_adversarial = rows["number"] >= summary.planned // models // 2
+        halves_of = [~with_adversarial, with_adversarial] if alone else [with_adversarial]
     for half in halves_of:
         for model, name in enumerate(config.models):
             mine = rows[half & (model_of == model)].reset_index(drop=True)
@@ -177,8 +168,8 @@ def _same(one: pd.Series, other: pd.Series) -> bool:
 
 def differing(sides: Sequence[Side]) -> list[str]:
     """Return the settings in which the sweeps of some sides differ and that decide predictions."""
-    settings = [side.config.deciding() for side in sides]
-    names = {name for one in settings[1:] for name in one if one[name] != settings[0][name]}
+    first, *others = (side.config.deciding() for side in sides)
+    names = {name for other in others for name in other if other[name] != first[name]}
     names |= {name for name in OF_THE_SIDE if len({side.named[name] for side in sides}) > 1}
     names |= {name for name in ("object", "model") if len({getattr(side.config, name) for side in sides}) > 1}
     return sorted(names - {*FOLLOWS, "adversarial_of"})
@@ -241,10 +232,7 @@ def _parts(column: pd.Series, edges: Sequence[float] | None) -> Iterator[tuple[A
 
 
 def _rules(table: pd.DataFrame, seed: int) -> list[PairRule] | None:
-    """Where one side alone is right more often than elsewhere; None of too few pairs, or where nothing varies.
-
-    These are the rules of `explain`, whose wrong predictions are the pairs that one side alone gets right.
-    """
+    """Where one side alone is right more often than elsewhere, by the rules of `explain`; None of too few pairs."""
     if len(table) < FEWEST_ROWS or not table.attrs["units"]:
         return None
 
@@ -252,74 +240,66 @@ def _rules(table: pd.DataFrame, seed: int) -> list[PairRule] | None:
         low, high = interval_of(pairs)
         return CountOf(count=int((~pairs["correct"]).sum()), total=len(pairs), interval=(1.0 - high, 1.0 - low))
 
-    return [
-        PairRule(
-            conditions=[one.row for one in rule.conditions], elsewhere=count(rule.elsewhere), **vars(count(rule.inside))
-        )
-        for rule in find_rules(*halves(table, seed), seeds.stream(seed, "compare")).told
-    ]
-
-
-def far_apart(first: Side, second: Side, most: int) -> list[int]:
-    """Return places of pairs that one side alone gets right, at most so many of each: first those of the first side,
-    where the margins are farthest apart first."""
-    right, other = first.right, second.right
-    apart = (second.rows["margin"] - first.rows["margin"]).fillna(0.0)
-    worse = (-apart[right & ~other]).sort_values(kind="stable").index[:most]
-    better = apart[~right & other].sort_values(kind="stable").index[:most]
-    return [*worse.tolist(), *better.tolist()]
+    rules = []
+    for rule in find_rules(*halves(table, seed), seeds.stream(seed, "compare")).told:
+        conditions = [condition.row for condition in rule.conditions]
+        rules.append(PairRule(conditions=conditions, elsewhere=count(rule.elsewhere), **vars(count(rule.inside))))
+    return rules
 
 
 @dataclass
-class Pictures:
+class PairPictures:
     """Small pictures of pairs in the folder of the run: those that sweeps kept, or rendered again."""
 
     asked: Asked[Any]
     rendered: int = 0
     warnings: list[str] = field(default_factory=list)
-    scenes: dict[Path, Scenes | None] = field(default_factory=dict)
+    scenes: dict[str, OpenScenes | None] = field(default_factory=dict)
 
     def of(self, first: Side, second: Side, pair: int) -> Iterator[PairPicture]:
-        """Yield what one side alone gets right, at most so many of each, with pictures as far as they are to be had."""
+        """Yield what one side alone gets right, at most so many of each, where the margins are farthest apart first,
+        with pictures as far as they are to be had."""
+        most, folder = self.asked.config.pictures, self.asked.run.path
+        apart = (first.rows["margin"] - second.rows["margin"]).fillna(0.0)
+        worse, better = -apart[first.right & ~second.right], apart[~first.right & second.right]
+        places = [
+            place for alone in (worse, better) for place in alone.sort_values(kind="stable").index[:most].tolist()
+        ]
         together = first.folder == second.folder and first.rows["number"].equals(second.rows["number"])
         sides = {"a": first} if together else {"a": first, "b": second}
-        places = far_apart(first, second, self.asked.config.pictures)
-        files = {(place, one): f"images/pair-{pair}-{place}-{one}.jpg" for place in places for one in sides}
-        folder = self.asked.run.path
+        files = {(place, side): f"images/pair-{pair}-{place}-{side}.jpg" for place in places for side in sides}
         with self.asked.until_interrupted():
-            self._make([(sides[one], place, folder / name) for (place, one), name in files.items()])
+            self._make([(sides[side], place, folder / name) for (place, side), name in files.items()])
         for place in places:
-            names = [files[place, one] for one in sides]
+            names = [files[place, side] for side in sides]
             values = first.rows.loc[place, first.varying].items()
             yield PairPicture(
                 number=place,
-                values={name: one if isinstance(one, str) else float(f"{one:.6g}") for name, one in values},
+                values={name: value if isinstance(value, str) else float(f"{value:.6g}") for name, value in values},
                 right=(first if first.right[place] else second).name,
                 answers=(first.rows["label"][place], second.rows["label"][place]),
                 pictures=names if all((folder / name).is_file() for name in names) else [],
             )
 
     def _make(self, wanted: Sequence[tuple[Side, int, Path]]) -> None:
-        """Put the pictures at some places of sides into files, where they are not there."""
-        missing: list[tuple[Side, int, Path]] = []
+        missing: list[tuple[str, int, Path, Side]] = []
         for side, place, file in wanted:
             number = int(side.rows["number"][place])
             kept = thumbnails.kept_file(side.folder, number)
             if kept is not None:
                 write_bytes(file, kept.read_bytes(), durable=False)
             elif not file.is_file():
-                missing.append((side, number, file))
+                missing.append((str(side.folder), number, file, side))
         if missing:
             self.asked.progress.stage("rendering pictures again", len(missing), hint="`pictures` says how many")
-        for side, number, file in sorted(missing, key=lambda one: (str(one[0].folder), one[1])):
-            if side.folder not in self.scenes:
-                self.scenes[side.folder] = None
+        for folder, number, file, side in sorted(missing, key=lambda picture: picture[:2]):
+            if folder not in self.scenes:
+                self.scenes[folder] = None
                 try:
-                    self.scenes[side.folder] = scenes_of(side.config)
+                    self.scenes[folder] = scenes_of(side.config)
                 except (InputError, ModelError) as error:  # scene or model are not to be had any more
                     self.warnings.append(f"Pictures of {side.folder.name} are not shown: {error}")
-            scenes = self.scenes[side.folder]
-            if scenes is not None:
+            if (scenes := self.scenes[folder]) is not None:
                 write_bytes(file, thumbnails.thumbnail(scenes.picture(number)), durable=False)
                 self.rendered += 1
             self.asked.progress.advance(1)

@@ -11,7 +11,7 @@ from pydantic import Field
 from advsearch.questions.sweep.summary import AxisValue, CountedPredictions
 from advsearch.report import wording
 from advsearch.report.markup import InNotebook
-from advsearch.report.shown import Claim, Column, Extent, Picture, ResultPart, ShownResult
+from advsearch.report.shown import Claim, Column, Picture, ResultPart, ShownResult, claim, counted
 from advsearch.report.wording import conditions_text, percent, share_of_text
 from advsearch.runs.results import ConditionRow, Fields, Interval, JsonFloat, RunResult
 
@@ -135,9 +135,7 @@ NOTE_OF_UNITS = (
     "each for its row by itself."
 )
 
-LEVEL = 0.05
-"""A p-value up to this is called a difference."""
-
+LEVEL = 0.05  # A p-value up to this is called a difference
 MOST_TABLES, MOST_PICTURES = 4, 3
 """Parameters, and pictures of what one side alone gets right, that a terminal shows; the page has all."""
 
@@ -153,8 +151,8 @@ def shown(result: CompareResult) -> ShownResult:
     columns: Mapping[str, Column] = {
         "": "{0.name}",
         "right in": "{0.correct} of {0.configurations}",
-        "accuracy": lambda one: percent(one.accuracy),
-        "95 % interval": lambda one: wording.interval_text(one.interval),
+        "accuracy": lambda side: percent(side.accuracy),
+        "95 % interval": lambda side: wording.interval_text(side.interval),
         "time a prediction": cost,
     }
     sections = [ResultPart.table(result.sides, columns, title="How often each is right")]
@@ -194,7 +192,6 @@ def alone_text(pair: ComparedPair) -> str:
 
 
 def _of_pair(pair: ComparedPair, *, several: bool) -> Iterator[ResultPart]:
-    """Two sides: the pairs in a table of two by two, where one is worse, the values of parameters, and pictures."""
     said = [headline(pair), alone_text(pair)] if several else [alone_text(pair)]
     heads = ["", f"{pair.second} right", f"{pair.second} wrong"]
     rows = [
@@ -214,11 +211,11 @@ def _of_pair(pair: ComparedPair, *, several: bool) -> Iterator[ResultPart]:
     heads += [f"{pair.first} alone", f"{pair.second} alone"]
     for name, parts in tables.items():
         rows = []
-        for one in parts:
-            shares = [percent(right / one.pairs) for right in one.right]
-            difference = f"{100.0 * one.difference:+.0f} ({points_text(one.interval)})"
-            alone = [str(one.first_only), str(one.second_only)]
-            rows.append([wording.value_text(one.value), str(one.pairs), *shares, difference, *alone])
+        for part in parts:
+            shares = [percent(right / part.pairs) for right in part.right]
+            difference = f"{100.0 * part.difference:+.0f} ({points_text(part.interval)})"
+            alone = [str(part.first_only), str(part.second_only)]
+            rows.append([wording.value_text(part.value), str(part.pairs), *shares, difference, *alone])
         yield ResultPart(name, heads=heads, rows=rows, only="" if name in told else "page")
     if len(told) < len(tables):
         more = f"The difference varies most over these; the page has all {len(tables)} parameters."
@@ -228,7 +225,6 @@ def _of_pair(pair: ComparedPair, *, several: bool) -> Iterator[ResultPart]:
 
 
 def _rules_texts(pair: ComparedPair) -> Iterator[str]:
-    """Where each side alone is right, in sentences; none where it was not looked for."""
     ways = (
         (pair.worse, pair.first_only, pair.first, pair.second),
         (pair.better, pair.second_only, pair.second, pair.first),
@@ -244,23 +240,21 @@ def _rules_texts(pair: ComparedPair) -> Iterator[str]:
 
 
 def _alone(name: str, pair: ComparedPair) -> Iterator[ResultPart]:
-    """What one side alone gets right: a picture of each pair where both were shown the same, or else the two beside
-    each other."""
     title, lines, missing, groups = f"Only {name} gets right:", list[list[str]](), list[str](), list[list[Picture]]()
-    for one in pair.shown:
-        if one.right != name:
-            continue
-        numbers = {key: value if isinstance(value, str) else format(value, ".3g") for key, value in one.values.items()}
-        values = ", ".join(f"{key} {value}" for key, value in numbers.items())
-        sides = zip((pair.first, pair.second), one.answers, strict=True)
-        said = [f"{side}: {text}{' (right)' if side == name else ''}" for side, text in sides]
-        lines.append(["; ".join([*said, values]), *one.pictures])
-        captions = said if len(one.pictures) == 2 else ["; ".join(said)]
-        captions[0] += f"; {values}"
-        if one.pictures:
-            groups.append([Picture(file, text) for file, text in zip(one.pictures, captions, strict=True)])
-        else:
+    for shown_pair in (shown_pair for shown_pair in pair.shown if shown_pair.right == name):
+        values = ", ".join(
+            f"{key} {value if isinstance(value, str) else format(value, '.3g')}"
+            for key, value in shown_pair.values.items()
+        )
+        sides = zip((pair.first, pair.second), shown_pair.answers, strict=True)
+        captions = [f"{side}: {text}{' (right)' if side == name else ''}" for side, text in sides]
+        lines.append(["; ".join([*captions, values]), *shown_pair.pictures])
+        if not shown_pair.pictures:
             missing.append(lines[-1][0])
+            continue
+        captions = captions if len(shown_pair.pictures) == 2 else ["; ".join(captions)]
+        captions[0] += f"; {values}"
+        groups.append([Picture(*captioned) for captioned in zip(shown_pair.pictures, captions, strict=True)])
     if all(len(group) == 1 for group in groups):
         groups = [[picture for group in groups for picture in group]] if groups else []
     yield ResultPart(title, rows=lines[:MOST_PICTURES], only="text")
@@ -272,11 +266,6 @@ def claims(result: CompareResult) -> Iterator[Claim]:
     for pair in result.pairs:
         how = "Newcombe's, of pairs" if pair.units is None else "over drives"
         text = f"{headline(pair)} {alone_text(pair)} The interval of the difference is {how}."
-        side = next(one for one in result.sides if one.name == pair.second)
-        extent = Extent(
-            what=f"configurations in which {pair.second} is right",
-            count=side.correct,
-            total=side.configurations,
-            interval=side.interval or (0.0, 1.0),
-        )
-        yield Claim(kind="measured", statement=text, extent=extent)
+        side = next(side for side in result.sides if side.name == pair.second)
+        what = f"configurations in which {pair.second} is right"
+        yield claim("measured", text, counted(what, side.correct, side.configurations, side.interval))

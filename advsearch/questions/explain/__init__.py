@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import ClassVar
 
 from advsearch.config import SceneConfig
 from advsearch.errors import InputError
 from advsearch.question import Asked, question
-from advsearch.questions.explain.result import EnvelopeRow, ExplainResult, ParameterWeight, RuleRow
+from advsearch.questions.explain.result import ExplainResult, RuleRow
 from advsearch.questions.explain.result import claims as claims
 from advsearch.questions.explain.result import shown as shown
 from advsearch.runs.directory import PARTS, find_run
 from advsearch.runs.results import INTERRUPTED
 from advsearch.runs.summary import read_result
-from advsearch.settings import Clash, Config, each_once, setting, setting_as_in, split_names, texts
+from advsearch.settings import Clash, Config, each_once, names_together, setting, setting_as_in, split_names, texts
 
 
 class ExplainConfig(Config):
@@ -24,36 +23,24 @@ class ExplainConfig(Config):
     command: ClassVar[str] = "explain"
     clashes: ClassVar[tuple[Clash, ...]] = tuple(one for one in SceneConfig.clashes if one.setting == "overwrite")
 
+    # fmt: off
     sweeps: str = setting(
-        ...,
-        "explain",
-        "the sweeps whose rows are read together, separated by commas",
+        ..., "explain", "the sweeps whose rows are read together, separated by commas",
         "names or folders of runs of sweep, or of recipes with sweeps",
     )
     confirm: int = setting(
-        100,
-        "explain",
-        "fresh configurations inside each rule that are rendered to confirm it; 0 for none",
-        unit="renders",
-        ge=0,
-        le=100_000,
+        100, "explain", "fresh configurations inside each rule that are rendered to confirm it; 0 for none",
+        unit="renders", ge=0, le=100_000,
     )
     pairs: int = setting(
-        12,
-        "explain",
-        "failures for which the nearest right configuration is looked for; 0 for none",
-        unit="failures",
-        ge=0,
-        le=100,
+        12, "explain", "failures for which the nearest right configuration is looked for; 0 for none",
+        unit="failures", ge=0, le=100,
     )
     clusters: int = setting(
-        100,
-        "explain",
-        "failures that are rendered again and grouped by what the model decides by; 0 for none",
-        unit="failures",
-        ge=0,
-        le=10_000,
+        100, "explain", "failures that are rendered again and grouped by what the model decides by; 0 for none",
+        unit="failures", ge=0, le=10_000,
     )
+    # fmt: on
     accuracy: float = setting(
         0.95, "explain", "accuracy that the envelope promises, at 95 % confidence", gt=0.0, le=0.999
     )
@@ -123,30 +110,20 @@ def explain(asked: Asked[ExplainConfig]) -> ExplainResult:
     if renders.interrupted:
         asked.ending = INTERRUPTED
     counted = right_of(table)
-
-    def together(names: Iterator[str]) -> str:
-        return ",".join(dict.fromkeys(one for name in names for one in split_names(name)))
-
     return asked.result(
         ExplainResult,
-        sweeps=[str(one.folder) for one in sweeps],
-        object=together(one.summary.object for one in sweeps),
-        model=together(one.summary.model for one in sweeps),
-        environment=together(one.summary.environment for one in sweeps),
+        sweeps=[str(sweep.folder) for sweep in sweeps],
+        object=names_together(sweep.summary.object for sweep in sweeps),
+        model=names_together(sweep.summary.model for sweep in sweeps),
+        environment=names_together(sweep.summary.environment for sweep in sweeps),
         controls=sweeps[0].summary.controls,
         parameters=list(table.attrs["units"]),
         **vars(counted),
         units=None if is_independent(table) else table["unit"].nunique(),
         rules=rules,
         not_told=not_told(found.next, len(table)),
-        importance=[ParameterWeight(**{**vars(one), "parameters": [*one.factors]}) for one in importance],
-        envelope=box
-        and EnvelopeRow(
-            conditions=[one.row for one in box.conditions],
-            **vars(right_of(box.inside)),
-            accuracy=config.accuracy,
-            held=box.held,
-        ),
+        importance=importance,
+        envelope=box,
         pairs=pairs,
         pairs_sought=min(config.pairs, counted.total - counted.right),
         clusters=clusters,
@@ -156,7 +133,6 @@ def explain(asked: Asked[ExplainConfig]) -> ExplainResult:
 
 
 def _sweeps_of(folder: Path) -> list[Path]:
-    """The folder of a sweep, or those of the sweeps that a recipe consists of."""
     made = read_result(folder)
     if made.command != "recipe":
         return [folder]

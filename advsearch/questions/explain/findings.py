@@ -8,10 +8,9 @@ in it, so that the index without parts is at least as large. Of two factors it i
 Of n predictions and k parts, n times the share that is counted is Pearson's chi-squared statistic of a table of k x 2,
 and the true share is its noncentrality over n (Cohen's w squared). The interval is that of the noncentrality (Smithson
 2003, "Confidence Intervals"). Where predictions are those of units (frames of drives), chance adds more to the
-statistic
-than with independent ones: it is divided by how much more, which the deviations of units say, and is one of F, as that
-is known from few units (Rao and Scott 1981, their first-order correction; Thomas and Rao 1987). `benchmarks/explain.py`
-and `benchmarks/drives.py` print in how many of repeated samples it covers the truth.
+statistic than with independent ones: it is divided by how much more, which the deviations of units say, and is one of
+F, as that is known from few units (Rao and Scott 1981, their first-order correction; Thomas and Rao 1987).
+`benchmarks/explain.py` and `benchmarks/drives.py` print in how many of repeated samples it covers the truth.
 
 The box is peeled (PRIM: Friedman and Fisher 1999, section 6): a thin slice of one factor, or one of its names, is taken
 off again and again where that raises the accuracy of what is left the most. One half of the rows chooses the box, and
@@ -35,7 +34,7 @@ from scipy.stats import chi2, ncf, ncx2
 from scipy.stats import f as fisher
 
 from advsearch.attacks.trials import CONFIDENCE
-from advsearch.questions.explain.result import RightOf, RuleNotTold
+from advsearch.questions.explain.result import EnvelopeRow, ParameterWeight, RightOf, RuleNotTold
 from advsearch.rules import CHANCE as RULES_CHANCE
 from advsearch.rules import (
     FEWEST_ROWS,
@@ -49,47 +48,31 @@ from advsearch.rules import (
 )
 
 MOST_PARTS = 20
-ROWS_IN_A_CELL = 25
-"""Rows that a cell of two factors' parts has on average, at least."""
+ROWS_IN_A_CELL = 25  # Rows that a cell of two factors' parts has on average, at least
 CHANCE = 0.01
 """Probability that any pair is told to decide together where none does; each is tested at its part (Bonferroni)."""
-
 LEAST_SPREAD = 0.1
 """What chance adds for units, at least, of what it adds to independent predictions, though units deviate in nothing."""
 
 Places = npt.NDArray[np.int64]
 
 
-@dataclass(frozen=True)
-class FactorWeight:
-    """What one factor, or two together, decide: a share of the variance of the predictions, in [0, 1], without what
-    chance adds to it, with its 95 % interval, and into how many parts it was cut."""
-
-    factors: tuple[str, ...]
-    share: float
-    interval: tuple[float, float]
-    parts: int
-
-
-def find_importance(table: pd.DataFrame) -> tuple[FactorWeight, ...]:
-    """Return each factor of a table (`rules`) by falling share, then the pairs that decide together more than each of
-    the two by itself.
-
-    Nothing where the predictions are all the same.
-    """
+def find_importance(table: pd.DataFrame) -> list[ParameterWeight]:
+    """Return each factor of a table (`rules`) by falling share, without what chance adds to it, then the pairs that
+    decide together more than each of the two by itself. Nothing where the predictions are all the same."""
     if table["correct"].nunique() < 2:
-        return ()
+        return []
     predictions, factors = _Predictions(table), list(table.attrs["units"])
     fine, few = round(predictions.count ** (1.0 / 3.0)), max(2, math.isqrt(predictions.count // ROWS_IN_A_CELL))
-    alone = [predictions.weight((one,), _parts(table[one], fine)) for one in factors]
+    alone = [predictions.weight([factor], _parts(table[factor], fine)) for factor in factors]
     pairs, tested = [], list(combinations(factors, 2))
-    coarse = {one: _parts(table[one], few) for one in factors}
+    coarse = {factor: _parts(table[factor], few) for factor in factors}
     for pair in tested:
-        one, other = (coarse[factor] for factor in pair)
-        both = one * (int(other.max()) + 1) + other
-        if predictions.chance_of_more(both, one, other) < CHANCE / len(tested):
-            pairs.append(predictions.weight(pair, both))
-    return (*sorted(alone, key=lambda one: -one.share), *sorted(pairs, key=lambda one: -one.share))
+        first, second = (coarse[factor] for factor in pair)
+        both = first * (int(second.max()) + 1) + second
+        if predictions.chance_of_more(both, first, second) < CHANCE / len(tested):
+            pairs.append(predictions.weight([*pair], both))
+    return [weight for weights in (alone, pairs) for weight in sorted(weights, key=lambda weight: -weight.share)]
 
 
 def _parts(column: pd.Series, most: int) -> Places:
@@ -117,10 +100,10 @@ class _Predictions:
         mean = float(self.right.mean())
         return float((seen[seen > 0] * (rate - mean) ** 2).sum()) / len(self.right) / self.variance, len(rate)
 
-    def weight(self, factors: tuple[str, ...], parts: Places) -> FactorWeight:
+    def weight(self, factors: list[str], parts: Places) -> ParameterWeight:
         (counted, k), n, by_chance = self.between(parts), len(self.right), self.by_chance(parts)
         if k < 2 or math.isnan(by_chance):
-            return FactorWeight(factors, 0.0, (0.0, 1.0), k)
+            return ParameterWeight(parameters=factors, share=0.0, interval=(0.0, 1.0), parts=k)
         tail, spread, others = (1.0 - CONFIDENCE) / 2.0, by_chance / (k - 1), float(self.count - k)
         if self.independent:
             spread, others = 1.0, math.inf
@@ -128,7 +111,8 @@ class _Predictions:
         low = spread * _noncentrality(statistic, k - 1, others, 1.0 - tail) / n
         high = spread * _noncentrality(max(statistic, k - 1.0), k - 1, others, tail) / n  # fewer: less than chance
         share = 1.0 - (1.0 - counted) * (n - 1) / max(n - k, 1) if self.independent else counted - by_chance / n
-        return FactorWeight(factors, max(share, 0.0), (min(low, 1.0), min(high, 1.0)), k)
+        interval = min(low, 1.0), min(high, 1.0)
+        return ParameterWeight(parameters=factors, share=max(share, 0.0), interval=interval, parts=k)
 
     def by_chance(self, parts: Places) -> float:
         """What chance adds to the statistic of some parts, from how much units deviate: k - 1 where predictions are
@@ -164,8 +148,7 @@ class _Predictions:
 
 
 def _noncentrality(statistic: float, freedom: int, others: float, probability: float) -> float:
-    """The noncentrality at which a chi-squared variable, or `freedom` times one of F, is at most the statistic with a
-    probability; 0 if none is."""
+    """Where a chi-squared variable, or `freedom` times one of F, is at most the statistic with a probability; or 0."""
 
     def over(at: float) -> float:
         if others < math.inf:
@@ -183,24 +166,12 @@ def _noncentrality(statistic: float, freedom: int, others: float, probability: f
     return float(brentq(over, 0.0, end, xtol=1e-6))
 
 
-SLICE = 0.05
-"""Share of the rows left that is peeled off a side at a time."""
-LEAST_INSIDE = 60
-"""Fewer rows, or drives, than this cannot show an accuracy of 95 %."""
-RESERVE = 0.01
-"""By how much more the choosing rows have to show, since they were chosen by."""
+SLICE = 0.05  # Share of the rows left that is peeled off a side at a time
+LEAST_INSIDE = 60  # Fewer rows, or drives, than this cannot show an accuracy of 95 %
+RESERVE = 0.01  # By how much more the choosing rows have to show, since they were chosen by
 
 
-@dataclass(frozen=True, eq=False)
-class Envelope:
-    """A box, the rows inside it that did not choose it, and whether they show the accuracy that was asked for."""
-
-    conditions: RuleConditions
-    inside: pd.DataFrame
-    held: bool
-
-
-def find_envelope(choosing: pd.DataFrame, counting: pd.DataFrame, accuracy: float) -> Envelope | None:
+def find_envelope(choosing: pd.DataFrame, counting: pd.DataFrame, accuracy: float) -> EnvelopeRow | None:
     """Return the largest box that promises an accuracy in (0, 1), the lower end of a 95 % interval; None where no box
     of enough rows does. Some rows choose the box, and others try it, once."""
     conditions: RuleConditions = ()
@@ -216,8 +187,9 @@ def find_envelope(choosing: pd.DataFrame, counting: pd.DataFrame, accuracy: floa
         if best is None:
             return None
         conditions, inside = best, kept
-    tried = counting[covered(conditions, counting)]
-    return Envelope(conditions, tried, interval_of(tried)[0] >= accuracy)
+    tried = right_of(counting[covered(conditions, counting)])
+    rows = [condition.row for condition in conditions]
+    return EnvelopeRow(conditions=rows, **vars(tried), accuracy=accuracy, held=tried.interval[0] >= accuracy)
 
 
 def _peeled(conditions: RuleConditions, inside: pd.DataFrame) -> Iterator[RuleConditions]:
@@ -251,17 +223,17 @@ def right_of(rows: pd.DataFrame) -> RightOf:
     return RightOf(right=int(rows["correct"].sum()), total=len(rows), interval=interval_of(rows))
 
 
-def cautions(table: pd.DataFrame, importance: Sequence[FactorWeight]) -> list[str]:
+def cautions(table: pd.DataFrame, importance: Sequence[ParameterWeight]) -> list[str]:
     """Return what a reader has to know of the rows of a table and of what decides."""
-    found, draws = list[str](), table["unit"].nunique()
+    texts, draws = list[str](), table["unit"].nunique()
     if draws < FEWEST_ROWS:
-        found = [f"The rows are of {draws} draws, each with several, which are not independent: few show little."]
+        texts.append(f"The rows are of {draws} draws, each with several, which are not independent: few show little.")
     if table["correct"].nunique() < 2:
         always = "right" if table["correct"].all() else "wrong"
-        return [*found, f"The model is {always} in every row: there is nothing to tell apart."]
-    if all(one.interval[0] <= 0.0 for one in importance):
-        return [*found, "No parameter is shown to decide anything: the intervals of all their shares begin at 0."]
-    return found
+        texts.append(f"The model is {always} in every row: there is nothing to tell apart.")
+    elif all(weight.interval[0] <= 0.0 for weight in importance):
+        texts.append("No parameter is shown to decide anything: the intervals of all their shares begin at 0.")
+    return texts
 
 
 def rule_counts(rule: CountedRule) -> dict[str, Any]:
@@ -274,25 +246,17 @@ def not_told(rule: CountedRule | None, rows: int) -> RuleNotTold | None:
     """Return what is said of a rule that is not told, found in so many rows."""
     if rule is None:
         return None
-    times = rule.times_needed()
-    needed = None if times is None else round_up(times * rows)
+    times, needed = rule.times_needed(), None
+    if times is not None:  # with two digits that mean something: 173.2 becomes 180
+        step: int = 10 ** max(0, math.floor(math.log10(times * rows)) - 1)
+        needed = math.ceil(times * rows / step) * step
     return RuleNotTold(**rule_counts(rule), chance=rule.chance, asked=RULES_CHANCE, rows=needed)
 
 
-def round_up(rows: float) -> int:
-    """Return a number of rows with two digits that mean something: 173.2 becomes 180."""
-    step: int = 10 ** max(0, math.floor(math.log10(rows)) - 1)
-    return math.ceil(rows / step) * step
-
-
-MOST, FEWEST = 6, 8
-"""Clusters at most, and failures of which clusters are sought at least."""
-
+MOST, FEWEST = 6, 8  # Clusters at most, and failures of which clusters are sought at least
 REFERENCES = 19
 """Draws of as many points from one normal distribution like them: groups in none of these may be as far apart."""
-
-DIMENSIONS = 8
-"""Principal components that distances are measured in."""
+DIMENSIONS = 8  # Principal components that distances are measured in
 
 
 @dataclass(frozen=True)
@@ -323,7 +287,9 @@ def find_clusters(features: NDArray[np.float64], seed: int) -> Clusters:
     drawn = (generator.standard_normal(points.shape) * spread for _ in range(REFERENCES))
     apart = all(_grouped(one)[0] < score for one in drawn)
     groups = [np.flatnonzero(found == k) for k in range(int(found.max()) + 1)]
-    ordered = sorted((_by_distance(points, group) for group in groups), key=len, reverse=True)
+    away = [np.linalg.norm(points[group] - points[group].mean(axis=0), axis=1) for group in groups]
+    typical = [group[np.argsort(far, kind="stable")].tolist() for group, far in zip(groups, away, strict=True)]
+    ordered = sorted(map(tuple, typical), key=len, reverse=True)
     return Clusters(tuple(ordered), score if len(ordered) > 1 else None, apart and len(ordered) > 1)
 
 
@@ -332,13 +298,8 @@ def _grouped(points: NDArray[np.float64]) -> tuple[float, NDArray[np.int64]]:
     best = (-1.0, np.zeros(len(points), dtype=np.int64))
     distinct = len(np.unique(points.round(9), axis=0))
     for k in range(2, min(MOST, distinct - 1) + 1):
-        found = import_library("sklearn.cluster").KMeans(k, n_init=4, random_state=0).fit_predict(points)
-        score = float(import_library("sklearn.metrics").silhouette_score(points, found))
+        groups = import_library("sklearn.cluster").KMeans(k, n_init=4, random_state=0).fit_predict(points)
+        score = float(import_library("sklearn.metrics").silhouette_score(points, groups))
         if score > best[0]:
-            best = score, found
+            best = score, groups
     return best
-
-
-def _by_distance(points: NDArray[np.float64], group: NDArray[np.intp]) -> tuple[int, ...]:
-    away = np.linalg.norm(points[group] - points[group].mean(axis=0), axis=1)
-    return tuple(int(one) for one in group[np.argsort(away, kind="stable")])

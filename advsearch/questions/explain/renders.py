@@ -37,8 +37,7 @@ from advsearch.runs.tables import read_sweep
 from advsearch.settings import split_names
 from advsearch.viewer.thumbnails import path_of
 
-ALONG = 9
-"""Values of a factor that are tried on the way to a right prediction."""
+ALONG = 9  # Values of a factor that are tried on the way to a right prediction
 SIDES, LEAST_LEFT = 2, 0.2
 """Arcs of a circle that a condition has, at most. Share of a rule that no rule before it covers, from which on more is
 rendered so that enough of it is left."""
@@ -69,28 +68,28 @@ def read_predictions(sweeps: Sequence[AskedSweep]) -> pd.DataFrame:
     draws share their units, so that two models' are not told twice. Object, environment and model are called as figures
     call them, and what a sweep has no parameter for is missing."""
     frames, draws = [], []
-    for number, one in enumerate(sweeps):
-        rows = read_sweep(one.folder).sort_values("step", ignore_index=True)
+    for number, sweep in enumerate(sweeps):
+        rows = read_sweep(sweep.folder).sort_values("step", ignore_index=True)
         for name in OUTER:
-            called = rows[name].astype(object) if name in rows else pd.Series(getattr(one.summary, name), rows.index)
+            called = rows[name].astype(object) if name in rows else pd.Series(getattr(sweep.summary, name), rows.index)
             rows[name] = called.map(figure_value)
-        if one.summary.sampler is None:  # samples of a point differ by noise alone
-            rows["unit"] //= one.summary.samples
-        deciding = one.config.deciding()
+        if sweep.summary.sampler is None:  # samples of a point differ by noise alone
+            rows["unit"] //= sweep.summary.samples
+        deciding = sweep.config.deciding()
         draws.append(f"{[deciding[name] for name in ('grid', 'controls', 'samples', 'sampler', 'seed')]}")
         frames.append(rows.assign(sweep=number))
     units = {name: unit for frame in frames for name, unit in frame.attrs["units"].items()}
     units = {**units, **dict.fromkeys(OUTER, "")}
-    found = pd.concat(frames, ignore_index=True)
+    table = pd.concat(frames, ignore_index=True)
     for name in units:
-        if not pd.api.types.is_float_dtype(found[name]):
-            found[name] = found[name].astype("category")
-    draw_of = [sorted({*draws}).index(one) for one in draws]
-    named = [f"{unit} {draw_of[sweep]}" for unit, sweep in zip(found["unit"], found["sweep"], strict=True)]
-    found["unit"] = np.unique(named, return_inverse=True)[1]
-    found["correct"] = (found["correct"] == 1) & is_shown(found)
-    found.attrs["units"] = units
-    return found
+        if not pd.api.types.is_float_dtype(table[name]):
+            table[name] = table[name].astype("category")
+    draw_of = [sorted({*draws}).index(draw) for draw in draws]
+    named = [f"{unit} {draw_of[sweep]}" for unit, sweep in zip(table["unit"], table["sweep"], strict=True)]
+    table["unit"] = np.unique(named, return_inverse=True)[1]
+    table["correct"] = (table["correct"] == 1) & is_shown(table)
+    table.attrs["units"] = units
+    return table
 
 
 def values_of(rows: pd.DataFrame, place: int) -> dict[str, float | str]:
@@ -117,7 +116,7 @@ def sweep_inside(
     outer = {name: getattr(config, name) for name in OUTER}
     for name in OUTER:
         if name in left and outer[name] is not None:
-            outer[name] = ",".join(one for value in left[name] for one in _like(config, name, value)) or outer[name]
+            outer[name] = ",".join(like for value in left[name] for like in _like(config, name, value)) or outer[name]
 
     def size(values: object) -> int:
         return len(values) if isinstance(values, list) else 1
@@ -130,11 +129,12 @@ def sweep_inside(
         grid[longest] = grid[longest][::2]
     points = math.prod(map(size, grid.values())) * others
     controls = {name: dict(given) for name, given in config.controls.items()}
-    for one in conditions:
-        name, _, parameter = one.factor.partition(".")
-        if one.options is None and is_drawn(config, one.factor):
-            low, high = float(table[one.factor].min()), float(table[one.factor].max())
-            low, high = one.arcs[arc % len(one.arcs)] if one.turn else (max(one.low, low), min(one.high, high))
+    for condition in conditions:
+        factor, arcs = condition.factor, condition.arcs
+        name, _, parameter = factor.partition(".")
+        if condition.options is None and is_drawn(config, factor):
+            low, high = max(condition.low, float(table[factor].min())), min(condition.high, float(table[factor].max()))
+            low, high = arcs[arc % len(arcs)] if condition.turn else (low, high)
             if high <= _declared(config, name)[parameter].high:
                 controls[name] = {**_ranges(config, name, table), **controls[name], parameter: [low, high]}
     draws = math.ceil(samples / points) if controls else None
@@ -149,25 +149,20 @@ def is_drawn(config: SweepConfig, factor: str) -> bool:
 
 
 def _declared(config: SweepConfig, name: str) -> dict[str, Parameter]:
-    """The parameters of a control that is drawn, by name."""
     given = config.controls.get(name)
     kind = None if given is None else CONTROLS.get(str(given.get("kind", name.partition(":")[0])))
     return {} if kind is None or kind.kind == BY_KEY else {one.name: one for one in kind.declared(given or {})}
 
 
 def _ranges(config: SweepConfig, name: str, table: pd.DataFrame) -> dict[str, Any]:
-    """What a control was given. Where it was given no range, what its rows have: with a range for one parameter, the
-    others would stay where they are."""
+    """What a control was given, or else what its rows have: with a range for one parameter, the others would stay."""
     given, declared = dict(config.controls[name]), _declared(config, name)
     if not declared.keys() & given.keys():
-        for parameter, one in declared.items():
+        for parameter, spec in declared.items():
             column = table.get(f"{name}.{parameter}")
             if column is not None and is_drawn(config, f"{name}.{parameter}"):
-                given[parameter] = (
-                    {"choices": column.cat.categories.tolist()}
-                    if one.options
-                    else [*map(float, (column.min(), column.max()))]
-                )
+                choices = {"choices": column.cat.categories.tolist()} if spec.options else None
+                given[parameter] = choices or [float(column.min()), float(column.max())]
     return given
 
 
@@ -175,23 +170,23 @@ def along(
     config: SweepConfig, row: Mapping[str, float | str], factor: str, table: pd.DataFrame, seed: int
 ) -> SweepConfig:
     """Return a sweep along one factor with everything else as a row has it; the row's own value comes first."""
-    own, column = row[factor], table[factor]
+    column = table[factor]
     if column.dtype == "category":
         others: Sequence[float | str] = column.cat.categories.tolist()
     else:
-        others = [float(f"{one:.4g}") for one in np.linspace(column.min(), column.max(), ALONG)]
-    values = list(dict.fromkeys([own, *others]))
+        others = [float(f"{value:.4g}") for value in np.linspace(column.min(), column.max(), ALONG)]
+    values = list(dict.fromkeys([row[factor], *others]))
     grid: dict[str, object] = {name: [row[name]] for name in row if "." in name and can_be_given(config, name)}
     outer = {name: next(iter(_like(config, name, str(row[name]))), None) for name in OUTER}
     if factor in OUTER:
-        outer[factor] = ",".join(one for value in values for one in _like(config, factor, str(value)))
+        outer[factor] = ",".join(like for value in values for like in _like(config, factor, str(value)))
     else:
         grid[factor] = values
     controls = {}
     for name, given in config.controls.items():
         kind = CONTROLS.get(str(given.get("kind", name)))
-        chosen = {one.name for one in getattr(kind, "choices", ())} & {*given}
-        if kind and chosen and all(f"{name}.{one.name}" in grid for one in kind.declared(given)):
+        chosen = {choice.name for choice in getattr(kind, "choices", ())} & {*given}
+        if kind and chosen and all(f"{name}.{parameter.name}" in grid for parameter in kind.declared(given)):
             controls[name] = {key: value for key, value in given.items() if key in {*chosen, "kind"}}
     fixed = {name: value for name, value in config.set_.items() if name not in grid}
     alone = {"workers": None, "cluster": None}  # ten pictures take less than a worker takes to load
@@ -266,19 +261,19 @@ class Renders:
         confirm it where they alone, beside the rows elsewhere, tell it."""
         if not self.config.confirm:
             return None
-        rule, before = rules[number], [one.conditions for one in rules[:number]]
+        rule, before = rules[number], [earlier.conditions for earlier in rules[:number]]
         under = self.table[covered(rule.conditions, self.table)]
         left = float(beyond(before, under).mean())
         fresh = []
-        for place, one in enumerate(self.sweeps):
-            sides = max((len(c.arcs) for c in rule.conditions if is_drawn(one.config, c.factor)), default=1) or 1
+        for place, sweep in enumerate(self.sweeps):
+            sides = max((len(c.arcs) for c in rule.conditions if is_drawn(sweep.config, c.factor)), default=1) or 1
             samples = math.ceil(self.config.confirm / len(self.sweeps) / sides / max(left, LEAST_LEFT))
             for side in range(sides):
                 part = (number * len(self.sweeps) + place) * SIDES + side
                 seed = seeds.stream(self.config.seed, "confirm", part)
                 self.progress.message(f"rule {number + 1}: rendering about {samples} configurations inside it")
-                own = sweep_inside(one.config, self.table, rule.conditions, samples, seed, side)
-                rows = self._rendered(f"rule-{number + 1}-{place}" + (f"-{side}" if side else ""), own)
+                config = sweep_inside(sweep.config, self.table, rule.conditions, samples, seed, side)
+                rows = self._rendered(f"rule-{number + 1}-{place}" + (f"-{side}" if side else ""), config)
                 if rows is not None:
                     inside = rows[covered(rule.conditions, rows) & beyond(before, rows) & is_shown(rows)]
                     fresh.append(inside.assign(unit=inside["unit"].astype(str) + f" of {part}"))
@@ -294,22 +289,23 @@ class Renders:
 
         A failure that no parameter alone puts right has none.
         """
+
+        def moved(pair: NearestRight) -> float:
+            """How far the value moved, as a share of what the rows have; another name is as far as it goes."""
+            column = self.table[pair.parameter]
+            if column.dtype == "category":
+                return 1.0
+            return abs(float(pair.right_at) - float(pair.wrong_at)) / float(column.max() - column.min())
+
         failures = typical_failures(self.table, rules, self.config.pairs)
         for number, (place, conditions) in enumerate(failures, start=1):
-            first = [one.factor for one in conditions]
+            first = [condition.factor for condition in conditions]
             others = [[factor] for factor in self.table.attrs["units"] if factor not in first]
             for factors in (first, *others):
-                near = [one for factor in factors if (one := self._nearest(f"pair-{number}", place, factor))]
+                near = [pair for factor in factors if (pair := self._nearest(f"pair-{number}", place, factor))]
                 if near:
-                    yield min(near, key=self._moved)
+                    yield min(near, key=moved)
                     break
-
-    def _moved(self, pair: NearestRight) -> float:
-        """How far the value moved, as a share of what the rows have; another name is as far as it goes."""
-        column = self.table[pair.parameter]
-        if column.dtype == "category":
-            return 1.0
-        return abs(float(pair.right_at) - float(pair.wrong_at)) / float(column.max() - column.min())
 
     def _nearest(self, name: str, place: int, factor: str) -> NearestRight | None:
         """Go along one factor until the prediction is right, twice with other noise; the failure fails in both."""

@@ -16,9 +16,10 @@ from advsearch.report.shown import (
     ResultPart,
     ShownResult,
     claim,
+    counted,
     nothing_claimed,
     share_text,
-)
+)  # fmt: skip
 from advsearch.report.wording import conditions_text, interval_text, percent, share_of_text
 from advsearch.runs.results import ConditionRow, Fields, Interval, JsonFloat, RunResult
 
@@ -156,10 +157,8 @@ DECIDES = (
     "equally many rows: its first-order Sobol index, by parts. Two parameters stand together where they decide "
     "more than each by itself. What differs inside a part is not counted."
 )
-MOST_WEIGHTS = 12
-"""Rows of it that are shown."""
-MOST_PREDICTIONS = 3
-"""Predictions of a cluster that are named."""
+MOST_WEIGHTS = 12  # Rows of it that are shown
+MOST_PREDICTIONS = 3  # Predictions of a cluster that are named
 
 
 def shown(result: ExplainResult) -> ShownResult:
@@ -186,10 +185,10 @@ def shown(result: ExplainResult) -> ShownResult:
         sections.append(ResultPart("One thing changed", [pairs_text(result)]))
     for pair in result.pairs:
         unit = f" {pair.unit}" if pair.unit not in ("", "1") else ""
-        wrong, right = (one if isinstance(one, str) else f"{one:.4g}" for one in (pair.wrong_at, pair.right_at))
+        wrong, right = (at if isinstance(at, str) else f"{at:.4g}" for at in (pair.wrong_at, pair.right_at))
         text = f"{pair.parameter} {wrong}{unit}: {pair.answered}; at {right}{unit}: {pair.answered_there}."
         captions = f"wrong: {pair.answered}", f"right: {pair.answered_there}"
-        pictures = [Picture(file, one) for file, one in zip(pair.pictures, captions, strict=False)]
+        pictures = [Picture(*captioned) for captioned in zip(pair.pictures, captions, strict=False)]
         sections.append(ResultPart(text=[text], pictures=[pictures]))
     if result.clusters:
         sections.append(_kinds(result.clusters))
@@ -251,7 +250,6 @@ def pairs_text(result: ExplainResult) -> str:
 
 
 def _kinds(found: FailureClusters) -> ResultPart:
-    """How many kinds of failures there are, with the most typical of each and what the model calls them."""
     again = f"the {found.failures} failures that were rendered again"
     text = f"One kind: {again} are alike by {found.features}."
     if found.silhouette is not None:
@@ -267,24 +265,20 @@ def _kinds(found: FailureClusters) -> ResultPart:
 
 def claims(result: ExplainResult) -> Iterator[Claim]:
     """Yield what the rules and the envelope stand for."""
+
+    def right_of(of: RightOf, what: str) -> Extent:
+        return counted(f"right, of {what}", of.right, of.total, of.interval)
+
     for number, rule in enumerate(result.rules, 1):
-        counted, how = (
-            rule.confirmed or rule,
-            "fresh renders" if rule.confirmed else "rows that did not choose the rule",
-        )
-        extent = Extent(what=f"right, of {how}", count=counted.right, total=counted.total, interval=counted.interval)
+        how = "fresh renders" if rule.confirmed else "rows that did not choose the rule"
+        extent = right_of(rule.confirmed or rule, how)
         text = f"Where {conditions_text(rule.conditions)} (rule {number}) the model is right in {share_text(extent)}"
         yield claim("measured", f"{text} {how}; elsewhere in {rule.elsewhere.text}.", extent)
     box = result.envelope
-    if box is None or not box.held or not box.total:
-        if result.rules:
-            return
-        yield nothing_claimed(
-            "no box of values was shown to keep the accuracy that was asked for", envelope_text(result)
-        )
-        return
-    extent = Extent(
-        what="right, of rows that did not choose the box", count=box.right, total=box.total, interval=box.interval
-    )
-    text = f"Inside {conditions_text(box.conditions)} the model is right in {share_text(extent)} configurations"
-    yield claim("measured", f"{text} that did not choose this box; the sweeps drew no others.", extent)
+    if box is not None and box.held and box.total:
+        extent = right_of(box, "rows that did not choose the box")
+        text = f"Inside {conditions_text(box.conditions)} the model is right in {share_text(extent)} configurations"
+        yield claim("measured", f"{text} that did not choose this box; the sweeps drew no others.", extent)
+    elif not result.rules:
+        why = "no box of values was shown to keep the accuracy that was asked for"
+        yield nothing_claimed(why, envelope_text(result))

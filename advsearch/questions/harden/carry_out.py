@@ -1,11 +1,12 @@
-"""`harden`: trains a copy of a model on its worst cases, and measures it on what training never saw, before and
-after."""
+"""`harden`: trains a copy of a model on its worst cases, and measures both on what training never saw."""
 
 from __future__ import annotations
 
 import gc
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
+from itertools import chain, product
 from pathlib import Path
 from typing import Any
 
@@ -36,8 +37,20 @@ from advsearch.runs.store import Row
 from advsearch.tasks import make_task
 
 MEANS = "means"  # the note of what a training has from Python
-MEASUREMENTS = ("before", "stronger_before", "after", "stronger")
-"""What is measured over each control, by its name in the table."""
+MEASUREMENTS = {
+    "before": ("attacking the model as it is", None),
+    "stronger_before": ("attacking it with a stronger search", "before"),
+    "after": ("attacking the hardened model", None),
+    "stronger": ("attacking it with a stronger search", "after"),
+}
+"""What is measured over each control, by its name in the table: what the progress says, and of the stronger search that
+of the usual one. What that has found is not sought any harder."""
+
+COURSES: Mapping[str, Callable[..., Course]] = {
+    "classification": ClassifierCourse,
+    "detection": DetectorCourse,
+    "segmentation": SegmenterCourse,
+}
 
 
 @asks(HardenConfig)
@@ -94,37 +107,38 @@ def hardened(
     config = asked.config
     asked.progress.stage(LOADING)
     check_run_settings(config)
-    finds, segments = config.task_name == "detection", config.task_name == "segmentation"
-    places = finds or segments
-    if not places and (config.task_name != "classification" or config.data or loss):
-        raise InputError(
-            "task: harden trains for classification, detection and segmentation; `data` is of detection, and `loss` of "
-            "both of the others"
-        )
-    if segments and config.data:
-        raise InputError("data: is of detection; leave it out")
-    if places and beside is not None:
-        raise InputError("beside: is of classifiers; give a detector a COCO folder as `data`")
-    if places and config.layers != "all":
-        raise InputError("layers: expected all of a detector or a segmenter; leave it out")
+    kind, classifies = config.task_name, config.task_name == "classification"
+    refused = {
+        "task: harden trains for classification, detection and segmentation; `data` is of detection, and `loss` of "
+        "both of the others": kind not in COURSES or (classifies and (config.data or loss)),
+        "data: is of detection; leave it out": kind == "segmentation" and config.data,
+        "beside: is of classifiers; give a detector a COCO folder as `data`": not classifies and beside is not None,
+        "layers: expected all of a detector or a segmenter; leave it out": not classifies and config.layers != "all",
+    }
+    for text, wrong in refused.items():
+        if wrong:
+            raise InputError(text)
     try:
         (loaded, *_), warnings = load_models([model or config.model], make_task(config.task), config)
     except ModelError as error:
-        if config.task_name != "classification":
+        if not classifies:
             raise
-        said = str(error).partition(": use `task=")[0]
-        raise ModelError(f"{said}; harden trains classifiers, and with `task` detectors and segmenters") from error
+        text = str(error).partition(": use `task=")[0]
+        raise ModelError(f"{text}; harden trains classifiers, and with `task` detectors and segmenters") from error
     work = SceneWork(config, loaded, scenes.splits_of(config, loaded), asked.progress)
-    student, means = trainable(loaded, config.layers, logits=not places), {"optimiser": optimiser is not None}
-    course: Course[Any]
-    if finds:
-        own = [] if config.data is None else read_coco(Path(config.data), loaded)
-        course, means["loss"] = DetectorCourse(work, student, optimiser, own, loss), loss is not None
-    elif segments:
-        course, means["loss"] = SegmenterCourse(work, student, optimiser, loss), loss is not None
-    else:
-        course, means["beside"] = ClassifierCourse(work, student, optimiser, beside), beside is not None
-    _same_means(asked.run, means)
+    student = trainable(loaded, config.layers, logits=classifies)
+    given: dict[str, Any] = {"beside": beside} if classifies else {"loss": loss}
+    more = {"own": read_coco(Path(config.data), loaded)} if config.data else {}
+    course = COURSES[kind](work, student, optimiser, **given, **more)
+    means = {name: value is not None for name, value in {"optimiser": optimiser, **given}.items()}
+    before = json.loads(asked.run.store.note(MEANS) or "{}")
+    asked.run.store.set_note(MEANS, json.dumps({**means, **before}))
+    for name, was in before.items():
+        if was != means[name]:
+            raise InputError(
+                f"{asked.run.path}: cannot resume: it began {'with' if was else 'without'} `{name}`, which only Python "
+                "gives; resume it with advsearch.harden(..., run=..., resume=True) and the same arguments"
+            )
     check_made_of(asked.run, [loaded])
     run = Hardening(asked.run, course)
     with asked.until_interrupted():
@@ -133,92 +147,73 @@ def hardened(
     return run.result(asked, warnings)
 
 
-def _same_means(run: RunDirectory, given: dict[str, bool]) -> None:
-    """Note what a training has from Python, or refuse (InputError) to go on with other means than it began with."""
-    before = json.loads(run.store.note(MEANS) or "{}")
-    run.store.set_note(MEANS, json.dumps({**given, **before}))
-    for name, was in before.items():
-        if was != given[name]:
-            raise InputError(
-                f"{run.path}: cannot resume: it began {'with' if was else 'without'} `{name}`, which only Python "
-                "gives; resume it with advsearch.harden(..., run=..., resume=True) and the same arguments"
-            )
-
-
 class Hardening:
-    """One run of `harden`. `wrong` says of what is measured, and of the number of a scene, whether it is not robust;
-    `clean` how many plain pictures are right, before and after, of all."""
+    """One run: `wrong` by measurement and number of a scene, `clean` for each plain picture whether it is right."""
 
-    def __init__(self, run: RunDirectory, course: Course[Any]) -> None:
+    def __init__(self, run: RunDirectory, course: Course) -> None:
         self.run, self.course, self.scenes, self.config = run, course, course.work, course.config
         self.rounds, self.stages = Rounds(run, course), Stages(course.work.progress)
         self.wrong = {(row.kind, row.step): bool(row.success) for row in run.store.rows()}
-        self.clean: Mapping[str, Share] = {}
+        self.clean: Mapping[str, list[bool]] = {}
         searched, held_out = self.config.scenes * self.config.rounds, scenes.CLEAN_SCENES * self.config.measured
         self.counts = {
             TRAINING: searched, FURTHER: course.further * searched, VALIDATION: self.rounds.judged, HELD_OUT: held_out
         }  # fmt: skip
 
     def carry_out(self) -> None:
-        """Measure, train, and measure again."""
-        sides, stages = self.scenes.splits, self.stages
+        sides, stages, weights = self.scenes.splits, self.stages, b""
         scenes.check_disjoint(sides[HELD_OUT], [sides[name] for name in (TRAINING, FURTHER, VALIDATION)])
         gc.freeze()  # as of `scenes_of`
         try:
-            stages.begin("measurement", "attacking the model as it is")
-            self._measure("before", "attacking the model as it is")
-            self._measure("stronger_before", "attacking it with a stronger search", known="before")
-            stages.begin("training", "training")
-            self.rounds.carry_out()
-            weights = (self.run.path / ARTIFACTS / WEIGHTS).read_bytes()
-            stages.begin("measurement", "attacking the hardened model")
-            self._measure("after", "attacking the hardened model", weights)
-            self._measure("stronger", "attacking it with a stronger search", weights, known="after")
-            looks = [scenes.Looking(number, weights) for number in range(self.counts[HELD_OUT])]
+            for which in MEASUREMENTS:
+                if which == "after":
+                    stages.begin("training", "training")
+                    self.rounds.carry_out()
+                    weights = (self.run.path / ARTIFACTS / WEIGHTS).read_bytes()
+                if "stronger" not in which:
+                    stages.begin("measurement", MEASUREMENTS[which][0])
+                self._measure(which, weights or None)
+            looks = [
+                partial(SceneWork.looked_at, number=number, weights=weights) for number in range(self.counts[HELD_OUT])
+            ]
             right = [both for _, both in self.scenes.each("looking at plain pictures of held-out scenes", looks)]
-            seen = len(right) * scenes.CLEAN_VIEWS
-            self.clean = {
-                name: _share(sum(both[k] for both in right), seen) for k, name in enumerate(("before", "after"))
-            }
+            self.clean = {when: [flag for both in right for flag in both[when]] for when in ("before", "after")}
         finally:
             stages.end()
             gc.unfreeze()
 
-    def _measure(self, which: str, title: str, weights: bytes | None = None, *, known: str | None = None) -> None:
-        """Attack the model, as it was given or with other weights, on every held-out scene over each control; what is
-        measured is not attacked again. With the name of what is `known` of the usual search: by the stronger one, and
-        what that had found is not sought any harder."""
-        wanted, times = list[scenes.Attacking](), 1 if known is None else scenes.TIMES
-        for number in range(self.config.measured):
-            for control in self.config.controls:
-                if (f"{which} {control}", number) in self.wrong:
-                    continue
-                if known is not None and self.wrong[f"{known} {control}", number]:
-                    self._note(which, control, number, wrong=True)
-                else:
-                    wanted.append(scenes.Attacking(control, number, times, weights))
-        for place, ending in self.scenes.each(title, wanted, hint="`measured` and `steps` shorten it"):
-            self._note(which, wanted[place].control, wanted[place].number, wrong=ending != ROBUST)
+    def _measure(self, which: str, weights: bytes | None) -> None:
+        """Attack the model, as given or with other weights, on the held-out scenes where that is not measured yet."""
+        title, usual = MEASUREMENTS[which]
+        keys = [
+            (control, number)
+            for number, control in product(range(self.config.measured), self.config.controls)
+            if (f"{which} {control}", number) not in self.wrong
+        ]
+        known = [key for key in keys if usual and self.wrong[f"{usual} {key[0]}", key[1]]]
+        sought, times = [key for key in keys if key not in known], scenes.TIMES if usual else 1
+        attack = partial(SceneWork.attacked, times=times, weights=weights)
+        attacks = [partial(attack, control=control, number=number) for control, number in sought]
+        endings = self.scenes.each(title, attacks, hint="`measured` and `steps` shorten it")
+        done = ((sought[place], ending != ROBUST) for place, ending in endings)
+        for (control, number), wrong in chain(((key, True) for key in known), done):
+            self.wrong[f"{which} {control}", number] = wrong
+            seed = seeds.stream(self.config.seed, f"measured {control}", number)
+            self.run.record(Row(f"{which} {control}", number, seed=seed, spp=self.config.verify_spp, success=wrong))
 
-    def _note(self, which: str, control: str, number: int, *, wrong: bool) -> None:
-        kind, seed = f"{which} {control}", seeds.stream(self.config.seed, f"measured {control}", number)
-        self.wrong[kind, number] = wrong
-        self.run.record(Row(kind, number, seed=seed, spp=self.config.verify_spp, success=wrong))
-
-    def _robust(self, which: str, controls: Sequence[str]) -> list[bool] | None:
+    def _robust(self, which: str, controls: Iterable[str]) -> list[bool] | None:
         """Whether each scene is robust to the searches over all of some controls; None where some are not known."""
         numbers = range(self.config.measured)
         wrong = [[self.wrong.get((f"{which} {control}", number)) for control in controls] for number in numbers]
         return None if any(None in each for each in wrong) else [not any(each) for each in wrong]
 
     def result(self, asked: Asked[HardenConfig], warnings: list[str]) -> HardenResult:
-        """Return what is known."""
         config, done, table = self.config, asked.ending == "done", list[HardenedControl]()
         for control in config.controls:
-            shares = {which: _share_of(self._robust(which, [control])) for which in MEASUREMENTS}
+            shares = {which: _share(self._robust(which, [control])) for which in MEASUREMENTS}
             if None not in shares.values():
                 table.append(HardenedControl.of({"control": control, **shares}))
-        before, after = (self._robust(which, list(config.controls)) for which in ("before", "after"))
+        before, after = (self._robust(which, config.controls) for which in ("before", "after"))
         paired: dict[str, Any] = {}
         if before is not None and after is not None:
             pairs = list(zip(before, after, strict=True))
@@ -226,43 +221,35 @@ class Hardening:
             paired = {"gained": gained, "lost": lost, "p": mcnemar(gained, lost)}
         if done and self.rounds.best == 0:
             warnings = [*warnings, "No round kept the clean accuracy, so the weights are the model's own."]
-        weights, taught = self.run.path / ARTIFACTS / WEIGHTS, self.scenes.splits[TRAINING]
+        artifacts, taught = self.run.path / ARTIFACTS, self.scenes.splits[TRAINING]
         views = dict(zip(self.counts, (self.course.views[0], 1, self.course.views[1], scenes.CLEAN_VIEWS), strict=True))
-        split = {
-            name: SplitSide.of({**vars(side), "scenes": self.counts[name], "views": views[name]})
-            for name, side in self.scenes.splits.items()
-        }
         name, _ = split_weights(config.model)
         facts = self.scenes.executor and self.scenes.executor.facts
+        split = {
+            side: SplitSide.of({**vars(each), "scenes": self.counts[side], "views": views[side]})
+            for side, each in self.scenes.splits.items()
+        }
+        rounds = [
+            each.model_copy(update={"kept": done and number == self.rounds.best})
+            for number, each in enumerate(self.rounds.done)
+        ]
         return asked.result(
-            HardenResult,
-            **paired,
-            environment=",".join(taught.environments),
-            objects=list(taught.objects),
-            before=_share_of(before),
-            after=_share_of(after),
-            clean_before=self.clean.get("before"),
-            clean_after=self.clean.get("after"),
-            table=table,
+            HardenResult, **paired, environment=",".join(taught.environments), objects=list(taught.objects),
+            before=_share(before), after=_share(after), clean_before=_share(self.clean.get("before")),
+            clean_after=_share(self.clean.get("after")), table=table, split=split, rounds=rounds,
             search=f"{config.policy_name}, {config.steps} steps",
             stronger_search=f"portfolio of pgd with restarts, cmaes and random, {scenes.TIMES * config.steps} steps",
-            split=split,
-            rounds=[
-                each.model_copy(update={"kept": done and number == self.rounds.best})
-                for number, each in enumerate(self.rounds.done)
-            ],
-            hardened=f"{name}@{weights}" if done and (name == "reference" or ":" in name) else None,  # or code makes it
-            weights=str(weights) if done else None,
-            pictures=str(self.run.path / ARTIFACTS / PICTURES) if done else None,
-            shared=SharedWork.of_facts(facts, facts.machines if facts else {}),
-            warnings=warnings,
+            # a name with a colon is of code that makes it
+            hardened=f"{name}@{artifacts / WEIGHTS}" if done and (name == "reference" or ":" in name) else None,
+            weights=str(artifacts / WEIGHTS) if done else None,
+            pictures=str(artifacts / PICTURES) if done else None,
+            shared=SharedWork.of_facts(facts, facts.machines if facts else {}), warnings=warnings,
             seconds=self.stages.seconds,
-        )
+        )  # fmt: skip
 
 
-def _share_of(flags: Sequence[bool] | None) -> Share | None:
-    return None if flags is None else _share(sum(flags), len(flags))
-
-
-def _share(right: int, count: int) -> Share:
-    return Share(accuracy=right / count, interval=clopper_pearson(right, count), right=right, count=count)
+def _share(right: Sequence[bool] | None) -> Share | None:
+    if right is None:
+        return None
+    total, count = sum(right), len(right)
+    return Share(accuracy=total / count, interval=clopper_pearson(total, count), right=total, count=count)

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import inspect
 import json
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -40,10 +41,8 @@ Loss = Callable[[nn.Module, Tensor, Sequence[Target]], Tensor]
 SPP = 8  # samples a pixel of a picture
 TRIALS = 6  # of a search
 SIDES = 3  # from which a scene is seen as it is
-SEEN = 5
-"""How often an epoch looks at a picture that a search made, for each look at one as it is."""
-LARGEST, LARGEST_SIDE = 256 << 20, 8192
-"""Bytes of a COCO file, and pixels along a picture of it."""
+SEEN = 5  # how often an epoch looks at a picture that a search made, for each look at one as it is
+LARGEST, LARGEST_SIDE = 256 << 20, 8192  # bytes of a COCO file, and pixels along a picture of it
 
 
 class Example(NamedTuple):
@@ -68,35 +67,28 @@ class Example(NamedTuple):
         return cls(levels_of(problem.picture(at, seed, SPP)), boxes, labels, problem.task, truth, u is not None)
 
     def right(self, model: Model) -> bool:
-        """Whether the model is right about it."""
         assert self.task is not None
         with torch.no_grad():
-            return bool(self.task.margin(model(self.levels[None] / 255.0), self.truth)[0] <= 0.0)
+            return bool(self.task.loss(model(self.levels[None] / 255.0), self.truth)[0] <= 0.0)
 
 
 def read_coco(folder: Path, model: Model) -> list[Example]:
     """Return the pictures of a folder as `export --format coco` writes it: `annotations.json` and `images/`. Categories
-    are found among the model's labels by their names; what is called otherwise is left out.
-
-    Raises:
-        FileFormatError: the folder is something else, or names files outside of it.
-        InputError: no category is one of the model's labels.
-    """
+    are found among the model's labels by their names; what is called otherwise is left out. A FileFormatError where it
+    is something else, or names files outside of it; an InputError where no category is one of the labels."""
     path, inside = folder / "annotations.json", (folder / "images").resolve()
     try:
-        told: Any = parse_json(read_text(path, "a COCO file", LARGEST))
-        indices = dict[Any, int]()
-        for one in told["categories"]:
-            if str(one["name"]) in model.labels:
-                indices[one["id"]] = model.labels.index(str(one["name"]))
-        things: dict[Any, list[Any]] = {}
-        for one in told["annotations"]:
-            if one["category_id"] in indices and not one.get("iscrowd"):
-                things.setdefault(one["image_id"], []).append(one)
+        coco: Any = parse_json(read_text(path, "a COCO file", LARGEST))
+        known = [kind for kind in coco["categories"] if str(kind["name"]) in model.labels]
+        indices = {kind["id"]: model.labels.index(str(kind["name"])) for kind in known}
+        things = defaultdict[Any, list[Any]](list)
+        for thing in coco["annotations"]:
+            if thing["category_id"] in indices and not thing.get("iscrowd"):
+                things[thing["image_id"]].append(thing)
         if not indices:
             raise InputError(f"data: {path}: none of its categories is a label of model {model.name}")
-        found = []
-        for image in told["images"]:
+        examples = []
+        for image in coco["images"]:
             name = Path(str(image["file_name"]))
             file = inside / name
             if name.is_absolute() or ".." in name.parts or file.is_symlink() or inside not in file.resolve().parents:
@@ -104,38 +96,34 @@ def read_coco(folder: Path, model: Model) -> list[Example]:
             picture = torch.from_numpy(upright(file, LARGEST_SIDE))
             if picture.shape[:2] != (image["height"], image["width"]):
                 raise ValueError(f"{name} of another size than it says")
-            here = things.get(image["id"], [])
-            boxes = torch.tensor([one["bbox"] for one in here], dtype=torch.float32).reshape(-1, 4)
-            boxes = torch.cat([boxes[:, :2], boxes[:, :2] + boxes[:, 2:]], dim=1)
-            labels = torch.tensor([indices[one["category_id"]] for one in here], dtype=torch.int64)
-            found.append(Example(levels_of(picture), boxes, labels))
-        return found
+            here = things[image["id"]]
+            boxes = torch.tensor([thing["bbox"] for thing in here], dtype=torch.float32).reshape(-1, 4)
+            boxes[:, 2:] += boxes[:, :2]
+            labels = torch.tensor([indices[thing["category_id"]] for thing in here], dtype=torch.int64)
+            examples.append(Example(levels_of(picture), boxes, labels))
+        return examples
     except (OSError, KeyError, TypeError, ValueError, RuntimeError) as error:
         raise FileFormatError(f"{path}: expected COCO's JSON beside images/, got {str(error)[:120]}") from None
 
 
 def own_loss(network: nn.Module, x: Tensor, targets: Sequence[Target]) -> Tensor:
     """Return the loss that a network gives in training: torchvision's of lists of pictures and targets, transformers'
-    of `labels`, and any network's whose `forward` takes targets after its input; the sum of several.
-
-    Raises:
-        ModelError: it gives none.
-    """
+    of `labels`, and any network's whose `forward` takes targets after its input; the sum of several. A ModelError where
+    it gives none."""
     inner: Any = getattr(network, "network", network)
+    returned: Any = None
     if hasattr(inner, "config"):
-        sides = x.new_tensor([x.shape[-1], x.shape[-2]] * 2)
-        shares = [one["boxes"] / sides for one in targets]
-        boxes = [torch.cat([(one[:, :2] + one[:, 2:]) / 2, one[:, 2:] - one[:, :2]], dim=1) for one in shares]
-        named = [{"class_labels": one["labels"], "boxes": of} for one, of in zip(targets, boxes, strict=True)]
-        returned: Any = inner(pixel_values=x, labels=named).loss
+        sides, named = x.new_tensor([x.shape[-1], x.shape[-2]] * 2), []
+        for target in targets:
+            low, high = (target["boxes"] / sides).split(2, dim=1)
+            named.append({"class_labels": target["labels"], "boxes": torch.cat([(low + high) / 2, high - low], dim=1)})
+        returned = inner(pixel_values=x, labels=named).loss
     elif inner is not network:
         returned = inner(list(x), list(targets))
     elif len(inspect.signature(network.forward).parameters) > 1:
         returned = network(x, list(targets))
-    else:
-        returned = None
     if isinstance(returned, Mapping):
-        returned = torch.stack([one.sum() for one in returned.values()]).sum()
+        returned = torch.stack([loss.sum() for loss in returned.values()]).sum()
     if not isinstance(returned, Tensor) or returned.numel() != 1:
         raise ModelError(
             "the network returns no loss: its `forward` has to take targets after its input and return a loss or a "
@@ -144,10 +132,9 @@ def own_loss(network: nn.Module, x: Tensor, targets: Sequence[Target]) -> Tensor
     return returned.sum()
 
 
-class DetectorCourse(Course[Example]):
+class DetectorCourse(Course):
     """Trains on the worst pictures that searches find for the student as it is, on the same scenes as they are, from
-    there and from other sides, and on examples of one's own; half of the time mirrored. Statistics of batches stay as
-    they are."""
+    other sides too, and on one's own examples; half of the time mirrored. Statistics of batches stay as they are."""
 
     batch, weight_decay, warm_up, views = 8, 1e-4, 0.3, (SIDES, SIDES)
 
@@ -158,22 +145,21 @@ class DetectorCourse(Course[Example]):
         super().__init__(work, student, optimiser, own)
         self.loss = loss or own_loss
 
-    def draw(self, title: str, split: str, places: Sequence[int]) -> list[Example]:
-        """Return pictures of scenes as they are, then the worst that a search finds over each control, whether or not
-        the student is wrong about it."""
-        side, controls, progress = self.work.splits[split], tuple(self.config.controls), self.work.progress
+    def draw(self, title: str, split: str, places: range) -> list[Example]:
+        """Return pictures of scenes as they are, then for each control the worst that a search finds, wrong or not."""
+        side, controls, model = self.work.splits[split], tuple(self.config.controls), self.student.model
         plain, worst = list[Example](), list[Example]()
-        progress.stage(title, len(places) * len(controls))
+        self.work.progress.stage(title, len(places) * len(controls))
         for number in places:
             name, scene = side.scene(number)
             for control in controls:
                 seed = seeds.stream(side.seed, f"search {control}", number)
                 config = self.work.attack((control,), name, seed=seed, trials=TRIALS, verify_spp=SPP)
-                searched = attack_on(config, scene, self.student.model)
-                problem = problem_of(config, scene, self.student.model, differentiated=False)
+                u = attack_on(config, scene, model).u
+                problem = problem_of(config, scene, model, differentiated=False)
                 plain.append(Example.of(problem, seeds.stream(seed, "plain", 0)))
-                worst.append(Example.of(problem, seeds.stream(seed, "worst", 0), searched.u))
-                progress.advance(1)
+                worst.append(Example.of(problem, seeds.stream(seed, "worst", 0), u))
+                self.work.progress.advance(1)
             around, _ = self.work.problem(side, number, controls[-1:])
             plain += [Example.of(around, seeds.stream(seed, "plain", view)) for view in range(1, SIDES)]
         return plain + worst
@@ -189,9 +175,9 @@ class DetectorCourse(Course[Example]):
                 part.eval()
 
         def take(batch: Sequence[Example], rng: np.random.Generator) -> None:
-            shown = [self.shown(item, bool(rng.random() < 0.5)) for item in batch]
+            inputs, targets = zip(*(self.shown(item, bool(rng.random() < 0.5)) for item in batch), strict=True)
             network.zero_grad()
-            self.loss(network, torch.cat([x for x, _ in shown]), [target for _, target in shown]).backward()
+            self.loss(network, torch.cat(inputs), targets).backward()
 
         yield take
         network.eval()
@@ -214,16 +200,23 @@ class DetectorCourse(Course[Example]):
     def save(self, folder: Path, number: int, new: Sequence[Example]) -> None:
         """Write them as COCO has it, for one's own training."""
         place, images, things = folder / f"round-{number:03d}", [], list[Any]()
-        for at, item in enumerate(new, 1):
-            name, (height, width) = f"{at:05d}-{'worst' if item.found else 'plain'}.png", item.levels.shape[:2]
-            (place / "images").mkdir(parents=True, exist_ok=True)
-            write_png(place / "images" / name, item.levels / 255.0)
-            images.append({"id": at, "file_name": name, "height": height, "width": width})
+        for at, (item, file) in enumerate(written(place / "images", new), 1):
+            height, width = item.levels.shape[:2]
+            images.append({"id": at, "file_name": file.name, "height": height, "width": width})
             for (left, top, right, bottom), label in zip(item.boxes.tolist(), item.labels.tolist(), strict=True):
                 box = [left, top, right - left, bottom - top]
                 things.append({"id": len(things) + 1, "image_id": at, "category_id": label, "bbox": box,
                                "area": box[2] * box[3], "iscrowd": 0})  # fmt: skip
         if new:
             named = [{"id": at, "name": name} for at, name in enumerate(self.student.model.labels)]
-            told = {"images": images, "annotations": things, "categories": named}
-            write_bytes(place / "annotations.json", json.dumps(told).encode())
+            coco = {"images": images, "annotations": things, "categories": named}
+            write_bytes(place / "annotations.json", json.dumps(coco).encode())
+
+
+def written(folder: Path, items: Sequence[Example]) -> Iterator[tuple[Example, Path]]:
+    """Write the picture of each item, and yield it with its file."""
+    for number, item in enumerate(items, 1):
+        folder.mkdir(parents=True, exist_ok=True)
+        file = folder / f"{number:05d}-{'worst' if item.found else 'plain'}.png"
+        write_png(file, item.levels / 255.0)
+        yield item, file

@@ -3,10 +3,8 @@
 Where light arrives linearly (textures, patches), a lesson holds a matrix of light transport of one view, which says the
 picture of any texture and its derivative without rendering: its adversarial texture is searched further each time that
 the lesson comes up (warm starts: Zheng et al. 2020, arXiv 1912.11969). A texture that several views share is one of
-expectation over transformation (EOT, Athalye et al. 2018). Everything else is rendered at random configurations, half
-of them with numbers at the ends of their ranges. To train on, a scene is rendered twice, as new scenes teach more than
-further configurations of one; to choose weights by, it is rendered more often, and the configuration that is worst for
-the model as it is counts.
+expectation over transformation (EOT, Athalye et al. 2018). Everything else is rendered at random configurations: twice
+to train on, as new scenes teach more than further configurations of one, and more often to choose weights by.
 """
 
 from __future__ import annotations
@@ -62,22 +60,16 @@ class Lesson:
 
 
 @dataclass(eq=False)
-class Disguise:
-    """An adversarial texture (d,), of one view or shared by several."""
-
-    u: Tensor
-
-
-@dataclass(eq=False)
 class TextureLesson(Lesson):
     """A lesson whose pictures `linear` says, the scene being let go of: the space and the domain of its texture, the
-    numbers of the conditions that it was made for, and the adversarial texture."""
+    numbers of the conditions that it was made for, and the adversarial texture (d,), which other views may share and
+    which changes in place."""
 
     space: Space
     domain: Domain
     linear: LinearRenderer
     numbers: Tensor
-    texture: Disguise
+    texture: Tensor
 
     def picture(self, u: Tensor) -> Tensor:
         """Return the picture (H, W, 3) of a texture, with a graph."""
@@ -86,9 +78,8 @@ class TextureLesson(Lesson):
 
     @property
     def worst(self) -> Tensor:
-        """(H, W, 3) the picture of the adversarial texture as it is now."""
         with torch.no_grad():
-            return to_8_bit(self.picture(self.texture.u))
+            return to_8_bit(self.picture(self.texture))
 
 
 @dataclass(eq=False)
@@ -106,18 +97,7 @@ class RenderedLesson(Lesson):
 
     @property
     def worst(self) -> Tensor:
-        """(H, W, 3) the picture whose loss was highest."""
         return self.pictures[int(self.losses.argmax())] / 255.0
-
-
-def plain_lessons(problem: Problem, views: int, seed: int) -> list[Lesson]:
-    """Draw views of one scene as it is: lessons that nothing makes harder. Arguments as for `lessons`."""
-    right = tuple(int(index) for index in problem.truth())
-    drawn = [seeds.stream(seed, "plain lesson", number) for number in range(views)]
-    quickly = problem.renderer.like(quick=True)
-    with torch.no_grad(), quickly.scene.shorter(DEPTH):
-        pictures = [quickly(problem.whole(problem.domain.start, view), seed=view, spp=SPP) for view in drawn]
-    return [Lesson(right, levels_of(picture)) for picture in pictures]
 
 
 def has_matrix(problem: Problem) -> bool:
@@ -125,38 +105,45 @@ def has_matrix(problem: Problem) -> bool:
     return why_not(problem.renderer, [control.name for control in problem.space.controls[problem.searched :]]) is None
 
 
-def lessons(problem: Problem, views: int, seed: int, *, tries: int | None = None, shared: bool = False) -> list[Lesson]:
-    """Draw lessons from so many views of one scene, each with conditions of its own, drawn by chance. Where no matrix
-    says the pictures, `tries` configurations are rendered beside each view as it is (see `tried`); None for two renders
-    of a view: one of the controls moved, and all of them. Views that are `shared` have one adversarial texture."""
-
-    def begun(seed: int) -> Disguise:
-        return Disguise(problem.domain.sample(torch.Generator().manual_seed(seed), extreme=True)[0])
-
-    linear, quickly, found = has_matrix(problem), problem.renderer.like(quick=True), list[Lesson]()
+def lessons(
+    problem: Problem, views: int, seed: int, *, plain: int = 0, tries: int | None = None, shared: bool = False
+) -> list[Lesson]:
+    """Draw lessons from so many views of one scene, each with conditions of its own, drawn by chance, and from `plain`
+    views of it as it is, which nothing makes harder. Where no matrix says the pictures, `tries` configurations are
+    rendered beside each view as it is (see `tried`); None for two renders of a view: one of the controls moved, and all
+    of them. Views that are `shared` have one adversarial texture."""
+    domain, start = problem.domain, problem.domain.start
+    linear, quickly, drawn = views and has_matrix(problem), problem.renderer.like(quick=True), list[Lesson]()
     right = tuple(int(index) for index in problem.truth())
-    common, whole_space = begun(seed), replace(problem.space, scene=None)
-    space = replace(problem.searched_space, scene=None)
+    space, whole_space = (replace(space, scene=None) for space in (problem.searched_space, problem.space))
+
+    def begun(seed: int) -> Tensor:
+        return domain.sample(torch.Generator().manual_seed(seed), extreme=True)[0].clone()
+
+    common = begun(seed)
     with torch.no_grad(), problem.renderer.scene.shorter(DEPTH):
         for number in range(views):
             view = seeds.stream(seed, "lesson", number)
-            whole = problem.whole(problem.domain.start, view)
-            numbers = whole[problem.domain.dim :].clone()  # and not all that it is a part of
+            whole = problem.whole(start, view)
+            numbers = whole[domain.dim :].clone()  # and not all that it is a part of
             if linear:
                 made = LinearRenderer(problem.renderer, whole, view, spp=MATRIX_SPP, quick=True)
-                plain, texture = made(whole), common if shared else begun(view)
+                levels, texture = levels_of(made(whole)), common if shared else begun(view)
                 made.let_go(whole_space)
-                found.append(TextureLesson(right, levels_of(plain), space, problem.domain, made, numbers, texture))
+                drawn.append(TextureLesson(right, levels, space, domain, made, numbers, texture))
                 continue
             generator = torch.Generator().manual_seed(view)
             if tries is None:
-                *alone, together = tried(problem.domain, generator, 1 + len(problem.searched_space.controls))
+                *alone, together = tried(domain, generator, 1 + len(problem.searched_space.controls))
                 wanted = [alone[torch.randint(len(alone), (), generator=generator)], together]
             else:
-                wanted = [problem.domain.start, *tried(problem.domain, generator, tries)]
-            plain, *pictures = (quickly(torch.cat([u, numbers]), seed=view, spp=SPP) for u in wanted)
-            found.append(RenderedLesson.of(right, plain, torch.stack(pictures)))
-    return found
+                wanted = [start, *tried(domain, generator, tries)]
+            first, *pictures = (quickly(torch.cat([u, numbers]), seed=view, spp=SPP) for u in wanted)
+            drawn.append(RenderedLesson.of(right, first, torch.stack(pictures)))
+        for number in range(plain):
+            view = seeds.stream(seed, "plain lesson", number)
+            drawn.append(Lesson(right, levels_of(quickly(problem.whole(start, view), seed=view, spp=SPP))))
+    return drawn
 
 
 def tried(domain: Domain, generator: torch.Generator, count: int) -> Tensor:
@@ -180,8 +167,8 @@ def tried(domain: Domain, generator: torch.Generator, count: int) -> Tensor:
 
 def surprise(logits: Tensor, right: Sequence[tuple[int, ...]]) -> Tensor:
     """Return (N,): the negative logarithm of the probability that logits (N, C) give to the right classes of each."""
-    found = F.log_softmax(logits, dim=1)
-    return torch.stack([-row[list(of)].logsumexp(dim=0) for row, of in zip(found, right, strict=True)])
+    known = F.log_softmax(logits, dim=1)
+    return torch.stack([-row[list(of)].logsumexp(dim=0) for row, of in zip(known, right, strict=True)])
 
 
 def with_worst(some: Sequence[Lesson]) -> list[TextureLesson | RenderedLesson]:
@@ -190,33 +177,31 @@ def with_worst(some: Sequence[Lesson]) -> list[TextureLesson | RenderedLesson]:
 
 
 def harder(chosen: Sequence[Lesson], model: Model, steps: int = 1) -> None:
-    """Make the worst pictures of lessons worse for a model: further steps of their textures, and a look at what was
-    rendered in several configurations."""
+    """Make lessons harder for a model: further steps of textures, and a look at what was rendered more than once."""
     for begin in range(0, len(chosen), TOGETHER):
         part = chosen[begin : begin + TOGETHER]
         ascend(part, partial(slopes, model=model), steps)
-        several = [one for one in part if isinstance(one, RenderedLesson) and len(one.pictures) > 1]
+        several = [lesson for lesson in part if isinstance(lesson, RenderedLesson) and len(lesson.pictures) > 1]
         if several:
             with torch.no_grad():
                 pictures = torch.cat([lesson.pictures for lesson in several]) / 255.0
                 loss = surprise(model(pictures), [lesson.right for lesson in several for _ in lesson.pictures])
-            for lesson, losses in zip(several, loss.split([len(one.pictures) for one in several]), strict=True):
+            for lesson, losses in zip(several, loss.split([len(each.pictures) for each in several]), strict=True):
                 lesson.losses = losses.clone()
 
 
 def ascend(
     some: Sequence[Lesson], slopes_of: Callable[[Sequence[TextureLesson]], Sequence[Tensor]], steps: int = 1
 ) -> None:
-    """Steps uphill of the textures of lessons, by what `slopes` says of them; views that share one add up. Lessons
-    without a texture stay as they are."""
+    """Steps uphill of textures, by what `slopes` says; views that share one add up. Other lessons stay as they are."""
     chosen = [lesson for lesson in some if isinstance(lesson, TextureLesson)]
     for _ in range(steps if chosen else 0):
-        total = dict[Disguise, tuple[Domain, Tensor]]()
+        total = dict[int, Tensor]()
         for lesson, slope in zip(chosen, slopes_of(chosen), strict=True):
-            before = total.get(lesson.texture)
-            total[lesson.texture] = lesson.domain, slope if before is None else before[1] + slope
-        for texture, (domain, slope) in total.items():
-            texture.u = domain.project(texture.u + STEP * domain.steepest(texture.u, slope))
+            total[id(lesson.texture)] = slope + total.get(id(lesson.texture), 0.0)
+        for lesson in {id(lesson.texture): lesson for lesson in chosen}.values():
+            steepest = lesson.domain.steepest(lesson.texture, total[id(lesson.texture)])
+            lesson.texture.copy_(lesson.domain.project(lesson.texture + STEP * steepest))
 
 
 def slopes(
@@ -224,11 +209,10 @@ def slopes(
     model: Callable[[Tensor], Tensor],
     change: Callable[[Tensor], Tensor] = lambda images: images,
 ) -> Sequence[Tensor]:
-    """Return the derivative (d,) of the loss of each lesson with respect to its texture; `change` is what happens to
-    the pictures (N, H, W, 3) before the model sees them."""
-    leaves = [lesson.texture.u.clone().requires_grad_() for lesson in chosen]
+    """Return the derivative (d,) of each lesson's loss by its texture; `change` is of the pictures (N, H, W, 3)."""
+    leaves = [lesson.texture.clone().requires_grad_() for lesson in chosen]
     pictures = torch.stack([lesson.picture(u) for lesson, u in zip(chosen, leaves, strict=True)])
-    return torch.autograd.grad(surprise(model(change(pictures)), [one.right for one in chosen]).sum(), leaves)
+    return torch.autograd.grad(surprise(model(change(pictures)), [lesson.right for lesson in chosen]).sum(), leaves)
 
 
 def save_pictures(folder: Path, number: int, chosen: Sequence[Lesson], labels: Sequence[str]) -> None:

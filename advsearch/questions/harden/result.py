@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any, ClassVar, Literal
 
 from pydantic import Field, JsonValue, model_validator
@@ -11,8 +11,8 @@ from advsearch.questions.attack.settings import STEPS, AttackConfig
 from advsearch.report import wording
 from advsearch.report.figures import BLUE, RED, draw_shares
 from advsearch.report.markup import InNotebook
-from advsearch.report.shown import NO_PROOF, Claim, Extent, ResultPart, ShownResult, claim, share_text
-from advsearch.report.wording import percent
+from advsearch.report.shown import NO_PROOF, Claim, Column, Extent, ResultPart, ShownResult, claim, share_text
+from advsearch.report.wording import interval_text, percent
 from advsearch.runs.results import Fields, Interval, RunResult, SharedWork
 from advsearch.settings import setting, setting_as_in
 
@@ -100,12 +100,10 @@ class HardenConfig(AttackConfig):
     @model_validator(mode="before")
     @classmethod
     def _quickly(cls, data: Any) -> Any:
-        """Let `quick` say what is not said otherwise."""
         return {**QUICK, **data} if data.get("quick") is True else data
 
     @property
     def texture_looks(self) -> int:
-        """How often an epoch looks at each view with a texture."""
         return max(1, TEXTURE_LOOKS // self.views)
 
     @property
@@ -120,15 +118,6 @@ class Share(Fields):
     interval: Interval
     right: int
     count: int
-
-    @property
-    def drawn(self) -> tuple[float, Interval]:
-        return self.accuracy, self.interval
-
-    @property
-    def cells(self) -> tuple[str, str]:
-        """The share and its interval, in words."""
-        return percent(self.accuracy), wording.interval_text(self.interval)
 
 
 class HardenedControl(Fields):
@@ -213,38 +202,48 @@ TRAINED = (
     "the training's environments on which it was not trained."
 )
 HEADS = ("on held-out scenes", "before", "95 % interval", "after", "95 % interval")
-ROUNDS = ("round", "views trained on", "part of the way", "plain pictures right", "worst pictures right", "kept")
-SPLIT = ("side", "objects", "environments", "scenes", "views")
+ROUNDS: Mapping[str, Column] = {
+    "round": "{0[0]}",
+    "views trained on": "{0[1].lessons}",
+    "part of the way": lambda row: percent(row[1].part),
+    "plain pictures right": lambda row: percent(row[1].clean),
+    "worst pictures right": lambda row: percent(row[1].robust),
+    "kept": lambda row: "yes" if row[1].kept else "",
+}
+SPLIT: Mapping[str, Column] = {
+    "side": "{0[0]}",
+    "objects": lambda row: ", ".join(row[1].objects),
+    "environments": lambda row: ", ".join(row[1].environments),
+    "scenes": "{0[1].scenes}",
+    "views": "{0[1].views}",
+}
 
 
 def shown(result: HardenResult) -> ShownResult:
     """Return how robust the model was and is, what it was trained on, and what never was."""
-    shares = shares_of(result)
+    shares: dict[str, tuple[Share | None, Share | None]] = {}
+    for row in result.table:
+        shares[f"robust to {row.control}"] = row.before, row.after
+        shares[f"robust to {row.control}, stronger search"] = row.stronger_before, row.stronger
+    if len(result.table) > 1:
+        shares["robust to each"] = result.before, result.after
+    if result.clean_after is not None:
+        shares["plain pictures right"] = result.clean_before, result.clean_after
 
     def draw(axes: Any) -> None:
-        bars = {name: [None if share is None else share.drawn for share in both] for name, both in shares.items()}
+        bars = {
+            name: [None if share is None else (share.accuracy, share.interval) for share in both]
+            for name, both in shares.items()
+        }
         draw_shares(axes, bars, ("before", "after"), (RED, BLUE))
         axes.set(xlabel="share that is right, with 95 % interval")
         axes.set_title(f"Held-out scenes: {wording.short_name(result.model)}")
         axes.figure.legend(loc="outside lower center", ncols=2)
 
-    measured = [
-        [name, *(text for share in both for text in (("", "") if share is None else share.cells))]
-        for name, both in shares.items()
-    ]
-    rounds = [
-        [
-            str(number),
-            str(done.lessons),
-            *map(percent, (done.part, done.clean, done.robust)),
-            "yes" if done.kept else "",
-        ]
-        for number, done in enumerate(result.rounds)
-    ]
-    split = [
-        [name, ", ".join(side.objects), ", ".join(side.environments), str(side.scenes), str(side.views)]
-        for name, side in result.split.items()
-    ]
+    measured = []
+    for name, both in shares.items():
+        cells = [(percent(share.accuracy), interval_text(share.interval)) if share else ("", "") for share in both]
+        measured.append([name, *cells[0], *cells[1]])
     facts = {
         "model": result.model,
         "searched with": result.search,
@@ -265,24 +264,10 @@ def shown(result: HardenResult) -> ShownResult:
     chart: dict[str, Any] = {"draw": draw, "size": (6.4, 1.4 + 0.45 * len(shares))} if shares else {}
     sections = [
         ResultPart("Before and after", heads=HEADS, rows=measured, note=ROBUST, height=110 + 44 * len(shares), **chart),
-        ResultPart("The training", heads=ROUNDS, rows=rounds, note=TRAINED, only="page"),
-        ResultPart("What it was trained and measured on", heads=SPLIT, rows=split, only="page"),
+        ResultPart.table(enumerate(result.rounds), ROUNDS, title="The training", note=TRAINED, only="page"),
+        ResultPart.table(result.split.items(), SPLIT, title="What it was trained and measured on", only="page"),
     ]
     return ShownResult(said, sections, facts, about=[",".join(result.objects), ", ".join(result.controls)])
-
-
-def shares_of(result: HardenResult) -> dict[str, tuple[Share | None, Share | None]]:
-    """Return what was measured, before and after: two for each control, one of each search; one for all of them where
-    there are several; and one of plain pictures."""
-    shares: dict[str, tuple[Share | None, Share | None]] = {}
-    for row in result.table:
-        shares[f"robust to {row.control}"] = row.before, row.after
-        shares[f"robust to {row.control}, stronger search"] = row.stronger_before, row.stronger
-    if len(result.table) > 1:
-        shares["robust to each"] = result.before, result.after
-    if result.clean_after is not None:
-        shares["plain pictures right"] = result.clean_before, result.clean_after
-    return shares
 
 
 def claims(result: HardenResult) -> Iterator[Claim]:

@@ -1,5 +1,5 @@
-"""The rounds of a hardening, of any kind of model: scenes are drawn, a copy of the model is trained on all of them, and
-that part of the way to its weights is kept which is best on scenes that it was not trained on."""
+"""The rounds of a hardening: scenes are drawn, a copy of the model is trained on all of them, and that part of the way
+to its weights is kept which is best on scenes that it was not trained on."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ import json
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
+from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -32,10 +33,8 @@ JUDGED = 168  # scenes by which weights are chosen, at most
 PARTS = (1.0, 0.85, 0.7, 0.55, 0.4, 0.25)
 """Of the way from the weights that were given to the trained ones, which are judged."""
 
-Item = TypeVar("Item")
 MakeOptimiser = Callable[[Sequence[nn.Parameter]], torch.optim.Optimizer]
-Take = Callable[[Sequence[Any], np.random.Generator], None]
-"""Leaves the gradient of a batch with the parameters."""
+Take = Callable[[Sequence[Any], np.random.Generator], None]  # leaves the gradient of a batch with the parameters
 
 
 class Score(NamedTuple):
@@ -45,18 +44,16 @@ class Score(NamedTuple):
     robust: float
 
 
-class Course(ABC, Generic[Item]):
+class Course(ABC):
     """How models of one kind are trained, on items of which each has one picture of a scene or more.
 
     Attributes:
-        work: what draws from scenes, with the model as it was given.
-        student: the copy that is trained.
+        work, student: what draws from scenes, with the model as it was given; the copy that is trained.
         optimiser: makes one of the parameters, whose own learning rate counts; None for AdamW.
         own: items that are trained on beside those that are drawn.
         further: scenes that are drawn on top of each one of the training.
         views: that are drawn of a scene of the training, and of one by which weights are chosen.
-        batch: items of a step.
-        warm_up: share of the steps in which the learning rate rises.
+        batch, warm_up: items of a step; share of the steps in which the learning rate rises.
         average: weight of the past in the average of the weights, per step, which a round ends with.
     """
 
@@ -67,7 +64,7 @@ class Course(ABC, Generic[Item]):
     views: tuple[int, int]
 
     def __init__(
-        self, work: SceneWork, student: Trainable, optimiser: MakeOptimiser | None = None, own: Sequence[Item] = ()
+        self, work: SceneWork, student: Trainable, optimiser: MakeOptimiser | None = None, own: Sequence[Any] = ()
     ) -> None:
         self.work, self.config, self.student, self.optimiser, self.own = work, work.config, student, optimiser, own
 
@@ -76,41 +73,40 @@ class Course(ABC, Generic[Item]):
         return 0
 
     @abstractmethod
-    def draw(self, title: str, split: str, places: Sequence[int]) -> list[Item]:
+    def draw(self, title: str, split: str, places: range) -> list[Any]:
         """Return items of the scenes with these numbers of a split; `title` is what the progress says."""
 
     @abstractmethod
-    def looks(self, item: Item) -> int:
+    def looks(self, item: Any) -> int:
         """Return how often an epoch looks at an item."""
 
     @abstractmethod
-    def gradients(self, new: Sequence[Item]) -> AbstractContextManager[Take]:
+    def gradients(self, new: Sequence[Any]) -> AbstractContextManager[Take]:
         """Begin a round in which these are new; inside there is what takes gradients."""
 
     @abstractmethod
-    def score(self, held_back: Sequence[Item]) -> Score:
+    def score(self, held_back: Sequence[Any]) -> Score:
         """Judge the student on items that it was not trained on, which stay as they are."""
 
     @abstractmethod
-    def save(self, folder: Path, number: int, new: Sequence[Item]) -> None:
+    def save(self, folder: Path, number: int, new: Sequence[Any]) -> None:
         """Write the pictures of a round's new items."""
 
-    def steps(self, pool: Sequence[Item]) -> int:
-        """Return how many steps a round takes."""
+    def steps(self, pool: Sequence[Any]) -> int:
         return self.config.epochs * -(-sum(map(self.looks, pool)) // self.batch)
 
     def round(
-        self, number: int, pool: Sequence[Item], new: Sequence[Item] = (), tick: Callable[[], None] = lambda: None
+        self, number: int, pool: Sequence[Any], new: Sequence[Any] = (), tick: Callable[[], None] = lambda: None
     ) -> None:
         """Train on items in an order that the number of the round decides."""
-        parameters, steps, done = self.student.parameters(), self.steps(pool), 0
-        usual = torch.optim.AdamW(parameters, lr=self.config.rate, weight_decay=self.weight_decay)
-        optimiser = usual if self.optimiser is None else self.optimiser(parameters)
-        highest = [float(group["lr"]) for group in optimiser.param_groups]
+        parameters, rate = self.student.parameters(), self.config.rate
+        make = self.optimiser or partial(torch.optim.AdamW, lr=rate, weight_decay=self.weight_decay)
+        optimiser = make(parameters)
         rates = torch.optim.lr_scheduler.OneCycleLR(
-            optimiser, highest, total_steps=steps + 1, pct_start=self.warm_up, cycle_momentum=False
-        )
-        average = [parameter.detach().clone() for parameter in parameters]
+            optimiser, [float(group["lr"]) for group in optimiser.param_groups], total_steps=self.steps(pool) + 1,
+            pct_start=self.warm_up, cycle_momentum=False,
+        )  # fmt: skip
+        average, done = [parameter.detach().clone() for parameter in parameters], 0
         rng = np.random.default_rng([seeds.stream(self.config.seed, "order"), number])
         places = [place for place, item in enumerate(pool) for _ in range(self.looks(item))]
         with self.gradients(new) as take:
@@ -134,7 +130,7 @@ class Course(ABC, Generic[Item]):
 class Rounds:
     """The rounds of a run; `done` is what each came to, of which the first is the model as it was."""
 
-    def __init__(self, run: RunDirectory, course: Course[Any]) -> None:
+    def __init__(self, run: RunDirectory, course: Course) -> None:
         self.run, self.course, self.config = run, course, course.config
         self.progress, self.folder = course.work.progress, run.path / ARTIFACTS
         self.done = [TrainingRound.of(noted) for noted in json.loads(run.store.note(ROUNDS) or "[]")]
@@ -157,8 +153,8 @@ class Rounds:
         """Do what is left of the rounds; the student has the best weights afterwards, which the run keeps."""
         course, config, net = self.course, self.config, self.course.student.net
         if len(self.done) <= config.rounds:
-            pool, begun, title = list(course.own), 0, "drawing scenes to choose weights by"
-            held_back = course.draw(title, VALIDATION, range(self.judged))
+            pool, begun = list(course.own), 0
+            held_back = course.draw("drawing scenes to choose weights by", VALIDATION, range(self.judged))
             if not self.done:
                 self.keep(0, [], course.score(held_back), 0, 0.0)
             for number in range(1, config.rounds + 1):
@@ -185,7 +181,7 @@ class Rounds:
         may; where all lose more, it is the one that loses least. Less of the way learned less: once that shows, the
         smaller parts are not looked at, as each costs a search of its own.
         """
-        net, given, found = self.course.student.net, self._weights(0), dict[float, Score]()
+        net, given, scores = self.course.student.net, self._weights(0), dict[float, Score]()
         learned = {name: weight.clone() for name, weight in net.state_dict().items()}
 
         def take(part: float) -> None:
@@ -195,13 +191,13 @@ class Rounds:
 
         for part in PARTS:
             take(part)
-            found[part] = self.course.score(held_back)
-            allowed = {part: each.robust for part, each in found.items() if self._allowed(each.clean)}
+            scores[part] = self.course.score(held_back)
+            allowed = {part: score.robust for part, score in scores.items() if self._allowed(score.clean)}
             if allowed and [*allowed.values()][-1] < max(allowed.values()):
                 break
-        best = max(allowed, key=lambda part: allowed[part], default=max(found, key=lambda part: found[part].clean))
+        best = max(allowed or scores, key=lambda part: allowed[part] if allowed else scores[part].clean)
         take(best)
-        return found[best], best
+        return scores[best], best
 
     def keep(self, number: int, new: Sequence[Any], judged: Score, trained: int, part: float) -> None:
         """Keep the weights of a round, with its new pictures and what it came to."""
@@ -209,7 +205,7 @@ class Rounds:
         self.course.save(self.folder / PICTURES, number, new)
         self.done.append(TrainingRound(lessons=trained, part=part, **judged._asdict(), kept=False))
         self.run.store.set_note(ROUNDS, json.dumps([done.model_dump() for done in self.done]))
-        clean, worst = percent(judged.clean), percent(judged.robust)
+        clean, worst = map(percent, judged)
         self.progress.message(f"round {number}: {clean} of plain pictures right, {worst} of the worst")
 
     def _save(self, name: str) -> None:

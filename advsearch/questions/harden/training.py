@@ -7,6 +7,7 @@ import itertools
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,7 @@ from advsearch.questions.harden import lessons
 from advsearch.questions.harden.lessons import Lesson, RenderedLesson, TextureLesson, surprise, with_worst
 from advsearch.questions.harden.result import PLAIN_SCENES, RENDERED_SCENES
 from advsearch.questions.harden.rounds import Course, MakeOptimiser, Score, Take
-from advsearch.questions.harden.scenes import FURTHER, TRAINING, Drawing, SceneWork
+from advsearch.questions.harden.scenes import FURTHER, TRAINING, SceneWork, Wanted
 
 PART = 6  # lessons of a step that one thread works at
 FIRST_STEPS, HELD_BACK_STEPS = 4, 8
@@ -40,7 +41,7 @@ Examples = Iterable[tuple[Tensor, Tensor]]
 """Batches of images (N, H, W, 3) sRGB in [0, 1] and class indices (N,), such as a `DataLoader`'s."""
 
 
-class ClassifierCourse(Course[Lesson]):
+class ClassifierCourse(Course):
     """Keeps the answers to plain pictures of the model as it was given. Of the examples `beside` a batch is taken with
     each step, from the start again when they end."""
 
@@ -58,7 +59,7 @@ class ClassifierCourse(Course[Lesson]):
     def further(self) -> int:
         return RENDERED_SCENES if self.work.rendered else PLAIN_SCENES
 
-    def draw(self, title: str, split: str, places: Sequence[int]) -> list[Lesson]:
+    def draw(self, title: str, split: str, places: range) -> list[Lesson]:
         """Return lessons of scenes: for each control whose pictures a matrix says, and for all others together.
 
         In the training a fourth of the scenes have one texture for all views, in half of them the controls that are
@@ -67,25 +68,28 @@ class ClassifierCourse(Course[Lesson]):
         count.
         """
         linear, rendered, training = self.work.linear, self.work.rendered, split == TRAINING
-        wanted, views = list[Drawing](), self.views[not training]
+        views, further = self.views[not training], range(self.further * places[0], self.further * (places[-1] + 1))
+
+        def drawing(number: int, controls: Sequence[str], views: int, plain: int, **how: Any) -> Wanted:
+            how = {"side": split, "number": number, "controls": controls, "views": views, "plain": plain, **how}
+            return partial(SceneWork.drawn, **how)
+
+        wanted = list[Wanted]()
         for control in linear:
             for number in places:
                 shared, moved = self.chance(control, number) if training else (False, False)
                 beside = self.work.beside if moved else ()
-                wanted.append(Drawing(split, number, (control,), views, 1, shared, beside))
-        more = [self.further * place + one for place in places for one in range(self.further)] if training else []
+                wanted.append(drawing(number, (control,), views, 1, shared=shared, beside=beside))
         if rendered:
-            harder, plain = (1, 1) if training else (views, 0)
-            wanted += [Drawing(split, number, rendered, harder, plain) for number in places]
-            wanted += [Drawing(FURTHER, number, rendered, 1, 0) for number in more]
-        else:
-            wanted += [Drawing(FURTHER, number, linear[:1], 0, 1) for number in more]
+            wanted += [drawing(number, rendered, *((1, 1) if training else (views, 0))) for number in places]
+        if training:
+            more = (rendered, 1, 0) if rendered else (linear[:1], 0, 1)
+            wanted += [drawing(number, *more, side=FURTHER) for number in further]
         drawn = dict(self.work.each(title, wanted))
         return [lesson for place in range(len(wanted)) for lesson in drawn[place]]
 
     def chance(self, control: str, number: int) -> tuple[bool, bool]:
-        """Return whether all views of a scene have one texture, and whether other controls vary beside it. Not by
-        turns, as the objects take turns."""
+        """Return whether all views of a scene share a texture, and others vary beside it; not by turns, as objects."""
         shared, moved = np.random.default_rng(seeds.stream(self.config.seed, f"views of {control}", number)).random(2)
         return bool(shared < SHARED), bool(moved < MOVED)
 
@@ -108,12 +112,11 @@ class ClassifierCourse(Course[Lesson]):
         return batch
 
     def score(self, held_back: Sequence[Lesson]) -> Score:
-        """Judge the student, by textures that are searched against it; lessons that nothing makes harder count for
-        `clean` alone."""
-        own, model = [copy.copy(one) for one in held_back], self.student.model
+        """Judge the student, by textures that are searched against it; plain lessons count for `clean` alone."""
+        own, model = [copy.copy(lesson) for lesson in held_back], self.student.model
         for lesson in own:
             if isinstance(lesson, TextureLesson):
-                lesson.texture = copy.copy(lesson.texture)
+                lesson.texture = lesson.texture.clone()
         lessons.harder(own, model, HELD_BACK_STEPS)
 
         def right(chosen: Sequence[Lesson], which: str) -> float:
@@ -142,7 +145,8 @@ class Gradients:
     def take(self, batch: Sequence[Lesson], beside: tuple[Tensor, Tensor] | None, seed: int) -> None:
         """Make the worst pictures of lessons worse, and leave the gradient of their loss with the parameters. Further
         images (N, H, W, 3) and class indices (N,) count too."""
-        batch = sorted(batch, key=lambda one: not isinstance(one, TextureLesson))  # so that both have the same parts
+        # textures first, so that both have the same parts
+        batch = sorted(batch, key=lambda lesson: not isinstance(lesson, TextureLesson))
 
         def each(do: Callable[..., Sequence[Any]], chosen: Sequence[Lesson]) -> list[Sequence[Any]]:
             parts = [chosen[begin : begin + PART] for begin in range(0, len(chosen), PART)]
@@ -175,7 +179,7 @@ class Gradients:
         """
         searched, rng, mixed = with_worst(part), np.random.default_rng(seed), list[int]()
         textured = [lesson.worst for lesson in searched if isinstance(lesson, TextureLesson)]
-        shown = [[lesson.plain for lesson in part], textured, [one.worst for one in searched[len(textured) :]]]
+        shown = [[lesson.plain for lesson in part], textured, [lesson.worst for lesson in searched[len(textured) :]]]
         images = torch.cat([_changed(torch.stack(some), seed) for some in shown if some])
         taught = [*part, *searched]
         right = [lesson.right for lesson in taught]

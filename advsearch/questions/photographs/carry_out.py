@@ -70,30 +70,22 @@ def photo_agreement(run: str | Path) -> PhotoAgreement:
     table = pd.DataFrame(rows, columns=[*kept, "model", "correct", "said"])
     table["agrees"] = table["right"] == table["correct"]
     four, agreeing = table.groupby(["right", "correct"]).size(), int(table["agrees"].sum())
-    return PhotoAgreement(
-        photos=len(table),
-        right_right=int(four.get((True, True), 0)),
-        right_wrong=int(four.get((True, False), 0)),
-        wrong_right=int(four.get((False, True), 0)),
-        wrong_wrong=int(four.get((False, False), 0)),
-        agreement=agreeing / len(table) if rows else None,
-        interval=clopper_pearson(agreeing, len(table)) if rows else None,
-        renderings=[
+    words = {True: "right", False: "wrong"}
+    counts = {f"{words[a]}_{words[b]}": int(four.get((a, b), 0)) for a in words for b in words}
+    renderings = []
+    for (name, model), group in table.groupby(["rendering", "model"], sort=False):
+        photos, last, alike = len(group), group.iloc[-1], int(group["agrees"].sum())
+        renderings.append(
             PhotographedRendering(
-                rendering=str(name),
-                model=str(model),
-                label=str(group["label"].iloc[-1]),
-                rendering_right=bool(group["right"].iloc[-1]),
-                photos=len(group),
-                photos_right=int(group["correct"].sum()),
-                agreeing=int(group["agrees"].sum()),
-                interval=clopper_pearson(int(group["agrees"].sum()), len(group)),
-                labels=list(group["said"]),
+                rendering=str(name), model=str(model), label=str(last["label"]), rendering_right=bool(last["right"]),
+                photos=photos, photos_right=int(group["correct"].sum()), agreeing=alike,
+                interval=clopper_pearson(alike, photos), labels=list(group["said"]),
                 files=list(map(str, group["file"])),
             )
-            for (name, model), group in table.groupby(["rendering", "model"], sort=False)
-        ],
-    )
+        )  # fmt: skip
+    interval = clopper_pearson(agreeing, len(table)) if rows else None
+    agreement = agreeing / len(table) if rows else None
+    return PhotoAgreement(photos=len(table), agreement=agreement, interval=interval, renderings=renderings, **counts)
 
 
 def _photo_of(row: Row) -> JsonObject:
@@ -147,8 +139,7 @@ class Photographs:
         return photo_agreement(run)
 
     def _add(self, run: Path, rendering: str | None, data: bytes, source: str) -> None:
-        """Judge and keep a photograph of the file `source`. Of one that was aligned with no rendering, only what the
-        models say of it is kept."""
+        """Judge and keep a photograph of the file `source`; without a rendering only what the models say is kept."""
         file, kind, sound, kept = None, PHOTO if rendering else LOOSE_PHOTO, b"", dict[str, JsonValue](source=source)
         if rendering is not None:
             file = result.rendering_file(run, rendering)
@@ -204,8 +195,7 @@ class _PhotoJudge:
 
 
 def _judges_of(run: Path) -> list[_PhotoJudge]:
-    """Who judges the photographs of a run. What depends on where the object is seen is judged by where the rendering
-    has it, with which the photograph was aligned."""
+    """Who judges photographs of a run; where an object is seen is judged by the rendering that it was aligned with."""
     command = read_yaml(run / CONFIG).get("command")
     if command == "sweep":
         return _by_sweep(SweepConfig.from_yaml(run / CONFIG))
@@ -226,18 +216,15 @@ def _by_sweep(config: SweepConfig) -> list[_PhotoJudge]:
         number = int(rendering)
         if number >= job.per_scene * len(job.places):
             raise InputError(f"rendering: the sweep has no picture {rendering}; it belongs to another run")
-        scene, _, query = job.queries(range(number, number + 1))[model]
-        return scenes.named(scene).problems[model].truth(query.u, query.values)
+        scene, queries = scenes.asked(number)
+        return scene.problems[model].truth(queries[model].u, queries[model].values)
 
-    alone = enumerate(zip(job.models, job.tasks, job.sizes, strict=True))
-    return [_PhotoJudge(model, task, size, partial(truth, number)) for number, (model, task, size) in alone]
+    each = enumerate(zip(job.models, job.tasks, job.sizes, strict=True))
+    return [_PhotoJudge(model, task, size, partial(truth, number)) for number, (model, task, size) in each]
 
 
 def _by_attack(run: Path, config: AttackConfig) -> list[_PhotoJudge]:
     problem, _ = problem_from_config(judged_alone(config))
-    alone: list[tuple[Model, Task]] = [(problem.model, problem.task)]
-    if isinstance(problem.task, Together):
-        alone = list(zip(problem.task.models, problem.task.tasks, strict=True))
 
     def truth(task: Task, rendering: str | None, _: str | None) -> Truth:
         """Of the clean configuration, of the adversarial one, or of one of its trials."""
@@ -248,5 +235,8 @@ def _by_attack(run: Path, config: AttackConfig) -> list[_PhotoJudge]:
         look = partial(problem.renderer.surfaces, whole)
         return task.truth(problem.facts(partial(problem.space.describe, whole), look))
 
+    alone: list[tuple[Model, Task]] = [(problem.model, problem.task)]
+    if isinstance(problem.task, Together):
+        alone = list(zip(problem.task.models, problem.task.tasks, strict=True))
     size = config.resolution
     return [_PhotoJudge(model, task, size or model.input_size, partial(truth, task)) for model, task in alone]

@@ -13,7 +13,8 @@ import hmac
 import io
 import json
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from email.message import Message
 from http import HTTPStatus
 from pathlib import Path
@@ -131,25 +132,21 @@ def align_page(run: str, renderings: Sequence[str], table: PhotoAgreement, key: 
     """Return the page of a run as HTML: the first of its renderings is shown, `key` is what the server wants to see
     with a photograph, and `elsewhere` the address by which another device opens the page, if one can."""
     named = ", ".join(renderings[:8]) + (f", ... {renderings[-1]}" if len(renderings) > 8 else "")
+    how = "Lay a rendering over what the camera sees, move the real object until both agree, and take a photograph."
     align = join_html(
-        element("p", "Lay a rendering over what the camera sees, move the real object until both agree, and take a "
-                "photograph."),
+        element("p", how),
         element("p", f"Renderings of this run ({len(renderings)}): {named}.", class_="soft", id="renderings"),
         element("noscript", element("p", "The camera needs JavaScript, which is switched off.")),
-    )  # fmt: skip
-    without = element(
-        "p", "This run kept no pictures to align with. An attack keeps them when it ends; a sweep with ",
-        element("code", "keep_pictures=all"), ".",
-    )  # fmt: skip
-    code = None
+    )
+    none = "This run kept no pictures to align with. An attack keeps them when it ends; a sweep with "
+    without, code = element("p", none, element("code", "keep_pictures=all"), "."), None
     if elsewhere is not None:
         made = qr_code(elsewhere)
         svg = made and Html(made.svg_inline(omitsize=True, light="#fff", title="QR code of the address below"))
-        code = element(
-            "details", element("summary", "Open this page on a phone"),
-            element("div", svg or element("p", f"A code to point the phone at would stand here: {NO_QR}"), class_="qr"),
-            element("pre", elsewhere, class_="wrap", tabindex="0"),
-        )  # fmt: skip
+        shown = svg or element("p", f"A code to point the phone at would stand here: {NO_QR}")
+        summary = element("summary", "Open this page on a phone")
+        address = element("pre", elsewhere, class_="wrap", tabindex="0")
+        code = element("details", summary, element("div", shown, class_="qr"), address)
     main = element(
         "main",
         element("div", align, id="align") if renderings else without,
@@ -176,21 +173,16 @@ def table_html(table: PhotoAgreement) -> Html:
         f"They agree in {agreeing} of {wording.count(table.photos, 'photograph')}: {percent(table.agreement)}, 95 % "
         f"interval {wording.interval_text(table.interval)}."
     )
-    several = len({row.model for row in table.renderings}) > 1
-    rows = []
+    several, rows = len({row.model for row in table.renderings}) > 1, []
     for row in table.renderings:
         photos = [
             join_html(element("a", label or "nothing", href=f"photos/{in_address(file)}"), " ")
             for label, file in zip(row.labels, row.files, strict=True)
         ]
-        rows.append([
-            row.rendering,
-            *([row.model] if several else []),
-            f"{'right' if row.rendering_right else 'wrong'}: {row.label}",
-            join_html(f"{row.photos_right} of {row.photos} right: ", *photos),
-            f"{row.agreeing} of {row.photos}",
-            wording.interval_text(row.interval),
-        ])  # fmt: skip
+        rendered = f"{'right' if row.rendering_right else 'wrong'}: {row.label}"
+        photographed = join_html(f"{row.photos_right} of {row.photos} right: ", *photos)
+        agree = f"{row.agreeing} of {row.photos}", wording.interval_text(row.interval)
+        rows.append([row.rendering, *([row.model] if several else []), rendered, photographed, *agree])
     heads = ["rendering", *(["model"] if several else []), "in the rendering", "in photographs", "agree", "interval"]
     each = study_table(heads, rows, [f"renderings/{in_address(row.rendering)}" for row in table.renderings])
     counted = ("photographs", "right in the photograph", "wrong in the photograph")
@@ -211,7 +203,8 @@ def photographs_html(taker: Any, run: Path, name: str, key: str, elsewhere: str 
 
 def picture(find: str, run: Path, name: str) -> tuple[str, bytes]:
     """Return the type and the data of a "rendering", or of a "photo" that was kept."""
-    file = _found(rendering_file if find == "rendering" else photo_file, run, name)
+    with _refused(HTTPStatus.NOT_FOUND):
+        file = rendering_file(run, name) if find == "rendering" else photo_file(run, name)
     return "image/png" if file.suffix == ".png" else "image/jpeg", file.read_bytes()
 
 
@@ -219,15 +212,13 @@ def take(taker: Any, run: Path, name: str, headers: Message, key: str, data: Cal
     """Take a photograph of a rendering in, from this server's own page: another one has no origin, or not the key.
     `data` reads what was sent, once there is something to compare it with. It is refused where there is no such
     rendering, or it is no photograph."""
-    if headers.get("Origin") is None or not hmac.compare_digest(
-        key.encode(), headers.get(KEY, "").encode("utf-8", "replace")
-    ):
+    sent = headers.get(KEY, "").encode("utf-8", "replace")
+    if headers.get("Origin") is None or not hmac.compare_digest(key.encode(), sent):
         raise Refused(HTTPStatus.FORBIDDEN, "a photograph is sent by the page that this server shows; open it anew")
-    _found(rendering_file, run, name)
-    try:
+    with _refused(HTTPStatus.NOT_FOUND):
+        rendering_file(run, name)
+    with _refused(HTTPStatus.BAD_REQUEST):
         table = _there(taker).add(run, name, data())
-    except InputError as error:
-        raise Refused(HTTPStatus.BAD_REQUEST, str(error)) from None
     return "application/json", json.dumps({"table": str(table_html(table))}).encode()
 
 
@@ -237,9 +228,10 @@ def _there(taker: Any) -> Any:
     return taker
 
 
-def _found(find: Callable[[Path, str], Path], run: Path, name: str) -> Path:
-    """The file that `find` returns; what it says of one that is not there is what is sent."""
+@contextmanager
+def _refused(status: HTTPStatus) -> Iterator[None]:
+    """What an InputError says is sent, with a status."""
     try:
-        return find(run, name)
+        yield
     except InputError as error:
-        raise Refused(HTTPStatus.NOT_FOUND, str(error)) from None
+        raise Refused(status, str(error)) from None

@@ -17,16 +17,13 @@ from torch import Tensor
 from advsearch import seeds
 from advsearch.engine.gradients import Estimate, Loss, Probe, agreement, estimated, only, probes, reference
 from advsearch.questions.precision.result import PrecisionReference
-from advsearch.questions.precision.rule import Array, Numbers, ReferenceValue, Setting, reference_of
+from advsearch.questions.precision.rule import Array, Numbers, ReferenceValue, SampleSetting, reference_of
 from advsearch.scene.gradients import BY_ADJOINT, Group, compared
 from advsearch.scene.renderer import Renderer
 
-LEAST, COLD = 5, 2
-"""Calls of a setting that have to fit into the budget for it to be begun; the first ones take longer."""
-CLAIM = 0.25
-"""Share of the time left that one setting may lay claim to."""
-MOST_PARTS = 64
-"""Independent parts of a reference, at most."""
+LEAST, COLD = 5, 2  # calls of a setting that have to fit into the budget for it to be begun; the first ones take longer
+CLAIM = 0.25  # share of the time left that one setting may lay claim to
+MOST_PARTS = 64  # independent parts of a reference, at most
 Part = TypeVar("Part")
 
 
@@ -38,7 +35,6 @@ class TimeBudget:
 
     @property
     def left(self) -> float:
-        """Seconds left, not below 0."""
         return max(0.0, self._end - self.clock())
 
     def share(self, part: float) -> TimeBudget:
@@ -47,14 +43,14 @@ class TimeBudget:
 
 
 @dataclass
-class Rounds:
+class MeasuredRounds:
     """What came out for each setting, the seconds of each call by the clock, and what did not fit at all."""
 
-    results: dict[Setting, list[Any]] = field(default_factory=dict)
-    walls: dict[Setting, list[float]] = field(default_factory=dict)
-    left_out: list[Setting] = field(default_factory=list)
+    results: dict[SampleSetting, list[Any]] = field(default_factory=dict)
+    walls: dict[SampleSetting, list[float]] = field(default_factory=dict)
+    left_out: list[SampleSetting] = field(default_factory=list)
 
-    def call_takes(self, setting: Setting) -> float:
+    def call_takes(self, setting: SampleSetting) -> float:
         """Seconds of a call but the first ones: as the setting's own, else in proportion to its line's dearest setting,
         else at the highest rate of any line; 0 where nothing is known."""
         if setting in self.walls:
@@ -63,7 +59,7 @@ class Rounds:
         rates = {line: self.call_takes(known) / known.cost for line, known in dearest.items()}
         return setting.cost * rates.get(setting.line, max(rates.values(), default=0.0))
 
-    def needs(self, setting: Setting, left: float) -> float:
+    def needs(self, setting: SampleSetting, left: float) -> float:
         """Seconds that a new setting needs for its calls, with what those begun still need for as many. One of these
         that needs more than a share `CLAIM` of what is left turned out too dear, and waits until the end."""
         cold = [sum(taken[:COLD]) - COLD * self.call_takes(at) for at, taken in self.walls.items() if len(taken) > COLD]
@@ -73,14 +69,9 @@ class Rounds:
 
 
 def in_rounds(
-    settings: Iterable[Setting],
-    measure: Callable[[Setting, int], Any],
-    budget: TimeBudget,
-    *,
-    rounds: int,
-    seed: int,
-    on_done: Callable[[Setting], None] = lambda setting: None,
-) -> Rounds:
+    settings: Iterable[SampleSetting], measure: Callable[[SampleSetting, int], Any], budget: TimeBudget, *,
+    rounds: int, seed: int, on_done: Callable[[SampleSetting], None] = lambda setting: None,
+) -> MeasuredRounds:  # fmt: skip
     """Measure settings, cheapest first, in rounds until these are done or the budget is used up; the first is always
     measured.
 
@@ -89,9 +80,9 @@ def in_rounds(
     once: without the second, nothing would be known of its time. A call that should not fit is not begun: a budget is
     kept to within a setting's first calls. Each call has a seed of its own.
     """
-    measured = Rounds()
+    measured = MeasuredRounds()
 
-    def call(setting: Setting) -> None:
+    def call(setting: SampleSetting) -> None:
         taken, begun = measured.results.setdefault(setting, []), budget.clock()
         stream = f"precision {'/'.join(setting.line)}/{setting.spp}"
         taken.append(measure(setting, seeds.stream(seed, stream, len(taken))))
@@ -173,10 +164,9 @@ class PictureBench:
         }
 
     @property
-    def settings(self) -> list[Setting]:
-        """Everything to measure."""
+    def settings(self) -> list[SampleSetting]:
         return [
-            Setting("picture", line, count, count * (1.0 if line in FIRST else LATER), family=denoiser_of(line))
+            SampleSetting("picture", line, count, count * (1.0 if line in FIRST else LATER), family=denoiser_of(line))
             for line in self._lines
             for count in COUNTS.get(line, (4, 16, 64, 256))
         ]
@@ -203,11 +193,10 @@ class PictureBench:
             rows.append(_row("margin", name, margin, spp))
         return rows
 
-    def floor(self, setting: Setting, quantity: str) -> float:
-        """The reference's own relative error for a setting."""
+    def floor(self, setting: SampleSetting, quantity: str) -> float:
         return self._references[quantity, setting.family].error
 
-    def measure(self, setting: Setting, seed: int) -> dict[str, Numbers]:
+    def measure(self, setting: SampleSetting, seed: int) -> dict[str, Numbers]:
         """Make one picture; return how it and the margin compare, and the times of rendering and denoising."""
         radiance, times = timed(partial(self._radiance, setting.estimator, seed, setting.spp))
         picture = self._picture(radiance)
@@ -233,14 +222,12 @@ def denoiser_of(line: str) -> str:
 
 ADJOINT_COST = {"adjoint": 3.0, "material": 60.0}
 """An adjoint takes about as long as so many renders, the kernels that the material form compiles included."""
-BY_COORDINATE = 32
-"""Sets of at most so many coordinates have a reference by differences, coordinate by coordinate."""
+BY_COORDINATE = 32  # sets of at most so many coordinates have a reference by differences, coordinate by coordinate
 
 
 @dataclass(frozen=True)
 class GradientPart:
-    """Coordinates of one control whose gradient one call of an estimator gives; named with parameters where a control
-    has several."""
+    """Coordinates of one control whose gradient one call gives; named with parameters where a control has several."""
 
     name: str
     groups: tuple[Group, ...]
@@ -248,12 +235,10 @@ class GradientPart:
 
     @property
     def names(self) -> set[str]:
-        """Of the groups."""
         return {group.name for group in self.groups}
 
     @property
     def size(self) -> int:
-        """Number of coordinates."""
         return sum(group.size for group in self.groups)
 
     def of(self, gradient: Tensor) -> Array:
@@ -292,18 +277,15 @@ class GradientBench:
         self.reference: ReferenceValue | None = None
 
     @property
-    def settings(self) -> list[Setting]:
-        """Everything to measure; the cost is in renders, the picture itself included."""
-        costs = {
-            name: 1.0
-            + ADJOINT_COST.get(name, sum(replace(group, estimator=name).renders for group in self.part.groups))
-            for name in self.part.estimators
-        }
-        return [
-            Setting("gradient", name, count, count * cost, self.part.name)
-            for name, cost in costs.items()
-            for count in COUNTS["independent"]
-        ]
+    def settings(self) -> list[SampleSetting]:
+        settings = []
+        for name in self.part.estimators:
+            renders = sum(replace(group, estimator=name).renders for group in self.part.groups)
+            cost = 1.0 + ADJOINT_COST.get(name, renders)
+            settings += [
+                SampleSetting("gradient", name, count, count * cost, self.part.name) for count in COUNTS["independent"]
+            ]
+        return settings
 
     def refer(self, budget: TimeBudget, seed: int, on_done: Callable[[], None]) -> list[PrecisionReference]:
         """Find the reference."""
@@ -330,11 +312,10 @@ class GradientBench:
             self.reference = reference_of(gather(partial(taken, spp=spp), budget, on_done, seed))
         return [_row("gradient", self._by, self.reference, spp, self.part.name)]
 
-    def floor(self, setting: Setting, quantity: str) -> float:
-        """The reference's own relative error."""
+    def floor(self, setting: SampleSetting, quantity: str) -> float:
         return self.reference.error if self.reference else 0.0
 
-    def measure(self, setting: Setting, seed: int) -> dict[str, Numbers]:
+    def measure(self, setting: SampleSetting, seed: int) -> dict[str, Numbers]:
         """Take one gradient; return how it compares, and its times, the picture itself included."""
         assert self.reference is not None
         gradient, times = timed(partial(self._taken, self._renderer, setting.estimator, seed, setting.spp))
@@ -369,16 +350,10 @@ def _coordinate(u: Tensor, group: Group, number: int) -> Probe:
 
 def _row(quantity: str, name: str, value: ReferenceValue, spp: int, control: str = "") -> PrecisionReference:
     return PrecisionReference(
-        quantity=quantity,
-        control=control,
-        reference=name,
-        error=value.error,
-        parts=value.parts,
-        spp=spp * value.parts,
-    )
+        quantity=quantity, control=control, reference=name, error=value.error, parts=value.parts, spp=spp * value.parts
+    )  # fmt: skip
 
 
 def flat(values: Tensor) -> Array:
-    """Return values of any shape as (n,) float64."""
     numbers: Array = values.detach().to(torch.float64).reshape(-1).numpy().copy()
     return numbers

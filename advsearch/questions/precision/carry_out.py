@@ -21,25 +21,10 @@ from advsearch.engine.record import Results, kept_rows
 from advsearch.errors import InputError
 from advsearch.progress import NullProgress, Progress
 from advsearch.questions.attack.carry_out import LOADING, problem_from_config
-from advsearch.questions.precision.benches import (
-    OIDN,
-    GradientBench,
-    GradientPart,
-    PictureBench,
-    TimeBudget,
-    gradient_parts,
-    in_rounds,
-)
-from advsearch.questions.precision.result import (
-    Machine,
-    PrecisionConfig,
-    PrecisionPoint,
-    PrecisionResult,
-    Recommended,
-    Sitting,
-    cautions,
-    precision_figures,
-)
+from advsearch.questions.precision import benches
+from advsearch.questions.precision import result as room
+from advsearch.questions.precision.benches import OIDN, GradientBench, GradientPart, PictureBench, TimeBudget
+from advsearch.questions.precision.result import PrecisionConfig, PrecisionPoint, PrecisionResult, Recommended, Sitting
 from advsearch.questions.precision.rule import RoundUp, confirmed, fit_line, point_of, reaching, warning_of
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.files import write_bytes
@@ -48,10 +33,8 @@ from advsearch.scene.formation import next_count
 from advsearch.settings import split_names
 from advsearch.viewer.pages import keep_result
 
-SHARES = {"image": 0.6, "gradient": 0.4}
-"""Of the time, by quantity; what one doesn't use is the others'."""
-REFERENCE_SHARE = 0.35
-"""Of the time of a quantity, for its reference."""
+SHARES = {"image": 0.6, "gradient": 0.4}  # of the time, by quantity; what one doesn't use is the others'
+REFERENCE_SHARE = 0.35  # of the time of a quantity, for its reference
 CONFIRM_SHARE, CONFIRM_LEAST, CONFIRM_MOST = 0.4, 4, 64
 """Of the time of a gradient's measurements, for measuring the recommended setting again; how often at least for that to
 count, and at most."""
@@ -92,34 +75,22 @@ def precision_from_config(
                     slopes.append(slope)
                     warnings += filter(None, [warning_of(slope, line)])
             again = [point for sitting in taken for point in sitting.again]
+            recommendations = recommended(points, again, config.error, job.round_up, job.or_steeper)
             return PrecisionResult(
-                run=str(run.path),
-                object=config.object,
-                model=problem.model.name,
-                environment=problem.environment,
-                controls=list(config.controls),
-                ending=ending,
-                image_formation=Formation.of(problem.renderer.formation),
-                depth=problem.renderer.scene.max_depth,
-                loss=config.loss,
-                spp=problem.spp,
-                machine=timing_machine(),
-                goal=config.error,
-                points=points,
-                slopes=slopes,
+                run=str(run.path), object=config.object, model=problem.model.name, environment=problem.environment,
+                controls=list(config.controls), ending=ending, depth=problem.renderer.scene.max_depth, loss=config.loss,
+                image_formation=Formation.of(problem.renderer.formation), spp=problem.spp, machine=timing_machine(),
+                goal=config.error, points=points, slopes=slopes, recommendations=recommendations, figures=[],
                 references=[reference for sitting in taken for reference in sitting.references],
-                recommendations=recommended(points, again, config.error, job.round_up, job.or_steeper),
-                warnings=[*warnings, *cautions(points)],
+                warnings=[*warnings, *room.cautions(points)],
                 left_out=[row for sitting in taken for row in sitting.left_out],
-                figures=[],
                 seconds={"budget": config.seconds, "setup": setup, "total": time.perf_counter() - begun},
-                seed=config.seed,
-                command_line=config.command_line(),
-            )
+                seed=config.seed, command_line=config.command_line(),
+            )  # fmt: skip
 
         found = kept_rows(run, results, sittings(), result)
         (run.path / "images").mkdir(exist_ok=True)
-        figures = precision_figures(found)
+        figures = room.precision_figures(found)
         written = [write_bytes(run.path / "images" / f"precision.{kind}", data) for kind, data in figures.items()]
         return keep_result(run, found.model_copy(update={"figures": [str(path) for path in written]}))
 
@@ -136,7 +107,7 @@ class Measurement:
             renderer = renderer.like(denoiser="none", transfer="linear")
             renderer.plan = renderer.plan.at_a_pixel()
             self._loss = smooth_loss(renderer.formation.resolution, config.seed)
-        self._renderer, parts = renderer, gradient_parts(renderer.plan.groups, linear=self._linear)
+        self._renderer, parts = renderer, benches.gradient_parts(renderer.plan.groups, linear=self._linear)
         if "gradient" in wanted and not parts:
             names = ",".join(config.controls)
             raise InputError(f"`controls` {names}: has no derivative; leave gradient out of `quantities`")
@@ -183,7 +154,7 @@ class Measurement:
             setting = replace(like, spp=chosen.spp, cost=like.cost / like.spp * chosen.spp)
             tick = self._stage(f"{title}: {chosen.estimator} with {chosen.spp} samples again", budget)
             seed = seeds.stream(self._seed, "confirm")
-            measured = in_rounds(
+            measured = benches.in_rounds(
                 [setting], bench.measure, budget, rounds=CONFIRM_MOST, seed=seed, on_done=lambda _: tick()
             )
             samples = [numbers["gradient"] for numbers in measured.results[setting]]
@@ -197,14 +168,10 @@ class Measurement:
         begun, share = time.perf_counter(), budget.share(REFERENCE_SHARE)
         references = bench.refer(share, self._seed, self._stage(f"{title}: references", share))
         tick = self._stage(f"{title}: measuring every setting in rounds", budget)
-        measured = in_rounds(
-            bench.settings,
-            bench.measure,
-            budget,
-            rounds=self._config.rounds,
-            seed=self._seed,
+        measured = benches.in_rounds(
+            bench.settings, bench.measure, budget, rounds=self._config.rounds, seed=self._seed,
             on_done=lambda setting: tick(now=setting.estimator, samples=setting.spp),
-        )
+        )  # fmt: skip
         points = []
         for setting, samples in measured.results.items():
             for quantity in samples[0]:
@@ -231,7 +198,6 @@ class Measurement:
 
 
 def lines_of(points: Sequence[PrecisionPoint]) -> dict[tuple[str, ...], list[PrecisionPoint]]:
-    """Return points by their line in a diagram, by rising samples."""
     lines: dict[tuple[str, ...], list[PrecisionPoint]] = {}
     for point in points:
         lines.setdefault((point.quantity, point.control, point.family, point.estimator), []).append(point)
@@ -254,7 +220,7 @@ def recommended(
     best = []
     for (quantity, control, family), reached in asked.items():
         chosen = min(
-            reached, key=lambda one: one.seconds or 0.0, default=Recommended(quantity=quantity, control=control)
+            reached, key=lambda row: row.seconds or 0.0, default=Recommended(quantity=quantity, control=control)
         )
         for point in again:
             if (point.control, point.estimator) == (chosen.control, chosen.estimator) and quantity == "gradient":
@@ -263,9 +229,9 @@ def recommended(
     return best
 
 
-def timing_machine(cpu_info: Path = Path("/proc/cpuinfo")) -> Machine:
+def timing_machine(cpu_info: Path = Path("/proc/cpuinfo")) -> room.Machine:
     """Return what a time has to be read with: processor (by Linux), cores, and the threads in use."""
     used = {"torch": torch.get_num_threads()}
     if "drjit" in sys.modules:
         used["render"] = int(sys.modules["drjit"].thread_count())
-    return Machine(cpu=processor(cpu_info), cores=threads.cores(), threads=used)
+    return room.Machine(cpu=processor(cpu_info), cores=threads.cores(), threads=used)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 from pydantic import Field, field_validator
 
@@ -14,12 +14,6 @@ from advsearch.report.shown import Column, ResultPart, ShownResult
 from advsearch.runs.results import Fields, Formation, Interval, JsonFloat, Measured, RunResult
 from advsearch.settings import Clash, check_once, setting, setting_as_in, split_names
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.axis import Axis
-    from matplotlib.figure import Figure
-
-
 QUANTITIES = ("image", "gradient")
 SAMPLERS = ("independent", "stratified", "multijitter", "orthogonal", "ldsampler")
 """What `precision` measures, and the samplers that it knows."""
@@ -28,19 +22,14 @@ SAMPLERS = ("independent", "stratified", "multijitter", "orthogonal", "ldsampler
 class PrecisionConfig(DerivativeConfig):
     """Everything that decides what `precision` does: error against run time, for a scene, its controls and a model."""
 
+    # fmt: off
     command: ClassVar[str] = "precision"
     clashes: ClassVar[tuple[Clash, ...]] = (
         *DerivativeConfig.clashes,
-        Clash(
-            "samplers",
-            lambda config: "image" not in split_names(config.quantities),
-            "is of the image, which `quantities` leaves out; leave it out too",
-        ),
-        Clash(
-            "loss",
-            lambda config: "gradient" not in split_names(config.quantities),
-            "is of the gradient, which `quantities` leaves out; leave it out too",
-        ),
+        Clash("samplers", lambda config: "image" not in split_names(config.quantities),
+              "is of the image, which `quantities` leaves out; leave it out too"),
+        Clash("loss", lambda config: "gradient" not in split_names(config.quantities),
+              "is of the gradient, which `quantities` leaves out; leave it out too"),
     )
 
     quantities: str = setting(
@@ -53,33 +42,29 @@ class PrecisionConfig(DerivativeConfig):
         ",".join(SAMPLERS), "search", "samplers that are compared, separated by commas", ", ".join(SAMPLERS)
     )
     loss: Literal["linear", "model"] = setting(
-        "linear",
-        "search",
+        "linear", "search",
         "whose gradient is measured: a smooth linear loss of the raw picture, or the model's in its image formation",
     )
     run: str | None = setting_as_in(SceneConfig, "run", otherwise="runs/OBJECT-precision-NNN")
+    # fmt: on
 
     @field_validator("quantities", "samplers", mode="before")
     @classmethod
     def _names_from_list(cls, value: Any) -> Any:
-        """Accept a list of names for names separated by commas."""
         return ",".join(str(part) for part in value) if isinstance(value, (list, tuple)) else value
 
     @field_validator("quantities", "samplers")
     @classmethod
     def _several(cls, value: str, info: Any) -> str:
         """Refuse lists with nothing in them, with something twice, and with names that are not known."""
-        names = split_names(value)
-        if not "".join(names).strip() or not set(names) <= set(
-            QUANTITIES if info.field_name == "quantities" else SAMPLERS
-        ):
+        names, known = split_names(value), QUANTITIES if info.field_name == "quantities" else SAMPLERS
+        if not "".join(names).strip() or not set(names) <= set(known):
             raise ValueError("nothing, or unknown names")
         check_once(names, info.field_name)
         return value
 
     @property
     def title(self) -> tuple[str, ...]:
-        """The object, and what is asked of it."""
         return self.object, self.command
 
 
@@ -192,13 +177,12 @@ may record them again, and so may the first one after other scenes were rendered
 FAMILIES = {"none": " without denoiser", "oidn": " with denoiser"}
 READING = (
     "Each row is a setting: its error beside a reference of far more samples, with the 95 % interval of that "
-    "error, and the processor time, in seconds, that one picture or gradient takes. A margin is how far the wrong "
-    "prediction leads the right one, in logits; a cosine of 1 means that a gradient points the right way."
+    "error, and the processor time, in seconds, that one picture or gradient takes. A margin is how far the right "
+    "prediction leads the wrong one, in logits; a cosine of 1 means that a gradient points the right way."
 )
 
 
 def named(quantity: str, control: str = "") -> str:
-    """Return what is measured in words."""
     return f"the gradient of {control}" if quantity == "gradient" else f"the {quantity}"
 
 
@@ -248,7 +232,7 @@ def shown(result: PrecisionResult) -> ShownResult:
 
 def headline(result: PrecisionResult) -> str:
     """Return the result in one line: what an error takes, of the first quantity that reaches it."""
-    found = next((one for one in result.recommendations if one.estimator), None)
+    found = next((row for row in result.recommendations if row.estimator), None)
     if found is None:
         return "Nothing that was measured is known to reach the error: give it more `seconds` or a larger `error`."
     return (
@@ -258,7 +242,6 @@ def headline(result: PrecisionResult) -> str:
 
 
 def sentence(found: Recommended, goal: float) -> str:
-    """Return a recommendation as a sentence."""
     asked = f"{100 * goal:.3g} % error of {named(found.quantity, found.control)}{FAMILIES.get(found.family, '')}"
     if found.estimator is None:
         return f"{asked}: not reached by anything that was measured; give it more `seconds` or a larger `error`"
@@ -310,8 +293,7 @@ def _between(interval: Interval | None) -> str:
 
 COLORS = (BLUE, "#b4540a", "#1f7a45", "#7a3fa8", RED, "#4a7d8c", "#8a6d00", GREY, "#c2488f", "#3f5fd0", "#a06a50")
 MARKERS = "osD^vP*X<>d"
-PANEL = (5.6, 3.9)
-"""Width and height of one diagram in inches."""
+PANEL = (5.6, 3.9)  # width and height of one diagram in inches
 PERCENT = 100.0
 MINUS = "\N{MINUS SIGN}"
 
@@ -331,24 +313,45 @@ def precision_figures(result: PrecisionResult) -> Figures:
         return {}
     wide = min(2, len(panels))
     tall = math.ceil(len(panels) / wide)
+    machine, points, (height, width) = result.machine, result.points, result.image_formation.resolution
+    threads = ", ".join(f"{count} {name} thread" + "s" * (count != 1) for name, count in machine.threads.items())
+    most = max(point.repeats for point in points)
+    seconds = f"of the last of {most} repeats at most"
+    if most > WARM_UP + 1:
+        seconds = f"medians of at most {most - WARM_UP} interleaved repeats"
+    key = "Filled: known" + (", with its 95 % interval." if any(point.interval for point in points) else ".")
+    if not all(point.known for point in points):
+        key += " Open, with an arrow: at most this, the reference is no better."
+    below = f"{machine.cpu}, {machine.cores} cores, {threads}; seconds are {seconds}.\n{key}"
+    what = f"{result.object} in {result.environment}, {result.model}, {width} x {height} pixels"
 
-    def draw(figure: Figure) -> None:
-        for number, (title, points) in enumerate(panels.items(), start=1):
+    def draw(figure: Any) -> None:
+        for number, (title, shown) in enumerate(panels.items(), start=1):
             axes = figure.add_subplot(tall, wide, number)
             axes.set_title(title)
-            _draw_errors(axes, points, result)
-        _explain(figure, result)
+            _draw_errors(axes, shown, result)
+        figure.suptitle(what, fontsize=11, fontweight="bold", x=0.01, ha="left")
+        figure.supxlabel(below, fontsize=8, color=GREY, x=0.01, ha="left")
 
     return drawn(draw, (PANEL[0] * wide, PANEL[1] * tall + 0.8))
 
 
-def _draw_errors(axes: Axes, points: Sequence[PrecisionPoint], result: PrecisionResult) -> None:
+def _draw_errors(axes: Any, points: Sequence[PrecisionPoint], result: PrecisionResult) -> None:
+    slopes = {(slope.quantity, slope.control, slope.estimator): slope for slope in result.slopes}
     for number, name in enumerate(dict.fromkeys(point.estimator for point in points)):
         line = sorted((point for point in points if point.estimator == name), key=lambda point: point.spp)
-        _draw_line(axes, line, number, _labelled(line[0], result))
-    axes.set_xscale("log")
-    axes.set_yscale("log")
-    _draw_theory(axes, points)
+        label, slope = name, slopes.get((line[0].quantity, line[0].control, name))
+        if slope is not None:  # and theory where that disagrees
+            doubt = f" (not {slope.theory:.2f})" if slope.agrees is False else ""
+            label = f"{name}  {slope.slope:.2f}{doubt}".replace(" -", f" {MINUS}")
+        _draw_line(axes, line, number, label)
+    axes.set(xscale="log", yscale="log", xlabel="seconds of processor time", ylabel="relative error, %")
+    low, high = min(point.seconds for point in points), max(point.seconds for point in points)
+    if high >= 1.5 * low:  # theory: a dashed line of slope -1/2 under the points
+        at = PERCENT * min(point.rms * math.sqrt(point.seconds) for point in points) * 0.8
+        middle = math.sqrt(low * high)
+        axes.plot([low, high], [at / math.sqrt(low), at / math.sqrt(high)], color=GREY, linewidth=1.0, linestyle="--")
+        axes.annotate(f"{MINUS}1/2", (middle, at / math.sqrt(middle)), fontsize=8, color=GREY, ha="right", va="top")
     _plain_axis(axes.xaxis)
     _plain_axis(axes.yaxis)
     goal, (low, high) = result.goal * PERCENT, axes.get_ylim()
@@ -356,15 +359,13 @@ def _draw_errors(axes: Axes, points: Sequence[PrecisionPoint], result: Precision
         axes.axhline(goal, color="#1c1d20", linewidth=0.8, linestyle=":")
         where = ("axes fraction", "data")
         axes.annotate(f"{goal:g} %", (1.0, goal), xycoords=where, ha="right", va="bottom", fontsize=8)
-    axes.set_xlabel("seconds of processor time")
-    axes.set_ylabel("relative error, %")
     axes.grid(True, which="major")
     place: dict[str, Any] = {"bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.2, "handlelength": 1.6}
     place |= {"title": "slope against samples", "title_fontsize": 8, "alignment": "left"}
     axes.legend(loc="upper left", **place)
 
 
-def _draw_line(axes: Axes, line: Sequence[PrecisionPoint], number: int, label: str) -> None:
+def _draw_line(axes: Any, line: Sequence[PrecisionPoint], number: int, label: str) -> None:
     color, marker = COLORS[number % len(COLORS)], MARKERS[number % len(MARKERS)]
     axes.plot([p.seconds for p in line], [PERCENT * p.rms for p in line], color=color, linewidth=1.0, alpha=0.55)
     for point in line:
@@ -379,59 +380,17 @@ def _draw_line(axes: Axes, line: Sequence[PrecisionPoint], number: int, label: s
     axes.plot([], [], marker=marker, markersize=5, color=color, linewidth=1.0, label=label)
 
 
-def _labelled(point: PrecisionPoint, result: PrecisionResult) -> str:
-    """An estimator with the slope of its line against samples, and theory where it disagrees with that."""
-    place = point.quantity, point.control, point.estimator
-    for slope in result.slopes:
-        if (slope.quantity, slope.control, slope.estimator) == place:
-            doubt = f" (not {slope.theory:.2f})" if slope.agrees is False else ""
-            return f"{point.estimator}  {slope.slope:.2f}{doubt}".replace(" -", f" {MINUS}")
-    return point.estimator
-
-
-def _draw_theory(axes: Axes, points: Sequence[PrecisionPoint]) -> None:
-    """A dashed line of slope -1/2 under the points."""
-    low, high = min(point.seconds for point in points), max(point.seconds for point in points)
-    if high < 1.5 * low:
-        return
-    at = PERCENT * min(point.rms * math.sqrt(point.seconds) for point in points) * 0.8
-    axes.plot([low, high], [at / math.sqrt(low), at / math.sqrt(high)], color=GREY, linewidth=1.0, linestyle="--")
-    middle = math.sqrt(low * high)
-    axes.annotate(f"{MINUS}1/2", (middle, at / math.sqrt(middle)), fontsize=8, color=GREY, ha="right", va="top")
-
-
-def _plain_axis(axis: Axis) -> None:
+def _plain_axis(axis: Any) -> None:
     """Ticks at 1, 2 and 5 times powers of ten (only at powers over a wide range), as plain numbers."""
     from matplotlib.ticker import FixedLocator, FuncFormatter, NullFormatter  # takes long to import
 
     low, high = sorted(axis.get_view_interval())
     powers = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
-    for factors in (
-        (1.0,),
-        (1.0, 2.0, 5.0),
-        (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0),
-        tuple(1.0 + 0.2 * k for k in range(45)),
-    ):
+    finest = [1.0 + 0.2 * k for k in range(45)]
+    for factors in ([1.0], [1.0, 2.0, 5.0], [1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0], finest):
         ticks = [factor * 10.0**power for power in powers for factor in factors if low <= factor * 10.0**power <= high]
         if len(ticks) >= 3:
             break
     axis.set_major_locator(FixedLocator(ticks))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.3g}"))
     axis.set_minor_formatter(NullFormatter())
-
-
-def _explain(figure: Figure, result: PrecisionResult) -> None:
-    machine, points = result.machine, result.points
-    height, width = result.image_formation.resolution
-    threads = ", ".join(f"{count} {name} thread" + "s" * (count != 1) for name, count in machine.threads.items())
-    what = f"{result.object} in {result.environment}, {result.model}, {width} x {height} pixels"
-    figure.suptitle(what, fontsize=11, fontweight="bold", x=0.01, ha="left")
-    most = max(point.repeats for point in points)
-    seconds = f"of the last of {most} repeats at most"
-    if most > WARM_UP + 1:
-        seconds = f"medians of at most {most - WARM_UP} interleaved repeats"
-    key = "Filled: known" + (", with its 95 % interval." if any(point.interval for point in points) else ".")
-    if not all(point.known for point in points):
-        key += " Open, with an arrow: at most this, the reference is no better."
-    place = f"{machine.cpu}, {machine.cores} cores, {threads}; seconds are {seconds}."
-    figure.supxlabel(f"{place}\n{key}", fontsize=8, color=GREY, x=0.01, ha="left")

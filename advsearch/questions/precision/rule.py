@@ -23,26 +23,20 @@ of all relative errors in a picture, whose squares `error` adds up."""
 RoundUp = Callable[[PrecisionPoint, float], int]
 """From a point and a number of samples to the next number that its setting takes."""
 
-KNOWN = 2.0
-"""Times the reference's own error that a measured one must have to be known."""
-LEVEL = 0.95
-"""Of every interval."""
+KNOWN = 2.0  # times the reference's own error that a measured one must have to be known
+LEVEL = 0.95  # of every interval
 WIDE, LEAST_VALUES = 1000, 100
 """From so many numbers on in a picture or gradient it is looked at how many of them hold its error. Below so many, in
 all measurements together, a few noisy pixels decide it, and an interval would cover the truth too seldom
 (`benchmarks/precision.py --intervals`)."""
-AGREES = 0.1
-"""How far a slope may be from theory, whatever its interval."""
-MONTE_CARLO = -0.5
-"""Slope of the error of a mean of independent samples against their number."""
-FURTHEST = 16.0
-"""Times the largest measured sample count beyond which nothing is said."""
-LEAST_POINTS = 3
-"""Of a fit."""
+AGREES = 0.1  # how far a slope may be from theory, whatever its interval
+MONTE_CARLO = -0.5  # slope of the error of a mean of independent samples against their number
+FURTHEST = 16.0  # times the largest measured sample count beyond which nothing is said
+LEAST_POINTS = 3  # of a fit
 
 
 @dataclass(frozen=True)
-class Setting:
+class SampleSetting:
     """One way to compute a quantity: an estimator at a sample count. `cost` is what it should take, in any one unit,
     and `family` what it is recommended among."""
 
@@ -61,8 +55,7 @@ class Setting:
 
 @dataclass(frozen=True, eq=False)
 class ReferenceValue:
-    """A value (n,) that stands for the truth: its own `error` relative to its `size`, the norm, from the scatter of
-    independent `parts`."""
+    """A value (n,) that stands for the truth: its `error`, over its `size`, the norm, from independent `parts`."""
 
     value: Array
     error: float
@@ -106,7 +99,7 @@ def reference_of(
     return ReferenceValue(value, _ratio(math.hypot(scatter, bend, bias), size), size, count)
 
 
-def point_of(setting: Setting, samples: Sequence[Numbers], floor: float = 0.0) -> PrecisionPoint:
+def point_of(setting: SampleSetting, samples: Sequence[Numbers], floor: float = 0.0) -> PrecisionPoint:
     """Return what measurements of a setting say about its error, given the reference's own (`floor`).
 
     The samples' noise and the reference's are independent, so their squares add: error^2 = mean of squares - floor^2.
@@ -121,27 +114,14 @@ def point_of(setting: Setting, samples: Sequence[Numbers], floor: float = 0.0) -
         relative = 0.5 * statistics.stdev(squares) / math.sqrt(len(squares)) / raw
         factor = math.exp(min(50.0, float(stdtrit(len(squares) - 1, (1.0 + LEVEL) / 2.0)) * relative))
         interval = (error / factor, error * factor)
-    times = {
-        name: typical([numbers[name] for numbers in samples])
-        for name in ("seconds", "wall_seconds")
-        if name in samples[0]
-    }
+    timed = [name for name in ("seconds", "wall_seconds") if name in samples[0]]
+    times = {name: typical([numbers[name] for numbers in samples]) for name in timed}
     cosine = [numbers["cosine"] for numbers in samples if "cosine" in numbers]
-    return PrecisionPoint(
-        quantity=setting.quantity,
-        control=setting.control,
-        family=setting.family,
-        estimator=setting.estimator,
-        spp=setting.spp,
-        repeats=len(samples),
-        status="ok" if known else "reference unusable",
-        error=error,
-        interval=interval,
-        reference_error=floor,
-        heavy_tailed=heavy,
-        cosine=statistics.fmean(cosine) if cosine and setting.quantity == "gradient" else None,
-        **times,
-    )
+    status = "ok" if known else "reference unusable"
+    more: dict[str, object] = {"repeats": len(samples), "status": status, "error": error, "interval": interval}
+    more |= {"reference_error": floor, "heavy_tailed": heavy}
+    more["cosine"] = statistics.fmean(cosine) if cosine and setting.quantity == "gradient" else None
+    return PrecisionPoint.of({**vars(setting), **more, **times})
 
 
 def heavy_tailed(samples: Sequence[Numbers]) -> bool:
@@ -180,18 +160,13 @@ def fit_line(points: Sequence[PrecisionPoint], or_steeper: bool | None = None) -
     line = linregress(np.log([float(point.spp) for point in known]), np.log([point.rms for point in known]))
     slope, half = float(line.slope), float(stdtrit(len(known) - 2, (1.0 + LEVEL) / 2.0)) * float(line.stderr)
     off = slope - MONTE_CARLO if or_steeper else abs(slope - MONTE_CARLO)
+    agrees = True if off <= AGREES else None if off <= half else False
     return PrecisionSlope(
-        quantity=known[0].quantity,
-        control=known[0].control,
-        estimator=known[0].estimator,
-        slope=slope,
-        interval=(slope - half, slope + half),
-        offset=float(line.intercept),
-        points=len(known),
-        theory=None if or_steeper is None else MONTE_CARLO,
-        or_steeper=bool(or_steeper),
-        agrees=None if or_steeper is None else True if off <= AGREES else None if off <= half else False,
-    )
+        quantity=known[0].quantity, control=known[0].control, estimator=known[0].estimator, slope=slope,
+        interval=(slope - half, slope + half), offset=float(line.intercept), points=len(known),
+        theory=None if or_steeper is None else MONTE_CARLO, or_steeper=bool(or_steeper),
+        agrees=None if or_steeper is None else agrees,
+    )  # fmt: skip
 
 
 def warning_of(slope: PrecisionSlope, points: Sequence[PrecisionPoint]) -> str | None:
@@ -262,16 +237,12 @@ def reaching(
     if count is None:
         return None
     spp = round_up(ordered[0], count)
+    error = fitted(spp) if explains else _at(ordered, spp, [point.rms for point in ordered], falls)
+    seconds = _at(ordered, spp, [point.seconds for point in ordered], 1.0)
     return Recommended(
-        quantity=ordered[0].quantity,
-        control=ordered[0].control,
-        goal=goal,
-        estimator=ordered[0].estimator,
-        spp=spp,
-        seconds=_at(ordered, spp, [point.seconds for point in ordered], 1.0),
-        error=fitted(spp) if explains else _at(ordered, spp, [point.rms for point in ordered], falls),
-        basis=basis,
-    )
+        quantity=ordered[0].quantity, control=ordered[0].control, goal=goal, estimator=ordered[0].estimator, spp=spp,
+        seconds=seconds, error=error, basis=basis,
+    )  # fmt: skip
 
 
 def confirmed(found: Recommended, point: PrecisionPoint, round_up: RoundUp = exactly) -> Recommended:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections import defaultdict
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -64,8 +65,7 @@ ANY = "*"  # stands for the parameters of a control that does not say beforehand
 
 
 def carried_out(asked: Asked[RecipeConfig]) -> RecipeResult:
-    """Carry out the recipe that a configuration names; parts that are done are not done again. An InputError where a
-    part or a figure does not work; nothing is written where that is seen before."""
+    """Carry out a recipe, but for what is done; what is seen not to work is refused before anything is written."""
     config, resumed, noted = asked.config, asked.resumed, None
     if config.photographs is not None and not Path(config.photographs).is_dir():
         raise InputError(f"photographs: expected a folder, got {config.photographs}")
@@ -74,8 +74,8 @@ def carried_out(asked: Asked[RecipeConfig]) -> RecipeResult:
             noted = store.noted(NOTE)
     where = f"{resumed}: the recipe that it began with"
     recipe = description.recipe_of(noted, where) if noted else description.read_recipe(config.recipe)
-    description.check_powers(recipe, config)
     runs = planned(recipe, config)
+    description.check_powers(recipe, runs, config.recipe)
     if not noted:
         check_described(recipe, config)
         check_figures(recipe, check_runs(runs), config.recipe)
@@ -85,31 +85,22 @@ def carried_out(asked: Asked[RecipeConfig]) -> RecipeResult:
         asked.ending = INTERRUPTED
     elif config.photographs is not None:
         warnings += _take(Path(config.photographs), _photographed(recipe, [run for run, _ in done]), asked.run)
-    figures = [] if asked.ending == INTERRUPTED else list(_figures(recipe, config, done, asked.run))
     settings = description.made_of(recipe, config).settings
-    controls = [name for run, _ in done for name in run.config.controls]
+    usual = {"object": "", "environment": DEFAULT_ENVIRONMENT, "model": "reference"}
+    listed = {name: description.names_listed(settings.get(name) or other) for name, other in usual.items()}
     warnings += [text for _, result in done for text in getattr(result, "warnings", ())]
-    parts = [
-        RecipePart.of({
-            **vars(run), "command": run.config.command, "object": run.config.object, "ending": result.ending,
-            "renders": sum(result.renders.values()),
-        })
-        for run, result in done
-    ]  # fmt: skip
     result = asked.result(
-        RecipeResult,
-        recipe=config.recipe,
-        title=recipe.title,
-        about=recipe.about,
-        quick=config.quick,
-        objects=description.names_listed(settings["object"]),
-        environment=",".join(description.names_listed(settings.get("environment") or DEFAULT_ENVIRONMENT)),
-        model=",".join(description.names_listed(settings.get("model") or "reference")),
-        controls=list(dict.fromkeys(controls)),
-        parts=parts,
-        figures=figures,
+        RecipeResult, recipe=config.recipe, title=recipe.title, about=recipe.about, quick=config.quick,
+        objects=listed["object"], environment=",".join(listed["environment"]), model=",".join(listed["model"]),
+        controls=list(dict.fromkeys(name for run, _ in done for name in run.config.controls)),
+        parts=[
+            RecipePart(name=run.name, part=run.part, command=run.config.command, object=run.config.object,
+                       ending=result.ending, renders=sum(result.renders.values()))
+            for run, result in done
+        ],
+        figures=[] if asked.ending == INTERRUPTED else list(_figures(recipe, config, done, asked.run)),
         warnings=list(dict.fromkeys(warnings)),
-    )
+    )  # fmt: skip
     if resumed is not None and (resumed / SUMMARY).is_file():  # a run that was killed has not noted any seconds
         result.seconds["total"] += getattr(read_result(resumed), "seconds", {"total": 0.0})["total"]
     return result
@@ -134,17 +125,17 @@ def check_described(recipe: Recipe, config: RecipeConfig) -> None:
 
 
 def check_runs(runs: Sequence[PlannedRun]) -> dict[str, set[str]]:
-    """Load everything that the runs name, as a wrong name or label would end hours of rendering; for each part the
-    parameters that its rows will have."""
-    known, columns = dict[str, set[str]](), dict[str, set[str]]()
+    """Load all that the runs name, as a wrong name would end hours of rendering; return each part's parameters."""
+    known, columns = dict[str, set[str]](), defaultdict[str, set[str]](set)
     searches = {run.name: run.config for run in runs}
     for run in runs:
         plain = {name: value for name, value in run.config.plain().items() if name not in ("seed", WORKERS)}
         same = f"{plain} {run.around}"
         if same not in known:
             known[same] = _check_run(run.config, searches[run.around] if run.around else None)
-        counted = {WORKERS} if getattr(run.config, WORKERS, None) is not None else set()
-        columns[run.part] = columns.get(run.part, set()) | known[same] | counted
+        columns[run.part] |= known[same]
+        if getattr(run.config, WORKERS, None) is not None:
+            columns[run.part].add(WORKERS)
     return columns
 
 
@@ -155,34 +146,34 @@ def _check_run(config: SceneConfig, search: SceneConfig | None) -> set[str]:
         space = job.space(job.places[0], job.sizes[0])
         halfway = torch.full_like(space.start, 0.5)
         return {name for u in (space.start, halfway) for name in space.describe(u)}
-    if search is None and isinstance(config, AttackConfig):
+    names = set[str]()
+    if search is None:
+        names.add(TRIAL)  # rows of an attack are its trials
+        assert isinstance(config, AttackConfig)
         check_from_config(config)
-    found = {TRIAL} if search is None else set[str]()  # rows of an attack are its trials
     source = search or config
     for name in (*source.controls, *getattr(source, "over", {})):
         declared = CONTROLS[kind].parameters if (kind := name.partition(":")[0]) in CONTROLS else ()
-        found |= {f"{name}.{parameter.name}" for parameter in declared} or {f"{name}.{ANY}"}
-    return found
+        names |= {f"{name}.{parameter.name}" for parameter in declared} or {f"{name}.{ANY}"}
+    return names
 
 
 def check_figures(recipe: Recipe, columns: Mapping[str, Collection[str]], where: str) -> None:
-    """Refuse, by an InputError, a figure of a part or of a column that there is not. `columns` are the parameters that
-    the rows of each part will have, and `where` is the recipe."""
+    """Refuse, by an InputError, a figure of a part or a column that there is not; `columns` are those of each part."""
     known = {*OUTER, *([frame.GROUP] if recipe.groups else [])}
     for number, described in enumerate(recipe.figures, start=1):
         kind, options = read_options(described, where)
         place, beside = f"It stands in {where}, figure {number} ({kind})", getattr(options, "beside", None)
-        for option, parts in (("of", options.of), ("beside", [beside] if beside else [])):
-            for part in parts:
-                if part not in (*recipe.parts, PHOTOGRAPHS):
-                    raise UnknownNameError("part", part, [*recipe.parts, PHOTOGRAPHS], f"{place}, as `{option}`.")
+        for option, part in [*(("of", part) for part in options.of), *([("beside", beside)] if beside else [])]:
+            if part not in (*recipe.parts, PHOTOGRAPHS):
+                raise UnknownNameError("part", part, [*recipe.parts, PHOTOGRAPHS], f"{place}, as `{option}`.")
         shown = {part: has for part, has in columns.items() if part != beside and part in (options.of or columns)}
-        for option in NAMING:
+        for option in NAMING if shown else ():
             value = getattr(options, option, None) or ()
             for column in [value] if isinstance(value, str) else value:
                 names = {column, f"{column.partition('.')[0]}.{ANY}"}
                 lacking = [part for part, has in shown.items() if column not in known and not names & {*has}]
-                if shown and len(lacking) == len(shown):
+                if len(lacking) == len(shown):
                     others = {name for has in shown.values() for name in has if not name.endswith(ANY)}
                     raise UnknownNameError("column", column, known | others, f"{place}, as `{option}`.")
                 if lacking:
@@ -196,12 +187,11 @@ def _photographed(recipe: Recipe, runs: Sequence[PlannedRun]) -> list[PlannedRun
 
 
 def _carried_out(runs: Sequence[PlannedRun], asked: Asked[RecipeConfig]) -> tuple[list[DoneRun], list[str]]:
-    """Carry out the runs that are not done, until one is interrupted; return all that there are, and a sentence for
-    each that cannot be carried out after another one's result."""
+    """Carry out what is not done, until a run is interrupted; return the runs, and a sentence for each left out."""
     done, left_out, folder = list[DoneRun](), list[str](), asked.run.path / PARTS
-    for number, run in enumerate(runs):
+    for number, run in enumerate(runs, start=1):
         config = run.config
-        asked.progress.message(f"run {number + 1} of {len(runs)}: {run.part}, {config.object}")
+        asked.progress.message(f"run {number} of {len(runs)}: {run.part}, {config.object}")
         if run.around is not None:
             search = attack_of(folder / run.around)
             if search.distribution is None:
@@ -226,7 +216,7 @@ def around(config: SceneConfig, distribution: SearchDistribution, searched: Mapp
     controls: dict[str, dict[str, object]] = {}
     for (name, mean), deviation in zip(distribution.mean.items(), distribution.deviation, strict=True):
         control, _, parameter = name.partition(".")
-        declared = next(one for one in CONTROLS[control].parameters if one.name == parameter)
+        declared = next(known for known in CONTROLS[control].parameters if known.name == parameter)
         ends = searched[name].low, searched[name].high, mean.value
         low, high, at = (math.log(value) if declared.log else float(value) for value in ends)  # type: ignore[arg-type]
         wide = math.sqrt(3.0) * deviation * (high - low)
@@ -254,31 +244,28 @@ def _take(folder: Path, wanted: Sequence[PlannedRun], run: RunDirectory) -> list
 def _figures(
     recipe: Recipe, config: RecipeConfig, done: Sequence[DoneRun], kept: RunDirectory
 ) -> Iterator[RecipeFigure]:
-    """Make and draw the figures of a recipe."""
-    rows, units, surfaces, number = list[dict[str, Any]](), dict[str, str](), {}, 0
+    rows, units, surfaces = list[dict[str, Any]](), dict[str, str](), dict[str, Any]()
     for run, result in done:
-        swept = isinstance(result, SweepSummary)
-        kinds = {run.part: ("sweep",), PHOTOGRAPHS: (PHOTO, LOOSE_PHOTO)} if swept else {run.part: tuple(TRIALS)}
+        kinds: dict[str, Sequence[str]] = {run.part: tuple(TRIALS)}
+        if isinstance(result, SweepSummary):
+            kinds = {run.part: ("sweep",), PHOTOGRAPHS: (PHOTO, LOOSE_PHOTO)}
+            surfaces |= {run.name: result.surface} if result.surface else {}
         workers = getattr(run.config, WORKERS, None)
-        for part, named in kinds.items():
-            found, of_found = read_rows(part, kept.path / PARTS / run.name, result, run.config.seed, named)
-            rows += [row if workers is None else {**row, WORKERS: workers} for row in found]
-            units |= of_found
-        if isinstance(result, SweepSummary) and result.surface:
-            surfaces[run.name] = result.surface
+        more = {} if workers is None else {WORKERS: workers}
+        for part, names in kinds.items():
+            stored, of_them = read_rows(part, kept.path / PARTS / run.name, result, run.config.seed, names, **more)
+            rows, units = rows + stored, units | of_them
     table = frame_of(rows, recipe.groups, units=units, surfaces=surfaces, cores=cores(), folder=kept.path)
-    for described in recipe.figures:
-        kind, options = read_options(described, config.recipe)
-        for made in make(table, kind, options):
-            number += 1
-            for suffix, data in files_of(made).items():
-                write_bytes(kept.path / IMAGES / f"figure-{number}.{suffix}", data)
-            yield RecipeFigure.of({"figure": kind, **vars(made)})
+    figures = [read_options(described, config.recipe) for described in recipe.figures]
+    every = ((kind, made) for kind, options in figures for made in make(table, kind, options))
+    for number, (kind, made) in enumerate(every, start=1):
+        for suffix, data in files_of(made).items():
+            write_bytes(kept.path / IMAGES / f"figure-{number}.{suffix}", data)
+        yield RecipeFigure.of({"figure": kind, **vars(made)})
 
 
 def read_options(described: Mapping[str, object], where: str) -> tuple[str, Options]:
-    """Return the kind of a figure and its options, as they stand in the recipe `where`; an UnknownNameError or a
-    FileFormatError where there is none of that kind, or such an option."""
+    """Return the kind of a figure and its options; refuse a kind that there is not, or such an option."""
     kind = str(described.get("figure", ""))
     if kind not in FIGURES:
         raise UnknownNameError("figure", kind, FIGURES, f"It stands in {where}.")
@@ -289,19 +276,18 @@ def read_options(described: Mapping[str, object], where: str) -> tuple[str, Opti
 
 
 def make(rows: Rows, kind: str, options: Options) -> Iterator[MadeFigure]:
-    """Yield a figure; where it does not tell several models apart, one of each. An InputError where it needs what the
-    predictions do not have."""
+    """Yield a figure, or one for each model; an InputError where it needs what the predictions do not have."""
     parts, made = rows[frame.PART], FIGURES[kind][1]
     shown = rows[parts.isin(options.parts) if options.parts else parts != PHOTOGRAPHS]
     together = kind in TOGETHER or frame.MODEL in vars(options).values() or frame.MODEL not in shown
     models = {"": shown} if together else frame.by(shown, frame.MODEL)
     for name, some in models.items():
         figure = made(some, options)
-        yield figure if len(models) == 1 else replace(figure, title=f"{figure.title}: {name}")
+        title = options.title or figure.title
+        yield replace(figure, title=title if len(models) == 1 else f"{title}: {name}")
 
 
 def files_of(made: MadeFigure) -> Figures:
-    """Return a figure as files."""
 
     def draw(figure: Any) -> None:
         figure.suptitle(made.title, x=0.01, ha="left", fontsize=10, fontweight="bold")

@@ -1,12 +1,9 @@
-"""A recipe as its YAML file describes it, and the runs that it comes to.
-
-A part is carried out once for each object, as a run of its command; figures are made of their results.
-"""
+"""A recipe as its YAML file describes it, and the runs that it comes to: a part is carried out once for each object."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from importlib import resources
 from itertools import product
@@ -40,9 +37,8 @@ class _Described(BaseModel):
 
 
 class Part(_Described):
-    """Runs of one command, one for each object, with settings over those that all parts have. What it draws is drawn
-    from the distributions that the searches of the part `around` answer with; or it draws the very configurations that
-    the part `drawn_as` does, which has the same ranges."""
+    """Runs of one command, one for each object. It draws from the distributions that the searches of the part `around`
+    found, or the very configurations that the part `drawn_as` does, which has the same ranges."""
 
     command: Literal["attack", "sweep"]
     settings: Settings = Field(default_factory=dict)
@@ -101,7 +97,6 @@ class Recipe(_Described):
         return value
 
     def made_quick(self) -> Recipe:
-        """Return it with what `quick` makes different."""
         for name in (*self.quick.parts, *self.quick.without):
             if name not in self.parts:
                 raise UnknownNameError("part", name, self.parts, "It stands under `quick` in the recipe.")
@@ -114,25 +109,21 @@ class Recipe(_Described):
 
 
 def recipe_names() -> tuple[str, ...]:
-    """Return the names of the bundled recipes."""
     return tuple(sorted(path.name[:-5] for path in BUNDLED.iterdir() if path.name.endswith(".yaml")))
 
 
 def titles() -> dict[str, str]:
-    """Return the question of each bundled recipe."""
     return {name: read_recipe(name).title for name in recipe_names()}
 
 
 def recipe_yaml(name: str) -> str:
-    """Return the YAML of a bundled recipe."""
     if name not in recipe_names():
         raise UnknownNameError("recipe", name, recipe_names(), "A recipe of your own is a YAML file: give its path.")
     return str((BUNDLED / f"{name}.yaml").read_text(encoding="utf-8"))
 
 
 def read_recipe(name: str) -> Recipe:
-    """Return a bundled recipe by its name, or that of a YAML file: it has a suffix, or a folder before it. An
-    UnknownNameError or a FileFormatError where there is none, or as for `recipe_of`."""
+    """Return a bundled recipe by its name, or that of a YAML file: it has a suffix, or a folder before it."""
     if is_file_name(name):
         return recipe_of(read_yaml(name), name)
     recipe_yaml(name)
@@ -141,13 +132,11 @@ def read_recipe(name: str) -> Recipe:
 
 
 def is_file_name(name: str) -> bool:
-    """Return whether what was asked for is a file, not a name."""
     return "/" in name or Path(name).suffix != ""
 
 
 def recipe_of(data: Mapping[str, object], where: str) -> Recipe:
-    """Return the recipe that a mapping describes, as it stands in the file `where`; a FileFormatError where something
-    is missing, unknown, or of another kind."""
+    """Return the recipe that a mapping in the file `where` describes; a FileFormatError where it describes none."""
     try:
         return Recipe(**{name: value for name, value in data.items() if name not in ("schema", "command")})
     except ValidationError as error:
@@ -164,8 +153,7 @@ def first_of(error: ValidationError) -> str:
 
 @dataclass(frozen=True)
 class PlannedRun:
-    """One run of a recipe; `around` is the folder of the run whose result says what is drawn, None where the settings
-    say it."""
+    """One run of a recipe; `around` is the folder of the run whose result says what is drawn."""
 
     name: str
     part: str
@@ -176,19 +164,42 @@ class PlannedRun:
 def planned(recipe: Recipe, config: RecipeConfig) -> list[PlannedRun]:
     """Return the runs of a recipe in the order in which they are carried out; an InputError names a part with a setting
     that its command has not. A run is about one object; a search, about one environment and one model, too."""
-    chosen = made_of(recipe, config)
-    runs = [run for name in chosen.parts for run in _runs(chosen, name, config)]
+    chosen, runs = made_of(recipe, config), list[PlannedRun]()
+    for name, part in chosen.parts.items():
+        where, kind = f"{config.recipe}: parts: {name}", CONFIGS[part.command]
+        settings = {**chosen.settings, **part.settings}
+        usual = {"environment": DEFAULT_ENVIRONMENT, "model": "reference"} if part.command == "attack" else {}
+        axes = {axis: names_listed(settings.get(axis) or names) for axis, names in {"object": "", **usual}.items()}
+        for number, values in enumerate(product(*axes.values())):
+            own: Settings = dict(zip(axes, values, strict=True))
+            words = [word for axis, word in zip(axes, values, strict=True) if axis == "object" or len(axes[axis]) > 1]
+            # a seed of its own, so that no two runs draw the same
+            own["seed"] = seeds.stream(config.seed, f"recipe {part.drawn_as or name} {number}")
+            own |= {"deterministic": True} if config.deterministic else {"threads": config.threads}
+            if (label := config.label_of(str(own["object"]))) is not None:
+                own["label"] = label
+            try:
+                made = kind(**{**settings, **own})
+            except SettingsError as error:
+                raise SettingsError(error.problems, where) from None
+            except UnknownNameError:
+                raise
+            except InputError as error:
+                raise InputError(f"{where}: {error}") from None
+            assert isinstance(made, SceneConfig)
+            folder = f"{number:02d}-{default_name(words[0], [default_name(word, []) for word in words[1:]])}"
+            runs.append(PlannedRun(f"{name}-{folder}", name, made, part.around and f"{part.around}-{folder}"))
     if len(runs) > MOST_RUNS:
         raise InputError(f"{config.recipe}: expected at most {MOST_RUNS} runs, got {len(runs)}; name fewer objects")
     return runs
 
 
-def check_powers(recipe: Recipe, config: RecipeConfig) -> None:
+def check_powers(recipe: Recipe, runs: Iterable[PlannedRun], name: str) -> None:
     """Refuse, by an InputError, a part that would do more than its run: connect, or start more processes than there are
     processors. A bundled recipe may."""
-    if is_file_name(config.recipe) or recipe != read_recipe(config.recipe):
-        for run in planned(recipe, config):
-            run.config.check_powers(f"{config.recipe}: parts: {run.part}")
+    if is_file_name(name) or recipe != read_recipe(name):
+        for run in runs:
+            run.config.check_powers(f"{name}: parts: {run.part}")
 
 
 def made_of(recipe: Recipe, config: RecipeConfig) -> Recipe:
@@ -205,31 +216,3 @@ def made_of(recipe: Recipe, config: RecipeConfig) -> Recipe:
 def names_listed(value: object) -> list[str]:
     """Return names that stand in a list, or in a text with commas between them."""
     return [str(name) for name in value] if isinstance(value, (list, tuple)) else list(split_names(str(value)))
-
-
-def _runs(recipe: Recipe, name: str, config: RecipeConfig) -> Iterator[PlannedRun]:
-    part, where = recipe.parts[name], f"{config.recipe}: parts: {name}"
-    kind, settings = CONFIGS[part.command], {**recipe.settings, **part.settings}
-    apart = {"object": ""} | (
-        {"environment": DEFAULT_ENVIRONMENT, "model": "reference"} if part.command == "attack" else {}
-    )
-    axes = {axis: names_listed(settings.get(axis) or usual) for axis, usual in apart.items()}
-    for number, values in enumerate(product(*axes.values())):
-        own: Settings = dict(zip(axes, values, strict=True))
-        words = [value for axis, value in zip(axes, values, strict=True) if axis == "object" or len(axes[axis]) > 1]
-        # a seed of its own, so that no two runs draw the same
-        own["seed"] = seeds.stream(config.seed, f"recipe {part.drawn_as or name} {number}")
-        own |= {"deterministic": True} if config.deterministic else {"threads": config.threads}
-        if (label := config.label_of(str(own["object"]))) is not None:
-            own["label"] = label
-        try:
-            made = kind(**{**settings, **own})
-        except SettingsError as error:
-            raise SettingsError(error.problems, where) from None
-        except UnknownNameError:
-            raise
-        except InputError as error:
-            raise InputError(f"{where}: {error}") from None
-        assert isinstance(made, SceneConfig)
-        folder = f"{number:02d}-{default_name(words[0], [default_name(word, []) for word in words[1:]])}"
-        yield PlannedRun(f"{name}-{folder}", name, made, part.around and f"{part.around}-{folder}")

@@ -30,8 +30,8 @@ of an attack it is, the model, and the number of processes that shared a sweep, 
 
 OTHERS = "other objects"
 
-CLEAN = dict.fromkeys(("first control", "control"), "clean scene")
-TRIALS = {**CLEAN, "verification": "answer", "baseline verification": "random search"}
+TRIALS = {"first control": "clean scene", "control": "clean scene", "verification": "answer",
+          "baseline verification": "random search"}  # fmt: skip
 """The rows of an attack that are in the frame, and what figures call them."""
 
 COUNT = ["of", "share", "low", "high"]  # columns of a count behind the one of what is counted
@@ -47,37 +47,30 @@ def read_rows(
     (`object`, `environment`, `model`, and parameters), what was said of it (`answer`, `correct`, `margin`), the `time`
     when it was stored, seconds since 1970, and the `unit` of what it shares with rows that are not independent of it:
     draws of one seed are the same ones, also in another part."""
-    rows, units = list[dict[str, Any]](), dict[str, str]()
+    rows, units, drawn, alike = list[dict[str, Any]](), dict[str, str](), None, 1
     with Store(folder / NAME, read_only=True) as store:
-        drawn, alike = None, 1
-        if swept := isinstance(summary, SweepSummary):
+        if isinstance(summary, SweepSummary):
             # without draws, samples of a point differ by noise alone
             drawn, alike = units_of(store), 1 if summary.sampler is not None else summary.samples
         for row in store.rows():
             if row.kind not in kinds or (row.kind == "sweep" and row.label == OUT_OF_VIEW):
                 continue
-            values = {name: told["value"] for name, told in row.values.items()}
-            units |= {name: told["unit"] for name, told in row.values.items()}
+            values: dict[str, Any] = {name: about["value"] for name, about in row.values.items()}
+            units |= {name: about["unit"] for name, about in row.values.items()}
             unit = f"{folder.name} {row.kind} {row.id}"
             if row.kind == "sweep" and drawn is not None:
                 unit = f"{seed} {drawn.of(row.step) // alike}"
-            if not swept:
+            if isinstance(summary, AttackSummary):
                 values[TRIAL], unit = TRIALS[row.kind], f"{seed} {row.step}"
             for name in ("object", "environment", MODEL):
                 values[name] = figure_value(str(values.get(name, getattr(summary, name))))
-            said = {
-                PREDICTION: row.label or "none",
-                "correct": bool(row.correct),
-                "margin": row.margin,
-                "time": row.time,
-            }
-            rows.append({**values, **said, PART: part, "unit": unit, **more})
+            values |= {PREDICTION: row.label or "none", "correct": bool(row.correct), "margin": row.margin}
+            rows.append({**values, "time": row.time, PART: part, "unit": unit, **more})
     return rows, units
 
 
 def frame_of(rows: Iterable[Mapping[str, Any]], groups: Mapping[str, Sequence[str]], **facts: Any) -> Rows:
-    """Return rows as a frame, with the groups of their objects if there are any: their names, each with those of
-    the objects in it. Its ``attrs`` are the facts."""
+    """Return rows as a frame, with the groups that name their objects if there are any; its ``attrs`` are the facts."""
     frame = pd.DataFrame(rows)
     if groups:
         named = {name: group for group, objects in reversed(list(groups.items())) for name in objects}
@@ -113,9 +106,9 @@ def by(rows: Rows, name: str) -> dict[str, Rows]:
     return {figure_value(value): some for value, some in rows.groupby(name, sort=size)}
 
 
-def most_frequent(rows: Rows) -> list[tuple[str, int]]:
-    """Return the predictions with how often each was given, the most frequent first."""
-    return sorted(Counter(rows[PREDICTION]).items(), key=lambda item: (-item[1], item[0]))
+def most_frequent(predictions: Iterable[str]) -> list[tuple[str, int]]:
+    """Return predictions with how often each was given, the most frequent first."""
+    return sorted(Counter(predictions).items(), key=lambda item: (-item[1], item[0]))
 
 
 class Tally:
@@ -169,16 +162,16 @@ def extremes(counts: Sequence[Tally], worst: str, best: str, thing: str, verb: s
         return [f"{count.name}: {count.told(verb)}." for count in known]
     shares = [count.share or 0.0 for count in known]
     low, high = known[int(np.argmin(shares))], known[int(np.argmax(shares))]
-    if min(shares) == max(shares):
+    if low.share == high.share:
         return [f"All {len(known)} {thing} have the same share, {percent(low.share)}: no difference is shown."]
-
-    def named(count: Tally) -> str:
+    named = []
+    for count in (low, high):
         ties = shares.count(count.share or 0.0) - 1
-        return f"is {count.name}" + (f" (as {ties} other{'s' if ties > 1 else ''})" if ties else "")
-
+        also = f" (as {ties} other{'s' if ties > 1 else ''})" if ties else ""
+        named.append(f"is {count.name}{also}: {count.told(verb)}")
     widened = f"the intervals of the two, widened for having been chosen among {len(known)},"
     return [
-        f"{worst} {named(low)}: {low.told(verb)}; {best} {named(high)}: {high.told(verb)}.",
+        f"{worst} {named[0]}; {best} {named[1]}.",
         f"The difference is shown: {widened} do not overlap."
         if low.below(high, len(known))
         else f"No difference between the {thing} is shown: {widened} overlap.",
@@ -197,8 +190,8 @@ def bare(name: str) -> str:
 
 
 class Options(BaseModel):
-    """Options that every figure has: a title, made from the other options where it is empty, and the parts whose
-    rows it shows; all where none is named."""
+    """Options that every figure has: a title in place of its own, and the parts whose rows it shows; all where none is
+    named."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -207,14 +200,12 @@ class Options(BaseModel):
 
     @property
     def parts(self) -> tuple[str, ...]:
-        """The parts whose rows it is made from; none for all that were rendered."""
         return self.of
 
 
 @dataclass(frozen=True)
 class MadeFigure:
-    """A figure: title, sentences, a table of its numbers, and what draws it, but for the title, on a figure of
-    matplotlib of a size in inches."""
+    """A figure: title, sentences, a table of its numbers, what draws all but the title, and its size in inches."""
 
     title: str
     text: Sequence[str]

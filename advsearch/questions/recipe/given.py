@@ -1,13 +1,10 @@
-"""Figures of which predictions are made: the most frequent ones, whether they go by shape or texture, and where in a
-mixture each is given (ternary diagrams)."""
+"""Figures of which predictions are made: the most frequent, by shape or texture, over mixtures (ternary diagrams)."""
 
 from __future__ import annotations
 
 import math
 import random
-from collections import Counter
 from collections.abc import Mapping, Sequence
-from itertools import product
 from statistics import NormalDist
 from typing import Any
 
@@ -33,13 +30,12 @@ class PredictionsOptions(Options):
 
 
 def predictions(rows: Rows, options: PredictionsOptions) -> MadeFigure:
-    """Count the most frequent predictions for each value of something."""
     groups: dict[str, list[tuple[Tally, int]]] = {}  # how often each was given, and how often it was a right one
     for value, some in frame.by(rows, options.by).items():
-        given = {label: some[frame.PREDICTION] == label for label, _ in frame.most_frequent(some)[: options.most]}
-        groups[value] = [
-            (Tally.over(label, some, flags), int(some["correct"][flags].sum())) for label, flags in given.items()
-        ]
+        groups[value] = []
+        for label, _ in frame.most_frequent(some[frame.PREDICTION])[: options.most]:
+            flags = some[frame.PREDICTION] == label
+            groups[value].append((Tally.over(label, some, flags), int(some["correct"][flags].sum())))
     wrong = {value: each[0] for value, each in groups.items() if 2 * each[0][1] < each[0][0].times}
     known, thing = len(groups) - len(wrong), frame.plural(options.by)
     text = [f"For {known} of {len(groups)} {thing} the most frequent prediction is mostly a right one."]
@@ -63,11 +59,9 @@ def predictions(rows: Rows, options: PredictionsOptions) -> MadeFigure:
         axes.set(xlabel="share of predictions; blue: mostly right, red: mostly wrong, grey: others", xlim=(0.0, 1.0))
 
     table = [[value, tally.name, *tally.cells, right] for value, given in groups.items() for tally, right in given]
-    heads, title = (
-        [options.by, "prediction", "given in", *frame.COUNT, "right"],
-        f"Most frequent predictions by {options.by}",
-    )
-    return MadeFigure(options.title or title, text, heads, table, draw, (6.4, 1.2 + 0.3 * len(groups)))
+    heads = [options.by, "prediction", "given in", *frame.COUNT, "right"]
+    title = f"Most frequent predictions by {options.by}"
+    return MadeFigure(title, text, heads, table, draw, (6.4, 1.2 + 0.3 * len(groups)))
 
 
 def fitting(name: str, share: float) -> str:
@@ -92,18 +86,15 @@ class CuesOptions(Options):
 
 
 def cues(rows: Rows, options: CuesOptions) -> MadeFigure:
-    """Count how often the prediction is the object and how often the texture, and which of both foretells predictions
-    better."""
+    """Count how often the prediction is the object and how often the texture, and which of both foretells it better."""
 
-    def says(texture: str, some: Rows) -> Any:  # the whole prediction, or one of the names that it consists of
-        classes = options.classes.get(texture, ())
-        return some[frame.PREDICTION].map(
-            lambda said: any(name.strip() in classes for name in [said, *said.split(",")])
-        )
-
-    textures = frame.by(rows, options.texture)
+    textures, naming = frame.by(rows, options.texture), dict[str, Any]()
+    for texture, some in textures.items():
+        classes = set(options.classes.get(texture, ()))
+        # the whole prediction, or one of the names that it consists of
+        parts = some[frame.PREDICTION].map(lambda label: {label.strip(), *map(str.strip, label.split(","))})
+        naming[texture] = ~parts.map(classes.isdisjoint)
     shapes = {name: Tally.over(name, some) for name, some in textures.items()}
-    naming = {name: says(name, some) for name, some in textures.items()}
     named = {name: Tally.over(name, some, naming[name]) for name, some in textures.items()}
     text = [f"The prediction is the object, whatever its texture: {Tally.over('', rows).told('so')}."]
     if asked := [name for name in textures if options.classes.get(name)]:
@@ -127,7 +118,7 @@ def cues(rows: Rows, options: CuesOptions) -> MadeFigure:
 
     table = [[name, *shapes[name].cells, named[name].times] for name in textures]
     heads, title = [options.texture, "the object", *frame.COUNT, "the texture"], "Predictions by shape and by texture"
-    return MadeFigure(options.title or title, text, heads, table, draw, (6.0, 1.7 + 0.27 * len(textures)))
+    return MadeFigure(title, text, heads, table, draw, (6.0, 1.7 + 0.27 * len(textures)))
 
 
 def predicted(rows: Rows, options: CuesOptions) -> list[tuple[int, int, int]]:
@@ -135,18 +126,17 @@ def predicted(rows: Rows, options: CuesOptions) -> list[tuple[int, int, int]]:
     it; return of each pair how many predictions there are, and how many of them the shape and the texture foretell. A
     cue predicts the most frequent one of as many predictions: those about the same object with other textures, and
     about the same texture on other objects, drawn so that both are as many as the fewer are. None of the predicted
-    predictions is among them, so that a model which goes by neither cue is predicted as well by both.
-    """
+    predictions is among them, so that a model which goes by neither cue is predicted as well by both."""
     generator, counts = random.Random(SEED), []
     groups = rows.groupby([frame.column(rows, options.shape), frame.column(rows, options.texture)], sort=False)
     pairs = {pair: list(some[frame.PREDICTION]) for pair, some in groups}
     for (shape, texture), given in pairs.items():
-        same_shape = [one for (s, t), more in pairs.items() if s == shape and t != texture for one in more]
-        same_texture = [one for (s, t), more in pairs.items() if t == texture and s != shape for one in more]
+        same_shape = [label for (s, t), more in pairs.items() if s == shape and t != texture for label in more]
+        same_texture = [label for (s, t), more in pairs.items() if t == texture and s != shape for label in more]
         if drawn := min(len(same_shape), len(same_texture)):
-            each = (Counter(generator.sample(cue, drawn)).items() for cue in (same_shape, same_texture))
-            by_shape, by_texture = (min(cue, key=lambda item: (-item[1], item[0]))[0] for cue in each)
-            counts.append((len(given), given.count(by_shape), given.count(by_texture)))
+            cues = (frame.most_frequent(generator.sample(cue, drawn))[0][0] for cue in (same_shape, same_texture))
+            by_shape, by_texture = map(given.count, cues)
+            counts.append((len(given), by_shape, by_texture))
     return counts
 
 
@@ -183,7 +173,7 @@ Shares = tuple[float, float, float]
 Triangle = tuple[int, int, bool]  # how far along the first and the second share it is, and whether it points down
 MEANINGLESS = (
     "The prediction is {} in every picture, so that shares of predictions tell nothing. Colours are how far the right "
-    "prediction leads the best wrong one: the margin with its sign turned, in logits for a classifier."
+    "prediction leads the best wrong one: the margin, in logits for a classifier."
 )
 
 
@@ -205,32 +195,32 @@ def ternary(rows: Rows, options: TernaryOptions) -> MadeFigure:
     most = mixtures.argmax(axis=1)  # of what most of each mixture is
     corners = all_triangles(options.side)
     places = pd.Series([triangle_of(mixture, options.side) for mixture in mixtures])
-    inside = {triangle: (places == triangle).to_numpy() for triangle in corners}
-    given, lead = frame.most_frequent(rows), -rows["margin"].astype(float).to_numpy()
+    inside = [(places == triangle).to_numpy() for triangle in corners]
+    given, lead = frame.most_frequent(rows[frame.PREDICTION]), rows["margin"].astype(float).to_numpy()
     leads = {name: lead[(most == number) & ~np.isnan(lead)] for number, name in enumerate(names)}
     by_lead = len(given) == 1 and min(map(len, leads.values())) >= 2
-    text, table = list[str](), list[list[frame.Cell]]()
-    panels: dict[str, list[float | None]] = {}
-    for label, times in given[: options.most]:
-        flags = (rows[frame.PREDICTION] == label).to_numpy()
-        values = lead if by_lead else flags
-        known = [values[here & ~np.isnan(values)] for here in inside.values()]
-        panels[label] = [float(some.mean()) if len(some) else None for some in known]
-        if not by_lead:
-            by_most = [Tally.over(name, rows[most == k], flags[most == k]) for k, name in enumerate(names)]
-            whose = f"{label}, {percent(times / len(rows))} of all predictions, is"
-            if len({tally.share for tally in by_most if tally.total}) == 1:
-                text.append(f"{whose} given as often whatever most of the mixture is: no difference is shown.")
-            else:
-                least, most_often = f"{whose} rarest where most of the mixture", "most frequent where most of it"
-                text += frame.extremes(by_most, least, most_often, "ingredients", "given")
-            table += [[label, tally.name, *tally.cells] for tally in by_most]
+    text, table, panels = list[str](), list[list[frame.Cell]](), dict[str, list[float | None]]()
     heads = ["prediction", "where most is", "given in", *frame.COUNT]
     if by_lead:
         text = [MEANINGLESS.format(given[0][0]), _told_leads(leads)]
         heads = ["where most is", "pictures", "mean lead of the right label", "standard error"]
-        table = [[name, len(own), float(own.mean()), _error(own)] for name, own in leads.items()]
-    if empty := sum(not here.any() for here in inside.values()):
+        table = [[name, len(values), float(values.mean()), _error(values)] for name, values in leads.items()]
+    for label, times in given[: options.most]:
+        flags = (rows[frame.PREDICTION] == label).to_numpy()
+        values = lead if by_lead else flags
+        known = [values[here & ~np.isnan(values)] for here in inside]
+        panels[label] = [float(some.mean()) if len(some) else None for some in known]
+        if by_lead:
+            break
+        by_most = [Tally.over(name, rows[most == k], flags[most == k]) for k, name in enumerate(names)]
+        whose = f"{label}, {percent(times / len(rows))} of all predictions, is"
+        if len({tally.share for tally in by_most if tally.total}) == 1:
+            text.append(f"{whose} given as often whatever most of the mixture is: no difference is shown.")
+        else:
+            least, most_often = f"{whose} rarest where most of the mixture", "most frequent where most of it"
+            text += frame.extremes(by_most, least, most_often, "ingredients", "given")
+        table += [[label, tally.name, *tally.cells] for tally in by_most]
+    if empty := sum(not here.any() for here in inside):
         text.append(f"No picture was drawn in {empty} of {len(corners)} parts of the diagram, which are hatched.")
 
     def draw(figure: Any) -> None:
@@ -246,7 +236,7 @@ def ternary(rows: Rows, options: TernaryOptions) -> MadeFigure:
         if not options.normalised:
             figure.colorbar(colours, ax=list(each), shrink=0.7 / len(each), location="bottom", label=label)
 
-    title = options.title or f"Predictions over {', '.join(names)}"
+    title = f"Predictions over {', '.join(names)}"
     return MadeFigure(title, text, heads, table, draw, (max(2.4 * len(panels), 4.8), 3.5))
 
 
@@ -264,32 +254,33 @@ def all_triangles(side: int) -> dict[Triangle, tuple[Shares, Shares, Shares]]:
     def at(x: int, y: int) -> Shares:
         return x / side, y / side, (side - x - y) / side
 
-    found = {}
-    for a, b in product(range(side), range(side)):
-        if a + b >= side:
-            continue
-        found[a, b, False] = at(a, b), at(a + 1, b), at(a, b + 1)
-        if a + b < side - 1:
-            found[a, b, True] = at(a + 1, b + 1), at(a, b + 1), at(a + 1, b)
-    return found
+    corners = {}
+    for a in range(side):
+        for b in range(side - a):
+            corners[a, b, False] = at(a, b), at(a + 1, b), at(a, b + 1)
+            if a + b < side - 1:
+                corners[a, b, True] = at(a + 1, b + 1), at(a, b + 1), at(a + 1, b)
+    return corners
 
 
 def _told_leads(leads: Mapping[str, Doubles]) -> str:
-    """The smallest mean lead beside the largest, by intervals of the normal distribution widened for a choice among
-    all."""
+    """The smallest mean lead beside the largest, by normal intervals widened for a choice among all."""
     least, most = (pick(leads, key=lambda name: leads[name].mean()) for pick in (min, max))
-    wide = NormalDist().inv_cdf(1.0 - (1.0 - CONFIDENCE) / (2.0 * len(leads)))
-    shown = leads[least].mean() + wide * _error(leads[least]) < leads[most].mean() - wide * _error(leads[most])
-    usual = NormalDist().inv_cdf(0.5 + CONFIDENCE / 2.0)
+    usual, wide = (NormalDist().inv_cdf(1.0 - (1.0 - CONFIDENCE) / (2.0 * among)) for among in (1, len(leads)))
 
-    def told(name: str) -> str:
-        mean, half, count = leads[name].mean(), usual * _error(leads[name]), len(leads[name])
-        return f"{name}: {mean:.3g} (95 % interval {mean - half:.3g} to {mean + half:.3g}, {count} pictures)"
+    def ends(name: str, deviations: float) -> tuple[float, float]:
+        mean, half = leads[name].mean(), deviations * _error(leads[name])
+        return mean - half, mean + half
 
+    told = [
+        f"{name}: {leads[name].mean():.3g} (95 % interval {low:.3g} to {high:.3g}, {len(leads[name])} pictures)"
+        for name, (low, high) in ((name, ends(name, usual)) for name in (least, most))
+    ]
+    shown = ends(least, wide)[1] < ends(most, wide)[0]
     verdict = "The difference is shown: {} do not overlap" if shown else "No difference is shown: {} overlap"
     widened = f"their intervals, widened for having been chosen among {len(leads)},"
     return (
-        f"It leads least where most of the mixture is {told(least)}; most where most of it is {told(most)}. "
+        f"It leads least where most of the mixture is {told[0]}; most where most of it is {told[1]}. "
         f"{verdict.format(widened)}."
     )
 
@@ -301,18 +292,17 @@ def _error(values: Doubles) -> float:
 def _panel(
     axes: Any, label: str, values: Sequence[float | None], corners: Sequence[Sequence[Shares]], names: Sequence[str]
 ) -> Any:
-    """Draw a diagram; what is coloured in it is returned."""
     from matplotlib.collections import PolyCollection  # matplotlib takes half a second
 
     def place(shares: Shares) -> tuple[float, float]:  # the first share at the left, the third at the top
         return shares[1] + shares[2] / 2.0, shares[2] * math.sqrt(3.0) / 2.0
 
-    places = [([place(corner) for corner in three], value) for three, value in zip(corners, values, strict=True)]
-    known = [(at, value) for at, value in places if value is not None]
+    known, empty = list[Any](), list[Any]()
+    for three, value in zip(corners, values, strict=True):
+        (empty if value is None else known).append([place(corner) for corner in three])
     coloured = PolyCollection(
-        [at for at, _ in known], array=[value for _, value in known], cmap="viridis", edgecolors="face"
+        known, array=[value for value in values if value is not None], cmap="viridis", edgecolors="face"
     )
-    empty = [at for at, value in places if value is None]
     axes.add_collection(coloured)
     axes.add_collection(PolyCollection(empty, facecolors="#eeeeef", edgecolors="#b9bbc0", hatch="////", linewidth=0))
     outer = [place(corner) for corner in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))]

@@ -1,5 +1,5 @@
-"""Figures of how often: right or wrong predictions by one or two columns, photographs that agree with renderings,
-pictures a second, and parts of a surface that go with wrong predictions."""
+"""Figures of how often: right or wrong predictions, photographs that agree with renderings, pictures a second, and
+parts of a surface that go with wrong predictions."""
 
 from __future__ import annotations
 
@@ -49,7 +49,6 @@ class RatesOptions(Options):
 
 
 def rates(rows: Rows, options: RatesOptions) -> MadeFigure:
-    """Count the predictions and say what the counts show."""
     verb, form, second = "wrong" if options.wrong else "right", options.form, options.series
     beside, rows = rows[rows[frame.PART] == options.beside], rows[rows[frame.PART] != options.beside]
     if rows.empty:
@@ -69,18 +68,17 @@ def rates(rows: Rows, options: RatesOptions) -> MadeFigure:
     if form == "bars" and middles is None and not is_numeric_dtype(frame.column(rows, options.by)):
         cells = dict(sorted(cells.items(), key=lambda item: -(item[1][0].share or 0.0)))
     series, totals = [called(name) for name in lines], counts("all", rows)
-    # a number says what it is of: "severity 3"
-    of_series = [
-        f"{frame.bare(second or '')} {name}" if name[:1] in "-0123456789" and name else name for name in series
-    ]
+    of_what = f"{frame.bare(second or '')} "  # a number says what it is of: "severity 3"
+    of_series = [of_what * (name[:1] in tuple("-0123456789")) + name for name in series]
     thing = frame.plural(options.by) + (f" and {frame.plural(second)}" if second else "")
     apart = {called(options.beside): counts("", beside)} if options.beside and len(beside) else {}
     text = list[str]()
     if form == "map":
-        tallies = [
-            (row, name, tally) for row, each in cells.items() for name, tally in zip(of_series, each, strict=True)
+        pairs = [
+            tally.called(f"{row} with {name}")
+            for row, each in cells.items()
+            for name, tally in zip(of_series, each, strict=True)
         ]
-        pairs = [tally.called(f"{row} with {name}") for row, name, tally in tallies]
         text += frame.extremes(pairs, "The lowest pair", "the highest", f"pairs of {thing}", verb)
     else:
         where = f" where {options.what}" if middles else ""
@@ -124,12 +122,10 @@ def rates(rows: Rows, options: RatesOptions) -> MadeFigure:
         if len(series) > 1 and form != "map":
             figure.legend(loc="outside lower center", ncols=min(len(series), 3))
 
-    size = {
-        "map": (max(2.8 + 0.42 * len(series), 5.4), 1.9 + 0.28 * len(cells)),
-        "lines": (6.0, 3.4),
-        "bars": (6.0, 1.4 + (0.2 + 0.09 * len(series)) * len({**apart, **cells})),
-    }[form]
-    title = options.title or f"{'Error' if options.wrong else 'Accuracy'} by {thing}"
+    size = (6.0, 3.4) if form == "lines" else (6.0, 1.4 + (0.2 + 0.09 * len(series)) * len({**apart, **cells}))
+    if form == "map":
+        size = max(2.8 + 0.42 * len(series), 5.4), 1.9 + 0.28 * len(cells)
+    title = f"{'Error' if options.wrong else 'Accuracy'} by {thing}"
     return MadeFigure(title, text, [options.by, *([second] if second else []), verb, *frame.COUNT], table, draw, size)
 
 
@@ -200,10 +196,8 @@ def agreement(rows: Rows, options: AgreementOptions) -> MadeFigure:
     renderings = rows[rows[frame.PART] == options.of[0]].dropna(axis=1, how="all")
     if renderings.empty:
         raise InputError(f"figures: agreement: expected predictions of a part {options.of[0]!r}, got none")
-    # the values that renderings have; other pictures may have more
-    shared = [
-        name for name in renderings if name not in (frame.PREDICTION, frame.PART, "correct", "margin", "time", "unit")
-    ]
+    of_each = {frame.PREDICTION, frame.PART, "correct", "margin", "time", "unit"}
+    shared = [name for name in renderings if name not in of_each]  # the values of renderings; others may have more
     text, table, series = list[str](), list[list[frame.Cell]](), list[str]()
     bars: dict[str, list[Tally]] = {thing: [] for thing in (ALL, *renderings["object"].unique())}
     for part in (PHOTOGRAPHS, *options.of[1:]):
@@ -243,8 +237,8 @@ def agreement(rows: Rows, options: AgreementOptions) -> MadeFigure:
 
     four_heads = ["right, right", "right, wrong", "wrong, right", "wrong, wrong"]
     heads = ["rendering and", "object", *four_heads, "same prediction", "agree", *frame.COUNT]
-    title = options.title or "Renderings and other pictures of the same"
-    return MadeFigure(title, text, heads, table, draw, (6.0, 1.7 + 0.2 * len(series) + 0.34 * (len(bars) - 1)))
+    size = 6.0, 1.7 + 0.2 * len(series) + 0.34 * (len(bars) - 1)
+    return MadeFigure("Renderings and other pictures of the same", text, heads, table, draw, size)
 
 
 def _where(right: bool, pairs: Rows) -> str:
@@ -259,9 +253,8 @@ def scaling(rows: Rows, options: Options) -> MadeFigure:
     """Measure the pictures a second of sweeps by the number of workers that shared them."""
     if frame.WORKERS not in rows:
         raise InputError("figures: scaling: expected sweeps with `workers` among the parts, got none")
-    runs = rows.groupby([frame.WORKERS, "object"], sort=False)["time"].agg(
-        _rate
-    )  # without rows of sweeps that say none
+    # without rows of sweeps that say none
+    runs = rows.groupby([frame.WORKERS, "object"], sort=False)["time"].agg(_rate)
     by_count = {int(workers): found.droplevel(0) for workers, found in runs.groupby(level=0)}
     fewest, slowest = next(iter(by_count.items()))
     text, table = list[str](), list[list[frame.Cell]]()
@@ -295,7 +288,7 @@ def scaling(rows: Rows, options: Options) -> MadeFigure:
         figure.legend(loc="outside lower center", ncols=2)
 
     heads = ["workers", "object", "pictures a second", "times as many as the fewest workers"]
-    return MadeFigure(options.title or "Pictures a second by number of workers", text, heads, table, draw, (6.0, 3.4))
+    return MadeFigure("Pictures a second by number of workers", text, heads, table, draw, (6.0, 3.4))
 
 
 def _rate(times: Any) -> float:
@@ -333,5 +326,5 @@ def surface(rows: Rows, options: Options) -> MadeFigure:
     ]
     heads = ["object", "model", "parts", "seen", "compared", "with wrong predictions", "with right predictions"]
     text = [sentence for found in surfaces.values() for sentence in surface_sentences(found)]
-    title = options.title or "Which parts of the surface go with wrong predictions"
+    title = "Which parts of the surface go with wrong predictions"
     return MadeFigure(title, text, heads, table, draw, (6.4, 2.65 * len(surfaces)))

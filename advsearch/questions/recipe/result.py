@@ -95,7 +95,6 @@ class RecipeConfig(Config):
     @field_validator("label", mode="before")
     @classmethod
     def _label_for_all(cls, value: Any) -> Any:
-        """Accept one text for all objects."""
         return {ALL_OBJECTS: value} if isinstance(value, str) else value
 
     @field_validator("label")
@@ -107,7 +106,6 @@ class RecipeConfig(Config):
 
     @property
     def title(self) -> tuple[str, ...]:
-        """The recipe's name, and the first object if one was asked for."""
         return (Path(self.recipe).stem, *(Path(name).stem for name in split_names(self.object or "")[:1]))
 
     def label_of(self, name: str) -> str | None:

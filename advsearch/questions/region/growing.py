@@ -28,28 +28,30 @@ from advsearch.questions.sweep.predicting import pays_from
 from advsearch.report.figures import MARGIN, Figures, axis_title, figure_of, heat
 from advsearch.runs.directory import CONFIG, RunDirectory, find_run
 from advsearch.runs.files import write_bytes
-from advsearch.runs.results import CleanScene, Formation, MovedValue
 from advsearch.runs.summary import read_configuration
 from advsearch.scene.surface import renderer as surface_renderer
 from advsearch.scene.surface.arrangement import CAMERAS, FREE
-from advsearch.seeds import stream
 from advsearch.settings import split_names
 
-MOST = 8
-"""A box is grown in at most so many parameters."""
-
-AT_CENTRE = 20
-"""Trials of the centre."""
+MOST = 8  # A box is grown in at most so many parameters
+AT_CENTRE = 20  # Trials of the centre
 
 
 @dataclass(frozen=True, eq=False)
 class Varied:
     """The parameters in which the box grows: their names, (k,) where they lie in u, and the groups of numbers that they
-    belong to."""
+    belong to; and the centre (d,)."""
 
     names: tuple[str, ...]
     places: Tensor
     groups: frozenset[str]
+    centre: Tensor
+
+    def at(self, values: Tensor) -> Tensor:
+        """Return the centre with other values (k,) of these parameters."""
+        u = self.centre.clone()
+        u[self.places] = values
+        return u
 
 
 def region_around(asked: Asked[RegionConfig]) -> RegionResult:
@@ -58,19 +60,19 @@ def region_around(asked: Asked[RegionConfig]) -> RegionResult:
     stages.begin("setup", LOADING)
     budget: dict[str, object] = {}
     if config.around is not None:  # its centre has to lie within
-        theirs = AttackConfig.from_yaml(find_run(config.around) / CONFIG)
-        budget = {"epsilon": theirs.epsilon, "norm": theirs.norm}
+        searched = AttackConfig.from_yaml(find_run(config.around) / CONFIG)
+        budget = {"epsilon": searched.epsilon, "norm": searched.norm}
     problem, warnings = problem_from_config(AttackConfig.of(config, **budget))
     for text in warnings:
         stages.progress.message(text)
     varied = _varied(problem, config)
-    centre = _centre(problem, config)
     verifier = Verifier(Journal(asked.run, Shared(problem)), ladder_of(config), stages)
     findings, grown = verifier.findings, GrownRegion()
     with asked.until_interrupted():
-        grown = _grown(verifier, config, varied, centre, asked.run)
+        grown = _grown(verifier, config, varied, asked.run)
     stages.end()
-    traced = findings.verification_renders + (findings.transport.traced if findings.transport else 0)
+    renders = {"verification": findings.verification_renders, "products": findings.predicted_trials}
+    renders["verification"] += findings.transport.traced if findings.transport else 0
     return asked.result(
         RegionResult,
         **vars(grown),
@@ -78,28 +80,20 @@ def region_around(asked: Asked[RegionConfig]) -> RegionResult:
         model=problem.model.name,
         task=problem.task.title,
         controls=[bound.name for bound in problem.space.controls],
-        image_formation=Formation.of(problem.renderer.formation),
-        clean=CleanScene(moved=[MovedValue.of(one) for one in problem.space.moved]),
+        image_formation=problem.renderer.formation,
+        clean={"moved": problem.space.moved},
         warnings=warnings,
         transport=transport_of(findings) if findings.transport or findings.rendered_because else None,
-        renders={"verification": traced}
-        | ({"products": findings.predicted_trials} if findings.predicted_trials else {}),
+        renders={name: number for name, number in renders.items() if number or name == "verification"},
         seconds={**stages.seconds, "total": stages.total},
     )
 
 
-def _grown(verifier: Verifier, config: RegionConfig, varied: Varied, centre: Tensor, run: RunDirectory) -> GrownRegion:
-    """Look at the centre, grow the box, check it, and draw the map if one was asked for."""
-    problem, stages = verifier.problem, verifier.stages
-    verifier.choose_spp({"centre": centre})
-    verdict, spp = _verdict(verifier, centre), verifier.findings.spp
-    light = _light(verifier, config, varied, centre)
-
-    def at(values: Tensor) -> Tensor:
-        u = centre.clone()
-        u[varied.places] = values
-        return u
-
+def _grown(verifier: Verifier, config: RegionConfig, varied: Varied, run: RunDirectory) -> GrownRegion:
+    stages = verifier.stages
+    verifier.choose_spp({"centre": varied.centre})
+    verdict, spp = _verdict(verifier, varied.centre), verifier.findings.spp
+    light = _light(verifier, config, varied)
     hint = f"pictures of {spp} samples a pixel; fewer parameters in `vary` or `verify_spp` shorten it"
     stages.begin("search", "growing the box", MOST_PROBED * len(varied.names), hint=hint, at_most=True)
     checking = False
@@ -114,12 +108,12 @@ def _grown(verifier: Verifier, config: RegionConfig, varied: Varied, centre: Ten
 
     def same(values: Tensor, number: int) -> bool:
         predictor = None if checking else light
-        (trial,) = verifier.trials("region", {number: at(values)}, sought=False, predictor=predictor)
+        (trial,) = verifier.trials("region", {number: varied.at(values)}, sought=False, predictor=predictor)
         return trial.success == verdict and not trial.not_a_number
 
-    seed = seeds.stream(config.seed, "region")
-    grown = grow(same, centre[varied.places], seed=seed, samples=config.samples, on_check=on_check)
-    box = _box(problem, grown, at, varied)
+    seed, centre = seeds.stream(config.seed, "region"), varied.centre[varied.places]
+    grown = grow(same, centre, seed=seed, samples=config.samples, on_check=on_check)
+    box = _box(verifier.problem, grown, varied)
     return GrownRegion(
         verdict="wrong" if verdict else "right",
         box=box,
@@ -129,13 +123,13 @@ def _grown(verifier: Verifier, config: RegionConfig, varied: Varied, centre: Ten
         interval=grown.interval,
         volume=grown.volume,
         spp=spp,
-        map=_map(verifier, config.map, at, box, run, light) if config.map else None,
+        map=_map(verifier, config.map, varied, box, run, light) if config.map else None,
     )
 
 
-def _light(verifier: Verifier, config: RegionConfig, varied: Varied, centre: Tensor) -> SurfaceLight | None:
-    """What predicts pictures while the box grows, and those of the map, where a camera moves and that pays; fresh
-    samples of the box are rendered (docs/surface-light.md)."""
+def _light(verifier: Verifier, config: RegionConfig, varied: Varied) -> SurfaceLight | None:
+    """What predicts pictures of the growing box and of the map, where a camera moves and that pays
+    (docs/surface-light.md); fresh samples of the box are rendered."""
     problem, stages, findings = verifier.problem, verifier.stages, verifier.findings
     moved = surface_renderer.varied(problem.renderer, varied.groups)
     if not config.specialise or not moved & CAMERAS or not moved <= FREE:
@@ -147,7 +141,7 @@ def _light(verifier: Verifier, config: RegionConfig, varied: Varied, centre: Ten
         reason = f"light on surfaces pays from {least} pictures on"
     if reason is None:
         stages.begin("transport", "finding the light on surfaces", LIGHTS, hint="`specialise=false` leaves it out")
-        light = SurfaceLight(problem, 0, at=centre, places=varied.places)
+        light = SurfaceLight(problem, 0, at=varied.centre, places=varied.places)
         light.prepare(stages.progress.advance)
         findings.transport, reason = light, light.too_far_off
         if reason is None:
@@ -156,29 +150,11 @@ def _light(verifier: Verifier, config: RegionConfig, varied: Varied, centre: Ten
     return None
 
 
-def _centre(problem: Problem, config: RegionConfig) -> Tensor:
-    if config.around is None:
-        return problem.domain.start.clone()
-    values = torch.from_numpy(read_configuration(find_run(config.around)))
-    if values.shape != problem.domain.start.shape:
-        raise InputError(
-            f"`around` {config.around}: expected a run over the same controls, whose configuration has "
-            f"{problem.domain.dim} numbers, got one with {len(values)}; leave `controls` out so that the run's own are "
-            "taken"
-        )
-    return problem.domain.project(values)
-
-
 def _varied(problem: Problem, config: RegionConfig) -> Varied:
-    """Where the parameters lie that the box grows in."""
-    places: dict[str, Tensor] = {}
-    owners: dict[str, str] = {}
+    places: dict[str, tuple[int, str]] = {}
     for group in problem.space.groups:
-        if group.options:
-            continue
-        for number, place in enumerate(torch.arange(group.begin, group.begin + group.size)):
-            name = group.name + (f".{number}" if group.size > 1 else "")
-            places[name], owners[name] = place[None], group.name
+        for number in range(0 if group.options else group.size):
+            places[group.name + (f".{number}" if group.size > 1 else "")] = group.begin + number, group.name
     names = tuple(places) if config.vary is None else split_names(config.vary)
     for name in names:
         if name not in places:
@@ -187,12 +163,22 @@ def _varied(problem: Problem, config: RegionConfig) -> Varied:
         raise InputError(f"vary: expected 1 to {MOST} parameters, got {len(names)}; name some of {', '.join(places)}")
     if config.map and len(names) != 2:
         raise InputError(f"map: expected two parameters in `vary`, got {len(names)}: {', '.join(names)}")
-    return Varied(names, torch.cat([places[name] for name in names]), frozenset(owners[name] for name in names))
+    centre = problem.domain.start.clone()
+    if config.around is not None:
+        values = torch.from_numpy(read_configuration(find_run(config.around)))
+        if values.shape != centre.shape:
+            raise InputError(
+                f"`around` {config.around}: expected a run over the same controls, whose configuration has "
+                f"{problem.domain.dim} numbers, got one with {len(values)}; leave `controls` out so that the run's own "
+                "are taken"
+            )
+        centre = problem.domain.project(values)
+    at, groups = zip(*(places[name] for name in names), strict=True)
+    return Varied(names, torch.tensor(at), frozenset(groups), centre)
 
 
 def _verdict(verifier: Verifier, centre: Tensor) -> bool:
-    """Whether the model is wrong at the centre; an InputError where that depends on the noise, or the prediction is not
-    a number."""
+    """Whether the model is wrong at the centre; refuses where that depends on the noise, or is not a number."""
     verifier.stages.begin("verification", "looking at the centre", AT_CENTRE)
     wrong = nothing = 0
     for trial in verifier.trials("centre", dict.fromkeys(range(AT_CENTRE), centre), sought=False):
@@ -211,8 +197,9 @@ def _verdict(verifier: Verifier, centre: Tensor) -> bool:
     return verdict
 
 
-def _box(problem: Problem, grown: GrownBox, at: Any, varied: Varied) -> list[BoxSide]:
-    ends = [problem.describe(at(values)) for values in (grown.low, grown.high, grown.centre)]
+def _box(problem: Problem, grown: GrownBox, varied: Varied) -> list[BoxSide]:
+    corners = grown.low, grown.high, grown.centre
+    ends = [problem.describe(varied.at(values)) for values in corners]
     rows = []
     for place, name in enumerate(varied.names):
         stem, _, number = name.rpartition(".")
@@ -221,7 +208,7 @@ def _box(problem: Problem, grown: GrownBox, at: Any, varied: Varied) -> list[Box
             low, high, centre = (_number(end[known], number if known == stem else "") for end in ends)
             unit = str(ends[0][known].get("unit", ""))
         else:  # one of many numbers, which nobody describes
-            low, high, centre = (float(side[place]) for side in (grown.low, grown.high, grown.centre))
+            low, high, centre = (float(side[place]) for side in corners)
             unit = "of the range"
         rows.append(BoxSide(name=name, unit=unit, low=low, high=high, centre=centre))
     return rows
@@ -233,24 +220,22 @@ def _number(described: Any, number: str) -> float:
 
 
 def _map(
-    verifier: Verifier, side: int, at: Any, box: Sequence[BoxSide], run: RunDirectory, light: SurfaceLight | None
+    verifier: Verifier, side: int, varied: Varied, box: Sequence[BoxSide], run: RunDirectory, light: SurfaceLight | None
 ) -> MarginMap:
     hint = f"{side * side} pictures of {verifier.findings.spp} samples a pixel; `map` or `verify_spp` shorten it"
     verifier.stages.begin("map", "drawing the map", side * side, hint=hint)
     steps = torch.linspace(0.0, 1.0, side) if side > 1 else torch.tensor([0.5])
-
-    scores = list[float]()
+    margins = list[float]()
     for numbers in batches(0, side * side, most_at_once(verifier.problem.domain.dim)):
-        places = {one: at(torch.stack([steps[one % side], steps[one // side]])) for one in numbers}
-        scores += [trial.score for trial in verifier.trials("map", places, sought=False, predictor=light)]
-    margins = [scores[begin : begin + side] for begin in range(0, len(scores), side)]
-    ends = [verifier.problem.describe(at(torch.full((2,), end))) for end in (0.0, 1.0)]
+        places = {number: varied.at(torch.stack([steps[number % side], steps[number // side]])) for number in numbers}
+        margins += [-trial.score for trial in verifier.trials("map", places, sought=False, predictor=light)]
+    rows = [margins[begin : begin + side] for begin in range(0, len(margins), side)]
+    ends = [verifier.problem.describe(varied.at(torch.full((2,), end))) for end in (0.0, 1.0)]
     axes = []
-    for side_of in box:
-        known = side_of.name in ends[0]
-        low, high = (_number(end[side_of.name], "") for end in ends) if known else (0.0, 1.0)
-        axes.append(AxisRange(name=side_of.name, unit=side_of.unit, low=low, high=high))
-    drawn = MarginMap(axes=(axes[0], axes[1]), margins=margins)
+    for grown in box:
+        low, high = (_number(end[grown.name], "") for end in ends) if grown.name in ends[0] else (0.0, 1.0)
+        axes.append(AxisRange(name=grown.name, unit=grown.unit, low=low, high=high))
+    drawn = MarginMap(axes=(axes[0], axes[1]), margins=rows)
     for suffix, data in map_figure(drawn, box).items():
         write_bytes(run.path / "images" / f"map.{suffix}", data)
     return drawn
@@ -302,10 +287,8 @@ class GrownBox:
         return float((self.high - self.low).prod())
 
 
-LEVELS, ATTEMPTS = 6, 4
-"""How often the step of the faces is halved, and final checks at most."""
-PROBES = 8
-"""Random points at which what a face would win is probed."""
+LEVELS, ATTEMPTS = 6, 4  # How often the step of the faces is halved, and final checks at most
+PROBES = 8  # Random points at which what a face would win is probed
 USUAL, MOST_PROBED = 100, 400
 """Pictures of growing for each parameter, usually and at most: that is more than twice what boxes, balls, planes and
 noise have taken."""
@@ -346,26 +329,27 @@ def grow(
     return GrownBox(centre, low, high, samples - len(wrong), samples, judge.count)
 
 
+@dataclass
 class _Judge:
     """Counts what it judges; every call has a seed of its own."""
 
-    def __init__(self, same: Same, seed: int) -> None:
-        self._same, self._seed = same, seed
-        self.count = self._drawn = 0
+    same: Same
+    seed: int
+    count: int = 0
+    drawn: int = 0
 
     def __call__(self, u: Tensor) -> bool:
         self.count += 1
-        return self._same(u, self.count - 1)
+        return self.same(u, self.count - 1)
 
     def points(self, low: Tensor, high: Tensor, number: int) -> Tensor:
         """(number, d) uniform in a box, other ones at every call."""
-        generator = torch.Generator().manual_seed(stream(self._seed, "region", self._drawn))
-        self._drawn += 1
+        generator = torch.Generator().manual_seed(seeds.stream(self.seed, "region", self.drawn))
+        self.drawn += 1
         return torch.lerp(low, high, torch.rand(number, low.numel(), generator=generator))
 
 
-SHORTEST = 1e-3
-"""A face does not move by less."""
+SHORTEST = 1e-3  # A face does not move by less
 
 
 def _push(judge: _Judge, low: Tensor, high: Tensor, face: int, share: float) -> bool:
@@ -381,13 +365,11 @@ def _push(judge: _Judge, low: Tensor, high: Tensor, face: int, share: float) -> 
     else:
         bottom[axis], top[axis] = low[axis] - step, low[axis]
     points = judge.points(bottom, top, PROBES)
-    points[0, axis] = top[axis] if up else bottom[axis]
+    points[0, axis] = outer = top[axis] if up else bottom[axis]
     if not all(judge(point) for point in points):
         return False
-    if up:
-        high[axis] = top[axis].clamp(max=1.0)
-    else:
-        low[axis] = bottom[axis].clamp(min=0.0)
+    face_at = high if up else low
+    face_at[axis] = outer.clamp(0.0, 1.0)
     return True
 
 
@@ -399,7 +381,5 @@ def _cut(low: Tensor, high: Tensor, centre: Tensor, point: Tensor) -> None:
     loss = torch.where(point > centre, (high - point) / width, (point - low) / width)
     loss = torch.where(point == centre, torch.inf, loss)
     axis = int(loss.argmin())
-    if point[axis] > centre[axis]:
-        high[axis] = torch.lerp(centre[axis], point[axis], 0.98)
-    else:
-        low[axis] = torch.lerp(centre[axis], point[axis], 0.98)
+    face = high if point[axis] > centre[axis] else low
+    face[axis] = torch.lerp(centre[axis], point[axis], 0.98)

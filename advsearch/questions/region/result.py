@@ -10,7 +10,7 @@ from pydantic import Field
 from advsearch.config import DerivativeConfig, SceneConfig
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.report.markup import InNotebook
-from advsearch.report.shown import Claim, Column, Extent, ResultPart, ShownResult, claim, share_text
+from advsearch.report.shown import Claim, Column, ResultPart, ShownResult, claim, counted, share_text
 from advsearch.report.wording import percent
 from advsearch.runs.results import (
     CleanScene,
@@ -152,9 +152,7 @@ def claims(result: RegionResult) -> Iterator[Claim]:
     """Yield in how much of the box the verdict stays."""
     if not result.samples or result.same is None or result.interval is None or result.verdict is None:
         return
-    extent = Extent(
-        what=f"samples that are {result.verdict}", count=result.same, total=result.samples, interval=result.interval
-    )
+    extent = counted(f"samples that are {result.verdict}", result.same, result.samples, result.interval)
     box = ", ".join(f"{side.name} {side.low:.4g} to {side.high:.4g} {side.unit}".strip() for side in result.box or ())
     text = (
         f"Inside {box or 'the box'} the model is {result.verdict} in {share_text(extent)} samples drawn evenly from it."

@@ -3,7 +3,7 @@ pictures."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -25,7 +25,7 @@ from advsearch.progress import Progress, Watched, watcher
 from advsearch.question import Asked, carried_out
 from advsearch.questions.attack.carry_out import LOADING, SEARCHED_WITH, AttackParts, parts_in, problem_of_parts
 from advsearch.questions.attack.result import AttackResult
-from advsearch.questions.attack.summary import AttackSummary, attack_of
+from advsearch.questions.attack.summary import attack_of
 from advsearch.questions.replay.result import NOT_DONE, ReplayConfig, ReplayResult, ReplayRow
 from advsearch.runs.directory import RunDirectory, find_run, only_here
 from advsearch.runs.store import NAME, Store
@@ -33,11 +33,8 @@ from advsearch.runs.summary import MADE_WITH, changed_file
 from advsearch.scene.cycles import BlenderError, Cycles
 from advsearch.scene.renderer import MAX_SPP
 
-OWN = "as verified"
-"""The way in which nothing is changed."""
-
-OWN_LIGHT = "own"
-"""What conditions share whose pictures come of the radiance that the run itself would render."""
+OWN = "as verified"  # The way in which nothing is changed
+OWN_LIGHT = "own"  # What conditions share whose pictures come of the radiance that the run itself would render
 
 QUALITIES = (90, 75, 50)
 
@@ -51,9 +48,7 @@ SENSORS: dict[str, dict[str, float]] = {
 
 CURVES = {"gamma": "a power of 1/2.2 in place of sRGB", "reinhard": "highlights rolled off, x / (1 + x)"}
 """Other tone curves, by `ImageFormation.transfer`."""
-
-SHORT, LONG = 2, 16
-"""Longest light paths in segments: direct light alone, and far more than a run renders."""
+SHORT, LONG = 2, 16  # Longest light paths in segments: direct light alone, and far more than a run renders
 
 
 @dataclass(frozen=True)
@@ -126,22 +121,16 @@ def ways_of(problem: Problem, spp: int, sized: Callable[[tuple[int, int]], Probl
         yield Way("jpeg", f"quality {quality}", same(change=_file(quality)), shares=True)
     for name, values in SENSORS.items():
         yield Way("sensor", name, same(change=_sensor(values)), shares=True)
-    yield _by_blender(problem, spp)
 
-
-def _by_blender(problem: Problem, spp: int) -> Way:
-    renderer, text = problem.renderer, "Cycles, Blender's renderer"
-
-    def condition(name: str) -> RetrialCondition:
+    def by_blender(name: str) -> RetrialCondition:
         return RetrialCondition(name, replace(problem, renderer=renderer.rendered_by(made.radiance)), spp, "blender")
 
-    scene, formation = renderer.scene, renderer.formation
-    denoise = formation.denoiser != "none"
+    denoise, missing = formation.denoiser != "none", ""
     try:
         made = Cycles(scene.made[0], formation.resolution, max_depth=scene.max_depth, denoise=denoise)
     except BlenderError as error:
-        return Way("blender", text, condition, missing=str(error))
-    return Way("blender", text, condition)
+        missing = str(error)
+    yield Way("blender", "Cycles, Blender's renderer", by_blender, missing=missing)
 
 
 def _file(quality: int) -> Callable[[Tensor, int], Tensor]:
@@ -173,13 +162,10 @@ def replay(attack: str | Path | AttackResult, *, progress: Watched = None, **set
 
 def rendered_again(asked: Asked[ReplayConfig], parts: AttackParts | None = None) -> ReplayResult:
     """Render an adversarial scene again as a configuration describes; every trial is stored at once, and a run goes on
-    with the next.
+    with the next. `parts` is what the attack was asked with; None loads what its run names.
 
-    `parts` is what the attack was asked with; None loads what its run names.
-
-    Raises:
-        InputError: the run has no adversarial configuration, or its scene is another one now.
-        FileFormatError: it did not end, or is of another command.
+    Raises InputError where the run has no adversarial configuration, or its scene is another one now, and
+    FileFormatError where it did not end, or is of another command.
     """
     config = asked.config
     asked.progress.stage(LOADING)
@@ -196,13 +182,13 @@ def rendered_again(asked: Asked[ReplayConfig], parts: AttackParts | None = None)
     problem, warnings = again()
     warnings += _changed(folder, parts)
     u = kept_configuration(folder, problem)
-    own, *others = ways_of(problem, _spp(summary), lambda size: again(resolution=size)[0])
-    ways = [own, *(way for way in others if way.name in config.chosen), *_models(config, again, problem, summary)]
-    table = _Table(ways, u, config.trials, seeds.stream(parts.config.seed, "replay"), asked.run, asked.progress)
+    spp = summary.sample_count.spp if summary.sample_count else summary.verified.spp if summary.verified else 64
+    own, *others = ways_of(problem, spp, lambda size: again(resolution=size)[0])
+    ways = [own, *(way for way in others if way.name in config.chosen), *_models(config, again, problem, spp)]
+    table = _Table(u, config.trials, seeds.stream(parts.config.seed, "replay"), asked.run, asked.progress)
     with asked.until_interrupted():
-        table.fill([number for number, way in enumerate(ways) if way.shares])
-        for number in (number for number, way in enumerate(ways) if not way.shares):
-            table.fill([number])
+        for batch in ([way for way in ways if way.shares], *([way] for way in ways if not way.shares)):
+            table.fill(batch)
     return asked.result(
         ReplayResult,
         answer=str(folder),
@@ -212,7 +198,7 @@ def rendered_again(asked: Asked[ReplayConfig], parts: AttackParts | None = None)
         task=summary.task,
         environment=summary.environment,
         controls=summary.controls,
-        table=[row for _, row in sorted(table.rows.items())],
+        table=[table.rows[way] for way in ways if way in table.rows],
         renders=table.renders,
         warnings=warnings,
         seed=parts.config.seed,
@@ -221,57 +207,50 @@ def rendered_again(asked: Asked[ReplayConfig], parts: AttackParts | None = None)
 
 @dataclass
 class _Table:
-    """The rows so far, by the place of their condition among all, for a configuration (d,), and the pictures
-    rendered."""
+    """The rows so far, by their condition, for a configuration (d,), and the pictures rendered."""
 
-    ways: Sequence[Way]
     u: torch.Tensor
     trials: int
     seed: int
     run: RunDirectory
     progress: Progress
-    rows: dict[int, ReplayRow] = field(default_factory=dict)
+    rows: dict[Way, ReplayRow] = field(default_factory=dict)
     renders: int = 0
 
-    def fill(self, batch: Sequence[int]) -> None:
+    def fill(self, ways: Sequence[Way]) -> None:
         """Add the rows of some conditions that share their renders: the clean scene under all of them, then the
         adversarial one. A condition that cannot be had, or that Blender fails at, gets a row that says why."""
-        ways = {number: self.ways[number] for number in batch}
-        missing = next((way.missing for way in ways.values() if way.missing), "")
+        missing = next((way.missing for way in ways if way.missing), "")
         try:
             if not missing:
                 self._try(ways)
         except BlenderError as error:
             missing = str(error)
-        for number, way in ways.items() if missing else ():
-            self.rows[number] = ReplayRow(way=way.name, condition=way.text, ending=NOT_DONE, reason=missing)
+        for way in ways if missing else ():
+            self.rows[way] = ReplayRow(way=way.name, condition=way.text, ending=NOT_DONE, reason=missing)
 
-    def _try(self, ways: Mapping[int, Way]) -> None:
-        text = ", ".join(dict.fromkeys(way.name for way in ways.values()))
-        text += "".join(f": {way.text}" for way in ways.values()) if len(ways) == 1 else ""
+    def _try(self, ways: Sequence[Way]) -> None:
+        text = ", ".join(dict.fromkeys(way.name for way in ways)) + (f": {ways[0].text}" if len(ways) == 1 else "")
         total = 2 * self.trials * len(ways)
         self.progress.stage(f"replaying, {text}", total, hint="`trials` or `ways` shorten it")
-        conditions = {number: way.condition() for number, way in ways.items()}
+        conditions = {way: way.condition() for way in ways}
         renderers = {id(one.problem.renderer): one.problem.renderer for one in conditions.values()}.values()
-        before = sum(one.renders for one in renderers)
+        before = sum(renderer.renders for renderer in renderers)
         retrials = Retrials([*conditions.values()], self.run, self.progress, trials=self.trials, seed=self.seed)
         try:
-            clean = {number: retrials.clean(condition) for number, condition in conditions.items()}
-            for number, condition in conditions.items():
+            clean = {way: control_group(retrials.clean(one), one.spp) for way, one in conditions.items()}
+            for way, condition in conditions.items():
                 checked = retrials.adversarial("answer", self.u, condition)
-                self.rows[number] = ReplayRow(
-                    way=ways[number].name,
-                    condition=ways[number].text,
-                    ending=checked.ending.value,
-                    clean=control_group(clean[number], condition.spp),
-                    verified=verified_rate(checked),
+                ending, rate = checked.ending.value, verified_rate(checked)
+                self.rows[way] = ReplayRow(
+                    way=way.name, condition=way.text, ending=ending, clean=clean[way], verified=rate
                 )
         finally:
-            self.renders += sum(one.renders for one in renderers) - before
+            self.renders += sum(renderer.renders for renderer in renderers) - before
 
 
 def _changed(folder: Path, parts: AttackParts) -> list[str]:
-    """What a reader has to know of a file that was another one when the run was made."""
+    """A caution where a file was another one when the run was made."""
     with Store(folder / NAME, read_only=True) as results:
         noted = results.noted(MADE_WITH)
     before = [one for one in noted if isinstance(one, dict)] if isinstance(noted, list) else []
@@ -281,18 +260,11 @@ def _changed(folder: Path, parts: AttackParts) -> list[str]:
 
 Again = Callable[..., tuple[Problem, list[str]]]
 """The problem of the run with some settings changed, and warnings; see `problem_of_parts`."""
-
-OWN_MODEL = "the run's own"
-"""What no other model is called."""
+OWN_MODEL = "the run's own"  # What no other model is called
 
 
-def _spp(summary: AttackSummary) -> int:
-    return summary.sample_count.spp if summary.sample_count else summary.verified.spp if summary.verified else 64
-
-
-def _models(config: ReplayConfig, again: Again, problem: Problem, summary: AttackSummary) -> Iterator[Way]:
-    """Other models, loaded before anything is rendered; those that are shown pictures as the run's own model is take
-    its renders."""
+def _models(config: ReplayConfig, again: Again, problem: Problem, spp: int) -> Iterator[Way]:
+    """Other models; those that are shown pictures as the run's own model is take its renders."""
     for name in config.models:
         other = again(model=name, ensemble=None)[0]
         shares = other.renderer.formation == problem.renderer.formation
@@ -301,6 +273,6 @@ def _models(config: ReplayConfig, again: Again, problem: Problem, summary: Attac
         source = OWN_LIGHT if shares else name
 
         def condition(title: str, other: Problem = other, source: str = source) -> RetrialCondition:
-            return RetrialCondition(title, other, _spp(summary), source, light=source)
+            return RetrialCondition(title, other, spp, source, light=source)
 
         yield Way("model", name, condition, shares)

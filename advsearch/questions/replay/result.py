@@ -18,7 +18,6 @@ from advsearch.settings import Clash, Config, each_once, setting, setting_as_in,
 
 WAYS = ("samples", "resolution", "depth", "integrator", "sampler", "denoiser", "curve", "jpeg", "sensor", "blender")
 """What a replay may change beside the model."""
-
 REPLAY_TRIALS = 10
 """Half of an attack's: there are many rows, to be compared. The 95 % interval of 10 of 10 begins at 69 %."""
 
@@ -78,8 +77,7 @@ class ReplayConfig(Config):
         return Path(self.attack).name, self.command
 
 
-NOT_DONE = "not done"
-"""How a condition ends that could not be had."""
+NOT_DONE = "not done"  # How a condition ends that could not be had
 
 
 class ReplayRow(Fields):

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from advsearch.cli import output
+from advsearch.cli.commands import Command
 from advsearch.errors import InputError
 
 HELP = "write what runs show, and no more than that, for a model card or a safety case"
@@ -20,8 +21,7 @@ EXAMPLES = (
     "report mug-texture-001 mug-sweep-001 --evidence --criterion 0.9 --out card --json",
 )
 NAME = "evidence"
-POSES, LARGEST_POSES = "poses.csv", 1 << 20
-"""The file that says where photographs were taken, and its most bytes."""
+POSES, LARGEST_POSES = "poses.csv", 1 << 20  # the file that says where photographs were taken, and its most bytes
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -29,17 +29,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("runs", nargs="+", metavar="RUN", help="names or folders of runs; of a recipe, its parts")
     parser.add_argument("--evidence", action="store_true", help="claims with what a reader needs to judge them")
     parser.add_argument("--criterion", metavar="SHARE", type=float, help="share of right predictions that is asked for")
-    parser.add_argument(
-        "--exposure",
-        metavar="FILE",
-        help="how common conditions are: YAML such as environment: {street: 0.8, noon: 0.2}",
+    common = "how common conditions are: YAML such as environment: {street: 0.8, noon: 0.2}"
+    parser.add_argument("--exposure", metavar="FILE", help=common)
+    aligned = (
+        "photographs aligned with renderings of the first run, by their names: rendering-12.jpg, "
+        "rendering-12-again.jpg; its model judges them, and the run keeps them"
     )
-    parser.add_argument(
-        "--photographs",
-        metavar="FOLDER",
-        help="photographs aligned with renderings of the first run, by their names: rendering-12.jpg, "
-        "rendering-12-again.jpg; its model judges them, and the run keeps them",
-    )
+    parser.add_argument("--photographs", metavar="FOLDER", help=aligned)
     parser.add_argument("--by", metavar="NAME", help="who answers for it, as it is to be written", default="")
     parser.add_argument("--out", metavar="FOLDER", help="where the three files go (default: %(default)s)", default=NAME)
     parser.add_argument("--overwrite", action="store_true", help="replace what is there")
@@ -63,7 +59,7 @@ def run(args: argparse.Namespace) -> int:
         )
     folder = Path(args.out)
     names = [folder / f"{NAME}.{suffix}" for suffix in ("html", "md", "json")]
-    there = [one for one in names if one.exists()]
+    there = [name for name in names if name.exists()]
     if there and not args.overwrite:
         raise InputError(f"{there[0]}: exists already; add --overwrite or choose another folder with --out")
     if args.criterion is not None and not 0.0 < args.criterion <= 1.0:
@@ -84,8 +80,8 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         output.print_json(evidence)
         return 0
-    for one in evidence.runs:
-        print("\n".join([one.run, *(f"  {claim.kind}: {claim.statement}" for claim in one.claims)]))
+    for told in evidence.runs:
+        print("\n".join([told.run, *(f"  {claim.kind}: {claim.statement}" for claim in told.claims)]))
     print("".join(f"\nNote: {text}" for text in evidence.warnings))
     print("\n".join(map(str, names)))
     return 0
@@ -104,7 +100,7 @@ def _take_in(folder: str, name: str) -> None:
         if (place / POSES).is_file():
             place = _named_by_pose(place, run, Path(named))
         files = photographs_in(place, task)
-        if loose := [one.name for one in files if not one.stem.startswith("rendering-")]:
+        if loose := [file.name for file in files if not file.stem.startswith("rendering-")]:
             raise InputError(
                 f"photographs: {loose[0]}: expected the number of a rendering in its name, such as rendering-12.jpg, "
                 f"or {POSES} beside it; advsearch dashboard aligns photographs by phone"
@@ -122,19 +118,19 @@ def _named_by_pose(folder: Path, run: Path, out: Path) -> Path:
     from advsearch.runs.store import Store
 
     with Store(run / STORE, read_only=True) as store:
-        rows = [(row.step, {name: one["value"] for name, one in row.values.items()}) for row in store.rows("sweep")]
-    for line, said in enumerate(csv.DictReader(read_text(folder / POSES, "poses", LARGEST_POSES).splitlines()), 2):
-        where, file = f"photographs: {folder / POSES}, line {line}", folder / Path(str(said.pop("file", ""))).name
+        rows = [(row.step, {name: value["value"] for name, value in row.values.items()}) for row in store.rows("sweep")]
+    for line, pose in enumerate(csv.DictReader(read_text(folder / POSES, "poses", LARGEST_POSES).splitlines()), 2):
+        where, file = f"photographs: {folder / POSES}, line {line}", folder / Path(str(pose.pop("file", ""))).name
         if not file.is_file():
             raise InputError(f"{where}: expected the name of a photograph beside it under `file`, got {file.name!r}")
-        found = [step for step, values in rows if all(_is_at(values.get(name), text) for name, text in said.items())]
-        if len(found) != 1:
-            told = ", ".join(f"{name} {text}" for name, text in said.items())
+        steps = [step for step, values in rows if all(_is_at(values.get(name), text) for name, text in pose.items())]
+        if len(steps) != 1:
+            told = ", ".join(f"{name} {text}" for name, text in pose.items())
             raise InputError(
-                f"{where}: expected a pose that one rendering of {run.name} has, got {told}, which {len(found)} have; "
+                f"{where}: expected a pose that one rendering of {run.name} has, got {told}, which {len(steps)} have; "
                 "sweep a grid of the poses"
             )
-        shutil.copyfile(file, out / f"rendering-{found[0]}-{file.name}")
+        shutil.copyfile(file, out / f"rendering-{steps[0]}-{file.name}")
     return out
 
 
@@ -146,3 +142,6 @@ def _is_at(value: object, text: str | None) -> bool:
         return math.isclose(float(str(value)), float(text), rel_tol=1e-3, abs_tol=1e-3)
     except ValueError:
         return False
+
+
+COMMAND = Command(run, (add_arguments,), MORE, EXAMPLES)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import fields
@@ -10,6 +11,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
+import advsearch.questions.report.engineering as engineering
 from advsearch import __version__, rooms
 from advsearch.errors import AdvsearchError
 from advsearch.files import read_bytes
@@ -17,17 +19,7 @@ from advsearch.options import FROM_RUN
 from advsearch.questions.attack import wording as attack_wording
 from advsearch.questions.attack.summary import AttackSummary
 from advsearch.questions.photographs.result import FOLDER, PHOTO, PhotoAgreement
-from advsearch.questions.report.engineering import (
-    Exposure,
-    conditions_of,
-    criterion_lines,
-    domain_of,
-    exposure_lines,
-    not_shown,
-    photograph_conditions,
-    pictures_of,
-    triggering_conditions,
-)
+from advsearch.questions.report.engineering import Exposure
 from advsearch.questions.report.result import CROSSWALK, CROSSWALK_HEADS, Evidence, EvidenceRun
 from advsearch.questions.sweep.summary import SweepSummary
 from advsearch.report import wording
@@ -77,17 +69,16 @@ def photo_claims(photos: PhotoAgreement) -> list[Claim]:
 
 
 def warnings_over(models: Sequence[str], digests: Sequence[str]) -> list[str]:
-    """Return what has to be known of runs together: their models, and the digests of each run's model files, one text a
-    run; empty where none is known."""
-    said = []
-    if len(set(models)) > 1:
-        names = ", ".join(sorted(set(models)))
-        said.append(f"The runs are of different models: {names}. A claim about one is none about another.")
-    for model in sorted(set(models)):
-        known = {text for one, text in zip(models, digests, strict=True) if one == model and text}
+    """Return what has to be known of runs together, from their models and the digests of these files, a text a run."""
+    warnings, names = [], sorted(set(models))
+    if len(names) > 1:
+        different = f"The runs are of different models: {', '.join(names)}."
+        warnings.append(f"{different} A claim about one is none about another.")
+    for name in names:
+        known = {text for model, text in zip(models, digests, strict=True) if model == name and text}
         if len(known) > 1:
-            said.append(f"{model}: its file was not the same in all runs, so that they are of {len(known)} models.")
-    return said
+            warnings.append(f"{name}: its file was not the same in all runs, so that they are of {len(known)} models.")
+    return warnings
 
 
 NOT_NOTED = "not noted: the run is older than that"
@@ -104,7 +95,6 @@ def evidence_of(
     """Return a run with what a reader needs to judge its claims: settings as its run.yaml has them, versions and
     digests as it noted them (empty of older runs), and the options of its task, such as thresholds."""
     values = {field: getattr(result, field) for field in type(result).model_fields}
-
     objects = values.get("object") or ", ".join(values.get("objects") or ())
     right = values.get("label_set") or settings.get("label")
     about = {
@@ -117,7 +107,9 @@ def evidence_of(
         "Counts as right": ", ".join(right) if isinstance(right, list) else str(right or "the object's own label"),
         "Sought": str(values.get("goal") or ""),
     }
-    seconds = values.get("seconds") or {}
+    renders, seconds = values.get("renders"), values.get("seconds") or {}
+    if isinstance(renders, Mapping):
+        renders = ", ".join(f"{number} {name}" for name, number in renders.items() if number) or "none"
     return EvidenceRun(
         run=name,
         command=result.command,
@@ -127,7 +119,10 @@ def evidence_of(
         searched=searched_lines(result, settings),
         measured=_measured(result, settings, judged_by or {}),
         excluded=_excluded(result, claims),
-        cost={"Renders": _renders(values.get("renders")), "Time": wording.seconds_text(seconds.get("total"))},
+        cost={
+            "Renders": "those of its parts" if renders is None else str(renders),
+            "Time": wording.seconds_text(seconds.get("total")),
+        },
         made_with=dict(made) or {"versions and files": NOT_NOTED},
         command_line=str(values.get("command_line") or ""),
     )
@@ -137,7 +132,7 @@ def _lit_by(result: Result) -> str:
     """What lights it, or that this is among what varied."""
     name = str(getattr(result, "environment", "") or "")
     moving = [*getattr(result, "over", ()), *getattr(result, "controls", ())]
-    if not {"environment", "sky"} & {one.partition(":")[0] for one in moving} or not name:
+    if not {"environment", "sky"} & {control.partition(":")[0] for control in moving} or not name:
         return name
     return f"varied, see below; the clean scene has {name}" if isinstance(result, AttackSummary) else f"{name}, varied"
 
@@ -148,50 +143,46 @@ def searched_lines(result: Result, settings: Mapping[str, object]) -> list[str]:
     if isinstance(result, AttackSummary):
         lines.append(attack_wording.changed_text(result))
         lines += [
-            f"{name}: {one.low:.4g} to {one.high:.4g} {one.unit}".rstrip()
-            for name, one in (result.configuration or {}).items()
-            if one.low is not None and one.high is not None
+            f"{name}: {found.low:.4g} to {found.high:.4g} {found.unit}".rstrip()
+            for name, found in (result.configuration or {}).items()
+            if found.low is not None and found.high is not None
         ]
         lines += [attack_wording.over_text(result)] if result.over else []
-        lines += [f"{name}: {_span(one)}, by chance" for name, one in result.conditions.items()]
+        lines += [f"{name}: {_span(varied)}, by chance" for name, varied in result.conditions.items()]
     elif isinstance(result, SweepSummary):
         lines += _axes(result)
-    given = settings.get("controls") or {}
+    controls = settings.get("controls") or {}
     for control in getattr(result, "controls", ()):
-        own = given.get(control) if isinstance(given, Mapping) else None
-        if own:
-            lines.append(f"{control}, as set: {json.dumps(own, ensure_ascii=False)}")
+        given = controls.get(control) if isinstance(controls, Mapping) else None
+        if given:
+            lines.append(f"{control}, as set: {json.dumps(given, ensure_ascii=False)}")
         elif not any(line.startswith((control, f"{control}.")) for line in lines):
             lines.append(f"{control}: everything that it searches by default")
-    for name in ("epsilon", "epsilons"):
-        value = settings.get(name)
-        if value is not None and not isinstance(result, AttackSummary):
-            lines.append(f"{name}: {json.dumps(value)}")
+    for name in () if isinstance(result, AttackSummary) else ("epsilon", "epsilons"):
+        if settings.get(name) is not None:
+            lines.append(f"{name}: {json.dumps(settings[name])}")
     return lines
 
 
 def _axes(result: SweepSummary) -> list[str]:
     """The values of each axis of a sweep: a declared range, or names."""
-    spans: dict[str, list[Any]] = {}
-    units = {row.axis: row.unit for row in result.axes}
+    spans, units, lines = dict[str, list[Any]](), {row.axis: row.unit for row in result.axes}, []
     for row in result.axes:
-        spans.setdefault(row.axis, []).append(row.value)
-    lines = []
+        if row.axis not in result.drawn:
+            spans.setdefault(row.axis, []).append(row.value)
     for axis, values in spans.items():
-        if axis in result.drawn:
-            continue
-        if all(isinstance(one, tuple) for one in values):
-            low, high = min(one[0] for one in values), max(one[1] for one in values)
-            lines.append(f"{axis}: {low:.4g} to {high:.4g} {units[axis]}".rstrip())
+        if not all(isinstance(value, tuple) for value in values):
+            text = ", ".join(map(wording.number_text, values))
         else:
-            lines.append(f"{axis}: {', '.join(map(wording.number_text, values))} {units[axis]}".rstrip())
-    return lines + [f"{name}: {_span(one)}, drawn by chance" for name, one in result.drawn.items()]
+            text = f"{min(low for low, _ in values):.4g} to {max(high for _, high in values):.4g}"
+        lines.append(f"{axis}: {text} {units[axis]}".rstrip())
+    return lines + [f"{name}: {_span(varied)}, drawn by chance" for name, varied in result.drawn.items()]
 
 
-def _span(one: VariedValue) -> str:
-    if one.low is None or one.high is None:
-        return " or ".join(one.names or ["something"])
-    return f"{one.low:.4g} to {one.high:.4g} {'' if one.unit == '1' else one.unit}".rstrip()
+def _span(varied: VariedValue) -> str:
+    if varied.low is None or varied.high is None:
+        return " or ".join(varied.names or ["something"])
+    return f"{varied.low:.4g} to {varied.high:.4g} {'' if varied.unit == '1' else varied.unit}".rstrip()
 
 
 def _measured(result: Result, settings: Mapping[str, object], judged_by: Mapping[str, object]) -> dict[str, str]:
@@ -222,97 +213,61 @@ def _excluded(result: Result, claims: Sequence[Claim]) -> list[str]:
     """What a reader has to know beside the claims: what stood still, what failed, the run's own warnings."""
     lines = ["Nothing varied but what stands under What varied, and the noise of the renders."]
     if isinstance(result, AttackSummary):
-        lines += [one for one in attack_wording.remarks(result) if one not in result.warnings]
+        lines += [remark for remark in attack_wording.remarks(result) if remark not in result.warnings]
         bad = result.non_finite
         if bad.objectives or bad.gradient_elements:
             lines.append(f"Not finite: {bad.objectives} objectives, {bad.gradient_elements} numbers of gradients.")
         lines += [
-            f"The clean scene has {one.parameter} {wording.number_text(one.used)} {one.unit} in place of "
-            f"{wording.number_text(one.scene)}: the control leaves that out."
-            for one in result.clean.moved
+            f"The clean scene has {moved.parameter} {wording.number_text(moved.used)} {moved.unit} in place of "
+            f"{wording.number_text(moved.scene)}: the control leaves that out."
+            for moved in result.clean.moved
         ]
     if isinstance(result, SweepSummary) and result.not_finite:
         lines.append(f"{result.not_finite} predictions were not numbers; they count as not right.")
     if isinstance(result, SweepSummary) and result.looked_at < result.planned:
         lines.append(f"Only {result.looked_at} of {result.planned} planned configurations were looked at.")
-    if all(one.kind == "nothing claimed" for one in claims):
+    if all(claim.kind == "nothing claimed" for claim in claims):
         lines.append("The run carries no claim; it is listed so that it is not left out unseen.")
     return lines + list(getattr(result, "warnings", ()))
 
 
-def _renders(renders: object) -> str:
-    if isinstance(renders, Mapping):
-        return ", ".join(f"{number} {name}" for name, number in renders.items() if number) or "none"
-    return "those of its parts" if renders is None else str(renders)
+SUITE = "suite"  # the note of a run of `test` that has its claims
 
-
-SUITE = "suite"
-"""The note of a run of `test` that has its claims."""
-
-MOST_OF_PICTURE = 16 << 20
-"""Bytes of a picture that is taken along."""
+MOST_OF_PICTURE = 16 << 20  # bytes of a picture that is taken along
 
 
 def collected(
     runs: list[str], *, criterion: float | None = None, exposure: Exposure | None = None, by: str = ""
 ) -> tuple[Evidence, dict[str, bytes]]:
-    """Return runs, by their names or folders, as evidence, with the pictures that it names.
-
-    Args:
-        criterion: share of right predictions that is asked for.
-        exposure: how common the values of axes are (`answer.read_exposure`).
-        by: who answers for it.
-    """
-    folders = {part.resolve(): part for name in runs for part in _with_parts(find_run(name))}
-    found, pictures = list[EvidenceRun](), dict[str, bytes]()
+    """Return runs, by their names or folders, as evidence, with the pictures that it names; `criterion` is the share of
+    right predictions that is asked for, `exposure` how common the values of axes are, and `by` who answers for it."""
+    told, pictures, folders = list[EvidenceRun](), dict[str, bytes](), dict[Path, Path]()
+    models, digests = list[str](), list[str]()
+    for folder in map(find_run, runs):
+        parts = [part for part in sorted((folder / PARTS).glob("*")) if is_run(part)]
+        of_recipe = parts and _settings(folder).get("command") == "recipe"  # the runs that it consists of
+        folders |= {part.resolve(): part for part in (parts if of_recipe else [folder])}
     for number, folder in enumerate(folders.values(), 1):
-        shown = {f"pictures/{number}-{one.name}": read_bytes(one, "a picture", MOST_OF_PICTURE)
-                 for one in pictures_of(folder)}  # fmt: skip
+        shown = {f"pictures/{number}-{file.name}": read_bytes(file, "a picture", MOST_OF_PICTURE)
+                 for file in engineering.pictures_of(folder)}  # fmt: skip
         pictures |= shown
-        one = _run(folder, criterion, exposure or {})
-        found.append(one.model_copy(update={"pictures": list(shown), "begun": _begun(folder)}))
-    models = [one.about.get("Model", "") for one in found]
-    files = [(model, model.rpartition("@")[2]) for model in models]
-    digests = [
-        " ".join(text for name, text in one.made_with.items() if name in own)
-        for one, own in zip(found, files, strict=True)
-    ]
-    warnings = warnings_over([one for one in models if one], [d for d, m in zip(digests, models, strict=True) if m])
-    unused = set(exposure or {}) - {row.axis for one in found for row in one.conditions}
+        run, begun = _run(folder, criterion, exposure or {}), ""
+        with suppress(OSError):  # when its settings were written
+            begun = f"{datetime.fromtimestamp((folder / CONFIG).stat().st_mtime, timezone.utc):%Y-%m-%d %H:%M} UTC"
+        told.append(run.model_copy(update={"pictures": list(shown), "begun": begun}))
+        if model := run.about.get("Model"):
+            files = model, model.rpartition("@")[2]
+            models.append(model)
+            digests.append(" ".join(text for name, text in run.made_with.items() if name in files))
+    warnings = warnings_over(models, digests)
+    unused = set(exposure or {}) - {row.axis for run in told for row in run.conditions}
     warnings += [f"exposure: no run has the axis {axis}." for axis in sorted(unused)]
     evidence = Evidence(
-        runs=found,
-        warnings=warnings,
-        rules=list(RULES),
-        version=__version__,
+        runs=told, warnings=warnings, rules=list(RULES), version=__version__, by=by, criterion=criterion,
         written=f"{datetime.now(timezone.utc):%Y-%m-%d %H:%M} UTC",
-        by=by,
-        criterion=criterion,
         crosswalk=[dict(zip(CROSSWALK_HEADS, row, strict=True)) for row in CROSSWALK],
-    )
+    )  # fmt: skip
     return evidence, pictures
-
-
-def _begun(folder: Path) -> str:
-    """When its settings were written, in UTC."""
-    with suppress(OSError):
-        return f"{datetime.fromtimestamp((folder / CONFIG).stat().st_mtime, timezone.utc):%Y-%m-%d %H:%M} UTC"
-    return ""
-
-
-def _with_parts(folder: Path) -> Iterator[Path]:
-    """A run; in place of a recipe, the runs that it consists of."""
-    parts = [one for one in sorted((folder / PARTS).glob("*")) if is_run(one)]
-    if parts and _settings(folder).get("command") == "recipe":
-        yield from parts
-    else:
-        yield folder
-
-
-def _of_quick_recipe(folder: Path) -> bool:
-    """Whether a run is a part of a recipe that was made with `quick`."""
-    outer = _settings(folder.resolve().parent.parent)
-    return outer.get("command") == "recipe" and outer.get("quick") is True
 
 
 def _settings(folder: Path) -> Mapping[str, object]:
@@ -341,36 +296,42 @@ def _run(folder: Path, criterion: float | None, exposure: Exposure) -> EvidenceR
             made_with=made or {"versions and files": NOT_NOTED},
             command_line=f"advsearch run {folder / CONFIG}",
         )
-    result = read_result(folder)
-    photographs = _photos(folder)
-    found = evidence_of(name, result, [*claims_of(result), *photographs], settings, made, _judged_by(settings))
-    few = [QUICK] if _of_quick_recipe(folder) else []
+    result, photographs, rows = read_result(folder), list[Claim](), list[Row]()
+    if (folder / IMAGES / FOLDER).is_dir():
+        from advsearch.questions.photographs.carry_out import photo_agreement  # it brings torch, which takes a second
+
+        photographs = photo_claims(photo_agreement(folder))
+        with Store(folder / STORE, read_only=True) as store:
+            rows = list(store.rows(PHOTO)) if photographs else []
+    run = evidence_of(name, result, [*claims_of(result), *photographs], settings, made, _judged_by(settings))
+    outer = _settings(folder.resolve().parent.parent)
+    few = [QUICK] if outer.get("command") == "recipe" and outer.get("quick") is True else []
     basis = list(_read_by(result))
-    searched = list(dict.fromkeys(line for one in basis for line in searched_lines(*one)))
-    searched = searched or (_of_a_suite(folder) if result.command == "test" else found.searched)
-    domain, conditions = domain_of(basis[0][0] if basis else result, settings, searched), conditions_of(result)
-    weighted = exposure_lines(result, conditions, exposure)
-    return found.model_copy(
-        update={
-            "searched": searched,
-            "excluded": [*few, *found.excluded],
-            "criterion": [] if criterion is None else criterion_lines(found.claims, conditions, criterion),
-            "triggering": triggering_conditions(result),
-            "exposure": weighted,
-            "conditions": conditions,
-            "photographs": photograph_conditions(result, _photograph_rows(folder)) if photographs else [],
-            "domain": domain,
-            "not_shown": not_shown(
-                domain, sum(one.extent.total for one in photographs if one.extent), weighted=bool(weighted)
-            ),
-        }
-    )
+    searched = list(dict.fromkeys(line for read in basis for line in searched_lines(*read)))
+    searched = searched or (_of_a_suite(folder) if result.command == "test" else run.searched)
+    domain = engineering.domain_of(basis[0][0] if basis else result, settings, searched)
+    conditions = engineering.conditions_of(result)
+    weighted = engineering.exposure_lines(result, conditions, exposure)
+    compared = sum(claim.extent.total for claim in photographs if claim.extent)
+    asked = [] if criterion is None else engineering.criterion_lines(run.claims, conditions, criterion)
+    more = {
+        "searched": searched,
+        "excluded": [*few, *run.excluded],
+        "criterion": asked,
+        "triggering": engineering.triggering_conditions(result),
+        "exposure": weighted,
+        "conditions": conditions,
+        "photographs": engineering.photograph_conditions(result, rows),
+        "domain": domain,
+        "not_shown": engineering.not_shown(domain, compared, weighted=bool(weighted)),
+    }
+    return run.model_copy(update=more)
 
 
 def _read_by(result: Result) -> Iterator[tuple[Result, Mapping[str, object]]]:
-    """The sweeps whose rows a run reads, with their settings, as far as they are to be had: it is about what varied
-    there."""
-    for name in dict.fromkeys([*getattr(result, "sweeps", ()), *(one.run for one in getattr(result, "sides", ()))]):
+    """The sweeps whose rows a run reads, with their settings: it is about what varied there."""
+    sides = [side.run for side in getattr(result, "sides", ())]
+    for name in dict.fromkeys([*getattr(result, "sweeps", ()), *sides]):
         with suppress(AdvsearchError):
             folder = find_run(str(name))
             yield read_result(folder), _settings(folder)
@@ -378,22 +339,23 @@ def _read_by(result: Result) -> Iterator[tuple[Result, Mapping[str, object]]]:
 
 def _of_a_suite(folder: Path) -> list[str]:
     """What the claims of a suite vary, as the run has kept it."""
-    lines = dict[str, list[str]]()
+    lines = defaultdict[str, list[str]](list)
     try:
         with Store(folder / STORE, read_only=True) as store:
             suite: Any = store.noted(SUITE)
         for name, claim in suite["claims"].items():
-            given = {**suite["settings"], **claim["settings"]}
-            controls = given.get("controls") or {}
-            for control in controls if isinstance(controls, Mapping) else str(controls).split(","):
-                own = controls[control] if isinstance(controls, Mapping) else None
-                said = json.dumps(own, ensure_ascii=False) if own else "everything it searches by default"
-                lines.setdefault(f"{control}: {said}", []).append(str(name))
-            if given.get("environment"):
-                lines.setdefault(f"environment: {given['environment']}", []).append(str(name))
+            settings = {**suite["settings"], **claim["settings"]}
+            controls = settings.get("controls") or {}
+            if not isinstance(controls, Mapping):
+                controls = dict.fromkeys(str(controls).split(","))
+            for control, given in controls.items():
+                text = json.dumps(given, ensure_ascii=False) if given else "everything it searches by default"
+                lines[f"{control}: {text}"].append(str(name))
+            if settings.get("environment"):
+                lines[f"environment: {settings['environment']}"].append(str(name))
     except (AdvsearchError, KeyError, AttributeError, TypeError, ValueError):
         return ["as the claims of its suite say, which cannot be read any more"]
-    return [f"{told} ({', '.join(names)})" for told, names in lines.items()]
+    return [f"{line} ({', '.join(names)})" for line, names in lines.items()]
 
 
 def _judged_by(settings: Mapping[str, object]) -> dict[str, object]:
@@ -406,27 +368,14 @@ def _judged_by(settings: Mapping[str, object]) -> dict[str, object]:
 
     with suppress(AdvsearchError):
         task = make_task(given)
-        alone = [("", task)] if not isinstance(task, Together) else [(f"{one.name}.", one) for one in task.parts]
+        alone = {f"{part.name}.": part for part in task.parts} if isinstance(task, Together) else {"": task}
         return {
-            f"{of}{option.name}": getattr(one, option.name)
-            for of, one in alone
-            for option in fields(one)
+            f"{of}{option.name}": getattr(part, option.name)
+            for of, part in alone.items()
+            for option in fields(part)
             if option.metadata != FROM_RUN
         }
     return {}
-
-
-def _photos(folder: Path) -> list[Claim]:
-    if not (folder / IMAGES / FOLDER).is_dir():
-        return []
-    from advsearch.questions.photographs.carry_out import photo_agreement  # it brings torch, which takes a second
-
-    return photo_claims(photo_agreement(folder))
-
-
-def _photograph_rows(folder: Path) -> list[Row]:
-    with Store(folder / STORE, read_only=True) as store:
-        return list(store.rows(PHOTO))
 
 
 def _made_with(folder: Path) -> dict[str, str]:

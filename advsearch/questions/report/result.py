@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from typing import ClassVar
 
 from pydantic import Field
 
 from advsearch.report.markup import Html, element, join_html
 from advsearch.report.shown import Claim
-from advsearch.report.wording import interval_text
+from advsearch.report.wording import count, interval_text
 from advsearch.runs.results import Fields, Interval, Result
 from advsearch.viewer.document import data_url, document, heading, study_table
 
@@ -71,25 +72,14 @@ class Evidence(Result):
 CROSSWALK_HEADS = ("in the evidence", "ISO 21448", "ISO/PAS 8800", "AI Act, article 15")
 # Compared in November 2026 with what is public: article 15 whole; the contents of ISO 21448 (clauses 4 to 8) and of
 # ISO/PAS 8800 (5 to 7), and for its clause 11 a published overview. The other clauses are from memory.
+# fmt: off
 CROSSWALK = (
-    (
-        "What varied, operational design domain",
-        "5 Specification and design",
-        "9 AI safety requirements; 11 data",
-        "15(4) environment of use",
-    ),
-    (
-        "Triggering conditions (rules of explain)",
-        "7 Triggering conditions",
-        "13 safety analysis",
-        "15(4) errors, inconsistencies",
-    ),
-    (
-        "Shares by condition, drives, criterion",
-        "6.5 Acceptance criteria; 10 known scenarios",
-        "12 verification",
-        "15(1), 15(3) accuracy",
-    ),
+    ("What varied, operational design domain", "5 Specification and design", "9 AI safety requirements; 11 data",
+     "15(4) environment of use"),
+    ("Triggering conditions (rules of explain)", "7 Triggering conditions", "13 safety analysis",
+     "15(4) errors, inconsistencies"),
+    ("Shares by condition, drives, criterion", "6.5 Acceptance criteria; 10 known scenarios", "12 verification",
+     "15(1), 15(3) accuracy"),
     ("Searches: found and not found", "11 unknown scenarios", "12 verification", "15(5) adversarial examples"),
     ("Before and after harden", "8 Functional modifications", "10 measures", "15(4) resilience"),
     ("Exposure", "6.4 Risk evaluation", "13 safety analysis", ""),
@@ -97,44 +87,41 @@ CROSSWALK = (
     ("Excluded, not shown, photographs", "12 achievement", "8 assurance argument", "15(3) instructions of use"),
     ("Versions, hashes, commands", "9 strategy", "15 confidence in tools", ""),
 )
+# fmt: on
 NO_CONFORMITY = (
     "The table says under which clause a figure may be read: ISO 21448:2022, ISO/PAS 8800:2024, Regulation (EU) "
     "2024/1689. Of the two standards only clauses 4 to 8 of ISO 21448, and 11 of ISO/PAS 8800, were compared with "
     "published contents: compare the others with your edition. It claims no conformity with any of them."
 )
-CONDITION_HEADS = ("condition", "right", "of", "95 % interval")
-PHOTOGRAPH_HEADS = ("photographs of", "agree", "of", "95 % interval")
 
 
-def condition_rows(conditions: Sequence[ConditionShare]) -> list[list[str]]:
-    """Return a row for each condition, under `CONDITION_HEADS` or `PHOTOGRAPH_HEADS`."""
-    return [[row.condition, str(row.right), str(row.total), interval_text(row.interval)] for row in conditions]
+def tables_of(run: EvidenceRun) -> Iterator[tuple[str, Sequence[str], list[list[str]]]]:
+    """Yield what shares by condition are of, the heads of their table and its rows, of those that a run has."""
+    for title, first, verb, conditions in (
+        ("Right", "condition", "right", run.conditions),
+        ("Photographs that agree", "photographs of", "agree", run.photographs),
+    ):
+        if conditions:
+            rows = [[row.condition, str(row.right), str(row.total), interval_text(row.interval)] for row in conditions]
+            yield title, (first, verb, "of", "95 % interval"), rows
 
 
 def markdown(evidence: Evidence) -> str:
     """Return the whole as Markdown, to be put into a model card."""
-    lines = ["# Evidence", "", *(f"> {one}" for one in evidence.warnings), "" if evidence.warnings else None]
-    for one in evidence.runs:
-        lines += [
-            f"## {_plain(one.run)}",
-            "",
-            *(f"- **{claim.kind}**: {_plain(claim.statement)}" for claim in one.claims),
-            "",
-        ]
-        for heads, conditions in ((CONDITION_HEADS, one.conditions), (PHOTOGRAPH_HEADS, one.photographs)):
-            lines += [*_table(heads, condition_rows(conditions)), ""] if conditions else []
-        lines += [f"![{name}]({name})" for name in one.pictures] + [""] * bool(one.pictures)
-        for title, facts in sections(one).items():
+    lines = ["# Evidence", "", *(f"> {text}" for text in evidence.warnings), *([""] if evidence.warnings else [])]
+    for run in evidence.runs:
+        lines += [f"## {_plain(run.run)}", ""]
+        lines += [*(f"- **{claim.kind}**: {_plain(claim.statement)}" for claim in run.claims), ""]
+        for _, heads, rows in tables_of(run):
+            lines += [*_table(heads, rows), ""]
+        lines += [f"![{name}]({name})" for name in run.pictures] + [""] * bool(run.pictures)
+        for title, facts in sections(run).items():
             lines += [f"{title}:", "", *(f"- {_plain(text)}" for text in facts), ""]
-        lines += (
-            ["To repeat it:", "", "```sh", one.command_line.replace("```", "` ` `"), "```", ""]
-            if one.command_line
-            else []
-        )
+        if run.command_line:
+            lines += ["To repeat it:", "", "```sh", run.command_line.replace("```", "` ` `"), "```", ""]
     lines += ["## How to read this", "", *(f"- {text}" for text in evidence.rules), ""]
     lines += ["## Where it belongs", "", *_table(CROSSWALK_HEADS, CROSSWALK), "", NO_CONFORMITY, ""]
-    lines.append(_signed(evidence))
-    return "\n".join(line for line in lines if line is not None) + "\n"
+    return "\n".join([*lines, _signed(evidence)]) + "\n"
 
 
 def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
@@ -147,31 +134,31 @@ def _signed(evidence: Evidence) -> str:
     return f"Written{by}, {evidence.written or 'at a time that is not noted'}, with advsearch {evidence.version}."
 
 
-def sections(one: EvidenceRun) -> dict[str, list[str]]:
+def sections(run: EvidenceRun) -> dict[str, list[str]]:
     """Return what stands beside the claims of a run, in lines under their headings."""
-    found = {
-        "Criterion": one.criterion,
-        "Triggering conditions": one.triggering,
-        "Exposure": one.exposure,
-        "Operational design domain": [f"{name}: {text}" for name, text in one.domain.items()],
-        "Not shown": one.not_shown,
-        "On what": [f"{name}: {text}" for name, text in one.about.items()],
-        "What varied": one.searched,
-        "Measured how": [f"ended as: {one.ending}", *(f"{name}: {text}" for name, text in one.measured.items())],
-        "Excluded, and to be known": one.excluded,
-        "Budget": [f"{name}: {text}" for name, text in one.cost.items()],
-        "Made with": [f"begun: {one.begun}"] * bool(one.begun)
-        + [f"{name}: {text}" for name, text in one.made_with.items()],
+
+    def named(facts: Mapping[str, str]) -> list[str]:
+        return [f"{name}: {text}" for name, text in facts.items()]
+
+    headed = {
+        "Criterion": run.criterion,
+        "Triggering conditions": run.triggering,
+        "Exposure": run.exposure,
+        "Operational design domain": named(run.domain),
+        "Not shown": run.not_shown,
+        "On what": named(run.about),
+        "What varied": run.searched,
+        "Measured how": named({"ended as": run.ending, **run.measured}),
+        "Excluded, and to be known": run.excluded,
+        "Budget": named(run.cost),
+        "Made with": [f"begun: {run.begun}"] * bool(run.begun) + named(run.made_with),
     }
-    return {title: lines for title, lines in found.items() if lines}
+    return {title: lines for title, lines in headed.items() if lines}
 
 
 def _plain(text: str) -> str:
     """Text that Markdown shows as it is."""
-    one_line = " ".join(text.split())
-    for sign in "\\<>*_[]`|":
-        one_line = one_line.replace(sign, f"\\{sign}")
-    return one_line
+    return re.sub(r"([\\<>*_\[\]`|])", r"\\\1", " ".join(text.split()))
 
 
 CLAIM_HEADS = ("claim", "in words", "counted", "95 % interval")
@@ -179,13 +166,12 @@ CLAIM_HEADS = ("claim", "in words", "counted", "95 % interval")
 
 def evidence_page(evidence: Evidence, pictures: Mapping[str, bytes] | None = None) -> str:
     """Return the page; `pictures` has the contents of those that the runs name."""
-    claims = [claim for one in evidence.runs for claim in one.claims]
+    claims = [claim for run in evidence.runs for claim in run.claims]
     carried = sum(claim.kind != "nothing claimed" for claim in claims)
-    runs = f"{len(evidence.runs)} run{'' if len(evidence.runs) == 1 else 's'}"
-    said = f"What {runs} show{'s' if len(evidence.runs) == 1 else ''}, and no more than that."
+    said = f"What {count(len(evidence.runs), 'run')} show{'s' * (len(evidence.runs) == 1)}, and no more than that."
     main = element(
         "main",
-        *(_run_html(one, pictures or {}) for one in evidence.runs),
+        *(_run_html(run, pictures or {}) for run in evidence.runs),
         element("h2", "How to read this"),
         element("ul", *(element("li", text.replace("`", "")) for text in evidence.rules)),
         element("h2", "Where it belongs"),
@@ -196,50 +182,32 @@ def evidence_page(evidence: Evidence, pictures: Mapping[str, bytes] | None = Non
     return document("evidence", header, main, footer="evidence. This page needs no other file.")
 
 
-def _run_html(one: EvidenceRun, pictures: Mapping[str, bytes]) -> Html:
-    rows = [
-        [
-            claim.kind,
-            claim.statement,
-            f"{claim.extent.count} of {claim.extent.total}" if claim.extent else "",
-            interval_text(claim.extent.interval) if claim.extent else "",
-        ]
-        for claim in one.claims
-    ]
+def _run_html(run: EvidenceRun, pictures: Mapping[str, bytes]) -> Html:
+    rows = []
+    for claim in run.claims:
+        extent = claim.extent
+        counted = [f"{extent.count} of {extent.total}", interval_text(extent.interval)] if extent else ["", ""]
+        rows.append([claim.kind, claim.statement, *counted])
     facts = [
         element("tr", element("th", name, scope="row"), element("td", *(element("div", line) for line in lines)))
-        for name, lines in sections(one).items()
+        for name, lines in sections(run).items()
     ]
     table = element("table", element("tbody", *facts), class_="facts")
-    beside = element("details", element("summary", "On what, how, and what is left out"), table, open="")
+    images = [
+        element("figure", element("img", src=data_url(pictures[name], "image/png"), alt=name))
+        for name in run.pictures
+        if name in pictures
+    ]
+    conditions = []
+    for title, heads, cells in tables_of(run):
+        summary = element("summary", f"{title} by condition, {len(cells)} rows")
+        conditions.append(element("details", summary, study_table(heads, cells)))
+    again = join_html(element("h2", "Do it again"), element("pre", run.command_line, class_="wrap"))
     return join_html(
-        element("h2", f"{one.run} ({one.command})"),
+        element("h2", f"{run.run} ({run.command})"),
         study_table(CLAIM_HEADS, rows),
-        element(
-            "div",
-            *(
-                element("figure", element("img", src=data_url(pictures[name], "image/png"), alt=name))
-                for name in one.pictures
-                if name in pictures
-            ),
-            class_="pictures",
-        )
-        if one.pictures
-        else None,
-        *(
-            element(
-                "details",
-                element("summary", f"{said} by condition, {len(conditions)} rows"),
-                study_table(heads, condition_rows(conditions)),
-            )
-            for said, heads, conditions in (
-                ("Right", CONDITION_HEADS, one.conditions),
-                ("Photographs that agree", PHOTOGRAPH_HEADS, one.photographs),
-            )
-            if conditions
-        ),
-        beside,
-        join_html(element("h2", "Do it again"), element("pre", one.command_line, class_="wrap"))
-        if one.command_line
-        else None,
+        element("div", *images, class_="pictures") if run.pictures else None,
+        *conditions,
+        element("details", element("summary", "On what, how, and what is left out"), table, open=""),
+        again if run.command_line else None,
     )

@@ -57,11 +57,8 @@ def sentences() -> dict[str, str]:
 
 
 def chosen(names: Sequence[str] = (), groups: Sequence[str] = ()) -> list[Case]:
-    """Return the cases of these names and of these groups; all where neither is given.
-
-    Raises:
-        UnknownNameError: there is no such case or group.
-    """
+    """Return the cases of these names and groups; all where neither is given, an UnknownNameError where one is
+    unknown."""
     for kind, asked, known in (
         ("case", names, [case.name for case in CASES]),
         ("group", groups, [case.group for case in CASES]),

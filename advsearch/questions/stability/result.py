@@ -25,7 +25,7 @@ class StabilityConfig(Config):
 
     command: ClassVar[str] = "stability"
     free: ClassVar[tuple[str, ...]] = (*Config.free, "seconds")
-    clashes: ClassVar[tuple[Clash, ...]] = tuple(one for one in SceneConfig.clashes if one.setting == "overwrite")
+    clashes: ClassVar[tuple[Clash, ...]] = tuple(clash for clash in SceneConfig.clashes if clash.setting == "overwrite")
 
     case: str | None = setting(
         None, "check", "cases to try, separated by commas", "names of cases", otherwise="all", form="names"
@@ -42,12 +42,10 @@ class StabilityConfig(Config):
 
     @property
     def cases(self) -> tuple[str, ...]:
-        """Names of cases."""
         return () if self.case is None else split_names(self.case)
 
     @property
     def groups(self) -> tuple[str, ...]:
-        """Names of groups."""
         return () if self.group is None else split_names(self.group)
 
 
@@ -114,7 +112,6 @@ class StabilityResult(InNotebook, Result):
 
     @property
     def brief(self) -> str:
-        """How many cases hold."""
         return f"{sum(row.status == OK for row in self.rows)} of {len(self.rows)} hold"
 
 
@@ -156,13 +153,8 @@ def shown(result: StabilityResult) -> ShownResult:
 @dataclass(frozen=True)
 class Outcome:
     """What a case found: the numbers that decide, and whether every picture and gradient was finite, and none had to be
-    made so.
-
-    Attributes:
-        relative_error: of a gradient (or of what the case is about) against the reference; None where there is none.
-        ending: how the case's search ended, "refused" where the input was, or empty.
-        measured: further numbers that are worth printing.
-    """
+    made so; the error of a gradient (or of what the case is about), None where there is none; how the case's search
+    ended, "refused" where the input was, or empty; and further numbers that are worth printing."""
 
     checks: Sequence[Check]
     finite: bool = True
@@ -177,14 +169,8 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Case:
-    """One extreme.
-
-    Attributes:
-        name: unique; what `--case` takes.
-        group: what it is about; what `--group` takes.
-        holds: what must hold, in a sentence.
-        slow: takes more than about a second on two quiet cores, so that the tests run it seldom.
-    """
+    """One extreme: its unique name, the group that it belongs to, and what must hold, in a sentence. A `slow` one takes
+    more than about a second on two quiet cores, so that the tests run it seldom."""
 
     name: str
     group: str
@@ -207,23 +193,13 @@ class Case:
             decides = "".join(str(number) for number in (failed[:1] or outcome.checks[-1:]))
         else:
             decides = "NaN or infinite values"
-        return CaseRow(
-            case=self.name,
-            group=self.group,
-            holds=self.holds,
-            status=OK if outcome.finite and not failed else FELL_SHORT,
-            decides=decides,
-            finite=outcome.finite,
-            relative_error=outcome.relative_error,
-            ending=outcome.ending,
-            checks=list(outcome.checks),
-            measured=dict(outcome.measured),
-            seconds=time.perf_counter() - begun,
-        )
+        status = OK if outcome.finite and not failed else FELL_SHORT
+        seconds = time.perf_counter() - begun
+        more = {"case": self.name, "status": status, "decides": decides, "seconds": seconds}
+        return CaseRow.of({**vars(self), **vars(outcome), **more})
 
 
-CASES: list[Case] = []
-"""Every case, in the order in which they run."""
+CASES: list[Case] = []  # every case, in the order in which they run
 
 
 def case(
@@ -240,7 +216,6 @@ def case(
 
 
 def cases(group: str, find: Callable[..., Outcome], table: Iterable[tuple[str, str, dict[str, Any]]]) -> None:
-    """Make each row of a table a case: a name, what must hold, and arguments of a function. `slow` is among these."""
     for name, holds, data in table:
-        given = {key: value for key, value in data.items() if key != "slow"}
-        CASES.append(Case(name, group, holds, bool(data.get("slow")), partial(find, **given)))
+        arguments = {key: value for key, value in data.items() if key != "slow"}
+        CASES.append(Case(name, group, holds, bool(data.get("slow")), partial(find, **arguments)))

@@ -27,20 +27,13 @@ from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.parts import ScenePart
 from advsearch.scene.renderer import Renderer
 
-SIZE = 24
-"""Side of the pictures in pixels."""
-SPP = 8
-"""Samples a pixel of a picture and of a working gradient."""
-REFERENCE_SPP = 64
-"""Samples a pixel of a reference render."""
-ERROR = 0.1
-"""Relative error that the mean of a gradient may have beyond what its noise explains."""
-DOUBT = 0.4
-"""The noise of a comparison, as a share of the derivative, from which it decides nothing."""
-SHARPNESS = 20.0
-"""Logits per unit of the linear loss that the searched model returns."""
-SAME_PICTURE = 2e-3
-"""Mean difference of two pictures that should be one: an 8-bit level is 4e-3."""
+SIZE = 24  # side of the pictures in pixels
+SPP = 8  # samples a pixel of a picture and of a working gradient
+REFERENCE_SPP = 64  # samples a pixel of a reference render
+ERROR = 0.1  # relative error that the mean of a gradient may have beyond what its noise explains
+DOUBT = 0.4  # the noise of a comparison, as a share of the derivative, from which it decides nothing
+SHARPNESS = 20.0  # logits per unit of the linear loss that the searched model returns
+SAME_PICTURE = 2e-3  # mean difference of two pictures that should be one: an 8-bit level is 4e-3
 
 ControlSettings = Mapping[str, Mapping[str, object]]
 Thing = str | Path | ObjectAsset | Callable[[], ObjectAsset]
@@ -226,7 +219,7 @@ def inward(renderer: Renderer, slope: Tensor, of: Tensor | float, seeds: int, sp
     return float(slope @ direction), math.fsum(wanted) / seeds
 
 
-class Evaluator:
+class LossEval:
     """Evaluates configurations of a renderer by a loss of the picture; over 0 is a success."""
 
     def __init__(self, renderer: Renderer, loss: Loss, spp: int) -> None:
@@ -253,7 +246,7 @@ def searched(renderer: Renderer, u: Tensor, evaluations: int, *, spp: int = SPP)
     """
     loss = smooth_loss(renderer.formation.resolution)
     here = float(loss(shown(renderer, u, 0, spp)))
-    evaluate = Evaluator(renderer, lambda image: SHARPNESS * (loss(image) - here) - 1.0, spp)
+    evaluate = LossEval(renderer, lambda image: SHARPNESS * (loss(image) - here) - 1.0, spp)
     domain = search_domain(renderer, u)
     steps = evaluations * (1 + domain.gradient_cost) + 1
     return search(partial(map, evaluate), domain, PGD(), steps=steps, seed=0, candidates=1, repeats=1)

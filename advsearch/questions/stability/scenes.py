@@ -24,7 +24,7 @@ from advsearch.questions.stability.scene import (
     SAME_PICTURE,
     SPP,
     ControlSettings,
-    Evaluator,
+    LossEval,
     black_and_white,
     checked,
     compared,
@@ -46,8 +46,7 @@ from advsearch.scene.mitsuba_backend.parts import Translation, translation
 from advsearch.scene.parts import ScenePart
 
 BRIGHT = 1e5
-PLATEAU_STEPS = 40
-"""Evaluations in which a search has to be off a plateau."""
+PLATEAU_STEPS = 40  # evaluations in which a search has to be off a plateau
 TEXTURE: ControlSettings = {"texture": {"resolution": 8}}
 FLASH = grey_map(0.3, BRIGHT)
 DARKNESS = grey_map(0.0)
@@ -120,7 +119,7 @@ def plateau(low: float, high: float) -> Outcome:
     """
     renderer = small({"camera": {"exposure": [low, high]}})
     start, checks, endings, flat = torch.ones_like(renderer.start), [], [], 0
-    evaluate = Evaluator(renderer, lambda image: 0.9 - image.mean(), 2)
+    evaluate = LossEval(renderer, lambda image: 0.9 - image.mean(), 2)
     for policy in (PGD(), Adam(), Auto()):
         domain = search_domain(renderer, start)
         result = search(partial(map, evaluate), domain, policy, steps=PLATEAU_STEPS, seed=0, candidates=0)
@@ -205,7 +204,7 @@ def texels_at_the_ends() -> Outcome:
     gradient, wanted = inward(renderer, slope, 1.0, 8, REFERENCE_SPP)
     error = abs(gradient / wanted - 1.0)
     best = search(
-        partial(map, Evaluator(renderer, loss, SPP)), search_domain(renderer), PGD(), steps=3, seed=0, candidates=0
+        partial(map, LossEval(renderer, loss, SPP)), search_domain(renderer), PGD(), steps=3, seed=0, candidates=0
     ).best_u
     return seen(controls, black_and_white, compare=False).also(
         check("gradient error along a direction that points inwards", error, most=ERROR),
@@ -219,8 +218,7 @@ def texels_at_the_ends() -> Outcome:
 
 # ---- light that is thrown --------------------------------------------------------------------------------------------
 
-SIDE = 8
-"""Texels along the picture of a projector."""
+SIDE = 8  # texels along the picture of a projector
 WHOLE = [1.0] * (3 * SIDE**2)
 ONE_TEXEL = {3 * (SIDE**2 // 2 + SIDE // 2) + channel: 1.0 for channel in range(3)}
 
@@ -261,8 +259,7 @@ def through_glass() -> Outcome:
 
 # ---- meshes, places and views ---------------------------------------------------------------------------------------
 
-QUAD = [[0.0, -0.5, 0.0], [0.0, 0.5, 0.0], [0.0, 0.5, 1.0], [0.0, -0.5, 1.0]]
-"""A square that faces +x."""
+QUAD = [[0.0, -0.5, 0.0], [0.0, 0.5, 0.0], [0.0, 0.5, 1.0], [0.0, -0.5, 1.0]]  # a square that faces +x
 HALVES = [[0, 1, 2], [0, 2, 3]]
 SQUARE = checked(mesh_of(QUAD, HALVES))
 LINE = [[0.0, 0.0, 0.5], [0.0, 0.1, 0.5], [0.0, 0.2, 0.5]]
@@ -273,8 +270,7 @@ TRIANGLE = checked(mesh_of([[0.0, -0.5, 0.0], [0.0, 0.5, 0.0], [0.0, 0.0, 1.0]],
 FRONT = {"camera.azimuth": 0.0, "camera.elevation": 10.0}
 PAINTED: ControlSettings = {"texture": {"resolution": 8}, "pose": {"y": [-0.3, 0.3]}}
 SHIFT: ControlSettings = {"pose": {"x": [-0.3, 0.3]}}
-BARE = {"ground.size": 0.0}
-"""Settings without the ground, so that a dark object has an outline and nothing else."""
+BARE = {"ground.size": 0.0}  # settings without the ground, so that a dark object has an outline and nothing else
 
 
 def mesh(thing: ObjectAsset, beside: ObjectAsset | None = None) -> dict[str, object]:

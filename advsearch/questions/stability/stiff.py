@@ -17,7 +17,7 @@ from torch import Tensor
 from advsearch.attacks import PGD, search
 from advsearch.engine.gradients import smooth_loss
 from advsearch.questions.stability.result import Outcome, case, cases, check, holds
-from advsearch.questions.stability.scene import SHARPNESS, ControlSettings, Evaluator, search_domain, seen, shown, small
+from advsearch.questions.stability.scene import SHARPNESS, ControlSettings, LossEval, search_domain, seen, shown, small
 
 RATIO = 1e6
 
@@ -77,7 +77,7 @@ def light_rotation_texel() -> Outcome:
     domain = search_domain(renderer, u)
     paths: list[list[Tensor]] = []
     for scale in (1.0, RATIO):
-        evaluate = Evaluator(renderer, partial(lambda scale, image: scale * loss(image), scale), 8)
+        evaluate = LossEval(renderer, partial(lambda scale, image: scale * loss(image), scale), 8)
         paths.append([])
         note = lambda record, at, evaluation: paths[-1].append(at)  # noqa: E731
         result = search(partial(map, evaluate), domain, PGD(), steps=18, seed=0, candidates=0, on_step=note)

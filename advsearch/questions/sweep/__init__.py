@@ -2,22 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from pathlib import Path
-from typing import Any
-
 from advsearch.question import Asked, question
-from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.sweep.display import claims as claims
 from advsearch.questions.sweep.display import shown as shown
 from advsearch.questions.sweep.page import page as page
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.questions.sweep.summary import SweepSummary
-
-
-def of_the_attack(file: Path, typed: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what the run of an attack brings: scene and model, and what varies where nothing else does."""
-    return SweepConfig.of_attack(AttackConfig.from_yaml(file), varies="grid" in typed or "controls" in typed)
 
 
 @question(
@@ -27,7 +17,7 @@ def of_the_attack(file: Path, typed: Mapping[str, Any]) -> dict[str, Any]:
     "sweep --object mug --control pose --samples 200 --surface",
     "sweep --adversarial-of mug-texture-001 --control camera,environment --samples 200",
     about="adversarial_of",
-    brought=of_the_attack,
+    brought=SweepConfig.of_attack,
     called="advsearch.questions.sweep.carry_out:sweep",
 )
 def sweep(asked: Asked[SweepConfig]) -> SweepSummary:

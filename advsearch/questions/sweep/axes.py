@@ -27,11 +27,8 @@ from advsearch.errors import InputError, UnknownNameError
 from advsearch.options import BY_KEY
 from advsearch.scene.description import SceneDescription
 
-MOST_VALUES = 100_000
-"""Values of one axis, at most; more are for draws."""
-
-TURN = 360.0
-"""Degrees after which a periodic parameter is the same again."""
+MOST_VALUES = 100_000  # values of one axis, at most; more are for draws
+TURN = 360.0  # degrees after which a periodic parameter is the same again
 
 _OUTER = {"object": "`object` mug,bowl", "environment": "`environment` studio,noon", "model": "`model` a.pt2,b.pt2"}
 
@@ -67,10 +64,10 @@ def read_axes(grid: Mapping[str, object], controls: Sequence[Control]) -> tuple[
     a list. A name is KIND.PARAMETER, INSTANCE.PARAMETER of one of `controls`, KIND:INSTANCE.PARAMETER, or mitsuba:KEY.
     """
     instances = {control.name: control for control in controls}
-    found: dict[str, Axis] = {}
+    axes: dict[str, Axis] = {}
     for name, given in grid.items():
         axis = _read_axis(name, given, instances)
-        if axis.name in found:
+        if axis.name in axes:
             raise InputError(f"`grid` {name}: {axis.name} is given twice; leave one of the two out")
         drawn = instances.get(axis.instance)
         if isinstance(drawn, NumberControl) and axis.parameter.name in drawn.specs:
@@ -78,8 +75,8 @@ def read_axes(grid: Mapping[str, object], controls: Sequence[Control]) -> tuple[
                 f"`grid` {name}: `controls` {axis.instance} sets {axis.parameter.name} too; leave it out of one "
                 "of the two"
             )
-        found[axis.name] = axis
-    return tuple(found.values())
+        axes[axis.name] = axis
+    return tuple(axes.values())
 
 
 def _read_axis(name: str, given: Any, instances: Mapping[str, Control]) -> Axis:
@@ -93,20 +90,21 @@ def _read_axis(name: str, given: Any, instances: Mapping[str, Control]) -> Axis:
     if control is None:
         hint = f"It stands in `grid` {name}; write `grid` CONTROL.PARAMETER=VALUES, such as pose.yaw=0:360:24."
         raise unknown_control(kind, hint, instances)
-    if kind == BY_KEY:
-        return _axis_by_key(control, name, given)
+    if kind == BY_KEY:  # the scene names the parameter, and says later whether there is such a one
+        key = name.partition(":")[2]
+        if not key:
+            raise InputError(f"`grid` {name}: expected Mitsuba's name and values, as in {BY_KEY}:KEY=FIRST:LAST:COUNT")
+        (parameter,) = control.declared([key])
+        return Axis(BY_KEY, BY_KEY, parameter, axis_values(f"`grid` {name}", parameter, given))
     there = instances[instance].own if instance in instances else ()
-    own = {one.name: one for one in (*control.declared({parameter_name: given}), *there)}
-    known = list(own)
+    own = {parameter.name: parameter for parameter in (*control.declared({parameter_name: given}), *there)}
     if not parameter_name:
-        raise InputError(
-            f"`grid` {name}: expected CONTROL.PARAMETER, got no parameter; choose one of {', '.join(known)}"
-        )
+        raise InputError(f"`grid` {name}: expected CONTROL.PARAMETER, got no parameter; choose one of {', '.join(own)}")
     check_instance(f"`grid` {name}", late or early, colon or early_colon)
-    if parameter_name not in known:
-        raise UnknownNameError(f"parameter of control {control.kind}", parameter_name, known, f"In `grid` {name}.")
+    if parameter_name not in own:
+        raise UnknownNameError(f"parameter of control {control.kind}", parameter_name, list(own), f"In `grid` {name}.")
     parameter = own[parameter_name]
-    pictures = any(len(one.shape) > 1 for one in control.parameters)
+    pictures = any(len(declared.shape) > 1 for declared in control.parameters)
     if pictures or not issubclass(control, NumberControl) or parameter.shape != ():
         raise InputError(
             f"`grid` {name}: expected a parameter that is one number or name, got one that is many numbers; draw it "
@@ -115,24 +113,13 @@ def _read_axis(name: str, given: Any, instances: Mapping[str, Control]) -> Axis:
     return Axis(control.kind, instance, parameter, axis_values(f"`grid` {name}", parameter, given))
 
 
-def _axis_by_key(control: type[Control], name: str, given: Any) -> Axis:
-    """Return an axis whose parameter the scene names, which says later whether there is such a one."""
-    key = name.partition(":")[2]
-    if not key:
-        raise InputError(f"`grid` {name}: expected Mitsuba's name and values, as in {BY_KEY}:KEY=FIRST:LAST:COUNT")
-    (parameter,) = control.declared([key])
-    return Axis(BY_KEY, BY_KEY, parameter, axis_values(f"`grid` {name}", parameter, given))
-
-
 def axis_values(where: str, parameter: Parameter, given: Any) -> tuple[Number, ...]:
     """Return the values of an axis, checked, from a text, a value, or a list; errors name `where`.
     ``"FIRST:LAST:COUNT"`` is COUNT values evenly spaced from FIRST to LAST, both included; of a periodic parameter over
     a whole turn, LAST would repeat FIRST and is left out."""
-    values: Sequence[Any]
+    values: Sequence[Any] = given if isinstance(given, (list, tuple)) else [given]
     if isinstance(given, str) and ":" in given and not parameter.options:
         values = _spaced(where, parameter, given)
-    else:
-        values = given if isinstance(given, (list, tuple)) else [given]
     if not values:
         raise InputError(f"{where}: expected at least one value, got none; write FIRST:LAST:COUNT or a list")
     if len(values) > MOST_VALUES:
@@ -213,15 +200,15 @@ def on_grid(controls: Sequence[Control], axes: Sequence[Axis], scene: SceneDescr
     The other parameters of a control that is drawn keep being drawn; those of one that is only in the grid stay as the
     scene has them.
     """
-    found = {control.name: control for control in controls}
+    on = {control.name: control for control in controls}
     for instance in dict.fromkeys(axis.instance for axis in axes):
-        mine = {axis.parameter.name: axis for axis in axes if axis.instance == instance}
-        drawn = found.get(instance)
-        kind: Any = CONTROLS[next(iter(mine.values())).control] if drawn is None else type(drawn)
+        own = [axis for axis in axes if axis.instance == instance]
+        drawn = on.get(instance)
+        kind: Any = CONTROLS[own[0].control] if drawn is None else type(drawn)
         given = _ranges(drawn, scene) if isinstance(drawn, NumberControl) else {}
-        given |= {name: {"choices": list(axis.values)} for name, axis in mine.items()}
-        found[instance] = kind(name=instance, **given)
-    return tuple(found.values())
+        given |= {axis.parameter.name: {"choices": list(axis.values)} for axis in own}
+        on[instance] = kind(name=instance, **given)
+    return tuple(on.values())
 
 
 def _ranges(control: NumberControl, scene: SceneDescription) -> dict[str, object]:

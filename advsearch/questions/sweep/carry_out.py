@@ -24,7 +24,7 @@ from advsearch.engine.judging import (
     shown,
 )
 from advsearch.engine.judging import only_here as metrics_only_here
-from advsearch.engine.loading import Controls, Scene, load_scene, named_camera, only_here, settings_of
+from advsearch.engine.loading import Controls, Scene, load_scene, only_here, scene_as_settings, settings_of
 from advsearch.engine.naming import (
     AnyModel,
     check_not_of_scene,
@@ -40,7 +40,6 @@ from advsearch.engine.naming import (
 )
 from advsearch.errors import InputError
 from advsearch.files import JsonObject
-from advsearch.models import Model
 from advsearch.options import as_setting
 from advsearch.progress import NullProgress, Progress, Watched, watcher
 from advsearch.questions.attack.carry_out import LOADING, executor_for, is_named
@@ -49,8 +48,8 @@ from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.summary import attack_of
 from advsearch.questions.sweep.axes import Axis, on_grid, read_axes
 from advsearch.questions.sweep.drives import with_frames
-from advsearch.questions.sweep.job import Job, NamedScene, Scenes, check_all, check_scenes
-from advsearch.questions.sweep.loop import carry_out
+from advsearch.questions.sweep.job import Job, NamedScene, OpenScenes, check_all, check_scenes
+from advsearch.questions.sweep.loop import Sweep
 from advsearch.questions.sweep.result import SweepResult
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.questions.sweep.tracks import Step
@@ -64,14 +63,12 @@ from advsearch.settings import split_names
 from advsearch.tasks import AnyTask, OwnTask, Task, function_of, make_task
 from advsearch.tasks.each_thing import each_thing
 
+OUTER = ("object", "environment")
 OF_A_SCENE = ("object", "environment", "up", "size", "unit", "camera", "things", "set_", "exposure")
 """Settings that a scene of the caller's own has."""
 
-WORKER = "advsearch.questions.sweep.carry_out:sweep_worker"
-"""What a worker does."""
-
-CLEAN = "clean"
-"""What the scene without the adversarial configuration of a run is called beside that with it."""
+WORKER = "advsearch.questions.sweep.carry_out:sweep_worker"  # what a worker does
+CLEAN = "clean"  # what the scene without the adversarial configuration of a run is called beside that with it
 
 AnyScene = Scene | str | Path
 
@@ -119,10 +116,14 @@ def sweep(
     options = {name: value for name, value in settings.items() if value is not None}
     if not isinstance(grid, (Mapping, type(None))):
         raise InputError(f"grid: expected a mapping from parameters to values, got {type(grid).__name__}")
-    folder, brought = _folder(adversarial_of), dict[str, Any]()
-    if folder is not None:
-        theirs = AttackConfig.from_yaml(find_run(folder) / CONFIG)
-        brought = SweepConfig.of_attack(theirs, varies=bool(grid) or bool(controls))
+    if isinstance(adversarial_of, AttackResult):
+        if adversarial_of.run is None:
+            raise InputError("adversarial_of: expected an attack that was kept, got one that was not; give it a `run`")
+        adversarial_of = adversarial_of.run
+    brought = dict[str, Any]()
+    if adversarial_of is not None:
+        file = find_run(str(adversarial_of)) / CONFIG
+        brought = SweepConfig.of_attack(file, {"grid": grid, "controls": controls})
     if scene is None and not brought:
         raise InputError("scene: expected what load_scene returns or takes, got nothing; name one")
     if scene is not None:
@@ -141,17 +142,19 @@ def sweep(
         "controls": settings_of(controls),
         "grid": dict(grid or {}),
         "samples": samples,
-        "adversarial_of": folder,
+        "adversarial_of": adversarial_of,
         "metrics": metrics_as_settings(metrics or {}),
     }
     loaded = tuple(
-        NamedScene(one.description.object_name, one.description.environment_name, one)
-        for one in scenes
-        if isinstance(one, Scene)
+        NamedScene(scene.description.object_name, scene.description.environment_name, scene)
+        for scene in scenes
+        if isinstance(scene, Scene)
     )
     if loaded:
         check_not_of_scene(options)
-        described |= _described(loaded)
+        described |= scene_as_settings(loaded[0].scene)
+        described |= {what: ",".join(dict.fromkeys(getattr(place, what) for place in loaded)) for what in OUTER}
+        described |= {"size": None, "set": {}} if len(loaded) > 1 else {}
     else:
         described["object"] = ",".join(name for some in names for name in some)
     config = SweepConfig(**{**brought, **described, **options, "run": None if run is None else str(run)})
@@ -163,19 +166,22 @@ def sweep(
     config = config.with_only_here([*parts, *(f"the control {name}" for name in only_here(controls))])
     if config.workers is not None or config.cluster is not None:
         check_shared(config.metrics)
-    if config.keep_pictures != "none" and config.run is None:
-        raise InputError("keep_pictures: expected `run` beside it, the folder that keeps them; name one")
-    if config.aov is not None and config.run is None:
-        raise InputError("aov: expected `run` beside it, the folder that keeps the layers; name one")
-    if config.surface and config.run is None:
-        raise InputError("surface: expected `run` beside it, the folder that keeps the map; name one")
+    kept = {"keep_pictures": "them", "aov": "the layers", "surface": "the map"}
+    for name, what in kept.items():
+        if config.run is None and getattr(config, name) not in ("none", None, False):
+            raise InputError(f"{name}: expected `run` beside it, the folder that keeps {what}; name one")
     progress = watcher(progress)
-    told = all(isinstance(one, (str, Path)) for one in networks) and not isinstance(task, OwnTask)
-    if loaded or only_here(controls) or not told:
+    named = all(isinstance(network, (str, Path)) for network in networks) and not isinstance(task, OwnTask)
+    if loaded or only_here(controls) or not named:
         check_not_spread(options)
-    resumed = _stopped(config)
-    if config.run is not None and resumed is None:
-        check_free(config.run, overwrite=config.overwrite)
+    resumed = None  # or the folder of a sweep of the same settings that was stopped
+    if config.run is not None:
+        path, recipe = run_path(config.run), run_path(config.run) / CONFIG
+        if not config.overwrite and is_run(path) and recipe.is_file():
+            before = SweepConfig.from_yaml(recipe, config.asked)
+            resumed = path if before.plain() == config.to_repeat().plain() and not finished(path) else None
+        if resumed is None:
+            check_free(config.run, overwrite=config.overwrite)
     asked = task if isinstance(task, Task) else config.task
     with begun(config) if config.run is not None and resumed is None else nullcontext(resumed) as begun_in:
         job = _job(config, loaded or _places(config), several(networks), asked, controls)
@@ -183,7 +189,7 @@ def sweep(
         if config.run is not None:
             return _kept(config, job, progress, begun_in)
         with executor_for(config, WORKER, progress) as executor:
-            return carry_out(job, None, progress, executor)
+            return Sweep(job, None, progress, executor).carry_out()
 
 
 def sweep_from_config(
@@ -200,23 +206,9 @@ def sweep_from_config(
 # ---- from names to things -------------------------------------------------------------------------------------------
 
 
-def _folder(attack: str | Path | AttackResult | None) -> str | None:
-    """The run of an attack; an InputError where the attack was not kept."""
-    if isinstance(attack, AttackResult) and attack.run is None:
-        raise InputError("adversarial_of: expected an attack that was kept, got one that was not; give it a `run`")
-    kept = attack.run if isinstance(attack, AttackResult) else attack
-    return None if kept is None else str(kept)
-
-
 def _beside_adversarial(
     config: SweepConfig, places: Sequence[NamedScene], drawn: Sequence[Control], axes: Sequence[Axis]
 ) -> tuple[NamedScene, ...]:
-    """The places as they are, and then with the adversarial scene of the run that the settings name.
-
-    Raises:
-        InputError: the run has no adversarial configuration, or the sweep varies what that sets.
-        FileFormatError: it did not end, or is of another command.
-    """
     if config.adversarial_of is None:
         return tuple(places)
     folder = find_run(config.adversarial_of)
@@ -245,32 +237,17 @@ def _several(given: Any) -> list[Any]:
     return listed
 
 
-def _described(places: Sequence[NamedScene]) -> dict[str, object]:
-    """Settings that say what loaded scenes are."""
-    first = places[0].scene.description
-    return {
-        "object": ",".join(dict.fromkeys(place.object for place in places)),
-        "environment": ",".join(dict.fromkeys(place.environment for place in places)),
-        "up": first.up,
-        "size": first.size if len(places) == 1 else None,
-        "unit": first.unit,
-        "camera": named_camera(first),
-        "things": first.things_spec or None,
-        "set": first.given_values if len(places) == 1 else {},
-    }
-
-
 def job_of(config: SweepConfig) -> Job:
     """Find and load everything that a configuration names."""
     job = _job(config, _places(config), config.models, config.task, config.controls)
     return replace(job, metrics=load_metrics(config.metrics))
 
 
-def scenes_of(config: SweepConfig) -> Scenes:
+def scenes_of(config: SweepConfig) -> OpenScenes:
     """Return what renders pictures of a sweep again; everything that it names is looked at first."""
     job = job_of(config)
     check_all(job)
-    return Scenes(job)
+    return OpenScenes(job)
 
 
 def _job(
@@ -300,7 +277,9 @@ def _job(
         for one in axes
     )
     made = make_task(task)
-    networks, warnings = _models(models, config, made)
+    _check_different([model_name(model) for model in models])
+    networks, warnings = load_models(models, made, config)
+    _check_different([model.name for model in networks])  # what a file or a function gives may have another's name
     scenes = [place.scene for place in places]
     tasks = tuple(shown(made.on(network), network, scenes, config) for network in networks)
     warnings += [remark for task in tasks for remark in task.remarks]
@@ -312,15 +291,7 @@ def _job(
         for control in on_grid(drawn, axes, described):
             described = control.prepare(described) if control.kind == ENVIRONMENT else described
         warnings += described.notes
-    job = Job(
-        config=config,
-        places=tuple(places),
-        models=networks,
-        tasks=tasks,
-        controls=drawn,
-        axes=axes,
-        aovs=aovs_of(config.aov),
-    )
+    job = Job(config, tuple(places), networks, tasks, drawn, axes, aovs_of(config.aov))
     for place in places:
         warnings += job.space(place, job.sizes[0]).notes(place.scene.description)
     return replace(job, warnings=tuple(dict.fromkeys(warnings)))
@@ -339,14 +310,6 @@ def _places(config: SweepConfig) -> tuple[NamedScene, ...]:
     return tuple(NamedScene(name, light, scenes[name].lit_by(lights[light])) for name in objects for light in lights)
 
 
-def _models(models: Sequence[AnyModel], config: SweepConfig, task: Task) -> tuple[tuple[Model, ...], list[str]]:
-    """Load the models; their warnings become sentences of the run."""
-    _check_different([model_name(one) for one in models])
-    loaded, warnings = load_models(models, task, config)
-    _check_different([one.name for one in loaded])  # what a file or a function gives may have the name of another
-    return loaded, warnings
-
-
 def _check_different(names: Sequence[str]) -> None:
     if len(set(names)) < len(names):
         raise InputError(
@@ -355,24 +318,13 @@ def _check_different(names: Sequence[str]) -> None:
         )
 
 
-def _stopped(config: SweepConfig) -> Path | None:
-    """The folder of a sweep of the same settings that was stopped, if `run` names one."""
-    if config.run is None or config.overwrite or not is_run(run_path(config.run)):
-        return None
-    path = run_path(config.run)
-    recipe = path / CONFIG
-    same = recipe.is_file() and SweepConfig.from_yaml(recipe, config.asked).plain() == config.to_repeat().plain()
-    return path if same and not finished(path) else None
-
-
 def _kept(config: SweepConfig, job: Job, progress: Progress, resumed: Path | None) -> SweepResult:
-    """Sweep in a run directory: a new one, or one that was begun."""
     with RunDirectory.of(config, resumed) as run, executor_for(config, WORKER, progress) as executor:
         functions = {f"metric {name}": one for name, one in job.metrics.items()}
         check_made_of(run, job.models, {**functions, "task": function_of(job.tasks[0])})
-        return carry_out(job, run, progress, executor)
+        return Sweep(job, run, progress, executor).carry_out()
 
 
 def sweep_worker(settings: JsonObject) -> Call:
     """Return what evaluates the queries of the sweep that the settings describe: what a worker does."""
-    return worker_call(Scenes(job_of(SweepConfig(**settings))).named)
+    return worker_call(OpenScenes(job_of(SweepConfig(**settings))).named)

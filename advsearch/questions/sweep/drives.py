@@ -5,6 +5,7 @@ has ends that it cannot pass (`attacks.units`)."""
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -16,18 +17,17 @@ from advsearch.described import OUT_OF_VIEW
 from advsearch.engine.naming import given_to
 from advsearch.questions.attack.result import evenly, write_drive
 from advsearch.questions.sweep.axes import Axis
-from advsearch.questions.sweep.job import Job, Scenes
+from advsearch.questions.sweep.job import Job, OpenScenes
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.questions.sweep.summary import DriveRates, OneDrive, OverDrives, TrackRates
-from advsearch.questions.sweep.tracks import Frame, frame_of, tracked
+from advsearch.questions.sweep.tracks import DetectedFrame, frame_of, tracked
 from advsearch.report.marks import marked
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row
 from advsearch.tasks import Detection
 
 ANIMATED = 60
-MOST_LISTED = 1000
-"""Drives of a model whose own numbers are kept."""
+MOST_LISTED = 1000  # drives of a model whose own numbers are kept
 
 UNKNOWN, HIDDEN = -1, 2
 
@@ -63,20 +63,18 @@ class Drives:
         place = time_axis(job.axes)
         assert place is not None
         self._job, axis = job, job.axes[place]
-        sizes = [len(one.values) for one in job.axes]
-        shape = (len(job.places), *sizes, job.samples, len(job.models))
+        shape = (len(job.places), *(len(one.values) for one in job.axes), job.samples, len(job.models))
         right: Flags = np.full(shape, UNKNOWN, np.int8)
         away = np.full(shape[:-1], np.nan)
         self._ways: dict[int, str] = {}
-        self._frames: dict[int, Frame] = {}
+        self._frames: dict[int, DetectedFrame] = {}
         names = [[job.right_names(place, model) for model in range(len(job.models))] for place in job.places]
         rows_of_a_place = right.size // len(job.places)
         which = f"{axis.instance}.{WAY}"
         name, self._unit = f"{axis.instance}.distance", "object sizes"
         for row in rows:
             right.flat[row.step] = HIDDEN if row.label == OUT_OF_VIEW else bool(row.correct)
-            if name in row.values:
-                distance = row.values[name]
+            if (distance := row.values.get(name)) is not None:
                 away.flat[row.step // len(job.models)] = float(str(distance["value"]))
                 self._unit = distance["unit"]
             if isinstance(job.tasks[row.step % len(job.models)], Detection) and isinstance(row.payload, dict):
@@ -84,81 +82,76 @@ class Drives:
                 self._frames[row.step] = frame_of(row.payload, right_names)
             if which in row.values:
                 self._ways[row.step] = str(row.values[which]["value"])
-        order = np.argsort([float(value) for value in axis.values])
-        self.times = np.array([float(value) for value in axis.values])[order]
+        times = np.array([float(value) for value in axis.values])
+        order = np.argsort(times)
+        self.times = times[order]
         self._numbers = np.moveaxis(np.arange(right.size).reshape(shape), place + 1, -1)[..., order]
         self._right = np.moveaxis(right, place + 1, -1)[..., order]
         self._away = np.moveaxis(away, place + 1, -1)[..., order]
 
+    def _whole(self, places: list[int], model: int) -> tuple[Flags, npt.NDArray[np.float64], npt.NDArray[np.int64]]:
+        """Of the drives with all their frames (n, frames): whether a model is right, how far away it is, and rows."""
+        right, numbers = (of[places][..., model, :].reshape(-1, len(self.times)) for of in (self._right, self._numbers))
+        whole = (right != UNKNOWN).all(axis=1) & (right != HIDDEN).any(axis=1)
+        return right[whole], self._away[places].reshape(right.shape)[whole], numbers[whole]
+
     def rates(self) -> list[DriveRates]:
         """Return what is said of the drives of each model, without and with an adversarial scene."""
-        found, places = list[DriveRates](), self._job.places
-        for beside_clean in dict.fromkeys(one.beside_clean for one in places):
-            mine = [number for number, one in enumerate(places) if one.beside_clean == beside_clean]
+        rates, places = list[DriveRates](), self._job.places
+        for beside_clean in dict.fromkeys(place.beside_clean for place in places):
+            those = [number for number, place in enumerate(places) if place.beside_clean == beside_clean]
             for model, network in enumerate(self._job.models):
-                right = self._right[mine][..., model, :].reshape(len(mine), -1, len(self.times))
-                whole = (right != UNKNOWN).all(axis=2) & (right != HIDDEN).any(axis=2)
-                away = self._away[mine].reshape(right.shape)[whole]
-                if whole.any():
-                    numbers = self._numbers[mine][..., model, :].reshape(right.shape)[whole]
-                    rates = self._rates(network.name, beside_clean, right[whole], away, numbers[:, 0])
-                    found.append(rates.model_copy(update={"tracks": self._tracks(model, numbers)}))
-        return found
+                flags, away, numbers = self._whole(those, model)
+                if len(flags):
+                    told = self._rates(flags, away, numbers[:, 0].tolist())
+                    tracks = self._tracks(model, numbers)
+                    rates.append(DriveRates(model=network.name, answer=beside_clean or None, tracks=tracks, **told))
+        return rates
 
-    def _rates(
-        self,
-        model: str,
-        beside_clean: str,
-        flags: Flags,
-        away: npt.NDArray[np.float64],
-        begins: npt.NDArray[np.int64],
-    ) -> DriveRates:
-        """What is said of drives: (n, frames) whether the model is right, and how far away it is; (n,) first rows.
-        Frames without the object are neither right nor a gap."""
+    def _rates(self, flags: Flags, away: npt.NDArray[np.float64], begins: list[int]) -> dict[str, Any]:
+        """What is said of drives, by their first rows (n,) too. Frames without the object are neither right nor a
+        gap."""
         right, wrong, shown = flags == 1, flags == 0, flags != HIDDEN
         share = right.sum(axis=1) / shown.sum(axis=1)
         seconds, frames = float(self.times[-1] - self.times[0]), len(self.times)
         step = seconds / (frames - 1)
         seen: npt.NDArray[np.bool_] = np.asarray(right.any(axis=1))
         at_first = away[np.arange(len(right)), right.argmax(axis=1)]
-        first, gaps = at_first[seen], np.array([longest(one) for one in wrong]) * step
+        first, gaps = at_first[seen], np.array([longest(drive) for drive in wrong]) * step
         together = shown[:, 1:] & shown[:, :-1]
         changes = ((right[:, 1:] != right[:, :-1]) & together).sum(axis=1) / seconds
         ends = float(away.min()), float(away.max())
-        return DriveRates(
-            model=model,
-            answer=beside_clean or None,
-            drives=len(right),
-            frames=right.shape[1],
-            seconds=seconds,
-            right=over_drives(share, worst=min),
-            longest_gap=over_drives(gaps, max, (0.0, frames * step)),
-            first_seen=over_drives(first, min, ends) if len(first) and np.isfinite(ends).all() else None,
-            unit=self._unit,
-            never_seen=int((~seen).sum()),
-            flicker=over_drives(changes, max, (0.0, (frames - 1) / seconds)),
-            each=[
+        return {
+            "drives": len(right),
+            "frames": frames,
+            "seconds": seconds,
+            "right": over_drives(share, worst=min),
+            "longest_gap": over_drives(gaps, max, (0.0, frames * step)),
+            "first_seen": over_drives(first, min, ends) if len(first) and np.isfinite(ends).all() else None,
+            "unit": self._unit,
+            "never_seen": int((~seen).sum()),
+            "flicker": over_drives(changes, max, (0.0, (frames - 1) / seconds)),
+            "each": [
                 OneDrive(
-                    row=int(begins[k]),
-                    path=self._ways.get(int(begins[k])),
+                    row=begin,
+                    path=self._ways.get(begin),
                     right=float(share[k]),
                     first_seen=float(at_first[k]) if seen[k] and np.isfinite(at_first[k]) else None,
                     longest_gap=float(gaps[k]),
                     flicker=float(changes[k]),
                 )
-                for k in range(min(len(right), MOST_LISTED))
+                for k, begin in enumerate(begins[:MOST_LISTED])
             ],
-        )
+        }
 
     def _tracks(self, model: int, numbers: npt.NDArray[np.int64]) -> TrackRates | None:
         """What a tracker makes of drives, by the numbers (n, frames) of their rows; None without boxes in all."""
-        task = self._job.tasks[model]
-        if not isinstance(task, Detection) or not all(one in self._frames for one in numbers.flat):
+        task, frames = self._job.tasks[model], len(self.times)
+        if not isinstance(task, Detection) or not all(number in self._frames for number in numbers.flat):
             return None
-        drives = [tracked([self._frames[one] for one in row], self._job.tracker, task.iou) for row in numbers.tolist()]
-        frames = len(self.times)
+        drives = [tracked([self._frames[k] for k in row], self._job.tracker, task.iou) for row in numbers.tolist()]
         step = float(self.times[-1] - self.times[0]) / (frames - 1)
-        lost, switches, gaps = (np.array(one, dtype=float) for one in zip(*drives, strict=True))
+        lost, switches, gaps = (np.array(values, dtype=float) for values in zip(*drives, strict=True))
         return TrackRates(
             tracker=str(getattr(self._job.tracker, "__name__", type(self._job.tracker).__name__)),
             lost=over_drives(lost, max),
@@ -166,23 +159,19 @@ class Drives:
             longest_gap=over_drives(gaps * step, max, (0.0, frames * step)),
         )
 
-    def keep_worst(self, scenes: Scenes, run: RunDirectory) -> None:
+    def keep_worst(self, scenes: OpenScenes, run: RunDirectory) -> None:
         """Write a strip and an animation of the drive in which the first model is right least often, with its marks."""
-        right = self._right[..., 0, :].reshape(-1, len(self.times))
-        numbers = self._numbers[..., 0, :].reshape(-1, len(self.times)) // len(self._job.models)
-        whole = (right != UNKNOWN).all(axis=1) & (right != HIDDEN).any(axis=1)
-        if not whole.any():
-            return
-        share = (right[whole] == 1).sum(axis=1) / (right[whole] != HIDDEN).sum(axis=1)
-        worst = numbers[whole][share.argmin()]
-        pictures = [picture_of(scenes, int(number)) for number in worst[evenly(len(worst), ANIMATED)]]
-        write_drive(run, "drive", pictures, float(self.times[-1] - self.times[0]))
+        flags, _, numbers = self._whole([*range(len(self._job.places))], 0)
+        if len(flags):
+            share = (flags == 1).sum(axis=1) / (flags != HIDDEN).sum(axis=1)
+            worst = numbers[share.argmin()] // len(self._job.models)
+            pictures = [picture_of(scenes, int(number)) for number in worst[evenly(len(worst), ANIMATED)]]
+            write_drive(run, "drive", pictures, float(self.times[-1] - self.times[0]))
 
 
-def picture_of(scenes: Scenes, number: int) -> npt.NDArray[np.float32]:
+def picture_of(scenes: OpenScenes, number: int) -> npt.NDArray[np.float32]:
     """Return the picture (h, w, 3) with a number, with the marks of the first model's prediction."""
-    sent = scenes.job.queries(range(number, number + 1))
-    view, query = scenes.named(sent[0][0]), sent[0][2]
+    view, (query, *_) = scenes.asked(number)
     picture = view.pictures([query])[0]
     return np.asarray(marked(picture.numpy(), view.problems[0].marks(picture, query.u)), dtype=np.float32)
 

@@ -16,8 +16,7 @@ from advsearch.report.figures import ACCURACY, BLUE, MARGIN, MOST_POINTS, Figure
 from advsearch.report.wording import short_name
 from advsearch.settings import split_names
 
-MOST_TICKS = 16
-"""Values of an axis that are written."""
+MOST_TICKS = 16  # values of an axis that are written
 
 
 def figure_size(summary: SweepSummary) -> tuple[float, float] | None:
@@ -56,10 +55,9 @@ def _cells(axes: Any, summary: SweepSummary, cells: SweepMap) -> None:
     if max(map(max, seen)) > 1:
         pairs = [zip(*rows, strict=True) for rows in zip(correct, seen, strict=True)]
         values = [[right / count if count else math.nan for right, count in row] for row in pairs]
-        heat(axes, values, extent, ACCURACY, *labels)
     else:
-        values = [[math.nan if one is None else one for one in row] for row in margin]
-        heat(axes, values, extent, MARGIN, *labels)
+        values = [[math.nan if mean is None else mean for mean in row] for row in margin]
+    heat(axes, values, extent, ACCURACY if max(map(max, seen)) > 1 else MARGIN, *labels)
     axes.set_xticks(*_ticks(first.values), rotation=45 if _long(first.values) else 0)
     axes.set_yticks(*_ticks(second.values))
     more = len(cells.over)
@@ -82,15 +80,14 @@ def _along(axes: Any, summary: SweepSummary, rows: Sequence[AxisRow]) -> None:
 
 def _ticks(values: Sequence[Any]) -> tuple[list[int], list[str]]:
     """Places and names of the values of an axis; of many, of some."""
-    every = -(-len(values) // MOST_TICKS)
-    places = list(range(0, len(values), every))
-    return places, [_written(values[place]) for place in places]
 
+    def name(value: Any) -> str:
+        if isinstance(value, (list, tuple)):
+            return " to ".join(f"{end:.3g}" for end in value)
+        return short_name(value) if isinstance(value, str) else f"{value:.4g}"
 
-def _written(value: Any) -> str:
-    if isinstance(value, (list, tuple)):
-        return " to ".join(f"{end:.3g}" for end in value)
-    return short_name(value) if isinstance(value, str) else f"{value:.4g}"
+    places = list(range(0, len(values), -(-len(values) // MOST_TICKS)))
+    return places, [name(values[place]) for place in places]
 
 
 def _who(summary: SweepSummary) -> str:
@@ -112,25 +109,16 @@ def _map_size(cells: SweepMap) -> tuple[float, float]:
 
 Doubles = npt.NDArray[np.float64]
 
-
-MOST_PANELS = 12
-"""Objects times models that are drawn; the file of the counts has all."""
-
-
-LIGHT = (0.36, 0.48, 0.80)
-"""The direction that the object is shaded from, world space; of length 1."""
-
+MOST_PANELS = 12  # objects times models that are drawn; the file of the counts has all
+LIGHT = (0.36, 0.48, 0.80)  # the direction that the object is shaded from, world space; of length 1
 
 COLOURS = "PuOr_r"
 """ColorBrewer's purple to orange, which people see apart who see no red or no green: orange is wrong more often."""
 
-
 UNTOLD, UNCOMPARED, NOTHING = (0.78, 0.78, 0.78), (0.45, 0.45, 0.45), (1.0, 1.0, 1.0)
 """Grey where a part is not told from chance, darker where too few pictures show it or do not; white beside charts."""
 
-
-ROWS = 2
-"""Rows of the views of an object."""
+ROWS = 2  # rows of the views of an object
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,17 +133,9 @@ class MapView:
 
 @dataclass(frozen=True, eq=False)
 class SurfacePanel:
-    """What is drawn of one object and one model; maps are (n, n) with row 0 at v = 1.
-
-    Attributes:
-        object: its name.
-        model: likewise.
-        surface: where there is a surface.
-        compared: where enough pictures show it, and do not.
-        difference: by how much predictions are wrong more often where a cell is seen, in [-1, 1]; NaN where that is not
-            told from chance.
-        views: of the object.
-    """
+    """What is drawn of one object and one model, by their names; maps are (n, n) with row 0 at v = 1: where there is a
+    surface, where enough pictures show it and do not, and by how much predictions are wrong more often where a cell is
+    seen, in [-1, 1], NaN where that is not told from chance."""
 
     object: str
     model: str
@@ -190,7 +170,11 @@ def surface_figure(panels: Sequence[SurfacePanel]) -> Figures:
                 height, width = view.cells.shape
                 row, column = divmod(number, across)
                 solid.text((column + 0.5) * width, row * height + 4, view.title, ha="center", va="top", fontsize=7)
-        bar = figure.colorbar(scale, ax=axes, shrink=0.8 if len(panels) == 1 else 0.4, format=_percent)
+
+        def percent(value: float, _: object) -> str:
+            return f"{100.0 * value:+.3g} %" if value else "0 %"
+
+        bar = figure.colorbar(scale, ax=axes, shrink=0.8 if len(panels) == 1 else 0.4, format=percent)
         bar.set_label("share of wrong predictions where it is seen,\nless that where it is not")
         marks = [
             mpl.patches.Patch(facecolor=colour, label=text)
@@ -201,12 +185,7 @@ def surface_figure(panels: Sequence[SurfacePanel]) -> Figures:
     return drawn(draw, (10.0, 0.5 + 3.6 * len(panels)), kinds=("png",))
 
 
-def _percent(value: float, _: object) -> str:
-    return f"{100.0 * value:+.3g} %" if value else "0 %"
-
-
 def _coloured(panel: SurfacePanel, scale: Any) -> Doubles:
-    """The map in colours, (n, n, 3)."""
     colours = np.where(panel.compared[..., None], UNTOLD, UNCOMPARED)
     told = np.isfinite(panel.difference)
     colours[told] = scale.to_rgba(panel.difference[told])[:, :3]

@@ -39,11 +39,8 @@ from advsearch.tasks import Detection, Facts, Judgement, Task
 from advsearch.tasks.base import Truth
 from advsearch.viewer import thumbnails
 
-KIND = "sweep"
-"""Rows of the sweep, and the stream of their seeds."""
-
-SAMPLES = 100
-"""Draws where there is no grid and nothing is said."""
+KIND = "sweep"  # rows of the sweep, and the stream of their seeds
+SAMPLES = 100  # draws where there is no grid and nothing is said
 
 
 @dataclass(frozen=True)
@@ -120,16 +117,16 @@ class Job:
         """The configurations of a scene for each size of picture; those of the last scene are held."""
         if scene not in self._bound:
             self._bound.clear()
-            spaces = self.spaces(self.places[scene])
-            self._bound[scene] = {size: self.points(space) for size, space in spaces.items()}
+            place, sizes = self.places[scene], dict.fromkeys(self.sizes)
+            self._bound[scene] = {size: self.points(self.space(place, size)) for size in sizes}
         return self._bound[scene]
 
     def queries(self, numbers: range) -> list[Sent]:
         """Ask all models about the pictures with these numbers, all of one scene, whose number is the name."""
         scene = numbers.start // self.per_scene
-        before, models = scene * self.per_scene, len(self.models)
+        before, models, sent = scene * self.per_scene, len(self.models), list[Sent]()
         place, keep = self.places[scene], self.config.keep_pictures != "none"
-        held, found = {control.name for control in place.held}, list[Sent]()
+        held = {control.name for control in place.held}
         picked: dict[tuple[int, int], tuple[Tensor, list[dict[str, Value]]]] = {}
         for size, points in self.bound(scene).items():
             picks = points.picks(numbers.start - before, len(numbers), before)
@@ -138,7 +135,7 @@ class Job:
         for k, number in enumerate(numbers):
             for model, size in enumerate(self.sizes):
                 points, (u, values) = self.bound(scene)[size], picked[size]
-                said, lit_by = place.values, points.lit_by(values[k])
+                said, lit_by = place.values, points.space.lit_by(values[k])
                 if lit_by is not None:
                     said["environment"] = {"value": lit_by, "unit": ""}
                 said["model"] = {"value": self.models[model].name, "unit": ""}
@@ -147,11 +144,8 @@ class Job:
                 query = Query(
                     u[k].clone(), seed, KIND, step, spp=self.spp, drawn=False, values=said, sought=False, keep=keep
                 )
-                found.append((str(scene), None, query))
-        return found
-
-    def spaces(self, place: NamedScene) -> dict[tuple[int, int], Space]:
-        return {size: self.space(place, size) for size in dict.fromkeys(self.sizes)}
+                sent.append((str(scene), None, query))
+        return sent
 
     def space(self, place: NamedScene, size: tuple[int, int]) -> Space:
         """The controls, those of the grid as choices, bound to a scene."""
@@ -161,7 +155,7 @@ class Job:
             return Space((), None)
         space = make_space(controls, description)
         if not place.held:
-            return space
+            return _checked(space, place)
         start = torch.cat([bound.start for bound in space.controls[: len(place.held)]])
         if place.u is not None and len(place.u) != len(start):
             raise InputError(
@@ -169,7 +163,7 @@ class Job:
                 f"and {place.object} takes {len(start)}: it is another object, or it has changed since; do the run "
                 "again"
             )
-        return space.holding(start if place.u is None else place.u)
+        return _checked(space.holding(start if place.u is None else place.u), place)
 
     def points(self, space: Space) -> Points:
         """The configurations of a space; those with an adversarial scene have the draws of those without it."""
@@ -180,36 +174,39 @@ class Job:
 
     def truth(self, place: NamedScene, model: int, values: Mapping[str, Value], look: Looked | None = None) -> Truth:
         """What is true of a configuration, by what is described and seen of it, as the task of a model needs it."""
-        return self.tasks[model].truth(self._facts(place, values, look))
+        return self.tasks[model].truth(self.facts(place, values, look))
 
-    def _facts(self, place: NamedScene, values: Mapping[str, Value], look: Looked | None = None) -> Facts:
+    def facts(self, place: NamedScene, values: Mapping[str, Value], look: Looked | None = None) -> Facts:
         return facts_of(place.scene, place.object, self.config, lambda: values, look)
 
     def right_names(self, place: NamedScene, model: int) -> tuple[str, ...]:
         """The names of the classes that are right for a detector; none for models of other tasks."""
         task = self.tasks[model]
-        return task.names(task.right_classes(self._facts(place, {}))) if isinstance(task, Detection) else ()
+        return task.names(task.right_classes(self.facts(place, {}))) if isinstance(task, Detection) else ()
 
-    def check_truths(self, place: NamedScene) -> None:
-        for task, model in zip(self.tasks, self.models, strict=True):
-            check_truth(task, model, place.scene, self._facts(place, {}), self.config)
+
+def _checked(space: Space, place: NamedScene) -> Space:
+    for group in space.groups:
+        if group.setting in place.scene.description.given - {ENVIRONMENT}:
+            raise InputError(
+                f"`controls` {group.control}: draws {group.parameter} by chance, and `set` {group.setting} fixes it; "
+                "leave it out of one of the two"
+            )
+    return space
 
 
 def check_scenes(places: Sequence[NamedScene], controls: Sequence[Control], axes: Sequence[Axis]) -> None:
     """Refuse to vary what the scenes were asked to have."""
     given = {name for place in places for name in place.scene.description.given}
-    drawn = {control.name: control for control in controls}
-    varied = {
-        axis: drawn.get(axis.instance)
-        or make_control(axis.instance, {"kind": axis.control, axis.parameter.name: axis.values[0]})
-        for axis in axes
-    }
-    settings = {axis: control.setting(axis.parameter) for axis, control in varied.items()}
-    for axis, setting in settings.items():
-        if setting in given and setting != ENVIRONMENT:
+    drawn, choosing = {control.name: control for control in controls}, list[str]()
+    for axis in axes:
+        settings = {"kind": axis.control, axis.parameter.name: axis.values[0]}
+        setting = (drawn.get(axis.instance) or make_control(axis.instance, settings)).setting(axis.parameter)
+        if setting == ENVIRONMENT:
+            choosing.append(f"`grid` {axis.name}")
+        elif setting in given:
             raise InputError(f"`grid` {axis.name}: `set` fixes it already; leave it out of one of the two")
     environments = list(dict.fromkeys(place.environment for place in places))
-    choosing = [f"`grid` {axis.name}" for axis, setting in settings.items() if setting == ENVIRONMENT]
     choosing += [
         f"`controls` {control.name}"
         for control in controls
@@ -228,11 +225,10 @@ def check_all(job: Job) -> tuple[Points, tuple[Drawn, ...]]:
     scene, and what the table shows of the draws: shares of the range where scenes, or pictures of different shapes,
     have different ones."""
     bound = []
-    for place in job.places:
-        spaces = list(job.spaces(place).values())
-        _check_draws(place, spaces[0])
-        bound += [(place, job.points(space)) for space in spaces]
-        job.check_truths(place)
+    for scene, place in enumerate(job.places):
+        bound += [(place, points) for points in job.bound(scene).values()]
+        for task, model in zip(job.tasks, job.models, strict=True):
+            check_truth(task, model, place.scene, job.facts(place, {}), job.config)
     first = bound[0][1]
     for place, points in bound:
         if points.drawn_numbers != first.drawn_numbers:
@@ -248,15 +244,6 @@ def check_all(job: Job) -> tuple[Points, tuple[Drawn, ...]]:
     return first, tuple(drawn)
 
 
-def _check_draws(place: NamedScene, space: Space) -> None:
-    for group in space.groups:
-        if group.setting in place.scene.description.given - {ENVIRONMENT}:
-            raise InputError(
-                f"`controls` {group.control}: draws {group.parameter} by chance, and `set` {group.setting} fixes it; "
-                "leave it out of one of the two"
-            )
-
-
 # ---- scenes, rendered ------------------------------------------------------------------------------------------------
 
 
@@ -266,17 +253,14 @@ class SweptScene:
 
     def __init__(self, job: Job, number: int) -> None:
         place, config = job.places[number], job.config
-        self.number, self.job = number, job
-        self.points: dict[tuple[int, int], Points] = {}
+        self.number, self.job, self.points = number, job, job.bound(number)
         self._without: dict[tuple[int, int], Renderer] = {}
-        self.renderers: dict[tuple[int, int], Renderer] = {}
-        spaces = job.spaces(place)
-        for size, space in spaces.items():
-            self.renderers[size] = self._renderer(size)
-            self.points[size] = job.points(space)
+        self.renderers = {size: self._renderer(size) for size in self.points}
         facts, spp, seed = partial(facts_of, place.scene, place.object, config), job.spp, config.seed
         self.problems = tuple(
-            Problem(self.renderers[size], spaces[size], model, task, facts, None, spp, seed, metrics=job.metrics)
+            Problem(
+                self.renderers[size], self.points[size].space, model, task, facts, None, spp, seed, metrics=job.metrics
+            )
             for size, model, task in zip(job.sizes, job.models, job.tasks, strict=True)
         )
         seed, self.predicted = seeds.stream(seed, "sweep light", number), dict[tuple[int, int], PredictedSweep]()
@@ -307,10 +291,9 @@ class SweptScene:
         seconds, evaluations = (time.perf_counter() - begun) / len(queries), list[Evaluation]()
         for query in queries:
             number, model = divmod(query.number, models)
-            picture, first = made[job.sizes[model]][number], job.first_of_size[model]
-            evaluation = Evaluation.of(
-                said[query.number], cost=picture.traced * first, predicted=picture.predicted, seconds=seconds
-            )
+            picture = made[job.sizes[model]][number]
+            cost, predicted = picture.traced * job.first_of_size[model], picture.predicted
+            evaluation = Evaluation.of(said[query.number], cost=cost, predicted=predicted, seconds=seconds)
             if model == 0 and query.keep and (job.config.keep_pictures == "all" or number in wrong):
                 evaluation = replace(evaluation, small=thumbnails.thumbnail(picture.picture))
             if model == 0 and job.aovs:
@@ -328,46 +311,44 @@ class SweptScene:
         claimed. What is true stays what it was before the change."""
         wholes, listed = [query.u for query in mine], [query.values for query in mine]
         for claim, when in self.job.config.claims:
-            if when == AWAY:
-                pictures = self._without_object(size, mine)
+            if when == AWAY:  # rendered with the same noise
+                # by a renderer of its own: a scene in which something was far away has other last bits
+                renderer = self._without[size] if size in self._without else self._renderer(size)
+                self._without[size], renderer.scene.assembly.away = renderer, True
+                with torch.no_grad():
+                    rendered = [renderer(query.u, query.seed, query.spp) for query in mine]
+                pictures = torch.stack(list(map(to_8_bit, rendered)))
             else:
-                pictures = torch.stack([changed(one, when, problem.model.cameras) for one in shown])
+                pictures = torch.stack([changed(picture, when, problem.model.cameras) for picture in shown])
             after = problem.judge_several(pictures, wholes, listed)
-            held = [as_claimed(claim, one.prediction, its.prediction) for one, its in zip(judged, after, strict=True)]
-            judged = [
-                replace(one, metrics={**(one.metrics or {}), f"{claim} {when}": float(right)})
-                for one, right in zip(judged, held, strict=True)
-            ]
+            for k, (before, now) in enumerate(zip(judged, after, strict=True)):
+                held = float(as_claimed(claim, before.prediction, now.prediction))
+                judged[k] = replace(before, metrics={**(before.metrics or {}), f"{claim} {when}": held})
         return judged
 
-    def _without_object(self, size: tuple[int, int], queries: Sequence[Query]) -> Tensor:
-        """The pictures (n, H, W, 3) of queries in the scene without its object, rendered with the same noise."""
-        renderer = self._without[size] if size in self._without else self._renderer(size)
-        renderer.scene.assembly.away = True
-        self._without[size] = renderer  # one of its own: a scene in which something was far away has other last bits
-        with torch.no_grad():
-            return torch.stack([to_8_bit(renderer(one.u, one.seed, one.spp)) for one in queries])
-
     def _renderer(self, size: tuple[int, int]) -> Renderer:
-        place, config = self.job.places[self.number], self.job.config
-        description, space = framed(place.scene.description, size), self.job.space(place, size)
+        config, space = self.job.config, self.points[size].space
+        description = framed(self.job.places[self.number].scene.description, size)
         return make_renderer(description, space, size, config.denoise, config.seed, sampler=config.pixel_sampler)
 
     def _made(self, size: tuple[int, int], queries: Sequence[Query]) -> dict[int, SweptPicture]:
         """The pictures of one size, rounded to 8 bits, by their numbers."""
         job, models, before = self.job, len(self.job.models), self.number * self.points[size].count
-        asked = {one.number // models - before: one for one in queries if job.sizes[one.number % models] == size}
+        asked = {
+            query.number // models - before: query for query in queries if job.sizes[query.number % models] == size
+        }
         with torch.no_grad():
             made = self.predicted[size].pictures(asked)
-        return {before + number: replace(one, picture=to_8_bit(one.picture)) for number, one in made.items()}
+        return {before + number: replace(swept, picture=to_8_bit(swept.picture)) for number, swept in made.items()}
 
     def pictures(self, queries: Sequence[Query]) -> Tensor:
         """Return the pictures (n, H, W, 3) of rows as the first model sees them."""
         made, models = self._made(self.job.sizes[0], queries), len(self.job.models)
-        return torch.stack([made[number].picture for number in dict.fromkeys(one.number // models for one in queries)])
+        numbers = dict.fromkeys(query.number // models for query in queries)
+        return torch.stack([made[number].picture for number in numbers])
 
 
-class Scenes:
+class OpenScenes:
     """The scenes of a sweep in this process, of which the last one is held."""
 
     def __init__(self, job: Job) -> None:
@@ -385,9 +366,15 @@ class Scenes:
         """The same by its number as text: see `advsearch.engine.journal.worker_call`."""
         return self.open(int(name))
 
-    def picture(self, number: int) -> Tensor:
+    def asked(self, number: int) -> tuple[SweptScene, list[Query]]:
+        """The scene of a picture, open, and what its models are asked about it."""
         sent = self.job.queries(range(number, number + 1))
-        return self.named(sent[0][0]).pictures([query for _, _, query in sent])[0]
+        return self.named(sent[0][0]), [query for _, _, query in sent]
+
+    def picture(self, number: int) -> Tensor:
+        """The picture (H, W, 3) as the first model sees it."""
+        scene, queries = self.asked(number)
+        return scene.pictures(queries)[0]
 
 
 def check_worst(

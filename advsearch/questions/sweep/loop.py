@@ -13,7 +13,6 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from advsearch.attacks import Evaluation, Query
 from advsearch.attacks.draws import batches
 from advsearch.attacks.units import most_shown
 from advsearch.cluster import Executor, InProcess
@@ -26,7 +25,7 @@ from advsearch.questions.attack.result import save_marked
 from advsearch.questions.sweep import summary as results
 from advsearch.questions.sweep.drives import Drives, time_axis
 from advsearch.questions.sweep.figures import sweep_figure
-from advsearch.questions.sweep.job import KIND, Job, Scenes, check_all, check_worst
+from advsearch.questions.sweep.job import KIND, Job, OpenScenes, check_all, check_worst
 from advsearch.questions.sweep.page import write_sweep_page
 from advsearch.questions.sweep.predicting import combined
 from advsearch.questions.sweep.result import (
@@ -52,22 +51,14 @@ from advsearch.runs.units import NOTE
 from advsearch.tasks import Judgement
 from advsearch.viewer import thumbnails
 
-NOT_FINITE = "pictures not finite"
-"""The note under which the store keeps that there were some."""
-
-PICTURE_SPP = 64
-"""Samples a pixel of the picture that is kept, unless verification needed more."""
-
-ENOUGH_DRIVES = 20
-"""Of fewer, a sweep says what they could show at best."""
+NOT_FINITE = "pictures not finite"  # the note under which the store keeps that there were some
+PICTURE_SPP = 64  # samples a pixel of the picture that is kept, unless verification needed more
+ENOUGH_DRIVES = 20  # of fewer, a sweep says what they could show at best
 
 TELL_SECONDS = 0.1
 
-MOST_METERED = 256
-"""Scenes whose gains a summary lists; of more it has none."""
-
-DRAWN_AT_ONCE = 4096
-"""Pictures whose draws are worked out at once for the tables."""
+MOST_METERED = 256  # scenes whose gains a summary lists; of more it has none
+DRAWN_AT_ONCE = 4096  # pictures whose draws are worked out at once for the tables
 
 
 class Sweep:
@@ -80,15 +71,13 @@ class Sweep:
         self.job, self.run, self.stages = job, run, Stages(progress)
         self.stages.begin("setup", "preparing the scenes for rendering")
         self.points, self._shown = check_all(job)
-        if run is not None:
-            run.store.set_note(EDGES, json.dumps({one.name: one.edges for one in self._shown if one.edges}))
         self.per_scene, self.models = self.points.count, len(job.models)
         self.units = replace(self.points.units, models=self.models)
         if run is not None:
+            run.store.set_note(EDGES, json.dumps({drawn.name: drawn.edges for drawn in self._shown if drawn.edges}))
             run.store.set_note(NOTE, json.dumps(self.units.noted))
         self.total = len(job.places) * self.per_scene * self.models
-        self.samples = job.spp
-        self._scenes = Scenes(job)
+        self._scenes = OpenScenes(job)
         self._executor = InProcess(worker_call(self._scenes.named)) if executor is None else executor
         self.journal = Journal(run, Shared(None, executor))
         self._rendered = self._traced = self._predicted = self._lost = 0
@@ -108,12 +97,10 @@ class Sweep:
         try:
             with interruptible():
                 left = [range(first, self.total)] if first is not None else self._left()
-                self._scenes.open((left[0].start if left else self.total - 1) // self.models // self.per_scene)
-                hint = (
-                    f"{self.total} predictions, pictures of {count(self.samples, 'sample')} a pixel; `resolution`, "
-                    "`spp`"
-                )
-                hint += " or fewer points shorten it"
+                self._scenes.open(self._scene_of(left[0].start if left else self.total - 1))
+                samples = count(self.job.spp, "sample")
+                hint = f"{self.total} predictions, pictures of {samples} a pixel; `resolution`, `spp` or fewer points"
+                hint += " shorten it"
                 if self.run is not None and self.job.config.keep_pictures != "none":
                     hint += f"; pictures that are kept take {self._pictures_text()}"
                 self.stages.begin("sweep", "rendering and classifying", self.total, hint=hint)
@@ -124,9 +111,13 @@ class Sweep:
                     worst = worst.model_copy(update=self._verified(worst))
                 if self.job.config.surface and self.run is not None:
                     self.stages.begin("surface", "tracing the surface that was seen", self.total)
-                    rows = self.run.store.rows(KIND)
-                    self._surface = map_surface(self.job, rows, self._scenes.open, self.run, self.stages.progress)
-                self._drives = self._driven()
+                    self._surface = map_surface(self._scenes, self.rows(), self.run, self.stages.progress)
+                if time_axis(self.job.axes) is not None:
+                    self.stages.begin("drives", "rendering the frames of the worst drive")
+                    drives = Drives(self.job, self.rows())
+                    if self.run is not None:
+                        drives.keep_worst(self._scenes, self.run)
+                    self._drives = drives.rates()
         except KeyboardInterrupt:
             ending = INTERRUPTED
             predictions = self._counted()
@@ -136,18 +127,35 @@ class Sweep:
 
     # ---- the loop ---------------------------------------------------------------------------------------------------
 
+    def _scene_of(self, configuration: int) -> int:
+        return configuration // self.models // self.per_scene
+
     def _left(self) -> list[range]:
         return [range(self.total)] if self.run is None else list(self.run.store.missing(KIND, self.total))
 
     def _go_through(self, left: Sequence[range], predictions: Predictions) -> None:
-        """Have what is left carried out, store and count it."""
         self._begun = time.monotonic()
         for done in self._executor.results(self._asked(left)):
-            queries = [query for _, _, query in done.items]
-            said = [lost(one, done.lost) for one in queries] if done.lost else done.value
-            self._take(queries, said, done.worker, done.machine)
-            for query, one in zip(queries, said, strict=True):
-                predictions.add(query.number, one.said)
+            queries = [query for *_, query in done.items]
+            evaluations = [lost(query, done.lost) for query in queries] if done.lost else done.value
+            evaluations = [replace(evaluation, machine=done.machine) for evaluation in evaluations]
+            evaluated = list(zip(queries, evaluations, strict=True))
+            if self.run is not None:
+                for query, evaluation in evaluated:
+                    number = query.number // self.models
+                    if evaluation.small is not None:
+                        thumbnails.keep(self.run.path, number, evaluation.small)
+                    if evaluation.layers is not None:
+                        write_layers(self.run.path / AOV_FOLDER / f"{number:06d}.exr", *evaluation.layers)
+            self._spend(self.journal.keep(evaluated, numbered=True))
+            self._rendered += sum(self.job.first_of_size[query.number % self.models] for query in queries)
+            self._transport[done.worker, self._scene_of(queries[0].number)] = evaluations[-1].light or []
+            if any(evaluation.non_finite for evaluation in evaluations) and not self._not_finite:
+                self._not_finite = True
+                if self.run is not None:
+                    self.run.store.set_note(NOT_FINITE, "yes")
+            for query, evaluation in evaluated:
+                predictions.add(query.number, evaluation.said)
             self._tell(len(queries), predictions)
         self.journal.rows.sort(key=lambda row: row.step)
 
@@ -162,29 +170,7 @@ class Sweep:
                     yield [one for one in asked if part.start <= one[2].number < part.stop]
                 first = before + self.per_scene
 
-    def _take(
-        self, queries: Sequence[Query], evaluations: Sequence[Evaluation], worker: str, machine: str | None
-    ) -> None:
-        evaluations = [replace(one, machine=machine) for one in evaluations]
-        if self.run is not None:
-            for query, evaluation in zip(queries, evaluations, strict=True):
-                number = query.number // self.models
-                if evaluation.small is not None:
-                    thumbnails.keep(self.run.path, number, evaluation.small)
-                if evaluation.layers is not None:
-                    write_layers(self.run.path / AOV_FOLDER / f"{number:06d}.exr", *evaluation.layers)
-        rows = self.journal.keep(list(zip(queries, evaluations, strict=True)), numbered=True)
-        self._spend(rows)
-        scene = queries[0].number // self.models // self.per_scene
-        self._rendered += sum(self.job.first_of_size[query.number % self.models] for query in queries)
-        self._transport[worker, scene] = evaluations[-1].light or []
-        if any(one.non_finite for one in evaluations) and not self._not_finite:
-            self._not_finite = True
-            if self.run is not None:
-                self.run.store.set_note(NOT_FINITE, "yes")
-
     def _pictures_text(self) -> str:
-        """What the kept pictures take, said beforehand."""
         height, width = self.job.sizes[0]
         share = min(1.0, thumbnails.SIDE / max(height, width)) ** 2 * height * width / thumbnails.SIDE**2
         megabytes = self.total // self.models * thumbnails.BYTES * share / 1e6
@@ -197,11 +183,10 @@ class Sweep:
         if row is None or self.run is None or self._executor.facts is not None or not any(map(len, self._left())):
             return
         number, model = divmod(row.step, self.models)
-        sent = self.job.queries(range(number, number + 1))
-        other = Scenes(self.job).named(sent[0][0])  # what is done here decides no row
+        other, queries = OpenScenes(self.job).asked(number)  # what is done here decides no row
 
         def look() -> float | None:
-            return finite(other.evaluate_all([query for _, _, query in sent])[model].said.margin)
+            return finite(other.evaluate_all(queries)[model].said.margin)
 
         now = look()
         if not same([row.margin], [now]) and same([now], [look()]):
@@ -211,12 +196,12 @@ class Sweep:
         self._untold += count
         now = time.monotonic()
         if now - self._told >= TELL_SECONDS:
-            facts, told = self._executor.facts, dict[str, float | str]()
+            beside = dict[str, float | str]()
             if seen := int(predictions.counted.sum()):
-                told["accuracy"] = int((predictions.right & predictions.counted).sum()) / seen
-            if facts is not None:
-                told |= {**facts.told, "a second": self._rendered / max(1e-9, now - self._begun)}
-            self.stages.progress.advance(self._untold, **told)
+                beside["accuracy"] = int((predictions.right & predictions.counted).sum()) / seen
+            if (facts := self._executor.facts) is not None:
+                beside |= {**facts.told, "a second": self._rendered / max(1e-9, now - self._begun)}
+            self.stages.progress.advance(self._untold, **beside)
             self._told, self._untold = now, 0
 
     # ---- counting ---------------------------------------------------------------------------------------------------
@@ -272,9 +257,10 @@ class Sweep:
         if index is None:
             return None
         rows = self.journal.rows if self.run is None else [self.run.store.row(KIND, index)]
-        row = next(one for one in rows if one is not None and one.step == index)
-        query, model = self._query(index)
-        task, scene = self.job.tasks[model], index // self.models // self.per_scene
+        row = next(row for row in rows if row is not None and row.step == index)
+        number, model = divmod(index, self.models)
+        *_, query = self.job.queries(range(number, number + 1))[model]
+        task, scene = self.job.tasks[model], self._scene_of(index)
         if task.varies:
             truth = self._scenes.open(scene).problems[model].truth(query.u, query.values)
         else:
@@ -290,8 +276,9 @@ class Sweep:
 
     def _verified(self, worst: WorstConfiguration) -> dict[str, object]:
         """What fresh renders say of it, and what the model says of the picture that is kept."""
-        query, model = self._query(worst.configuration)
-        problem = self._scenes.open(worst.configuration // self.models // self.per_scene).problems[model]
+        number, model = divmod(worst.configuration, self.models)
+        scene, queries = self._scenes.asked(number)
+        query, problem = queries[model], scene.problems[model]
         checked = check_worst(problem, self.job.config, query.u, self.run, self.stages)
         if self.run is None:
             return {"verified": checked}
@@ -301,20 +288,6 @@ class Sweep:
         save_marked(self.run, "worst", picture, problem.marks(picture, query.u))
         return {"verified": checked, "pictured": _claim_of(problem.judge(picture, query.u))}
 
-    def _query(self, index: int) -> tuple[Query, int]:
-        number, model = divmod(index, self.models)
-        return self.job.queries(range(number, number + 1))[model][2], model
-
-    def _driven(self) -> list[results.DriveRates] | None:
-        """What is said of whole drives, where frames of a path were swept; the worst of them is kept."""
-        if time_axis(self.job.axes) is None:
-            return None
-        self.stages.begin("drives", "rendering the frames of the worst drive")
-        drives = Drives(self.job, self.rows())
-        if self.run is not None:
-            drives.keep_worst(self._scenes, self.run)
-        return drives.rates()
-
     # ---- the result -------------------------------------------------------------------------------------------------
 
     def _finish(self, predictions: Predictions, ending: str, worst: WorstConfiguration | None) -> SweepResult:
@@ -323,13 +296,16 @@ class Sweep:
         predicting = self._transport.values() or [[one.summary() for one in (view.predicted.values() if view else ())]]
         swept = seconds.get("sweep", 0.0)
         formation = Formation.of(next(iter(view.renderers.values())).formation) if view else None
-        gains = self._gains() if formation else {}
+        gains: dict[str, float] = {}
+        if formation and len(job.places) <= MOST_METERED:
+            for place in job.places:
+                gains[f"{place.object}, {place.environment}"] = framed(place.scene.description, job.sizes[0]).gain
+        if formation and len(set(gains.values())) != 1:
+            formation = formation.model_copy(update={"gain": None})
         models, adversarial = [model.name for model in job.models], job.places[-1].beside_clean
         numbers = np.flatnonzero(predictions.counted)
         right, units, axes = predictions.right[numbers], self.units.of(numbers), self._axes(numbers)
         changes = self._changes()
-        if formation is not None and len(set(gains.values())) != 1:
-            formation = formation.model_copy(update={"gain": None})
         summary = results.SweepSummary(
             run=None if self.run is None else str(self.run.path),
             object=job.config.object,
@@ -356,7 +332,7 @@ class Sweep:
             grid={axis.name: len(axis.values) for axis in job.axes},
             samples=job.samples,
             sampler=job.config.sampler if self.points.draws else None,
-            spp=self.samples,
+            spp=job.spp,
             renders={
                 "sweep": self._traced,
                 "verification": checked.renders if checked else 0,
@@ -370,7 +346,7 @@ class Sweep:
             renders_per_second=self._rendered / swept if self._rendered and swept else None,
             seconds={**seconds, "total": self.stages.total},
             seed=job.config.seed,
-            warnings=[*job.warnings, *self._remarks(predictions, checked), *_blind_remarks(changes or ())],
+            warnings=[*job.warnings, *self._remarks(predictions, checked, changes or ())],
             command_line=job.config.command_line(),
         )
         if self.run is not None:
@@ -381,7 +357,6 @@ class Sweep:
         return SweepResult(summary, None if self.run is None else self.run.path, tuple(self.journal.rows))
 
     def _changes(self) -> list[results.ChangeRates] | None:
-        """How often changed pictures did what is claimed of them, for each model."""
         found: list[results.ChangeRates] = []
         for claim, when in self.job.config.claims:
             held = {row.step: row.metrics[name] for row in self.rows() if (name := f"{claim} {when}") in row.metrics}
@@ -393,20 +368,11 @@ class Sweep:
                 found.append(results.ChangeRates(**counts, model=network.name, claim=claim, when=when, row=row))
         return found or None
 
-    def _gains(self) -> dict[str, float]:
-        """The gain of each scene, by object and environment, where there are not too many to meter."""
-        if len(self.job.places) > MOST_METERED:
-            return {}
-        size = self.job.sizes[0]
-        return {
-            f"{place.object}, {place.environment}": framed(place.scene.description, size).gain
-            for place in self.job.places
-        }
-
-    def _remarks(self, predictions: Predictions, checked: WorstVerified | None) -> list[str]:
-        remarks = lost_remarks(self._lost)
-        remarks += self.journal.machines.remarks
-        few = min((one.drives for one in self._drives or ()), default=ENOUGH_DRIVES)
+    def _remarks(
+        self, predictions: Predictions, checked: WorstVerified | None, changes: Sequence[results.ChangeRates]
+    ) -> list[str]:
+        remarks = [*lost_remarks(self._lost), *self.journal.machines.remarks]
+        few = min((rates.drives for rates in self._drives or ()), default=ENOUGH_DRIVES)
         if few < ENOUGH_DRIVES:
             remarks.append(
                 f"{count(few, 'drive')} can show little: were the model right in all their frames, the interval of "
@@ -428,24 +394,13 @@ class Sweep:
                 f"It is not shown that the worst margin keeps its side beyond {checked.spp} samples a pixel, the most "
                 "that a check takes: noise may take part in it."
             )
+        for rates in changes:
+            if rates.claim == "must_change" and rates.interval is not None and rates.interval[1] < 0.5:
+                alike = f"{rates.configurations - rates.correct} of {rates.configurations} pictures"
+                text = f"{rates.model} says the same in {alike} when {BLIND[rates.when]}"
+                remarks.append(f"{text}: it may not be looking at the object.")
         return remarks
-
-
-def _blind_remarks(changes: Sequence[results.ChangeRates]) -> list[str]:
-    """Return a sentence for each change with which nothing is left to see, and after which a model mostly says the
-    same: the interval of how often it says something else ends under one half."""
-    return [
-        f"{one.model} says the same in {one.configurations - one.correct} of {one.configurations} pictures when "
-        f"{BLIND[one.when]}: it may not be looking at the object."
-        for one in changes
-        if one.claim == "must_change" and one.interval is not None and one.interval[1] < 0.5
-    ]
 
 
 def _claim_of(seen: Judgement) -> results.WorstClaim:
     return results.WorstClaim(**vars(seen.prediction), margin=seen.margin, payload=seen.payload)
-
-
-def carry_out(job: Job, run: RunDirectory | None, progress: Progress, executor: Executor | None = None) -> SweepResult:
-    """Sweep, check the worst configuration and write the summary; see `Sweep`."""
-    return Sweep(job, run, progress, executor).carry_out()

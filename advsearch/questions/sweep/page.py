@@ -9,7 +9,7 @@ from __future__ import annotations
 import base64
 import gzip
 import shlex
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,20 +21,14 @@ from advsearch.questions.sweep import display as sweeps
 from advsearch.questions.sweep.summary import SweepSummary
 from advsearch.report import wording
 from advsearch.report.markup import Html, element, join_html
-from advsearch.report.shown import shown
-from advsearch.report.wording import beside_text, percent, prediction_text
+from advsearch.report.shown import shown as shown_of
+from advsearch.report.wording import beside_text, prediction_text
 from advsearch.runs import directory
 from advsearch.runs.files import placed_by, write_bytes, write_text
 from advsearch.runs.summary import read_result
 from advsearch.settings import read_yaml
 from advsearch.viewer.columns import packed, read_columns
-from advsearch.viewer.document import (
-    data_script,
-    data_url,
-    document,
-    remarks_html,
-    subject_html,
-)
+from advsearch.viewer.document import data_script, data_url, document, remarks_html, subject_html
 from advsearch.viewer.pages import end_html, page_of, part_html
 from advsearch.viewer.thumbnails import Kept, kept_pictures, path_of, read_thumbnail
 
@@ -44,22 +38,15 @@ if TYPE_CHECKING:
 MOST_EMBEDDED = 3_000_000
 """Bytes of pictures that a page which needs no other file takes along; the worst predictions first."""
 
-MOST_ROWS = 200_000
-"""Rows that such a page takes along; more are for `advsearch dashboard`."""
+MOST_ROWS = 200_000  # rows that such a page takes along; more are for `advsearch dashboard`
 
 
 @dataclass(frozen=True)
 class SweepSource:
-    """Where the page of a run gets what it shows.
-
-    Attributes:
-        name: of the run.
-        rows: columns for a page that needs no other file; else the address they are fetched from; None where they are
-            too many for such a page, which then has the tables only.
-        parts: whether the address gives them in parts (``?after=ID``), as those of a sweep that goes on.
-        pictures: which thumbnails there are; None for none.
-        folder: address of the thumbnails; None puts them into the page.
-    """
+    """Where the page of a run, by its name, gets what it shows: rows as columns for a page that needs no other file,
+    else the address they are fetched from, in `parts` (``?after=ID``) as those of a sweep that goes on; None where they
+    are too many for such a page, which then has the tables only. And the thumbnails, and their address; None puts them
+    into the page."""
 
     name: str
     rows: pd.DataFrame | str | None
@@ -74,11 +61,7 @@ class SweepSource:
 
 def write_sweep_page(run: Path, summary: SweepSummary) -> Path:
     """Write `report.html` of a sweep that has ended, and its rows as columns, into its folder; return the page's path.
-
-    Raises:
-        FileFormatError: the results are damaged.
-        StorageError: it cannot be written.
-    """
+    Raises FileFormatError where results are damaged, StorageError where it cannot be written."""
     columns = read_columns(run)
     write_bytes(run / directory.COLUMNS, packed(columns), durable=False)
     return write_text(run / directory.REPORT, page(run, summary, columns), durable=False)
@@ -94,32 +77,37 @@ def page(run: Path, summary: SweepSummary, columns: pd.DataFrame | None = None) 
 def sweep_page_html(runs: Sequence[tuple[Path, SweepSummary | None]], sources: Sequence[SweepSource]) -> str:
     """Return the page of sweeps as HTML, of each its folder, its result (None where it has none yet) and what its
     explorer reads."""
-    connects = any(isinstance(one.rows, str) or one.folder for one in sources)
+    connects = any(isinstance(source.rows, str) or source.folder for source in sources)
     summaries = [(path, summary) for path, summary in runs if summary is not None]
     title = ", ".join(path.name for path, _ in runs)
     described, data, left_out = [], [], []
-    shown = [(one, *run) for one, run in zip(sources, runs, strict=True) if one.rows is not None]
+    shown = [(source, *run) for source, run in zip(sources, runs, strict=True) if source.rows is not None]
     for number, (source, path, summary) in enumerate(shown):
-        described.append(_described(source, number) | (_going_on(path) if summary is None else _judged(summary)))
+        described.append(_described(source, number) | _judged(path, summary))
         if source.embedded:
             zipped = base64.b64encode(gzip.compress(packed(source.rows), 6, mtime=0)).decode()
             data.append(element("script", Html(zipped), type="application/octet-stream", id=f"rows-{number}"))
-            left_out += [] if source.folder else [_left_out(described[-1], source)]
+            pictures, kept = described[-1].get("pictures"), source.pictures
+            taken = pictures.get("embedded") if isinstance(pictures, dict) else None
+            if kept is not None and isinstance(taken, dict) and len(taken) < len(kept.numbers):
+                some = f"{len(taken):,} of the {len(kept.numbers):,} pictures that were kept"
+                left_out.append(element("p", f"This file has {some}, those of the worst margins.", class_="soft"))
+    parts = []
+    for path, summary in summaries:  # what is shown of a sweep on a page alone, and how it came about
+        given = shown_of(summary)
+        parts += [
+            part_html(path, part, given.said) for part in given.sections if part.only == "page" and not part.empty
+        ]
+        parts.append(end_html(path, summary, given))
     main = element(
         "main",
         element("div", id="explorer", hidden="hidden") if shown else _too_many(runs),
         *left_out,
         *(_still(path, summary) for path, summary in summaries),
-        *(join_html(*_parts(path, summary)) for path, summary in summaries),
+        *parts,
     )
-    return document(
-        title,
-        _header(runs),
-        main,
-        data=[data_script(described, "runs"), *data],
-        scripts=["sweep.js"],
-        connects=connects,
-    )
+    data = [data_script(described, "runs"), *data]
+    return document(title, _header(runs), main, data=data, scripts=["sweep.js"], connects=connects)
 
 
 def _described(source: SweepSource, number: int) -> JsonObject:
@@ -130,26 +118,23 @@ def _described(source: SweepSource, number: int) -> JsonObject:
         return described
     pictures: JsonObject = {"models": kept.models}
     if source.folder is not None:
-        pictures |= {"folder": source.folder, "suffix": kept.suffix, "kept": list(kept.numbers) if kept.some else None}
+        pictures |= {"folder": source.folder, "suffix": "jpg", "kept": list(kept.numbers) if kept.some else None}
     elif source.embedded:
         pictures["embedded"] = dict(kept.embedded(source.rows, MOST_EMBEDDED))
     return {**described, "pictures": pictures}
 
 
-def _going_on(run: Path) -> JsonObject:
-    """The task of a sweep that has no result yet, as far as its settings can be read."""
-    with suppress(AdvsearchError):
-        given = read_yaml(run / directory.CONFIG).get("task")
-        return {"task": str(given.get("name") if isinstance(given, Mapping) else given).partition("=")[0]}
-    return {}
-
-
-def _judged(summary: SweepSummary) -> JsonObject:
-    """The task, the axes of the grid, and height and width in pixels of what was judged, where that is one size: boxes
-    are told in them."""
+def _judged(run: Path, summary: SweepSummary | None) -> JsonObject:
+    """The task, as far as settings can be read where there is no result yet, the axes of the grid, and height and width
+    in pixels of what was judged, where that is one size: boxes are told in them."""
+    if summary is None:
+        with suppress(AdvsearchError):
+            given = read_yaml(run / directory.CONFIG).get("task")
+            return {"task": str(given.get("name") if isinstance(given, Mapping) else given).partition("=")[0]}
+        return {}
     formed = summary.image_formation
     size = None if formed is None or "," in summary.model else list[JsonValue](formed.resolution)
-    grid = list[JsonValue](dict.fromkeys(one.axis for one in summary.axes))
+    grid = list[JsonValue](dict.fromkeys(row.axis for row in summary.axes))
     return {"task": summary.task, "size": size, "grid": grid, "drives": bool(summary.drives)}
 
 
@@ -183,27 +168,15 @@ def _too_many(runs: Sequence[tuple[Path, SweepSummary | None]]) -> Html:
     )
 
 
-def _left_out(described: JsonObject, source: SweepSource) -> Html | None:
-    """What a file says of the pictures that it does not take along."""
-    pictures, kept = described.get("pictures"), source.pictures
-    taken = len(pictures["embedded"]) if isinstance(pictures, dict) and isinstance(pictures["embedded"], dict) else 0
-    if kept is None or taken == len(kept.numbers):
-        return None
-    said = f"This file has {taken:,} of the {len(kept.numbers):,} pictures that were kept, those of the worst margins."
-    return element("p", said, class_="soft")
-
-
 def sweep_verdict(summary: SweepSummary) -> str:
     """Return what a sweep came to, in one sentence."""
     if not summary.configurations:
         return "The object is in no picture." if summary.out_of_view else "No configuration was looked at."
     if summary.beside and summary.beside.pairs:
         return " ".join(beside_text(summary.beside.answer, one) for one in summary.beside.pairs)
-    over = sweeps.over_drives(summary)
-    share = f"{percent(summary.accuracy)}, 95 % interval {wording.interval_text(summary.interval)}{over}"
     ended = "" if summary.looked_at == summary.planned else f" so far, of {summary.planned} planned"
-    grid = "" if summary.sampler is not None or not summary.grid else " of this grid; another has another share"
-    return f"Right in {summary.correct} of {summary.configurations} configurations{ended} ({share}){grid}."
+    share = f"({sweeps.rate_text(summary)}){sweeps.of_grid(summary)}"
+    return f"Right in {summary.correct} of {summary.configurations} configurations{ended} {share}."
 
 
 def _still(path: Path, summary: SweepSummary) -> Html:
@@ -211,31 +184,20 @@ def _still(path: Path, summary: SweepSummary) -> Html:
     single = summary.cells is not None and max(map(max, summary.cells.configurations)) <= 1
     axes = " and ".join(list(dict.fromkeys(row.axis for row in summary.axes))[:2]) or "all configurations"
     figure = _figure(path / "images" / "sweep.png", f"{'Margin' if single else 'Accuracy'} over {axes}.")
-    worst = _figure(path / "images" / "worst.png", _worst_text(summary))
+    text = ""
+    if summary.worst is not None:
+        values = ", ".join(f"{name} {wording.number_text(one.value)}" for name, one in summary.worst.values.items())
+        claim, rate = summary.worst.pictured or summary.worst.claimed, summary.worst.verified
+        text = f"{values}: the model predicts {prediction_text(summary.task, claim)}"
+        if rate is not None:
+            tally = wording.tally("wrong", rate.successes, rate.trials, rate.not_a_number)
+            text += f"; {tally} fresh renders"
+    worst = _figure(path / "images" / "worst.png", f"{text}." if text else "")
     return join_html(
         element("div", figure, class_="pictures", data_still="true") if figure else None,
         element("h2", "The worst configuration") if worst else None,
         element("div", worst, class_="pictures pair") if worst else None,
     )
-
-
-def _parts(path: Path, summary: SweepSummary) -> Iterator[Html]:
-    """What is shown of a sweep on a page alone, and how it came about."""
-    given = shown(summary)
-    yield from (part_html(path, one, given.said) for one in given.sections if one.only == "page" and not one.empty)
-    yield end_html(path, summary, given)
-
-
-def _worst_text(summary: SweepSummary) -> str:
-    worst = summary.worst
-    if worst is None:
-        return ""
-    where = ", ".join(f"{name} {wording.number_text(one.value)}" for name, one in worst.values.items())
-    said = prediction_text(summary.task, worst.pictured or worst.claimed)
-    told, rate = f"{where}: the model predicts {said}", worst.verified
-    if rate is None:
-        return f"{told}."
-    return f"{told}; {wording.tally('wrong', rate.successes, rate.trials, rate.not_a_number)} fresh renders."
 
 
 def _figure(file: Path, caption: str) -> Html | None:
@@ -248,10 +210,8 @@ def _figure(file: Path, caption: str) -> Html | None:
 def result_of(run: Path) -> SweepSummary | None:
     """Return the result of the sweep in a folder; None where it has none yet. Raises FileFormatError where it is
     damaged, or that of another command."""
-    if not (run / "summary.json").is_file():
-        return None
-    found = read_result(run)
-    return found if isinstance(found, SweepSummary) else None
+    result = read_result(run) if (run / "summary.json").is_file() else None
+    return result if isinstance(result, SweepSummary) else None
 
 
 INDEX = "index.html"
@@ -259,12 +219,8 @@ INDEX = "index.html"
 
 def write_bundle(runs: Sequence[Path], folder: Path) -> Path:
     """Write a folder with a page, the rows and the thumbnails of sweeps, or the page of another run; return the page.
-
-    Raises:
-        InputError: the folder is there and not empty, or runs of these commands have no common page.
-        FileFormatError: results are damaged.
-        StorageError: the folder cannot be written.
-    """
+    Raises InputError where the folder is there and not empty, or these runs have no common page, and otherwise as
+    `write_sweep_page`."""
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(f"bundle: {folder} is there already and not empty; name another folder")
     results = [(run, read_result(run)) for run in runs]
@@ -272,9 +228,8 @@ def write_bundle(runs: Sequence[Path], folder: Path) -> Path:
     with placed_by("bundle"):
         if len(results) == 1 and not sweeps:
             run, result = results[0]
-            for page in sorted(
-                (run / directory.PARTS).glob(f"*/{directory.REPORT}")
-            ):  # made anew: what lies there may be anybody's
+            # made anew: what lies there may be anybody's
+            for page in sorted((run / directory.PARTS).glob(f"*/{directory.REPORT}")):
                 write_text(folder / page.relative_to(run), page_of(page.parent, read_result(page.parent)))
             return write_text(folder / INDEX, page_of(run, result))
         if len(sweeps) < len(results):
@@ -291,7 +246,7 @@ def _copied(run: Path, folder: Path, number: int) -> SweepSource:
     if not embedded:
         write_bytes(folder / rows, packed(columns))
     kept = kept_pictures(run)
-    for one in kept.numbers if kept else ():
-        place = path_of(folder / pictures, one)
-        write_bytes(folder / pictures / place.parent.name / place.name, read_thumbnail(run, one))
+    for picture in kept.numbers if kept else ():
+        place = path_of(folder / pictures, picture)
+        write_bytes(folder / pictures / place.parent.name / place.name, read_thumbnail(run, picture))
     return SweepSource(run.name, columns if embedded else rows, pictures=kept, folder=pictures)

@@ -5,7 +5,7 @@ the same ones."""
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,17 +30,11 @@ MOST_PARTS, FEWEST_PARTS = 10, 2
 LEAST_IN_A_CELL = 5
 """Draws that a cell of the map over two drawn parameters has on average, at least, where there are enough."""
 
-MOST_QUASI = 64
-"""Numbers of a group up to which Sobol points are used; more (a texture) are drawn pseudo-randomly."""
-
-MOST_BINNED = 4
-"""Numbers of a parameter up to which the table shows them."""
-
-MOST_KEPT = 4096
-"""Descriptions of one control that are kept for points of the grid."""
+MOST_QUASI = 64  # numbers of a group up to which Sobol points are used; more (a texture) are drawn pseudo-randomly
+MOST_BINNED = 4  # numbers of a parameter up to which the table shows them
+MOST_KEPT = 4096  # descriptions of controls that are kept for points of the grid
 
 Doubles = NDArray[np.float64]
-Tell = Callable[[Tensor, "Picks"], list[Mapping[str, Value]]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,10 +76,8 @@ class Drawn:
 
 
 def parts_of_ranges(pictures: int) -> int:
-    """Return into how many equal parts the range of a drawn parameter is cut, by the pictures of the whole sweep.
-
-    The table, the map and the page (viewer/columns.py) show these parts.
-    """
+    """Return into how many equal parts table, map and page cut the range of a drawn parameter, by the pictures of the
+    whole sweep."""
     return min(max(FEWEST_PARTS, math.isqrt(pictures // LEAST_IN_A_CELL)), MOST_PARTS)
 
 
@@ -111,39 +103,15 @@ class Points:
         self.parts = parts_of_ranges(self.count * among)
         frames = next((place for place, axis in enumerate(axes) if axis.is_time), None)
         self.units = Units(self.grid.sizes, frames, samples, again=scenes * self.count)
-        self._space, self._domain, self._axes = space, domain, tuple(axes)
+        self.space, self._axes = space, tuple(axes)
         self._start = domain.start.numpy().astype(np.float64)
         self._lower, self._upper = domain.lower.numpy(), domain.upper.numpy()
         self._places: list[tuple[int, int, int]] = []
         self._small: list[tuple[Block, slice, slice]] = []
         self._large: list[tuple[Block, slice, slice]] = []
-        self.drawn = self._lay_out()
-        small, large = (chosen[-1][2].stop if chosen else 0 for chosen in (self._small, self._large))
-        self._columns = [one.column for one in self.drawn]
-        self._sizes = np.array([len(one.shares or one.parts) for one in self.drawn], dtype=np.int64)
-        self._draws = Draws(small, sampler, seed)
-        self._noise = Draws(large, "random", seed, "large draws")
-        shown = tuple((one.name, one.column, len(one.parts)) for one in self.drawn)
-        self.drawn_numbers = (small, shown)
-        self._tellers = [
-            _teller(
-                space,
-                control,
-                part,
-                [(number, axis) for number, axis in enumerate(axes) if axis.instance == control.name],
-            )
-            for control, part in zip(space.controls, _slices(space), strict=True)
-        ]
-
-    # ---- layout -----------------------------------------------------------------------------------------------------
-
-    def _lay_out(self) -> tuple[Drawn, ...]:
-        """Say of every coordinate of u whether it is an axis of the grid or drawn, and from which columns; return what
-        the table shows."""
-        number_of = {axis.name: number for number, axis in enumerate(self._axes)}
-        shown: list[Drawn] = []
-        controls = {control.name: control for control in self._space.controls}
-        for group, (block, part) in zip(self._space.groups, self._domain.parts(), strict=True):
+        number_of, drawn = {axis.name: number for number, axis in enumerate(axes)}, list[Drawn]()
+        controls = {control.name: control for control in space.controls}
+        for group, (block, part) in zip(space.groups, domain.parts(), strict=True):
             control = controls[group.control]
             if group.name in number_of:
                 number = number_of[group.name]
@@ -151,11 +119,17 @@ class Points:
                 continue
             into = self._small if block.size <= MOST_QUASI else self._large
             first = into[-1][2].stop if into else 0
-            columns = slice(first, first + block.size + (block.norm == "l2"))
-            into.append((block, part, columns))
+            into.append((block, part, slice(first, first + block.size + (block.norm == "l2"))))
             if block.size <= MOST_BINNED and block.norm != "l2" and isinstance(control, NumberControl):
-                shown += self._shown(control, group.parameter, block, part, first)
-        return tuple(shown)
+                drawn += self._shown(control, group.parameter, block, part, first)
+        self.drawn = tuple(drawn)
+        small, large = (chosen[-1][2].stop if chosen else 0 for chosen in (self._small, self._large))
+        self._columns = [one.column for one in self.drawn]
+        self._sizes = np.array([len(one.shares or one.parts) for one in self.drawn], dtype=np.int64)
+        self._draws = Draws(small, sampler, seed)
+        self._noise = Draws(large, "random", seed, "large draws")
+        self.drawn_numbers = (small, tuple((one.name, one.column, len(one.parts)) for one in self.drawn))
+        self._described: dict[tuple[object, ...], Mapping[str, Value]] = {}
 
     def _shown(self, control: NumberControl, name: str, block: Block, part: slice, first: int) -> list[Drawn]:
         parameter, spec = _spec(control, name)
@@ -178,7 +152,7 @@ class Points:
 
     def picks(self, first: int, count: int, before: int = 0) -> Picks:
         """Return the pictures from number `first` of the scene on; `before` is how many the scenes before it have."""
-        digits = [self.digits(number) for number in range(first, first + count)]
+        digits = [self.grid.digits(number // self.samples) for number in range(first, first + count)]
         return Picks(before + first, digits, self._drawn(self._draws, before + first, count))
 
     def parts_of(self, first: int, count: int) -> NDArray[np.int64]:
@@ -195,9 +169,6 @@ class Points:
     def draws(self) -> bool:
         """Whether anything is drawn: not where controls have all from the grid, as a path its time."""
         return self._draws.dimensions + self._noise.dimensions > 0
-
-    def digits(self, number: int) -> tuple[int, ...]:
-        return self.grid.digits(number // self.samples)
 
     def noise(self, number: int) -> int:
         """Return the number of the noise of the picture with this number in the whole sweep."""
@@ -237,34 +208,60 @@ class Points:
     @property
     def environment(self) -> str | None:
         """What lights all pictures in the place of the scene's environment; None if that does, or if it varies."""
-        varies = any(group.setting == ENVIRONMENT for group in self._space.groups)
-        return None if varies else self._space.environment
-
-    def lit_by(self, values: Mapping[str, Value]) -> str | None:
-        """Return what lights a picture in the place of the scene's environment, by what is stored of it."""
-        return self._space.lit_by(values)
+        varies = any(group.setting == ENVIRONMENT for group in self.space.groups)
+        return None if varies else self.space.environment
 
     def values(self, u: Tensor, picks: Picks) -> list[dict[str, Value]]:
-        """Return what is stored of the pictures: parameter to value and unit, as `Space.describe` says it.
+        """Return what is stored of the pictures: parameter to value and unit, as `Space.describe` says it. One of the
+        grid has the value that was listed, not what single precision makes of it."""
+        rows: list[dict[str, Value]] = [{} for _ in picks.digits]
+        for control, own in zip(self.space.controls, u.split(self.space.sizes, dim=1), strict=True):
+            says = (type(control).describe, getattr(type(control), "measured", None))
+            if isinstance(control, NumberControl) and says == (NumberControl.describe, NumberControl.measured):
+                for name, column in self._by_column(control, own, picks):
+                    for row, value in zip(rows, column, strict=True):
+                        row[name] = value
+            else:
+                for row, whole, part, digits in zip(rows, u, own, picks.digits, strict=True):
+                    row |= self._description(control, whole, part, digits)
+        return rows
 
-        A parameter of the grid has the value that was listed, not what single precision makes of it.
-        """
-        found: list[dict[str, Value]] = [{} for _ in picks.digits]
-        for tell in self._tellers:
-            for into, said in zip(found, tell(u, picks), strict=True):
-                into.update(said)
-        return found
+    def _by_column(self, control: NumberControl, own: Tensor, picks: Picks) -> Iterator[tuple[str, list[Value]]]:
+        """Values of all configurations at once, parameter by parameter; the same numbers as `describe`."""
+        axes, begin = {axis.name: (number, axis) for number, axis in enumerate(self._axes)}, 0
+        for group in control.groups:
+            name, columns = f"{control.name}.{group.parameter}", own[:, begin : begin + group.size].T
+            begin += group.size
+            if name in axes:
+                number, axis = axes[name]
+                yield name, [{"value": axis.values[digits[number]], "unit": axis.unit} for digits in picks.digits]
+                continue
+            parameter, spec = _spec(control, group.parameter)
+            for number, column in enumerate(columns):
+                full, values = name, list[Any]()
+                if isinstance(spec, OneOf):
+                    count = len(spec.values)
+                    values = [spec.values[min(count - 1, int(share * count))] for share in column.tolist()]
+                else:
+                    values = to_value(spec, parameter.log, column).tolist()
+                    full += f".{number}" if parameter.shape else ""
+                yield full, [{"value": value, "unit": _unit(parameter)} for value in values]
 
-
-# ---- saying what a control does, fast -------------------------------------------------------------------------------
-
-
-def _slices(space: Space) -> list[slice]:
-    found, begin = [], 0
-    for control in space.controls:
-        found.append(slice(begin, begin + len(control.start)))
-        begin = found[-1].stop
-    return found
+    def _description(
+        self, control: Control, whole: Tensor, own: Tensor, digits: tuple[int, ...]
+    ) -> Mapping[str, Value]:
+        """What the control itself says of one configuration; kept for the next time if axes are all that it depends
+        on."""
+        listed = [(axis, digits[number]) for number, axis in enumerate(self._axes) if axis.instance == control.name]
+        key = (control.name, *(place for _, place in listed))
+        if key in self._described:
+            return self._described[key]
+        said = dict(self.space.describe(whole, (control,)) if control.refines else control.describe(own))
+        for axis, place in listed:
+            said[axis.name] = {"value": axis.values[place], "unit": axis.unit}
+        if not control.refines and len(listed) == len(control.groups) and len(self._described) < MOST_KEPT:
+            self._described[key] = said
+        return said
 
 
 def _unit(parameter: Parameter) -> str:
@@ -272,90 +269,6 @@ def _unit(parameter: Parameter) -> str:
 
 
 def _spec(bound: NumberControl, name: str) -> tuple[Parameter, Range | OneOf]:
-    """A parameter that is not fixed, and what it is set to."""
-    slot = next(one for one in bound.slots if one.parameter.name == name)
+    slot = next(slot for slot in bound.slots if slot.parameter.name == name)
     assert not isinstance(slot.spec, Fixed)
     return slot.parameter, slot.spec
-
-
-def _teller(space: Space, control: Control, part: slice, axes: Sequence[tuple[int, Axis]]) -> Tell:
-    """Return what says the values of one control for many configurations."""
-    if isinstance(control, NumberControl) and _says_its_numbers(type(control)):
-        return _by_column(control, part, axes)
-    if control.refines:
-        return _by_description(lambda u: space.describe(u, (control,)), axes, keep=False)
-    return _by_description(lambda u: control.describe(u[part]), axes, keep=len(axes) == len(control.groups))
-
-
-def _says_its_numbers(kind: type[NumberControl]) -> bool:
-    """Whether what a control says of a configuration is its parameters' values and nothing else."""
-    return (kind.describe, kind.measured) == (NumberControl.describe, NumberControl.measured)
-
-
-def _by_column(control: NumberControl, part: slice, axes: Sequence[tuple[int, Axis]]) -> Tell:
-    """Values of all configurations at once, parameter by parameter; the same numbers as `describe`."""
-    number_of = {axis.parameter.name: (number, axis) for number, axis in axes}
-    columns: list[Callable[[Tensor, Picks], list[tuple[str, Value]]]] = []
-    begin = part.start
-    for group in control.groups:
-        name = f"{control.name}.{group.parameter}"
-        if group.parameter in number_of:
-            number, axis = number_of[group.parameter]
-            listed: list[Value] = [{"value": value, "unit": axis.unit} for value in axis.values]
-            columns.append(_listed(name, listed, number))
-        else:
-            columns += _drawn(control, group.parameter, name, begin, group.size)
-        begin += group.size
-
-    def tell(u: Tensor, picks: Picks) -> list[Mapping[str, Value]]:
-        said = [column(u, picks) for column in columns]
-        return [dict(row) for row in zip(*said, strict=True)] if said else [{} for _ in picks.digits]
-
-    return tell
-
-
-def _listed(name: str, listed: list[Value], number: int) -> Callable[[Tensor, Picks], list[tuple[str, Value]]]:
-    pairs = [(name, value) for value in listed]
-    return lambda u, picks: [pairs[digits[number]] for digits in picks.digits]
-
-
-def _drawn(
-    control: NumberControl, parameter_name: str, name: str, begin: int, size: int
-) -> list[Callable[[Tensor, Picks], list[tuple[str, Value]]]]:
-    parameter, spec = _spec(control, parameter_name)
-    unit = _unit(parameter)
-    if isinstance(spec, OneOf):
-        pairs: list[tuple[str, Value]] = [(name, {"value": value, "unit": unit}) for value in spec.values]
-        return [lambda u, picks: [pairs[min(len(pairs) - 1, int(one * len(pairs)))] for one in u[:, begin].tolist()]]
-
-    def column(number: int) -> Callable[[Tensor, Picks], list[tuple[str, Value]]]:
-        full = f"{name}.{number}" if parameter.shape else name
-
-        def tell(u: Tensor, picks: Picks) -> list[tuple[str, Value]]:
-            values = to_value(spec, parameter.log, u[:, begin + number]).tolist()
-            return [(full, {"value": value, "unit": unit}) for value in values]
-
-        return tell
-
-    return [column(number) for number in range(size)]
-
-
-def _by_description(
-    describe: Callable[[Tensor], Mapping[str, Value]], axes: Sequence[tuple[int, Axis]], *, keep: bool
-) -> Tell:
-    """What the control itself says, one configuration after the other; kept for the next time if these axes are all
-    that it depends on."""
-    kept: dict[tuple[int, ...], dict[str, Value]] = {}
-
-    def one(u: Tensor, digits: tuple[int, ...]) -> Mapping[str, Value]:
-        key = tuple(digits[number] for number, _ in axes)
-        if keep and key in kept:
-            return kept[key]
-        said: dict[str, Value] = dict(describe(u))
-        for number, axis in axes:
-            said[axis.name] = {"value": axis.values[digits[number]], "unit": axis.unit}
-        if keep and len(kept) < MOST_KEPT:
-            kept[key] = said
-        return said
-
-    return lambda u, picks: [one(row, digits) for row, digits in zip(u, picks.digits, strict=True)]

@@ -36,65 +36,34 @@ PAYS = 2.0
 """Times the samples that a prediction takes, comparisons included, that a group has to take rendered, for it to pay."""
 
 
-@dataclass(frozen=True)
 class Groups:
     """How the pictures of a scene fall into groups: whether they may differ along each axis of the grid (`within`), and
     in what is `drawn`. The frames of a drive, on the axis `frames`, have one draw."""
 
-    grid: Product
-    samples: int
-    within: tuple[bool, ...]
-    drawn: bool
-    frames: int | None = None
-
-    @property
-    def _free(self) -> tuple[bool, ...]:
-        """Of every axis, whether a group goes along it."""
-        if self.drawn:
-            return self.within
-        return tuple(within and axis == self.frames for axis, within in enumerate(self.within))
-
-    @property
-    def _draws(self) -> int:
-        """Draws at a point of the grid that are in different groups."""
-        return 1 if self.drawn else self.samples
-
-    @property
-    def size(self) -> int:
-        free = math.prod(size for size, free in zip(self.grid.sizes, self._free, strict=True) if free)
-        return free * self.samples // self._draws
-
-    @property
-    def count(self) -> int:
-        return self.grid.count * self.samples // self.size
-
-    @property
-    def at_once(self) -> int:
-        """How many have to be held at once, so that none is made twice."""
-        if True not in self._free:
-            return 1
-        first = self._free.index(True)
-        later = zip(self.grid.sizes[first:], self._free[first:], strict=True)
-        return self._draws * math.prod(size for size, free in later if not free)
+    def __init__(
+        self, grid: Product, samples: int, within: tuple[bool, ...], drawn: bool, frames: int | None = None
+    ) -> None:
+        self.grid, self.samples = grid, samples
+        self._all = Product((*grid.sizes, samples))  # draws are like one more axis, the fastest
+        self._free = (*(within[axis] and (drawn or axis == frames) for axis in range(len(within))), drawn)
+        axes = list(zip(self._all.sizes, self._free, strict=True))
+        self._within = Product(tuple(size for size, free in axes if free))
+        self._between = Product(tuple(size for size, free in axes if not free))
+        self.size, self.count = self._within.count, self._between.count
+        first = self._free.index(True) if True in self._free else len(axes)
+        # how many have to be held at once, so that none is made twice
+        self.at_once = math.prod(size for size, free in axes[first:] if not free)
 
     def group(self, number: int) -> int:
         """Return the number of the group of a picture of the scene."""
-        place, sample = divmod(number, self.samples)
-        found = 0
-        for digit, size, free in zip(self.grid.digits(place), self.grid.sizes, self._free, strict=True):
-            found = found if free else found * size + digit
-        return found if self.drawn else found * self.samples + sample
+        digits = zip(self._all.digits(number), self._free, strict=True)
+        return self._between.index([digit for digit, free in digits if not free])
 
     def member(self, number: int, place: int) -> int:
         """Return the number of the picture at a place among those of the group of another one."""
-        point, sample = divmod(number, self.samples)
-        if self.drawn:
-            place, sample = divmod(place, self.samples)
-        found = list(self.grid.digits(point))
-        for axis in reversed(range(len(found))):
-            if self._free[axis]:
-                place, found[axis] = divmod(place, self.grid.sizes[axis])
-        return self.grid.index(found) * self.samples + sample
+        own = iter(self._within.digits(place))
+        digits = zip(self._all.digits(number), self._free, strict=True)
+        return self._all.index([next(own) if free else digit for digit, free in digits])
 
 
 Fall = Callable[[frozenset[str]], Groups]
@@ -138,12 +107,9 @@ class BasisPictures:
 ARRANGED, LIT = 2_200_000, 80_000
 """Samples that take as long as finding what texels see, and the light of an environment: 0.8 and 0.03 s where a picture
 of 128 x 128 pixels with 8 samples a pixel takes 46 ms."""
-SHOWN = 0.8
-"""Samples a pixel that take as long as a predicted picture."""
-ARRANGED_BYTES = 50_000_000
-"""Memory of an arrangement, about."""
-LIT_BYTES = 4_000_000
-"""Memory of the light of an environment beside its map, about."""
+SHOWN = 0.8  # samples a pixel that take as long as a predicted picture
+ARRANGED_BYTES = 50_000_000  # memory of an arrangement, about
+LIT_BYTES = 4_000_000  # memory of the light of an environment beside its map, about
 
 
 def pays_from(renderer: Renderer, spp: int, arrangements: float = 1.0) -> int:
@@ -179,8 +145,7 @@ class LightOnSurfaces:
         least = pays_from(self._renderer, spp, arranged.count / groups.count)
         if groups.size < least:
             return f"light on surfaces pays where {least} pictures differ in the camera alone; here {groups.size} do"
-        reason = why_not_kept(self._renderer)
-        if reason is not None:
+        if (reason := why_not_kept(self._renderer)) is not None:
             return reason
         lit = LIT_BYTES + 4 * self._renderer.scene.base(MAP).numel()
         if arranged.at_once * ARRANGED_BYTES + groups.at_once * lit > scaled(MOST_BYTES):
@@ -234,46 +199,42 @@ class PredictedSweep:
     def __post_init__(self) -> None:
         """Choose basis pictures where they pay, or light on surfaces."""
         self.renderer = self.problem.renderer
-        basis = BasisPictures(self.renderer)
-        self.way: BasisPictures | LightOnSurfaces = basis
-        self.reason = self._reason_against(basis)
+
+        def reason_against(way: BasisPictures | LightOnSurfaces) -> str | None:
+            if not way.moves:
+                return ""
+            if self.renderer.composed or not self.specialise:
+                return self.renderer.composed or "nothing is left out"
+            return way.reason_against(self._fall, self.problem.spp)
+
+        self.way: BasisPictures | LightOnSurfaces = BasisPictures(self.renderer)
+        self.reason = reason_against(self.way)
         if self.reason is not None:
             surfaces = LightOnSurfaces(self.renderer, self.seed)
-            reason = self._reason_against(surfaces)
+            reason = reason_against(surfaces)
             if reason is None or not self.reason:
                 self.way, self.reason = surfaces, reason
         self._groups = self._fall(self.way.follows)
 
-    def _reason_against(self, way: BasisPictures | LightOnSurfaces) -> str | None:
-        if not way.moves:
-            return ""
-        if self.renderer.composed:
-            return self.renderer.composed
-        return way.reason_against(self._fall, self.problem.spp) if self.specialise else "nothing is left out"
-
     def _fall(self, follows: frozenset[str]) -> Groups:
         of_grid = [axis.name for axis in self.axes]
         drawn = all(group.name in follows for group in self.renderer.space.groups if group.name not in of_grid)
-        frames = next((place for place, axis in enumerate(self.axes) if axis.is_time), None)
         within = tuple(name in follows for name in of_grid)
-        return Groups(self.points.grid, self.points.samples, within, drawn, frames)
+        return Groups(self.points.grid, self.points.samples, within, drawn, self.points.units.frames)
 
     def pictures(self, asked: Mapping[int, Query]) -> dict[int, SweptPicture]:
         """Return pictures by their numbers in the scene, each rendered or predicted."""
         pictures: dict[int, SweptPicture] = {}
-        waiting: dict[int, list[int]] = {}
-        made: dict[int, Predictor] = {}
+        waiting: dict[Predictor, list[int]] = {}
         for number, query in asked.items():
-            group = self._groups.group(number)
-            predictor = None if self.reason is not None else self._of(group, number)
+            predictor = None if self.reason is not None else self._of(self._groups.group(number), number)
             if predictor is None:
                 picture = self.renderer(query.u, seed=query.seed, spp=self.problem.spp)
                 pictures[number] = SweptPicture(picture, predicted=0, traced=self._spent_on(number) + 1)
             else:
-                made[group] = predictor
-                waiting.setdefault(group, []).append(number)
-        for group, numbers in waiting.items():
-            predicted = made[group].pictures([asked[number].u for number in numbers])
+                waiting.setdefault(predictor, []).append(number)
+        for predictor, numbers in waiting.items():
+            predicted = predictor.pictures([asked[number].u for number in numbers])
             for number, picture in zip(numbers, predicted, strict=True):
                 pictures[number] = SweptPicture(picture, self.way.samples, self._spent_on(number))
         return pictures
@@ -293,11 +254,14 @@ class PredictedSweep:
         seed = seeds.stream(self.seed, "light", self.before + group)
         made = self.way.made(self._configuration(number, 0), seed)
 
+        def margin(picture: Tensor, u: Tensor) -> float:
+            return self.problem.judge(to_8_bit(picture), u).margin
+
         def view(check: int) -> ComparedView:
             u = self._configuration(number, seeds.stream(seed, "check", check) % self._groups.size)
             (predicted,) = made.pictures([u])
             noise = seeds.stream(seed, "traced", check)
-            return view_of(self.renderer, predicted, u, noise, self.problem.spp, self._margin)
+            return view_of(self.renderer, predicted, u, noise, self.problem.spp, margin)
 
         with torch.no_grad():
             deviation = compared(view)
@@ -309,14 +273,9 @@ class PredictedSweep:
         self.seconds += time.perf_counter() - begun
         return self._held[group]
 
-    def _margin(self, picture: Tensor, u: Tensor) -> float:
-        return self.problem.judge(to_8_bit(picture), u).margin
-
     def _configuration(self, number: int, place: int) -> Tensor:
         member = self._groups.member(number, place)
         return self.points.configurations(self.points.picks(member, 1, self.before))[0]
-
-    # ---- what is said of it -----------------------------------------------------------------------------------------
 
     @property
     def not_finite(self) -> int:

@@ -4,7 +4,6 @@ that another program made are read into a run here, too. Counting takes some 15 
 from __future__ import annotations
 
 import math
-import warnings
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -15,13 +14,12 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 import pandas as pd
-from PIL import Image
 
 from advsearch.attacks import clopper_pearson
 from advsearch.attacks.units import paired_by_unit, per_unit, share_interval
 from advsearch.described import OUT_OF_VIEW
 from advsearch.errors import FileFormatError
-from advsearch.pictures import FORMATS
+from advsearch.pictures import LARGEST_FILE, check_pixels, opened
 from advsearch.questions.sweep.figures import sweep_axes, sweep_figure
 from advsearch.questions.sweep.job import KIND
 from advsearch.questions.sweep.page import write_sweep_page
@@ -39,20 +37,14 @@ from advsearch.viewer import thumbnails
 
 FINISHED, INTERRUPTED = "finished", "interrupted"
 
-MOST_CELLS = 4096
-"""Cells of a map; with more pairs of values there is none."""
-
-MOST_PREDICTIONS = 20
-"""Wrong predictions that the summary lists, the most frequent first."""
+MOST_CELLS = 4096  # cells of a map; with more pairs of values there is none
+MOST_PREDICTIONS = 20  # wrong predictions that the summary lists, the most frequent first
 
 
 def counted(right: npt.ArrayLike, of: npt.ArrayLike) -> CountedPredictions:
     """Return count, accuracy and its 95 % interval, from right predictions and predictions of each unit (n,)."""
-    correct, seen = int(np.sum(right)), int(np.sum(of))
-    interval = share_interval(right, of) if seen else None
-    return CountedPredictions(
-        configurations=seen, correct=correct, accuracy=correct / seen if seen else None, interval=interval
-    )
+    seen = int(np.sum(of))
+    return rate(int(np.sum(right)), seen, share_interval(right, of) if seen else None)
 
 
 def counted_by_unit(right: npt.ArrayLike, units: npt.NDArray[np.int64]) -> CountedPredictions:
@@ -61,15 +53,11 @@ def counted_by_unit(right: npt.ArrayLike, units: npt.NDArray[np.int64]) -> Count
     return counted(per_unit(right, units), per_unit(np.ones(len(right)), units))
 
 
-def rate(correct: int, seen: int) -> CountedPredictions:
-    """Return count, accuracy and its 95 % Clopper-Pearson interval, of predictions that are independent; None where
-    nothing was seen."""
-    return CountedPredictions(
-        configurations=seen,
-        correct=correct,
-        accuracy=correct / seen if seen else None,
-        interval=clopper_pearson(correct, seen) if seen else None,
-    )
+def rate(correct: int, seen: int, interval: tuple[float, float] | None = None) -> CountedPredictions:
+    """Return count, accuracy and its 95 % interval, by default that of Clopper and Pearson, of predictions that are
+    independent; None where nothing was seen."""
+    accuracy, interval = (correct / seen, interval or clopper_pearson(correct, seen)) if seen else (None, None)
+    return CountedPredictions(configurations=seen, correct=correct, accuracy=accuracy, interval=interval)
 
 
 class Predictions:
@@ -96,9 +84,9 @@ class Predictions:
 
     @property
     def worst(self) -> int | None:
-        """The first configuration of the largest margin; None where none is a number."""
+        """The first configuration of the smallest margin; None where none is a number."""
         margin = self.margin if self.hidden[self.seen].all() else np.where(self.hidden, np.nan, self.margin)
-        return None if np.isnan(margin).all() else int(np.nanargmax(margin))
+        return None if np.isnan(margin).all() else int(np.nanargmin(margin))
 
     @property
     def not_finite(self) -> int:
@@ -110,23 +98,22 @@ class Predictions:
         """How often each of the most frequent wrong predictions was given, the most frequent first."""
         names = list(self._names)
         wrong = Counter(names[label] for label in self._labels[self._wrong])
-        return dict(sorted(wrong.most_common(MOST_PREDICTIONS), key=lambda one: (-one[1], one[0])))
+        return dict(sorted(wrong.most_common(MOST_PREDICTIONS), key=lambda label: (-label[1], label[0])))
 
     def beside(self, models: Sequence[str], units: Units) -> list[PairedRates]:
         """Return both rates of each model without and with an adversarial scene, of the pairs of which both are known:
         the second half of the configurations are the first with the adversarial scene."""
-        halves = (2, -1, len(models))
-        found = list[PairedRates]()
+        halves, pairs = (2, -1, len(models)), list[PairedRates]()
         seen: npt.NDArray[np.bool_] = np.logical_and(*self.counted.reshape(halves))
         for model, name in enumerate(models):
             known = np.flatnonzero(seen[:, model])
-            before, after = self.right.reshape(halves)[:, known, model]
             if not len(known):
                 continue
+            before, after = self.right.reshape(halves)[:, known, model]
             draws = units.draw(known)
             difference, interval, _ = paired_by_unit(before, after, draws)
             of = per_unit(np.ones(len(known)), draws)
-            found.append(
+            pairs.append(
                 PairedRates(
                     model=name,
                     clean=counted(per_unit(before, draws), of),
@@ -139,7 +126,7 @@ class Predictions:
                     interval=interval,
                 )
             )
-        return found
+        return pairs
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,13 +143,9 @@ class SweptAxis:
     def rows(self, right: npt.NDArray[np.bool_], units: npt.NDArray[np.int64]) -> list[AxisRow]:
         """Return the table: right predictions (n,), which are of units (n,), by value; values without any are left
         out."""
-        rows = pd.DataFrame({"right": right, "unit": units}).groupby(self.places)
-        return [
-            AxisRow(
-                axis=self.name, unit=self.unit, value=self.values[place], **vars(counted_by_unit(one.right, one.unit))
-            )
-            for place, one in rows
-        ]
+        by_place = pd.DataFrame({"right": right, "unit": units}).groupby(self.places)
+        counts = ((self.values[place], counted_by_unit(rows.right, rows.unit)) for place, rows in by_place)
+        return [AxisRow(axis=self.name, unit=self.unit, value=value, **vars(count)) for value, count in counts]
 
 
 def map_over(
@@ -243,7 +226,7 @@ class SweepResult:
 
     def __repr__(self) -> str:
         right = f"{self.summary.correct} of {self.summary.configurations} right"
-        place = None if self.run is None else str(self.run)
+        place = self.run and str(self.run)
         return f"SweepResult({self.summary.object!r}, {self.summary.model!r}, {right}, run={place!r})"
 
     def _repr_html_(self) -> str:
@@ -253,14 +236,9 @@ class SweepResult:
         return sweep_figure(self.summary).get("png")
 
 
-MOST_PIXELS = 1 << 22
-"""Of a picture that is read."""
-
-MOST_VALUES = 96
-"""Different values of a parameter that the result lists."""
-
-AT_ONCE = 1000
-"""Rows that are stored at once."""
+MOST_PIXELS = 1 << 22  # of a picture that is read
+MOST_VALUES = 96  # different values of a parameter that the result lists
+AT_ONCE = 1000  # rows that are stored at once
 
 
 def import_threedb(folder: Path, run: str | Path | None = None, *, overwrite: bool = False) -> Path:
@@ -268,10 +246,10 @@ def import_threedb(folder: Path, run: str | Path | None = None, *, overwrite: bo
     with RunDirectory.create(run, overwrite=overwrite, default=default_name(folder.resolve().name, ["3db"])) as kept:
         lines = read_threedb(folder)
         while some := list(islice(lines, AT_ONCE)):
-            for one in some:
-                if one.picture is not None:
-                    thumbnails.keep(kept.path, one.row.step, thumbnails.thumbnail(read_picture(one.picture)))
-            kept.record(*(one.row for one in some))
+            for row, picture in some:
+                if picture is not None:
+                    thumbnails.keep(kept.path, row.step, thumbnails.thumbnail(read_picture(picture)))
+            kept.record(*(row for row, _ in some))
         rows = read_sweep(kept.path)
         if rows.empty:
             raise FileFormatError(f"{folder}: expected the log of 3DB with at least one line, got an empty one")
@@ -282,7 +260,6 @@ def import_threedb(folder: Path, run: str | Path | None = None, *, overwrite: bo
 
 
 def _summary_of(rows: pd.DataFrame, run: Path, folder: Path) -> SweepSummary:
-    """What rows that another program made come to."""
     right, tables = np.asarray(rows["correct"] == 1), list[AxisRow]()
     for name in rows.attrs["units"]:
         values, places = np.unique(rows[name].astype(object), return_inverse=True)
@@ -322,15 +299,6 @@ def _summary_of(rows: pd.DataFrame, run: Path, folder: Path) -> SweepSummary:
 
 def read_picture(path: Path) -> object:
     """Return the picture (H, W, 3) in [0, 1] in a file."""
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", Image.DecompressionBombWarning)
-            opened = Image.open(path, formats=FORMATS)
-        with opened as image:
-            if image.width * image.height > MOST_PIXELS:
-                raise FileFormatError(
-                    f"{path}: expected at most {MOST_PIXELS} pixels, got {image.width} x {image.height}"
-                )
-            return np.asarray(image.convert("RGB"), dtype=np.float32) / np.float32(255.0)
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
-        raise FileFormatError(f"{path}: expected a picture, got {str(error)[:100]}") from None
+    with opened(path, LARGEST_FILE) as image:
+        check_pixels(path, *image.size, MOST_PIXELS)
+        return np.asarray(image.convert("RGB"), dtype=np.float32) / np.float32(255.0)

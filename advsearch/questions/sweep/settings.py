@@ -27,8 +27,7 @@ HARMLESS = {
 }
 """Changes that mean nothing: it says the same."""
 
-Grid = dict[str, object]
-"""Values, or numbers of them, by the parameters of the grid."""
+Grid = dict[str, object]  # values, or numbers of them, by the parameters of the grid
 
 
 class SweepConfig(SceneConfig):
@@ -167,12 +166,13 @@ class SweepConfig(SceneConfig):
         return split_names(self.lit_by)
 
     @classmethod
-    def of_attack(cls, theirs: AttackConfig, *, varies: bool) -> dict[str, Any]:
-        """Return the settings that a sweep of an attack's adversarial scene takes from the attack, where it says
-        nothing else. Unless it says itself what `varies`, that is what the attack was over."""
+    def of_attack(cls, file: Path, typed: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the settings that a sweep of an attack's adversarial scene takes from the `run.yaml` of the attack,
+        where it says nothing else. Unless what was `typed` says what varies, that is what the attack was over."""
+        attacked = AttackConfig.from_yaml(file)
         apart = ("controls", "texture_resolution", "spp", "seed", "threads", "deterministic")
-        kept = {name: value for name, value in cls.shared(theirs).items() if name not in apart}
-        return kept if varies else {**kept, "controls": theirs.over}
+        kept = {name: value for name, value in cls.shared(attacked).items() if name not in apart}
+        return kept if typed.get("grid") or typed.get("controls") else {**kept, "controls": attacked.over}
 
     @field_validator("adversarial_of", mode="before")
     @classmethod
@@ -205,9 +205,8 @@ def _grid_values(given: Any) -> Any:
             return text
         given = [part.strip() for part in text.split(",") if part.strip()]
     given = given.tolist() if hasattr(given, "tolist") else given
-    sequence = isinstance(given, (range, tuple, list))
-    values = [one.item() if hasattr(one, "item") else one for one in given] if sequence else given
-    values = values if isinstance(values, list) else [values]
-    if not values or any(one is None or isinstance(one, (bool, list, Mapping)) for one in values):
+    given = given if isinstance(given, (range, tuple, list)) else [given]
+    values = [value.item() if hasattr(value, "item") else value for value in given]
+    if not values or any(value is None or isinstance(value, (bool, list, Mapping)) for value in values):
         raise ValueError("not values")
-    return [number_or_text(one) for one in values]
+    return [number_or_text(value) for value in values]

@@ -20,10 +20,10 @@ from advsearch.runs.results import (
     VerifiedRate,
     as_fact,
     having,
+    optional,
 )
 
-AxisValue = int | float | str | tuple[float, float]
-"""A number, a name, or both ends of a part of a range."""
+AxisValue = int | float | str | tuple[float, float]  # a number, a name, or both ends of a part of a range
 
 
 class CountedPredictions(Fields):
@@ -68,7 +68,7 @@ class WorstClaim(Fields):
     index: int | None
     probability: JsonFloat | None
     margin: JsonFloat
-    payload: Payload = Field(default=None, description="what else the task keeps of it; absent without")
+    payload: Payload = optional("what else the task keeps of it; absent without")
 
 
 class WorstVerified(VerifiedRate):
@@ -79,7 +79,7 @@ class WorstVerified(VerifiedRate):
 
 
 class WorstConfiguration(Fields):
-    """The configuration with the largest margin."""
+    """The configuration with the smallest margin."""
 
     configuration: int = Field(description="its number")
     values: Annotated[dict[str, DescribedValue], having("object", "model")]
@@ -87,7 +87,7 @@ class WorstConfiguration(Fields):
     label_set: list[str] = Field(description="the names that count as right there")
     claimed: WorstClaim = Field(description="of the sweep's own picture")
     verified: WorstVerified | None = Field(description="null where it was not rendered again")
-    pictured: WorstClaim | None = Field(default=None, description="of the picture that is kept; absent without")
+    pictured: WorstClaim | None = optional("of the picture that is kept; absent without")
 
 
 class SurfacePart(Fields):
@@ -197,8 +197,8 @@ class DriveRates(Fields):
     unit: str = Field(default="object sizes", description="of that distance")
     never_seen: int = Field(description="drives without a frame in which it is right")
     flicker: OverDrives = Field(description="changes between right and wrong a second")
-    tracks: TrackRates | None = Field(
-        default=None, description="what a [tracker](drives.md#tracks) makes of the boxes; absent without a detector"
+    tracks: TrackRates | None = optional(
+        "what a [tracker](drives.md#tracks) makes of the boxes; absent without a detector"
     )
     each: list[OneDrive] = Field(default=[], description="the numbers of each drive, the first 1,000")
 
@@ -232,28 +232,23 @@ class SweepSummary(CountedPredictions, RunResult):
     cells: SweepMap | None = Field(
         description="over the first two axes with several values; null where there are fewer, or more than 4096 pairs"
     )
-    beside: BesideClean | None = Field(
-        default=None,
-        description="the clean scene beside [an adversarial "
-        "one](sweeps.md#an-adversarial-scene-beside-the-clean-one); absent without",
+    beside: BesideClean | None = optional(
+        "the clean scene beside [an adversarial "
+        "one](sweeps.md#an-adversarial-scene-beside-the-clean-one); absent without"
     )
     worst: WorstConfiguration | None
-    drives: list[DriveRates] | None = Field(
-        default=None, description="of [whole drives](drives.md); absent where no frames of a path are swept"
+    drives: list[DriveRates] | None = optional(
+        "of [whole drives](drives.md); absent where no frames of a path are swept"
     )
-    changes: list[ChangeRates] | None = Field(
-        default=None,
-        description="of [pictures that are also shown changed](sweeps.md#is-it-looking); absent unless asked",
+    changes: list[ChangeRates] | None = optional(
+        "of [pictures that are also shown changed](sweeps.md#is-it-looking); absent unless asked"
     )
-    units: int | None = Field(
-        default=None,
-        description="draws that the configurations are of, such as [drives](drives.md), and intervals over; absent "
-        "where none share one",
+    units: int | None = optional(
+        "draws that the configurations are of, such as [drives](drives.md), and intervals over; absent "
+        "where none share one"
     )
     grid: dict[str, int] = Field(description="how many values each axis of the grid has")
-    gains: dict[str, float] | None = Field(
-        default=None, description="the gain of each scene, by object and environment; absent of one scene"
-    )
+    gains: dict[str, float] | None = optional("the gain of each scene, by object and environment; absent of one scene")
     drawn: dict[str, VariedValue] = Field(
         default={}, description="what each value was drawn from, of parameters of few numbers"
     )
@@ -263,19 +258,14 @@ class SweepSummary(CountedPredictions, RunResult):
     renders: Annotated[dict[str, int], having("sweep")] = Field(
         description="of the sweep and of the verification; `products`: predicted instead"
     )
-    transport: LinearTransport | None = Field(
-        default=None,
-        description="whether [basis pictures](transport.md#light) or [light on surfaces](surface-light.md#sweeps) "
-        "predicted pictures; absent where neither light nor camera moves",
+    transport: LinearTransport | None = optional(
+        "whether [basis pictures](transport.md#light) or [light on surfaces](surface-light.md#sweeps) "
+        "predicted pictures; absent where neither light nor camera moves"
     )
-    surface: SurfaceMap | None = Field(
-        default=None,
-        description="which parts of the [surface](sweeps.md#the-surface), when seen, go with wrong predictions; absent "
-        "unless asked",
+    surface: SurfaceMap | None = optional(
+        "which parts of the [surface](sweeps.md#the-surface), when seen, go with wrong predictions; absent unless asked"
     )
-    shared: SharedWork | None = Field(
-        default=None, description="how [workers](cluster.md) did that shared the work; absent without"
-    )
+    shared: SharedWork | None = optional("how [workers](cluster.md) did that shared the work; absent without")
     renders_per_second: float | None = Field(
         description="pictures of the sweep; null where nothing was rendered now", json_schema_extra=as_fact("{:.3g}")
     )

@@ -7,7 +7,7 @@ exchanged whole, and no interval is told."""
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from math import ceil
 from typing import Any
@@ -24,7 +24,7 @@ from advsearch.engine.loading import framed, load_scene
 from advsearch.engine.record import judgement_of
 from advsearch.progress import Progress
 from advsearch.questions.sweep.figures import MapView, SurfacePanel, surface_figure
-from advsearch.questions.sweep.job import Job, SweptScene
+from advsearch.questions.sweep.job import OpenScenes
 from advsearch.questions.sweep.result import rate
 from advsearch.questions.sweep.summary import SurfaceMap, SurfacePart, SurfaceTable
 from advsearch.runs.directory import RunDirectory
@@ -40,11 +40,8 @@ from advsearch.scene.surfaces import Surfaces
 Counts = npt.NDArray[np.int64]
 Doubles = npt.NDArray[np.float64]
 
-SHARINGS = 199
-"""How often the wrong predictions are shared out anew, so that no p-value is under 0.005."""
-
-LEVEL = 0.05
-"""Where no part has to do with the predictions, the chance that any is told from chance."""
+SHARINGS = 199  # how often the wrong predictions are shared out anew, so that no p-value is under 0.005
+LEVEL = 0.05  # where no part has to do with the predictions, the chance that any is told from chance
 
 
 class PartCounts:
@@ -135,8 +132,7 @@ def _newcombe(k: Counts, n: Counts, others: Counts, rest: Counts) -> tuple[Doubl
     return difference, low, high
 
 
-LEAST = 5
-"""Pictures that have to see a part, and as many that do not, before its predictions are compared."""
+LEAST = 5  # pictures that have to see a part, and as many that do not, before its predictions are compared
 
 RAYS = 4 * CELLS
 """Least number of rays along each side of a picture: in smaller ones, many cells would lie between two pixels."""
@@ -144,8 +140,7 @@ RAYS = 4 * CELLS
 STRONGEST = 5
 """Parts of each kind that the summary lists: so many that go with wrong predictions, and so many with right ones."""
 
-APART = 0.1
-"""Distance of two listed parts, in units of the object's largest extent, so that one spot is listed once."""
+APART = 0.1  # distance of two listed parts, in units of the object's largest extent, so that one spot is listed once
 
 FILE = "artifacts/surface.npz"
 
@@ -154,11 +149,8 @@ SIDES = ((0.0, 20.0), (90.0, 20.0), (180.0, 20.0), (270.0, 20.0), (0.0, 80.0), (
 
 SIDE_PIXELS = 240
 
-UNKNOWN = -1
-"""Stands for the prediction of a picture of which there is no row."""
-
-AT_ONCE = 16
-"""Pictures whose places are worked out at once."""
+UNKNOWN = -1  # stands for the prediction of a picture of which there is no row
+AT_ONCE = 16  # pictures whose places are worked out at once
 
 
 class SurfaceCounts:
@@ -193,37 +185,36 @@ class SurfaceCounts:
             compared=int(found.compared.sum()),
             worse=int((found.told & (found.difference > 0)).sum()),
             better=int((found.told & (found.difference < 0)).sum()),
-            strongest=[self._part(some.start + one, one, tally, found) for one in self._strongest(some.start, found)],
+            strongest=[self._part(number, some.start, tally, found) for number in self._strongest(some.start, found)],
         )
 
     def _strongest(self, first: int, found: Association) -> list[int]:
         """The parts that are told from chance most clearly, none close to another: those that go with wrong
         predictions, and then those that go with right ones."""
         extent = float(np.ptp(self.parts.mesh.vertices, axis=0).max())
-        order = np.argsort(-found.strength, kind="stable")
-        listed: list[int] = []
+        order, strongest = np.argsort(-found.strength, kind="stable"), list[int]()
         for side in (found.difference > 0.0, found.difference < 0.0):
-            mine: list[int] = []
+            of_side: list[int] = []
             for number in order[(found.told & side)[order]]:
-                places = self.parts.place[[first + one for one in mine]]
+                places = self.parts.place[[first + other for other in of_side]]
                 away = np.linalg.norm(places - self.parts.place[first + number], axis=1)
                 if away.min(initial=np.inf) >= APART * extent:
-                    mine.append(int(number))
-                if len(mine) == STRONGEST:
+                    of_side.append(int(number))
+                if len(of_side) == STRONGEST:
                     break
-            listed += mine
-        return listed
+            strongest += of_side
+        return strongest
 
-    def _part(self, part: int, number: int, tally: PartCounts, found: Association) -> SurfacePart:
+    def _part(self, number: int, first: int, tally: PartCounts, found: Association) -> SurfacePart:
+        part = first + number
         seen, wrong = int(tally.seen[part]), int(tally.wrong[part])
         hidden, others = tally.pictures - seen, tally.failures - wrong
-        x, y, z = self.parts.place[part].tolist()
         u, v = self.parts.at[part].tolist()
         return SurfacePart(
             face=int(self.parts.face[part]),
             u=u,
             v=v,
-            place=(x, y, z),
+            place=self.parts.place[part].tolist(),
             seen=rate(seen - wrong, seen),
             hidden=rate(hidden - others, hidden),
             difference=float(found.difference[number]),
@@ -232,18 +223,26 @@ class SurfaceCounts:
         )
 
 
-def map_surface(
-    job: Job, rows: Iterable[Row], opened: Callable[[int], SweptScene], run: RunDirectory, progress: Progress
-) -> SurfaceMap:
+def map_surface(scenes: OpenScenes, rows: Iterable[Row], run: RunDirectory, progress: Progress) -> SurfaceMap:
     """Count over the surface of each object, write the counts and their figure, and return what the summary says."""
-    per_scene, models = opened(0).points[job.sizes[0]].count, len(job.models)
+    job, points = scenes.job, scenes.open(0).points[scenes.job.sizes[0]]
+    per_scene, models = points.count, len(job.models)
     wrong: npt.NDArray[np.int8] = np.full((len(job.places), per_scene, models), UNKNOWN, np.int8)
     for row in rows:
         wrong.flat[row.step] = not judgement_of(row).right
-    draws = np.asarray(opened(0).points[job.sizes[0]].units.draw(np.arange(wrong[..., 0].size)))
-    counts = _empty(job, wrong, draws.reshape(wrong.shape[:2]))
+    draws = np.asarray(points.units.draw(np.arange(wrong[..., 0].size))).reshape(wrong.shape[:2])
+    assets = {place.object: place.scene.description.object for place in job.places}
+    counts = dict[str, SurfaceCounts]()
+    for number, (name, asset) in enumerate(assets.items()):
+        parts, tallies = SurfaceParts(asset.mesh), list[PartCounts]()
+        here = [place.object == name for place in job.places]
+        for model in range(models):
+            seed, own = seeds.stream(job.config.seed, "surface", number * models + model), wrong[here][..., model]
+            exchanged = exchange(own.ravel(), draws[here].ravel(), seed)
+            tallies.append(PartCounts(parts.count, int((own >= 0).sum()), int((own >= 1).sum()), seed, exchanged))
+        counts[name] = SurfaceCounts(parts, tallies)
     for scene, pictures in enumerate(wrong):
-        view, mine = opened(scene), counts[job.places[scene].object]
+        view, mine = scenes.open(scene), counts[job.places[scene].object]
         for some in batches(0, per_scene, AT_ONCE):
             for size in dict.fromkeys(job.sizes):
                 asked = [model for model in range(models) if job.sizes[model] == size]
@@ -253,24 +252,7 @@ def map_surface(
                 for said, shown in zip(pictures[some.start : some.stop], seen, strict=True):
                     mine.add(shown, {model: bool(said[model]) for model in asked if said[model] != UNKNOWN})
             progress.advance(len(some) * models)
-    return _told(job, counts, run)
-
-
-def _empty(job: Job, wrong: npt.NDArray[np.int8], draws: Counts) -> dict[str, SurfaceCounts]:
-    """Counts of each object, by its name, that know how many predictions (scenes, pictures, models) there will be, and
-    of which draw (scenes, pictures) each is."""
-    counts, models = {}, len(job.models)
-    for number, (name, asset) in enumerate(_assets(job).items()):
-        parts, tallies = SurfaceParts(asset.mesh), []
-        here = [place.object == name for place in job.places]
-        mine = wrong[here]
-        for model in range(models):
-            seed = seeds.stream(job.config.seed, "surface", number * models + model)
-            pictures, failures = (int((mine[..., model] >= least).sum()) for least in (0, 1))
-            exchanged = exchange(mine[..., model].ravel(), draws[here].ravel(), seed)
-            tallies.append(PartCounts(parts.count, pictures, failures, seed, exchanged))
-        counts[name] = SurfaceCounts(parts, tallies)
-    return counts
+    return _written(counts, assets, [model.name for model in job.models], run)
 
 
 def exchange(wrong: npt.NDArray[np.int8], draws: Counts, seed: int) -> npt.NDArray[np.uint8] | None:
@@ -286,25 +268,26 @@ def exchange(wrong: npt.NDArray[np.int8], draws: Counts, seed: int) -> npt.NDArr
     return np.packbits(found[:, known], axis=0)
 
 
-def _assets(job: Job) -> dict[str, ObjectAsset]:
-    return {place.object: place.scene.description.object for place in job.places}
-
-
-def _told(job: Job, counts: Mapping[str, SurfaceCounts], run: RunDirectory) -> SurfaceMap:
-    assets, models = _assets(job), [model.name for model in job.models]
+def _written(
+    counts: Mapping[str, SurfaceCounts], assets: Mapping[str, ObjectAsset], models: Sequence[str], run: RunDirectory
+) -> SurfaceMap:
     tables, panels = [], []
     arrays: dict[str, Any] = {"objects": np.array(list(counts)), "models": np.array(models)}
     for number, (name, mine) in enumerate(counts.items()):
-        views = _views(assets[name], mine.parts)
+        parts, views = mine.parts, tuple(_views(assets[name], mine.parts))
         found = [mine.compared(model) for model in range(len(models))]
         for what in ("pictures", "failures", "seen", "wrong"):
             arrays[f"{what}_{number}"] = np.stack([getattr(one, what) for one in mine.tallies])
         for what in ("difference", "low", "high", "p"):
             joined = [np.concatenate([getattr(one, what) for one in kinds.values()]) for kinds in found]
             arrays[f"{what}_{number}"] = np.stack(joined).astype(np.float32)
-        arrays[f"map_{number}"] = mine.parts.corners.astype(np.float32)
+        arrays[f"map_{number}"] = parts.corners.astype(np.float32)
         for model, tally, kinds in zip(models, mine.tallies, found, strict=True):
-            panels.append(_panel(name, model, mine.parts, tally, kinds["cell"], views))
+            cells = kinds["cell"]
+            surface = parts.covered | (tally.seen[parts.kinds["cell"]] > 0).reshape(CELLS, CELLS)
+            difference = np.where(cells.told, cells.difference, np.nan).reshape(CELLS, CELLS)
+            compared = cells.compared.reshape(CELLS, CELLS)
+            panels.append(SurfacePanel(name, model, surface, compared, difference, views))
             tables += [mine.table(name, model, tally, kind, one) for kind, one in kinds.items()]
     stream = io.BytesIO()
     np.savez_compressed(stream, **arrays)
@@ -314,28 +297,13 @@ def _told(job: Job, counts: Mapping[str, SurfaceCounts], run: RunDirectory) -> S
     return SurfaceMap(file=FILE, cells=CELLS, least=LEAST, tables=tables)
 
 
-def _panel(
-    name: str, model: str, parts: SurfaceParts, tally: PartCounts, found: Association, views: Sequence[MapView]
-) -> SurfacePanel:
-    square = (CELLS, CELLS)
-    return SurfacePanel(
-        object=name,
-        model=model,
-        surface=parts.covered | (tally.seen[parts.kinds["cell"]] > 0).reshape(square),
-        compared=found.compared.reshape(square),
-        difference=np.where(found.told, found.difference, np.nan).reshape(square),
-        views=tuple(views),
-    )
-
-
-def _views(asset: ObjectAsset, parts: SurfaceParts) -> list[MapView]:
+def _views(asset: ObjectAsset, parts: SurfaceParts) -> Iterator[MapView]:
     alone = framed(load_scene(asset, settings={"ground.size": 0.0}).description, SIDE_PIXELS)
-    scene, views = MitsubaScene(alone, (SIDE_PIXELS, SIDE_PIXELS)), []
+    scene = MitsubaScene(alone, (SIDE_PIXELS, SIDE_PIXELS))
     for azimuth, elevation in SIDES:
         camera = camera_to_world(alone.with_values(camera__azimuth=azimuth, camera__elevation=elevation), 1.0)
         shown = scene.surfaces({"camera.to_world": torch.from_numpy(camera.astype(np.float32))})
         there = shown.seen(OBJECT).numpy()
         cells = np.full(there.shape, -1, np.int64)
         cells[there] = parts.cells(shown.face.numpy()[there], shown.uv.numpy()[there].astype(np.float64))
-        views.append(MapView(f"{azimuth:g}°, {elevation:g}° up", cells, shown.normal.numpy()))
-    return views
+        yield MapView(f"{azimuth:g}°, {elevation:g}° up", cells, shown.normal.numpy())

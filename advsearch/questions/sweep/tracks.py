@@ -22,11 +22,10 @@ Doubles = NDArray[np.float64]
 Step = Callable[[Doubles, Doubles], Sequence[tuple[int, Any]]]
 """From the boxes (n, 4) of a frame, x0, y0, x1, y1 in pixels, and their scores (n,) to the tracks that are in it: a
 number that stays the same, and a box."""
-Tracker = Callable[[], Step]
-"""Makes a new one for each drive; frames come in their order."""
+Tracker = Callable[[], Step]  # makes a new one for each drive; frames come in their order
 
 
-class Frame(NamedTuple):
+class DetectedFrame(NamedTuple):
     """What a picture of a drive shows (its true box, None where nothing is seen), and what a detector says of it."""
 
     true: Doubles | None
@@ -92,17 +91,17 @@ def overlaps(boxes: Doubles, box: Doubles) -> Doubles:
     return found
 
 
-def frame_of(payload: Any, names: Collection[str]) -> Frame:
+def frame_of(payload: Any, names: Collection[str]) -> DetectedFrame:
     """Return what the payload of a detection's row says of boxes with some names."""
     found = [one for one in payload["found"] if one["label"] in names]
     boxes = np.array([one["box"] for one in found], dtype=float).reshape(-1, 4)
     true = payload["box"]
-    return Frame(
+    return DetectedFrame(
         None if true is None else np.array(true, dtype=float), boxes, np.array([one["score"] for one in found])
     )
 
 
-def tracked(frames: Sequence[Frame], tracker: Tracker, iou: float) -> Tracked:
+def tracked(frames: Sequence[DetectedFrame], tracker: Tracker, iou: float) -> Tracked:
     """Return what a tracker makes of a drive; a track is on the object where it overlaps the true box by `iou`."""
     step, last = tracker(), None
     lost, switches = list[bool](), 0

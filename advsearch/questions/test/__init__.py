@@ -60,4 +60,4 @@ def write_files(config: Config, result: SuiteResult) -> None:
         write_text(path, getattr(room, name)(result), durable=False)
 
 
-COMMAND = _Test("test", about="suite", place=Positional("SUITE", "a suite, a YAML file"))
+COMMAND = _Test("test", about="suite", place=Positional("SUITE", "a suite, a YAML file"), examples=EXAMPLES)

@@ -10,6 +10,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import advsearch.questions.test.counterexamples as beside
+import advsearch.questions.test.result as room
+import advsearch.questions.test.settings as suites
 from advsearch.config import SceneConfig
 from advsearch.engine.record import Results
 from advsearch.errors import InputError, UnknownNameError
@@ -18,43 +21,16 @@ from advsearch.progress import NullProgress, Progress
 from advsearch.questions.attack.carry_out import check_from_config
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.test.claims import Trial, check_pictures
-from advsearch.questions.test.counterexamples import (
-    Counterexample,
-    add,
-    counterexamples,
-    read_expected,
-    remove,
-    write_expected,
-)
-from advsearch.questions.test.result import (
-    FAILED,
-    NOT_TRIED,
-    NOT_YET,
-    STOPPED,
-    TIME_OVER,
-    UNDECIDED,
-    ClaimResult,
-    SuiteResult,
-    statement,
-    verdict,
-)
-from advsearch.questions.test.settings import (
-    COUNTEREXAMPLES,
-    NotBrokenClaim,
-    NoWorseClaim,
-    Suite,
-    SuiteConfig,
-    read_suite,
-    suite_of,
-)
+from advsearch.questions.test.counterexamples import Counterexample
+from advsearch.questions.test.result import FAILED, NOT_TRIED, NOT_YET, STOPPED, TIME_OVER, ClaimResult, SuiteResult
+from advsearch.questions.test.settings import COUNTEREXAMPLES, NotBrokenClaim, NoWorseClaim, Suite, SuiteConfig
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results import INTERRUPTED, OUT_OF_TIME
 from advsearch.runs.store import NAME as STORE
 from advsearch.runs.store import Store
 from advsearch.viewer.pages import keep_result
 
-NOTE = "suite"
-"""Under which a run's store keeps the suite with its seed, so that it goes on as it began."""
+NOTE = "suite"  # under which a run's store keeps the suite with its seed, so that it goes on as it began
 
 
 @dataclass(frozen=True)
@@ -64,64 +40,57 @@ class PlannedClaim:
     name: str
     kind: str
     config: SceneConfig
-    one: Counterexample | None = None
+    example: Counterexample | None = None
 
 
 def test_from_config(
     config: SuiteConfig, *, progress: Progress | None = None, resumed: Path | None = None, suite: Suite | None = None
 ) -> SuiteResult:
-    """Try the claims of the suite that a configuration names, or of another one; what is decided is not tried again.
-
-    Raises:
-        InputError: the suite names something that is not there, contradicts itself, or could not be judged; nothing is
-            rendered then.
-    """
+    """Try the claims of the suite that a configuration names, or of another one; what is decided is not tried again. An
+    InputError where the suite names something that is not there, contradicts itself, or could not be judged; nothing is
+    rendered then."""
     begun, progress = time.perf_counter(), progress or NullProgress()
     progress.stage("reading the suite")
-    noted = None if resumed is None else _noted(resumed)
-    described = noted or suite
+    noted = None
+    if resumed is not None and (resumed / STORE).is_file():  # a run that was stopped at once has noted no suite
+        with Store(resumed / STORE, read_only=True) as store:
+            noted = store.noted(NOTE)
+    described = suites.suite_of(noted, f"{resumed}: the suite that it began with") if noted is not None else suite
     if described is None:
-        described = read_suite(config.suite)
+        described = suites.read_suite(config.suite)
         seed = secrets.randbelow(2**31) if config.fresh else described.seed if config.seed is None else config.seed
         described = described.model_copy(update={"seed": seed})
     seconds = config.seconds or described.seconds or math.inf
-    added = None if config.add is None else add(config.suite, config.add)
+    added = None if config.add is None else beside.add(config.suite, config.add)
     try:
         planned = _planned(described, config, added)
-        for one in planned if described is not suite else ():
-            one.config.check_powers(f"claims.{one.name}.settings")
+        for claim in planned if described is not suite else ():
+            claim.config.check_powers(f"claims.{claim.name}.settings")
         remarks = _check(planned, described)
     except InputError as error:
         if added is not None:
-            remove(added)
+            beside.remove(added)
         raise InputError(f"{config.suite}: {error}") from None
 
-    def left() -> float:
-        return max(0.001, seconds - (time.perf_counter() - begun))
+    def passed() -> float:
+        return time.perf_counter() - begun
 
     with RunDirectory.of(config, resumed) as run:
         run.store.set_note(NOTE, json.dumps(described.model_dump(mode="json")))
-        for one in planned:
-            run.note_sitting(one.config)
+        for claim in planned:
+            run.note_sitting(claim.config)
         trial = Trial(
-            run,
-            described.confidence,
-            lambda: time.perf_counter() - begun >= seconds,
-            left,
-            config.workers,
-            config.cluster,
-            progress,
-            remarks,
-        )
+            run, described.confidence, lambda: passed() >= seconds, lambda: max(0.001, seconds - passed()),
+            config.workers, config.cluster, progress, remarks,
+        )  # fmt: skip
         for remark in remarks:
             progress.message(remark)
-        suite_run = _SuiteRun(config, described, planned, trial, read_expected(config.suite))
+        suite_run = _SuiteRun(config, described, planned, trial, beside.read_expected(config.suite))
         ending = suite_run.carry_out()
         if added is not None and suite_run.results[0].answer != FAILED:
-            remove(added)
+            beside.remove(added)
             raise InputError(f"add: the adversarial scene of {config.add} is not kept: {suite_run.results[0].reason}")
-        result = suite_run.result(ending, time.perf_counter() - begun, added)
-        return keep_result(run, result)
+        return keep_result(run, suite_run.result(ending, passed(), added))
 
 
 @dataclass
@@ -142,142 +111,124 @@ class _SuiteRun:
         results, begun = Results(self.trial.run), time.perf_counter()
         try:
             with interruptible():
-                for number, one in enumerate(self.planned):
-                    self._add(one, self._tried(one, results))
-                    progress = f"{one.name}: {self.results[-1].answer}: {self.results[-1].reason}"
-                    self.trial.progress.message(progress)
-                    if number + 1 < len(self.planned):
+                for number, claim in enumerate(self.planned, start=1):
+                    self._add(claim, self._tried(claim, results))
+                    self.trial.progress.message(f"{claim.name}: {self.results[-1].answer}: {self.results[-1].reason}")
+                    if number < len(self.planned):
                         seconds = time.perf_counter() - begun
                         self.trial.run.write_summary(self.result(INTERRUPTED, seconds, None))  # what a kill leaves
         except KeyboardInterrupt:
-            for one in self.planned[len(self.results) :]:
-                self._add(one, self._not_tried(one, STOPPED))
+            for claim in self.planned[len(self.results) :]:
+                self._add(claim, self._not_tried(claim, STOPPED))
             return INTERRUPTED
-        if any(one.reason == NOT_TRIED for one in self.results):
+        if any(tried.reason == NOT_TRIED for tried in self.results):
             self.trial.warnings.append("A counterexample failed, so that no claim was tried; `all` goes on with them.")
-        return OUT_OF_TIME if any(TIME_OVER in one.reason for one in self.results) else "done"
+        return OUT_OF_TIME if any(TIME_OVER in tried.reason for tried in self.results) else "done"
 
-    def _tried(self, one: PlannedClaim, results: Results) -> ClaimResult:
+    def _tried(self, claim: PlannedClaim, results: Results) -> ClaimResult:
         """What a claim says; what is decided, or has used its pictures, is stored."""
-        key = f"claim {one.name}"
+        key = f"claim {claim.name}"
         if (stored := results.stored(key)) is not None:
             return ClaimResult.of(stored)
-        failed = [known for known in self.results if known.kind == "counterexample" and not known.accepted]
-        if failed and one.one is None and not self.config.all:
-            return self._not_tried(one, NOT_TRIED)
+        failed = any(known.kind == "counterexample" and not known.accepted for known in self.results)
+        if failed and claim.example is None and not self.config.all:
+            return self._not_tried(claim, NOT_TRIED)
         if self.trial.late():
-            return self._not_tried(one, f"{TIME_OVER} before it began")
-        asked, begun = self._not_tried(one, ""), time.perf_counter()
-        if one.one is None:
-            found = self.trial.claim(asked, self.suite.claims[one.name], one.config)
+            return self._not_tried(claim, f"{TIME_OVER} before it began")
+        asked, begun = self._not_tried(claim, ""), time.perf_counter()
+        if claim.example is None:
+            tried = self.trial.claim(asked, self.suite.claims[claim.name], claim.config)
         else:
-            assert isinstance(one.config, AttackConfig)
-            found = self.trial.counterexample(asked, one.one, one.config, added=self.config.add is not None)
-        found = found.model_copy(update={"seconds": time.perf_counter() - begun})
-        if TIME_OVER not in found.reason and found.reason != STOPPED:
-            results.put(key, found.to_dict())
-        if found.reason == STOPPED:
+            assert isinstance(claim.config, AttackConfig)
+            added = self.config.add is not None
+            tried = self.trial.counterexample(asked, claim.example, claim.config, added=added)
+        if tried.reason == STOPPED:
             raise KeyboardInterrupt
-        return found
+        tried = tried.model_copy(update={"seconds": time.perf_counter() - begun})
+        if TIME_OVER not in tried.reason:
+            results.put(key, tried.to_dict())
+        return tried
 
-    def _not_tried(self, one: PlannedClaim, reason: str) -> ClaimResult:
-        claim = self.suite.claims.get(one.name)
-        said = "" if claim is None or one.one is not None else statement(claim, one.config)
-        return ClaimResult(name=one.name, kind=one.kind, statement=said, answer=UNDECIDED, reason=reason)
+    def _not_tried(self, claim: PlannedClaim, reason: str) -> ClaimResult:
+        text = room.statement(self.suite.claims[claim.name], claim.config) if claim.example is None else ""
+        return ClaimResult(name=claim.name, kind=claim.kind, statement=text, answer=room.UNDECIDED, reason=reason)
 
-    def _add(self, one: PlannedClaim, found: ClaimResult) -> None:
-        only = {"only": one.name, "seed": self.suite.seed, "fresh": False, "add": None, "update": False, "run": None}
-        files = {"junit": None, "sarif": None, "markdown": None, "overwrite": False}
-        again = self.config.model_copy(update={**only, **files}).with_only_here(self.config.only_here)
-        expected = self.expected.get(one.name, "held")
-        self.results.append(found.model_copy(update={"expected": expected, "repeat": again.command_line()}))
+    def _add(self, claim: PlannedClaim, tried: ClaimResult) -> None:
+        no = {"add": None, "run": None, "junit": None, "sarif": None, "markdown": None}
+        repeat = self._repeat(only=claim.name, update=False, overwrite=False, **no)
+        expected = self.expected.get(claim.name, "held")
+        self.results.append(tried.model_copy(update={"expected": expected, "repeat": repeat}))
+
+    def _repeat(self, **changes: object) -> str:
+        asked = self.config.model_copy(update={"seed": self.suite.seed, "fresh": False, **changes})
+        return asked.with_only_here(self.config.only_here).command_line()
 
     def result(self, ending: str, seconds: float, added: Counterexample | None) -> SuiteResult:
         """Return what the claims so far come to."""
-        configs = [one.config for one in self.planned]
-        changes: list[str] = []
-        rest = [self._not_tried(one, NOT_YET) for one in self.planned[len(self.results) :]]
-        results = [*self.results, *rest]
+        configs, changes = [claim.config for claim in self.planned], list[str]()
+        results = [*self.results, *(self._not_tried(claim, NOT_YET) for claim in self.planned[len(self.results) :])]
         if self.config.update and ending == "done":
-            now = {one.name: one.answer for one in results if NOT_TRIED not in one.reason}
-            changes = write_expected(self.config.suite, now)
-            results = [one.model_copy(update={"expected": now.get(one.name, one.expected)}) for one in results]
+            now = {tried.name: tried.answer for tried in results if NOT_TRIED not in tried.reason}
+            changes = beside.write_expected(self.config.suite, now)
+            results = [tried.model_copy(update={"expected": now.get(tried.name, tried.expected)}) for tried in results]
         return SuiteResult(
-            run=str(self.trial.run.path),
-            suite=self.config.suite,
-            title=self.suite.title,
-            object=",".join(dict.fromkeys(one.object for one in configs)),
-            model=",".join(dict.fromkeys(one.model for one in configs)),
-            environment=",".join(dict.fromkeys(one.lit_by for one in configs)),
-            controls=list(dict.fromkeys(name for one in configs for name in one.controls)),
-            answer=verdict(results),
-            confidence=self.suite.confidence,
-            claims=results,
-            ending=ending,
-            added=None if added is None else str(added.path),
-            changes=changes,
-            warnings=list(dict.fromkeys(self.trial.warnings)),
-            seconds={"total": seconds},
-            seed=self.suite.seed,
-            command_line=self.config.model_copy(update={"seed": self.suite.seed, "fresh": False})
-            .with_only_here(self.config.only_here)
-            .command_line(),
-        )
-
-
-def _noted(path: Path) -> Suite | None:
-    """The suite that a run began with; None of one that was stopped at once."""
-    if not (path / STORE).is_file():
-        return None
-    with Store(path / STORE, read_only=True) as store:
-        noted = store.noted(NOTE)
-    return None if noted is None else suite_of(noted, f"{path}: the suite that it began with")
+            run=str(self.trial.run.path), suite=self.config.suite, title=self.suite.title,
+            object=",".join(dict.fromkeys(config.object for config in configs)),
+            model=",".join(dict.fromkeys(config.model for config in configs)),
+            environment=",".join(dict.fromkeys(config.lit_by for config in configs)),
+            controls=list(dict.fromkeys(name for config in configs for name in config.controls)),
+            answer=room.verdict(results), confidence=self.suite.confidence, claims=results, ending=ending,
+            added=None if added is None else str(added.path), changes=changes,
+            warnings=list(dict.fromkeys(self.trial.warnings)), seconds={"total": seconds}, seed=self.suite.seed,
+            command_line=self._repeat(),
+        )  # fmt: skip
 
 
 def _planned(suite: Suite, config: SuiteConfig, added: Counterexample | None) -> list[PlannedClaim]:
     changes = {"model": config.model, "threads": config.threads, "deterministic": config.deterministic or None}
-    kept = counterexamples(config.suite) if added is None else [added]
-    first = [PlannedClaim(one.name, "counterexample", one.config_for(suite, changes), one) for one in kept]
-    if twice := [one.name for one in first if one.name in suite.claims]:
+    planned = [
+        PlannedClaim(example.name, "counterexample", example.config_for(suite, changes), example)
+        for example in (beside.counterexamples(config.suite) if added is None else [added])
+    ]
+    if twice := [example.name for example in planned if example.name in suite.claims]:
         raise InputError(f"claims.{twice[0]}: a counterexample is called so, too; call the claim something else")
     if added is not None:
-        return first
-    rest = [
-        PlannedClaim(name, one.claim, suite.config_of(name, **changes).with_only_here(config.only_here))
-        for name, one in suite.claims.items()
-    ]
-    chosen, planned = config.chosen, [*first, *rest]
-    known = [one.name for one in planned]
-    for name in chosen:
-        if name not in (*known, COUNTEREXAMPLES):
-            raise UnknownNameError("claim in `only`", name, [*known, COUNTEREXAMPLES])
-    if not chosen:
         return planned
-    return [one for one in planned if one.name in chosen or (one.one is not None and COUNTEREXAMPLES in chosen)]
+    for name, claim in suite.claims.items():
+        claim_config = suite.config_of(name, **changes).with_only_here(config.only_here)
+        planned.append(PlannedClaim(name, claim.claim, claim_config))
+    known = [*(claim.name for claim in planned), COUNTEREXAMPLES]
+    for name in config.chosen:
+        if name not in known:
+            raise UnknownNameError("claim in `only`", name, known)
+    every = not config.chosen
+    return [
+        claim
+        for claim in planned
+        if every or claim.name in config.chosen or (claim.example is not None and COUNTEREXAMPLES in config.chosen)
+    ]
 
 
 def _check(planned: Sequence[PlannedClaim], suite: Suite) -> list[str]:
     """Load everything that claims name, and refuse what could not be judged or decided; a wrong name would end minutes
     of rendering. Return what has to be said before."""
-    known: list[AttackConfig] = []
-    claims = {one.name: suite.claims[one.name] for one in planned if one.one is None}
-    remarks = [check_pictures(name, claim, suite.confidence) for name, claim in claims.items()]
-    for one in planned:
-        if one.one is not None:
-            continue  # what is beside the suite is loaded when it is tried, at once
-        claim = claims[one.name]
+    known = list[AttackConfig]()
+    own = [each for each in planned if each.example is None]
+    # what is beside the suite is loaded when it is tried, at once
+    remarks = [check_pictures(each.name, suite.claims[each.name], suite.confidence) for each in own]
+    for each in own:
+        claim = suite.claims[each.name]
         if isinstance(claim, NotBrokenClaim):
-            _check_search(one.name, one.config)
-        whole = one.config if isinstance(one.config, AttackConfig) else AttackConfig.of(one.config)
-        wanted = [whole]
+            _check_search(each.name, each.config)
+        wanted = [each.config if isinstance(each.config, AttackConfig) else AttackConfig.of(each.config)]
         if isinstance(claim, NoWorseClaim):
-            wanted.append(whole.model_copy(update={"model": claim.than}))
+            wanted.append(wanted[0].model_copy(update={"model": claim.than}))
         for config in wanted:
             if config not in known:
                 try:
                     check_from_config(config)
                 except InputError as error:
-                    raise InputError(f"claims.{one.name}: {error}") from None
+                    raise InputError(f"claims.{each.name}: {error}") from None
                 known.append(config)
     return [remark for remark in remarks if remark]
 

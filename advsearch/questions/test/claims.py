@@ -12,6 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+import advsearch.questions.test.result as words
 from advsearch import seeds
 from advsearch.attacks import Evaluation
 from advsearch.attacks.evaluation import Query
@@ -29,52 +30,24 @@ from advsearch.questions.attack.carry_out import executor_for, parts_of, problem
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.studies import carry_out_part
 from advsearch.questions.attack.summary import AttackSummary
-from advsearch.questions.test.counterexamples import TRIALS, Counterexample, is_over, same_scene
-from advsearch.questions.test.result import (
-    FAILED,
-    HELD,
-    TIME_OVER,
-    UNDECIDED,
-    ClaimResult,
-    difference_reason,
-    search_verdict,
-    share_reason,
-    tried_reason,
-)
-from advsearch.questions.test.settings import (
-    AnyClaim,
-    DrawnConfig,
-    MustChangeClaim,
-    MustNotChangeClaim,
-    NoWorseClaim,
-    RightClaim,
-    ShareClaim,
-)
+from advsearch.questions.test.counterexamples import TRIALS, Counterexample, is_over, scene_digest
+from advsearch.questions.test.result import FAILED, HELD, TIME_OVER, UNDECIDED, ClaimResult
+from advsearch.questions.test.settings import AnyClaim, ChangeClaim, DrawnConfig, NoWorseClaim, RightClaim, ShareClaim
 from advsearch.report.wording import number_text
 from advsearch.runs.directory import IMAGES, PARTS, RunDirectory
 from advsearch.settings import split_names
 
-MANY = 4
-"""Values of a configuration that are said in words, at most."""
+MANY = 4  # values of a configuration that are said in words, at most
 
-MOST_KEPT = 64
-"""Of a configuration with more numbers, a picture's row does not hold the values."""
+MOST_KEPT = 64  # of a configuration with more numbers, a picture's row does not hold the values
 
-AHEAD = 2
-"""Pictures that are asked for at once, for each worker."""
+AHEAD = 2  # pictures that are asked for at once, for each worker
 
 
 @dataclass
 class Trial:
-    """What claims are tried with.
-
-    Attributes:
-        confidence: of each claim that pictures decide.
-        late: whether the time of the suite is over.
-        left: seconds until then; infinite without a limit.
-        workers, cluster: who shares the pictures of a claim.
-        warnings: gets sentences that a reader has to know.
-    """
+    """What claims are tried with: `confidence` is of each that pictures decide, `late` whether the time of the suite is
+    over and `left` the seconds until then, infinite without a limit; `warnings` gets what a reader has to know."""
 
     run: RunDirectory
     confidence: float
@@ -91,41 +64,40 @@ class Trial:
             return self._right(asked, claim, config)
         if isinstance(claim, NoWorseClaim):
             return self._no_worse(asked, claim, config)
-        if isinstance(claim, MustChangeClaim | MustNotChangeClaim):
+        if isinstance(claim, ChangeClaim):
             return self._changes(asked, claim, config)
         assert isinstance(config, AttackConfig)
         return self._not_broken(asked, config)
 
     def _right(self, asked: ClaimResult, claim: RightClaim, config: SceneConfig) -> ClaimResult:
         problem, shared = self._problem(config), self._shared(config)
-        sequence, right, hidden = ConfidenceSequence(self.confidence, sides=1), 0, 0
-        wrong: list[tuple[float, Query, str]] = []
+        sequence, right, hidden, verdict = ConfidenceSequence(self.confidence, sides=1), 0, 0, UNDECIDED
+        wrong: tuple[float, Query, str] | None = None
         self.progress.stage(asked.name, claim.pictures, hint="fewer pictures in the suite shorten it", at_most=True)
         with executor_for(shared, "advsearch.questions.attack.carry_out:attack_worker", self.progress) as executor:
             journal = Journal(self.run, Shared(problem, executor))
             queries = drawn(problem, f"claim {asked.name}", claim.pictures, spp_of(config))
-            verdict = UNDECIDED
             for query, evaluation in self._evaluations(journal, queries):
-                said = evaluation.said
-                if said.prediction.label == OUT_OF_VIEW:
+                judged = evaluation.said
+                if judged.prediction.label == OUT_OF_VIEW:
                     hidden += 1
                     continue
-                sequence.add(1.0 if said.right else 0.0)
-                right += said.right
-                if not said.right:
-                    score = said.score if math.isfinite(said.score) else -math.inf
-                    wrong = sorted([*wrong, (score, query, said.prediction.label)], key=lambda one: -one[0])[:1]
+                sequence.add(float(judged.right))
+                right += judged.right
+                score = judged.score if math.isfinite(judged.score) else -math.inf
+                if not judged.right and (wrong is None or score > wrong[0]):
+                    wrong = score, query, judged.prediction.label
                 verdict = decided(sequence, least_mean(claim))
                 if verdict != UNDECIDED:
                     break
         worst, picture = "", None
-        if wrong:
-            _, query, label = wrong[0]
+        if wrong is not None:
+            _, query, label = wrong
             worst = f"most wrong where it says {label}: {self._described(problem, query)}"
             picture = self._picture(asked.name, problem, query)
-        reason = share_reason("right", verdict, right, sequence.count, sequence.interval, worst)
+        reason = words.share_reason("right", verdict, right, sequence.count, sequence.interval, worst)
         reason += f"; the object is not to be seen in {hidden} more, which are not counted" if hidden else ""
-        return self._decided(asked, verdict, reason, sequence, config, picture, (0.0, 1.0))
+        return self._decided(asked, verdict, reason, sequence, config, picture)
 
     def _no_worse(self, asked: ClaimResult, claim: NoWorseClaim, config: SceneConfig) -> ClaimResult:
         problem, other = self._problem(config), self._problem(config.model_copy(update={"model": claim.than}))
@@ -148,13 +120,11 @@ class Trial:
                     break
         low, high = sequence.interval
         counts = (sequence.count, ours, theirs)
-        reason = difference_reason(verdict, counts, (2 * low - 1, 2 * high - 1), claim.than)
+        reason = words.difference_reason(verdict, counts, (2 * low - 1, 2 * high - 1), claim.than)
         picture = None if first is None else self._picture(asked.name, problem, first)
         return self._decided(asked, verdict, reason, sequence, config, picture, (-1.0, 2.0))
 
-    def _changes(
-        self, asked: ClaimResult, claim: MustChangeClaim | MustNotChangeClaim, config: SceneConfig
-    ) -> ClaimResult:
+    def _changes(self, asked: ClaimResult, claim: ChangeClaim, config: SceneConfig) -> ClaimResult:
         """Whether a change of the picture changes what the model says, or not."""
         problem = self._problem(config)
         other = self._problem(config) if claim.when == AWAY else problem
@@ -181,18 +151,13 @@ class Trial:
                 verdict = decided(sequence, least_mean(claim))
                 if verdict != UNDECIDED:
                     break
-        reason = share_reason("as claimed", verdict, held, sequence.count, sequence.interval, example)
-        return self._decided(asked, verdict, reason, sequence, config, picture, (0.0, 1.0))
+        reason = words.share_reason("as claimed", verdict, held, sequence.count, sequence.interval, example)
+        return self._decided(asked, verdict, reason, sequence, config, picture)
 
     def _pairs(
-        self,
-        asked: ClaimResult,
-        claim: NoWorseClaim | MustChangeClaim | MustNotChangeClaim,
-        config: SceneConfig,
-        journal: Journal,
-        beside: Journal,
-        shown: Callable[[Query, Tensor], Tensor] | None,
-    ) -> Iterator[tuple[Query, Evaluation, Evaluation]]:
+        self, asked: ClaimResult, claim: NoWorseClaim | ChangeClaim, config: SceneConfig, journal: Journal,
+        beside: Journal, shown: Callable[[Query, Tensor], Tensor] | None,
+    ) -> Iterator[tuple[Query, Evaluation, Evaluation]]:  # fmt: skip
         """Yield a claim's pictures, what is said of each, and what the other side says of what is `shown` to it of this
         picture; without, of a picture of its own."""
         kind = f"claim {asked.name}"
@@ -208,77 +173,68 @@ class Trial:
 
         def there(queries: Sequence[Query]) -> Iterable[Evaluation]:
             if shown is None:
-                return beside.traced(queries)
-            return (_judged(other, query, shown(query, picture_of(query))) for query in queries)
+                yield from beside.traced(queries)
+                return
+            for query in queries:
+                picture = pictures.get(query.number)  # what was asked before is read back, without its picture
+                if picture is None:
+                    picture = problem.picture(query.u, query.seed, query.spp)
+                yield other.trial(shown(query, picture), other.whole(query.u))
 
-        def picture_of(query: Query) -> Tensor:
-            kept = pictures.get(query.number)  # what was asked before is read back, without its picture
-            return problem.picture(query.u, query.seed, query.spp) if kept is None else kept
-
-        queries = drawn(problem, kind, claim.pictures, spp_of(config))
-        while batch := list(islice(queries, self._at_once(journal))):
+        for batch in self._batches(journal, drawn(problem, kind, claim.pictures, spp_of(config))):
             pictures.clear()
             mine = list(journal.evaluate_all(batch, here))
             both = beside.evaluate_all([replace(query, kind=f"{kind} beside") for query in batch], there)
             for query, own, its in zip(batch, mine, both, strict=True):
                 self.progress.advance(1, **journal.traced.told)
                 yield query, own, its
-            if self.late():
-                return
 
     def _not_broken(self, asked: ClaimResult, config: AttackConfig) -> ClaimResult:
         seconds = min(self.left(), config.seconds or math.inf)
         shared = {"workers": self.workers, "cluster": self.cluster}
         limited = {**shared, "seconds": seconds if math.isfinite(seconds) else None}
         own = config.model_copy(update=limited).with_only_here(config.only_here)
-        path = self.run.path / PARTS / asked.name
-        summary = carry_out_part(path, own, self.progress)
+        summary = carry_out_part(self.run.path / PARTS / asked.name, own, self.progress)
         assert isinstance(summary, AttackSummary)
         self.warnings += summary.warnings
-        verdict, reason = search_verdict(summary, own.model_copy(update={"steps": own.steps or summary.steps}))
+        verdict, reason = words.search_verdict(summary, own.model_copy(update={"steps": own.steps or summary.steps}))
         shown = "clean" if summary.ending == "already wrong" else "adversarial"
         file = f"{PARTS}/{asked.name}/{IMAGES}/{shown}.png"
-        return asked.model_copy(
-            update={
-                "answer": verdict,
-                "reason": reason,
-                "pictures": sum(count for name, count in summary.renders.items() if name != "products"),
-                "picture": file if verdict == FAILED and (self.run.path / file).is_file() else None,
-                "part": asked.name,
-            }
-        )
+        outcome: dict[str, Any] = {"answer": verdict, "reason": reason, "part": asked.name}
+        outcome["pictures"] = sum(count for name, count in summary.renders.items() if name != "products")
+        outcome["picture"] = file if verdict == FAILED and (self.run.path / file).is_file() else None
+        return asked.model_copy(update=outcome)
 
     def counterexample(
-        self, asked: ClaimResult, one: Counterexample, config: AttackConfig, *, added: bool = False
+        self, asked: ClaimResult, example: Counterexample, config: AttackConfig, *, added: bool = False
     ) -> ClaimResult:
         """Try a counterexample: the model should be right on it. Trials by which it is `added` are no trials of it."""
-        asked = asked.model_copy(update={"statement": f"{config.model} is right where it said {one.said}"})
+        asked = asked.model_copy(update={"statement": f"{config.model} is right where it said {example.said}"})
         parts = parts_of(config)
-        if not same_scene(one, parts.scene):
+        if scene_digest(parts.scene) != example.scene:
             reason = "its scene is another one now; remove it, or add the adversarial scene of a new run"
             return asked.model_copy(update={"reason": reason})
         problem = problem_of(config, parts.scene, parts.loaded[0], differentiated=False)
-        u = problem.domain.project(one.configuration(problem.domain.start))
-        count, right, label, picture = TRIALS[is_over(config)], 0, "", None
-        self.progress.stage(one.name, count, at_most=True)
-        kind = f"{'added ' if added else ''}counterexample {one.name}"
+        u = problem.domain.project(example.configuration(problem.domain.start))
+        count, tried, right, label, picture = TRIALS[is_over(config)], 0, 0, "", None
+        self.progress.stage(example.name, count, at_most=True)
+        kind = f"{'added ' if added else ''}counterexample {example.name}"
         queries = (
-            Query(u, seeds.stream(problem.seed, kind, number), kind, number, spp=one.spp) for number in range(count)
+            Query(u, seeds.stream(problem.seed, kind, number), kind, number, spp=example.spp) for number in range(count)
         )
-        tried = 0
         for query, evaluation in self._evaluations(Journal(self.run, Shared(problem)), queries):
             tried, right = tried + 1, right + evaluation.said.right
             if not evaluation.said.right and not label:
-                label, picture = evaluation.said.prediction.label, self._picture(one.name, problem, query)
+                label, picture = evaluation.said.prediction.label, self._picture(example.name, problem, query)
             if 0 < right < tried:
                 break  # it depends on the noise, whatever comes
         interval = clopper_pearson(right, tried) if tried else None
-        verdict, reason = tried_reason(right, tried - right, label, interval)
+        verdict, reason = words.tried_reason(right, tried - right, label, interval)
         if tried < count and not 0 < right < tried:
             verdict, reason = UNDECIDED, TIME_OVER
-        said = {"answer": verdict, "reason": reason, "pictures": tried, "spp": one.spp, "picture": picture}
-        said |= {"rate": right / tried if tried else None, "interval": interval}
-        return asked.model_copy(update=said)
+        outcome = {"answer": verdict, "reason": reason, "pictures": tried, "spp": example.spp, "picture": picture}
+        outcome |= {"rate": right / tried if tried else None, "interval": interval}
+        return asked.model_copy(update=outcome)
 
     def _problem(self, config: SceneConfig) -> Problem:
         whole = AttackConfig.of(config)
@@ -291,16 +247,18 @@ class Trial:
         return AttackConfig.of(config, workers=self.workers, cluster=self.cluster)
 
     def _evaluations(self, journal: Journal, queries: Iterator[Query]) -> Iterator[tuple[Query, Evaluation]]:
-        """Ask, as many at once as there are workers for, until the time is over."""
-        while batch := list(islice(queries, self._at_once(journal))):
+        for batch in self._batches(journal, queries):
             for query, evaluation in zip(batch, journal.evaluate_all(batch), strict=True):
                 self.progress.advance(1, **journal.traced.told)
                 yield query, evaluation
+
+    def _batches(self, journal: Journal, queries: Iterator[Query]) -> Iterator[list[Query]]:
+        """As many at once as there are workers for, until the time is over."""
+        at_once = 1 if journal.traced.executor is None else AHEAD * (self.workers or 8)
+        while batch := list(islice(queries, at_once)):
+            yield batch
             if self.late():
                 return
-
-    def _at_once(self, journal: Journal) -> int:
-        return 1 if journal.traced.executor is None else AHEAD * (self.workers or 8)
 
     def _picture(self, name: str, problem: Problem, query: Query) -> str:
         self.run.save_image(name, problem.picture(query.u, query.seed, query.spp, drawn=query.drawn))
@@ -308,38 +266,24 @@ class Trial:
 
     def _described(self, problem: Problem, query: Query) -> str:
         values = list(problem.describe(query.u, query.seed).items())
-        shown = [
-            f"{name} {number_text(one['value'])}" + ("" if one["unit"] in ("1", "name") else f" {one['unit']}")
-            for name, one in values[:MANY]
-        ]
+        shown = []
+        for name, value in values[:MANY]:
+            unit = "" if value["unit"] in ("1", "name") else f" {value['unit']}"
+            shown.append(f"{name} {number_text(value['value'])}{unit}")
         return ", ".join([*shown, *(["..."] if len(values) > MANY else [])])
 
     def _decided(
-        self,
-        asked: ClaimResult,
-        verdict: str,
-        reason: str,
-        sequence: ConfidenceSequence,
-        config: SceneConfig,
-        picture: str | None,
-        scale: tuple[float, float],
-    ) -> ClaimResult:
+        self, asked: ClaimResult, verdict: str, reason: str, sequence: ConfidenceSequence, config: SceneConfig,
+        picture: str | None, scale: tuple[float, float] = (0.0, 1.0),
+    ) -> ClaimResult:  # fmt: skip
         """What drawn pictures say; `scale` has the value of a mean of 0, and how much more that of 1 is."""
-        if verdict == UNDECIDED and self.late():
-            reason = f"{reason}; {TIME_OVER}"
         begin, wide = scale
         low, high = sequence.interval
-        return asked.model_copy(
-            update={
-                "answer": verdict,
-                "reason": reason,
-                "pictures": sequence.count,
-                "rate": begin + wide * sequence.mean if sequence.count else None,
-                "interval": (begin + wide * low, begin + wide * high),
-                "spp": spp_of(config),
-                "picture": picture,
-            }
-        )
+        late = f"; {TIME_OVER}" if verdict == UNDECIDED and self.late() else ""
+        outcome = {"answer": verdict, "reason": reason + late, "pictures": sequence.count, "picture": picture}
+        outcome["rate"] = begin + wide * sequence.mean if sequence.count else None
+        outcome |= {"interval": (begin + wide * low, begin + wide * high), "spp": spp_of(config)}
+        return asked.model_copy(update=outcome)
 
 
 def claim_worker(settings: JsonObject) -> Callable[[Any], Any]:
@@ -354,10 +298,6 @@ def claim_worker(settings: JsonObject) -> Callable[[Any], Any]:
     return worker_call(cache(problem))
 
 
-def _judged(problem: Problem, query: Query, picture: Tensor) -> Evaluation:
-    return Evaluation.of(problem.judge(picture, problem.whole(query.u)))
-
-
 def drawn(problem: Problem, kind: str, count: int, spp: int) -> Iterator[Query]:
     """Draw configurations evenly from the whole space and budget, one after the other, each with a seed of its own."""
     for number in range(count):
@@ -369,21 +309,17 @@ def drawn(problem: Problem, kind: str, count: int, spp: int) -> Iterator[Query]:
 
 
 def least_mean(claim: ShareClaim | NoWorseClaim) -> float:
-    """Return what the mean of the draws is claimed to be over: 1 for as claimed and 0 for not; or 0, 1/2 and 1, of two
-    models."""
+    """Return what the mean of the draws, from 0 to 1, has to be over; of two models 1/2 is that both are as good."""
     return claim.at_least if isinstance(claim, ShareClaim) else 0.5 - claim.points / 200.0
 
 
 def check_pictures(name: str, claim: AnyClaim, confidence: float) -> str:
-    """Return what has to be said of a claim's number of pictures before any is made; nothing where it is enough.
-
-    Raises:
-        InputError: no predictions of so many pictures could decide it, or only one way.
-    """
+    """Return what has to be said of a claim's number of pictures before any is made; nothing where it is enough. An
+    InputError where no predictions of so many pictures could decide it, or only one way."""
     if not isinstance(claim, ShareClaim | NoWorseClaim):
         return ""
     least = least_mean(claim)
-    needed = max(draws_needed(one, confidence=confidence) for one in (least, 1.0 - least))
+    needed = max(draws_needed(mean, confidence=confidence) for mean in (least, 1.0 - least))
     if claim.pictures < needed:
         raise InputError(
             f"claims.{name}.pictures: expected at least {needed}, as fewer cannot both hold and fail this claim at a "

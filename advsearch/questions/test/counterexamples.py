@@ -46,17 +46,11 @@ FORMS = ((True, 4), (True, 2), (True, 1), (False, 1))
 """How the numbers of a large block are kept, the smallest first: whether each is only a step up, down or none, and the
 side of the squares of texels that have one."""
 
-PICTURE = ".jpg"
-"""How the name of the picture ends."""
+PICTURE = ".jpg"  # how the name of the picture ends
+LARGEST = 1 << 24  # most bytes of a file, and most numbers of a configuration
+MEMORY = 1 << 27  # bytes that unpacking one may take
 
-LARGEST = 1 << 24
-"""Most bytes of a file, and most numbers of a configuration."""
-
-MEMORY = 1 << 27
-"""Bytes that unpacking one may take."""
-
-TRIALS = {False: 6, True: 20}
-"""Fresh renders that try one, and one that has to hold under many conditions."""
+TRIALS = {False: 6, True: 20}  # fresh renders that try one, and one that has to hold under many conditions
 
 OF_SEARCH = (
     *(*OWN, "policy", "steps", "objective", "metrics", "log", "average", "baseline", "trials"),
@@ -105,8 +99,8 @@ class _Block(BaseModel):
         if self.square > 1:
             squares = steps.reshape(side // self.square, side // self.square, 3)
             steps = squares.repeat(self.square, axis=0).repeat(self.square, axis=1).ravel()
-        found: Floats = steps.astype(np.float32) * np.float32(self.step)
-        return found
+        moved: Floats = steps.astype(np.float32) * np.float32(self.step)
+        return moved
 
 
 def _three_in_one(steps: np.ndarray[Any, np.dtype[np.int16]]) -> bytes:
@@ -133,16 +127,9 @@ class _File(BaseModel):
 
 @dataclass(frozen=True)
 class Counterexample:
-    """The adversarial scene of a run.
-
-    Attributes:
-        path: of its file; the picture is beside it.
-        config: what it was found with.
-        said: what the model said of it.
-        scene: digest of the scene.
-        spp: samples a pixel that it was verified with.
-        moved: (d,) float32, how far each number is from the clean scene's.
-    """
+    """The adversarial scene of a run: its file, beside which its picture is; what it was found with; what the model
+    `said` of it; digest of the scene; samples a pixel that it was verified with; and how far each number (d,) float32
+    is `moved` from the clean scene's."""
 
     name: str
     path: Path
@@ -154,10 +141,12 @@ class Counterexample:
 
     def config_for(self, suite: Suite, changes: Mapping[str, object]) -> AttackConfig:
         """Return what it is tried with: the run's scene, and the suite's model."""
-        theirs = {name: value for name, value in suite.settings.items() if name in OF_MODEL}
-        said = {name: value for name, value in changes.items() if value is not None}
-        own = {} if "model" not in {**theirs, **said} else {name: None for name in ("labels", "prompt")}
-        return AttackConfig(**{**self.config.plain(), "run": None, **own, **theirs, "seed": suite.seed, **said})
+        of_suite = {name: value for name, value in suite.settings.items() if name in OF_MODEL}
+        changed = {name: value for name, value in changes.items() if value is not None}
+        plain = {**self.config.plain(), "run": None}
+        if "model" in {**of_suite, **changed}:
+            plain |= {"labels": None, "prompt": None}
+        return AttackConfig(**{**plain, **of_suite, "seed": suite.seed, **changed})
 
     def configuration(self, start: Tensor) -> Tensor:
         """Return u, (d,) float32, from that of the clean scene."""
@@ -185,11 +174,8 @@ def scene_digest(scene: Scene) -> str:
 
 
 def add(suite: str, run: str) -> Counterexample:
-    """Keep the adversarial scene of a run as a counterexample of a suite.
-
-    Raises:
-        InputError: the run found nothing, or its scene is no counterexample.
-    """
+    """Keep the adversarial scene of a run as a counterexample of a suite; an InputError where the run found nothing, or
+    its scene is none."""
     path = find_run(run)
     summary, config = attack_of(path), AttackConfig.from_yaml(path / CONFIG)
     if summary.ending != "found" or summary.verified is None:
@@ -201,52 +187,42 @@ def add(suite: str, run: str) -> Counterexample:
     moved = (kept_configuration(path, problem) - problem.domain.start).numpy()
     of = path.parents[1].name if path.parent.name == PARTS else ""
     folder, name = folder_of(suite), default_name(of or path.name, (path.name,) if of else ())
-    values: dict[str, Any] = {
-        "schema": 1,
-        "run": path.name,
-        "said": next(iter(summary.verified.labels), ""),
-        "settings": _settings(config),
-        "scene": scene_digest(parts.scene),
-        "spp": summary.verified.spp,
+    # what decides the scene, what may vary in it, and what is right; files below the current folder relative to it
+    plain, here = config.to_repeat().plain(), os.getcwd()
+    kept = {
+        setting.name: plain[setting.name]
+        for setting in settings(AttackConfig)
+        if setting.name not in OF_SEARCH and getattr(config, setting.field) != setting.default
     }
+    for file in FILES:
+        if isinstance(place := kept.get(file), str) and os.path.isabs(place) and Path(place).is_relative_to(here):
+            kept[file] = os.path.relpath(place, here)
+    values: dict[str, Any] = {"schema": 1, "run": path.name, "said": next(iter(summary.verified.labels), "")}
+    values |= {"settings": kept, "scene": scene_digest(parts.scene), "spp": summary.verified.spp}
     folder.mkdir(parents=True, exist_ok=True)
     write_bytes(folder / f"{name}{PICTURE}", thumbnail(read_png(path / IMAGES / "adversarial.png")))
     blocks = [block.size for block in problem.domain.blocks]
     forms = FORMS if max(blocks) > FEW else FORMS[-1:]
     for form in forms:
-        kept = [_Block.of(part, *form) for part in np.split(moved, np.cumsum(blocks)[:-1])]
-        text = json.dumps({**values, "blocks": [one.model_dump() for one in kept]}, indent=1)
-        one = _read(write_text(folder / f"{name}.json", text + "\n"))
-        if form == forms[-1] or _is_wrong(problem, one):
+        parted = [_Block.of(part, *form) for part in np.split(moved, np.cumsum(blocks)[:-1])]
+        text = json.dumps({**values, "blocks": [block.model_dump() for block in parted]}, indent=1)
+        example = _read(write_text(folder / f"{name}.json", text + "\n"))
+        if form == forms[-1] or _is_wrong(problem, example):
             break
-    return one
+    return example
 
 
-def _is_wrong(problem: Problem, one: Counterexample) -> bool:
+def _is_wrong(problem: Problem, example: Counterexample) -> bool:
     """Whether the run's model is wrong on what is kept, in twice as many trials as will try it."""
-    u = problem.domain.project(one.configuration(problem.domain.start))
-    drawn = (seeds.stream(problem.seed, "kept", number) for number in range(2 * TRIALS[is_over(one.config)]))
-    return not any(problem.judge(problem.picture(u, seed, one.spp), problem.whole(u, seed)).right for seed in drawn)
+    u, trials = problem.domain.project(example.configuration(problem.domain.start)), TRIALS[is_over(example.config)]
+    fresh = (seeds.stream(problem.seed, "kept", number) for number in range(2 * trials))
+    return not any(problem.judge(problem.picture(u, seed, example.spp), problem.whole(u, seed)).right for seed in fresh)
 
 
-def remove(one: Counterexample) -> None:
+def remove(example: Counterexample) -> None:
     """Remove the files of a counterexample."""
-    one.path.unlink(missing_ok=True)
-    one.path.with_suffix(PICTURE).unlink(missing_ok=True)
-
-
-def _settings(config: AttackConfig) -> dict[str, Any]:
-    """What decides the scene, what may vary in it, and what is right; files below the current folder relative to it."""
-    plain, here = config.to_repeat().plain(), os.getcwd()
-    given = {
-        one.name: plain[one.name]
-        for one in settings(AttackConfig)
-        if one.name not in OF_SEARCH and getattr(config, one.field) != one.default
-    }
-    for name in FILES:
-        if isinstance(path := given.get(name), str) and os.path.isabs(path) and Path(path).is_relative_to(here):
-            given[name] = os.path.relpath(path, here)
-    return given
+    example.path.unlink(missing_ok=True)
+    example.path.with_suffix(PICTURE).unlink(missing_ok=True)
 
 
 def counterexamples(suite: str) -> list[Counterexample]:
@@ -274,13 +250,11 @@ def _read(path: Path) -> Counterexample:
 
 # ---- what is expected -----------------------------------------------------------------------------------------------
 
-EXPECTED = "expected.json"
-"""What claims said when that was accepted, where they were not held."""
+EXPECTED = "expected.json"  # what claims said when that was accepted, where they were not held
 
 
 def read_expected(suite: str) -> dict[str, str]:
-    """Return what is expected of each claim that is not expected to be held; a FileFormatError where the file is
-    damaged."""
+    """Return what is expected of claims that are not to be held; a FileFormatError where the file is damaged."""
     path = folder_of(suite) / EXPECTED
     if not path.is_file():
         return {}
@@ -288,27 +262,20 @@ def read_expected(suite: str) -> dict[str, str]:
         values = parse_json(read_text(path, "what is expected of a suite", LARGEST))
     except (OSError, ValueError) as error:
         raise FileFormatError(f"{path}: expected verdicts by claim, got {str(error)[:80]}; remove it") from None
-    found = values.get("expected") if isinstance(values, dict) else None
-    if not isinstance(found, dict) or not set(map(str, found.values())) <= set(VERDICTS):
+    verdicts = values.get("expected") if isinstance(values, dict) else None
+    if not isinstance(verdicts, dict) or not set(map(str, verdicts.values())) <= set(VERDICTS):
         raise FileFormatError(f"{path}: expected verdicts by claim, got something else; remove it")
-    return {str(name): str(verdict) for name, verdict in found.items()}
+    return {str(name): str(verdict) for name, verdict in verdicts.items()}
 
 
 def write_expected(suite: str, verdicts: Mapping[str, str]) -> list[str]:
     """Expect these verdicts from now on, and return what changes, in words."""
-    before = read_expected(suite)
-    now = {**before, **verdicts}
-    kept = {name: verdict for name, verdict in sorted(now.items()) if verdict != HELD}
-    folder = folder_of(suite)
+    before, folder = read_expected(suite), folder_of(suite)
+    kept = {name: verdict for name, verdict in sorted({**before, **verdicts}.items()) if verdict != HELD}
     folder.mkdir(parents=True, exist_ok=True)
     write_text(folder / EXPECTED, json.dumps({"schema": 1, "expected": kept}, indent=1) + "\n")
     changed = {name: (before.get(name, HELD), verdict) for name, verdict in verdicts.items()}
     return [f"{name}: {was} -> {now}" for name, (was, now) in changed.items() if was != now]
-
-
-def same_scene(one: Counterexample, scene: Scene) -> bool:
-    """Whether a scene is the one that a counterexample was found in."""
-    return scene_digest(scene) == one.scene
 
 
 def is_over(config: SceneConfig) -> bool:

@@ -17,24 +17,16 @@ from advsearch.config import SceneConfig
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.summary import AttackSummary
 from advsearch.questions.sweep.settings import BLIND, HARMLESS
-from advsearch.questions.test.settings import (
-    AnyClaim,
-    MustChangeClaim,
-    MustNotChangeClaim,
-    NoWorseClaim,
-    RightClaim,
-)
+from advsearch.questions.test.settings import AnyClaim, ChangeClaim, NoWorseClaim, RightClaim
 from advsearch.report.markup import InNotebook
 from advsearch.report.shown import Claim, Kind, Picture, ResultPart, ShownResult
 from advsearch.report.wording import count, interval_text, number_text, percent, seconds_text, short_name, with_article
 from advsearch.runs.results import INTERRUPTED, RUNNING, Fields, Interval, JsonFloat, RunResult
 
 HELD, UNDECIDED, FAILED = "held", "undecided", "failed"
-VERDICTS = (HELD, UNDECIDED, FAILED)
-"""From the best to the worst."""
+VERDICTS = (HELD, UNDECIDED, FAILED)  # from the best to the worst
 
-STATUS = {HELD: 0, FAILED: 1, UNDECIDED: 2}
-"""Exit status of the command, by what the suite says as a whole."""
+STATUS = {HELD: 0, FAILED: 1, UNDECIDED: 2}  # exit status of the command, by what the suite says as a whole
 
 
 class ClaimResult(Fields):
@@ -91,8 +83,8 @@ class SuiteResult(InNotebook, RunResult):
 
     @property
     def brief(self) -> str:
-        """How many claims were held, failed and undecided."""
-        counts = {verdict: sum(one.answer == verdict for one in self.claims) for verdict in (HELD, FAILED, UNDECIDED)}
+        answers = [claim.answer for claim in self.claims]
+        counts = {verdict: answers.count(verdict) for verdict in (HELD, FAILED, UNDECIDED)}
         return ", ".join(f"{count} {verdict}" for verdict, count in counts.items() if count)
 
     @property
@@ -103,12 +95,10 @@ class SuiteResult(InNotebook, RunResult):
 
 def verdict(claims: list[ClaimResult]) -> str:
     """Return what a suite says as a whole: the worst of what was not expected."""
-    worse = [one.answer for one in claims if not one.accepted]
-    return max(worse, key=VERDICTS.index, default=HELD)
+    return max((claim.answer for claim in claims if not claim.accepted), key=VERDICTS.index, default=HELD)
 
 
 RESULT = SuiteResult
-
 
 TABLE_HEADS = ("claim", "verdict", "pictures", "why")
 
@@ -125,13 +115,13 @@ NOT_YET = "not tried yet"
 
 def shown(result: SuiteResult) -> ShownResult:
     """Return what the suite says, a table of its claims, and what repeats those that are not held."""
-    runs = [one.part for one in result.claims]
+    runs = [claim.part for claim in result.claims]
     sections = [ResultPart("The claims", heads=TABLE_HEADS, rows=table_rows(result), note=NOTE, parts=runs)]
-    for one in result.claims:
-        if one.answer != HELD and one.reason != NOT_TRIED:
-            caption = f"{one.statement}: {one.answer}. {one.reason}."
-            pictures = [[Picture(one.picture, caption)]] if one.picture else []
-            sections.append(ResultPart(one.name, rows=[["repeat", one.repeat]], pictures=pictures))
+    for claim in result.claims:
+        if claim.answer != HELD and claim.reason != NOT_TRIED:
+            caption = f"{claim.statement}: {claim.answer}. {claim.reason}."
+            pictures = [[Picture(claim.picture, caption)]] if claim.picture else []
+            sections.append(ResultPart(claim.name, rows=[["repeat", claim.repeat]], pictures=pictures))
     sections.append(ResultPart("Expected from now on", result.changes))
     about = [Path(result.suite).name, result.object, result.model]
     return ShownResult(f"{result.title}. {suite_text(result)}", sections, facts(result), about)
@@ -144,8 +134,8 @@ def statement(claim: AnyClaim, config: SceneConfig) -> str:
         spanned = "the frames" if "path" in config.controls else "the pictures"
         share = f"at least {percent(claim.at_least)} of {spanned} that the ranges span"
         return f"{short_name(config.model)} is right in {share}: {what}"
-    if isinstance(claim, MustChangeClaim | MustNotChangeClaim):
-        says = "says something else" if isinstance(claim, MustChangeClaim) else "says the same"
+    if isinstance(claim, ChangeClaim):
+        says = "says something else" if claim.claim == "must_change" else "says the same"
         when = f"{(BLIND | HARMLESS)[claim.when]}, in at least {percent(claim.at_least)} of pictures"
         return f"{short_name(config.model)} {says} when {when}: {what}"
     if isinstance(claim, NoWorseClaim):
@@ -217,21 +207,21 @@ def tried_reason(right: int, wrong: int, label: str, interval: tuple[float, floa
 
 def table_rows(result: SuiteResult) -> list[list[str]]:
     """Return a row for each claim, under `TABLE_HEADS`."""
-    return [[one.name, verdict_text(one), str(one.pictures or ""), one.reason] for one in result.claims]
+    return [[claim.name, verdict_text(claim), str(claim.pictures or ""), claim.reason] for claim in result.claims]
 
 
-def verdict_text(one: ClaimResult) -> str:
+def verdict_text(claim: ClaimResult) -> str:
     """Return the verdict, with what was expected where that is another one."""
-    if one.expected == HELD:
-        return one.answer
-    return f"{one.answer} ({'as expected' if one.answer == one.expected else f'expected: {one.expected}'})"
+    if claim.expected == HELD:
+        return claim.answer
+    return f"{claim.answer} ({'as expected' if claim.answer == claim.expected else f'expected: {claim.expected}'})"
 
 
 def suite_text(result: SuiteResult) -> str:
     """Return what a suite says as a whole, in a sentence."""
     if result.added is not None:
         return f"Kept as {result.added}."
-    known = sum(one.answer != HELD and one.accepted for one in result.claims)
+    known = sum(claim.answer != HELD and claim.accepted for claim in result.claims)
     beside = f", {known} of them as expected" if known else ""
     said = {RUNNING: "Running, so far", INTERRUPTED: "Stopped, so far"}.get(result.ending, result.answer.capitalize())
     return f"{said}: {result.brief or 'no claims'}{beside}."
@@ -242,7 +232,7 @@ def facts(result: SuiteResult) -> dict[str, str]:
     return {
         "model": result.model,
         "confidence": f"{percent(result.confidence)} for each claim that pictures decide",
-        "pictures": str(sum(one.pictures for one in result.claims)),
+        "pictures": str(sum(claim.pictures for claim in result.claims)),
         "seed": str(result.seed),
         "time": seconds_text(result.seconds["total"]),
     }
@@ -250,17 +240,15 @@ def facts(result: SuiteResult) -> dict[str, str]:
 
 def claims(result: SuiteResult) -> Iterator[Claim]:
     """Yield what the run stands for: what each claim of the suite came to, by its own test."""
-    for one in result.claims:
-        said = f"{one.name}: that {one.statement} is {one.answer}: {one.reason}."
-        if one.kind in ("not_broken", "counterexample"):
-            kind: Kind = "found" if one.answer == FAILED else "not found" if one.answer == HELD else "nothing claimed"
-            yield Claim(kind=kind, statement=said, extent=None)
-        elif one.answer == UNDECIDED:
-            yield Claim(kind="nothing claimed", statement=said, extent=None)
-        else:
+    for tried in result.claims:
+        text = f"{tried.name}: that {tried.statement} is {tried.answer}: {tried.reason}."
+        kind: Kind = "nothing claimed" if tried.answer == UNDECIDED else "measured"
+        if tried.kind in ("not_broken", "counterexample") and tried.answer != UNDECIDED:
+            kind = "found" if tried.answer == FAILED else "not found"
+        elif kind == "measured":
             sure = percent(result.confidence)
-            more = f" Each end of the interval is a confidence sequence at {sure}, in place of Clopper-Pearson's."
-            yield Claim(kind="measured", statement=said + more, extent=None)
+            text += f" Each end of the interval is a confidence sequence at {sure}, in place of Clopper-Pearson's."
+        yield Claim(kind=kind, statement=text, extent=None)
 
 
 SARIF_SCHEMA = "https://docs.oasis-open.org/sarif/sarif/v2.1.0/errata01/os/schemas/sarif-schema-2.1.0.json"
@@ -279,35 +267,30 @@ MEANINGS = {
 def junit(result: SuiteResult) -> str:
     """Return JUnit XML: a test case for each claim. What failed is a failure, what is undecided an error, and what is
     so as expected is skipped."""
-    cases = result.claims
-    bad = [one for one in cases if not one.accepted]
+    answers = [(claim.answer, claim.accepted) for claim in result.claims]
     counts = {
-        "tests": len(cases),
-        "failures": sum(one.answer == FAILED for one in bad),
-        "errors": sum(one.answer == UNDECIDED for one in bad),
-        "skipped": sum(one.accepted and one.answer != HELD for one in cases),
+        "tests": len(answers),
+        "failures": answers.count((FAILED, False)),
+        "errors": answers.count((UNDECIDED, False)),
+        "skipped": sum(accepted and answer != HELD for answer, accepted in answers),
     }
-    given = {name: str(count) for name, count in counts.items()}
-    time = f"{result.seconds['total']:.3f}"
-    root = ElementTree.Element("testsuites", {"name": "advsearch", **given, "time": time})
-    suite = ElementTree.SubElement(root, "testsuite", {"name": _xml(result.title), **given, "time": time})
+    attributes = {name: str(count) for name, count in counts.items()} | {"time": f"{result.seconds['total']:.3f}"}
+    root = ElementTree.Element("testsuites", {"name": "advsearch", **attributes})
+    suite = ElementTree.SubElement(root, "testsuite", {"name": _xml(result.title), **attributes})
     properties = ElementTree.SubElement(suite, "properties")
     for name, value in {**facts(result), "run": result.run or ""}.items():
         ElementTree.SubElement(properties, "property", {"name": name, "value": _xml(value)})
-    for one in cases:
-        case = ElementTree.SubElement(
-            suite,
-            "testcase",
-            {"name": one.name, "classname": _xml(f"{result.title}.{one.kind}"), "time": f"{one.seconds:.3f}"},
-        )
-        if one.answer != HELD:
-            tag = "skipped" if one.accepted else "failure" if one.answer == FAILED else "error"
-            said = ElementTree.SubElement(case, tag, {"message": _xml(f"{one.answer}: {one.reason}")})
-            if tag != "skipped":
-                said.set("type", one.answer)
-            said.text = _xml("\n".join(filter(None, [one.statement, _picture(result, one), one.repeat])))
-        else:
-            ElementTree.SubElement(case, "system-out").text = _xml(f"{one.statement}\n{one.reason}")
+    for claim in result.claims:
+        named = {"name": claim.name, "classname": _xml(f"{result.title}.{claim.kind}")}
+        case = ElementTree.SubElement(suite, "testcase", {**named, "time": f"{claim.seconds:.3f}"})
+        if claim.answer == HELD:
+            ElementTree.SubElement(case, "system-out").text = _xml(f"{claim.statement}\n{claim.reason}")
+            continue
+        tag = "skipped" if claim.accepted else "failure" if claim.answer == FAILED else "error"
+        said = ElementTree.SubElement(case, tag, {"message": _xml(f"{claim.answer}: {claim.reason}")})
+        if tag != "skipped":
+            said.set("type", claim.answer)
+        said.text = _xml("\n".join(filter(None, [claim.statement, _picture(result, claim), claim.repeat])))
     ElementTree.indent(root)
     return '<?xml version="1.0" encoding="UTF-8"?>\n' + ElementTree.tostring(root, encoding="unicode") + "\n"
 
@@ -315,41 +298,31 @@ def junit(result: SuiteResult) -> str:
 def sarif(result: SuiteResult) -> str:
     """Return SARIF 2.1.0: a rule for each kind of claim, and a result for each claim that is not held, at the suite's
     file. What is so as expected is `unchanged`, all else `new`."""
-    kinds = list(dict.fromkeys(one.kind for one in result.claims))
+    kinds = list(dict.fromkeys(claim.kind for claim in result.claims))
     rules = [
         {"id": kind, "shortDescription": {"text": MEANINGS[kind]}, "defaultConfiguration": {"level": "error"}}
         for kind in kinds
     ]
     lines = Path(result.suite).read_text("utf-8").splitlines() if Path(result.suite).is_file() else []
-    results = [
-        {
-            "ruleId": one.kind,
-            "ruleIndex": kinds.index(one.kind),
-            "level": "error" if one.answer == FAILED else "warning",
-            "message": {"text": f"{one.name}: {one.answer}: {one.reason}. Claimed: {one.statement}."},
-            "locations": [
-                {
-                    "physicalLocation": {
-                        "artifactLocation": {"uri": quote(result.suite)},
-                        "region": {"startLine": _line_of(one.name, lines)},
-                    }
-                }
-            ],
-            "partialFingerprints": {"claim/v1": one.name},
-            "baselineState": "unchanged" if one.accepted else "new",
-            "properties": {
-                name: value
-                for name, value in (
-                    ("picture", _picture(result, one)),
-                    ("repeat", one.repeat),
-                    ("pictures", one.pictures),
-                )
-                if value
-            },
-        }
-        for one in result.claims
-        if one.answer != HELD
-    ]
+    results = []
+    for claim in result.claims:
+        if claim.answer == HELD:
+            continue
+        # the line of the suite's file in which the claim begins; the first for what stands elsewhere
+        begins = re.compile(rf"\s+{re.escape(claim.name)}\s*:")
+        line = next((number for number, text in enumerate(lines, start=1) if begins.match(text)), 1)
+        place = {"artifactLocation": {"uri": quote(result.suite)}, "region": {"startLine": line}}
+        more = {"picture": _picture(result, claim), "repeat": claim.repeat, "pictures": claim.pictures}
+        results.append({
+            "ruleId": claim.kind,
+            "ruleIndex": kinds.index(claim.kind),
+            "level": "error" if claim.answer == FAILED else "warning",
+            "message": {"text": f"{claim.name}: {claim.answer}: {claim.reason}. Claimed: {claim.statement}."},
+            "locations": [{"physicalLocation": place}],
+            "partialFingerprints": {"claim/v1": claim.name},
+            "baselineState": "unchanged" if claim.accepted else "new",
+            "properties": {name: value for name, value in more.items() if value},
+        })  # fmt: skip
     driver = {"name": "advsearch", "version": __version__, "rules": rules}
     invocation = {"executionSuccessful": not result.goes_on, "commandLine": result.command_line}
     run = {"tool": {"driver": driver}, "invocations": [invocation], "results": results}
@@ -361,24 +334,18 @@ def markdown(result: SuiteResult) -> str:
     lines = [f"### {_plain(result.title)}", "", _plain(suite_text(result)), ""]
     lines += [_line(TABLE_HEADS), _line(["---"] * len(TABLE_HEADS)), *map(_line, table_rows(result))]
     lines += ["", ", ".join(f"{name} {_plain(value)}" for name, value in facts(result).items())]
-    again = [one.repeat for one in result.claims if one.answer != HELD and one.repeat]
+    again = [claim.repeat for claim in result.claims if claim.answer != HELD and claim.repeat]
     lines += ["", "```sh", *again, "```"] if again else []
     return "\n".join(lines) + "\n"
 
 
-def _picture(result: SuiteResult, one: ClaimResult) -> str:
-    return f"{result.run}/{one.picture}" if one.picture else ""
+def _picture(result: SuiteResult, claim: ClaimResult) -> str:
+    return f"{result.run}/{claim.picture}" if claim.picture else ""
 
 
 def _xml(text: str) -> str:
     """What XML can hold of a text."""
     return re.sub(r"[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]", "?", text)
-
-
-def _line_of(name: str, lines: Sequence[str]) -> int:
-    """The line of a suite's file, from 1, in which a claim begins; the first for what stands elsewhere."""
-    begins = re.compile(rf"\s+{re.escape(name)}\s*:")
-    return next((number for number, line in enumerate(lines, start=1) if begins.match(line)), 1)
 
 
 def _plain(text: str) -> str:
@@ -387,4 +354,4 @@ def _plain(text: str) -> str:
 
 
 def _line(cells: Sequence[str]) -> str:
-    return "| " + " | ".join(one if one == "---" else _plain(one) for one in cells) + " |"
+    return "| " + " | ".join(cell if cell == "---" else _plain(cell) for cell in cells) + " |"

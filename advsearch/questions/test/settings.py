@@ -1,7 +1,4 @@
-"""What `test` needs to know: its settings, and the suite that a YAML file describes.
-
-And what a picture of a claim needs.
-"""
+"""What `test` needs to know: its settings, the suite that a YAML file describes, and what a claim's picture needs."""
 
 from __future__ import annotations
 
@@ -34,38 +31,29 @@ from advsearch.settings.configuration import PLACE
 class SuiteConfig(Config):
     """Everything that decides what `test` does: which suite, which of its claims, and on what model."""
 
+    # fmt: off
     command: ClassVar[str] = "test"
     free: ClassVar[tuple[str, ...]] = (
-        *(*Config.free, "seconds", "workers", "cluster", "junit", "sarif", "markdown", "update"),
+        *Config.free, "seconds", "workers", "cluster", "junit", "sarif", "markdown", "update",
     )
     clashes: ClassVar[tuple[Clash, ...]] = (
         *SceneConfig.clashes,
-        Clash("fresh", lambda one: one.seed is not None, "draws a seed, and `seed` says one; leave one of the two out"),
-        Clash(
-            "update", lambda one: one.add is not None, "renews what claims are expected to say; first `add`, then it"
-        ),
-        Clash(
-            "only",
-            lambda one: one.add is not None,
-            "names claims, and `add` tries the new counterexample alone; leave one of the two out",
-        ),
+        Clash("fresh", lambda config: config.seed is not None,
+              "draws a seed, and `seed` says one; leave one of the two out"),
+        Clash("update", lambda config: config.add is not None,
+              "renews what claims are expected to say; first `add`, then it"),
+        Clash("only", lambda config: config.add is not None,
+              "names claims, and `add` tries the new counterexample alone; leave one of the two out"),
     )
 
     suite: str = setting(..., "test", "the claims", "a YAML file")
     only: str | None = setting(
-        None,
-        "test",
-        "claims or counterexamples that are tried, separated by commas; counterexamples: all of these",
-        "names in the suite",
-        otherwise="all",
+        None, "test", "claims or counterexamples that are tried, separated by commas; counterexamples: all of these",
+        "names in the suite", otherwise="all",
     )
     add: str | None = setting(
-        None,
-        "test",
-        "keep the adversarial scene of this run as a counterexample beside the suite, and try it",
-        "the name or the folder of a run of attack",
-        otherwise="nothing is added",
-        power=power.beside_suite,
+        None, "test", "keep the adversarial scene of this run as a counterexample beside the suite, and try it",
+        "the name or the folder of a run of attack", otherwise="nothing is added", power=power.beside_suite,
     )
     update: bool = setting(
         False, "test", "expect from now on what the claims say today, and show what changes", power=power.beside_suite
@@ -73,25 +61,16 @@ class SuiteConfig(Config):
     all: bool = setting(False, "test", "go on with the other claims where a counterexample fails")
     fresh: bool = setting(False, "test", "draw a new seed, which is told, in place of the suite's")
     seconds: float | None = setting(
-        None,
-        "test",
-        "begin nothing more after this time; what is left is undecided",
-        otherwise="what the suite says, or no limit",
-        unit="seconds",
-        gt=0.0,
-        le=1e9,
+        None, "test", "begin nothing more after this time; what is left is undecided",
+        otherwise="what the suite says, or no limit", unit="seconds", gt=0.0, le=1e9,
     )
     model: str | None = setting_as_in(SceneConfig, "model", default=None, otherwise="what the suite says, or reference")
     junit: str | None = setting(
         None, "files", "write JUnit XML, a test case for each claim", "a file", otherwise="none", power=power.file
     )
     sarif: str | None = setting(
-        None,
-        "files",
-        "write SARIF 2.1.0, a result for each claim that is not held",
-        "a file",
-        otherwise="none",
-        power=power.file,
+        None, "files", "write SARIF 2.1.0, a result for each claim that is not held", "a file",
+        otherwise="none", power=power.file,
     )
     markdown: str | None = setting(
         None, "files", "write a Markdown table, for the summary of a job", "a file", otherwise="none", power=power.file
@@ -105,6 +84,7 @@ class SuiteConfig(Config):
     cluster: str | None = setting_as_in(AttackConfig, "cluster")
     run: str | None = setting_as_in(SceneConfig, "run", otherwise="runs/SUITE-test-NNN")
     overwrite: bool = setting_as_in(SceneConfig, "overwrite")
+    # fmt: on
 
     _named = texts("suite", "add", "model", "junit", "sarif", "markdown", "run", several=["only"])
     _different = each_once("only")
@@ -116,7 +96,6 @@ class SuiteConfig(Config):
 
     @property
     def title(self) -> tuple[str, ...]:
-        """The suite's name, and what is done with it."""
         return Path(self.suite).stem, self.command
 
 
@@ -133,15 +112,12 @@ class DrawnConfig(SceneConfig):
 
 CONFIG = SuiteConfig
 
-
 OWN = (*PLACE, "seed", "threads", "deterministic", "workers", "cluster", "seconds")
 """Settings that the suite or its command says for all claims."""
 
-PICTURES, MOST = 400, 1_000_000
-"""Pictures that a claim may take, and the most that it may ask for."""
+PICTURES, MOST = 400, 1_000_000  # pictures that a claim may take, and the most that it may ask for
 
-COUNTEREXAMPLES = "counterexamples"
-"""What stands for all of them, and no claim is called."""
+COUNTEREXAMPLES = "counterexamples"  # what stands for all of them, and no claim is called
 
 Settings = dict[str, object]
 
@@ -161,12 +137,10 @@ EXPECTED = {
 }
 
 A_CLAIM = "a claim such as {claim: right, at_least: 0.9}"
-
-
 NUMBERS = ("at_least", "points", "pictures", "confidence", "seconds", "seed")
 
 
-class _Described(BaseModel):
+class _FromYaml(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, strict=False)
 
     @field_validator(*NUMBERS, mode="before", check_fields=False)
@@ -178,22 +152,22 @@ class _Described(BaseModel):
         return value
 
 
-class _Claim(_Described):
+class _Claim(_FromYaml):
     kind: ClassVar[type[SceneConfig]]
     settings: Settings = Field(default_factory=dict)
 
 
-class ShareClaim(_Claim):
-    """Something is so in at least a share of the pictures that the controls span.
-
-    Attributes:
-        at_least: that share.
-        pictures: that are drawn, at most.
-    """
+class _PicturesClaim(_Claim):
+    """Pictures decide it that are drawn, at most so many, from what the controls span."""
 
     kind: ClassVar[type[SceneConfig]] = DrawnConfig
-    at_least: Annotated[float, Field(gt=0.0, lt=1.0)]
     pictures: Annotated[int, Field(ge=1, le=MOST)] = PICTURES
+
+
+class ShareClaim(_PicturesClaim):
+    """Something is so in at least a share of the pictures that the controls span."""
+
+    at_least: Annotated[float, Field(gt=0.0, lt=1.0)]
 
     @field_validator("at_least", mode="before")
     @classmethod
@@ -210,22 +184,15 @@ class RightClaim(ShareClaim):
 
 
 class MustChangeClaim(ShareClaim):
-    """The model says something else where there is nothing left to see: a model that does not is not looking.
-
-    Attributes:
-        when: what is done to the picture, a name of `BLIND`.
-    """
+    """The model says something else where there is nothing left to see: a model that does not is not looking. `when` is
+    what is done to the picture, a name of `BLIND`."""
 
     claim: Literal["must_change"]
     when: Literal["black", "covered", "away"]
 
 
 class MustNotChangeClaim(ShareClaim):
-    """The model says the same where a change means nothing.
-
-    Attributes:
-        when: what is done to the picture, a name of `HARMLESS`.
-    """
+    """The model says the same where a change means nothing; `when` is a name of `HARMLESS`."""
 
     claim: Literal["must_not_change"]
     when: Literal["exposure", "shift", "jpeg"]
@@ -238,40 +205,25 @@ class NotBrokenClaim(_Claim):
     claim: Literal["not_broken"]
 
 
-class NoWorseClaim(_Claim):
-    """The model is right at most so many points less often than another one, on the same pictures.
+class NoWorseClaim(_PicturesClaim):
+    """The model is right at most so many percentage points less often than another one, on the same pictures."""
 
-    Attributes:
-        than: the other model.
-        points: percentage points.
-        pictures: that are drawn, at most.
-    """
-
-    kind: ClassVar[type[SceneConfig]] = DrawnConfig
     claim: Literal["no_worse"]
     than: Annotated[str, Field(min_length=1)]
     points: Annotated[float, Field(gt=0.0, lt=100.0)]
-    pictures: Annotated[int, Field(ge=1, le=MOST)] = PICTURES
 
 
-AnyClaim = RightClaim | NotBrokenClaim | NoWorseClaim | MustChangeClaim | MustNotChangeClaim
+ChangeClaim = MustChangeClaim | MustNotChangeClaim
+AnyClaim = RightClaim | NotBrokenClaim | NoWorseClaim | ChangeClaim
 """The kinds of claims; each is tried by a method of `Trial`. A claim about the frames of a drive would stand here."""
-
 
 KINDS = ("right", "not_broken", "no_worse", "must_change", "must_not_change")
 
 
-class Suite(_Described):
-    """What the file of a suite says.
-
-    Attributes:
-        title: what it is about.
-        settings: of all claims, as for `attack`; what a claim says itself takes their place.
-        seed: root of all random numbers.
-        confidence: of each claim that is decided by drawn pictures.
-        seconds: after which nothing more is begun; None for no limit.
-        claims: by name.
-    """
+class Suite(_FromYaml):
+    """What the file of a suite says: settings of all claims, as for `attack`, in whose place come those of a claim; the
+    root of all random numbers; `confidence` of each claim that is decided by drawn pictures; seconds after which
+    nothing more is begun, None for no limit; and the claims by name."""
 
     title: Annotated[str, Field(min_length=1, max_length=200)] = "Claims about a model"
     settings: Settings = Field(default_factory=dict)
@@ -292,18 +244,14 @@ class Suite(_Described):
 
     def config_of(self, name: str, **changes: object) -> SceneConfig:
         """Return what a claim's pictures are made with; settings that the command says for all claims go over its own,
-        None says nothing.
-
-        Raises:
-            InputError: a setting is unknown, impossible, or the suite's own.
-        """
+        None says nothing. An InputError where one is unknown, impossible, or the suite's own."""
         claim = self.claims[name]
         for where, given in (("settings", self.settings), (f"claims.{name}.settings", claim.settings)):
-            if own := [one for one in given if one in OWN]:
+            if own := [known for known in given if known in OWN]:
                 raise InputError(f"{where}: {own[0]} is said for the whole suite; leave it out there")
-        said = {one: value for one, value in changes.items() if value is not None}
+        changed = {key: value for key, value in changes.items() if value is not None}
         try:
-            return claim.kind(**{**self.settings, **claim.settings, "seed": self.seed, **said})
+            return claim.kind(**{**self.settings, **claim.settings, "seed": self.seed, **changed})
         except InputError as error:
             raise InputError(f"claims.{name}: {error}") from None
 
@@ -314,41 +262,32 @@ def read_suite(path: str | Path) -> Suite:
 
 
 def suite_of(data: Mapping[str, object], where: str) -> Suite:
-    """Return the suite that a mapping describes, as it stands in the file `where`.
-
-    Raises:
-        FileFormatError: something is missing, unknown, or of another kind; one sentence says what.
-    """
-    given = {name: value for name, value in data.items() if name not in ("schema", "command")}
+    """Return the suite that a mapping describes, as it stands in the file `where`; a FileFormatError says in one
+    sentence what is missing, unknown, or of another kind."""
     try:
-        return Suite(**given)
+        return Suite(**{name: value for name, value in data.items() if name not in ("schema", "command")})
     except ValidationError as error:
-        found = error.errors(include_url=False)
-        first = next((one for one in found if one["type"] == "extra_forbidden"), found[0])  # a slip in a name
+        errors = error.errors(include_url=False)
+        first = next((each for each in errors if each["type"] == "extra_forbidden"), errors[0])  # a slip in a name
         raise FileFormatError(f"{where}: {_told(first)}") from None
 
 
 def _told(error: Any) -> str:
     """What is wrong, in words: where, what was expected and what was got."""
-    place = [str(one) for one in error["loc"] if one not in KINDS]
+    kind, place, got = error["type"], [str(part) for part in error["loc"] if part not in KINDS], shown(error["input"])
     if place[-1] == "[key]":  # a name that is a number
-        got = shown(error["input"])
         return f"{place[0]}: expected names of small letters, digits and hyphens, got {got}; put it in quotes"
-    name, got = place[-1], shown(error["input"])
-    if error["type"].startswith("union_tag"):
-        place, name = [*place, "claim"], "claim"
-        got = "nothing" if error["type"] == "union_tag_not_found" else shown(error["ctx"]["tag"])
-    where = ".".join(place)
-    if error["type"] == "extra_forbidden":
+    if kind.startswith("union_tag"):
+        place.append("claim")
+        got = "nothing" if kind == "union_tag_not_found" else shown(error["ctx"]["tag"])
+    where, name = ".".join(place), place[-1]
+    if kind == "extra_forbidden":
         if name in EXPECTED:
             return f"{where}: {'a claim of this kind' if len(place) > 2 else 'a suite'} has no {name}; leave it out"
         near = resembling(name, sorted(EXPECTED))[:1]
         guess = f"did you mean {near[0]}?" if near else "docs/testing.md has the names"
         return f"{where}: there is no such name in a suite, or in a claim of this kind; {guess}"
-    if error["type"] == "missing":
-        got = "nothing"
-    if error["type"] == "too_short":
-        got = "none"
-    if error["type"] == "value_error":
+    if kind == "value_error":
         return f"{where}: {str(error['msg']).removeprefix('Value error, ')}"
+    got = {"missing": "nothing", "too_short": "none"}.get(kind, got)
     return f"{where}: expected {EXPECTED.get(name, A_CLAIM)}, got {got}"

@@ -22,11 +22,9 @@ from advsearch.scene.importing.usd import USD, converted
 BLEND = ".blend"
 PROGRAM = "ADVSEARCH_BLENDER"
 """Variable of the environment: a Blender, or a Python that has `bpy`, in the place of those that are looked for."""
-LONGEST = 120
-"""Seconds that Blender may take, before `advsearch.files.scaled`."""
+LONGEST = 120  # seconds that Blender may take, before `advsearch.files.scaled`
 BEGINNINGS = (b"BLENDER", b"\x28\xb5\x2f\xfd", b"\x1f\x8b")
 """How a .blend file begins: as it is, compressed with zstd, or with gzip (before Blender 3.0)."""
-
 EXPORT = """
 import sys
 source, target, most = sys.argv[-3:]
@@ -48,11 +46,8 @@ bpy.ops.export_scene.gltf(
 
 
 def read_mesh_bytes(path: Path, what: str, suffixes: tuple[str, ...]) -> bytes:
-    """Return the content of a mesh or scene file, of a Blender or OpenUSD file as binary glTF; see `read_bytes`.
-
-    Raises:
-        FileFormatError: as for `read_bytes`; there is no Blender, it can't read the file, or it takes too long.
-    """
+    """Return the content of a mesh or scene file, of a Blender or OpenUSD file as binary glTF; see `read_bytes`. Raises
+    FileFormatError: as for `read_bytes`; there is no Blender, it can't read the file, or it takes too long."""
     data = read_bytes(path, what, suffixes)
     if path.suffix.lower() in USD:
         return converted(path, data)
@@ -60,19 +55,25 @@ def read_mesh_bytes(path: Path, what: str, suffixes: tuple[str, ...]) -> bytes:
         return data
     if not data.startswith(BEGINNINGS):
         raise damaged(path, "a Blender scene", looks_like(data))
-    return _exported(path)
+    program = command(f"{path}: Blender has to read it", "export glTF (.glb) from Blender and name that")
+    with tempfile.TemporaryDirectory(prefix="advsearch-blender-") as folder:
+        script, target = Path(folder) / "export.py", Path(folder) / "scene.glb"
+        script.write_text(EXPORT, "utf-8")
+        names = [str(path.resolve()), str(target), str(files.scaled(LARGEST_FILE))]
+        started = [*program, str(script), *([] if "-I" in program else ["--"]), *names]
+        try:
+            done = run_converter(path, "Blender", started, folder=folder, seconds=LONGEST, env=surroundings(folder))
+        except OSError as error:
+            raise FileFormatError(f"{path}: Blender can't be started ({error.strerror}); check {program[0]}") from error
+        if done.returncode or not target.is_file():
+            last = last_line(done.stdout + done.stderr)
+            raise FileFormatError(f"{path}: Blender could not read it{last}; export glTF (.glb) from it yourself")
+        return read_bytes(target, "object", (".glb",))
 
 
 def command(who: str, otherwise: str) -> list[str]:
-    """Return the program that is given a script behind it, with what makes it run that and nothing else.
-
-    Args:
-        who: needs it, for the message.
-        otherwise: what else can be done.
-
-    Raises:
-        FileFormatError: there is none.
-    """
+    """Return the program that is given a script behind it, with what makes it run that and nothing else. Raises
+    FileFormatError, for which it is told who needs it, and what else can be done: there is none."""
     program = os.environ.get(PROGRAM) or shutil.which("blender")
     if program is None and importlib.util.find_spec("bpy") is not None:
         program = sys.executable
@@ -99,22 +100,3 @@ def last_line(said: str) -> str:
     """Return the last line of what Blender has said, for a message; empty if there is none."""
     lines = [line for line in said.splitlines() if line.strip()]
     return f": {shown(lines[-1].strip(), quoted=False)}" if lines else ""
-
-
-def _exported(path: Path) -> bytes:
-    """Have the file written as glTF in a folder of its own, and return that."""
-    program = command(f"{path}: Blender has to read it", "export glTF (.glb) from Blender and name that")
-    with tempfile.TemporaryDirectory(prefix="advsearch-blender-") as folder:
-        script, target = Path(folder) / "export.py", Path(folder) / "scene.glb"
-        script.write_text(EXPORT, "utf-8")
-        names = [str(path.resolve()), str(target), str(files.scaled(LARGEST_FILE))]
-        between = [] if "-I" in program else ["--"]
-        started = [*program, str(script), *between, *names]
-        try:
-            done = run_converter(path, "Blender", started, folder=folder, seconds=LONGEST, env=surroundings(folder))
-        except OSError as error:
-            raise FileFormatError(f"{path}: Blender can't be started ({error.strerror}); check {program[0]}") from error
-        if done.returncode or not target.is_file():
-            said = last_line(done.stdout + done.stderr)
-            raise FileFormatError(f"{path}: Blender could not read it{said}; export glTF (.glb) from it yourself")
-        return read_bytes(target, "object", (".glb",))

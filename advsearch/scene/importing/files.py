@@ -24,11 +24,8 @@ from advsearch import files
 from advsearch.errors import FileFormatError
 from advsearch.scene.importing.other_formats import advice
 
-LARGEST_FILE = 1 << 29
-"""Bytes that a mesh, a texture or an environment may have, before `advsearch.files.scaled`."""
-
+LARGEST_FILE = 1 << 29  # bytes that a mesh, a texture or an environment may have, before `advsearch.files.scaled`
 _LONGEST_NAME = 100
-
 _KINDS = (
     (b"\x89PNG", "a PNG picture"),
     (b"\xff\xd8\xff", "a JPEG picture"),
@@ -56,17 +53,9 @@ _KINDS = (
 
 
 def read_bytes(path: Path, what: str, suffixes: Sequence[str]) -> bytes:
-    """Return the content of an input file.
-
-    Args:
-        path: the file.
-        what: what it should hold, for messages: ``"object"`` or ``"environment"``.
-        suffixes: the supported endings, lower case with dot.
-
-    Raises:
-        FileFormatError: an unsupported ending, or a file that is missing, not an ordinary file, unreadable, empty or
-            larger than `LARGEST_FILE`.
-    """
+    """Return the content of a file that holds an ``"object"``, an ``"environment"`` or the like, with one of these
+    endings, lower case with dot. Raises FileFormatError: another ending, or a file that is missing, not an ordinary
+    file, unreadable, empty or larger than `LARGEST_FILE`."""
     try:
         if path.is_dir():
             raise FileFormatError(f"{path}: expected a file with an {what}, got a directory; name a file inside it")
@@ -140,8 +129,7 @@ def shown(name: str, *, quoted: bool = True) -> str:
 
 def safe_name(path: Path) -> str:
     """Return the file's name without ending, with everything but letters, digits, '.', '_' and '-' made a '-'."""
-    kept = "".join(c if c.isascii() and (c.isalnum() or c in "._-") else "-" for c in path.stem)
-    return kept.strip(".-") or "imported"
+    return re.sub(r"[^A-Za-z0-9._-]", "-", path.stem).strip(".-") or "imported"
 
 
 class Names:
@@ -182,19 +170,19 @@ def _near(path: Path, suffixes: Sequence[str]) -> str:
 
 LARGEST_FACES = 2_000_000
 """Triangles that a mesh may have, before `advsearch.files.scaled`; each takes over 1 KB of memory to import."""
-
-MOST_CORNERS = 10_000
-"""Corners that one face may have."""
+MOST_CORNERS = 10_000  # corners that one face may have
 
 
-def check_faces(path: Path, count: int) -> None:
-    """Refuse a mesh with too many triangles.
+def check_most(path: Path | str, count: int, limit: int, expected: str, got: str | None = None) -> None:
+    """Raise FileFormatError where a file has more of something than a limit, before `advsearch.files.scaled`; what was
+    expected has {} in the place of that, and what it got is the count by itself."""
+    if count > (most := files.scaled(limit)):
+        raise files.too_large(path, expected.format(f"{most:,}"), f"{count:,}" if got is None else got)
 
-    Raises:
-        FileFormatError: there are more than `LARGEST_FACES`, before `advsearch.files.scaled`.
-    """
-    if count > files.scaled(LARGEST_FACES):
-        raise files.too_large(path, f"a mesh of at most {files.scaled(LARGEST_FACES):,} triangles", f"{count:,}")
+
+def check_faces(path: Path | str, count: int, got: str | None = None) -> None:
+    """Raise FileFormatError for a mesh of more than `LARGEST_FACES` triangles."""
+    check_most(path, count, LARGEST_FACES, "a mesh of at most {} triangles", got)
 
 
 class Notes:
@@ -238,7 +226,6 @@ class Notes:
 
 MISSING = "is missing"
 OUTSIDE = "is outside its folder and is not read"
-
 _NO_SUCH_NAME = (errno.ENOENT, errno.ENOTDIR, errno.ENAMETOOLONG, errno.EINVAL)
 
 
@@ -248,11 +235,8 @@ def plain_name(name: str) -> str:
 
 
 class References:
-    """Finds the files that a mesh file names; it remembers what it could not get, and why.
-
-    Attributes:
-        refused: for each name, as `plain_name` gives it, why it was not read: `MISSING`, `OUTSIDE` or another clause.
-    """
+    """Finds the files that a mesh file names. `refused` are those that it could not get, as `plain_name` gives them,
+    and why: `MISSING`, `OUTSIDE` or another clause."""
 
     def __init__(self, path: Path) -> None:
         self.refused: dict[str, str] = {}
@@ -261,25 +245,22 @@ class References:
         self._size = 0
 
     def get(self, name: str) -> bytes:
-        """Return the content of a named file; after the name as it stands, its usual distortions are tried.
-
-        Raises:
-            FileNotFoundError: it is not there, or must not be read; `refused` says which.
-        """
-        found = self.tried(name)
-        if isinstance(found, bytes):
-            return found
-        self.refused[plain_name(name)] = found
+        """Return the content of a named file; after the name as it stands, its usual distortions are tried. Raises
+        FileNotFoundError: it is not there, or must not be read; `refused` says which."""
+        content = self.tried(name)
+        if isinstance(content, bytes):
+            return content
+        self.refused[plain_name(name)] = content
         raise FileNotFoundError(name)
 
     def tried(self, name: str) -> bytes | str:
         """Return the content of a named file, or why it is not read, which is not remembered."""
         reason = MISSING
-        plain = plain_name(name)
-        tried = [form for text in (name.strip(), plain) for form in (text, text.lstrip("/"), os.path.basename(text))]
-        for candidate in [form for form in dict.fromkeys(tried) if form]:
+        spellings = (name.strip(), plain_name(name))
+        forms = [form for text in spellings for form in (text, text.lstrip("/"), os.path.basename(text))]
+        for form in filter(None, dict.fromkeys(forms)):
             try:
-                return self._content(candidate)
+                return self._content(form)
             except ValueError:  # a zero byte in the name
                 continue
             except OSError as error:
@@ -295,41 +276,27 @@ class References:
             raise FileFormatError(OUTSIDE if os.path.lexists(path) else MISSING)
         if path not in self._contents:
             try:
-                self._keep(path, files.read_bytes(Path(path), "an ordinary file", LARGEST_FILE))
+                data = files.read_bytes(Path(path), "an ordinary file", LARGEST_FILE)
+                check_most(path, self._size + len(data), LARGEST_FILE, "files of at most {} bytes in all")
             except FileFormatError as error:
                 raise FileFormatError(f"is not read ({str(error).removeprefix(f'{path}: ')})") from error
+            self._contents[path] = data
+            self._size += len(data)
         return self._contents[path]
-
-    def _keep(self, path: str, data: bytes) -> None:
-        most, size = files.scaled(LARGEST_FILE), len(data) + self._size
-        if size > most:
-            raise files.too_large(path, f"files of at most {most:,} bytes in all", f"{size:,}")
-        self._contents[path], self._size = data, size
 
 
 def run_converter(
     path: Path, program: str, command: Sequence[str], *, folder: str | Path, seconds: int, env: Mapping[str, str] | None
 ) -> subprocess.CompletedProcess[str]:
-    """Run a program that makes glTF of the file at `path`, in a folder, and return what it said.
-
-    Raises:
-        FileFormatError: it takes longer than so many seconds, before `advsearch.files.scaled`.
-        OSError: it can't be started.
-    """
+    """Run a program that makes glTF of the file at `path`, in a folder, and return what it said. Raises OSError: it
+    can't be started; FileFormatError: it takes longer than so many seconds, before `advsearch.files.scaled`."""
+    longest, unread = files.scaled(seconds), subprocess.DEVNULL
     try:
         return subprocess.run(
-            command,
-            cwd=folder,
-            env=env,
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            text=True,
-            errors="replace",
-            timeout=files.scaled(seconds),
-            check=False,
+            command, cwd=folder, env=env, stdin=unread, capture_output=True, errors="replace", timeout=longest
         )
     except subprocess.TimeoutExpired:
         raise FileFormatError(
-            f"{path}: {program} had not read it after {files.scaled(seconds)} seconds; export glTF (.glb) from it "
-            f"yourself, or give it longer: {files.FACTOR}=10 in the environment makes all limits ten times as large"
+            f"{path}: {program} had not read it after {longest} seconds; export glTF (.glb) from it yourself, or give "
+            f"it longer: {files.FACTOR}=10 in the environment makes all limits ten times as large"
         ) from None

@@ -14,87 +14,55 @@ from scipy.sparse import coo_array, csgraph
 from scipy.spatial import cKDTree
 
 from advsearch.errors import InputError
-from advsearch.scene.assets import Bools, Doubles, Ints, Mesh
+from advsearch.scene.assets import Bools, Doubles, Ints, Mesh, face_vectors
 from advsearch.scene.importing.parts import ImportedPart
 
-UPRIGHT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-"""From y up to z up."""
-
+UPRIGHT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # from y up to z up
 WELD = 1e-6
 """Points closer than this share of the largest extent are one point; text and 32-bit files round to about that."""
-
-FLAT = 1e-12
-"""Twice the area, in squared extents, up to which a face counts as having none."""
-
+FLAT = 1e-12  # twice the area, in squared extents, up to which a face counts as having none
 CREASE_DEGREES = 40.0
 """Where the normals of two neighbouring faces differ by more, a computed normal is not smoothed across their edge."""
-
 TRUSTED = 0.98
 """Share of the surface on which a file's normals must face the same way as the faces for the normals to be kept."""
 
 
 @dataclass(frozen=True, eq=False)
 class Soup:
-    """Triangles with welded points and per-corner attributes.
+    """Triangles with welded points and per-corner attributes."""
 
-    Attributes:
-        points: (P, 3) float64, the largest extent 1.
-        faces: (F, 3) int64 indices of points.
-        part: (F,) int64, the part of the file that the face belongs to.
-        normals: (F, 3, 3) float64 unit normals of the corners; NaN where unknown.
-        uvs: (F, 3, 2) float64; NaN where unknown.
-        colors: (F, 3, 3) float64 linear factors of the base colour; 1 where the file gives none.
-        flat: (F,) the faces that are flat where they have no normals; None where none are.
-        stored: (F, 3) the vertices of the parts, one part after the other, that the corners were; None where they need
-            not be known.
-    """
-
-    points: Doubles
-    faces: Ints
-    part: Ints
-    normals: Doubles
-    uvs: Doubles
-    colors: Doubles
-    flat: Bools | None = None
-    stored: Ints | None = None
+    points: Doubles  # (P, 3), the largest extent 1
+    faces: Ints  # (F, 3) points
+    part: Ints  # (F,) the part of the file that the face belongs to
+    normals: Doubles  # (F, 3, 3) unit normals of the corners; NaN where unknown
+    uvs: Doubles  # (F, 3, 2); NaN where unknown
+    colors: Doubles  # (F, 3, 3) linear factors of the base colour; 1 where the file gives none
+    flat: Bools | None = None  # (F,) the faces that are flat where they have no normals; None where none are
+    stored: Ints | None = (
+        None  # (F, 3) vertices of the parts, one after the other, that the corners were; None: unknown
+    )
 
     def only(self, keep: Bools) -> Soup:
         """Return the soup with a part of its faces; `keep` is (F,)."""
-        return Soup(
-            self.points, self.faces[keep], self.part[keep], self.normals[keep], self.uvs[keep], self.colors[keep],
-            None if self.flat is None else self.flat[keep], None if self.stored is None else self.stored[keep],
-        )  # fmt: skip
+        held = {name: values for name, values in vars(self).items() if name != "points" and values is not None}
+        return replace(self, **{name: values[keep] for name, values in held.items()})
 
     def reversed(self, turn: Bools) -> Soup:
         """Return the soup with some faces turned over; `turn` is (F,). Normals stay as they are."""
         order = np.where(turn[:, None], [0, 2, 1], [0, 1, 2])
         rows = np.arange(len(order))[:, None]
-        return replace(
-            self,
-            faces=self.faces[rows, order],
-            normals=self.normals[rows, order],
-            uvs=self.uvs[rows, order],
-            colors=self.colors[rows, order],
-            stored=None if self.stored is None else self.stored[rows, order],
-        )
+        corners = ("faces", "normals", "uvs", "colors", *(() if self.stored is None else ("stored",)))
+        return replace(self, **{name: getattr(self, name)[rows, order] for name in corners})
 
     def face_vectors(self) -> Doubles:
         """Return (F, 3) vectors along the face normals, as long as twice the faces' areas."""
-        a, b, c = (self.points[self.faces[:, k]] for k in range(3))
-        return np.cross(b - a, c - a)
+        return face_vectors(self.points[self.faces])
 
 
 def join(parts: Sequence[ImportedPart], source: str, *, y_up: bool) -> Soup:
-    """Join parts into one soup of unit extent, z up, with welded points.
-
-    Args:
-        parts: at least one.
-        source: the file, for messages.
-        y_up: whether the file's y axis points up; it is turned about x by 90 degrees, which keeps handedness.
-
-    Raises:
-        InputError: vertices that are NaN or infinite, or no extent.
-    """
+    """Join parts, at least one, into one soup of unit extent, z up, with welded points; where the file's y axis points
+    up, it is turned about x by 90 degrees, which keeps handedness. Raises InputError, with the name of the file:
+    vertices that are NaN or infinite, or no extent."""
     vertices = np.concatenate([part.vertices for part in parts])
     starts = np.cumsum([0] + [len(part.vertices) for part in parts])
     bad = ~np.isfinite(vertices).all(axis=1)
@@ -111,15 +79,15 @@ def join(parts: Sequence[ImportedPart], source: str, *, y_up: bool) -> Soup:
         what = "all vertices coincide" if size == 0.0 else "its extent is too large to compute with"
         raise InputError(f"{source}: expected an object with a size, got a mesh in which {what}; export it again")
     points, index = _welded((vertices - low) / size @ turn.T)
-    normals = unit_vectors(np.concatenate([_corners(part.normals, part.faces, 3) for part in parts])) @ turn.T
+    counts = [len(part.faces) for part in parts]
     return Soup(
         points=points,
         faces=index[faces],
-        part=np.concatenate([np.full(len(part.faces), number) for number, part in enumerate(parts)]),
-        normals=normals,
+        part=np.arange(len(parts)).repeat(counts),
+        normals=unit_vectors(np.concatenate([_corners(part.normals, part.faces, 3) for part in parts])) @ turn.T,
         uvs=np.concatenate([_corners(part.uvs, part.faces, 2) for part in parts]),
         colors=np.concatenate([np.ones((len(p.faces), 3, 3)) if p.colors is None else p.colors for p in parts]),
-        flat=np.concatenate([np.full(len(part.faces), part.flat) for part in parts]),
+        flat=np.array([part.flat for part in parts]).repeat(counts),
         stored=faces if any(part.movable is not None for part in parts) else None,
     )
 
@@ -127,23 +95,15 @@ def join(parts: Sequence[ImportedPart], source: str, *, y_up: bool) -> Soup:
 def extent_of(parts: Sequence[ImportedPart]) -> float:
     """Return the largest extent of all faces together along an axis, in the file's unit; infinite beyond float64."""
     used = [part.vertices[np.unique(part.faces)] for part in parts]
-    low, high = np.min([one.min(axis=0) for one in used], axis=0), np.max([one.max(axis=0) for one in used], axis=0)
+    low = np.min([points.min(axis=0) for points in used], axis=0)
+    high = np.max([points.max(axis=0) for points in used], axis=0)
     return float((high / 2 - low / 2).max()) * 2
 
 
 def repaired(soup: Soup, source: str) -> tuple[Soup, list[str]]:
-    """Drop faces without area, make the winding consistent and outward, and fill in or replace bad normals.
-
-    Args:
-        soup: as `join` gives it.
-        source: the file, for errors.
-
-    Returns:
-        The repaired soup, every normal of unit length and on the front of its face, and the warnings.
-
-    Raises:
-        InputError: no face has an area.
-    """
+    """Return a soup, as `join` gives it, without faces without area, its winding consistent and outward, every normal
+    of unit length and on the front of its face; and the warnings. Raises InputError, with the name of the file: no face
+    has an area."""
     notes = []
     flat = np.linalg.norm(soup.face_vectors(), axis=1) <= FLAT
     if flat.all():
@@ -180,8 +140,7 @@ def assemble(soup: Soup) -> tuple[Mesh, Ints | None]:
 def _wound(soup: Soup) -> tuple[Soup, list[str]]:
     """Turn faces over until neighbours agree and closed shells, and sheets with normals, face outwards."""
     left, right, same_way = neighbours(soup.faces)
-    area = np.linalg.norm(soup.face_vectors(), axis=1)
-    turn, shell, twisted = _agreement(area, left, right, same_way)
+    turn, shell, twisted = _agreement(np.linalg.norm(soup.face_vectors(), axis=1), left, right, same_way)
     notes = []
     if turn.any():
         notes.append(f"{int(turn.sum())} faces wound against their neighbours were turned over")
@@ -239,7 +198,7 @@ def _inside_out(soup: Soup, shell: Ints, closed: Bools) -> Bools:
     """
     count, vectors = len(closed), soup.face_vectors()
     corners = soup.points[soup.faces]
-    sums = [np.bincount(shell, weights=one) for one in corners.mean(axis=1).T]
+    sums = [np.bincount(shell, weights=place) for place in corners.mean(axis=1).T]
     middle = np.stack(sums, axis=1) / np.bincount(shell)[:, None]
     volume = np.bincount(shell, weights=((corners[:, 0] - middle[shell]) * vectors).sum(axis=1), minlength=count)
     toward = np.nan_to_num((soup.normals * vectors[:, None]).sum(axis=2)).sum(axis=1)
@@ -306,9 +265,6 @@ def smooth_normals(soup: Soup) -> Doubles:
     smooth = unit_vectors(sums)[group].reshape(-1, 3, 3)
     sound = (smooth * unit[:, None]).sum(axis=2, keepdims=True) > 0.0  # NaN, where normals cancel, is not
     return np.where(sound, smooth, unit[:, None])
-
-
-# --- small pieces ----------------------------------------
 
 
 def _welded(points: Doubles) -> tuple[Doubles, Ints]:

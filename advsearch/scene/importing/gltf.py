@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import base64
-import binascii
 import json
 import struct
 from collections.abc import Iterable, Iterator, Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote_to_bytes
@@ -22,6 +22,7 @@ from advsearch.scene.assets import Doubles, Ints
 from advsearch.scene.importing.files import (
     References,
     check_faces,
+    check_most,
     damaged,
     looks_like,
     plain_name,
@@ -35,16 +36,12 @@ MOST_VALUES = 1_000_000
 
 
 def read_header(path: Path, data: bytes) -> Header:
-    """Return the header of a .gltf or .glb file.
-
-    Raises:
-        FileFormatError: the file is not glTF, is shorter than it says, has other types in its header than glTF has,
-            refers to what is not there, is over a limit, or needs what is not supported.
-    """
+    """Return the header of a .gltf or .glb file. Raises FileFormatError: the file is not glTF, is shorter than it says,
+    has other types in its header than glTF has, refers to what is not there, is over a limit, or needs what is not
+    supported."""
     chunk = data if path.suffix.lower() == ".gltf" else _json_chunk(path, data).rstrip(b"\0")  # some pad with zeros
     text = text_of(chunk)
-    if text.count(",") + text.count("[") + text.count("{") > files.scaled(MOST_VALUES):
-        raise files.too_large(path, f"a glTF header of at most {files.scaled(MOST_VALUES):,} values", "more")
+    check_most(path, sum(map(text.count, ",[{")), MOST_VALUES, "a glTF header of at most {} values", "more")
     try:
         content = files.parse_json(text)
     except ValueError as error:
@@ -116,45 +113,28 @@ def _first(error: ValidationError) -> tuple[str, str]:
 
 LARGEST_VALUES = 1 << 28
 """Bytes that all views, and all accessors, of a file may have; they may overlap, so its size says nothing."""
-
-LARGEST_TREE = 20_000
-"""Nodes, and pieces of geometry at their places, in one file."""
-
-DEEPEST_TREE = 500
-"""Nodes from the root to a leaf."""
-
-READ = (
-    "EXT_texture_webp",
-    "KHR_lights_punctual",
-    "KHR_materials_emissive_strength",
-    "KHR_materials_pbrSpecularGlossiness",
-    "KHR_mesh_quantization",
-    "KHR_texture_transform",
-    "VRM",
-    "VRMC_vrm",
+LARGEST_TREE = 20_000  # nodes, and pieces of geometry at their places, in one file
+DEEPEST_TREE = 500  # nodes from the root to a leaf
+READ = tuple(
+    "EXT_texture_webp KHR_lights_punctual KHR_materials_emissive_strength KHR_materials_pbrSpecularGlossiness "
+    "KHR_mesh_quantization KHR_texture_transform VRM VRMC_vrm".split()
 )
 """Extensions that are understood."""
-
 _LOOKS = ("KHR_materials_", "KHR_xmp")
 """Beginnings of those without which a file looks otherwise and has the same geometry: they are named in warnings."""
 
 
 def check_header(path: Path, header: Header) -> None:
-    """Check what the types leave open: extensions, limits, and that whatever is referred to is there.
-
-    Raises:
-        FileFormatError: the header needs what is not supported, refers to what is not there, or is over a limit.
-    """
+    """Check what the types leave open: extensions, limits, and that whatever is referred to is there. Raises
+    FileFormatError: the header needs what is not supported, refers to what is not there, or is over a limit."""
     needed = sorted(name for name in header.extensionsRequired if name not in READ and not name.startswith(_LOOKS))
     if needed:
         raise _needs(path, needed)
-    for kind, index, entries in _references(header):
-        if index is not None and index >= len(entries):
-            raise damaged(path, f"glTF with {index + 1} {kind}, as it refers to", f"{len(entries)}")
-    sizes = (sum(view.byteLength for view in header.bufferViews), sum(a.size() for a in header.accessors))
-    if max(sizes) > files.scaled(LARGEST_VALUES):
-        most = f"geometry and pictures of at most {files.scaled(LARGEST_VALUES):,} bytes"
-        raise files.too_large(path, most, f"{max(sizes):,}")
+    for kind, index, count in _references(header):
+        if index >= count:
+            raise damaged(path, f"glTF with {index + 1} {kind}, as it refers to", f"{count}")
+    size = max(sum(view.byteLength for view in header.bufferViews), sum(a.size() for a in header.accessors))
+    check_most(path, size, LARGEST_VALUES, "geometry and pictures of at most {} bytes")
     for mesh in header.meshes:
         for primitive in mesh.primitives:
             _check_primitive(path, header, primitive)
@@ -172,48 +152,44 @@ def _unread_extensions(entry: BaseModel) -> list[str]:
     return sorted(name for name in held if name not in READ) if isinstance(held, dict) else []
 
 
-def _references(header: Header) -> Iterator[tuple[str, int | None, Sequence[object]]]:
-    """Yield every number by which the header refers to another entry: the kind, the number and what there is."""
-    for view in header.bufferViews:
-        yield "buffers", view.buffer, header.buffers
-    for skin in header.skins:
-        yield "accessors", skin.inverseBindMatrices, header.accessors
-        for joint in skin.joints:
-            yield "nodes", joint, header.nodes
-    sparse = [part for one in header.accessors if one.sparse for part in (one.sparse.indices, one.sparse.values)]
-    for held in (*header.accessors, *sparse, *header.images):
-        yield "bufferViews", held.bufferView, header.bufferViews
-    for texture in header.textures:
-        yield "images", texture.image, header.images
-        yield "samplers", texture.sampler, header.samplers
-    for one in header.materials:
-        for use in (*vars(one.surface).values(), one.normalTexture, one.emissiveTexture):
-            if isinstance(use, TextureUse):
-                yield "textures", use.index, header.textures
-    for primitive in (primitive for mesh in header.meshes for primitive in mesh.primitives):
-        for index in (*primitive.attributes.values(), primitive.indices):
-            yield "accessors", index, header.accessors
-        for index in (index for target in primitive.targets for index in target.values()):
-            yield "accessors", index, header.accessors
-        yield "materials", primitive.material, header.materials
+def _references(header: Header) -> Iterator[tuple[str, int, int]]:
+    """Yield every number by which the header refers to another entry: the kind, the number and how many there are."""
+    sparse = [values.sparse for values in header.accessors if values.sparse]
+    looks = [(*vars(look.surface).values(), look.normalTexture, look.emissiveTexture) for look in header.materials]
+    primitives = [primitive for mesh in header.meshes for primitive in mesh.primitives]
+    channels = [channel for animation in header.animations for channel in animation.channels]
+    samplers = [sampler for animation in header.animations for sampler in animation.samplers]
+    table: Sequence[tuple[Iterable[object], dict[str, str]]] = (
+        (header.bufferViews, {"buffer": "buffers"}),
+        (header.skins, {"inverseBindMatrices": "accessors", "joints": "nodes"}),
+        ([*header.accessors, *header.images], {"bufferView": "bufferViews"}),
+        ([part for held in sparse for part in (held.indices, held.values)], {"bufferView": "bufferViews"}),
+        (header.textures, {"image": "images", "sampler": "samplers"}),
+        ([use for uses in looks for use in uses if isinstance(use, TextureUse)], {"index": "textures"}),
+        (primitives, {"attributes": "accessors", "indices": "accessors", "targets": "accessors"}),
+        (primitives, {"material": "materials"}),
+        (samplers, {"input": "accessors", "output": "accessors"}),
+        ([*(channel.target for channel in channels), *header.vrm.values(), *header.vrm_0], {"node": "nodes"}),
+        (header.nodes, {"mesh": "meshes", "skin": "skins", "camera": "cameras", "lamp": "lights", "children": "nodes"}),
+        (header.scenes, {"nodes": "nodes"}),
+        ([header], {"scene": "scenes"}),
+    )
+    for entries, fields in table:
+        for entry, (name, kind) in product(entries, fields.items()):
+            for index in _numbers(getattr(entry, name)):
+                yield kind, index, len(getattr(header, kind))
     for animation in header.animations:
         for channel in animation.channels:
-            yield "samplers of an animation", channel.sampler, animation.samplers
-            yield "nodes", channel.target.node, header.nodes
-        for index in (index for sampler in animation.samplers for index in (sampler.input, sampler.output)):
-            yield "accessors", index, header.accessors
-    for bone in (*header.vrm.values(), *header.vrm_0):
-        yield "nodes", bone.node, header.nodes
-    for node in header.nodes:
-        yield "meshes", node.mesh, header.meshes
-        yield "skins", node.skin, header.skins
-        yield "cameras", node.camera, header.cameras
-        yield "lights", node.lamp, header.lights
-    for child in (child for one in header.nodes for child in one.children):
-        yield "nodes", child, header.nodes
-    for child in (root for scene in header.scenes for root in scene.nodes):
-        yield "nodes", child, header.nodes
-    yield "scenes", header.scene, header.scenes
+            yield "samplers of an animation", channel.sampler, len(animation.samplers)
+
+
+def _numbers(held: Any) -> Iterator[int]:
+    """Yield a number, or those in lists and dictionaries; none of None."""
+    if isinstance(held, int):
+        yield held
+    else:
+        for inner in held.values() if isinstance(held, dict) else held or ():
+            yield from _numbers(inner)
 
 
 def _check_primitive(path: Path, header: Header, primitive: Primitive) -> None:
@@ -227,31 +203,27 @@ def _check_primitive(path: Path, header: Header, primitive: Primitive) -> None:
         if name in held and "POSITION" in held and held[name].count != held["POSITION"].count:
             expected = f"as many values of {name} as of POSITION, {held['POSITION'].count:,}"
             raise damaged(path, expected, f"{held[name].count:,}")
-    for index in (*primitive.attributes.values(), primitive.indices):
-        bare = (
-            index is not None and header.accessors[index].bufferView is None and header.accessors[index].sparse is None
-        )
+    indices = None if primitive.indices is None else header.accessors[primitive.indices]
+    for values in (*held.values(), indices):
+        bare = values is not None and values.bufferView is None and values.sparse is None
         if bare and (unread := _unread_extensions(primitive)):  # which has the numbers, as Draco's
             raise _needs(path, unread)
-    if primitive.indices is not None and header.accessors[primitive.indices].type != "SCALAR":
-        raise damaged(path, "indices of type SCALAR", header.accessors[primitive.indices].type)
-    if primitive.indices is not None and header.accessors[primitive.indices].componentType not in (5121, 5123, 5125):
+    if indices is not None and indices.type != "SCALAR":
+        raise damaged(path, "indices of type SCALAR", indices.type)
+    if indices is not None and indices.componentType not in (5121, 5123, 5125):
         raise damaged(path, "indices that are unsigned integers", "other numbers")
-
-
-def _triangles(header: Header, primitive: Primitive) -> int:
-    """Return how many triangles a primitive has, at most."""
-    index = primitive.attributes.get("POSITION") if primitive.indices is None else primitive.indices
-    if index is None or primitive.mode < 4:
-        return 0
-    count = header.accessors[index].count
-    return count // 3 if primitive.mode == 4 else max(0, count - 2)
 
 
 def _check_tree(path: Path, header: Header) -> None:
     """Check that the nodes form trees, as glTF demands, and neither too large nor too deep ones."""
+
+    def triangles_of(primitive: Primitive) -> int:  # at most
+        index = primitive.attributes.get("POSITION") if primitive.indices is None else primitive.indices
+        count = 0 if index is None or primitive.mode < 4 else header.accessors[index].count
+        return count // 3 if primitive.mode == 4 else max(0, count - 2)
+
     parents: set[int] = set()
-    triangles = [sum(_triangles(header, primitive) for primitive in mesh.primitives) for mesh in header.meshes]
+    triangles = [sum(map(triangles_of, mesh.primitives)) for mesh in header.meshes]
     pieces, drawn = 0, 0
     for node in header.nodes:
         if node.mesh is not None:
@@ -262,16 +234,12 @@ def _check_tree(path: Path, header: Header) -> None:
             parents.add(child)
     pieces = max(pieces, sum(len(mesh.primitives) for mesh in header.meshes), len(header.nodes))
     check_faces(path, max(drawn, sum(triangles)))
-    if pieces > files.scaled(LARGEST_TREE):
-        raise files.too_large(path, f"glTF of at most {files.scaled(LARGEST_TREE):,} nodes and pieces", f"{pieces:,}")
-    level, reached = [index for index in range(len(header.nodes)) if index not in parents], 0
-    for _ in range(files.scaled(DEEPEST_TREE)):
-        reached += len(level)
+    check_most(path, pieces, LARGEST_TREE, "glTF of at most {} nodes and pieces")
+    level, reached, depth = [index for index in range(len(header.nodes)) if index not in parents], 0, 0
+    while level:
+        check_most(path, depth + 1, DEEPEST_TREE, "nodes of at most {} levels", "more")
+        depth, reached = depth + 1, reached + len(level)
         level = [child for index in level for child in header.nodes[index].children]
-        if not level:
-            break
-    if level:
-        raise files.too_large(path, f"nodes of at most {files.scaled(DEEPEST_TREE)} levels", "more")
     if reached < len(header.nodes):
         raise damaged(path, "nodes that form trees", "a cycle")
 
@@ -279,93 +247,73 @@ def _check_tree(path: Path, header: Header) -> None:
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 
 
-class Buffers:
-    """Reads what the header of a file refers to.
+class GltfFile:
+    """A file: its header, and what that refers to, also in files that `references` finds. Raises FileFormatError: as
+    `read_header`."""
 
-    Args:
-        path: the file.
-        header: as `gltf.read_header` gives it.
-        chunk: what a .glb file has after its header; None where it has nothing.
-        references: finds the files that it names.
-    """
-
-    def __init__(self, path: Path, header: Header, chunk: bytes | None, references: References) -> None:
-        self._path, self._header, self._chunk, self._references = path, header, chunk, references
+    def __init__(self, path: Path, data: bytes) -> None:
+        self.path, self.header, self.references = path, read_header(path, data), References(path)
+        self._chunk = None if path.suffix.lower() == ".gltf" else binary_chunk(data)
         self._read: dict[int, bytes] = {}
         self._put_in: dict[int, npt.NDArray[Any]] = {}
 
     def uri(self, uri: str) -> bytes:
-        """Return what a URI holds, or the file in the folder that it names.
-
-        Raises:
-            FileNotFoundError: there is no such file, or it must not be read; the references say which.
-            ValueError: base64 that is none.
-        """
+        """Return what a URI holds, or the file in the folder that it names. Raises FileNotFoundError: there is no such
+        file, or it must not be read; the references say which. Raises ValueError: base64 that is none."""
         if not uri.startswith("data:"):
-            return self._references.get(uri)
+            return self.references.get(uri)
         kind, _, content = uri.partition(",")
-        try:
-            return (
-                base64.b64decode(unquote_to_bytes(content)) if kind.endswith(";base64") else unquote_to_bytes(content)
-            )
-        except binascii.Error as error:
-            raise ValueError(str(error)) from None
+        data = unquote_to_bytes(content)
+        return base64.b64decode(data) if kind.endswith(";base64") else data
 
     def view(self, index: int) -> memoryview:
-        """Return the bytes of a view.
-
-        Raises:
-            FileFormatError: they are not there.
-        """
-        view = self._header.bufferViews[index]
+        """Return the bytes of a view. Raises FileFormatError: they are not there."""
+        view = self.header.bufferViews[index]
         data, end = self._buffer(view.buffer), view.byteOffset + view.byteLength
         if end > len(data):
-            raise damaged(self._path, f"a buffer of at least {end:,} bytes", f"{len(data):,}; the file is cut short")
+            raise damaged(self.path, f"a buffer of at least {end:,} bytes", f"{len(data):,}; the file is cut short")
         return memoryview(data)[view.byteOffset : end]
 
     def _buffer(self, number: int) -> bytes:
         if number not in self._read:
-            uri = self._header.buffers[number].uri
+            uri = self.header.buffers[number].uri
             try:
                 if uri is None and (number > 0 or self._chunk is None):
-                    views = [one for one in self._header.bufferViews if one.buffer == number]
-                    if unread := {name for one in views for name in _unread_extensions(one)}:  # as meshopt's
-                        raise _needs(self._path, sorted(unread))
-                    raise damaged(self._path, f"a buffer {number} with content", "none")
+                    views = [view for view in self.header.bufferViews if view.buffer == number]
+                    if unread := {name for view in views for name in _unread_extensions(view)}:  # as meshopt's
+                        raise _needs(self.path, sorted(unread))
+                    raise damaged(self.path, f"a buffer {number} with content", "none")
                 self._read[number] = self.uri(uri) if uri is not None else self._chunk or b""
             except FileNotFoundError:
                 name = plain_name(uri or "")
-                reason = self._references.refused.get(name, "is missing")
-                message = f"{self._path}: needs {shown(name)}, which {reason}; put that file beside it"
+                reason = self.references.refused.get(name, "is missing")
+                message = f"{self.path}: needs {shown(name)}, which {reason}; put that file beside it"
                 raise FileFormatError(message) from None
             except ValueError:
-                raise damaged(self._path, f"a buffer {number} in base64", "other text") from None
+                raise damaged(self.path, f"a buffer {number} in base64", "other text") from None
         return self._read[number]
 
     def values(self, index: int) -> npt.NDArray[Any]:
-        """Return the values (count, width) of an accessor as they are stored, those that are sparse put in.
-
-        Raises:
-            FileFormatError: they reach beyond their view.
-        """
+        """Return the values (count, width) of an accessor as they are stored, those that are sparse put in. Raises
+        FileFormatError: they reach beyond their view."""
         if index in self._put_in:
             return self._put_in[index]
-        accessor = self._header.accessors[index]
+        accessor = self.header.accessors[index]
         values = np.zeros((accessor.count, accessor.width), _TYPES[accessor.componentType])
         if accessor.bufferView is not None and accessor.count:
-            stride = self._header.bufferViews[accessor.bufferView].byteStride
+            stride = self.header.bufferViews[accessor.bufferView].byteStride
             values = self._array(accessor.bufferView, accessor.byteOffset, values.shape, values.dtype, stride)
         if accessor.sparse is None or not accessor.sparse.count:
             return values
-        places, given, count = accessor.sparse.indices, accessor.sparse.values, accessor.sparse.count
+        places, fresh, count = accessor.sparse.indices, accessor.sparse.values, accessor.sparse.count
         if count > accessor.count:
-            raise damaged(self._path, f"at most {accessor.count:,} sparse values", f"{count:,}")
+            raise damaged(self.path, f"at most {accessor.count:,} sparse values", f"{count:,}")
         kind = np.dtype(_TYPES[places.componentType])
         rows = self._array(places.bufferView, places.byteOffset, (count, 1), kind)[:, 0]
         if rows.max() >= accessor.count:
-            raise damaged(self._path, f"sparse values at places under {accessor.count:,}", f"{int(rows.max()):,}")
+            raise damaged(self.path, f"sparse values at places under {accessor.count:,}", f"{int(rows.max()):,}")
         values = np.array(values)
-        values[rows] = self._array(given.bufferView, given.byteOffset, (count, accessor.width), values.dtype)
+        values[rows] = self._array(fresh.bufferView, fresh.byteOffset, (count, accessor.width), values.dtype)
         self._put_in[index] = values
         return values
 
@@ -375,14 +323,14 @@ class Buffers:
         data, step = self.view(view), stride or shape[1] * kind.itemsize
         end = offset + (shape[0] - 1) * step + shape[1] * kind.itemsize
         if end > len(data):
-            raise damaged(self._path, f"a view of at least {end:,} bytes", f"{len(data):,}")
-        found: npt.NDArray[Any] = np.ndarray(shape, kind, data, offset, (step, kind.itemsize))
-        return found
+            raise damaged(self.path, f"a view of at least {end:,} bytes", f"{len(data):,}")
+        values: npt.NDArray[Any] = np.ndarray(shape, kind, data, offset, (step, kind.itemsize))
+        return values
 
     def numbers(self, index: int, rows: Ints) -> Doubles:
         """Return rows (N,) of an accessor as (N, width), normalised integers as the numbers that they stand for."""
         values = self.values(index)[rows]
         numbers: Doubles = values.astype(np.float64)
-        if not self._header.accessors[index].normalized or values.dtype.kind == "f":
+        if not self.header.accessors[index].normalized or values.dtype.kind == "f":
             return numbers
         return np.asarray(numbers / np.iinfo(values.dtype).max).clip(-1.0)

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import AliasPath, BaseModel, BeforeValidator, ConfigDict, FailFast, Field, JsonValue
 
 T = TypeVar("T")
-
 List = Annotated[list[T], FailFast()]
 """A list of which only the first wrong entry is reported; a million reports take gigabytes."""
-
 Unread = Annotated[JsonValue, Field(exclude=True)]
 """What is never read, and named in a warning of its own, or makes no difference."""
-
 Index = Annotated[int, Field(ge=0, lt=1 << 32)]
 Size = Annotated[int, Field(ge=0, lt=1 << 40)]
 _COMPONENTS = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}
@@ -50,15 +48,13 @@ class BufferView(_Entry):
     byteStride: Annotated[int, Field(ge=4, le=252)] | None = None
 
 
-class SparseIndices(_Entry):
-    bufferView: Index
-    componentType: Literal[5121, 5123, 5125]
-    byteOffset: Size = 0
-
-
 class SparseValues(_Entry):
     bufferView: Index
     byteOffset: Size = 0
+
+
+class SparseIndices(SparseValues):
+    componentType: Literal[5121, 5123, 5125]
 
 
 class Sparse(_Entry):
@@ -93,17 +89,14 @@ class Primitive(_Entry):
     indices: Index | None = None
     material: Index | None = None
     mode: Annotated[int, Field(ge=0, le=6)] = 4
-    targets: List[dict[str, Index]] = []
-    """Morph targets: how far each attribute goes where their weight is 1."""
+    targets: List[dict[str, Index]] = []  # morph targets: how far each attribute goes where their weight is 1
 
 
 class MeshEntry(_Entry):
     primitives: List[Primitive]
     name: str | None = None
-    weights: List[float] = []
-    """Of its morph targets, where a node says none of its own."""
-    extras: Unread = None
-    """`targetNames` in it are what they are called: not of the format, but exporters write them."""
+    weights: List[float] = []  # of its morph targets, where a node says none of its own
+    extras: Unread = None  # `targetNames` in it are what they are called: not of the format, but exporters write them
 
 
 class Node(_Entry):
@@ -111,8 +104,7 @@ class Node(_Entry):
     mesh: Index | None = None
     camera: Index | None = None
     skin: Index | None = None
-    lamp: Index | None = _extension("KHR_lights_punctual", "light")
-    """Number of the light that the node carries."""
+    lamp: Index | None = _extension("KHR_lights_punctual", "light")  # number of the light that the node carries
     matrix: Annotated[list[float], Field(min_length=16, max_length=16)] | None = None
     translation: Annotated[list[float], Field(min_length=3, max_length=3)] | None = None
     rotation: Annotated[list[float], Field(min_length=4, max_length=4)] | None = None
@@ -128,7 +120,7 @@ class Skin(_Entry):
     inverseBindMatrices: Index | None = None
 
 
-class Target(_Entry):
+class ChannelTarget(_Entry):
     """What a channel moves; without a node nothing (an extension may know what)."""
 
     path: str
@@ -137,7 +129,7 @@ class Target(_Entry):
 
 class Channel(_Entry):
     sampler: Index
-    target: Target
+    target: ChannelTarget
 
 
 class AnimationSampler(_Entry):
@@ -223,10 +215,8 @@ class TextureUse(_Entry):
 
     def looked_up_as(self, other: TextureUse) -> bool:
         """Whether another texture is looked up at the same places."""
-        ours, theirs = (
-            (one.attribute, one.transform.offset, one.transform.rotation, one.transform.scale) for one in (self, other)
-        )
-        return ours == theirs
+        moves = [(by.offset, by.rotation, by.scale) for by in (self.transform, other.transform)]
+        return self.attribute == other.attribute and moves[0] == moves[1]
 
 
 class NormalUse(TextureUse):
@@ -250,10 +240,8 @@ class SpecularGlossiness(_Entry):
     glossinessFactor: float = 1.0
 
 
-CUT_OUTS = ("MASK", "BLEND")
-"""Modes in which the alpha of the base colour counts."""
-CUTOFF = 0.5
-"""The alpha under which there is nothing, where the file does not say which."""
+CUT_OUTS = ("MASK", "BLEND")  # modes in which the alpha of the base colour counts
+CUTOFF = 0.5  # the alpha under which there is nothing, where the file does not say which
 
 
 class MaterialEntry(_Entry):
@@ -278,11 +266,9 @@ class MaterialEntry(_Entry):
         old = self.glossiness
         if old is None:
             return self.pbrMetallicRoughness or MetallicRoughness()
+        color, texture, rough = old.diffuseFactor, old.diffuseTexture, 1.0 - old.glossinessFactor
         return MetallicRoughness(
-            baseColorFactor=old.diffuseFactor,
-            baseColorTexture=old.diffuseTexture,
-            metallicFactor=0.0,
-            roughnessFactor=1.0 - old.glossinessFactor,
+            baseColorFactor=color, baseColorTexture=texture, metallicFactor=0.0, roughnessFactor=rough
         )
 
     @property
@@ -299,7 +285,7 @@ class MaterialEntry(_Entry):
     def textures(self) -> list[TextureUse]:
         """The uses of textures that are read, `layout` first."""
         uses = (self.surface.baseColorTexture, self.normalTexture, self.emissiveTexture)
-        return [one for one in uses if one is not None and self.reads(one)]
+        return [use for use in uses if use is not None and self.reads(use)]
 
     def reads(self, use: TextureUse | None) -> bool:
         """Whether a texture is looked up at the same places as the others, if there is one; else it is left out."""
@@ -308,13 +294,11 @@ class MaterialEntry(_Entry):
     @property
     def emission(self) -> list[float]:
         """(3,) linear radiance, where there is a texture that times its colour."""
-        return [one * self.strength for one in self.emissiveFactor]
+        return [channel * self.strength for channel in self.emissiveFactor]
 
 
-REPEAT, MIRRORED, CLAMPED = 10497, 33648, 33071
-"""How a texture goes on beyond its edges."""
-NEAREST = 9728
-"""The filter that leaves texels sharp."""
+REPEAT, MIRRORED, CLAMPED = 10497, 33648, 33071  # how a texture goes on beyond its edges
+NEAREST = 9728  # the filter that leaves texels sharp
 
 
 class Sampler(_Entry):
@@ -370,7 +354,24 @@ class Header(_Entry):
     @property
     def bones(self) -> dict[int, str]:
         """What nodes are called as bones of a person, by their numbers."""
-        return {one.node: one.bone for one in self.vrm_0} | {one.node: name for name, one in self.vrm.items()}
+        return {bone.node: bone.bone for bone in self.vrm_0} | {bone.node: name for name, bone in self.vrm.items()}
+
+    def below(self, nodes: Iterable[int]) -> set[int]:
+        """Return nodes, and all that hang on them."""
+        reached, level = set[int](), set(nodes)
+        while level:
+            reached |= level
+            level = {child for node in level for child in self.nodes[node].children} - reached
+        return reached
+
+    @property
+    def parents(self) -> list[int]:
+        """The node on which each one hangs; -1 of a root."""
+        parents = [-1] * len(self.nodes)
+        for number, node in enumerate(self.nodes):
+            for child in node.children:
+                parents[child] = number
+        return parents
 
     def label(self, index: int) -> str:
         """Return what a node is called: by its name, its mesh's, or its number."""

@@ -5,7 +5,7 @@ Each of them begins with the name of the file, which the caller puts before it.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Mapping
 
 from pydantic import BaseModel
 
@@ -16,7 +16,6 @@ from advsearch.scene.importing.usd import GENERATOR
 from advsearch.scene.skeleton import Skeleton
 
 _OPAQUE = " lets light pass through surfaces with {name}; here they are opaque"
-
 EXTENSIONS = {
     "EXT_mesh_gpu_instancing": " repeats meshes with {name}; each is there once",
     "KHR_materials_diffuse_transmission": _OPAQUE,
@@ -26,9 +25,7 @@ EXTENSIONS = {
     "KHR_materials_variants": " has variants of its materials ({name}); those that it shows by itself are taken",
 }
 """What becomes of a file with an extension; of all that are not named here, nor understood, `UNKNOWN`."""
-
 UNKNOWN = " uses {name}, which is not understood and left out"
-
 FAR = 1000.0
 """Distance of a directional light, in object sizes."""
 
@@ -36,57 +33,50 @@ FAR = 1000.0
 def left_out(header: Header, notes: Notes) -> None:
     """Say what the file has that is not carried over, whether one node or all of it is the object."""
     if header.asset.generator == GENERATOR and isinstance(header.asset.extras, dict):
-        told = header.asset.extras.get("left_out")
-        for what in told if isinstance(told, list) else ():
+        sentences = header.asset.extras.get("left_out")
+        for what in sentences if isinstance(sentences, list) else ():
             notes.say(" " + shown(str(what), quoted=False))
     used = {*header.extensionsUsed, *header.extensionsRequired}
     for name in sorted(used & set(EXTENSIONS) | used - set(READ)):
         notes.say(EXTENSIONS.get(name, UNKNOWN).format(name=shown(name, quoted=False)))
-    drawn = in_the_scene(header)
-    absent = sum(node.mesh is not None for index, node in enumerate(header.nodes) if index not in drawn)
-    found = {
-        "occlusion map{s}: left out": sum(one.occlusionTexture is not None for one in header.materials),
-        "normal map{s} with other texture coordinates than the base colour: left out": sum(
-            not one.reads(one.normalTexture) for one in header.materials
+    drawn = header.below(header.scenes[header.scene or 0].nodes if header.scenes else range(len(header.nodes)))
+    looks = header.materials
+    kinds = {
+        "occlusion map{s}: left out": (look.occlusionTexture is not None for look in looks),
+        "normal map{s} with other texture coordinates than the base colour: left out": (
+            not look.reads(look.normalTexture) for look in looks
         ),
-        "emission texture{s} with other coordinates than the base colour: left out, with the emission": sum(
-            any(one.emission) and not one.reads(one.emissiveTexture) for one in header.materials
+        "emission texture{s} with other coordinates than the base colour: left out, with the emission": (
+            any(look.emission) and not look.reads(look.emissiveTexture) for look in looks
         ),
-        "material{s} with an alphaMode that glTF does not have: opaque": sum(
-            one.alphaMode not in ("OPAQUE", *CUT_OUTS) for one in header.materials
+        "material{s} with an alphaMode that glTF does not have: opaque": (
+            look.alphaMode not in ("OPAQUE", *CUT_OUTS) for look in looks
         ),
-        "further scene{s}: left out": max(0, len(header.scenes) - 1),
-        "node{s} with a mesh outside of its scene: left out": absent,
+        "further scene{s}: left out": (True for _ in header.scenes[1:]),
+        "node{s} with a mesh outside of its scene: left out": (
+            node.mesh is not None for index, node in enumerate(header.nodes) if index not in drawn
+        ),
     }
-    for what, count in found.items():
-        if count:
-            notes.say(counted(count, what))
+    for sentence in _counts(kinds):
+        notes.say(sentence)
     _note_unread(header, notes)
 
 
 def moves(skeleton: Skeleton) -> str:
     """Say what of a file moves, and how."""
-    names = [one.name for one in skeleton.clips]
+    names = [clip.name for clip in skeleton.clips]
     clips = f", and plays {', '.join(names[:5])}{', ...' if len(names) > 5 else ''}" if names else ""
     return f" is shown at rest: the control body moves it{clips}"
 
 
 WORDS = {
     "Header": "entry",
-    "MaterialEntry": "entry of a material",
-    "MetallicRoughness": "entry of a material",
-    "TextureUse": "entry of a material's texture",
-    "NormalUse": "entry of a material's texture",
-    "MeshEntry": "entry of a mesh",
-    "Primitive": "entry of a primitive",
-    "Node": "entry of a node",
-    "Sampler": "entry of a sampler",
-    "Texture": "entry of a texture",
-    "Image": "entry of an image",
-    "LightEntry": "entry of a light",
+    **dict.fromkeys(("MaterialEntry", "MetallicRoughness"), "entry of a material"),
+    **dict.fromkeys(("TextureUse", "NormalUse"), "entry of a material's texture"),
+    **{name: f"entry of a {name.lower()}" for name in ("Primitive", "Node", "Sampler", "Texture")},
+    **{"MeshEntry": "entry of a mesh", "Image": "entry of an image", "LightEntry": "entry of a light"},
 }
 """What is left out of entries whose contents are seen."""
-
 PLAIN = frozenset(("name", "weights", "extensions"))
 """Keys without a field that make no difference, or are named with what they belong to."""
 
@@ -96,7 +86,7 @@ def _note_unread(header: Header, notes: Notes) -> None:
     level: list[object] = [header]
     for entry in level:  # which grows
         if isinstance(entry, list):
-            level.extend(one for one in entry if isinstance(one, BaseModel))
+            level.extend(inner for inner in entry if isinstance(inner, BaseModel))
         elif isinstance(entry, BaseModel):
             kind = WORDS.get(type(entry).__name__)
             for key in (entry.model_extra or {}) if kind else ():
@@ -114,42 +104,32 @@ def _note_unread(header: Header, notes: Notes) -> None:
                     notes.has("attribute", name)
 
 
-def beside(header: Header) -> str | None:
-    """Return what a file read as one object leaves out of its scene; None if nothing."""
-    lights = sum(node.lamp is not None for node in header.nodes)
-    cameras = sum(node.camera is not None for node in header.nodes)
-    found = [counted(count, what) for count, what in ((lights, "light{s}"), (cameras, "camera{s}")) if count]
-    if not found:
-        return None
-    verb = "is" if lights + cameras == 1 else "are"
+def beside(header: Header, file: str) -> list[str]:
+    """Return what a file of that name, read as one object, leaves out of its scene: one sentence, or none."""
+    lights, cameras = ([getattr(node, kind) is not None for node in header.nodes] for kind in ("lamp", "camera"))
+    what = _counts({"light{s}": lights, "camera{s}": cameras})
+    left = f"{'is' if sum(lights + cameras) == 1 else 'are'} left out of the object"
     what_to_do = "name one node as the object, FILE#NODE, to keep the rest around it"
-    return f": {' and '.join(found)} {verb} left out of the object; {what_to_do}"
+    return [f"{file}: {' and '.join(what)} {left}; {what_to_do}"] if what else []
 
 
-def lights_and_cameras(header: Header) -> Iterator[str]:
-    """Yield what becomes of lights and cameras that are not what they are in the file."""
-    distant = [light.type == "directional" for light in header.lights]
-    found = {
-        f"directional light{{s}}, here as lamps {FAR:g} object sizes away": sum(distant),
-        "light{s} with a range, which is left out: light reaches beyond it": sum(
-            light.range is not None for light in header.lights
-        ),
-        "camera{s} without perspective: left out": sum(one.perspective is None for one in header.cameras),
+def lights_and_cameras(header: Header, file: str) -> list[str]:
+    """Return what becomes of lights and cameras that are not what they are in a file of that name."""
+    distant = f"directional light{{s}}, here as lamps {FAR:g} object sizes away"
+    ranged = "light{s} with a range, which is left out: light reaches beyond it"
+    kinds = {
+        distant: (light.type == "directional" for light in header.lights),
+        ranged: (light.range is not None for light in header.lights),
+        "camera{s} without perspective: left out": (camera.perspective is None for camera in header.cameras),
     }
-    yield from (f": {counted(count, what)}" for what, count in found.items() if count)
+    return [f"{file}: {sentence}" for sentence in _counts(kinds)]
+
+
+def _counts(kinds: Mapping[str, Iterable[bool]]) -> list[str]:
+    """Return how many there are of each kind, but for those of which there are none."""
+    return [counted(count, what) for what, those in kinds.items() if (count := sum(those))]
 
 
 def counted(count: int, what: str) -> str:
+    """Return a count of things, whose words have {s} or {es} where several have that."""
     return f"{count} {what.format(s='' if count == 1 else 's', es='' if count == 1 else 'es')}"
-
-
-def in_the_scene(header: Header) -> set[int]:
-    """The nodes of the scene that is read."""
-    if not header.scenes:
-        return set(range(len(header.nodes)))
-    found: set[int] = set()
-    level = list(header.scenes[header.scene or 0].nodes)
-    while level:
-        found.update(level)
-        level = [child for index in level for child in header.nodes[index].children]
-    return found

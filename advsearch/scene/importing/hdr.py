@@ -20,23 +20,20 @@ import numpy as np
 import numpy.typing as npt
 import OpenEXR
 
-from advsearch import files
 from advsearch.errors import AdvsearchError, FileFormatError
 from advsearch.pictures import LARGEST_PIXELS, check_pixels
 from advsearch.scene.assets import Floats
-from advsearch.scene.importing.files import damaged, looks_like, shown
+from advsearch.scene.importing.files import check_most, damaged, looks_like, shown
 
 Plane = npt.NDArray[np.floating]
 Planes = tuple[Plane, Plane, Plane]
-
 LARGEST = 2 * LARGEST_PIXELS
 """Pixels times channels of a file (8192 x 4096 with 4), before `advsearch.files.scaled`."""
 COLORS = {"r": "R", "red": "R", "g": "G", "green": "G", "b": "B", "blue": "B", "y": "Y", "ry": "RY", "by": "BY"}
 """Names of channels, in any case, and what they hold."""
 WHOLE = ("", "rgba", "rgb", "beauty", "combined", "color", "colour", "main", "image")
 """Names of layers that are the picture itself, the likeliest first; others are taken where there is none of these."""
-LUMINANCE = (0.2126, 0.7152, 0.0722)
-"""Of red, green and blue: ITU-R BT.709, which a file has that names no others."""
+LUMINANCE = (0.2126, 0.7152, 0.0722)  # of red, green and blue: ITU-R BT.709, which a file has that names no others
 PRIMARIES = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.329)
 CUBE = 1
 
@@ -56,19 +53,11 @@ def _quiet() -> Iterator[None]:
 
 
 def read_exr(file: Path, data: bytes) -> tuple[Planes, list[str]]:
-    """Read the picture of an OpenEXR file: its display window, which is black where the file has no data.
+    """Read the picture of an OpenEXR file: red, green and blue, each (H, W) in half or float, of its display window,
+    which is black where the file has no data; and clauses about what is left out.
 
     Of several parts and layers the one that is called as the picture itself, or else the first with colours, is taken.
-
-    Args:
-        file: for messages.
-        data: its content.
-
-    Returns:
-        Red, green and blue, each (H, W) in half or float, and clauses about what is left out.
-
-    Raises:
-        FileFormatError: it is damaged, too large, deep, a cube map, or has no colours.
+    Raises FileFormatError: it is damaged, too large, deep, a cube map, or has no colours.
     """
     if not data.startswith(b"\x76\x2f\x31\x01"):
         raise damaged(file, "an OpenEXR picture", looks_like(data))
@@ -85,19 +74,18 @@ def read_exr(file: Path, data: bytes) -> tuple[Planes, list[str]]:
     except (AdvsearchError, MemoryError):
         raise
     except Exception as error:
-        raise FileFormatError(
-            f"{file}: cannot be read as OpenEXR; it is damaged or cut short, export it again"
-        ) from error
+        message = f"{file}: cannot be read as OpenEXR; it is damaged or cut short, export it again"
+        raise FileFormatError(message) from error
     if header.get("envmap") is not None and getattr(header["envmap"], "value", header["envmap"]) == CUBE:
         raise FileFormatError(f"{file}: expected a map of latitude and longitude, got a cube map; convert it")
-    size = tuple(int(extent) for extent in _window(header, "dataWindow")[1])
+    size = _window(header, "dataWindow")[1]
     sized = all(plane.shape == size for key, plane in planes.items() if key not in ("RY", "BY"))
     if not sized or any(plane.dtype.kind != "f" or plane.ndim != 2 for plane in planes.values()):
         got = ", ".join(f"{name} {plane.dtype} {plane.shape}" for name, plane in planes.items())
         raise FileFormatError(f"{file}: expected channels of equal size in half or float, got {got}; save it again")
     whole = planes if "R" in planes else _colored(planes, size)
-    given = header.get("chromaticities")
-    if given is not None and not np.allclose(np.asarray(given, np.float64).ravel(), PRIMARIES, atol=2e-3):
+    primaries = header.get("chromaticities")
+    if primaries is not None and not np.allclose(np.asarray(primaries, np.float64).ravel(), PRIMARIES, atol=2e-3):
         notes.append("its colours have primaries of their own and are taken for those of sRGB")
     return _displayed(header, (whole["R"], whole["G"], whole["B"]), notes), notes
 
@@ -112,9 +100,7 @@ def _check_size(file: Path, picture: Any) -> None:
         (height, width), (tall, wide) = (_window(header, name)[1] for name in ("dataWindow", "displayWindow"))
         values += max(width, 0) * max(height, 0) * len(header["channels"])
         check_pixels(file, max(wide, 0), max(tall, 0))
-    most = files.scaled(LARGEST)
-    if values > most:
-        raise files.too_large(file, f"OpenEXR pictures of at most {most:,} pixels times channels", f"{values:,}")
+    check_most(file, values, LARGEST, "OpenEXR pictures of at most {} pixels times channels")
 
 
 def _window(header: Mapping[str, Any], name: str) -> tuple[tuple[int, int], tuple[int, int]]:
@@ -130,28 +116,26 @@ def _chosen(
     """Return the header and the channels of the layer that is the picture, and clauses about other ones."""
     layers: list[tuple[str, dict[str, Any], dict[str, Any]]] = []
     for header, channels in parts:
-        found: dict[str, dict[str, Any]] = {}
+        by_layer: dict[str, dict[str, Any]] = {}
         for name, channel in channels.items():
             layer, _, last = name.rpartition(".")
-            found.setdefault(layer, {}).setdefault(COLORS.get(last.lower(), last), channel)
+            by_layer.setdefault(layer, {}).setdefault(COLORS.get(last.lower(), last), channel)
         called = str(header.get("name", "")) if len(parts) > 1 else ""
-        for layer, held in found.items():
+        for layer, held in by_layer.items():
             grey = "Y" in held and ("RY" in held) == ("BY" in held) and not {"R", "G", "B", "X", "Z"} & set(held)
             if grey or {"R", "G", "B"} <= set(held):
                 layers.append((layer or called, header, held))
     if not layers:
-        names = sorted({name for _, channels in parts for name in channels})
-        got = ", ".join(shown(name, quoted=False) for name in names)
-        raise FileFormatError(
-            f"{file}: expected the channels R, G and B (or Y alone), got {got}; save the picture as plain RGB"
-        )
-    rank = {name: number for number, name in enumerate(WHOLE)}
-    order = [
-        (rank.get(name.split(".")[-1].lower(), len(WHOLE)), "R" not in held, number)
-        for number, (name, _, held) in enumerate(layers)
-    ]
-    name, header, held = layers[min(order)[2]]
-    others = ", ".join(shown(one) for one, _, _ in layers[:20] if one != name)
+        got = ", ".join(shown(name, quoted=False) for name in sorted({name for _, held in parts for name in held}))
+        wanted = "expected the channels R, G and B (or Y alone)"
+        raise FileFormatError(f"{file}: {wanted}, got {got}; save the picture as plain RGB")
+
+    def rank(layer: tuple[str, Mapping[str, Any], Mapping[str, Any]]) -> tuple[int, bool]:
+        last = layer[0].split(".")[-1].lower()
+        return WHOLE.index(last) if last in WHOLE else len(WHOLE), "R" not in layer[2]
+
+    name, header, held = min(layers, key=rank)
+    others = ", ".join(shown(layer) for layer, _, _ in layers[:20] if layer != name)
     taken = f"of its layers {shown(name)} is taken; left out: " if name else "layers are left out: "
     wanted = ("R", "G", "B") if "R" in held else ("Y", "RY", "BY")
     return header, {key: held[key] for key in wanted if key in held}, [taken + others] if others else []
@@ -170,15 +154,14 @@ def _colored(planes: Mapping[str, Plane], size: tuple[int, ...]) -> dict[str, Pl
 
 def _enlarged(plane: Plane, size: tuple[int, ...]) -> Plane:
     """Interpolate a channel that has a value at every n-th row and column only."""
-    found = plane.astype(np.float32)
+    plane = plane.astype(np.float32)
     for axis in (0, 1):
-        step = round(size[axis] / found.shape[axis])
-        at = np.minimum(np.arange(size[axis]) / step, found.shape[axis] - 1)
+        last = plane.shape[axis] - 1
+        at = np.minimum(np.arange(size[axis]) / round(size[axis] / (last + 1)), last)
         low = at.astype(np.int64)
-        high, share = np.minimum(low + 1, found.shape[axis] - 1), (at - low).astype(np.float32)
-        share = share[:, None] if axis == 0 else share[None, :]
-        found = found.take(low, axis) * (1.0 - share) + found.take(high, axis) * share
-    return found
+        share = np.expand_dims((at - low).astype(np.float32), 1 - axis)
+        plane = plane.take(low, axis) * (1.0 - share) + plane.take(np.minimum(low + 1, last), axis) * share
+    return plane
 
 
 def _displayed(header: Mapping[str, Any], planes: Planes, notes: list[str]) -> Planes:
@@ -191,41 +174,36 @@ def _displayed(header: Mapping[str, Any], planes: Planes, notes: list[str]) -> P
     columns = slice(max(left, near), min(left + size[1], near + width))
     if rows.start - top or columns.start - left or rows.stop < top + size[0] or columns.stop < left + size[1]:
         notes.append("its data beyond the display window is left out")
-    found = []
-    for plane in planes:
+
+    def displayed(plane: Plane) -> Plane:
         whole = np.zeros((height, width), plane.dtype)
         if rows.stop > rows.start and columns.stop > columns.start:
             inside = plane[rows.start - top : rows.stop - top, columns.start - left : columns.stop - left]
             whole[rows.start - high : rows.stop - high, columns.start - near : columns.stop - near] = inside
-        found.append(whole)
-    return found[0], found[1], found[2]
+        return whole
+
+    red, green, blue = map(displayed, planes)
+    return red, green, blue
 
 
 Bytes = npt.NDArray[np.uint8]
-
 _RESOLUTION = re.compile(rb"([-+])([YX]) +(\d{1,6}) +([-+])([YX]) +(\d{1,6})\r?\n")
 _NUMBER = rb"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 
 
 def read_radiance(path: Path, data: bytes) -> tuple[Bytes, Floats, list[str]]:
-    """Unpack a Radiance RGBE picture; `linear` makes floats of it, which take three times the memory.
-
-    Args:
-        path: the file, for messages.
-        data: its content.
+    """Unpack a Radiance RGBE picture; `linear` makes floats of it, which take three times the memory. Raises
+    FileFormatError: not a Radiance picture, one in XYZ colours, too large, or cut short.
 
     Returns:
         (H, W, 4) uint8: three mantissas and an exponent; row 0 is the top, column 0 the left. (3,) float32 by which the
         linear values are multiplied: the inverse of all COLORCORR lines. And clauses about what is left out.
-
-    Raises:
-        FileFormatError: not a Radiance picture, one in XYZ colours, too large, or cut short.
     """
-    found = re.search(rb"\r?\n\r?\n", data)
-    if not data.startswith(b"#?") or not found:
+    end = re.search(rb"\r?\n\r?\n", data)
+    if not data.startswith(b"#?") or not end:
         got = looks_like(data) if not data.startswith(b"#?") else "half a header"
         raise damaged(path, "a Radiance .hdr picture", got)
-    head, rest = data[: found.start()], data[found.end() :]
+    head, rest = data[: end.start()], data[end.end() :]
     coding = re.search(rb"^FORMAT=\s*(\S+)", head, re.MULTILINE)
     if coding and coding[1] != b"32-bit_rle_rgbe":
         got = shown(coding[1].decode("latin-1"), quoted=False)
@@ -237,14 +215,10 @@ def read_radiance(path: Path, data: bytes) -> tuple[Bytes, Floats, list[str]]:
     lines, length = int(size[3]), int(size[6])
     check_pixels(path, length, lines)
     pixels = _scanlines(path, rest[size.end() :], lines, length)
-    pixels = pixels[:: 1 if _forward(size[1], size[2]) else -1, :: 1 if _forward(size[4], size[5]) else -1]
-    scale, notes = _scale(head)
-    return pixels if size[2] == b"Y" else pixels.transpose(1, 0, 2), scale, notes
-
-
-def _forward(sign: bytes, axis: bytes) -> bool:
-    """Whether what runs along an axis comes in our order: from the top, and from the left."""
-    return sign == (b"-" if axis == b"Y" else b"+")
+    # in our order it comes from the top, and from the left
+    down, across = (1 if sign + axis in (b"-Y", b"+X") else -1 for sign, axis in (size.group(1, 2), size.group(4, 5)))
+    pixels = pixels[::down, ::across]
+    return pixels if size[2] == b"Y" else pixels.transpose(1, 0, 2), *_scale(head)
 
 
 def _scale(head: bytes) -> tuple[Floats, list[str]]:
@@ -254,7 +228,7 @@ def _scale(head: bytes) -> tuple[Floats, list[str]]:
     """
     scale, notes = np.ones(3), list[str]()
     for text in re.findall(rb"^COLORCORR=(.*)$", head, re.MULTILINE)[:100]:
-        numbers = np.array([float(one) for one in re.findall(_NUMBER, text)[:4]])
+        numbers = np.array(list(map(float, re.findall(_NUMBER, text)[:4])))
         undone = scale / numbers if len(numbers) == 3 and (numbers > 0.0).all() else np.full(3, np.nan)
         if ((undone > 1e-20) & (undone < 1e20)).all():
             scale = undone
@@ -284,10 +258,8 @@ def _scanlines(path: Path, body: bytes, height: int, width: int) -> Bytes:
             else:
                 position = _plain_line(body, position, result[row])
         except (IndexError, ValueError):
-            got = f"{row} whole ones and the start of another"
-            raise damaged(
-                path, f"{height} scanlines of {width} pixels", f"{got}; the file is cut short or damaged"
-            ) from None
+            got = f"{row} whole ones and the start of another; the file is cut short or damaged"
+            raise damaged(path, f"{height} scanlines of {width} pixels", got) from None
     return result
 
 
@@ -298,6 +270,8 @@ def _run_lengths(body: bytes, position: int, line: Bytes) -> int:
         pieces, filled = [], 0
         while filled < width:
             count = body[position]
+            if count == 0:
+                raise ValueError("a run of length zero")
             if count > 128:
                 count -= 128
                 pieces.append(body[position + 1 : position + 2] * count)
@@ -306,8 +280,6 @@ def _run_lengths(body: bytes, position: int, line: Bytes) -> int:
                 pieces.append(body[position + 1 : position + 1 + count])
                 position += 1 + count
             filled += count
-            if count == 0:
-                raise ValueError("a run of length zero")
         line[:, channel] = np.frombuffer(b"".join(pieces), np.uint8)
     return position
 

@@ -14,7 +14,6 @@ import numpy as np
 from advsearch.scene.assets import Doubles, Floats
 
 Pair = tuple[float, float]
-
 _NUMBER = r"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?"
 _OPTIONS = {
     "blendu": "on|off",
@@ -43,21 +42,14 @@ _CONTINUED = re.compile(r"^([^#\n][^\n]*?)\\[ \t]*\n", re.MULTILINE)
 
 @dataclass
 class MtlMaterial:
-    """A material as its file has it.
+    """A material as its file has it: the rest of each line by its keyword in lower case (of several lines with the same
+    one, the last), and that as the file spells it."""
 
-    Attributes:
-        name: as it stands after ``newmtl``, with what may be a comment.
-        file: name of the material file.
-        statements: the rest of each line by its keyword in lower case; of several lines with the same one, the last.
-        spelled: the keywords as the file spells them.
-        again: keywords of lines that others with the same one, and something else to say, come after.
-    """
-
-    name: str
-    file: str
+    name: str  # as it stands after ``newmtl``, with what may be a comment
+    file: str  # name of the material file
     statements: dict[str, str] = field(default_factory=dict)
     spelled: dict[str, str] = field(default_factory=dict)
-    again: list[str] = field(default_factory=list)
+    again: list[str] = field(default_factory=list)  # keywords of lines that others come after that say something else
 
     def numbers(self, key: str) -> str:
         """Return what a statement of numbers says, without a comment; empty where there is none."""
@@ -66,15 +58,10 @@ class MtlMaterial:
 
 @dataclass(frozen=True)
 class MapUse:
-    """A statement that names a picture.
+    """A statement that names a picture."""
 
-    Attributes:
-        name: of the picture, as the file has it.
-        options: its options by their names, in lower case, as (name, value).
-    """
-
-    name: str
-    options: dict[str, str]
+    name: str  # of the picture, as the file has it
+    options: dict[str, str]  # its options by their names, in lower case, as (name, value)
 
     @property
     def scale(self) -> Pair:

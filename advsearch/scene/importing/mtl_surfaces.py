@@ -4,37 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from PIL import Image
 
 from advsearch.scene.assets import Doubles, Floats
-from advsearch.scene.importing import udim
+from advsearch.scene.importing import mtl, udim
 from advsearch.scene.importing.files import Notes, References, plain_name, shown, text_of
-from advsearch.scene.importing.mtl import (
-    MapUse,
-    MtlMaterial,
-    Pair,
-    color_of,
-    map_of,
-    numbers_of,
-    parsed,
-    radiance_of,
-    share_of,
-    without_comment,
-)
 from advsearch.scene.importing.parts import (
     NEUTRAL,
     ImportedSurface,
     holds_normals,
+    instead_of_texture,
     limited_radiance,
     normal_map,
     with_opacity,
 )
-from advsearch.scene.importing.pictures import Kind, Pictures
+from advsearch.scene.importing.pictures import FilePictures, Kind
 from advsearch.scene.importing.texture import mean_over
 
-STATEMENT = "material statement"
 READ = frozenset("kd ke d tr pr pm map_kd map_ke map_d map_pr map_pm norm map_kn map_bump bump illum".split())
 """Statements that become something, in lower case."""
 QUIET = frozenset("ka ks ns ni sharpness map_aat".split())
@@ -42,50 +31,33 @@ QUIET = frozenset("ka ks ns ni sharpness map_aat".split())
 NORMALS = ("norm", "map_kn", "map_bump", "bump")
 PLACED = ("map_kd", "map_d", *NORMALS, "map_ke")
 """Maps that are looked up by texture coordinates; the first of a material says where all of them lie."""
-CHANNELS = {"r": 0, "g": 1, "b": 2, "m": 3}
-"""Channels of a picture by the value of ``-imfchan``."""
+CHANNELS = {"r": 0, "g": 1, "b": 2, "m": 3}  # channels of a picture by the value of ``-imfchan``
 DEFAULTS = {"blendu": "on", "blendv": "on", "cc": "off", "clamp": "off", "bm": "1", "boost": "0"}
 """What options say by default."""
 
 
 @dataclass(frozen=True, eq=False)
 class Painted:
-    """A material that was read.
+    """A material that was read."""
 
-    Attributes:
-        surface: what it looks like.
-        scale: factors of texture coordinates.
-        offset: what is added to them then.
-        clamped: whether its textures are not to repeat.
-    """
-
-    surface: ImportedSurface
-    scale: Pair = (1.0, 1.0)
-    offset: Pair = (0.0, 0.0)
-    clamped: bool = False
+    surface: ImportedSurface  # what it looks like
+    scale: mtl.Pair = (1.0, 1.0)  # factors of texture coordinates
+    offset: mtl.Pair = (0.0, 0.0)  # what is added to them then
+    clamped: bool = False  # whether its textures are not to repeat
 
 
 @dataclass
 class MtlReader:
-    """Reads the material files that a mesh file names, and turns their materials into surfaces, each once.
-
-    Attributes:
-        references: finds files.
-        notes: about the mesh file.
-        shown_on: returns texture coordinates (F, 3, 2) and areas (F,) of the faces with a material, by its name and a
-            UDIM square.
-        libraries: how many material files were read.
-    """
+    """Reads the material files that a mesh file names, and turns their materials into surfaces, each once. `shown_on`
+    returns UVs (F, 3, 2) and areas (F,) of the faces with a material, by its name and a UDIM square."""
 
     references: References
     notes: Notes
     shown_on: Callable[[str, int], tuple[Doubles, Doubles]]
-    libraries: int = 0
-    _materials: dict[str, MtlMaterial] = field(default_factory=dict)
+    libraries: int = 0  # how many material files were read
+    _materials: dict[str, mtl.MtlMaterial] = field(default_factory=dict)
     _painted: dict[tuple[int, int], Painted] = field(default_factory=dict)
-    _uses: dict[tuple[int, str], MapUse | None] = field(default_factory=dict)
-    _pictures: Pictures | None = None
-    _read: dict[tuple[str, Kind], Floats | str] = field(default_factory=dict)
+    _uses: dict[tuple[int, str], mtl.MapUse | None] = field(default_factory=dict)
 
     def read_library(self, name: str) -> None:
         """Read a material file; of materials with the same name, the first counts."""
@@ -98,21 +70,23 @@ class MtlReader:
             return
         self.libraries += 1
         file = plain_name(name).rpartition("/")[2]
-        materials, stray = parsed(text, file)
+        materials, stray = mtl.parsed(text, file)
         for key in stray:
             self.notes.has(f"before the first material of {shown(file, quoted=False)}, statement", key)
         for material in materials:
             first = self._materials.setdefault(material.name, material)
             if first.statements != material.statements and first.file == material.file:
-                twice = f"{file} has the material {shown(material.name)} more than once"
-                self.notes.say(f"{twice}; the first counts")
+                self.notes.say(f"{file} has the material {shown(material.name)} more than once; the first counts")
         for material in materials:  # a comment, or part of the name: both are tried
-            self._materials.setdefault(without_comment(material.name), material)
+            self._materials.setdefault(mtl.without_comment(material.name), material)
+
+    def _named(self, name: str) -> mtl.MtlMaterial | None:
+        return self._materials.get(name) or self._materials.get(mtl.without_comment(name))
 
     def painted(self, name: str, square: int = 0) -> Painted | None:
         """Return a material by its name, or None; the name may have a comment after it. Of pictures of one UDIM square
         each, it takes those of that one, or as the file names them."""
-        material = self._materials.get(name) or self._materials.get(without_comment(name))
+        material = self._named(name)
         if material is None:
             return None
         if (id(material), square) not in self._painted:
@@ -122,153 +96,133 @@ class MtlReader:
     def squares_of(self, name: str, wanted: Sequence[int]) -> list[int]:
         """Return for which of these UDIM squares, the first of them 1001, there are pictures of their own; none of a
         material whose pictures have no square in their names, or repeat."""
-        material = self._materials.get(name) or self._materials.get(without_comment(name))
+        material = self._named(name)
         maps = [use for key in PLACED if material is not None and (use := self._use(material, key)) is not None]
         numbered = next((use.name for use in maps if udim.number_in(use.name) is not None), None)
-        if numbered is None or not (others := [one for one in wanted if one and one != udim.number_in(numbered)]):
+        if numbered is None:
             return []
-        beside = [one for one in others if isinstance(self.references.tried(udim.named(numbered, one)), bytes)]
-        if udim.number_in(numbered) == 0 or beside:
-            return [one for one in wanted if one]
-        self.notes.say(
-            f"{shown(numbered)} is named like one of several pictures (UDIM), and there is none for the "
-            f"faces in {', '.join(map(str, others[:8]))}: it repeats there; put those pictures beside it"
-        )
+        others = [square for square in wanted if square and square != udim.number_in(numbered)]
+        beside = (isinstance(self.references.tried(udim.named(numbered, square)), bytes) for square in others)
+        if others and (udim.number_in(numbered) == 0 or any(beside)):
+            return [square for square in wanted if square]
+        if others:
+            self.notes.say(
+                f"{shown(numbered)} is named like one of several pictures (UDIM), and there is none for the "
+                f"faces in {', '.join(map(str, others[:8]))}: it repeats there; put those pictures beside it"
+            )
         return []
 
-    def _look_of(self, material: MtlMaterial, square: int, name: str) -> Painted:
+    def _look_of(self, material: mtl.MtlMaterial, square: int, name: str) -> Painted:
         """Read all statements of a material."""
         if not any(known == id(material) for known, _ in self._painted):
             self._list(material)
         uses = {key: use for key in (*PLACED, "map_pr", "map_pm") if (use := self._use(material, key)) is not None}
         if square:
             uses = {key: replace(use, name=udim.named(use.name, square)) for key, use in uses.items()}
-        first = next((uses[key] for key in PLACED if key in uses), None)
+        first = next((uses[key] for key in PLACED if key in uses), mtl.MapUse("", {}))
         for key in [key for key in PLACED if key in uses]:
-            if first is not None and (uses[key].scale, uses[key].offset) != (first.scale, first.offset):
+            if (uses[key].scale, uses[key].offset) != (first.scale, first.offset):
                 what = f"{material.spelled[key]} of the material {shown(material.name)}"
                 self.notes.say(f"{what} lies elsewhere than its other maps (-s, -o); it is left out")
                 del uses[key]
         rest = material.numbers("kd")
-        color = color_of(rest)
+        color = mtl.color_of(rest)
         if "kd" in material.statements and color is None:
-            self.notes.say(
-                f"the Kd {shown(rest)} of the material {shown(material.name)} is no colour; neutral grey"
-                " is used instead"
-            )
+            what = f"the Kd {shown(rest)} of the material {shown(material.name)}"
+            self.notes.say(f"{what} is no colour; neutral grey is used instead")
         texture = self._texture(material, uses.get("map_kd"), color)
         if "map_kd" in uses and color is not None and (color > 0.999).all():
             color = None  # plain white only leaves a texture alone
-        look = self._see_through(material, uses.get("map_d"), ImportedSurface(color, texture))
         look = replace(
-            look,
+            self._see_through(material, uses.get("map_d"), ImportedSurface(color, texture, name=material.name)),
             roughness=self._share(material, "pr", uses.get("map_pr"), name, square),
             metallic=self._share(material, "pm", uses.get("map_pm"), name, square),
-            normal_map=self._bumps(material, uses),
+            normal_map=self._bumps(uses),
             emission=self._glow(material, uses.get("map_ke")),
-            name=material.name,
         )
-        if first is None:
-            return Painted(look)
-        clamped = any(use.options.get("clamp", "").lower() == "on" for use in uses.values())
+        clamped = bool(first.name) and any(use.options.get("clamp", "").lower() == "on" for use in uses.values())
         return Painted(look, first.scale, first.offset, clamped)
 
-    def _list(self, material: MtlMaterial) -> None:
+    def _list(self, material: mtl.MtlMaterial) -> None:
         """Put what is not read into the inventory; what is there by default, and changes nothing, is not in it."""
-        said = {key: without_comment(rest) for key, rest in material.statements.items()}
-        zero = {key for key in said if not any(numbers_of(material.numbers(key)) or [1.0])}
+        said = {key: mtl.without_comment(rest) for key, rest in material.statements.items()}
+        zero = {key for key in said if not any(mtl.numbers_of(material.numbers(key)) or [1.0])}
         for key in material.again:
             self.notes.has("earlier material statement", key)
         if len(material.numbers("kd").split()) == 4:
             self.notes.has("fourth number of", material.spelled["kd"])
-        base = map_of(said.get("map_kd", ""))
+        base = mtl.map_of(said.get("map_kd", ""))
         for key, rest in said.items():
-            use = map_of(rest)
+            use = mtl.map_of(rest)
             quiet = key in READ or key in QUIET or key in zero or (key == "pcr" and "pc" in zero)
             quiet |= key == "tf" and len(set(rest.split())) == 1
             quiet |= key == "map_ka" and use is not None and base is not None and use.name == base.name
             if key == "illum" and material.numbers(key) not in ("", "0", "1", "2"):
                 self.notes.has("illumination model", rest)
             elif not quiet:
-                self.notes.has(STATEMENT, material.spelled[key])
+                self.notes.has("material statement", material.spelled[key])
 
-    def _use(self, material: MtlMaterial, key: str) -> MapUse | None:
+    def _use(self, material: mtl.MtlMaterial, key: str) -> mtl.MapUse | None:
         """Return what a statement says that names a picture, and put options that are not read into the inventory."""
-        if (id(material), key) not in self._uses:
-            self._uses[id(material), key] = self._new_use(material, key)
-        return self._uses[id(material), key]
-
-    def _new_use(self, material: MtlMaterial, key: str) -> MapUse | None:
+        if (id(material), key) in self._uses:
+            return self._uses[id(material), key]
         rest = material.statements.get(key, "")
-        use = map_of(without_comment(rest))
-        whole = map_of(rest)
+        use, whole = mtl.map_of(mtl.without_comment(rest)), mtl.map_of(rest)
         if whole is not None and whole != use and isinstance(self.references.tried(whole.name), bytes):
             use = whole  # the # belongs to the name
+        self._uses[id(material), key] = use
+        taken = ("s", "o", "mm", "clamp", "bm" if key in NORMALS else "imfchan")
+        colors = key in ("map_kd", "map_ke")
         for option, value in {} if use is None else use.options.items():
-            taken = {
-                "s",
-                "o",
-                "mm",
-                "clamp",
-                *(["bm"] if key in NORMALS else []),
-                *([] if key in NORMALS else ["imfchan"]),
-            }
-            colors = key in ("map_kd", "map_ke")
             if option == "colorspace":
                 quiet = value.lower() == ("srgb" if colors else "linear")
             elif option == "imfchan" and colors:
                 quiet = False
             else:
-                quiet = option in taken or value.lower() == DEFAULTS.get(option) or not any(numbers_of(value) or [1.0])
+                quiet = (
+                    option in taken or value.lower() == DEFAULTS.get(option) or not any(mtl.numbers_of(value) or [1.0])
+                )
             if not quiet:
                 self.notes.has("texture option", f"-{option} of {material.spelled[key]}")
         return use
 
-    def _texture(self, material: MtlMaterial, use: MapUse | None, color: Floats | None) -> Floats | None:
+    def _texture(self, material: mtl.MtlMaterial, use: mtl.MapUse | None, color: Floats | None) -> Floats | None:
         """Return the base colour texture. It stands alone: a Kd beside it is an exporter's default more often than a
-        tint. Warn where it cannot be had."""
-        if use is None:
+        tint."""
+        instead = f"{instead_of_texture(color)} is used instead"
+        words = f"{material.file} names the texture {{name}}, which {{why}}; {instead}"
+        picture = self._picture(use, "colours and alpha", words)
+        if use is None or picture is None:
             return None
-        found = self._picture(use, "colours and alpha")
-        if isinstance(found, np.ndarray):
-            if found[:, :, 3].min() < 1.0 and "map_d" not in material.statements:
-                self.notes.say(f"the alpha of {shown(use.name)} is left out: no map_d makes it an opacity")
-            return np.ascontiguousarray(found[:, :, :3])
-        plain = color is None or bool((color > 0.999).all())
-        instead = (
-            "neutral grey" if color is None or plain else f"its base colour ({', '.join(f'{c:.2f}' for c in color)})"
-        )
-        where = f"{material.file} names the texture {shown(use.name)}"
-        self.notes.say(f"{where}, which {found}; {instead} is used instead")
-        return None
+        if picture[:, :, 3].min() < 1.0 and "map_d" not in material.statements:
+            self.notes.say(f"the alpha of {shown(use.name)} is left out: no map_d makes it an opacity")
+        return np.ascontiguousarray(picture[:, :, :3])
 
-    def _see_through(self, material: MtlMaterial, use: MapUse | None, surface: ImportedSurface) -> ImportedSurface:
+    def _see_through(
+        self, material: mtl.MtlMaterial, use: mtl.MapUse | None, surface: ImportedSurface
+    ) -> ImportedSurface:
         """Give a surface its opacity: ``d``, a number, or ``Tr``, and ``map_d``, a picture."""
-        factor, map = self._opacity(material), None
-        if use is not None:
-            found = self._picture(use, "colours and alpha")
-            if isinstance(found, np.ndarray):
-                map = _channel(found, use)
-            else:
-                self.notes.say(f"the opacity {shown(use.name)} {found}; it is opaque instead")
-        if map is None and factor == 1.0:
+        factor = self._opacity(material)
+        picture = self._picture(use, "colours and alpha", "the opacity {name} {why}; it is opaque instead")
+        if picture is None and factor == 1.0:
             return surface
         share, color, texture = np.array([factor], np.float32), surface.color, surface.texture
-        if map is None and color is None and texture is None:
-            color = np.full(3, NEUTRAL, np.float32)
-        if map is not None:
-            plain = np.full(3, NEUTRAL, np.float32) if color is None else color
-            texture = np.broadcast_to(plain, (*map.shape, 3)) if texture is None else texture
+        plain = np.full(3, NEUTRAL, np.float32) if color is None else color
+        if use is None or picture is None:
+            color = plain if texture is None else color
+        else:
+            opacity = _channel(picture, use)
+            texture = np.broadcast_to(plain, (*opacity.shape, 3)) if texture is None else texture
             size = (texture.shape[1], texture.shape[0])
-            fitted = np.asarray(Image.fromarray(map).resize(size, Image.Resampling.BILINEAR))
+            fitted = np.asarray(Image.fromarray(opacity).resize(size, Image.Resampling.BILINEAR))
             texture = np.concatenate([texture, fitted[:, :, None]], axis=2)
         return replace(surface, color=with_opacity(color, share, None), texture=with_opacity(texture, share, None))
 
-    def _opacity(self, material: MtlMaterial) -> float:
+    def _opacity(self, material: mtl.MtlMaterial) -> float:
         """Return ``d``, or 1 - ``Tr`` where there is none; some programs write Tr for d."""
         if "-halo" in material.numbers("d").lower().split():
             self.notes.has("option", "-halo of d")
-        opacity, clear = share_of(material.numbers("d"), -1.0), share_of(material.numbers("tr"), -1.0)
+        opacity, clear = mtl.share_of(material.numbers("d"), -1.0), mtl.share_of(material.numbers("tr"), -1.0)
         what = f"the material {shown(material.name)} has Tr {clear:g}"
         if opacity >= 0.0:
             if clear >= 0.0 and min(abs(clear - opacity), abs(1.0 - clear - opacity)) > 0.01:
@@ -281,66 +235,59 @@ class MtlReader:
             )
         return 1.0 - max(clear, 0.0)
 
-    def _share(self, material: MtlMaterial, key: str, use: MapUse | None, name: str, square: int) -> float | None:
+    def _share(
+        self, material: mtl.MtlMaterial, key: str, use: mtl.MapUse | None, name: str, square: int
+    ) -> float | None:
         """Return a roughness or metallic: the mean of its map over the faces that show it, or else its number; None
         where there is neither."""
-        if use is not None:
-            found = self._picture(use, "numbers")
-            if isinstance(found, np.ndarray):
-                self.notes.say("textures of roughness and metallic are replaced by their means")
-                uvs, areas = self.shown_on(name, square)
-                return float(mean_over(_channel(found, use)[:, :, None], uvs * use.scale + use.offset, areas)[0])
-            self.notes.say(f"{material.spelled[f'map_{key}']} {shown(use.name)} {found}; it is left out")
-        rest = material.numbers(key)
-        value = share_of(rest, -1.0)
+        words = f"{material.spelled.get(f'map_{key}')} {{name}} {{why}}; it is left out"
+        picture = self._picture(use, "numbers", words)
+        if use is not None and picture is not None:
+            self.notes.say("textures of roughness and metallic are replaced by their means")
+            uvs, areas = self.shown_on(name, square)
+            return float(mean_over(_channel(picture, use)[:, :, None], uvs * use.scale + use.offset, areas)[0])
+        value = mtl.share_of(material.numbers(key), -1.0)
         return value if value >= 0.0 else None
 
-    def _bumps(self, material: MtlMaterial, uses: dict[str, MapUse]) -> Floats | None:
+    def _bumps(self, uses: dict[str, mtl.MapUse]) -> Floats | None:
         """Return the normal map: ``norm``, or ``map_Bump`` or ``bump`` where these hold normals."""
-        for key in NORMALS:
-            use = uses.get(key)
-            if use is None:
-                continue
-            picture = self._picture(use, "numbers")
-            if isinstance(picture, np.ndarray):
+        words = "the normal map {name} {why}; it is left out"
+        for key, use in ((key, uses[key]) for key in NORMALS if key in uses):
+            picture = self._picture(use, "numbers", words)
+            if picture is not None:
                 if key in ("norm", "map_kn") or holds_normals(picture):
                     return normal_map(picture, use.bump)
-                picture = "holds heights, and no normals"
-            self.notes.say(f"the normal map {shown(use.name)} {picture}; it is left out")
+                self._pictures.lacks(use.name, "holds heights, and no normals", words)
         return None
 
-    def _glow(self, material: MtlMaterial, use: MapUse | None) -> Floats | None:
+    def _glow(self, material: mtl.MtlMaterial, use: mtl.MapUse | None) -> Floats | None:
         """Return the radiance that is said by ``Ke`` and ``map_Ke``; where there are both, their product."""
         rest = material.numbers("ke")
-        factor, picture = radiance_of(rest), None
+        factor = mtl.radiance_of(rest)
         if factor is None:
             self.notes.say(f"the emission {shown(rest)} is no colour; it is left out")
             return None
-        if use is not None:
-            found = self._picture(use, "colours")
-            if not isinstance(found, np.ndarray):
-                self.notes.say(f"the texture {shown(use.name)} of the emission {found}; it is left out")
-                return None
-            picture, factor = found, factor if factor.any() else np.ones(3)
-        radiance, cut = limited_radiance(factor, picture)
-        if cut is not None:
-            self.notes.say(f"{cut}")
-        return radiance
+        picture = self._picture(use, "colours", "the texture {name} of the emission {why}; it is left out")
+        if use is not None and picture is None:
+            return None
+        if use is not None and not factor.any():
+            factor = np.ones(3)
+        return limited_radiance(factor, picture, self.notes)
 
-    def _picture(self, use: MapUse, kind: Kind) -> Floats | str:
-        """Return a picture's values with its ``-mm`` applied, or why they cannot be had."""
-        if self._pictures is None:
-            self._pictures = Pictures(len(self._materials), self.references, self.notes)
-        if (use.name, kind) not in self._read:
-            self._read[use.name, kind] = self._pictures.of_file(use.name, kind)
-        found, (base, gain) = self._read[use.name, kind], use.range
-        if isinstance(found, str) or (base, gain) == (0.0, 1.0):
-            return found
-        colors = np.clip(found[:, :, :3] * np.float32(gain) + np.float32(base), 0.0, 1.0)
-        return np.concatenate([colors, found[:, :, 3:]], axis=2)
+    @cached_property
+    def _pictures(self) -> FilePictures:
+        return FilePictures(len(self._materials), self.references, self.notes)
+
+    def _picture(self, use: mtl.MapUse | None, kind: Kind, words: str) -> Floats | None:
+        """Return a picture's values with its ``-mm`` applied; None where there is none, or it cannot be had."""
+        picture = None if use is None else self._pictures.of_file(use.name, kind, words)
+        if use is None or picture is None or use.range == (0.0, 1.0):
+            return picture
+        base, gain = map(np.float32, use.range)
+        return np.concatenate([np.clip(picture[:, :, :3] * gain + base, 0.0, 1.0), picture[:, :, 3:]], axis=2)
 
 
-def _channel(picture: Floats, use: MapUse) -> Floats:
+def _channel(picture: Floats, use: mtl.MapUse) -> Floats:
     """Return the (H, W) values that a picture holds for a map of numbers: of the channel that ``-imfchan`` names, or
     else its alpha, or its grey where it has none."""
     number = CHANNELS.get(use.options.get("imfchan", "").lower())
@@ -358,23 +305,18 @@ def libraries_of(rests: Sequence[str], references: References) -> list[str]:
     """
     names: list[str] = []
     for rest in rests:
-        plain = without_comment(rest)
+        plain = mtl.without_comment(rest)
         for line in (rest, plain):
             if isinstance(references.tried(line), bytes):
                 names.append(line)
                 break
         else:
-            parts = _split(plain)
+            parts, name = list[str](), ""
+            for word in plain.split():
+                name = f"{name} {word}".strip()
+                if word.strip('"').lower().endswith(".mtl"):
+                    parts, name = [*parts, name], ""
+            parts += name.split()
             ended = all(part.strip('"').lower().endswith(".mtl") for part in parts)
             names += parts if ended or any(isinstance(references.tried(part), bytes) for part in parts) else [plain]
-    return list(dict.fromkeys(one for one in names if one))
-
-
-def _split(line: str) -> list[str]:
-    names, name = [], ""
-    for word in line.split():
-        name = f"{name} {word}".strip()
-        if word.strip('"').lower().endswith(".mtl"):
-            names.append(name)
-            name = ""
-    return [*names, *name.split()]
+    return list(dict.fromkeys(filter(None, names)))

@@ -23,7 +23,7 @@ from scipy.spatial import ConvexHull, QhullError
 from advsearch.errors import FileFormatError, InputError
 from advsearch.files import MESHES
 from advsearch.pictures import without_pillows_limit
-from advsearch.scene.assets import Doubles, Floats, Material, Mesh, ObjectAsset, UpAxis, normalised
+from advsearch.scene.assets import Doubles, Floats, Material, Mesh, ObjectAsset, UpAxis, grouped, normalised
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.importing import gltf, gltf_left_out
 from advsearch.scene.importing.blender import read_mesh_bytes
@@ -38,7 +38,6 @@ from advsearch.scene.importing.wavefront import read_obj
 from advsearch.scene.sizes import LARGEST, SMALLEST
 
 Attributes = npt.NDArray[np.uint16]
-
 _FACET = np.dtype([("normal", "<f4", 3), ("vertices", "<f4", (3, 3)), ("attribute", "<u2")])
 _VERTEX = re.compile(rb"\bvertex\s+(\S+)\s+(\S+)\s+(\S+)", re.IGNORECASE)
 _NAMED = re.compile(rb"^[ \t]*(?:end[ \t]?)?solid\b(?:(?!facet\s+normal)[^\n])*", re.IGNORECASE | re.MULTILINE)
@@ -47,11 +46,8 @@ _OWN = 0x8000
 
 
 def read_stl(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
-    """Read an STL file as one part; its facet normals are made anew, as every program does.
-
-    Raises:
-        FileFormatError: it is damaged, or has no facets.
-    """
+    """Read an STL file as one part; its facet normals are made anew, as every program does. Raises FileFormatError: it
+    is damaged, or has no facets."""
     promised = 84 + 50 * struct.unpack_from("<I", data, 80)[0] if len(data) >= 84 else 84
     colors = None
     if len(data) == promised:
@@ -114,108 +110,71 @@ def _colors(head: bytes, attributes: Attributes, notes: Notes) -> Doubles | None
             if attributes.any():
                 notes.has("attribute bytes of its facets, which are no colours known here,", f"{attributes.max():#06x}")
             return None
-    found = np.where(own[:, None], bits, plain).astype(np.float32)
-    return np.asarray(srgb_to_linear(found), dtype=np.float64)
+    display = np.where(own[:, None], bits, plain).astype(np.float32)
+    return np.asarray(srgb_to_linear(display), dtype=np.float64)
 
 
 GLTF = (".glb", ".gltf", ".vrm", ".blend", *USD)
 """Endings of glTF files, which have conventions of their own: y up, linear colours; and of what is read as glTF."""
-
 Reader = Callable[[Path, bytes, Notes], list[ImportedPart]]
 """From a file, its content and what is said of it to its parts that have faces; raises as `read_parts`."""
-
 READERS: dict[str, Reader] = {".obj": read_obj, ".ply": read_ply, ".stl": read_stl, **dict.fromkeys(GLTF, read_gltf)}
 """Readers by the endings of files."""
 
 
 def read_parts(path: Path, data: bytes) -> tuple[list[ImportedPart], list[str]]:
-    """Parse a mesh file.
-
-    Args:
-        path: the file; its ending names the format, and files that it refers to are looked up beside it.
-        data: its content.
-
-    Returns:
-        The parts that have faces (at least one), always in the same order, and the warnings.
-
-    Raises:
-        FileFormatError: the file is damaged, not a mesh, refers to missing geometry, or has no faces.
-    """
+    """Return the parts of a mesh file that have faces (at least one), always in the same order, and the warnings. Its
+    ending names the format, and files that it refers to are looked up beside it. Raises FileFormatError: it is damaged,
+    not a mesh, refers to missing geometry, or has no faces."""
     with warnings.catch_warnings(), np.errstate(all="ignore"), without_pillows_limit():
         warnings.simplefilter("ignore")
         notes = Notes(path.name)
         return READERS[path.suffix.lower()](path, data, notes), list(notes)
 
 
-MOST_WARNINGS = 20
-"""Warnings about one file."""
+MOST_WARNINGS = 20  # warnings about one file
 
 
 def import_object(path: str | PathLike[str], *, up: Literal["y", "z"] | None = None) -> ObjectAsset:
-    """Read an object from a mesh file, repaired, normalised and with a texture.
+    """Read an object from a mesh file, one of `advsearch.files.MESHES`, with the files beside it that it refers to;
+    `up` is the axis that points up in it, None for what the format or else the shape says.
 
-    - All geometry in the file is joined, with the transforms of its scene graph.
-    - Axes: y up for .glb and .gltf, as their specification says; for the formats that leave it open, the axis along
-      which the object stands best (`guess_up`); `up` overrides. y up is turned to z up by 90 degrees about x. Then the
-      object is scaled to a largest extent of 1 and set on z = 0.
+    What becomes of materials, units and axes is in docs/scenes.md ("Your own object"). The geometry is repaired:
+
+    - All of it is joined, with the transforms of the file's scene graph, turned z up by 90 degrees about x where it is
+      y up, scaled to a largest extent of 1 and set on z = 0.
     - Faces without area are removed, the winding is made consistent, closed shells that are inside out are turned over.
     - Normals are the file's; where it has none, or they contradict the faces, they are computed: smooth, with creases
       where faces meet at more than 40 degrees; flat in glTF.
     - UVs are the file's, moved into [0, 1] where that takes little. Where it has none, where they repeat a texture or
-      are squashed, and where there are several materials, xatlas makes new ones and the colours are baked into a map.
-    - Base colour: the material's texture (averaged down to at most 1024 texels on its long side, with a warning;
-      alpha is opacity where a glTF material says so), otherwise its colour, otherwise vertex or face colours, otherwise
-      grey of display-referred 0.5. A glTF texture is multiplied by its linear factor. The ``Kd`` of an .mtl
-      is taken as display-referred, multiplied by the colours of vertices, and ignored beside a ``map_Kd``. Where a
-      texture is missing, the colour takes its place, or grey if that is plain white, with a warning.
-    - Emission is that of glTF, and of an .mtl ``Ke`` and ``map_Ke``: linear radiance on the front of the faces.
-    - The normal map of glTF, and of an .mtl ``norm``, ``map_Bump`` or ``bump`` that holds normals; where textures are
-      baked, it is turned to the new texture coordinates.
-    - Roughness and metallic are those of glTF, and of an .mtl ``Pr`` and ``Pm`` where given, their mean over several
-      materials, and else `Material`'s.
-    - Parts with an opacity of 0 everywhere are left out, with a warning, unless the whole object is so.
-    - What else a file has is named in the warnings.
+      are squashed, and where there are several materials, xatlas makes new ones and the pictures are baked into maps.
 
-    - glTF is in metres, which gives the object its size; the other formats leave the unit open.
-
-    The same file gives the same bytes every time.
-
-    Args:
-        path: a file that ends in one of `advsearch.files.MESHES`; files that it refers to are looked up beside it.
-        up: the axis that points up in the file; None for what the format or else the shape says.
-
-    Raises:
-        FileFormatError: the file is missing, of another kind, damaged, or holds no faces; the message names it.
-        InputError: `up` is neither, or the geometry has NaN, infinite, or coincident vertices only.
+    What is left out or changed is named in the warnings. The same file gives the same bytes every time. Raises
+    FileFormatError: the file is missing, of another kind, damaged, or holds no faces; the message names it. Raises
+    InputError: `up` is neither, or the geometry has NaN, infinite, or coincident vertices only.
     """
     if up not in (None, "y", "z"):
         raise InputError(f"up axis: expected 'y' or 'z', got {up!r}")
     file = Path(path)
     data = read_mesh_bytes(file, "object", MESHES)
     parts, notes = read_parts(file, data)
-    rest = gltf_left_out.beside(gltf.read_header(file, data)) if file.suffix.lower() in GLTF else None
-    notes += [] if rest is None else [file.name + rest]
+    notes += gltf_left_out.beside(gltf.read_header(file, data), file.name) if file.suffix.lower() in GLTF else []
     return object_of(parts, notes, file, safe_name(file), up)
 
 
 def object_of(parts: list[ImportedPart], notes: list[str], file: Path, name: str, up: str | None) -> ObjectAsset:
-    """Return the object that some parts of a file make up; see `import_object`.
-
-    Args:
-        parts: at least one.
-        notes: warnings about them so far.
-        file: where they are from.
-        name: of the object.
-        up: the axis that points up in the file; None for what the format or else the shape says.
-
-    Raises:
-        InputError: the geometry has NaN, infinite, or coincident vertices only.
-    """
+    """Return the object of that name which some parts of a file, at least one, make up; `notes` are warnings about them
+    so far, and `up` as in `import_object`. Raises InputError: the geometry has NaN, infinite, or coincident vertices
+    only."""
     seen = visible(parts)
     clear = ", ".join(dict.fromkeys(shown(part.surface.name or "a part") for part in parts if part not in seen))
     cleared = [f"all light passes through {clear} (opacity 0): left out; give it an opacity to see it"] if clear else []
-    parts = seen
-    soup, axis = _upright(parts, file, up)
+    parts, gltf_file = seen, file.suffix.lower() in GLTF
+    known = up or ("y" if gltf_file else None)
+    soup = join(parts, str(file), y_up=known == "y")
+    axis = guess_up(soup.points[np.unique(soup.faces)], file.name) if known is None else UpAxis(known)
+    if known is None and axis.axis == "y":
+        soup = join(parts, str(file), y_up=True)
     soup, repairs = repaired(soup, str(file))
     surfaces = [part.surface for part in parts]
     soup, maps, bakes = textured(soup, surfaces)
@@ -224,79 +183,59 @@ def object_of(parts: list[ImportedPart], notes: list[str], file: Path, name: str
         opacity, bakes = None, [*bakes, "it is transparent all over; it is shown opaque"]
     material, blends = _material(soup, surfaces)
     warnings = [*notes, *(f"{file.name}: {note}" for note in cleared + repairs + bakes + blends)]
+    if (more := len(warnings) - MOST_WARNINGS) > 0:
+        warnings = [*warnings[:MOST_WARNINGS], f"{file.name}: {more:,} more warnings are left out"]
     extent = extent_of(parts) * float(np.ptp(soup.points[soup.faces].reshape(-1, 3), axis=0).max())
-    kept = warnings[:MOST_WARNINGS]
-    more = len(warnings) - len(kept)
     return ObjectAsset(
         name=name,
         mesh=_mesh(soup, surfaces, file, parts, UPRIGHT if axis.axis == "y" else np.eye(3)),
         base_color=np.ascontiguousarray(maps.color[:, :, :3]),
         material=material,
         source=str(file),
-        warnings=(*kept, *([f"{file.name}: {more:,} more warnings are left out"] if more else [])),
+        warnings=tuple(warnings),
         up=axis,
         opacity=opacity,
         normal_map=maps.normals,
         emission=_let_out(maps.emission, opacity),
-        metres=extent if file.suffix.lower() in GLTF and SMALLEST <= extent <= LARGEST else None,
+        metres=extent if gltf_file and SMALLEST <= extent <= LARGEST else None,
         extent=extent,
     )
 
 
 def _mesh(soup: Soup, surfaces: list[ImportedSurface], file: Path, parts: list[ImportedPart], upright: Doubles) -> Mesh:
     names, number = by_material(soup, surfaces)
-    faces = np.split(np.argsort(number, kind="stable"), np.cumsum(np.bincount(number, minlength=len(names)))[:-1])
-    materials = {name: group for name, group in zip(names, faces, strict=True) if name and len(group)}
+    materials = {name: faces for name, faces in zip(names, grouped(number), strict=False) if name and len(faces)}
     try:
         mesh, stored = assemble(soup)
-        made = replace(normalised(mesh), materials=materials)
+        standing = replace(normalised(mesh), materials=materials)
     except InputError as error:  # which knows of no file
         raise InputError(f"{file}: {error}") from None
-    moving = [part.movable for part in parts if part.movable is not None]
     if stored is None:
-        return made
+        return standing
     from advsearch.scene.rigged import SkeletonRig  # torch takes seconds, and most have no joints
 
+    moving = [part.movable for part in parts if part.movable is not None]
     size = extent_of(parts) * float(np.ptp(mesh.vertices.astype(np.float64), axis=0).max())
-    return replace(made, rig=SkeletonRig(moving, stored, upright / size))
+    return replace(standing, rig=SkeletonRig(moving, stored, upright / size))
 
 
 def _let_out(emission: Floats | None, opacity: Floats | None) -> Floats | None:
     """Return the radiance (H, W, 3) of what is not cut out; None where it is dark."""
     if emission is None or opacity is None:
         return emission
-    sizes = [(one.shape[1], one.shape[0]) for one in (emission, opacity)]
-    width, height = max(sizes)
+    (rows, columns), (height, width) = emission.shape[:2], opacity.shape
+    width, height = max((columns, rows), (width, height))
     share = np.asarray(Image.fromarray(opacity).resize((width, height), Image.Resampling.BILINEAR))[:, :, None]
-    columns, rows = ((np.arange(n) * m) // n for n, m in ((width, sizes[0][0]), (height, sizes[0][1])))
-    found = np.asarray(emission[rows][:, columns] * share, np.float32)
-    return found if found.any() else None
-
-
-def _upright(parts: list[ImportedPart], file: Path, up: str | None) -> tuple[Soup, UpAxis]:
-    """Return the joined parts, z up, and the axis of the file that was taken for up."""
-    if up is None and file.suffix.lower() in GLTF:
-        up = "y"
-    soup = join(parts, str(file), y_up=up == "y")
-    if up is not None:
-        return soup, UpAxis(up)
-    guess = guess_up(soup.points[np.unique(soup.faces)], file.name)
-    return (soup if guess.axis == "z" else join(parts, str(file), y_up=True)), guess
+    enlarged = emission[np.arange(height) * rows // height][:, np.arange(width) * columns // width]
+    radiance = np.asarray(enlarged * share, np.float32)
+    return radiance if radiance.any() else None
 
 
 def _material(soup: Soup, surfaces: list[ImportedSurface]) -> tuple[Material, list[str]]:
     """Return the mean of the parts' roughness and metallic, weighted by area, and a warning where they differ."""
     area = np.bincount(soup.part, weights=np.linalg.norm(soup.face_vectors(), axis=1), minlength=len(surfaces))
-    default = Material()
-    values = np.array(
-        [
-            [
-                default.roughness if surface.roughness is None else surface.roughness,
-                default.metallic if surface.metallic is None else surface.metallic,
-            ]
-            for surface in surfaces
-        ]
-    )
+    looks = [Material().with_values(vars(surface), "") for surface in surfaces]
+    values = np.array([[look.roughness, look.metallic] for look in looks])
     same = bool((values[area > 0] == values[area > 0][0]).all())
     roughness, metallic = values[area > 0][0] if same else (values * area[:, None]).sum(axis=0) / area.sum()
     means = f"{roughness:.2g} and {metallic:.2g}"
@@ -306,25 +245,20 @@ def _material(soup: Soup, surfaces: list[ImportedSurface]) -> tuple[Material, li
 
 TOUCHING = 0.02
 """Height, as a share of the largest extent, up to which a vertex touches the ground: feet and scans are uneven."""
-CLEAR = 1.1
-"""The shares of two axes differ by more than this factor, or the shape does not tell which one is up."""
+CLEAR = 1.1  # the shares of two axes differ by more than this factor, or the shape does not tell which one is up
 
 
 def guess_up(points: Doubles, name: str) -> UpAxis:
-    """Return the axis that points up, y or z, by the shape alone; z where that does not tell.
+    """Return the axis that points up, y or z, by the shape of vertices (P, 3) alone; z where that does not tell.
 
     What stands on a table touches it with a large part of what it covers, seen from above: the foot of a vase, the four
     wheels of a car. Lying on its side it touches with less. Of 39 meshes of several authors and the bundled objects,
     each written with y and with z up, it takes the right axis for all that can stand in only one way.
-
-    Args:
-        points: (P, 3) vertices of faces, finite.
-        name: the file's, for the sentence.
     """
     shares = {"y": touching_share(points[:, [2, 0, 1]]), "z": touching_share(points)}
     axis, other = ("y", "z") if shares["y"] > CLEAR * shares["z"] else ("z", "y")
     if shares[axis] > CLEAR * shares[other]:
-        on = (f"{100 * shares[one]:.0f} %" for one in (axis, other))
+        on = (f"{100 * shares[way]:.0f} %" for way in (axis, other))
         why = "it then rests on {} of what it covers, seen from above, and on {} otherwise".format(*on)
     else:
         why = "its shape does not tell, as it rests as well either way"
@@ -332,10 +266,8 @@ def guess_up(points: Doubles, name: str) -> UpAxis:
 
 
 def touching_share(points: Doubles) -> float:
-    """Return which share, in [0, 1], of what an object covers from above (along its third axis) touches the ground.
-
-    Both are areas of convex hulls.
-    """
+    """Return which share, in [0, 1], of what an object covers from above (along its third axis) touches the ground:
+    areas of convex hulls."""
     height = points[:, 2] - points[:, 2].min()
     touching = height <= TOUCHING * np.ptp(points, axis=0).max()
     covered = _hull_area(points[:, :2])

@@ -40,17 +40,13 @@ SAID = {
         (".png", ".jpg", ".jpeg", ".webp", ".hdr", ".exr"),
     ),
 }
-
 CAMERAS = {
     ".bin": "COLMAP's binary cameras: write them as text, colmap model_converter --input_path FOLDER --output_path "
     "FOLDER --output_type TXT, and give cameras.txt",
     ".npz": "NumPy's arrays: write them as JSON, with image_width, image_height, camera_matrix and "
     "distortion_coefficients (numpy.ndarray.tolist)",
 }
-CAMERAS |= {
-    ".npy": CAMERAS[".npz"],
-    ".pkl": CAMERAS[".npz"].replace("NumPy's arrays", "a pickle, which may run code"),
-}
+CAMERAS |= {".npy": CAMERAS[".npz"], ".pkl": CAMERAS[".npz"].replace("NumPy's arrays", "a pickle, which may run code")}
 """What files of cameras are that are not read, and what to do."""
 
 
@@ -65,19 +61,17 @@ def advice(path: Path) -> str | None:
             steps = f"bpy.ops.wm.read_factory_settings(use_empty=True); {operator}(filepath={json.dumps(name)})"
             script = f"import bpy; {steps}; bpy.ops.export_scene.gltf(filepath={json.dumps(f'{path.stem}.glb')})"
             return f"{what}: make glTF of it, with Blender: blender -b --python-expr {shlex.quote(script)}"
+    file, obj, stl, glb = map(shlex.quote, (name, *(f"{path.stem}.{kind}" for kind in ("obj", "stl", "glb"))))
     for what, suffixes in ASSIMP_READS.items():
         if ending in suffixes:
-            names = " ".join(map(shlex.quote, (name, f"{path.stem}.obj")))
-            return f"{what}: make an .obj of it, with assimp (Open Asset Import Library): assimp export {names}"
+            return f"{what}: make an .obj of it, with assimp (Open Asset Import Library): assimp export {file} {obj}"
     if ending in (".step", ".stp", ".iges", ".igs", ".brep"):
-        names = f"{shlex.quote(name)} -2 -o {shlex.quote(f'{path.stem}.stl')}"
-        return f"a CAD model without triangles: mesh it, with Gmsh: gmsh {names}"
+        return f"a CAD model without triangles: mesh it, with Gmsh: gmsh {file} -2 -o {stl}"
     if ending == ".ifc":
-        return f"a building (IFC): make glTF of it: IfcConvert {shlex.quote(name)} {shlex.quote(f'{path.stem}.glb')}"
+        return f"a building (IFC): make glTF of it: IfcConvert {file} {glb}"
     if ending == ".b3dm":
-        names = f"-i {shlex.quote(name)} -o {shlex.quote(f'{path.stem}.glb')}"
-        return f"a tile of 3D Tiles: take its glTF out: npx 3d-tiles-tools b3dmToGlb {names}"
+        return f"a tile of 3D Tiles: take its glTF out: npx 3d-tiles-tools b3dmToGlb -i {file} -o {glb}"
     if ending == ".bin":
-        beside = sorted(one.name for one in path.parent.glob("*.gltf"))[:1] if path.parent.is_dir() else []
+        beside = sorted(other.name for other in path.parent.glob("*.gltf"))[:1] if path.parent.is_dir() else []
         return f"a buffer, as a .gltf file has beside it: name that file{f', {beside[0]}' if beside else ''}"
     return next((f"{what}: {said}" for what, (said, endings) in SAID.items() if ending in endings), None)

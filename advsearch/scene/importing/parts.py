@@ -7,36 +7,29 @@ convention).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import distance_transform_edt
 
-from advsearch.scene.assets import Doubles, Floats, Ints
+from advsearch.scene.assets import Bools, Doubles, Floats, Ints, grouped
 from advsearch.scene.color import srgb_to_linear
+from advsearch.scene.importing.files import Notes
 from advsearch.scene.skeleton import Movable
 
-FLAT = np.array([0.5, 0.5, 1.0], np.float32)
-"""The texel of a normal map that changes nothing."""
-LARGEST_SCALE = 100.0
-"""Larger factors of x and y make no visible difference."""
-LOWEST = 0.01
-"""Least z of a normal before it is scaled to length 1: it points out of the surface."""
-BLUE = 0.1
-"""How much bluer than red a normal map is, on average; a grey map of heights is not."""
+FLAT = np.array([0.5, 0.5, 1.0], np.float32)  # the texel of a normal map that changes nothing
+LARGEST_SCALE = 100.0  # larger factors of x and y make no visible difference
+LOWEST = 0.01  # least z of a normal before it is scaled to length 1: it points out of the surface
+BLUE = 0.1  # how much bluer than red a normal map is, on average; a grey map of heights is not
 LENGTH, MOSTLY = 0.2, 0.9
 """By how much the length of a normal in a picture is off 1 at most, and of what share of the texels that is asked."""
 
 
 def normal_map(picture: Floats, scale: float = 1.0) -> Floats:
-    """Return a normal map (H, W, 3) with unit normals that point out of the surface.
-
-    Args:
-        picture: (H, W, 3) in [0, 1], its values as they are in the file.
-        scale: factor of x and y, finite.
-    """
+    """Return a normal map (H, W, 3) with unit normals that point out of the surface, of a picture (H, W, 3) in [0, 1]
+    as it is in the file and a finite factor of x and y."""
     factor = min(max(scale, -LARGEST_SCALE), LARGEST_SCALE)
     normals = picture * 2.0 - 1.0
     normals[..., :2] *= factor
@@ -60,43 +53,35 @@ def texels_of(normals: npt.NDArray[np.floating]) -> Floats:
     return np.asarray(unit * 0.5 + 0.5, dtype=np.float32)
 
 
-NEUTRAL = 0.5
-"""Display-referred grey of an object without material."""
-
-
-BRIGHTEST = 1e5
-"""Largest radiance that a surface may emit; white in the light of a bundled environment is about 1."""
+NEUTRAL = 0.5  # display-referred grey of an object without material
+BRIGHTEST = 1e5  # largest radiance that a surface may emit; white in the light of a bundled environment is about 1
 
 
 @dataclass(frozen=True, eq=False)
 class ImportedSurface:
-    """What a part looks like; every colour is display-referred sRGB in [0, 1].
+    """What a part looks like; colours are display-referred sRGB in [0, 1], and pictures have row 0 on top. None is what
+    the file does not give."""
 
-    Attributes:
-        color: (3,) float32 base colour where there is no texture; None when the file gives none. Where light passes
-            through the part, (4,) with its opacity in [0, 1].
-        texture: (H, W, 3) float32 base colour, row 0 on top, or (H, W, 4) with the opacity; or None.
-        roughness: in [0, 1], or None when the file gives none.
-        metallic: in [0, 1], or None when the file gives none.
-        normal_map: (H, W, 3) float32 of this module, row 0 on top; or None.
-        emission: (H, W, 3) float32 linear radiance, row 0 on top; (1, 1, 3) where it is the same everywhere, None where
-            there is none.
-        name: of the material in the file; empty where it has none.
-    """
-
-    color: Floats | None = None
-    texture: Floats | None = None
-    roughness: float | None = None
-    metallic: float | None = None
-    normal_map: Floats | None = None
-    emission: Floats | None = None
-    name: str = ""
+    color: Floats | None = None  # (3,) base colour where there is no texture; (4,) with its opacity in [0, 1]
+    texture: Floats | None = None  # (H, W, 3) base colour, or (H, W, 4) with the opacity
+    roughness: float | None = None  # in [0, 1]
+    metallic: float | None = None  # in [0, 1]
+    normal_map: Floats | None = None  # (H, W, 3) of this module
+    emission: Floats | None = None  # (H, W, 3) linear radiance; (1, 1, 3) where it is the same everywhere
+    name: str = ""  # of the material in the file; empty where it has none
 
     @property
     def pictures(self) -> tuple[Floats, ...]:
         """What is looked up by texture coordinates."""
         glow = None if self.emission is None or self.emission.shape == (1, 1, 3) else self.emission
-        return tuple(one for one in (self.texture, self.normal_map, glow) if one is not None)
+        return tuple(picture for picture in (self.texture, self.normal_map, glow) if picture is not None)
+
+    def with_pictures(self, pictures: Iterable[Floats]) -> ImportedSurface:
+        """Return the surface with others in the place of its `pictures`."""
+        left = iter(pictures)
+        texture = None if self.texture is None else next(left)
+        normals = None if self.normal_map is None else next(left)
+        return replace(self, texture=texture, normal_map=normals, emission=next(left, self.emission))
 
     @property
     def clear(self) -> bool:
@@ -111,25 +96,27 @@ class ImportedSurface:
         return all(a is b or (a is not None and b is not None and np.array_equal(a, b)) for a, b in pairs)
 
 
-def limited_radiance(factor: Doubles, picture: Floats | None = None) -> tuple[Floats | None, str | None]:
-    """Return a factor (3,) times the linear values of a picture (H, W, 3), as in `ImportedSurface`, and a warning where
+def limited_radiance(factor: Doubles, picture: Floats | None, notes: Notes) -> Floats | None:
+    """Return a factor (3,) times the linear values of a picture (H, W, 3), as in `ImportedSurface`; a note says where
     that is cut to `BRIGHTEST`."""
-    cut = f"emission brighter than {BRIGHTEST:g} is cut to that" if factor.max() > BRIGHTEST else None
+    if factor.max() > BRIGHTEST:
+        notes.say(f"emission brighter than {BRIGHTEST:g} is cut to that")
     linear = np.ones((1, 1, 3), np.float32) if picture is None else srgb_to_linear(picture)
-    found = (linear * np.minimum(factor, BRIGHTEST)).astype(np.float32)
-    return (found if found.any() else None), cut
+    radiance = (linear * np.minimum(factor, BRIGHTEST)).astype(np.float32)
+    return radiance if radiance.any() else None
+
+
+def instead_of_texture(color: Floats | None) -> str:
+    """Return what is seen where a texture is missing, in words; plain white only leaves a texture alone."""
+    if color is None or (color > 0.999).all():
+        return "neutral grey"
+    return f"its base colour ({', '.join(f'{channel:.2f}' for channel in color)})"
 
 
 def with_opacity(color: Floats | None, factor: Floats, cutoff: float | None) -> Floats | None:
-    """Return a base colour (..., 3 or 4) with its opacity, or as (..., 3) where it is opaque.
-
-    What is cut out of a picture gets the nearest colour that is seen.
-
-    Args:
-        color: with or without alpha; None stays None.
-        factor: (1,) of alpha.
-        cutoff: the alpha from which it is opaque, and under which there is nothing; None for shares in between.
-    """
+    """Return a base colour (..., 3 or 4), None of None, with its alpha times a factor (1,) as opacity, or as (..., 3)
+    where it is opaque. What is cut out of a picture gets the nearest colour that is seen. From the cutoff on it is
+    opaque, and under it there is nothing; None for shares in between."""
     if color is None:
         return None
     opacity = (color[..., 3:] if color.shape[-1] == 4 else np.ones_like(color[..., :1])) * factor
@@ -151,30 +138,26 @@ def unit(value: float | None) -> float | None:
 
 @dataclass(frozen=True, eq=False)
 class ImportedPart:
-    """One piece of a mesh file, with the transform of its place in the file applied.
+    """One piece of a mesh file, with the transform of its place in the file applied; None is what the file does not
+    give."""
 
-    Attributes:
-        vertices: (V, 3) float64 positions in the file's axes and units; may hold NaN.
-        faces: (F, 3) int64 vertex indices, F > 0.
-        normals: (V, 3) float64 of the file, not necessarily unit length or finite; None when the file gives none.
-        uvs: (V, 2) float64 of the file, v = 0 at the bottom row; None when the file gives none.
-        colors: (F, 3, 3) float64 linear colour of each corner in [0, 1], which multiplies the base colour in linear
-            light; None when the file gives none.
-        surface: the part's material.
-        node: number of its node in a glTF file; -1 in others.
-        flat: where the file gives no normals, its faces are flat; otherwise smooth normals are made.
-        movable: of a glTF file in which something moves, the part as it is stored, with its vertices in this order.
-    """
-
-    vertices: Doubles
-    faces: Ints
-    normals: Doubles | None
-    uvs: Doubles | None
-    colors: Doubles | None
+    vertices: Doubles  # (V, 3) positions in the file's axes and units; may hold NaN
+    faces: Ints  # (F, 3) vertices, F > 0
+    normals: Doubles | None  # (V, 3) of the file, not necessarily unit length or finite
+    uvs: Doubles | None  # (V, 2), v = 0 at the bottom row
+    colors: (
+        Doubles | None
+    )  # (F, 3, 3) colour of each corner in [0, 1], which multiplies the base colour in linear light
     surface: ImportedSurface
-    node: int = -1
-    flat: bool = False
-    movable: Movable | None = None
+    node: int = -1  # number of its node in a glTF file; -1 in others
+    flat: bool = False  # where the file gives no normals, its faces are flat; otherwise smooth normals are made
+    movable: Movable | None = None  # where something moves, the part as it is stored, its vertices in this order
+
+
+def alike(*keys: Ints | Bools) -> list[Ints]:
+    """Return the faces, by number, that have all of some (F,) in common: one group for each combination, rising."""
+    _, kind = np.unique(np.stack(keys, axis=1), axis=0, return_inverse=True)
+    return grouped(kind.reshape(-1))
 
 
 def visible(parts: Sequence[ImportedPart]) -> list[ImportedPart]:
@@ -191,25 +174,24 @@ def placed(part: ImportedPart, matrix: Doubles) -> ImportedPart:
         vertices = part.vertices @ turn.T + matrix[:3, 3]
         if normals is not None:  # a normal turns with the cofactors of the matrix
             normals = normals @ np.cross(turn[[1, 2, 0]], turn[[2, 0, 1]]).T
-    if not np.linalg.det(turn) < 0.0:
-        return replace(part, vertices=vertices, normals=normals)
-    colors = None if part.colors is None else part.colors[:, ::-1]  # a mirror turns faces over, and cofactors normals
-    return replace(
-        part, vertices=vertices, faces=part.faces[:, ::-1], normals=None if normals is None else -normals, colors=colors
-    )
+    return put(part, vertices, normals, mirrored=bool(np.linalg.det(turn) < 0.0))
+
+
+def put(part: ImportedPart, vertices: Doubles, normals: Doubles | None, *, mirrored: bool) -> ImportedPart:
+    """Return a part with other places and normals; a mirror turns faces over, and cofactors normals."""
+    part = replace(part, vertices=vertices, normals=normals)
+    if not mirrored:
+        return part
+    colors = None if part.colors is None else part.colors[:, ::-1]
+    return replace(part, faces=part.faces[:, ::-1], normals=None if normals is None else -normals, colors=colors)
 
 
 @dataclass(frozen=True, eq=False)
 class Looked:
-    """Values that the corners of triangles look up.
+    """Values that the corners of triangles look up."""
 
-    Attributes:
-        values: (N, C) float64.
-        index: (F, 3) int64 rows of `values`; -1 where a corner has none.
-    """
-
-    values: Doubles
-    index: Ints
+    values: Doubles  # (N, C) float64
+    index: Ints  # (F, 3) int64 rows of `values`; -1 where a corner has none
 
     def at(self, chosen: Ints) -> Looked | None:
         """Return the values of some triangles (f,); None where these have none at all."""
@@ -226,31 +208,23 @@ def split_at_corners(
     *,
     flat: bool = False,
 ) -> ImportedPart:
-    """Return a part in which corners with the same point, normal and texture coordinate are one vertex.
-
-    Args:
-        points: (N, 3) positions, and one for every corner.
-        normals: (N, 3), or None.
-        uvs: (N, 2), or None.
-        colors: as in `ImportedPart`.
-        surface: of the part.
-        flat: as in `ImportedPart`.
-    """
-    given = [one for one in (points, normals, uvs) if one is not None]
+    """Return a part in which corners with the same point (N, 3), normal (N, 3) and texture coordinate (N, 2) are one
+    vertex; every corner has a point. The rest is as in `ImportedPart`."""
+    looked_up = [values for values in (points, normals, uvs) if values is not None]
     key, most = np.zeros(points.index.size, dtype=np.int64), 1
-    for one in given:
-        if most * (len(one.values) + 1) >= 2**63:  # numbered anew, so that it does not overflow
+    for corners in looked_up:
+        if most * (len(corners.values) + 1) >= 2**63:  # numbered anew, so that it does not overflow
             key = np.unique(key, return_inverse=True)[1].reshape(-1)
             most = len(key)
-        key = key * (len(one.values) + 1) + one.index.reshape(-1) + 1
-        most *= len(one.values) + 1
+        key = key * (len(corners.values) + 1) + corners.index.reshape(-1) + 1
+        most *= len(corners.values) + 1
     _, first, faces = np.unique(key, return_index=True, return_inverse=True)
 
-    def rows(one: Looked | None) -> Doubles | None:
-        if one is None:
+    def rows(corners: Looked | None) -> Doubles | None:
+        if corners is None:
             return None
-        index = one.index.reshape(-1)[first]
-        return np.where(index[:, None] >= 0, one.values[index], np.nan)
+        index = corners.index.reshape(-1)[first]
+        return np.where(index[:, None] >= 0, corners.values[index], np.nan)
 
     vertices = points.values[points.index.reshape(-1)[first]]
     return ImportedPart(vertices, faces.reshape(-1, 3), rows(normals), rows(uvs), colors, surface, flat=flat)

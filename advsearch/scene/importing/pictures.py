@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import io
 import warnings
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -13,25 +14,19 @@ import numpy as np
 from PIL import Image
 from scipy import sparse
 
-from advsearch import files
 from advsearch.errors import FileFormatError
 from advsearch.pictures import FORMATS, LARGEST_PIXELS, check_decodable, check_pixels, opened, steps_of
 from advsearch.scene.assets import Floats
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
-from advsearch.scene.importing.files import LARGEST_FILE, Notes, References, plain_name, shown
+from advsearch.scene.importing.files import LARGEST_FILE, Notes, References, check_most, plain_name, shown
 
-TEXTURE_LIMIT = 1024
-"""Longest side of an imported texture, in texels; larger ones are averaged down."""
-
+TEXTURE_LIMIT = 1024  # longest side of an imported texture, in texels; larger ones are averaged down
 _BAND = 1 << 22  # pixels of a large picture that are averaged at a time
 
 
 def read_picture(path: Path, limit: int | None = TEXTURE_LIMIT, *, raw: bool = False) -> Floats:
-    """Read a picture file; arguments and result as for `display_image`.
-
-    Raises:
-        FileFormatError: it is missing, no ordinary file, no picture, too large or damaged.
-    """
+    """Read a picture file; arguments and result as for `display_image`. Raises FileFormatError: it is missing, no
+    ordinary file, no picture, too large or damaged."""
     with opened(path, LARGEST_FILE) as image:
         return display_image(image, limit, path, raw=raw)
 
@@ -44,22 +39,17 @@ def display_image(
     alpha: bool = False,
     raw: bool = False,
 ) -> Floats:
-    """Decode a picture.
+    """Return an opened picture of any mode as (H, W, 3 or 4) float32 display-referred values in [0, 1], row 0 on top.
+    Raises FileFormatError: too many pixels, or a format that is not one of `FORMATS`. Raises OSError, ValueError,
+    SyntaxError: the file's pixels are truncated or damaged.
 
     Args:
-        image: an opened picture of any mode.
+        image: the picture.
         limit: longest side of the result; larger pictures are averaged down in linear light, and so that what is
             transparent does not count. None: no limit.
         path: where it is from, for messages.
         alpha: keep it as a fourth channel, 1 where the picture has none; otherwise it is dropped.
         raw: it holds numbers, as a normal map does, and no colours; larger ones are averaged down as they are.
-
-    Returns:
-        (H, W, 3 or 4) float32 display-referred values in [0, 1], row 0 on top.
-
-    Raises:
-        FileFormatError: too many pixels, or a format that is not one of `FORMATS`.
-        OSError, ValueError, SyntaxError: the file's pixels are truncated or damaged.
     """
     check_decodable(image, path)
     width, height = image.size
@@ -90,16 +80,9 @@ def display_image(
 
 
 def banded_average(band: Callable[[int, int], Floats], size: tuple[int, int], target: tuple[int, int]) -> Floats:
-    """Average an image down that is too large to hold in floats; the same as `area_average` of the whole.
-
-    Args:
-        band: returns rows from the first to before the second of its arguments, (n, W, C) float32.
-        size: rows and columns of the image.
-        target: rows and columns of the result, at most those.
-
-    Returns:
-        (H, W, C) float32.
-    """
+    """Average an image of a size (rows, columns), too large to hold in floats, down to a target size (H, W): the same
+    as `area_average` of the whole. `band` returns rows from the first to before the second of its arguments, (n, W, C)
+    float32; so is the result, (H, W, C)."""
     down, across = _overlaps(size[0], target[0]), _overlaps(size[1], target[1])
     count = max(1, _BAND * target[0] // (size[0] * size[1]))
     pieces = []
@@ -111,16 +94,8 @@ def banded_average(band: Callable[[int, int], Floats], size: tuple[int, int], ta
 
 
 def area_average(image: Floats, height: int, width: int) -> Floats:
-    """Resample an image to a smaller size; each new pixel is the exact mean over the area that it covers.
-
-    Args:
-        image: (H, W, C) float32, any values.
-        height: rows of the result, at most H.
-        width: columns of the result, at most W.
-
-    Returns:
-        (height, width, C) float32 with the same mean as `image`.
-    """
+    """Return an image (H, W, C) float32 resampled to a smaller size (height, width, C), with the same mean: each new
+    pixel is the exact mean over the area that it covers."""
     return _averaged(image, _overlaps(image.shape[0], height), _overlaps(image.shape[1], width))
 
 
@@ -146,32 +121,23 @@ def _overlaps(source: int, target: int) -> sparse.csr_array:
     return sparse.csr_array(share @ weights)
 
 
-Kind = Literal["colours", "colours and alpha", "numbers"]
-"""What a picture holds."""
-
+Kind = Literal["colours", "colours and alpha", "numbers"]  # what a picture holds
 LARGEST_SUM = 2 * LARGEST_PIXELS
 """Pixels that the colour textures of a file may have in all, and those of numbers, before `advsearch.files.scaled`."""
-
+UNREADABLE = "cannot be read as a picture"
 MOST_TEXTURES = 16
 """Materials whose textures are kept at `TEXTURE_LIMIT`; more are baked into one map, for which less will do."""
 
 
 @dataclass
-class Pictures:
-    """Decodes the pictures of one file.
+class FilePictures:
+    """Decodes the pictures of one file, each once."""
 
-    Attributes:
-        materials: how many the file has.
-        references: finds the files that it names.
-        notes: about the file; which pictures were made smaller is said there.
-    """
-
-    materials: int
-    references: References
-    notes: Notes
-    _known: dict[tuple[int, Kind], Floats | str] = field(default_factory=dict)
-    _opened: list[Image.Image] = field(default_factory=list)
-    _pixels: dict[bool, int] = field(default_factory=lambda: {False: 0, True: 0})
+    materials: int  # how many the file has
+    references: References  # finds the files that it names
+    notes: Notes  # about the file: which pictures were made smaller, and which cannot be had, and why
+    _known: dict[tuple[Hashable, Kind], Floats | str] = field(default_factory=dict)
+    _pixels: Counter[bool] = field(default_factory=Counter)
 
     @property
     def side(self) -> int:
@@ -181,47 +147,48 @@ class Pictures:
             side //= 2
         return side
 
-    def decoded(self, image: Image.Image | None, kind: Kind = "colours", name: str = "") -> Floats | str | None:
-        """Return a picture's values, why there are none, or None where there is no picture.
+    def of_file(self, name: str, kind: Kind, words: str) -> Floats | None:
+        """Return the values of a picture that the file names; as `read`."""
+        return self.read(name, lambda: self.references.get(name), kind, name, words)
+
+    def read(self, key: Hashable, content: Callable[[], bytes], kind: Kind, name: str, words: str) -> Floats | None:
+        """Return a picture's values, as `display_image` has them; None where it cannot be had, and a note.
 
         Args:
-            image: as it was opened.
-            kind: what it holds. Values are as in `display_image`.
-            name: what the file calls it, for notes.
+            key: the same for the same picture.
+            content: returns its file; raises OSError or ValueError where it cannot be had.
+            kind: what it holds.
+            name: what the file calls it.
+            words: of the note, with {name} and {why}.
         """
-        if image is None:
+        if (key, kind) not in self._known:
+            self._known[key, kind] = self._decoded(content, kind, name)
+        values = self._known[key, kind]
+        if isinstance(values, str):
+            self.lacks(name, values, words)
             return None
-        if (id(image), kind) not in self._known:
-            self._known[id(image), kind] = self._pixels_of(image, kind, name)
-        return self._known[id(image), kind]
+        return values
 
-    def of_file(self, name: str, kind: Kind) -> Floats | str:
-        """Return the values of a picture file that the file names, or why there are none."""
-        try:
-            image = Image.open(io.BytesIO(self.references.get(name)), formats=FORMATS)
-            found = self.decoded(image, kind, name)
-            self._opened.append(image)  # what is decoded is known by its identity
-        except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
-            found = None
-        return self.why(name, found) if found is None or isinstance(found, str) else found
+    def lacks(self, name: str, why: str, words: str) -> None:
+        """Note that a picture cannot be had, and what takes its place."""
+        self.notes.say(words.replace("{name}", shown(name)).replace("{why}", why))
 
-    def why(self, name: str, found: str | None) -> str:
-        """Return why a named picture cannot be had, after what `decoded` said of it."""
-        return self.references.refused.get(plain_name(name)) or found or "cannot be read as a picture"
-
-    def _pixels_of(self, image: Image.Image, kind: Kind, name: str) -> Floats | str:
+    def _decoded(self, content: Callable[[], bytes], kind: Kind, name: str) -> Floats | str:
         """Decode a picture, or say why not."""
+        try:
+            image = Image.open(io.BytesIO(content()), formats=FORMATS)
+        except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
+            return self.references.refused.get(plain_name(name), UNREADABLE)
         (width, height), raw = image.size, kind == "numbers"
-        pixels, most = self._pixels[raw] + width * height, files.scaled(LARGEST_SUM)
+        pixels = self._pixels[raw] + width * height
         try:
             check_pixels("", width, height)
-            if pixels > most:
-                raise files.too_large("", f"pictures of at most {most:,} pixels", f"{pixels:,} in all")
+            check_most("", pixels, LARGEST_SUM, "pictures of at most {} pixels", f"{pixels:,} in all")
             texture = display_image(image, self.side, "", alpha=kind == "colours and alpha", raw=raw)
         except FileFormatError as error:
             return f"is not read ({str(error).removeprefix(': ')})"
         except (OSError, ValueError, SyntaxError, EOFError):
-            return "cannot be read as a picture"
+            return UNREADABLE
         self._pixels[raw] = pixels
         rows, columns = texture.shape[:2]
         if (columns, rows) != (width, height):

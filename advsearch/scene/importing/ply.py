@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from advsearch import files
 from advsearch.errors import FileFormatError
 from advsearch.scene.assets import Doubles, Ints
 from advsearch.scene.color import srgb_to_linear
@@ -19,6 +18,7 @@ from advsearch.scene.importing.files import (
     Notes,
     References,
     check_faces,
+    check_most,
     damaged,
     is_number,
     looks_like,
@@ -27,12 +27,11 @@ from advsearch.scene.importing.files import (
     text_of,
 )
 from advsearch.scene.importing.other_formats import SPLATS
-from advsearch.scene.importing.parts import NEUTRAL, ImportedPart, ImportedSurface, Looked, split_at_corners
-from advsearch.scene.importing.pictures import Pictures
-from advsearch.scene.importing.polygons import FEW, triangulated
+from advsearch.scene.importing.parts import NEUTRAL, ImportedPart, ImportedSurface, Looked, alike, split_at_corners
+from advsearch.scene.importing.pictures import FilePictures
+from advsearch.scene.importing.polygons import cut_up
 
 Numbers = npt.NDArray[np.generic]
-
 _TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4"},
     **{"double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
@@ -44,70 +43,41 @@ _END = re.compile(rb"^end_header[ \t]*(?:\r\n|\n|\r)", re.MULTILINE)
 
 @dataclass(frozen=True, eq=False)
 class Lists:
-    """A property with several values in each row.
+    """A property with several values in each row."""
 
-    Attributes:
-        counts: (N,) how many.
-        values: those of all rows, one after the other.
-    """
-
-    counts: Ints
-    values: Numbers
+    counts: Ints  # (N,) how many
+    values: Numbers  # those of all rows, one after the other
 
 
 @dataclass
 class Element:
-    """A table of a file.
-
-    Attributes:
-        name: in the file.
-        count: of its rows.
-        types: of its properties, as the header has them, in the order of the file; of a list, that of its values.
-        lists: the types of the counts of those that are lists.
-        scalars: the values (N,) of properties with one a row.
-        listed: those with several.
-    """
+    """A table of a file, with the types of its properties, and of the counts of those that are lists, as the header has
+    them; and the values (N,) of properties with one a row, and those with several."""
 
     name: str
-    count: int
-    types: dict[str, np.dtype[np.generic]] = field(default_factory=dict)
+    count: int  # of its rows
+    types: dict[str, np.dtype[np.generic]] = field(default_factory=dict)  # of a list, that of its values
     lists: dict[str, np.dtype[np.generic]] = field(default_factory=dict)
     scalars: dict[str, Numbers] = field(default_factory=dict)
     listed: dict[str, Lists] = field(default_factory=dict)
 
 
 def read_elements(path: Path, data: bytes) -> tuple[dict[str, Element], list[str]]:
-    """Return the elements of a file by their names, and its comments.
-
-    Raises:
-        FileFormatError: it is no PLY file, its header is odd, or it is shorter than that says.
-    """
-    end = _END.search(
-        data.replace(b"\r", b"\n") if data.startswith(b"ply\r") and not data.startswith(b"ply\r\n") else data
-    )
+    """Return the elements of a file by their names, and its comments. Raises FileFormatError: it is no PLY file, its
+    header is odd, or it is shorter than that says."""
+    lone = data.startswith(b"ply\r") and not data.startswith(b"ply\r\n")  # carriage returns end its lines
+    end = _END.search(data.replace(b"\r", b"\n") if lone else data)
     if not data.startswith(b"ply") or end is None:
-        raise damaged(
-            path, "a PLY file with a complete header", "half of one" if data.startswith(b"ply") else looks_like(data)
-        )
-    elements, comments, order = _header(path, text_of(data[: end.start()]))
-    cells = _Words(data[end.end() :]) if order == "" else _Bytes(data[end.end() :])
-    at = 0
-    for element in elements.values():
-        at = _fill(path, element, cells, at)
-    return elements, comments
-
-
-def _header(path: Path, text: str) -> tuple[dict[str, Element], list[str], str]:
-    """Return the elements without values, the comments, and the order of bytes, empty for text."""
+        got = "half of one" if data.startswith(b"ply") else looks_like(data)
+        raise damaged(path, "a PLY file with a complete header", got)
     elements: dict[str, Element] = {}
-    comments, order = [], None
-    current = None
-    for line in text.splitlines()[1:]:
+    comments, order, current = list[str](), None, None
+    for line in text_of(data[: end.start()]).splitlines()[1:]:
         match line.split():
             case ["format", kind, *_] if kind in _FORMATS:
                 order = _FORMATS[kind]
             case ["comment" | "obj_info", *_]:
-                comments.append(line.split(None, 1)[1].strip() if len(line.split(None, 1)) == 2 else "")
+                comments.append(line.strip().partition(line.split()[0])[2].strip())
             case ["element", name, count] if count.isdecimal() and len(count) < 20 and name not in elements:
                 current = elements[name] = Element(name, int(count))
             case ["property", "list", counts, kind, name] if current and {counts, kind} <= set(_TYPES):
@@ -122,15 +92,18 @@ def _header(path: Path, text: str) -> tuple[dict[str, Element], list[str], str]:
     if order is None:
         raise damaged(path, f"a PLY header with a format of {', '.join(_FORMATS)}", "none of these")
     check_faces(path, elements["face"].count if "face" in elements else 0)
-    return elements, comments, order
+    cells, at = (_Bytes if order else _Words)(data[end.end() :]), 0
+    for element in elements.values():
+        at = _fill(path, element, cells, at)
+    return elements, comments
 
 
 class _Words:
     """The numbers of a text, one a cell."""
 
     def __init__(self, data: bytes) -> None:
-        self.values = numbers_in(data, np.float64)
-        self.end, self.data = len(self.values), data
+        self.values, self.data = numbers_in(data, np.float64), data
+        self.end = len(self.values)
 
     def width(self, kind: np.dtype[np.generic]) -> int:
         return 1
@@ -141,9 +114,10 @@ class _Words:
     def number(self, place: int, kind: np.dtype[np.generic]) -> float:
         return float(self.values.item(place))
 
-    def odd(self) -> str | None:
-        """The first word that is no number, if there is one."""
-        return next((word for word in map(text_of, self.data.split()) if not is_number(word)), None)
+    def missing(self) -> str:
+        """What there is in the place of numbers: a word that is none, or nothing."""
+        odd = next((word for word in map(text_of, self.data.split()) if not is_number(word)), None)
+        return CUT if odd is None else f"{shown(odd)} among their numbers"
 
 
 class _Bytes:
@@ -165,8 +139,8 @@ class _Bytes:
         part, signed = self.data[place : place + kind.itemsize], kind.kind == "i"
         return int.from_bytes(part, "big" if kind.str[0] == ">" else "little", signed=signed)
 
-    def odd(self) -> str | None:
-        return None
+    def missing(self) -> str:
+        return CUT
 
 
 def _fill(path: Path, element: Element, cells: _Words | _Bytes, at: int) -> int:
@@ -179,9 +153,9 @@ def _fill(path: Path, element: Element, cells: _Words | _Bytes, at: int) -> int:
     places, after = _rows(path, element, cells, at, widths, 1)
     last = at + (after - at) * element.count
     steps = (after - at) * np.arange(element.count if last <= cells.end else 0)
-    even = {name: one + steps for name, one in places.items()}
+    even = {name: first + steps for name, first in places.items()}
     counts = [cells.taken(even[name], kind) for name, kind in element.lists.items()]
-    if last <= cells.end and all((some == some[0]).all() for some in counts):
+    if last <= cells.end and all((sizes == sizes[0]).all() for sizes in counts):
         places, at = even, last
     else:  # the lists differ in length
         places, at = _rows(path, element, cells, at, widths, element.count)
@@ -219,15 +193,14 @@ def _rows(
             at += width
     if at > cells.end:
         raise _cut(path, element, cells)
-    return {name: np.array(one, dtype=np.int64) for name, one in places.items()}, at
+    return {name: np.array(begins, dtype=np.int64) for name, begins in places.items()}, at
+
+
+CUT = "fewer; the file is cut short"
 
 
 def _cut(path: Path, element: Element, cells: _Words | _Bytes) -> FileFormatError:
-    expected = f"{element.count:,} rows of {shown(element.name)}, as the PLY header says"
-    odd = cells.odd()
-    return damaged(
-        path, expected, "fewer; the file is cut short" if odd is None else f"{shown(odd)} among their numbers"
-    )
+    return damaged(path, f"{element.count:,} rows of {shown(element.name)}, as the PLY header says", cells.missing())
 
 
 COLORS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
@@ -236,25 +209,19 @@ MAPPED = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"), ("texture_s", "tex
 WEDGES = ("texcoord", "texcoords", "texture_coordinates")
 CORNERS = ("vertex_indices", "vertex_index", "vertex_indexes")
 """Names of properties that mean the same, in the order in which they are looked for."""
-
 _TEXTURE = re.compile(r"texture_?file\s*[:=]?\s+(.*)", re.IGNORECASE)
 
 
 def read_ply(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
-    """Read a PLY file as one part for each texture.
-
-    Raises:
-        FileFormatError: it is damaged, refers to vertices that are not there, or has no faces.
-    """
+    """Read a PLY file as one part for each texture. Raises FileFormatError: it is damaged, refers to vertices that are
+    not there, or has no faces."""
     elements, comments = read_elements(path, data)
-    reader = _Reader(path, elements, notes)
+    reader = _Properties(path, elements, notes)
     points = reader.columns("vertex", (("x", "y", "z"),))
     if points is None:
         raise damaged(path, "a PLY file with vertices that have x, y and z", "none")
     corner, counts = reader.polygons(len(points))
-    triangles, face, wrong = triangulated(points[corner], counts)
-    if wrong:
-        notes.say(f"{wrong:,} faces cross themselves, or are too much work, and may be cut up wrongly")
+    triangles, face = cut_up(points[corner], counts, notes)
     at = corner[triangles]
     normals = reader.columns("vertex", (("nx", "ny", "nz"),))
     uvs = reader.mapped(corner, counts, triangles)
@@ -263,10 +230,9 @@ def read_ply(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
     tint = reader.colors(at, face)
     surfaces = [*reader.textures(names, plain=tint is None), ImportedSurface()]
     parts = []
-    kinds = np.stack([number, np.zeros_like(number) if uvs is None else (uvs.index >= 0).all(axis=1)], axis=1)
-    _, kind = np.unique(kinds, axis=0, return_inverse=True)
-    for chosen in np.split(np.argsort(kind, kind="stable"), np.cumsum(np.bincount(kind.reshape(-1)))[:-1]):
-        surface, colors = surfaces[kinds[chosen[0]][0]], None if tint is None else tint[chosen]
+    mapped = np.full((len(at), 3), -1) if uvs is None else uvs.index
+    for chosen in alike(number, (mapped >= 0).all(axis=1)):
+        surface, colors = surfaces[number[chosen[0]]], None if tint is None else tint[chosen]
         if colors is not None and surface.texture is not None:
             if colors.min() < 1.0:
                 notes.say("colours of vertices or faces are left out where there is a texture")
@@ -274,20 +240,14 @@ def read_ply(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
         if colors is not None:
             surface = ImportedSurface(color=np.ones(3, np.float32))
         part_normals = None if normals is None else Looked(normals, at[chosen])
-        mapped = None if uvs is None else uvs.at(chosen)
-        parts.append(split_at_corners(Looked(points, at[chosen]), part_normals, mapped, colors, surface))
+        part_uvs = None if uvs is None else uvs.at(chosen)
+        parts.append(split_at_corners(Looked(points, at[chosen]), part_normals, part_uvs, colors, surface))
     return parts
 
 
 @dataclass
-class _Reader:
-    """Finds what is known among the properties of a file, and notes what is not.
-
-    Attributes:
-        path: the file.
-        elements: of it.
-        notes: about the file.
-    """
+class _Properties:
+    """Finds what is known among the properties of a file, and notes what is not."""
 
     path: Path
     elements: dict[str, Element]
@@ -304,29 +264,26 @@ class _Reader:
 
     def columns(self, element: str, names: Sequence[tuple[str, ...]]) -> Doubles | None:
         """Return the values (N, C) of the first of several groups of properties that an element has; None for none."""
-        table = self.elements.get(element)
-        for group in names:
-            if table is not None and all(name in table.scalars for name in group):
-                for name in group:
-                    self.notes.take(f"{element} property", name)
-                return np.stack([table.scalars[name].astype(np.float64) for name in group], axis=1)
-        return None
+        group = self._known(element, "scalars", *names)
+        scalars = self.elements[element].scalars if group else {}
+        return np.stack([scalars[name].astype(np.float64) for name in group], axis=1) if group else None
 
     def _list(self, element: str, names: Sequence[str]) -> Lists | None:
-        table = self.elements.get(element)
-        for name in names:
-            if table is not None and name in table.listed:
-                self.notes.take(f"{element} property", name)
-                return table.listed[name]
-        return None
+        group = self._known(element, "listed", *((name,) for name in names))
+        return self.elements[element].listed[group[0]] if group else None
+
+    def _known(self, element: str, table: str, *groups: tuple[str, ...]) -> tuple[str, ...]:
+        """Take the first of several groups of properties that an element has, and return it; () for none."""
+        has = getattr(self.elements.get(element), table, {})
+        group = next((group for group in groups if all(name in has for name in group)), ())
+        for name in group:
+            self.notes.take(f"{element} property", name)
+        return group
 
     def polygons(self, points: int) -> tuple[Ints, Ints]:
         """Return the vertices (C,) of the corners of all polygons, and how many corners each has, (P,); those of faces
-        come first, then the triangles of strips.
-
-        Raises:
-            FileFormatError: there are none, one has too many or too few corners, or refers to what is not there.
-        """
+        come first, then the triangles of strips. Raises FileFormatError: there are none, one has too many or too few
+        corners, or refers to what is not there."""
         table = self.elements.get("face")
         names = CORNERS if table is None else (*CORNERS, *(name for name in table.listed if name not in WEDGES))
         faces, strips = self._list("face", names), self._list("tristrips", CORNERS)
@@ -336,16 +293,11 @@ class _Reader:
             corner.append(_of_strips(_whole(strips.values), strips.counts).reshape(-1))
             counts.append(np.full(len(corner[-1]) // 3, 3))
         all_corners, all_counts = np.concatenate(corner), np.concatenate(counts)
-        few = int((all_counts < 3).sum())
-        if few == len(all_counts):
+        if (all_counts < 3).all():
             splats = "f_dc_0" in self.elements["vertex"].scalars  # of 3D Gaussian splatting
             what = f"Gaussian splats, a model that {SPLATS}" if splats else "points or lines only; export triangles"
             raise FileFormatError(f"{self.path}: expected a mesh with faces, got {what}")
-        if few:
-            self.notes.say(FEW.format(count=few, s="" if few == 1 else "s"))
-        if all_counts.max() > files.scaled(MOST_CORNERS):
-            most = f"faces with at most {files.scaled(MOST_CORNERS):,} corners"
-            raise files.too_large(self.path, most, f"{all_counts.max():,}")
+        check_most(self.path, int(all_counts.max()), MOST_CORNERS, "faces with at most {} corners")
         check_faces(self.path, int((all_counts - 2).clip(0).sum()))
         if all_corners.min() < 0 or all_corners.max() >= points:
             raise damaged(self.path, "faces of its own vertices", "a face that refers to a vertex that is not there")
@@ -377,48 +329,38 @@ class _Reader:
             if values is None:
                 continue
             table = self.elements[element]
-            kind = table.types[next(group[0] for group in COLORS if all(name in table.scalars for name in group))]
-            self._alpha(table, kind)
+            kind = table.types[self._known(element, "scalars", *COLORS)[0]]
+            for name in set(ALPHAS) & set(table.scalars):
+                alphas = table.scalars[name].astype(np.float64)
+                if not len(alphas) or alphas.min() >= _scale(alphas[:, None], kind):
+                    self.notes.take(f"{element} property", name)
             linear = srgb_to_linear(np.clip(np.nan_to_num(values / _scale(values, kind)), 0.0, 1.0).astype(np.float32))
             padded = np.concatenate([linear, srgb_to_linear(np.full((1, 3), NEUTRAL, np.float32))])  # of strips
             colors = padded[np.minimum(index, len(linear))].astype(np.float64)
             channels[element] = colors if element == "vertex" else np.repeat(colors[:, None], 3, axis=1)
         if len(channels) < 2:
             return next(iter(channels.values()), None)
-        better = "face" if np.ptp(channels["vertex"]) == 0.0 else "vertex"
-        other = "faces" if better == "vertex" else "vertices"
-        self.notes.say(
-            f"colours of {other} are left out: its {'vertices' if better == 'vertex' else 'faces'} have some, too"
-        )
+        better, other = ("face", "vertices") if np.ptp(channels["vertex"]) == 0.0 else ("vertex", "faces")
+        has = "faces" if better == "face" else "vertices"
+        self.notes.say(f"colours of {other} are left out: its {has} have some, too")
         return channels[better]
-
-    def _alpha(self, table: Element, kind: np.dtype[np.generic]) -> None:
-        for name in ALPHAS:
-            if name in table.scalars:
-                values = table.scalars[name].astype(np.float64)
-                if not len(values) or values.min() >= _scale(values[:, None], kind):
-                    self.notes.take(f"{table.name} property", name)
 
     def texture_numbers(self, names: Sequence[str], corner: Ints, counts: Ints) -> Ints:
         """Return the number (P,) of each polygon's texture among several; -1 for none."""
-        faces, vertices = (self.elements.get(name) for name in ("face", "vertex"))
+        number = np.full(len(counts), -1)
         if not names:
-            return np.full(len(counts), -1)
-        if faces is not None and "texnumber" in faces.scalars:
-            self.notes.take("face property", "texnumber")
-            number = np.full(len(counts), -1)
-            number[: faces.count] = _whole(faces.scalars["texnumber"])
-        elif vertices is not None and "texnumber" in vertices.scalars:
-            self.notes.take("vertex property", "texnumber")
-            number = _whole(vertices.scalars["texnumber"])[
-                corner[np.minimum(np.cumsum(counts) - counts, len(corner) - 1)]
-            ]
-        else:
+            return number
+        has = next((kind for kind in ("face", "vertex") if self._known(kind, "scalars", ("texnumber",))), None)
+        if has is None:
             if len(names) > 1:
-                self.notes.say(
-                    f"of its {len(names)} textures only {shown(names[0])} is used, as its faces have no texnumber"
-                )
+                only = f"of its {len(names)} textures only {shown(names[0])} is used"
+                self.notes.say(f"{only}, as its faces have no texnumber")
             return np.zeros(len(counts), np.int64)
+        numbers = _whole(self.elements[has].scalars["texnumber"])
+        if has == "face":
+            number[: len(numbers)] = numbers
+        else:
+            number = numbers[corner[np.minimum(np.cumsum(counts) - counts, len(corner) - 1)]]
         wrong = int(((number < -1) | (number >= len(names))).sum())
         if wrong:
             self.notes.say(f"{wrong:,} faces have a texnumber of a texture that it does not name; they have none")
@@ -427,20 +369,17 @@ class _Reader:
     def textures(self, names: Sequence[str], *, plain: bool) -> list[ImportedSurface]:
         """Return the surface of each texture; `plain` tells that there are no colours beside them."""
         references = References(self.path)
-        pictures = Pictures(len(names), references, self.notes)
-        surfaces = []
+        pictures = FilePictures(len(names), references, self.notes)
+        surfaces = {}
         instead = "neutral grey is" if plain else "the colours of its vertices or faces are"
-        read = {name: pictures.of_file(name, "colours and alpha") for name in dict.fromkeys(names)}
-        for name in names:
-            found = read[name]
-            if isinstance(found, str):
-                self.notes.say(f" names the texture {shown(name)}, which {found}; {instead} used instead")
-                surfaces.append(ImportedSurface(name=name))
-                continue
-            if found[:, :, 3].min() < 1.0:
+        for name in dict.fromkeys(names):
+            words = f" names the texture {{name}}, which {{why}}; {instead} used instead"
+            picture = pictures.of_file(name, "colours and alpha", words)
+            if picture is not None and picture[:, :, 3].min() < 1.0:
                 self.notes.say(f"the alpha of {shown(name)} is left out")
-            surfaces.append(ImportedSurface(texture=np.ascontiguousarray(found[:, :, :3]), name=name))
-        return surfaces
+            texture = None if picture is None else np.ascontiguousarray(picture[:, :, :3])
+            surfaces[name] = ImportedSurface(texture=texture, name=name)
+        return [surfaces[name] for name in names]
 
 
 def _whole(values: npt.NDArray[np.generic]) -> Ints:

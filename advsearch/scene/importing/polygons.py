@@ -5,23 +5,29 @@ from __future__ import annotations
 import numpy as np
 
 from advsearch.scene.assets import Bools, Doubles, Ints
+from advsearch.scene.importing.files import Notes
 
-MOST_WORK = 50_000_000
-"""Points that are compared with ears, in all; then the polygons that are left are cut up as fans."""
-
-FEW = "{count:,} face{s} of fewer than 3 corners left out"
+MOST_WORK = 50_000_000  # points that are compared with ears, in all; then the polygons that are left are cut up as fans
 _FLAT = 1e-9  # twice the area of a triangle, as a share of that of its polygon, up to which it has none
+
+
+def cut_up(points: Doubles, counts: Ints, notes: Notes) -> tuple[Ints, Ints]:
+    """Return the triangles of polygons, and the polygon of each, as `triangulated`; what is odd is noted."""
+    if few := int((counts < 3).sum()):
+        notes.say(f"{few:,} face{'' if few == 1 else 's'} of fewer than 3 corners left out")
+    triangles, owner, wrong = triangulated(points, counts)
+    if wrong:
+        notes.say(f"{wrong:,} faces cross themselves, or are too much work, and may be cut up wrongly")
+    return triangles, owner
 
 
 def triangulated(points: Doubles, counts: Ints) -> tuple[Ints, Ints, int]:
     """Cut polygons up into triangles.
 
     Where the triangles from a polygon's first corner all face as the polygon does (it is convex, mostly), these are
-    taken. Otherwise ears are cut off (Meisters 1975) in the plane that the polygon lies in on average (Newell).
-
-    Args:
-        points: (C, 3) positions of the corners of all polygons, one polygon after the other; may hold NaN.
-        counts: (P,) number of corners of each; those of fewer than 3 become no triangle.
+    taken. Otherwise ears are cut off (Meisters 1975) in the plane that the polygon lies in on average (Newell). Points
+    (C, 3) are those of the corners of all polygons, one polygon after the other, and may be NaN; counts (P,) are of
+    each one's corners, and those of fewer than 3 become no triangle.
 
     Returns:
         (T, 3) corners of the triangles, as indices into `points`, in the order of the polygons; (T,) the polygon of
@@ -35,20 +41,15 @@ def triangulated(points: Doubles, counts: Ints) -> tuple[Ints, Ints, int]:
             continue
         polygons = np.flatnonzero(group == number)
         corners = starts[polygons, None] + np.arange(count)
-        cut = np.stack(
-            [np.broadcast_to(corners[:, :1], (len(corners), count - 2)), corners[:, 1:-1], corners[:, 2:]], 2
-        )
+        cut = np.stack([corners[:, :1].repeat(count - 2, axis=1), corners[:, 1:-1], corners[:, 2:]], axis=2)
         if count > 3:
             flat = _flattened(points[corners])
             areas = _doubled_areas(flat[:, :1], flat[:, 1:-1], flat[:, 2:])
             bad = np.flatnonzero((areas <= _FLAT * np.abs(areas.sum(axis=1))[:, None]).any(axis=1))
             if len(bad):
                 ears, failed, used = _ears(flat[bad], left)
-                left -= used
-                wrong += failed
-                cut[bad] = np.take_along_axis(corners[bad, None], ears.reshape(len(bad), 1, -1), axis=2).reshape(
-                    ears.shape
-                )
+                left, wrong = left - used, wrong + failed
+                cut[bad] = corners[bad][np.arange(len(bad))[:, None, None], ears]
         triangles.append(cut.reshape(-1, 3))
         owners.append(np.repeat(polygons, count - 2))
     if not owners:
@@ -78,11 +79,8 @@ def _doubled_areas(a: Doubles, b: Doubles, c: Doubles) -> Doubles:
 
 
 def _ears(flat: Doubles, budget: int) -> tuple[Ints, int, int]:
-    """Cut the ears off polygons with the same number of corners, all at once, each in turns of its own.
-
-    Args:
-        flat: (P, n, 2) as `_flattened` gives them.
-        budget: comparisons that may be made.
+    """Cut the ears off polygons (P, n, 2) with the same number of corners, as `_flattened` gives them, all at once,
+    each in turns of its own, with so many comparisons at most.
 
     Returns:
         (P, n - 2, 3) corners of the triangles; how many polygons with an area had no ear at some time, or were left
@@ -109,7 +107,7 @@ def _ears(flat: Doubles, budget: int) -> tuple[Ints, int, int]:
         hopeless = tries[busy] >= left
         if used < budget:
             used += places[busy].size // 2
-            ends = [flat[busy, one] for one in (a, b, c)]
+            ends = [flat[busy, corner] for corner in (a, b, c)]
             ear |= _is_ear(ends, places[busy], there[busy], _FLAT * size[busy])
         else:
             hopeless[:] = True
@@ -129,8 +127,8 @@ def _is_ear(ends: list[Doubles], places: Doubles, there: Bools, least: Doubles) 
     """Tell of triangles, three times (P, 2), whether they have an area and hold no place (P, n, 2) that is there."""
     ear: Bools = _doubled_areas(*ends) > least
     x, y, inside = places[ear, :, 0], places[ear, :, 1], there[ear]
-    for one, other in zip(ends, [*ends[1:], ends[0]], strict=True):
-        (x0, y0), (x1, y1) = one[ear, :, None].swapaxes(0, 1), other[ear, :, None].swapaxes(0, 1)
+    for begin, end in zip(ends, [*ends[1:], ends[0]], strict=True):
+        (x0, y0), (x1, y1) = begin[ear, :, None].swapaxes(0, 1), end[ear, :, None].swapaxes(0, 1)
         inside &= (x1 - x0) * (y - y0) >= (y1 - y0) * (x - x0)
         inside &= (x != x0) | (y != y0)
     ear[ear] = ~inside.any(axis=1)

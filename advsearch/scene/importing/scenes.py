@@ -17,7 +17,7 @@ import numpy as np
 
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.files import MESHES
-from advsearch.scene.assets import Doubles, ObjectAsset
+from advsearch.scene.assets import Doubles, ObjectAsset, face_vectors, footing
 from advsearch.scene.importing import gltf, gltf_left_out
 from advsearch.scene.importing.blender import read_mesh_bytes
 from advsearch.scene.importing.files import Names, clean, safe_name, shown
@@ -28,119 +28,90 @@ from advsearch.scene.importing.objects import GLTF, object_of, read_parts
 from advsearch.scene.importing.parts import ImportedPart, visible
 from advsearch.scene.importing.usd import GENERATOR
 from advsearch.scene.parts import PlacedCamera, PointLamp, ScenePart, SpotLamp, mesh_part
+from advsearch.scene.skeleton import with_above
 
 BEHIND = np.diag([-1.0, 1.0, -1.0])
 """Cameras of glTF look along -z with +x to the right; ours along +z with +x to the left."""
-MITSUBA_FILE = ".xml"
-"""Ending of Mitsuba's scenes."""
+MITSUBA_FILE = ".xml"  # ending of Mitsuba's scenes
 LUMENS = 683.0
 """Lumens of a watt: the eye's at 555 nm. Blender's exporter multiplies the power of lights by it, and no emission."""
-FURTHEST = 1e12
-"""Distance of a light or camera in object sizes, and radiant intensity of a light."""
-SQUARE = 1e-3
-"""Cosine of the angle between two axes of a camera, at most."""
-WIDEST_VIEW = 170.0
-"""Field of view of a camera along the larger side of its picture, degrees."""
-MOST_SURROUNDINGS = 200
-"""Meshes and lamps around an object."""
+FURTHEST = 1e12  # distance of a light or camera in object sizes, and radiant intensity of a light
+SQUARE = 1e-3  # cosine of the angle between two axes of a camera, at most
+WIDEST_VIEW = 170.0  # field of view of a camera along the larger side of its picture, degrees
+MOST_SURROUNDINGS = 200  # meshes and lamps around an object
 TAKEN = frozenset(("object", "environment", "ground", "camera", "orbit"))
 
 
 @dataclass(frozen=True, eq=False)
 class ImportedScene:
-    """What a file holds.
+    """What a file holds."""
 
-    Attributes:
-        object: the node that was asked for, with all that hangs on it.
-        surroundings: meshes and lamps beside it.
-        cameras: by name.
-    """
-
-    object: ObjectAsset
-    surroundings: tuple[ScenePart, ...] = ()
-    cameras: Mapping[str, PlacedCamera] = field(default_factory=dict)
+    object: ObjectAsset  # the node that was asked for, with all that hangs on it
+    surroundings: tuple[ScenePart, ...] = ()  # meshes and lamps beside it
+    cameras: Mapping[str, PlacedCamera] = field(default_factory=dict)  # by name
 
 
 def split_node(spec: str) -> tuple[str, str | None]:
     """Return the file and the node of ``scene.glb#chair``; None where no node is named."""
-    found = re.fullmatch(
-        rf"(.+({'|'.join(map(re.escape, (*GLTF, MITSUBA_FILE)))}))#(.*)", spec, re.IGNORECASE | re.DOTALL
-    )
+    endings = "|".join(map(re.escape, (*GLTF, MITSUBA_FILE)))
+    found = re.fullmatch(rf"(.+({endings}))#(.*)", spec, re.IGNORECASE | re.DOTALL)
     return (found[1], found[3]) if found and not os.path.exists(spec) else (spec, None)
 
 
 @np.errstate(all="ignore")  # what is out of range is refused
 def import_scene(path: Path, node: str) -> ImportedScene:
-    """Read a scene from a .glb or .gltf file.
+    """Read a scene from a .glb or .gltf file, with the node of that name as the object: or of that mesh, where a node
+    has no name; "node 3" is the one with that number.
 
     The object is repaired, normalised and textured as `import_object` does it; so is every other node with a mesh,
-    which stays in its place beside it. Point and spot lights of KHR_lights_punctual become lamps, directional
-    ones distant lamps; perspective cameras are kept by name. What is not carried over is among the object's
-    warnings.
-
-    Args:
-        path: of the file.
-        node: name of the object's node, or of its mesh where the node has none; "node 3" is the one with that number.
-
-    Raises:
-        UnknownNameError: no node of that name has a mesh, or one below it.
-        FileFormatError: as for `import_object`.
-        InputError: as for `import_object`; several nodes have the name; or there is too much beside the object.
+    which stays in its place beside it. Point and spot lights of KHR_lights_punctual become lamps, directional ones
+    distant lamps; perspective cameras are kept by name. What is not carried over is among the object's warnings. Raises
+    UnknownNameError: no node of that name has a mesh, or one below it. Raises FileFormatError: as for `import_object`.
+    Raises InputError: as for `import_object`; several nodes have the name; or there is too much beside the object.
     """
     data = read_mesh_bytes(path, "scene", GLTF)
     header = gltf.read_header(path, data)
     parts, notes = read_parts(path, data)
     places = dict(poses(header))
-    chosen = _below(header, _named(path, header, node, {part.node for part in parts}))
+    chosen = header.below([_named(path, header, node, {part.node for part in parts})])
     chosen_parts = [part for part in parts if part.node in chosen]
     others = sorted({part.node for part in parts} - chosen)
-    lamps = [index for index in places if header.nodes[index].lamp is not None]
-    if len(others) + len(lamps) > MOST_SURROUNDINGS:
-        raise InputError(
-            f"{path}: expected at most {MOST_SURROUNDINGS} meshes and lights beside the object, got "
-            f"{len(others) + len(lamps)}; join some of them in the file"
-        )
+    lamps = {index: header.lights[lamp] for index in places if (lamp := header.nodes[index].lamp) is not None}
+    if (count := len(others) + len(lamps)) > MOST_SURROUNDINGS:
+        most = f"at most {MOST_SURROUNDINGS} meshes and lights beside the object"
+        raise InputError(f"{path}: expected {most}, got {count}; join some of them in the file")
     frame, names = _frame(chosen_parts), Names(TAKEN)
     called = _mesh_names(header, parts, names)
     surroundings: list[ScenePart] = []
     for number in others:
         group = [part for part in parts if part.node == number]
-        name, place = called[number], _frame(group)
-        made = object_of(group, [], path, name, "y")
-        notes.extend(made.warnings)
+        place, shape = _frame(group), object_of(group, [], path, called[number], "y")
+        notes.extend(shape.warnings)
         matrix = np.eye(4)
         matrix[:3, :3] *= place.size / frame.size
         matrix[:3, 3] = frame.inside(place.origin)
-        surroundings.append(mesh_part(name, made, matrix, made.material))
-    lit = [header.lights[header.nodes[index].lamp or 0] for index in lamps]
+        surroundings.append(mesh_part(shape.name, shape, matrix, shape.material))
     glows = any(part.surface.emission is not None for part in parts)
-    unit, told = _unit_of_light(header, bool(lit) and glows)
-    notes.extend([f"{path.name}: {told}"] if told else [])
-    for index, light in zip(lamps, lit, strict=True):
-        lamp = _lamp(names.free(light.name or header.label(index)), light, unit, places[index], frame)
-        _check_lamp(path, lamp)
-        surroundings.append(lamp)
+    unit, why = _unit_of_light(header, bool(lamps) and glows)
+    notes.extend([f"{path.name}: {why}"] if why else [])
+    for index, light in lamps.items():
+        name = names.free(light.name or header.label(index))
+        surroundings.append(_lamp(path, name, light, unit, places[index], frame))
     cameras = {
-        name: _camera(header.cameras[header.nodes[index].camera or 0], places[index], frame)
+        name: _camera(path, name, header.cameras[header.nodes[index].camera or 0], places[index], frame)
         for index, name in _camera_names(header, places).items()
     }
-    for name, camera in cameras.items():
-        _check_camera(path, name, camera)
-    notes.extend(_changed(path, header))
-    return ImportedScene(
-        object_of(chosen_parts, notes, path, f"{safe_name(path)}-{clean(node)}", "y"), tuple(surroundings), cameras
-    )
+    notes.extend(gltf_left_out.lights_and_cameras(header, path.name))
+    whole = object_of(chosen_parts, notes, path, f"{safe_name(path)}-{clean(node)}", "y")
+    return ImportedScene(whole, tuple(surroundings), cameras)
 
 
 def node_names(path: Path) -> list[str]:
-    """Return what `import_scene` takes as the object of a glTF file, several of the same name once.
-
-    Raises:
-        FileFormatError: as for `import_object`.
-    """
+    """Return what `import_scene` takes as the object of a glTF file, several of the same name once. Raises
+    FileFormatError: as for `import_object`."""
     header = gltf.read_header(path, read_mesh_bytes(path, "scene", GLTF))
     drawn = {index for index, node in enumerate(header.nodes) if node.mesh is not None}
-    return list(dict.fromkeys(map(header.label, sorted(_above(header, drawn)))))
+    return list(dict.fromkeys(map(header.label, sorted(with_above(header.parents, drawn)))))
 
 
 def _mesh_names(header: Header, parts: Sequence[ImportedPart], names: Names) -> dict[int, str]:
@@ -150,60 +121,45 @@ def _mesh_names(header: Header, parts: Sequence[ImportedPart], names: Names) -> 
 
 def _camera_names(header: Header, nodes: Iterable[int]) -> dict[int, str]:
     """Names of the cameras with perspective, by the number of their node."""
-    names, found = Names(TAKEN), {}
+    names, called = Names(TAKEN), {}
     for index in sorted(nodes):
         camera = header.nodes[index].camera
         if camera is not None and header.cameras[camera].perspective is not None:
-            found[index] = names.free(header.cameras[camera].name or header.label(index))
-    return found
+            called[index] = names.free(header.cameras[camera].name or header.label(index))
+    return called
 
 
 @dataclass(frozen=True)
 class NodeContents:
-    """A node with geometry.
+    """A node with geometry."""
 
-    Attributes:
-        name: as `import_scene` takes it.
-        mesh: what it is called in names of controls, beside another node.
-        triangles: of its own mesh.
-        size: of its bounding box in the file's axes and units, (3,).
-    """
-
-    name: str
-    mesh: str
-    triangles: int
-    size: tuple[float, float, float]
+    name: str  # as `import_scene` takes it
+    mesh: str  # what it is called in names of controls, beside another node
+    triangles: int  # of its own mesh
+    size: tuple[float, float, float]  # of its bounding box in the file's axes and units, (3,)
 
 
 @dataclass(frozen=True, eq=False)
 class Contents:
-    """What is in a file.
+    """What is in a file."""
 
-    Attributes:
-        object: everything with geometry, as one object.
-        nodes: of a glTF file, in their order.
-        lights, cameras: names.
-    """
-
-    object: ObjectAsset
-    nodes: tuple[NodeContents, ...] = ()
+    object: ObjectAsset  # everything with geometry, as one object
+    nodes: tuple[NodeContents, ...] = ()  # of a glTF file, in their order
     lights: tuple[str, ...] = ()
     cameras: tuple[str, ...] = ()
 
 
 @np.errstate(all="ignore")
 def contents(path: Path) -> Contents:
-    """Return what is understood of a mesh or glTF file; one of Mitsuba has a function of that name of its own.
-
-    Raises:
-        FileFormatError, InputError: as for `import_object`.
-    """
+    """Return what is understood of a mesh or glTF file; one of Mitsuba has a function of that name of its own. Raises
+    FileFormatError, InputError: as for `import_object`."""
     data = read_mesh_bytes(path, "object", (*MESHES, MITSUBA_FILE))
     parts, notes = read_parts(path, data)
     if path.suffix.lower() not in GLTF:
         return Contents(object_of(parts, notes, path, safe_name(path), None))
     header = gltf.read_header(path, data)
-    whole = object_of(parts, [*notes, *_changed(path, header)], path, safe_name(path), None)
+    notes += gltf_left_out.lights_and_cameras(header, path.name)
+    whole = object_of(parts, notes, path, safe_name(path), None)
     nodes: dict[int, list[ImportedPart]] = {}
     for part in parts:
         nodes.setdefault(part.node, []).append(part)
@@ -211,7 +167,8 @@ def contents(path: Path) -> Contents:
     for index, group in sorted(nodes.items()):
         places = np.concatenate([part.vertices[part.faces].reshape(-1, 3) for part in group])
         x, y, z = map(float, np.ptp(places, axis=0))
-        listed.append(NodeContents(header.label(index), called[index], sum(len(one.faces) for one in group), (x, y, z)))
+        faces = sum(len(part.faces) for part in group)
+        listed.append(NodeContents(header.label(index), called[index], faces, (x, y, z)))
     lights = tuple(light.name or f"light {index}" for index, light in enumerate(header.lights))
     cameras = _camera_names(header, dict(poses(header))).values()
     return Contents(whole, tuple(listed), lights, tuple(cameras))
@@ -234,19 +191,19 @@ def _frame(parts: Sequence[ImportedPart]) -> FileFrame:
     corners = []
     for part in visible(parts):
         triangles = part.vertices[part.faces]
-        area = np.linalg.norm(np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=1)
+        area = np.linalg.norm(face_vectors(triangles), axis=1)
         extent = float(np.ptp(triangles.reshape(-1, 3), axis=0).max())
         corners.append(triangles[area > FLAT * extent**2].reshape(-1, 3))
     places = np.concatenate(corners) @ UPRIGHT.T
     if not np.isfinite(places).all() or not len(places) or not np.ptp(places, axis=0).max() > 0.0:
         return FileFrame(1.0, np.zeros(3))  # refused with a reason when it is repaired
-    low, high = places.min(axis=0), places.max(axis=0)
-    return FileFrame(float((high - low).max()), np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]]))
+    origin, size = footing(places)
+    return FileFrame(size, origin)
 
 
 def _named(path: Path, header: Header, name: str, with_mesh: set[int]) -> int:
     """The number of the node of that name which has a mesh, or one below it."""
-    labels = {index: header.label(index) for index in sorted(_above(header, with_mesh))}
+    labels = {index: header.label(index) for index in sorted(with_above(header.parents, with_mesh))}
     found = [index for index, label in labels.items() if name in (label, f"node {index}")]
     if not found:
         raise UnknownNameError(f"node of {path.name}", name, list(dict.fromkeys(labels.values())))
@@ -254,30 +211,6 @@ def _named(path: Path, header: Header, name: str, with_mesh: set[int]) -> int:
         numbers = ", ".join(f"{path.name}#node {index}" for index in found[:10])
         raise InputError(f"{path}: {len(found)} nodes are called {shown(name)}; say which: {numbers}")
     return found[0]
-
-
-def _below(header: Header, index: int) -> set[int]:
-    """A node and all that hangs on it."""
-    return _reached({index}, [node.children for node in header.nodes])
-
-
-def _above(header: Header, nodes: set[int]) -> set[int]:
-    """Nodes, and all on which they hang."""
-    parents: list[list[int]] = [[] for _ in header.nodes]
-    for index, node in enumerate(header.nodes):
-        for child in node.children:
-            parents[child].append(index)
-    return _reached(nodes, parents)
-
-
-def _reached(begin: set[int], steps: Sequence[Sequence[int]]) -> set[int]:
-    """The nodes to which steps lead from others, and these."""
-    found, left = set(begin), list(begin)
-    while left:
-        new = [one for one in steps[left.pop()] if one not in found]
-        found.update(new)
-        left += new
-    return found
 
 
 def _unit_of_light(header: Header, both: bool) -> tuple[float, str | None]:
@@ -298,7 +231,9 @@ def _unit_of_light(header: Header, both: bool) -> tuple[float, str | None]:
     return 1.0, "it has lights beside surfaces that emit light: they are taken as candela and nit, as glTF defines them"
 
 
-def _lamp(name: str, light: LightEntry, unit: float, pose: Doubles, frame: FileFrame) -> PointLamp | SpotLamp:
+def _lamp(
+    path: Path, name: str, light: LightEntry, unit: float, pose: Doubles, frame: FileFrame
+) -> PointLamp | SpotLamp:
     """A light at its place; light falls off with the square of the distance in object sizes as it does in the file."""
     power = np.array(light.color) * light.intensity / unit
     if light.type == "directional":
@@ -306,68 +241,43 @@ def _lamp(name: str, light: LightEntry, unit: float, pose: Doubles, frame: FileF
         place, power = gltf_left_out.FAR * way / max(float(np.linalg.norm(way)), 1e-12), power * gltf_left_out.FAR**2
     else:
         place, power = frame.inside(UPRIGHT @ pose[:3, 3]), power / frame.size**2
-    x, y, z = map(float, place)
-    red, green, blue = map(float, power)
-    if light.type != "spot":
-        return PointLamp(name, dark=not power.any(), position=(x, y, z), intensity=(red, green, blue))
-    along = UPRIGHT @ -pose[:3, 2]
-    across, up, ahead = map(float, along / max(float(np.linalg.norm(along)), 1e-12))
-    return SpotLamp(
-        name,
-        dark=not power.any(),
-        position=(x, y, z),
-        direction=(across, up, ahead),
-        intensity=(red, green, blue),
-        cutoff=math.degrees(light.spot.outerConeAngle),
-        beam=math.degrees(light.spot.innerConeAngle),
-    )
-
-
-def _changed(path: Path, header: Header) -> list[str]:
-    return [path.name + what for what in gltf_left_out.lights_and_cameras(header)]
-
-
-def _check_lamp(path: Path, lamp: PointLamp | SpotLamp) -> None:
-    """Refuse places and powers that are no numbers, or too large for the renderer's."""
-    if not all(abs(one) <= FURTHEST for one in (*lamp.position, *lamp.intensity)):  # NaN is not
+    if not (np.abs([*place, *power]) <= FURTHEST).all():  # NaN is not
         raise InputError(
-            f"{path}: expected the light {lamp.name} within {FURTHEST:g} object sizes, and no brighter than that, got "
+            f"{path}: expected the light {name} within {FURTHEST:g} object sizes, and no brighter than that, got "
             "more; correct its place or its intensity, or remove it"
         )
+    x, y, z = map(float, place)
+    red, green, blue = map(float, power)
+    lamp = PointLamp(name, dark=not power.any(), position=(x, y, z), intensity=(red, green, blue))
+    if light.type != "spot":
+        return lamp
+    along = UPRIGHT @ -pose[:3, 2]
+    across, up, ahead = map(float, along / max(float(np.linalg.norm(along)), 1e-12))
+    cutoff, beam = math.degrees(light.spot.outerConeAngle), math.degrees(light.spot.innerConeAngle)
+    return SpotLamp(**vars(lamp), direction=(across, up, ahead), cutoff=cutoff, beam=beam)
 
 
-def _check_camera(path: Path, name: str, camera: PlacedCamera) -> None:
-    """Refuse a place that is no number or too large, axes that are none, and fields of view that a plane has not."""
-    if not all(abs(one) <= FURTHEST for one in camera.to_world[:3, 3]):
-        raise InputError(
-            f"{path}: expected the camera {name} within {FURTHEST:g} object sizes, got more; correct its place, or "
-            "remove it"
-        )
-    axes = camera.to_world[:3, :3]
-    if not np.allclose(np.linalg.norm(axes, axis=0), 1.0):
-        raise InputError(
-            f"{path}: expected the camera {name} to look somewhere, got axes without length; correct the scale of its "
-            "node, or remove it"
-        )
-    if not np.allclose(axes.T @ axes, np.eye(3), atol=SQUARE) or np.linalg.det(axes) < 0.0:
-        what = "mirrored" if np.linalg.det(axes) < 0.0 else "sheared"
-        raise InputError(
-            f"{path}: expected the camera {name} under nodes that turn, move and scale it, got {what} axes; apply the "
-            "scale of the nodes above it (in Blender Ctrl A), or remove it"
-        )
-    if not 0.0 < camera.fov <= WIDEST_VIEW:
-        raise InputError(
-            f"{path}: expected the camera {name} with a field of view up to {WIDEST_VIEW:g} degrees, got "
-            f"{camera.fov:.4g}; correct it, or remove it"
-        )
-
-
-def _camera(camera: CameraEntry, pose: Doubles, frame: FileFrame) -> PlacedCamera:
+def _camera(path: Path, name: str, camera: CameraEntry, pose: Doubles, frame: FileFrame) -> PlacedCamera:
     assert camera.perspective is not None
     turn = UPRIGHT @ pose[:3, :3] @ BEHIND
     matrix = np.eye(4)
-    matrix[:3, :3] = turn / np.maximum(np.linalg.norm(turn, axis=0), 1e-12)
-    matrix[:3, 3] = frame.inside(UPRIGHT @ pose[:3, 3])
+    axes = turn / np.maximum(np.linalg.norm(turn, axis=0), 1e-12)
+    matrix[:3, :3], matrix[:3, 3] = axes, frame.inside(UPRIGHT @ pose[:3, 3])
     ratio = camera.perspective.aspectRatio  # without one, that of the picture holds (section 5.13)
-    half = math.tan(camera.perspective.yfov / 2.0) * max(ratio or 1.0, 1.0)
-    return PlacedCamera(matrix, math.degrees(2.0 * math.atan(half)), upright=ratio is None)
+    fov = math.degrees(2.0 * math.atan(math.tan(camera.perspective.yfov / 2.0) * max(ratio or 1.0, 1.0)))
+    mirrored = np.linalg.det(axes) < 0.0
+    problem = ""
+    if not (np.abs(matrix[:3, 3]) <= FURTHEST).all():  # NaN is not
+        problem = f"within {FURTHEST:g} object sizes, got more; correct its place"
+    elif not np.allclose(np.linalg.norm(axes, axis=0), 1.0):
+        problem = "to look somewhere, got axes without length; correct the scale of its node"
+    elif not np.allclose(axes.T @ axes, np.eye(3), atol=SQUARE) or mirrored:
+        problem = (
+            f"under nodes that turn, move and scale it, got {'mirrored' if mirrored else 'sheared'} axes; apply the "
+            "scale of the nodes above it (in Blender Ctrl A)"
+        )
+    elif not 0.0 < fov <= WIDEST_VIEW:
+        problem = f"with a field of view up to {WIDEST_VIEW:g} degrees, got {fov:.4g}; correct it"
+    if problem:
+        raise InputError(f"{path}: expected the camera {name} {problem}, or remove it")
+    return PlacedCamera(matrix, fov, upright=ratio is None)

@@ -6,7 +6,7 @@ and whatever the file has (repeating textures, several materials, vertex colours
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,12 +21,8 @@ from advsearch.scene.importing.pictures import TEXTURE_LIMIT
 from advsearch.scene.raster import doubled_areas, looked_up, pixels_in
 from advsearch.scene.surface_parts import unwrapped
 
-PLAIN_SIZE = 8
-"""Width and height, in texels, of the base colour map of an object of one colour."""
-
-BAKED_SIZE = 512
-"""Width and height of the smallest base colour map that is baked."""
-
+PLAIN_SIZE = 8  # width and height, in texels, of the base colour map of an object of one colour
+BAKED_SIZE = 512  # width and height of the smallest base colour map that is baked
 _SLACK = 1e-4  # how far UVs may overstep [0, 1] and still be clipped
 _SQUASHED = 0.05  # share of the surface that may have no area in UV space
 _CRAMPED = 0.02  # share of the unit square that UVs must cover in all
@@ -40,31 +36,20 @@ _FILLED = 0.5  # share of an atlas that its charts fill, about
 
 @dataclass(frozen=True, eq=False)
 class SurfaceMaps:
-    """What an object looks like by its texture coordinates; row 0 is on top, at v = 1.
+    """What an object looks like by its texture coordinates; row 0 is on top, at v = 1."""
 
-    Attributes:
-        color: (H, W, 3) float32 display-referred base colour in [0, 1]; (H, W, 4) with the opacity where light passes
-            through a part.
-        normals: (H', W', 3) float32 of `advsearch.scene.importing.parts`; None where there is no normal map.
-        emission: (H", W", 3) float32 linear radiance; (1, 1, 3) where it is the same everywhere, None where there is
-            none.
-    """
-
-    color: Floats
-    normals: Floats | None = None
-    emission: Floats | None = None
+    color: Floats  # (H, W, 3) display-referred base colour in [0, 1]; (H, W, 4) with the opacity of what has one
+    normals: Floats | None = None  # (H', W', 3) as `ImportedSurface.normal_map`
+    emission: Floats | None = None  # (H", W", 3) linear radiance; (1, 1, 3) where it is the same everywhere
 
 
 def textured(soup: Soup, surfaces: Sequence[ImportedSurface]) -> tuple[Soup, SurfaceMaps, list[str]]:
-    """Return the soup with UVs in [0, 1] on every corner, the maps that fit them, and the warnings.
-
-    Args:
-        soup: repaired geometry.
-        surfaces: the surface of each part.
-    """
+    """Return a repaired soup with UVs in [0, 1] on every corner, the maps that fit them and the surface of each part,
+    and the warnings."""
     used = list({id(surfaces[number]): surfaces[number] for number in np.unique(soup.part)}.values())
     first, uniform = used[0], all(surface.same_maps(used[0]) for surface in used)
-    colored, twice, material = uniform and _one_factor(soup), False, by_material(soup, surfaces)[1]
+    one_factor = bool((soup.colors == soup.colors[0, 0]).all())
+    colored, twice, material = uniform and one_factor, False, by_material(soup, surfaces)[1]
     if colored and not first.pictures:
         kept = _usable(soup, soup.uvs) and not _overlap(soup.uvs, material)
         soup = replace(soup, uvs=np.clip(soup.uvs, 0.0, 1.0)) if kept else unwrapped(soup, material)
@@ -73,11 +58,16 @@ def textured(soup: Soup, surfaces: Sequence[ImportedSurface]) -> tuple[Soup, Sur
         uvs, pictures = _windowed(_into_unit_square(soup), first.pictures, first.texture)
         twice = _usable(soup, uvs) and _lit_twice(uvs, first, pictures)
         if _usable(soup, uvs) and not twice:
-            return *_kept(soup, np.clip(uvs, 0.0, 1.0), first, pictures), []
+            kept_maps = first.with_pictures(pictures)
+            color = _of_one_color(soup, first) if kept_maps.texture is None else kept_maps.texture
+            uvs, maps = np.clip(uvs, 0.0, 1.0), SurfaceMaps(color, kept_maps.normal_map, kept_maps.emission)
+            if maps.normals is not None:
+                uvs, maps = unmirrored(uvs, mirrored(soup, uvs), maps, maps.normals)
+            return replace(soup, uvs=uvs), maps, []
     fresh = unwrapped(soup, material)
     maps = baked(fresh.uvs, soup, surfaces)
     shared = "several faces share a texture that emits light; it was unwrapped anew and its texture resampled"
-    size, why = len(maps.color), shared if twice else _why(soup, used, uniform)
+    size, why = len(maps.color), shared if twice else _why(soup, used, uniform, one_factor)
     times = _texels(soup, surfaces) / (size * size * _FILLED)
     fewer = "" if times < _FINER else f", {times:.0f} times fewer than its pictures have there"
     return fresh, maps, [f"{why} ({size} x {size} texels{fewer})"]
@@ -106,46 +96,34 @@ def _of_one_color(soup: Soup, surface: ImportedSurface) -> Floats:
     return np.full((PLAIN_SIZE, PLAIN_SIZE, len(color)), color, dtype=np.float32)
 
 
-def _kept(soup: Soup, uvs: Doubles, surface: ImportedSurface, pictures: Sequence[Floats]) -> tuple[Soup, SurfaceMaps]:
-    """Return the soup with the file's own UVs, and its pictures, as `ImportedSurface.pictures` has them, as maps."""
-    left = list(pictures)
-    color = _of_one_color(soup, surface) if surface.texture is None else left.pop(0)
-    normals = None if surface.normal_map is None else left.pop(0)
-    emission = left.pop(0) if left else surface.emission
-    if normals is not None:
-        uvs, (color, normals, emission) = unmirrored(uvs, mirrored(soup, uvs), color, normals, emission)
-    return replace(soup, uvs=uvs), SurfaceMaps(color, normals, emission)
-
-
 def _lit_twice(uvs: Doubles, surface: ImportedSurface, pictures: Sequence[Floats]) -> bool:
     """Whether a texel that emits light lies on several faces: Mitsuba would send light from one of them only."""
     if surface.emission is None or surface.emission.shape == (1, 1, 3):
         return False
     lit = pictures[-1].any(axis=2)
     height, width = lit.shape
-    corners = np.stack([uvs[:, :, 0] * width - 0.5, (1.0 - uvs[:, :, 1]) * height - 0.5], axis=2)
-    _, rows, columns, _ = pixels_in(corners, (height, width), tolerance=-1e-6)
+    _, rows, columns, _ = pixels_in(_in_texels(uvs, (height, width)), (height, width), tolerance=-1e-6)
     count = np.bincount(rows * width + columns, minlength=height * width).reshape(height, width)[lit]
     return bool((count > 1).sum() > _SHARED * max(1, len(count)))
 
 
-def _why(soup: Soup, used: Sequence[ImportedSurface], uniform: bool) -> str:
+def _in_texels(uvs: Doubles, shape: tuple[int, int]) -> Doubles:
+    """Return texture coordinates (F, 3, 2) as columns and rows of a picture of that height and width."""
+    return np.stack([uvs[:, :, 0] * shape[1] - 0.5, (1.0 - uvs[:, :, 1]) * shape[0] - 0.5], axis=2)
+
+
+def _why(soup: Soup, used: Sequence[ImportedSurface], uniform: bool, one_factor: bool) -> str:
     """Return the sentence that says why the object was unwrapped anew."""
     if not uniform:
         count = len({surface.name or id(surface) for surface in used})
         what = f"the colours of its {count} materials" if count > 1 else "the pictures of its material"
         return f"{what} were baked into one texture"
-    if not _one_factor(soup) or soup.colors.min() < 1.0:
+    if not one_factor or soup.colors.min() < 1.0:
         return "its vertex or face colours were baked into a texture"
     if not np.isfinite(soup.uvs).all():
         mean = "the texture's mean colour is used" if used[0].texture is not None else "its normal map is left out"
         return f"it has a texture but lacks texture coordinates; where it does, {mean}"
     return "its texture coordinates repeat or hardly use the texture; it was unwrapped anew and its texture resampled"
-
-
-def _one_factor(soup: Soup) -> bool:
-    """Tell whether the same colour factor holds everywhere."""
-    return bool((soup.colors == soup.colors[0, 0]).all())
 
 
 def _plain(surface: ImportedSurface) -> Floats:
@@ -192,50 +170,45 @@ def _windowed(uvs: Doubles, pictures: Sequence[Floats], colors: Floats | None) -
     Returns:
         The UVs and the pictures, unchanged or all made to fit the window.
     """
-    texel = np.max([1.0 / np.array(one.shape[1::-1]) for one in pictures], axis=0)
+    texel = np.max([1.0 / np.array(picture.shape[1::-1]) for picture in pictures], axis=0)
     low, high = uvs.min(axis=(0, 1)) - texel, uvs.max(axis=(0, 1)) + texel
     size = high - low
     inside = low.min() >= -_SLACK - texel.max() and high.max() <= 1.0 + _SLACK + texel.max()
     if size.max() > _WINDOW or (inside and np.abs(doubled_areas(uvs)).sum() / 2.0 >= _CRAMPED):
         return uvs, pictures
-    return (uvs - low) / size, [_cut(one, low, high, filtered if one is colors else sampled) for one in pictures]
-
-
-def _cut(picture: Floats, low: Doubles, high: Doubles, look_up: Callable[[Floats, Doubles], Floats]) -> Floats:
-    """Return the window of a repeating picture (H, W, C) between two corners (u, v), with texels of the same size."""
-    size = high - low
-    width, height = np.clip(np.ceil(size * np.array(picture.shape[1::-1])), 1, TEXTURE_LIMIT).astype(int)
-    columns = low[0] + (np.arange(width) + 0.5) / width * size[0]
-    rows = high[1] - (np.arange(height) + 0.5) / height * size[1]
-    grid = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
-    return look_up(picture, grid).reshape(height, width, -1)
+    cut = []
+    for picture in pictures:  # with texels of the same size
+        width, height = np.clip(np.ceil(size * np.array(picture.shape[1::-1])), 1, TEXTURE_LIMIT).astype(int)
+        columns = low[0] + (np.arange(width) + 0.5) / width * size[0]
+        rows = high[1] - (np.arange(height) + 0.5) / height * size[1]
+        grid = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
+        look_up = filtered if picture is colors else sampled
+        cut.append(look_up(picture, grid).reshape(height, width, -1))
+    return (uvs - low) / size, cut
 
 
 # --- baking ----------------------------------------
 
 
 def baked(uvs: Doubles, soup: Soup, surfaces: Sequence[ImportedSurface]) -> SurfaceMaps:
-    """Paint the colours and the normals of a soup into maps for new UVs.
+    """Paint the colours and the normals of a soup, with the file's UVs (NaN where it has none), and of the surface of
+    each part into maps (N, N, ...) for new UVs (F, 3, 2) in [0, 1] without overlaps.
 
-    Args:
-        uvs: (F, 3, 2) new UVs in [0, 1], without overlaps.
-        soup: the geometry with the file's UVs (NaN where it has none) and colour factors.
-        surfaces: the surface of each part.
-
-    Returns:
-        Maps (N, N, ...) with room for the texels that the object shows. Texels outside every chart repeat the nearest
-        one inside, so that filtering finds no seam.
+    They have room for the texels that the object shows. Texels outside every chart repeat the nearest one inside, so
+    that filtering finds no seam.
     """
     size, texels = BAKED_SIZE, _texels(soup, surfaces)
     while size < TEXTURE_LIMIT and size * size * _FILLED < texels:
         size *= 2
-    corners = np.stack([uvs[:, :, 0] * size - 0.5, (1.0 - uvs[:, :, 1]) * size - 0.5], axis=2)
-    face, rows, columns, weights = pixels_in(corners, (size, size), tolerance=1e-9)
-    through = any(int((_plain(one) if one.texture is None else one.texture).shape[-1]) == 4 for one in surfaces)
+    face, rows, columns, weights = pixels_in(_in_texels(uvs, (size, size)), (size, size), tolerance=1e-9)
+    bases = [_plain(surface) if surface.texture is None else surface.texture for surface in surfaces]
+    through = any(base.shape[-1] == 4 for base in bases)
     image, inside = np.ones((size, size, 3 + through), np.float32), np.zeros((size, size), np.bool_)
-    bumpy = any(one.normal_map is not None for one in surfaces)
+    bumpy, glows = (
+        any(getattr(surface, what) is not None for surface in surfaces) for what in ("normal_map", "emission")
+    )
     normals = np.full((size, size, 3), FLAT) if bumpy else None
-    emission = None if all(one.emission is None for one in surfaces) else np.zeros((size, size, 3), np.float32)
+    emission = np.zeros((size, size, 3), np.float32) if glows else None
     factor = np.einsum("tk,tkc->tc", weights, soup.colors[face])
     part = soup.part[face]
     order = np.argsort(part, kind="stable")
@@ -265,7 +238,7 @@ def _looked_up(surface: ImportedSurface, at: Doubles, soup: Soup, surfaces: Sequ
         return filtered(surface.texture, at)
     color = _plain(surface)
     if surface.texture is not None:
-        mine = np.array([one.texture is surface.texture for one in surfaces])[soup.part]
+        mine = np.array([other.texture is surface.texture for other in surfaces])[soup.part]
         areas = np.linalg.norm(soup.face_vectors(), axis=1)[mine]
         color = _in_display(mean_over(_in_linear(surface.texture), soup.uvs[mine], areas))
     return np.broadcast_to(color[None], (len(at), len(color)))
@@ -275,40 +248,30 @@ def _texels(soup: Soup, surfaces: Sequence[ImportedSurface]) -> float:
     """Return how many texels of its pictures the object shows."""
     texels, areas = 0.0, np.nan_to_num(np.abs(doubled_areas(soup.uvs)) / 2.0)
     for number, area in enumerate(np.bincount(soup.part, areas)):
-        texels += float(area) * max((one.shape[0] * one.shape[1] for one in surfaces[number].pictures), default=0)
+        sizes = (picture.shape[0] * picture.shape[1] for picture in surfaces[number].pictures)
+        texels += float(area) * max(sizes, default=0)
     return texels
 
 
 def mean_over(texture: Floats, uvs: Doubles, areas: Doubles) -> Floats:
-    """Return the mean (C,) of a texture (H, W, C) over faces; what none of them shows does not count.
-
-    Args:
-        texture: its values, row 0 on top.
-        uvs: (F, 3, 2) of the faces, v = 0 at the bottom; NaN where one has none.
-        areas: (F,) of the faces.
-
-    Returns:
-        float32; the mean of all texels where no face has texture coordinates and an area.
-    """
+    """Return the mean (C,) float32 of a texture (H, W, C) over faces with these UVs (F, 3, 2), NaN where one has none,
+    and areas (F,): what none of them shows does not count, unless no face has both."""
     known = np.isfinite(uvs).all(axis=(1, 2)) & (areas > 0.0)
     if not known.any():
         return np.asarray(texture.mean(axis=(0, 1), dtype=np.float64), np.float32)
     uvs, areas = uvs[known], areas[known]
     steps = int(np.clip(np.sqrt(_LOOKS / len(areas)), 1, _FINEST))
-    i, j = (one.reshape(-1) for one in np.meshgrid(np.arange(steps), np.arange(steps)))
+    i, j = (index.reshape(-1) for index in np.meshgrid(np.arange(steps), np.arange(steps)))
     up, down = i + j < steps, i + j < steps - 1  # the two kinds of small triangles, by their middles
-    b, c = (np.concatenate([one[up] + 1.0 / 3.0, one[down] + 2.0 / 3.0]) / steps for one in (i, j))
+    b, c = (np.concatenate([index[up] + 1.0 / 3.0, index[down] + 2.0 / 3.0]) / steps for index in (i, j))
     weights = np.stack([1.0 - b - c, b, c], axis=1)
     total = np.zeros(texture.shape[2])
     for some in np.array_split(np.arange(len(areas)), -(-len(areas) * len(b) // _LOOKS)):
         places = np.einsum("pk,fkc->fpc", weights, uvs[some]).reshape(-1, 2)
-        rows, columns = np.stack([(1.0 - places[:, 1]) % 1.0, places[:, 0] % 1.0]) * [
-            [texture.shape[0]],
-            [texture.shape[1]],
-        ]
-        texels = texture[rows.astype(int) % texture.shape[0], columns.astype(int) % texture.shape[1]]
-        found = texels.reshape(len(some), len(b), -1).mean(axis=1, dtype=np.float64)
-        total += areas[some] @ found
+        height, width = texture.shape[:2]
+        rows, columns = (1.0 - places[:, 1]) % 1.0 * height, places[:, 0] % 1.0 * width
+        texels = texture[rows.astype(int) % height, columns.astype(int) % width]
+        total += areas[some] @ texels.reshape(len(some), len(b), -1).mean(axis=1, dtype=np.float64)
     return np.asarray(total / areas.sum(), np.float32)
 
 
@@ -333,15 +296,8 @@ def _in_display(colors: Floats) -> Floats:
 
 
 def sampled(texture: Floats, uvs: Doubles) -> Floats:
-    """Look a repeating texture up with bilinear interpolation of its values, as they are.
-
-    Args:
-        texture: (H, W, C) float32, row 0 on top.
-        uvs: (T, 2), any finite values; v = 0 is the bottom.
-
-    Returns:
-        (T, C) float32.
-    """
+    """Look a repeating texture (H, W, C) float32 up at any finite UVs (T, 2), with bilinear interpolation of its
+    values, as they are: (T, C) float32."""
     height, width = texture.shape[:2]
     u, v = (uvs % 1.0).T  # first, since a huge number times a width is infinite
     return looked_up(texture, u * width - 0.5, (1.0 - v) * height - 0.5)
@@ -352,8 +308,7 @@ def sampled(texture: Floats, uvs: Doubles) -> Floats:
 # In a file the bitangent runs up the picture; Mitsuba's is normal x tangent, which runs down it where texture
 # coordinates are mirrored.
 
-FEW = 1e-3
-"""Share of the surface whose texture coordinates may be mirrored without anything being done about it."""
+FEW = 1e-3  # share of the surface whose texture coordinates may be mirrored without anything being done about it
 
 
 def mirrored(soup: Soup, uvs: Doubles) -> Bools:
@@ -364,53 +319,36 @@ def mirrored(soup: Soup, uvs: Doubles) -> Bools:
     return np.full(len(turned), share > 0.5) if min(share, 1.0 - share) < FEW else turned
 
 
-def unmirrored(
-    uvs: Doubles, over: Bools, color: Floats, normals: Floats, emission: Floats | None
-) -> tuple[Doubles, tuple[Floats, Floats, Floats | None]]:
-    """Return texture coordinates that mirror no face, and the maps for them; no texel is resampled.
-
-    The maps get a second half, which is the first one mirrored, and there the faces go.
-
-    Args:
-        uvs: (F, 3, 2) in [0, 1].
-        over: (F,) the mirrored faces, as `mirrored` gives them.
-        color: (H, W, C).
-        normals: (H', W', 3), a normal map.
-        emission: (H", W", 3); None where there is none.
-    """
+def unmirrored(uvs: Doubles, over: Bools, maps: SurfaceMaps, normals: Floats) -> tuple[Doubles, SurfaceMaps]:
+    """Return texture coordinates (F, 3, 2) in [0, 1] that mirror no face, also of those that are over, (F,) as
+    `mirrored` gives them, and the maps for them, which have a normal map; no texel is resampled. The maps get a second
+    half, which is the first one mirrored, and there the faces go."""
     if not over.any():
-        return uvs, (color, normals, emission)
+        return uvs, maps
     if over.all():
-        return uvs, (color, normals * np.array([1, -1, 1], np.float32) + np.array([0, 1, 0], np.float32), emission)
+        turned_over = normals * np.array([1, -1, 1], np.float32) + np.array([0, 1, 0], np.float32)
+        return uvs, replace(maps, normals=turned_over)
     placed = uvs.copy()
     placed[over, :, 0] = 2.0 - placed[over, :, 0]
     placed[:, :, 0] /= 2.0
+    color, glow = maps.color, maps.emission
     other = normals[:, ::-1] * np.array([-1, 1, 1], np.float32) + np.array([1, 0, 0], np.float32)
-    glow = emission if emission is None or emission.shape == (1, 1, 3) else _beside(emission, emission[:, ::-1])
-    return placed, (_beside(color, color[:, ::-1]), _beside(normals, other), glow)
-
-
-def _beside(left: Floats, right: Floats) -> Floats:
-    return np.concatenate([left, right], axis=1)
+    if glow is not None and glow.shape != (1, 1, 3):
+        glow = np.concatenate([glow, glow[:, ::-1]], axis=1)
+    color, normals = np.concatenate([color, color[:, ::-1]], axis=1), np.concatenate([normals, other], axis=1)
+    return placed, SurfaceMaps(color, normals, glow)
 
 
 def turned(texels: Floats, before: Soup, after: Doubles, face: Ints, weights: Doubles) -> Floats:
-    """Return texels of a normal map for other texture coordinates.
-
-    Args:
-        texels: (T, 3) as they are for the coordinates of the soup.
-        before: with these.
-        after: (F, 3, 2) the other ones.
-        face: (T,) on which each lies.
-        weights: (T, 3) where on it.
-    """
+    """Return texels (T, 3) of a normal map, which lie on faces (T,) with these weights (T, 3) of their corners, for
+    other texture coordinates (F, 3, 2) than those of the soup."""
     normal = unit_vectors(np.einsum("tk,tkc->tc", weights, before.normals[face]))
-    old, new = (_tangents(one, normal, face) for one in (before, replace(before, uvs=after)))
+    old, new = (_tangents(soup, normal, face) for soup in (before, replace(before, uvs=after)))
     up = np.cross(normal, old) * np.sign(doubled_areas(before.uvs[face]))[:, None]
     x, y, z = np.moveaxis(texels.astype(np.float64) * 2.0 - 1.0, -1, 0)
     way = x[:, None] * old + y[:, None] * up
-    found = np.stack([(way * new).sum(axis=1), (way * np.cross(normal, new)).sum(axis=1), z], axis=1)
-    return texels_of(np.where(np.isfinite(found).all(axis=1, keepdims=True), found, [0.0, 0.0, 1.0]))
+    bumps = np.stack([(way * new).sum(axis=1), (way * np.cross(normal, new)).sum(axis=1), z], axis=1)
+    return texels_of(np.where(np.isfinite(bumps).all(axis=1, keepdims=True), bumps, [0.0, 0.0, 1.0]))
 
 
 def _tangents(soup: Soup, normal: Doubles, face: Ints) -> Doubles:

@@ -30,11 +30,8 @@ def named(name: str, number: int) -> str:
 
 
 def squares(uvs: Doubles) -> Ints:
-    """Return the numbers (F,) of the squares that the middles of faces lie in; 0 where there is none.
-
-    Args:
-        uvs: (F, 3, 2) texture coordinates.
-    """
+    """Return the numbers (F,) of the squares that the middles of faces, with these UVs (F, 3, 2), lie in; 0 for
+    none."""
     column, row = np.floor(uvs.mean(axis=1)).T
     known = (column >= 0) & (column < ACROSS) & (row >= 0) & (row < 100)
     return np.where(known, FIRST + column + ACROSS * row, 0).astype(np.int64)

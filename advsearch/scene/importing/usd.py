@@ -18,15 +18,11 @@ PACKAGE = ".usdz"
 LAYERS = (".usd", ".usda", ".usdc")
 USD = (*LAYERS, PACKAGE)
 """Endings of OpenUSD files."""
-GENERATOR = "advsearch, of OpenUSD"
-"""What the glTF is made by; what it leaves out is in the extras of its asset."""
-LONGEST = 120
-"""Seconds that it may take, before `advsearch.files.scaled`."""
-MEMORY = 8 << 30
-"""Bytes of memory that it may take, before `advsearch.files.scaled`."""
+GENERATOR = "advsearch, of OpenUSD"  # what the glTF is made by; what it leaves out is in the extras of its asset
+LONGEST = 120  # seconds that it may take, before `advsearch.files.scaled`
+MEMORY = 8 << 30  # bytes of memory that it may take, before `advsearch.files.scaled`
 BEGINNINGS = (b"PXR-USDC", b"#usda", b"PK\x03\x04")
 REFUSED = "refused: "
-
 _LIMITED = f"""
 import runpy, sys
 try:
@@ -47,11 +43,8 @@ def is_installed() -> bool:
 
 
 def converted(path: Path, data: bytes) -> bytes:
-    """Return an OpenUSD file as binary glTF.
-
-    Raises:
-        FileFormatError: it is none, names what lies outside its folder, is too large, or `usd-core` is missing.
-    """
+    """Return an OpenUSD file as binary glTF. Raises FileFormatError: it is none, names what lies outside its folder, is
+    too large, or `usd-core` is missing."""
     if not data.startswith(BEGINNINGS):
         raise damaged(path, "an OpenUSD file", looks_like(data))
     if not is_installed():

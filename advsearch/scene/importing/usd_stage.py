@@ -14,7 +14,7 @@ import re
 import sys
 import zipfile
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -27,8 +27,9 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade, UsdSkel, Vt
 from advsearch import files
 from advsearch.errors import FileFormatError
 from advsearch.pictures import FORMATS, check_decodable
-from advsearch.scene.glb_buffer import GlbBuffer
-from advsearch.scene.importing.files import LARGEST_FACES, LARGEST_FILE
+from advsearch.scene.assets import face_vectors
+from advsearch.scene.glb_buffer import GlbBuffer, mime_type
+from advsearch.scene.importing.files import LARGEST_FILE, check_faces, check_most
 from advsearch.scene.importing.gltf import DEEPEST_TREE, LARGEST_TREE
 from advsearch.scene.importing.polygons import triangulated
 from advsearch.scene.importing.usd import GENERATOR, LAYERS, PACKAGE
@@ -40,7 +41,6 @@ PURPOSES = ("default", "render")
 WRAPS = {"repeat": 10497, "mirror": 33648, "clamp": 33071, "black": 33071, "useMetadata": 10497}
 COAT = ("clearcoat", "displacement", "occlusion", "specularColor")
 """Inputs of a preview surface that our surfaces have nothing for."""
-
 Array = npt.NDArray[Any]
 
 
@@ -66,10 +66,10 @@ def unpacked(package: Path, folder: Path) -> Path:
     try:
         with zipfile.ZipFile(package) as archive:
             entries = archive.infolist()
-            size = sum(one.file_size for one in entries)
-            if len(entries) > files.scaled(MOST_ENTRIES) or size > files.scaled(LARGEST_FILE):
-                most = f"at most {files.scaled(MOST_ENTRIES):,} files of {files.scaled(LARGEST_FILE):,} bytes in all"
-                raise files.too_large(package.name, most, f"{len(entries):,} of {size:,}")
+            got = f"{len(entries):,} of {(size := sum(entry.file_size for entry in entries)):,}"
+            most = f"at most {files.scaled(MOST_ENTRIES):,} files of {files.scaled(LARGEST_FILE):,} bytes in all"
+            check_most(package.name, len(entries), MOST_ENTRIES, most, got)
+            check_most(package.name, size, LARGEST_FILE, most, got)
             for entry in entries:
                 place = PurePosixPath(entry.filename)
                 odd = place.is_absolute() or ".." in place.parts or "\\" in entry.filename or ":" in entry.filename
@@ -99,8 +99,9 @@ def checked_layers(file: Path) -> list[str]:
             continue
         known[path] = None
         size += path.stat().st_size
-        if len(known) > files.scaled(MOST_LAYERS) or size > files.scaled(LARGEST_FILE):
-            raise files.too_large(file.name, f"at most {files.scaled(MOST_LAYERS):,} layers", "more, or larger ones")
+        most = f"at most {files.scaled(MOST_LAYERS):,} layers"
+        check_most(file.name, len(known), MOST_LAYERS, most, "more, or larger ones")
+        check_most(file.name, size, LARGEST_FILE, most, "more, or larger ones")
         try:
             layer = Sdf.Layer.FindOrOpen(str(path))
         except Exception as error:  # Tf.ErrorException, of which there are many kinds
@@ -160,7 +161,6 @@ class Conversion:
         self.header |= {"samplers": [], "cameras": [], "asset": {"version": "2.0", "generator": GENERATOR}}
         self.lights: list[dict[str, Any]] = []
         self._materials: dict[str, tuple[int, str]] = {}
-        self._images: dict[str, int | None] = {}
         self._skins, self.transforms = UsdSkel.Cache(), dict[int | None, Array]()
         for prim in self._prims():
             if prim.IsA(UsdSkel.Root):
@@ -168,10 +168,9 @@ class Conversion:
 
     def _prims(self) -> Iterator[Any]:
         for number, prim in enumerate(Usd.PrimRange(self.stage.GetPseudoRoot(), Usd.TraverseInstanceProxies())):
-            if number > files.scaled(LARGEST_TREE):
-                raise files.too_large(self.source, f"USD of at most {files.scaled(LARGEST_TREE):,} prims", "more")
-            if prim.GetPath().pathElementCount > files.scaled(DEEPEST_TREE):
-                raise files.too_large(self.source, f"prims of at most {files.scaled(DEEPEST_TREE)} levels", "more")
+            check_most(self.source, number, LARGEST_TREE, "USD of at most {} prims", "more")
+            depth = prim.GetPath().pathElementCount
+            check_most(self.source, depth, DEEPEST_TREE, "prims of at most {} levels", "more")
             yield prim
 
     def glb(self) -> bytes:
@@ -191,13 +190,18 @@ class Conversion:
         names = Counter(prim.GetName() for prim in self._prims())
         places: dict[Any, int] = {}
         for prim in self._prims():
-            self._name_unread(prim)
+            kind = prim.GetTypeName()
+            if (prim.IsA(UsdGeom.Gprim) and not prim.IsA(UsdGeom.Mesh)) or kind == "PointInstancer":
+                self._leave(f"has a {kind}, which is no mesh: left out; make meshes of it where the file is from")
+            if prim.HasAPI(UsdSkel.BindingAPI) and UsdSkel.BindingAPI(prim).GetBlendShapesAttr().HasAuthoredValue():
+                self._leave("has a mesh with blend shapes, which are left out")
+            if kind == "SkelAnimation":
+                self._leave("has an animation of a skeleton, which is shown at rest")
             if not prim.IsA(UsdGeom.Imageable) or prim.IsA(UsdGeom.Subset):
                 continue
             name = prim.GetName() if names[prim.GetName()] == 1 else str(prim.GetPath()).lstrip("/")
             node: dict[str, Any] = {"name": name, "children": []}
-            parent = 0
-            moves = UsdGeom.Xformable(prim)
+            parent, moves = 0, UsdGeom.Xformable(prim)
             if moves:
                 local = np.array(moves.GetLocalTransformation(FIRST))  # rows, as glTF's columns
                 if not np.isfinite(local).all():
@@ -217,23 +221,12 @@ class Conversion:
         header["scenes"], header["scene"] = [{"nodes": [0]}], 0
         if self.lights:
             header["extensions"] = {"KHR_lights_punctual": {"lights": self.lights}}
-        notes = [one if count == 1 else f"{one} ({count:,} times)" for one, count in self.left.items()]
+        notes = [what if count == 1 else f"{what} ({count:,} times)" for what, count in self.left.items()]
         header["asset"]["extras"] = {"left_out": notes[:100]}
         return self.buffer.file({key: value for key, value in header.items() if value or key == "asset"})
 
     def _leave(self, what: str) -> None:
         self.left[what] += 1
-
-    def _name_unread(self, prim: Any) -> None:
-        """Say what of a prim, or of its kind, is not carried over."""
-        kind = prim.GetTypeName()
-        gprim = prim.IsA(UsdGeom.Gprim) and not prim.IsA(UsdGeom.Mesh)
-        if gprim or kind == "PointInstancer":
-            self._leave(f"has a {kind}, which is no mesh: left out; make meshes of it where the file is from")
-        if prim.HasAPI(UsdSkel.BindingAPI) and UsdSkel.BindingAPI(prim).GetBlendShapesAttr().HasAuthoredValue():
-            self._leave("has a mesh with blend shapes, which are left out")
-        if kind == "SkelAnimation":
-            self._leave("has an animation of a skeleton, which is shown at rest")
 
     def _fill(self, prim: Any, node: dict[str, Any]) -> None:
         """Give a node what its prim shows, if it is seen."""
@@ -255,12 +248,10 @@ class Conversion:
     # ---- cameras and lights ------------------------------------------------------------------------------------------
 
     def _camera(self, camera: Any, node: dict[str, Any]) -> None:
-        wide, high = (one.Get(FIRST) for one in (camera.GetHorizontalApertureAttr(), camera.GetVerticalApertureAttr()))
-        focal = camera.GetFocalLengthAttr().Get(FIRST)
-        offsets = camera.GetHorizontalApertureOffsetAttr().Get(FIRST), camera.GetVerticalApertureOffsetAttr().Get(FIRST)
+        wide, high, focal = (_first(camera, name) for name in ("HorizontalAperture", "VerticalAperture", "FocalLength"))
         entry: dict[str, Any] = {"name": node["name"], "type": "orthographic"}
-        if camera.GetProjectionAttr().Get(FIRST) == UsdGeom.Tokens.perspective and min(wide, high, focal) > 0.0:
-            if any(offsets):
+        if _first(camera, "Projection") == UsdGeom.Tokens.perspective and min(wide, high, focal) > 0.0:
+            if _first(camera, "HorizontalApertureOffset") or _first(camera, "VerticalApertureOffset"):
                 self._leave("has a camera whose aperture is shifted; the shift is left out")
             view = {"yfov": 2.0 * math.atan(high / (2.0 * focal)), "aspectRatio": wide / high, "znear": 0.01}
             entry |= {"type": "perspective", "perspective": view}
@@ -270,30 +261,25 @@ class Conversion:
     def _light(self, prim: Any, node: dict[str, Any]) -> None:
         """A sphere as a point, a spot where it is shaped, and a distant light; radiant power as UsdLux defines it."""
         light, kind = UsdLux.LightAPI(prim), prim.GetTypeName()
-        power = light.GetIntensityAttr().Get(FIRST) * 2.0 ** light.GetExposureAttr().Get(FIRST)
-        normalised = light.GetNormalizeAttr().Get(FIRST)
-        color = np.array(light.GetColorAttr().Get(FIRST), np.float64)
-        if light.GetEnableColorTemperatureAttr().Get(FIRST):
-            color *= np.array(UsdLux.BlackbodyTemperatureAsRgb(light.GetColorTemperatureAttr().Get(FIRST)))
+        power = _first(light, "Intensity") * 2.0 ** _first(light, "Exposure")
+        normalised = _first(light, "Normalize")
+        color = np.array(_first(light, "Color"), np.float64)
+        if _first(light, "EnableColorTemperature"):
+            color *= np.array(UsdLux.BlackbodyTemperatureAsRgb(_first(light, "ColorTemperature")))
         if kind == "DistantLight":
-            half = math.radians(UsdLux.DistantLight(prim).GetAngleAttr().Get(FIRST)) / 2.0
+            half = math.radians(_first(UsdLux.DistantLight(prim), "Angle")) / 2.0
             entry: dict[str, Any] = {"type": "directional"}
             power *= 1.0 if normalised or half <= 0.0 else math.pi * math.sin(half) ** 2
         elif kind == "SphereLight":
-            sphere, shaping = UsdLux.SphereLight(prim), UsdLux.ShapingAPI(prim)
-            radius = sphere.GetRadiusAttr().Get(FIRST)
             # radiance times the disk that is seen; normalised, what is emitted is divided by the area of the sphere
-            power *= 0.25 if normalised else math.pi * radius**2
+            power *= 0.25 if normalised else math.pi * _first(UsdLux.SphereLight(prim), "Radius") ** 2
             power *= self.unit**2
-            entry = {"type": "point"}
-            cone = shaping.GetShapingConeAngleAttr().Get(FIRST) if prim.HasAPI(UsdLux.ShapingAPI) else 90.0
+            entry, shaping = {"type": "point"}, UsdLux.ShapingAPI(prim)
+            cone = _first(shaping, "ShapingConeAngle") if prim.HasAPI(UsdLux.ShapingAPI) else 90.0
             if cone is not None and cone < 90.0:
-                soft = shaping.GetShapingConeSoftnessAttr().Get(FIRST) or 0.0
-                outer = math.radians(max(cone, 0.1))
-                entry |= {
-                    "type": "spot",
-                    "spot": {"outerConeAngle": outer, "innerConeAngle": outer * (1.0 - min(soft, 1.0))},
-                }
+                soft, outer = _first(shaping, "ShapingConeSoftness") or 0.0, math.radians(max(cone, 0.1))
+                cone_angles = {"outerConeAngle": outer, "innerConeAngle": outer * (1.0 - min(soft, 1.0))}
+                entry = {"type": "spot", "spot": cone_angles}
             self._leave("has a SphereLight, which shines from its middle here")
         else:
             self._leave(f"has a {kind}, which is left out; `environment` and `controls=light` light a scene")
@@ -307,9 +293,10 @@ class Conversion:
 
     def _mesh(self, prim: Any, node: dict[str, Any]) -> None:
         mesh, path = UsdGeom.Mesh(prim), str(prim.GetPath())
-        points = _array(mesh.GetPointsAttr().Get(FIRST), np.float64, 3)
-        counts = _array(mesh.GetFaceVertexCountsAttr().Get(FIRST), np.int64)
-        corners = _array(mesh.GetFaceVertexIndicesAttr().Get(FIRST), np.int64)
+        points = _array(_first(mesh, "Points"), np.float64, 3)
+        counts, corners, holes = (
+            _array(_first(mesh, name), np.int64) for name in ("FaceVertexCounts", "FaceVertexIndices", "HoleIndices")
+        )
         if not len(points) or not len(counts):
             return
         if (counts < 0).any() or counts.sum() != len(corners) or corners.min() < 0 or corners.max() >= len(points):
@@ -317,44 +304,47 @@ class Conversion:
         moved, points = self._at_rest(prim, points)
         if moved is not None:
             node["moved"] = moved.ravel().tolist()
-        scheme = mesh.GetSubdivisionSchemeAttr().Get(FIRST)
-        normals, per_normal = self._normals(mesh, len(points), len(counts), len(corners))
-        if scheme != UsdGeom.Tokens.none:
-            self._leave("has a mesh that is to be subdivided, which is shown as it is, and smooth")
-            normals = None
         self.triangles += int(np.maximum(counts - 2, 0).sum())
-        if self.triangles > files.scaled(LARGEST_FACES):
-            raise files.too_large(self.source, f"a mesh of at most {files.scaled(LARGEST_FACES):,} triangles", "more")
+        check_faces(self.source, self.triangles, "more")
         picked, face, _ = triangulated(points[corners], counts)
-        holes = _array(mesh.GetHoleIndicesAttr().Get(FIRST), np.int64)
         keep = ~np.isin(face, holes)
         picked, face = picked[keep], face[keep]
-        if mesh.GetOrientationAttr().Get(FIRST) == UsdGeom.Tokens.leftHanded:
+        if _first(mesh, "Orientation") == UsdGeom.Tokens.leftHanded:
             picked = picked[:, ::-1]
-        if scheme != UsdGeom.Tokens.none:
-            normals, per_normal = _smooth(points, corners[picked]), "vertex"
+        primvars = UsdGeom.PrimvarsAPI(prim)
+        normals = _flattened(primvars.GetPrimvar("normals"), 3)
+        if normals is None and len(own := _array(_first(mesh, "Normals"), np.float64, 3)):
+            normals = own, str(mesh.GetNormalsInterpolation())
+        if _first(mesh, "SubdivisionScheme") != UsdGeom.Tokens.none:
+            self._leave("has a mesh that is to be subdivided, which is shown as it is, and smooth")
+            normals = _smooth(points, corners[picked]), "vertex"
         primitives = []
         for material, uv_name, faces in self._groups(prim, mesh, len(counts)):
-            triangles = picked[np.isin(face, faces)] if faces is not None else picked
-            owners = face[np.isin(face, faces)] if faces is not None else face
-            if not len(triangles):
+            mine = np.isin(face, faces) if faces is not None else np.ones(len(face), bool)
+            at = picked[mine].reshape(-1)
+            if not len(at):
                 continue
-            uvs, per_uv = self._uvs(prim, uv_name, material)
-            colors, per_color = self._colors(prim, material)
-            at = triangles.reshape(-1)
-            by = {"vertex": corners[at], "varying": corners[at], "faceVarying": at, "uniform": owners.repeat(3)}
-            index = [corners[at]]
-            for values, per in ((normals, per_normal), (uvs, per_uv), (colors, per_color)):
-                rows = by.get(per, np.zeros(len(at), np.int64))
-                if values is not None and rows.max() >= len(values):
+            uvs = _flattened(primvars.FindPrimvarWithInheritance(uv_name), 2)
+            if uvs is not None:  # as glTF has them, v down, with the transform that the material asks for
+                turned = self.transforms.get(material, np.eye(3)) if material is not None else np.eye(3)
+                moved_uvs = uvs[0] @ turned[:2, :2].T + turned[:2, 2]
+                uvs = np.stack([moved_uvs[:, 0], 1.0 - moved_uvs[:, 1]], axis=1), uvs[1]
+            colors = None  # which only count where there is no material
+            if material is None:
+                colors = _flattened(primvars.FindPrimvarWithInheritance("displayColor"), 3)
+            by = {"vertex": corners[at], "varying": corners[at], "faceVarying": at, "uniform": face[mine].repeat(3)}
+            held = {"NORMAL": normals, "TEXCOORD_0": uvs, "COLOR_0": colors}
+            index, none = [corners[at]], np.zeros(len(at), np.int64)
+            for values, per in (given or (None, "") for given in held.values()):
+                index.append(none if values is None else by.get(per, none))
+                if values is not None and index[-1].max() >= len(values):
                     raise FileFormatError(f"{self.source}: expected as many values as corners on {path}, got fewer")
-                index.append(rows if values is not None else np.zeros(len(at), np.int64))
             rows, inverse = np.unique(np.stack(index, axis=1), axis=0, return_inverse=True)
             attributes = {"POSITION": self.buffer.accessor(points[rows[:, 0]].astype(np.float32), "VEC3", bounds=True)}
-            for name, values, column in (("NORMAL", normals, 1), ("TEXCOORD_0", uvs, 2), ("COLOR_0", colors, 3)):
-                if values is not None:
-                    kind = "VEC2" if name == "TEXCOORD_0" else "VEC3"
-                    attributes[name] = self.buffer.accessor(values[rows[:, column]].astype(np.float32), kind)
+            for column, (name, given) in enumerate(held.items(), 1):
+                if given is not None:
+                    values = given[0][rows[:, column]].astype(np.float32)
+                    attributes[name] = self.buffer.accessor(values, f"VEC{values.shape[1]}")
             entry = {"attributes": attributes, "mode": 4}
             entry["indices"] = self.buffer.accessor(inverse.reshape(-1).astype(np.uint32), "SCALAR")
             primitives.append(entry if material is None else {**entry, "material": material})
@@ -362,40 +352,16 @@ class Conversion:
             node["mesh"] = len(self.header["meshes"])
             self.header["meshes"].append({"name": node["name"], "primitives": primitives})
 
-    def _normals(self, mesh: Any, points: int, faces: int, corners: int) -> tuple[Array | None, str]:
-        given = UsdGeom.PrimvarsAPI(mesh).GetPrimvar("normals")
-        if given and given.HasValue():
-            return _array(given.ComputeFlattened(FIRST), np.float64, 3), str(given.GetInterpolation())
-        values = _array(mesh.GetNormalsAttr().Get(FIRST), np.float64, 3)
-        return (values, str(mesh.GetNormalsInterpolation())) if len(values) else (None, "vertex")
-
-    def _uvs(self, prim: Any, name: str, material: int | None) -> tuple[Array | None, str]:
-        """Texture coordinates as glTF has them, v down, with the transform that the material asks for."""
-        given = UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance(name)
-        if not given or not given.HasValue():
-            return None, "vertex"
-        values = _array(given.ComputeFlattened(FIRST), np.float64, 2)
-        turned = self.transforms.get(material, np.eye(3)) if material is not None else np.eye(3)
-        values = values @ turned[:2, :2].T + turned[:2, 2]
-        return np.stack([values[:, 0], 1.0 - values[:, 1]], axis=1), str(given.GetInterpolation())
-
-    def _colors(self, prim: Any, material: int | None) -> tuple[Array | None, str]:
-        """Colours of vertices, where there is no material."""
-        given = UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance("displayColor")
-        if material is not None or not given or not given.HasValue():
-            return None, "vertex"
-        return _array(given.ComputeFlattened(FIRST), np.float64, 3), str(given.GetInterpolation())
-
     def _groups(self, prim: Any, mesh: Any, faces: int) -> Iterator[tuple[int | None, str, Array | None]]:
         """Yield the materials of a mesh: number, name of the texture coordinates, and faces (None for all)."""
         subsets = UsdShade.MaterialBindingAPI(prim).GetMaterialBindSubsets()
         rest = np.ones(faces, bool)
         for subset in subsets:
-            some = _array(subset.GetIndicesAttr().Get(FIRST), np.int64)
-            some = some[(some >= 0) & (some < faces)]
-            some = some[rest[some]]
-            rest[some] = False
-            yield *self._material(subset.GetPrim()), some
+            chosen = _array(_first(subset, "Indices"), np.int64)
+            chosen = chosen[(chosen >= 0) & (chosen < faces)]
+            chosen = chosen[rest[chosen]]
+            rest[chosen] = False
+            yield *self._material(subset.GetPrim()), chosen
         if rest.any():
             yield *self._material(prim), np.flatnonzero(rest) if subsets else None
 
@@ -415,19 +381,18 @@ class Conversion:
         mapper = skin.GetJointMapper()
         if mapper and not mapper.IsNull() and not mapper.IsIdentity():
             moves = mapper.RemapTransforms(type(rest)(moves))
-        given = Vt.Vec3fArray([Gf.Vec3f(*map(float, one)) for one in points])
-        if not skin.ComputeSkinnedPoints(Vt.Matrix4dArray(list(moves)), given, FIRST):
+        skinned = Vt.Vec3fArray([Gf.Vec3f(*map(float, point)) for point in points])
+        if not skin.ComputeSkinnedPoints(Vt.Matrix4dArray(list(moves)), skinned, FIRST):
             return None, points
         place = UsdGeom.Xformable(bound.GetPrim()).ComputeLocalToWorldTransform(FIRST)
-        return np.array(place), _array(given, np.float64, 3)
+        return np.array(place), _array(skinned, np.float64, 3)
 
     # ---- materials ---------------------------------------------------------------------------------------------------
 
     def _material(self, prim: Any) -> tuple[int | None, str]:
         """The number of what a prim is made of, and the name of its texture coordinates; (None, "st") of none."""
-        bound, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial(UsdShade.Tokens.preview)
-        if not bound:
-            bound, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
+        binding = UsdShade.MaterialBindingAPI(prim)
+        bound = binding.ComputeBoundMaterial(UsdShade.Tokens.preview)[0] or binding.ComputeBoundMaterial()[0]
         if not bound:
             return None, "st"
         path = str(bound.GetPath())
@@ -439,35 +404,21 @@ class Conversion:
         number, shader = len(self.header["materials"]), bound.ComputeSurfaceSource()[0]
         entry: dict[str, Any] = {"name": name, "doubleSided": True}
         self.header["materials"].append(entry)
+        surface = entry["pbrMetallicRoughness"] = {}
         if not shader or shader.GetIdAttr().Get() != "UsdPreviewSurface":
             self._leave("has a material that is no UsdPreviewSurface, which is grey here")
-            entry["pbrMetallicRoughness"] = {"baseColorFactor": [0.2140, 0.2140, 0.2140, 1.0], "metallicFactor": 0.0}
-            entry["pbrMetallicRoughness"]["roughnessFactor"] = 0.5
+            grey = [0.2140, 0.2140, 0.2140, 1.0]
+            surface |= {"baseColorFactor": grey, "metallicFactor": 0.0, "roughnessFactor": 0.5}
             return number, "st"
         inputs = Inputs(self, shader, number)
-        self._ask(inputs, entry)
-        for one in COAT:
-            if inputs.differs(one):
-                self._leave(f"has materials with {one}, which is left out")
-        if inputs.number("useSpecularWorkflow", 0.0):
-            self._leave("has materials with a specular workflow, of which the diffuse colour is read")
-        if abs(inputs.number("ior", 1.5) - 1.5) > 1e-3:
-            self._leave("has materials with an ior other than 1.5, which is left out")
-        return number, inputs.uv_name
-
-    def _ask(self, inputs: Inputs, entry: dict[str, Any]) -> None:
-        surface = entry["pbrMetallicRoughness"] = {}
         color, base = inputs.color("diffuseColor", (0.18, 0.18, 0.18)), inputs.texture("diffuseColor", "rgb")
         opacity, cutoff = inputs.number("opacity", 1.0), inputs.number("opacityThreshold", 0.0)
         cut = inputs.texture("opacity", "a")
         if base is not None:
             surface["baseColorTexture"] = {"index": base}
-        if cut is not None and cut == base:
-            opacity = 1.0
-        elif cut is not None:
+        if cut is not None and cut != base:
             self._leave("has an opacity of another picture than the colour's, which is left out")
-            opacity = 1.0
-        elif inputs.connected("opacity"):
+        if cut is not None or inputs.connected("opacity"):
             opacity = 1.0
         surface["baseColorFactor"] = [*color, opacity]
         if opacity < 1.0 or (cut is not None and cut == base):
@@ -485,52 +436,57 @@ class Conversion:
         glow, glowing = inputs.color("emissiveColor", (0.0, 0.0, 0.0)), inputs.texture("emissiveColor", "rgb")
         if glowing is not None:
             entry["emissiveTexture"] = {"index": glowing}
-        most = max(*glow, 1e-12)
-        if max(glow) > 0.0:
-            entry["emissiveFactor"] = [one / max(most, 1.0) for one in glow]
+        if (most := max(glow)) > 0.0:
+            entry["emissiveFactor"] = [channel / max(most, 1.0) for channel in glow]
             if most > 1.0:
                 entry["extensions"] = {"KHR_materials_emissive_strength": {"emissiveStrength": most}}
+        for unread in COAT:
+            if inputs.differs(unread):
+                self._leave(f"has materials with {unread}, which is left out")
+        if inputs.number("useSpecularWorkflow", 0.0):
+            self._leave("has materials with a specular workflow, of which the diffuse colour is read")
+        if abs(inputs.number("ior", 1.5) - 1.5) > 1e-3:
+            self._leave("has materials with an ior other than 1.5, which is left out")
+        return number, inputs.uv_name
 
     def _packed(self, inputs: Inputs) -> int | None:
         """One picture of roughness (green) and metallic (blue), of the pictures of each; None where there is none."""
         planes = [inputs.plane(name) for name in ("roughness", "metallic")]
-        if planes == [None, None]:
+        size = next((plane.size for plane in planes if plane is not None), None)
+        if size is None:
             return None
-        sizes = [one.size for one in planes if one is not None]
         values = (inputs.number("roughness", 0.5), inputs.number("metallic", 0.0))
-        made = [
-            Image.new("L", sizes[0], round(255 * min(max(value, 0.0), 1.0))) if one is None else one.resize(sizes[0])
-            for one, value in zip(planes, values, strict=True)
+        channels = [
+            Image.new("L", size, round(255 * min(max(value, 0.0), 1.0))) if plane is None else plane.resize(size)
+            for plane, value in zip(planes, values, strict=True)
         ]
         file = io.BytesIO()
-        Image.merge("RGB", [Image.new("L", sizes[0], 255), *made]).save(file, "PNG")
+        Image.merge("RGB", [Image.new("L", size, 255), *channels]).save(file, "PNG")
         return self.add_texture(file.getvalue(), {"wrapS": 10497, "wrapT": 10497})
 
     def image(self, asset: Any, name: str) -> bytes | None:
         """The bytes of a picture in the folder; None, and a note, of one that is not there."""
-        given = str(asset.path)
-        resolved = os.path.realpath(str(asset.resolvedPath) or str(self.folder / given))
+        path = str(asset.path)
+        resolved = os.path.realpath(str(asset.resolvedPath) or str(self.folder / path))
         inside = Path(resolved).is_relative_to(self.folder)
         if not inside or not os.path.isfile(resolved):
             why = "is missing" if inside else "is outside its folder and is not read"
-            self._leave(f"the texture {given[:100]!r} of {name} {why}")
+            self._leave(f"the texture {path[:100]!r} of {name} {why}")
             return None
         self.read.append(resolved)
         return files.read_bytes(Path(resolved), "a picture", LARGEST_FILE)
 
     def add_texture(self, data: bytes, sampler: Mapping[str, int]) -> int:
         """Put a picture into the file, and return the number of its texture."""
-        kind = "image/png" if data.startswith(b"\x89PNG") else "image/jpeg"
-        image = {"mimeType": kind, "bufferView": self.buffer.view(data)}
-        if image not in self.header["images"]:
-            self.header["images"].append(image)
-        if sampler not in self.header["samplers"]:
-            self.header["samplers"].append(dict(sampler))
-        entry = {"source": self.header["images"].index(image), "sampler": self.header["samplers"].index(sampler)}
-        if entry not in self.header["textures"]:
-            self.header["textures"].append(entry)
-        found: int = self.header["textures"].index(entry)
-        return found
+        image = self._numbered("images", {"mimeType": mime_type(data), "bufferView": self.buffer.view(data)})
+        return self._numbered("textures", {"source": image, "sampler": self._numbered("samplers", sampler)})
+
+    def _numbered(self, kind: str, entry: Mapping[str, Any]) -> int:
+        """The number of an entry, which is put in where there is none like it."""
+        entries: list[Mapping[str, Any]] = self.header[kind]
+        if entry not in entries:
+            entries.append(entry)
+        return entries.index(entry)
 
 
 @dataclass
@@ -543,10 +499,7 @@ class Inputs:
     uv_name: str = "st"
 
     def _source(self, name: str) -> tuple[Any, str] | None:
-        given = self.shader.GetInput(name)
-        if not given:
-            return None
-        for attribute in UsdShade.Utils.GetValueProducingAttributes(given):
+        for attribute in _producing(self.shader, name):
             prim = UsdShade.Shader(attribute.GetPrim())
             if prim and UsdShade.Utils.GetType(attribute.GetName()) == UsdShade.AttributeType.Output:
                 return prim, UsdShade.Utils.GetBaseNameAndType(attribute.GetName())[0]
@@ -557,9 +510,7 @@ class Inputs:
         return self._source(name) is not None
 
     def _value(self, name: str) -> Any:
-        given = self.shader.GetInput(name)
-        attributes = UsdShade.Utils.GetValueProducingAttributes(given) if given else []
-        return attributes[0].Get(FIRST) if attributes and not self.connected(name) else None
+        return None if self.connected(name) else _produced(self.shader, name)
 
     def differs(self, name: str) -> bool:
         """Whether an input that is not read does something."""
@@ -579,10 +530,10 @@ class Inputs:
         source = self._source(name)
         if source is not None:
             scale = source[0].GetInput("scale")
-            value = None if not scale else scale.Get(FIRST)
-            return (1.0, 1.0, 1.0) if value is None else tuple(float(one) for one in value[:3])
-        value = self._value(name)
-        return otherwise if value is None else tuple(float(one) for one in value)
+            value, otherwise = (scale.Get(FIRST) if scale else None), (1.0, 1.0, 1.0)
+        else:
+            value = self._value(name)
+        return otherwise if value is None else tuple(map(float, value[:3]))
 
     def _picture(self, name: str) -> tuple[bytes, Any, str] | None:
         source = self._source(name)
@@ -592,8 +543,7 @@ class Inputs:
         if texture.GetIdAttr().Get() != "UsdUVTexture":
             self.conversion._leave(f"has a {name} of {texture.GetIdAttr().Get()}, which is left out")
             return None
-        asset = UsdShade.Utils.GetValueProducingAttributes(texture.GetInput("file"))
-        path = asset[0].Get(FIRST) if asset else None
+        path = _produced(texture, "file")
         if path is None:
             return None
         if "<UDIM>" in str(path.path):
@@ -604,10 +554,10 @@ class Inputs:
 
     def texture(self, name: str, output: str) -> int | None:
         """The number of the texture that an input shows; None where there is none, or it cannot be read."""
-        found = self._picture(name)
-        if found is None:
+        picture = self._picture(name)
+        if picture is None:
             return None
-        data, texture, shown = found
+        data, texture, shown = picture
         if shown != output:
             self.conversion._leave(f"has a {name} of the output {shown!r} of a picture, which is left out")
             return None
@@ -615,10 +565,10 @@ class Inputs:
 
     def plane(self, name: str) -> Image.Image | None:
         """The picture of 8 bits of an input that is one number."""
-        found = self._picture(name)
-        if found is None:
+        picture = self._picture(name)
+        if picture is None:
             return None
-        data, texture, output = found
+        data, texture, output = picture
         self._sampler(texture, name)
         try:
             with Image.open(io.BytesIO(data), formats=FORMATS) as image:
@@ -642,19 +592,16 @@ class Inputs:
         if reader is not None and reader.GetIdAttr().Get() == "UsdTransform2d":
             turned, reader = _transform2d(reader), self._st(reader, "in")
         if reader is not None and reader.GetInput("varname"):
-            found = UsdShade.Utils.GetValueProducingAttributes(reader.GetInput("varname"))
-            self.uv_name = str(found[0].Get(FIRST) or "st") if found else "st"
+            self.uv_name = str(_produced(reader, "varname") or "st")
         known = self.conversion.transforms.setdefault(self.material, turned)
         if not np.array_equal(known, turned):
-            self.conversion._leave(
-                f"has a {name} with another UsdTransform2d than the first texture's, which is left out"
-            )
+            another = f"has a {name} with another UsdTransform2d than the first texture's"
+            self.conversion._leave(f"{another}, which is left out")
         return {"wrapS": wraps[0], "wrapT": wraps[1]}
 
     def _st(self, shader: Any, name: str = "st") -> Any:
-        given = shader.GetInput(name)
-        found = UsdShade.Utils.GetValueProducingAttributes(given) if given else []
-        return UsdShade.Shader(found[0].GetPrim()) if found and found[0].GetPrim() != shader.GetPrim() else None
+        prim = next((attribute.GetPrim() for attribute in _producing(shader, name)), shader.GetPrim())
+        return UsdShade.Shader(prim) if prim != shader.GetPrim() else None
 
 
 _TO_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1.0, 0], [0, -1.0, 0, 0], [0, 0, 0, 1.0]])
@@ -662,26 +609,45 @@ _TO_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1.0, 0], [0, -1.0, 0, 0], [0, 0, 0, 
 
 def _transform2d(shader: Any) -> Array:
     """The matrix (3, 3) of a UsdTransform2d: scaled, turned counter-clockwise in degrees, moved."""
-    given = {name: shader.GetInput(name) for name in ("scale", "rotation", "translation")}
-    values = {name: one.Get(FIRST) if one else None for name, one in given.items()}
-    angle = math.radians(values["rotation"] or 0.0)
-    scale, shift = values["scale"] or (1.0, 1.0), values["translation"] or (0.0, 0.0)
+    inputs = (shader.GetInput(name) for name in ("scale", "rotation", "translation"))
+    scale, rotation, shift = (value.Get(FIRST) if value else None for value in inputs)
+    angle, matrix = math.radians(rotation or 0.0), np.eye(3)
     turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
-    made = np.eye(3)
-    made[:2, :2], made[:2, 2] = turn @ np.diag(scale), shift
-    return made
+    matrix[:2, :2], matrix[:2, 2] = turn @ np.diag(scale or (1.0, 1.0)), shift or (0.0, 0.0)
+    return matrix
+
+
+def _first(schema: Any, name: str) -> Any:
+    """The value of a schema's attribute at the first time."""
+    return getattr(schema, f"Get{name}Attr")().Get(FIRST)
+
+
+def _producing(shader: Any, name: str) -> Sequence[Any]:
+    """The attributes that an input of a shader has its value from."""
+    given = shader.GetInput(name)
+    return UsdShade.Utils.GetValueProducingAttributes(given) if given else ()
+
+
+def _produced(shader: Any, name: str) -> Any:
+    """The value of an input of a shader; None where there is none."""
+    return next((attribute.Get(FIRST) for attribute in _producing(shader, name)), None)
+
+
+def _flattened(primvar: Any, width: int) -> tuple[Array, str] | None:
+    """The values (N, width) of a primvar, and what each belongs to; None where there are none."""
+    if not primvar or not primvar.HasValue():
+        return None
+    return _array(primvar.ComputeFlattened(FIRST), np.float64, width), str(primvar.GetInterpolation())
 
 
 def _array(values: Any, kind: Any, width: int = 0) -> Array:
-    if values is None:
-        return np.zeros((0, width) if width else 0, kind)
-    made = np.asarray(values, dtype=kind)
-    return made.reshape(-1, width) if width else made
+    array = np.asarray([] if values is None else values, dtype=kind)
+    return array.reshape(-1, width) if width else array
 
 
 def _smooth(points: Array, faces: Array) -> Array:
     """Normals (P, 3) of points: the mean of those of their triangles (T, 3), by area."""
-    across = np.cross(points[faces[:, 1]] - points[faces[:, 0]], points[faces[:, 2]] - points[faces[:, 0]])
+    across = face_vectors(points[faces])
     normals = np.zeros_like(points)
     for corner in range(3):
         np.add.at(normals, faces[:, corner], across)

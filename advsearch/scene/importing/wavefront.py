@@ -7,15 +7,15 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from advsearch import files
 from advsearch.errors import FileFormatError
-from advsearch.scene.assets import Doubles, Ints
+from advsearch.scene.assets import Doubles, Ints, face_vectors
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.importing import udim
 from advsearch.scene.importing.files import (
@@ -23,6 +23,7 @@ from advsearch.scene.importing.files import (
     Notes,
     References,
     check_faces,
+    check_most,
     damaged,
     is_number,
     looks_like,
@@ -32,114 +33,86 @@ from advsearch.scene.importing.files import (
 )
 from advsearch.scene.importing.mtl import without_comment
 from advsearch.scene.importing.mtl_surfaces import MtlReader, Painted, libraries_of
-from advsearch.scene.importing.parts import NEUTRAL, ImportedPart, ImportedSurface, Looked, split_at_corners
-from advsearch.scene.importing.polygons import FEW, triangulated
+from advsearch.scene.importing.parts import NEUTRAL, ImportedPart, ImportedSurface, Looked, alike, split_at_corners
+from advsearch.scene.importing.polygons import cut_up
 
-GROUPING = frozenset(("g", "o"))
-"""Statements that only name parts; all parts are joined."""
+GROUPING = frozenset(("g", "o"))  # statements that only name parts; all parts are joined
 FREE_FORM = frozenset(
     "bmat bsp bzp cdc cdp con cstype curv curv2 deg end hole mg parm res scrv sp step surf trim vp".split()
 )
 """Statements of curves and curved surfaces."""
-MOST_NAMED = 10_000
-"""Material files, and materials, that a file may name, before `advsearch.files.scaled`."""
-BEYOND = 0.01
-"""How far texture coordinates may lie outside of a texture before it matters how that goes on."""
+MOST_NAMED = 10_000  # material files, and materials, that a file may name, before `advsearch.files.scaled`
+BEYOND = 0.01  # how far texture coordinates may lie outside of a texture before it matters how that goes on
 
 
 def read_obj(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
     """Read an OBJ file, and the material files that it names, as one part for each material, and another for its faces
-    without texture coordinates.
-
-    Raises:
-        FileFormatError: it is of another kind, is cut short, refers to what is not in it, or has no faces.
-    """
+    without texture coordinates. Raises FileFormatError: it is of another kind, is cut short, refers to what is not in
+    it, or has no faces."""
     lines = Lines(path, data)
     tables = {kind: lines.table(kind) for kind in TABLES}
     if not len(tables["v"]):
         raise damaged(path, EXPECTED, looks_like(data))
     corners, counts, rows = lines.faces({kind: len(table) for kind, table in tables.items()})
-    few = int((counts < 3).sum())
-    if few == len(counts):
+    if (counts < 3).all():
         raise FileFormatError(f"{path}: expected a mesh with faces, got points or lines only; export triangles")
     references = References(path)
 
     def shown_on(name: str, number: int) -> tuple[Doubles, Doubles]:
-        mine = np.flatnonzero((material == names.index(name)) & (square == number) & (mapped >= 0).all(axis=1))
-        a, b, c = (points[position[mine, corner]] for corner in range(3))
-        return tables["vt"][mapped[mine]], np.linalg.norm(np.cross(b - a, c - a), axis=1)
+        mine = (material == names.index(name)) & (square == number) & (mapped >= 0).all(axis=1)
+        return tables["vt"][mapped[mine]], np.linalg.norm(face_vectors(points[position[mine]]), axis=1)
 
     reader = MtlReader(references, notes, shown_on)
     statements = _statements(lines, notes)
     libraries = list(dict.fromkeys(statements.libraries))
-    _check_count(path, libraries, "lines that name material files (mtllib)")
+    check_most(path, len(libraries), MOST_NAMED, "at most {} lines that name material files (mtllib)")
     libraries = libraries_of(libraries, references)
-    _check_count(path, libraries, "material files")
+    check_most(path, len(libraries), MOST_NAMED, "at most {} material files")
     for name in libraries:
         reader.read_library(name)
-    if few:
-        notes.say(f"{FEW.format(count=few, s='' if few == 1 else 's')}")
     points = tables["v"][:, :3]
-    triangles, face, wrong = triangulated(points[corners[:, 0]], counts)
-    if wrong:
-        notes.say(f"{wrong:,} faces cross themselves, or are too much work, and may be cut up wrongly")
+    triangles, face = cut_up(points[corners[:, 0]], counts, notes)
     position, mapped, normal = (corners[triangles, place] for place in range(3))
     names, material = _in_effect(statements.materials, rows[face])
-    _check_count(path, names, "materials")
+    check_most(path, len(names), MOST_NAMED, "at most {} materials")
     smoothness, smooth = _in_effect(statements.smoothing, rows[face])
     off = np.array([*(word in ("off", "0", "") for word in smoothness), False])[smooth]
     if ((smooth >= 0) & ~off & (normal < 0).any(axis=1)).any():
         notes.say("smoothing groups are left out: its normals are made, with creases at sharp edges")
     colors = _colors(lines, tables["v"], notes)
     parts = []
-    square = _squares(reader, names, material, tables["vt"], mapped)
-    kinds = np.stack([material, (mapped >= 0).all(axis=1), off, square], axis=1)
-    _, kind = np.unique(kinds, axis=0, return_inverse=True)
-    for chosen in np.split(np.argsort(kind, kind="stable"), np.cumsum(np.bincount(kind.reshape(-1)))[:-1]):
-        first = kinds[chosen[0]]
-        named = first[0] >= 0 and names[first[0]]
-        painted = reader.painted(names[first[0]], int(first[3])) if named else Painted(ImportedSurface())
+    square, inside = np.zeros(len(mapped), np.int64), (mapped >= 0).all(axis=1)  # of UDIM; 0: one picture for all
+    for number in np.unique(material[inside & (material >= 0)]):
+        mine = np.flatnonzero(inside & (material == number))
+        squares = udim.squares(tables["vt"][mapped[mine]])
+        several = reader.squares_of(names[number], np.unique(squares).tolist())
+        square[mine] = np.where(np.isin(squares, several), squares, 0)
+    for chosen in alike(material, inside, off, square):
+        first = chosen[0]
+        name, number = names[material[first]] if material[first] >= 0 else "", int(square[first])
+        painted = reader.painted(name, number) if name else Painted(ImportedSurface())
         tint = None if colors is None else colors[position[chosen]]
         if painted is None:
-            painted = Painted(ImportedSurface(name=without_comment(names[first[0]])))
-            instead = "neutral grey" if tint is None else "the colour of its vertices"
-            _note_unknown(reader, statements, names[first[0]], instead)
-        surface, tint = _tinted(reader, painted.surface, tint)
+            painted = Painted(ImportedSurface(name=without_comment(name)))
+            instead = f"{'neutral grey' if tint is None else 'the colour of its vertices'} is used instead"
+            if reader.libraries:
+                lacks = "its .mtl file lacks" if reader.libraries == 1 else "its .mtl files lack"
+                notes.say(f" uses the material {shown(name)}, which {lacks}; {instead}")
+            elif not statements.libraries:  # else it is said already that none could be read
+                notes.say(f" uses materials and names no material file (mtllib); {instead}")
+        surface, tint = _tinted(notes, painted.surface, tint)
         uvs = Looked(tables["vt"], mapped).at(chosen)
         if uvs is not None:
-            uvs = replace(uvs, values=(uvs.values - udim.corner_of(int(first[3]))) * painted.scale + painted.offset)
+            uvs = replace(uvs, values=(uvs.values - udim.corner_of(number)) * painted.scale + painted.offset)
             used = uvs.values[uvs.index[(uvs.index >= 0).all(axis=1)]]
             if painted.clamped and len(used) and not (used.min() >= -BEYOND and used.max() <= 1.0 + BEYOND):
                 notes.say(" has textures that are not to repeat beyond their edges (-clamp); here they do")
-        at = Looked(points, position[chosen])
-        parts.append(
-            split_at_corners(at, Looked(tables["vn"], normal).at(chosen), uvs, tint, surface, flat=bool(first[2]))
-        )
+        at, normals = Looked(points, position[chosen]), Looked(tables["vn"], normal).at(chosen)
+        parts.append(split_at_corners(at, normals, uvs, tint, surface, flat=bool(off[first])))
     return parts
 
 
-def _squares(reader: MtlReader, names: list[str], material: Ints, table: Doubles, mapped: Ints) -> Ints:
-    """Return for each face (F,) the UDIM square whose pictures it has; 0 where its material has one picture for all."""
-    found, inside = np.zeros(len(mapped), np.int64), (mapped >= 0).all(axis=1)
-    for number in np.unique(material[inside & (material >= 0)]):
-        mine = np.flatnonzero(inside & (material == number))
-        squares = udim.squares(table[mapped[mine]])
-        several = reader.squares_of(names[number], np.unique(squares).tolist())
-        found[mine] = np.where(np.isin(squares, several), squares, 0)
-    return found
-
-
-def _check_count(path: Path, named: list[str], what: str) -> None:
-    """Refuse a file that names too many: each is looked for on the disk, or is a part of its own."""
-    if len(named) > files.scaled(MOST_NAMED):
-        raise files.too_large(path, f"at most {files.scaled(MOST_NAMED):,} {what}", f"{len(named):,}")
-
-
-# --- what the statements beside numbers say ----------------------------------------
-
-
-@dataclass(frozen=True)
-class _Said:
+class _Statements(NamedTuple):
     """What stands after ``mtllib``, names after ``usemtl`` and words after ``s``, with the rows that they are in."""
 
     libraries: list[str]
@@ -147,9 +120,9 @@ class _Said:
     smoothing: list[tuple[int, str]]
 
 
-def _statements(lines: Lines, notes: Notes) -> _Said:
+def _statements(lines: Lines, notes: Notes) -> _Statements:
     """Read the statements that are no numbers; what nothing becomes of is put into the inventory."""
-    statements = _Said([], [], [])
+    statements = _Statements([], [], [])
     for row, word, rest in lines.others():
         key, plain = word.lower(), without_comment(rest).lower()
         if key == "mtllib":
@@ -174,18 +147,6 @@ def _in_effect(changes: list[tuple[int, str]], rows: Ints) -> tuple[list[str], I
     return list(numbers), np.array([*(numbers[value] for _, value in changes), -1])[last]
 
 
-def _note_unknown(reader: MtlReader, said: _Said, name: str, instead: str) -> None:
-    """Say that a material is nowhere; where no material file could be read, that is enough."""
-    if reader.libraries:
-        lacks = "its .mtl file lacks" if reader.libraries == 1 else "its .mtl files lack"
-        reader.notes.say(f" uses the material {shown(name)}, which {lacks}; {instead} is used instead")
-    elif not said.libraries:
-        reader.notes.say(f" uses materials and names no material file (mtllib); {instead} is used instead")
-
-
-# --- colours of vertices ----------------------------------------
-
-
 def _colors(lines: Lines, table: Doubles, notes: Notes) -> Doubles | None:
     """Return the linear colour (V, 3) of every vertex; neutral grey where a file with colours has none.
 
@@ -194,39 +155,35 @@ def _colors(lines: Lines, table: Doubles, notes: Notes) -> Doubles | None:
     """
     if (np.isfinite(table[:, 3]) & np.isnan(table[:, 4]) & (table[:, 3] != 1.0)).any():
         notes.has("weights of vertices, the fourth number of", "v")
-    given = table[:, 3:6]
+    given: Doubles | None = table[:, 3:6]
     if np.isfinite(table[:, 6]).any() and not np.isin(table[:, 6], (1.0, 255.0)).all():
         notes.has("opacities of vertices, the seventh number of", "v")
-    if np.isnan(given[:, 2]).all():
-        found = lines.zbrush_colors(len(table))
-        if found is None:
-            return None
-        given = found
+    if np.isnan(table[:, 5]).all():
+        given = lines.zbrush_colors(len(table))
+    if given is None:
+        return None
     known = np.asarray(np.isfinite(given).all(axis=1))
     scale = 255.0 if known.any() and given[known].max() > 2.0 else 1.0
     colors = np.where(known[:, None], given / scale, NEUTRAL)
     return np.asarray(srgb_to_linear(np.clip(colors, 0.0, 1.0).astype(np.float32)), dtype=np.float64)
 
 
-def _tinted(
-    reader: MtlReader, surface: ImportedSurface, tint: Doubles | None
-) -> tuple[ImportedSurface, Doubles | None]:
+def _tinted(notes: Notes, surface: ImportedSurface, tint: Doubles | None) -> tuple[ImportedSurface, Doubles | None]:
     """Return a surface and the colours (F, 3, 3) of its corners that multiply it: all but those of a texture."""
     if tint is None:
         return surface, None
     if surface.texture is not None:
         if tint.min() < 1.0:
-            reader.notes.say("colours of vertices are left out where there is a texture")
+            notes.say("colours of vertices are left out where there is a texture")
         return surface, None
     if surface.color is None:
         return replace(surface, color=np.ones(3, np.float32)), tint
     if surface.color[:3].min() < 0.999 and tint.min() < 1.0:
-        reader.notes.say("colours of vertices are multiplied by the Kd of their material")
+        notes.say("colours of vertices are multiplied by the Kd of their material")
     return surface, tint
 
 
 Bytes = npt.NDArray[np.uint8]
-
 TABLES = {"v": (3, 7), "vt": (1, 2), "vn": (3, 3)}
 """Statements of numbers with the fewest that they have, and how many are read."""
 KINDS = (*TABLES, "f")
@@ -241,11 +198,8 @@ _BLANK, _IN_CORNERS = (
 
 
 class Lines:
-    """The lines of a file, each of its kind: ``v``, ``vt``, ``vn``, ``f``, or another.
-
-    Raises:
-        FileFormatError: it is no text.
-    """
+    """The lines of a file, each of its kind: ``v``, ``vt``, ``vn``, ``f``, or another. Raises FileFormatError: it is no
+    text."""
 
     def __init__(self, path: Path, data: bytes) -> None:
         if b"\x00" in data:
@@ -279,11 +233,8 @@ class Lines:
             yield int(row), key, rest.strip()
 
     def table(self, kind: str) -> Doubles:
-        """Return the numbers of all lines of a kind in a table; where one has fewer, 0 for ``vt``, else NaN.
-
-        Raises:
-            FileFormatError: a line has too few, or something else.
-        """
+        """Return the numbers of all lines of a kind in a table; where one has fewer, 0 for ``vt``, else NaN. Raises
+        FileFormatError: a line has too few, or something else."""
         (fewest, most), rest = TABLES[kind], 0.0 if kind == "vt" else np.nan
         rows, data = self._of(kind)
         if not len(rows):
@@ -295,7 +246,14 @@ class Lines:
         counts = np.add.reduceat(begins, np.concatenate([[0], ends[:-1] + 1]), dtype=np.int64)
         values: Doubles = numbers_in(data.tobytes(), np.float64).astype(np.float64, copy=False)
         if counts.min() < fewest or len(values) != counts.sum():
-            self._blame_numbers(kind, fewest, rows)
+            for number, words in self._words(rows):
+                where, got = f"after {kind!r} on line {number}", shown(" ".join(words))
+                if len(words) < fewest:
+                    what = "3 numbers" if fewest == 3 else "numbers"
+                    raise damaged(self.path, f"{what} {where}", f"{got} (is the file cut short?)")
+                if not all(map(is_number, words)):
+                    raise damaged(self.path, f"numbers {where}", got)
+            raise damaged(self.path, f"numbers after {kind!r}", "something else")
         if (counts == counts[0]).all():
             table = values.reshape(len(rows), -1)[:, :most]
             return np.pad(table, ((0, 0), (0, most - table.shape[1])), constant_values=rest)
@@ -307,11 +265,8 @@ class Lines:
 
     def faces(self, counts: dict[str, int]) -> tuple[Ints, Ints, Ints]:
         """Return the corners of all faces: (C, 3) rows of the tables of points, texture coordinates and normals, -1
-        where there is none; (P,) how many corners each face has; and (P,) the rows that they are in.
-
-        Raises:
-            FileFormatError: a face is damaged, is too large, or refers to what is not there; or they are too many.
-        """
+        where there is none; (P,) how many corners each face has; and (P,) the rows that they are in. Raises
+        FileFormatError: a face is damaged, is too large, or refers to what is not there; or they are too many."""
         rows, data = self._of("f")
         if not len(rows):
             return np.zeros((0, 3), np.int64), rows, rows
@@ -334,9 +289,8 @@ class Lines:
             ((number, words),) = self._words(rows[-1:])
             got = f"{shown(' '.join(['f', *words]))} (is the file cut short?)"
             raise damaged(self.path, f"3 or more corners on line {number}", got)
-        if sizes.max() > files.scaled(MOST_CORNERS):
-            expected = f"at most {files.scaled(MOST_CORNERS):,} corners in the face on line {rows[sizes.argmax()] + 1}"
-            raise files.too_large(self.path, expected, f"{sizes.max():,}")
+        where = f"in the face on line {rows[sizes.argmax()] + 1}"
+        check_most(self.path, int(sizes.max()), MOST_CORNERS, f"at most {{}} corners {where}")
         check_faces(self.path, int((sizes - 2).clip(0).sum()))
         corners = np.zeros((len(at), 3), dtype=np.int64)
         corners[np.cumsum(first) - 1, place] = values
@@ -347,7 +301,7 @@ class Lines:
             if (index < 0).any():
                 before = np.repeat(np.cumsum(self.kind == KINDS.index(kind))[rows], sizes)
                 if (index < -before).any():
-                    self._blame_faces(rows, before=True)
+                    self._blame_faces(rows)
                 index[index < 0] += (before + 1)[index < 0]
             if index.max() > counts[kind]:
                 row = rows[np.searchsorted(np.cumsum(sizes), int(index.argmax()), side="right")]
@@ -366,10 +320,10 @@ class Lines:
 
     def _of(self, kind: str) -> tuple[Ints, Bytes]:
         """Return the rows of a kind, and their bytes without keywords and comments."""
-        mine = self.kind == KINDS.index(kind)
+        mine, lengths = self.kind == KINDS.index(kind), self.ends - self.starts + 1
         rows = np.flatnonzero(mine)
-        data = self.bytes[np.repeat(mine, self.ends - self.starts + 1)]
-        starts = np.cumsum((self.ends - self.starts + 1)[rows]) - (self.ends - self.starts + 1)[rows]
+        data = self.bytes[np.repeat(mine, lengths)]
+        starts = np.cumsum(lengths[rows]) - lengths[rows]
         for place in range(len(kind)):
             data[starts + place] = ord(" ")
         if (data == _HASH).any():
@@ -382,17 +336,7 @@ class Lines:
             line = text_of(self.text[self.starts[row] : self.ends[row]])
             yield int(row) + 1, line.partition("#")[0].split()[1:]
 
-    def _blame_numbers(self, kind: str, fewest: int, rows: Ints) -> None:
-        for number, words in self._words(rows):
-            rest = shown(" ".join(words))
-            if len(words) < fewest:
-                what = "3 numbers" if fewest == 3 else "numbers"
-                raise damaged(self.path, f"{what} after {kind!r} on line {number}", f"{rest} (is the file cut short?)")
-            if not all(map(is_number, words)):
-                raise damaged(self.path, f"numbers after {kind!r} on line {number}", rest)
-        raise damaged(self.path, f"numbers after {kind!r}", "something else")
-
-    def _blame_faces(self, rows: Ints, *, before: bool = False) -> None:
+    def _blame_faces(self, rows: Ints) -> None:
         counts = np.stack([np.cumsum(self.kind == KINDS.index(kind)) for kind in TABLES], axis=1)
         for number, words in self._words(rows):
             for word in words:

@@ -32,8 +32,7 @@ def denoise(radiance: Tensor, albedo: Tensor, normal: Tensor, *, quick: bool = F
 
     Args:
         radiance: (H, W, 3) float32 linear radiance, at least 0.
-        albedo: (H, W, 3) float32 reflectance of the first hit in [0, 1].
-        normal: (H, W, 3) float32 shading normal of the first hit in [-1, 1].
+        albedo, normal: (H, W, 3) float32 reflectance in [0, 1] and shading normal in [-1, 1] of the first hit.
         quick: take some 0.6 of the time, and leave a little more error.
 
     Raises:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 
@@ -26,20 +26,16 @@ UNSURE = (*BEHIND, "adjoint")
 
 
 def plugin_numbers(description: SceneDescription, name: str, keys: tuple[str, ...]) -> tuple[PluginNumber, ...]:
-    """Return some numbers and colours of a scene, each once.
-
-    Args:
-        description: of the scene.
-        name: of the part that they will be in, with which their inputs begin; but for those that the scene has as
-            inputs of another name.
-        keys: Mitsuba's names of them; `KEY.red` is a channel of the colour KEY.
+    """Return some numbers and colours of a scene by Mitsuba's names, each once; `KEY.red` is a channel of the colour
+    KEY. Their inputs begin with the name of the part that they will be in, but for those that the scene has as other
+    inputs.
 
     Raises:
         UnknownNameError: the scene has no such key; the message has near ones.
         InputError: it is something else than a number or a colour.
     """
     numbers, others = _all(description)
-    channels = {f"{key}.{one}": key for key in numbers for one in CHANNELS if len(numbers[key].values) > 1}
+    channels = {f"{key}.{channel}": key for key in numbers for channel in CHANNELS if len(numbers[key].values) > 1}
     keys = tuple(dict.fromkeys(channels.get(key, key) for key in keys))
     for key in keys:
         if key in others:
@@ -49,11 +45,7 @@ def plugin_numbers(description: SceneDescription, name: str, keys: tuple[str, ..
             )
         if key not in numbers:
             raise UnknownNameError("number or colour in Mitsuba", key, numbers)
-    return tuple(_named(numbers[key], name) for key in keys)
-
-
-def _named(one: PluginNumber, name: str) -> PluginNumber:
-    return one if one.input else PluginNumber(one.key, one.values, f"{name}.{one.key}", one.valid, one.plain)
+    return tuple(replace(numbers[key], input=numbers[key].input or f"{name}.{key}") for key in keys)
 
 
 @lru_cache(maxsize=1)
@@ -61,25 +53,17 @@ def _all(description: SceneDescription) -> tuple[dict[str, PluginNumber], dict[s
     """Every number and colour of a scene by its key, without inputs but for those that it has; and the type of the
     rest."""
     scene = MitsubaScene(description, SMALL)
-    own = {key: name for name, (key, one) in scene.declared.items() if one.write in (number, color)}
+    inputs = {key: name for name, (key, takes) in scene.declared.items() if takes.write in (number, color)}
     numbers: dict[str, PluginNumber] = {}
     others: dict[str, str] = {}
     for key in scene.parameters.keys():
         value, flags = scene.parameters[key], scene.parameters.flags(key)
-        values = _values(value)
-        if values is None:
+        plain = isinstance(value, float)
+        if not (plain or (isinstance(value, mi.Float) and len(value) == 1) or isinstance(value, mi.Color3f)):
             others[key] = f"a {type(value).__name__}"
             continue
         still = flags == mi.ParamFlags.Differentiable.value
         valid = BEHIND if flags & mi.ParamFlags.NonDifferentiable.value else STILL if still else UNSURE
-        numbers[key] = PluginNumber(key, values, own.get(key, ""), valid, isinstance(value, float))
+        values = (value,) if plain else tuple(map(float, np.array(value).reshape(-1)))
+        numbers[key] = PluginNumber(key, values, inputs.get(key, ""), valid, plain)
     return numbers, others
-
-
-def _values(value: Any) -> tuple[float, ...] | None:
-    """The numbers of a parameter; None where it is neither one number nor a colour."""
-    if isinstance(value, float):
-        return (value,)
-    if (isinstance(value, mi.Float) and len(value) == 1) or isinstance(value, mi.Color3f):
-        return tuple(float(one) for one in np.array(value).reshape(-1))
-    return None

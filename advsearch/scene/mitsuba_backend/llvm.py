@@ -84,23 +84,15 @@ class LibraryFile:
 
 def find(root: Path = Path("/"), environ: Mapping[str, str] = os.environ) -> list[LibraryFile]:
     """Every libLLVM of this machine, usable ones first, each group newest first; `DRJIT_LIBLLVM_PATH` is not looked at.
-
-    Args:
-        root: the folder taken for the root of the file system (tests give another one).
-        environ: where ``CONDA_PREFIX`` is read from.
-    """
-    found = {path.resolve(): path for path in _files(root, environ)}
-    candidates = [examine(path, name_hint=link) for path, link in found.items()]
-    return sorted(candidates, key=lambda c: (not c.refused, c.version), reverse=True)
+    Tests give another root of the file system; ``CONDA_PREFIX`` is read from `environ`."""
+    links = {path.resolve(): path for path in _files(root, environ)}
+    candidates = [examine(path, name_hint=link) for path, link in links.items()]
+    return sorted(candidates, key=lambda candidate: (not candidate.refused, candidate.version), reverse=True)
 
 
 def examine(path: Path, *, name_hint: Path | None = None) -> LibraryFile:
-    """Say which version a libLLVM file is, from its name or else by asking it, and whether Dr.Jit can use it.
-
-    Args:
-        path: the file, symbolic links resolved.
-        name_hint: the link through which it was found; its name may hold the version where the file's does not.
-    """
+    """Say which version a libLLVM file is, symbolic links resolved, from its name, else from that of the link through
+    which it was found, or else by asking it; and whether Dr.Jit can use it."""
     if problem := _unreadable(path):
         return LibraryFile(path, (), problem)
     version = version_in(path) or (version_in(name_hint) if name_hint else ()) or asked_version(str(path))
@@ -134,19 +126,15 @@ def ensure_llvm() -> LLVM:
         EnvironmentSetupError: there is no usable file, or the one that the variable names is not usable; the message
             lists what was found and the command that installs a good one.
     """
-    given = os.environ.get(VARIABLE, "")
-    chosen = _given(given) if given else newest(find())
+    named = os.environ.get(VARIABLE, "")
+    chosen = _given(named) if named else newest(find())
     os.environ[VARIABLE] = str(chosen.path)
     return chosen
 
 
 def install_command(os_release: str | None = None, platform: str = sys.platform) -> str:
-    """The command that installs a good libLLVM on this machine, or one line for each known platform.
-
-    Args:
-        os_release: the text of ``/etc/os-release``; None reads it.
-        platform: as in `sys.platform`.
-    """
+    """The command that installs a good libLLVM on this machine, or one line for each known platform; by the text of
+    ``/etc/os-release``, None reads it."""
     sudo = "" if hasattr(os, "geteuid") and os.geteuid() == 0 else "sudo "
     commands = {
         "Debian, Ubuntu": f"{sudo}apt-get install libllvm19",
@@ -170,30 +158,26 @@ def install_command(os_release: str | None = None, platform: str = sys.platform)
 
 def _given(value: str) -> LLVM:
     """Check the file (or the bare library name) that the variable names."""
-    path = Path(value)
+    path, correct = Path(value), "Correct it, or unset it to let advsearch look for one."
     if os.sep in value and not path.is_file():
         raise EnvironmentSetupError(
-            f"{VARIABLE}: expected a libLLVM file, got {value!r}, which does not exist. "
-            f"Correct it, or unset it to let advsearch look for one."
+            f"{VARIABLE}: expected a libLLVM file, got {value!r}, which does not exist. {correct}"
         )
-    candidate = examine(path.resolve(), name_hint=path) if os.sep in value else _bare(value)
+    if os.sep in value:
+        candidate = examine(path.resolve(), name_hint=path)
+    else:  # the dynamic loader looks it up; only the library itself knows its version
+        version = asked_version(value)
+        candidate = LibraryFile(path, version, refusal(version))
     if candidate.refused:
         raise EnvironmentSetupError(
-            f"{VARIABLE}: expected a libLLVM of version {MINIMUM} or later, got {candidate}. "
-            f"Correct it, or unset it to let advsearch look for one."
+            f"{VARIABLE}: expected a libLLVM of version {MINIMUM} or later, got {candidate}. {correct}"
         )
     return LLVM(path, candidate.version)
 
 
-def _bare(name: str) -> LibraryFile:
-    """A library name without a folder is looked up by the dynamic loader; only the library itself knows its version."""
-    version = asked_version(name)
-    return LibraryFile(Path(name), version, refusal(version))
-
-
 def newest(candidates: list[LibraryFile]) -> LLVM:
     """The first usable candidate that can be loaded."""
-    refused = [str(c) for c in candidates if c.refused]
+    refused = [str(candidate) for candidate in candidates if candidate.refused]
     for candidate in candidates:
         if candidate.refused:
             continue
@@ -203,37 +187,26 @@ def newest(candidates: list[LibraryFile]) -> LLVM:
             refused.append(f"{candidate.path} (cannot be loaded: {error})")
         else:
             return LLVM(candidate.path, candidate.version)
-    raise EnvironmentSetupError(_missing(refused))
-
-
-def _missing(refused: list[str]) -> str:
-    found = "Found: " + "; ".join(refused) + "." if refused else "Found none."
+    there = "Found: " + "; ".join(refused) + "." if refused else "Found none."
     command = install_command()
     separator = "\n" if "\n" in command else " "
-    return (
-        f"expected a libLLVM of version {MINIMUM} or later, with which Dr.Jit compiles its kernels. {found} "
+    raise EnvironmentSetupError(
+        f"expected a libLLVM of version {MINIMUM} or later, with which Dr.Jit compiles its kernels. {there} "
         f"Install one with:{separator}{command}{separator}or name a file in {VARIABLE}."
     )
 
 
 def _files(root: Path, environ: Mapping[str, str]) -> Iterator[Path]:
     patterns = list(_PATTERNS)
-    for folder in _conda_folders(environ):
-        patterns += [f"{folder}/{name}" for name in ("libLLVM*.so*", "libLLVM*.dylib", "LLVM-C.dll")]
+    if prefix := environ.get("CONDA_PREFIX", ""):  # an active conda environment
+        inside = Path(prefix).relative_to(Path(prefix).anchor).as_posix()
+        for folder in (f"{inside}/lib", f"{inside}/Library/bin"):
+            patterns += [f"{folder}/{name}" for name in ("libLLVM*.so*", "libLLVM*.dylib", "LLVM-C.dll")]
     for pattern in patterns:
         yield from (path for path in root.glob(pattern) if _NAME.fullmatch(path.name) and path.is_file())
     library = ctypes.util.find_library("LLVM") if root == Path("/") else None
     if library and os.sep in library:
         yield Path(library)
-
-
-def _conda_folders(environ: Mapping[str, str]) -> list[str]:
-    """The library folders of an active conda environment, relative to the root."""
-    prefix = environ.get("CONDA_PREFIX", "")
-    if not prefix:
-        return []
-    inside = Path(prefix).relative_to(Path(prefix).anchor).as_posix()
-    return [f"{inside}/lib", f"{inside}/Library/bin"]
 
 
 def _unreadable(path: Path) -> str:

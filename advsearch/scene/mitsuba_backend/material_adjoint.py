@@ -27,10 +27,10 @@ counts at the first hit and its shadow ray only; see `LIMITS`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from advsearch.scene.mitsuba_backend.material_edges import outline_terms, shadow_terms
@@ -43,7 +43,6 @@ from advsearch.scene.mitsuba_backend.material_view import (
     gradient_of,
     is_rough,
     moving_mesh,
-    padded,
     read_camera,
     shared_sampler,
     still_meshes,
@@ -51,54 +50,33 @@ from advsearch.scene.mitsuba_backend.material_view import (
 )
 from advsearch.scene.mitsuba_backend.variant import dr, mi
 
-
-@dataclass(frozen=True)
-class Limit:
-    """Something that the estimator does not cover.
-
-    Attributes:
-        what: in words.
-        measured: what it costs, as measured at 128 x 128 pixels, 16 samples a pixel.
-    """
-
-    what: str
-    measured: str
-
-
-LIMITS: tuple[Limit, ...] = (
-    Limit(
-        "without shadow samples the shadows of the mesh, on the ground and on itself, do not move",
-        "mug on the ground, direct light: cosine 0.65 without, 0.995 with 4 shadow samples a pixel",
+LIMITS: Mapping[str, str] = {
+    "without shadow samples the shadows of the mesh, on the ground and on itself, do not move": (
+        "mug on the ground, direct light: cosine 0.65 without, 0.995 with 4 shadow samples a pixel"
     ),
-    Limit(
-        "light that reaches the camera over more than one surface is a constant at the first, and its shadows stay",
+    "light that reaches the camera over more than one surface is a constant at the first, and its shadows stay": (
         "mug on the ground, 6 segments: error 0.34, cosine 0.95 (smooth cotangent), 0.09 and 0.997 (2 pixels); "
-        "chair on the ground: 0.34, 0.97 and 0.43, 0.92",
+        "chair on the ground: 0.34, 0.97 and 0.43, 0.92"
     ),
-    Limit(
-        "a cotangent that changes from pixel to pixel is smoothed by a tent two pixels wide, and the noise grows",
+    "a cotangent that changes from pixel to pixel is smoothed by a tent two pixels wide, and the noise grows": (
         "variance x time against central differences of 16 samples, six axes: 15 times better for cotangents smooth "
-        "over 16 pixels, 4 to 14 times over 2 pixels, 0.1 to 1 times for white ones, which are off by 0.33",
+        "over 16 pixels, 4 to 14 times over 2 pixels, 0.1 to 1 times for white ones, which are off by 0.33"
     ),
-    Limit(
-        "polished surfaces are noisy, since directions of light are fixed in the world; a mirror's reflections stay",
-        "roughness 0.3, 0.1, 0.02: noise of a rotation 0.1, 0.4, 4.5 where the gradient is 4",
+    "polished surfaces are noisy, since directions of light are fixed in the world; a mirror's reflections stay": (
+        "roughness 0.3, 0.1, 0.02: noise of a rotation 0.1, 0.4, 4.5 where the gradient is 4"
     ),
-    Limit(
-        "direct sun: shadow samples ignore where the light comes from, so they are noisy",
-        "low sun, ground alone, 16 shadow samples a pixel: noise 0.16 where the gradient is 0.23",
+    "direct sun: shadow samples ignore where the light comes from, so they are noisy": (
+        "low sun, ground alone, 16 shadow samples a pixel: noise 0.16 where the gradient is 0.23"
     ),
-    Limit(
-        "a deformation that is not rigid reads low, for a reason not found yet",
-        "smooth deformation of a mug or ball: 4 to 5 % low with normals that follow, 7 to 13 % with normals held",
+    "a deformation that is not rigid reads low, for a reason not found yet": (
+        "smooth deformation of a mug or ball: 4 to 5 % low with normals that follow, 7 to 13 % with normals held"
     ),
-    Limit("shadows of point, spot and directional lights stay where they are", "not measured: derivative 0"),
-    Limit("a surface that cuts through another: the line where they meet is taken for fixed", "not measured: about 0"),
-    Limit(
-        "a thin lens counts as a pinhole; participating media and what shines on the mesh itself are left out",
-        "not measured",
+    "shadows of point, spot and directional lights stay where they are": "not measured: derivative 0",
+    "a surface that cuts through another: the line where they meet is taken for fixed": "not measured: about 0",
+    "a thin lens counts as a pinhole; participating media and what shines on the mesh itself are left out": (
+        "not measured"
     ),
-)
+}
 """What the estimator does not cover, and what that cost where it was measured. Errors are relative, of the mean of
 several seeds over six pose axes; noise is the standard deviation of one estimate."""
 
@@ -146,9 +124,10 @@ def material_adjoint(
     Returns:
         The gradients by the vertices and by the normals of each mesh, (V, 3) float32.
     """
-    meshes = [moving_mesh(scene, parameters, *one) for one in zip(names, vertices, normals, strict=True)]
+    meshes = [moving_mesh(scene, parameters, *each) for each in zip(names, vertices, normals, strict=True)]
     still = still_meshes(scene, parameters, names)
-    view = FilmView(scene, read_camera(sensor), meshes, still, as_array(padded(cotangent)), max_depth)
+    padded = torch.nn.functional.pad(cotangent.detach(), (0, 0, 1, 1, 1, 1))
+    view = FilmView(scene, read_camera(sensor), meshes, as_array(padded), max_depth)
     total = mi.Float(0)
     if spp > 0:
         total += _interior(view, seed, spp, ROUGH_TILE if is_rough(cotangent) else 1)
@@ -171,14 +150,19 @@ def _interior(view: FilmView, seed: int, spp: int, tile: int) -> Any:
             return mi.Float(0)
         si = hit.compute_surface_interaction(view.camera.ray(film), mi.RayFlags.All)
     attached = view.follow(hit)[:3]
-    loose = [type(one)(dr.detach(one)) for one in attached]
+    loose = [type(value)(dr.detach(value)) for value in attached]
     dr.enable_grad(loose)
-    dr.backward(_contributions(view, film, si, sampler, *loose))
+    place, facet, bent = loose
+    # Sum of W L J / J over all samples, attached to these places and normals
+    spread = dr.dot(facet, place - view.camera.eye) / view.camera.depth(place) ** 3
+    weight = view.weight(dr.replace_grad(film, view.camera.project(place)), mi.Bool(True))
+    radiance = _reflected(view, _attached(view.camera, si, place, facet, bent), si, sampler)
+    dr.backward(dr.sum(dr.sum(weight * radiance) * _relative(spread)))
     total = mi.Float(0)
-    for one, free in zip(attached, loose, strict=True):
+    for value, free in zip(attached, loose, strict=True):
         pull = dr.grad(free)
         usable = dr.all(dr.isfinite(pull))
-        total += dr.sum(dr.select(usable, dr.dot(one, dr.select(usable, pull, 0)), 0))
+        total += dr.sum(dr.select(usable, dr.dot(value, dr.select(usable, pull, 0)), 0))
     return total / spp
 
 
@@ -203,18 +187,8 @@ def _first_hits(view: FilmView, seed: int, spp: int, tile: int) -> tuple[Any, An
         on |= hit.is_valid() & (hit.shape == mesh.shape)
     dr.eval(on, film, hit, sampler)
     kept = dr.compress(on)
-    film, hit, sampler.rng = (dr.gather(type(one), one, kept) for one in (film, hit, sampler.rng))
+    film, hit, sampler.rng = (dr.gather(type(value), value, kept) for value in (film, hit, sampler.rng))
     return film, hit, sampler
-
-
-def _contributions(view: FilmView, film: Any, si: Any, sampler: Any, place: Any, facet: Any, bent: Any) -> Any:
-    """Sum of W L J / J over all samples, attached to the given places and normals."""
-    camera = view.camera
-    spread = dr.dot(facet, place - camera.eye) / camera.depth(place) ** 3
-    seen = dr.replace_grad(film, camera.project(place))
-    weight = view.weight(seen, mi.Bool(True))
-    radiance = _reflected(view, _attached(camera, si, place, facet, bent), si, sampler)
-    return dr.sum(dr.sum(weight * radiance) * _relative(spread))
 
 
 def _relative(value: Any) -> Any:

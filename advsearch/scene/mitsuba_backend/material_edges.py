@@ -38,10 +38,10 @@ NEAREST = 1e-3
 
 def outline_terms(view: FilmView, mesh: TriMesh, stream: int, spp: int) -> Any:
     """A number whose gradient is the outline term's, for the edges of one mesh."""
-    found = _sampled_outline(view.camera, mesh, uniform_numbers(stream, spp * view.camera.pixels, 1)[:, 0])
-    if found is None:
+    sampled = _sampled_outline(view.camera, mesh, uniform_numbers(stream, spp * view.camera.pixels, 1)[:, 0])
+    if sampled is None:
         return mi.Float(0)
-    ends, part, normal, share = found
+    ends, part, normal, share = sampled
     n = mi.Vector2f(as_numbers(normal[:, 0]), as_numbers(normal[:, 1]))
     edge = mesh.point(ends, part)
     film = view.camera.project(edge)
@@ -60,16 +60,11 @@ def outline_terms(view: FilmView, mesh: TriMesh, stream: int, spp: int) -> Any:
 
 
 def _sampled_outline(camera: Camera, mesh: TriMesh, numbers: Tensor) -> tuple[Tensor, Tensor, Tensor, float] | None:
-    """Sample the outline evenly by its length on the film, hidden parts included.
-
-    Args:
-        camera: the camera.
-        mesh: the mesh.
-        numbers: (n,) in [0, 1), one for each sample.
+    """Sample the outline evenly by its length on the film, hidden parts included, by numbers (n,) in [0, 1).
 
     Returns:
-        None if nothing is in the picture; else (n, 2) vertices of the edge, (n,) part of the way along it in space,
-        (n, 2) unit normal on the film away from the mesh, and the length in pixels for each sample.
+        None if nothing is in the picture; else (n, 2) vertices of the edge, (n,) part of the way along it in space, (n,
+        2) unit normal on the film away from the mesh, and the length in pixels for each sample.
     """
     eye, forward = from_vector(camera.eye), from_vector(camera.forward)
     ends, away = _silhouette(mesh.places, mesh.corners, eye)
@@ -78,10 +73,8 @@ def _sampled_outline(camera: Camera, mesh: TriMesh, numbers: Tensor) -> tuple[Te
     a, b = film_places(camera, mesh.places[ends[:, 0]]), film_places(camera, mesh.places[ends[:, 1]])
     depth = (mesh.places[ends] - eye) @ forward
     size = torch.tensor([camera.width, camera.height], dtype=torch.float64)
-    shown = (depth > NEAREST).all(dim=1) & ((torch.maximum(a, b) > -0.5) & (torch.minimum(a, b) < size + 0.5)).all(
-        dim=1
-    )
-    length = torch.where(shown, (b - a).norm(dim=1), 0.0)
+    on_film = (torch.maximum(a, b) > -0.5) & (torch.minimum(a, b) < size + 0.5)
+    length = torch.where((depth > NEAREST).all(dim=1) & on_film.all(dim=1), (b - a).norm(dim=1), 0.0)
     if not float(length.sum()) > 0.0:
         return None
     pick, part = _along(length, numbers)
@@ -104,12 +97,8 @@ def _along(length: Tensor, numbers: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _edges(places: Tensor, corners: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Edges of a mesh, vertices at the same place counting as one.
-
-    Returns:
-        (E, 2) vertices of each edge; for each of the 3 F sides of faces, (3 F,) which edge it is and (3 F,) the
-        vertex across.
-    """
+    """Edges of a mesh, vertices at the same place counting as one: (E, 2) vertices of each; for each of the 3 F sides
+    of faces, (3 F,) which edge it is and (3 F,) the vertex across."""
     same = torch.unique(places, dim=0, return_inverse=True)[1]
     sides = torch.cat([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])
     across = torch.cat([corners[:, 2], corners[:, 0], corners[:, 1]])
@@ -121,11 +110,8 @@ def _edges(places: Tensor, corners: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _silhouette(places: Tensor, corners: Tensor, eye: Tensor) -> tuple[Tensor, Tensor]:
-    """Edges all of whose faces lie on one side of the plane through the edge and the eye.
-
-    Returns:
-        (n, 2) vertices of each, and (n, 3) the unit normal of that plane, away from the faces.
-    """
+    """Edges all of whose faces lie on one side of the plane through the edge and the eye: (n, 2) vertices of each, and
+    (n, 3) the unit normal of that plane, away from the faces."""
     ends, owner, across = _edges(places, corners)
     plane = torch.linalg.cross(places[ends[:, 0]] - eye, places[ends[:, 1]] - eye)
     plane = torch.nn.functional.normalize(plane, dim=1)
@@ -141,10 +127,10 @@ def _silhouette(places: Tensor, corners: Tensor, eye: Tensor) -> tuple[Tensor, T
 
 def shadow_terms(view: FilmView, mesh: TriMesh, stream: int, spp: int) -> Any:
     """A number whose gradient is the shadow term's, for the edges of one mesh."""
-    found = _sampled_tangents(mesh, uniform_numbers(stream, spp * view.camera.pixels, 4))
-    if found is None:
+    sampled = _sampled_tangents(mesh, uniform_numbers(stream, spp * view.camera.pixels, 4))
+    if sampled is None:
         return mi.Float(0)
-    ends, part, direction, normal, share = found
+    ends, part, direction, normal, share = sampled
     p = as_vectors(mi.Point3f, torch.lerp(mesh.places[ends[:, 0]], mesh.places[ends[:, 1]], part[:, None]))
     d, n = as_vectors(mi.Vector3f, direction), as_vectors(mi.Vector3f, normal)
     beside = SHADOW_OFFSET * mesh.extent * n
@@ -152,13 +138,13 @@ def shadow_terms(view: FilmView, mesh: TriMesh, stream: int, spp: int) -> Any:
         ray = mi.Ray3f(p + beside, -d)
         hit = view.scene.ray_intersect_preliminary(ray, coherent=False)
         si = hit.compute_surface_interaction(ray, mi.RayFlags.All, hit.is_valid())
-        value = _lit_value(view, si, d)
-        dr.eval(value, hit, si, p, beside)
-        kept = dr.compress(dr.any(value != 0.0))
+        lit = _lit_value(view, si, d)
+        dr.eval(lit, hit, si, p, beside)
+        kept = dr.compress(dr.any(lit != 0.0))
         if dr.width(kept) == 0:
             return mi.Float(0)
-        value, hit, si, p, beside, n = (dr.gather(type(one), one, kept) for one in (value, hit, si, p, beside, n))
-        strength = dr.sum(value * _past_minus_hit(view, si, p, beside, stream))
+        lit, hit, si, p, beside, n = (dr.gather(type(value), value, kept) for value in (lit, hit, si, p, beside, n))
+        strength = dr.sum(lit * _past_minus_hit(view, si, p, beside, stream))
         strength = dr.select(dr.isfinite(strength), strength, 0.0)
         dr.eval(strength, hit)
     chosen = kept.torch().to("cpu", torch.int64)
@@ -185,10 +171,6 @@ def _lit_value(view: FilmView, si: Any, d: Any) -> Any:
 def _past_minus_hit(view: FilmView, si: Any, p: Any, beside: Any, stream: int) -> Any:
     """Difference of the radiance that arrives at a lit point just past an edge and just inside it."""
 
-    def seen(target: Any, active: Any) -> Any:
-        ray = towards(target)
-        return view.radiance(ray, own_sampler(stream + _PATHS, dr.width(p)), view.max_depth - 1, active)
-
     def towards(target: Any) -> Any:
         ray = si.spawn_ray_to(target)
         return mi.Ray3f(ray.o, ray.d)
@@ -196,42 +178,43 @@ def _past_minus_hit(view: FilmView, si: Any, p: Any, beside: Any, stream: int) -
     first = view.scene.ray_intersect_preliminary(towards(p + beside), coherent=False)
     reach = dr.norm(p - si.p) * (1.0 - DEPTH_TOLERANCE) - 2.0 * dr.norm(beside)
     free = ~first.is_valid() | (first.t > reach)
-    return dr.select(free, seen(p + beside, free) - seen(p - beside, free), 0.0)
+
+    def radiance(target: Any) -> Any:
+        sampler = own_sampler(stream + _PATHS, dr.width(p))
+        return view.radiance(towards(target), sampler, view.max_depth - 1, free)
+
+    return dr.select(free, radiance(p + beside) - radiance(p - beside), 0.0)
 
 
 def _sampled_tangents(mesh: TriMesh, numbers: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, float] | None:
-    """Sample points on edges and lines through them that touch the mesh there, evenly.
+    """Sample points on edges and lines through them that touch the mesh there, evenly, by numbers (n, 4) in [0, 1).
 
     The lines through a point of an edge that have both faces on one side fill the exterior angle of the edge, to
     either side. An edge with one face lets every line pass.
 
-    Args:
-        mesh: the mesh.
-        numbers: (n, 4) in [0, 1).
-
     Returns:
-        None if there is nothing to sample; else (n, 2) vertices of the edge, (n,) part of the way along it, (n, 3)
-        unit direction of the line, (n, 3) unit normal of edge and line away from the mesh, and the measure (world
-        units times steradians) for each sample.
+        None if there is nothing to sample; else (n, 2) vertices of the edge, (n,) part of the way along it, (n, 3) unit
+        direction of the line, (n, 3) unit normal of edge and line away from the mesh, and the measure (world units
+        times steradians) for each sample.
     """
-    ends, one, two, single = _folds(mesh.places, mesh.corners)
-    cosine = (one * two).sum(dim=1, keepdim=True)
-    rest = one - cosine * two
+    ends, first, second, single = _folds(mesh.places, mesh.corners)
+    cosine = (first * second).sum(dim=1, keepdim=True)
+    rest = first - cosine * second
     axis = _unit_edges(mesh.places, ends)
-    turned = torch.where(single[:, None], torch.linalg.cross(axis, two), -torch.nn.functional.normalize(rest, dim=1))
+    turned = torch.where(single[:, None], torch.linalg.cross(axis, second), -torch.nn.functional.normalize(rest, dim=1))
     angle = torch.pi - torch.atan2(rest.norm(dim=1), cosine[:, 0])
     measure = (mesh.places[ends[:, 1]] - mesh.places[ends[:, 0]]).norm(dim=1) * angle
     if len(numbers) == 0 or not float(measure.sum()) > 0.0:
         return None
     pick, _ = _along(measure, numbers[:, 0])
-    ends, one, two, turned, axis = (tensor[pick] for tensor in (ends, one, two, turned, axis))
+    ends, first, second, turned, axis = (tensor[pick] for tensor in (ends, first, second, turned, axis))
     turn = numbers[:, 2:3] * angle[pick][:, None]
-    across = torch.cos(turn) * two + torch.sin(turn) * turned
+    across = torch.cos(turn) * second + torch.sin(turn) * turned
     height = 4.0 * numbers[:, 3:4] - 2.0  # the sign chooses the side, the rest is the cosine with the edge
     across, height = torch.where(height < 0.0, -across, across), height.abs() - 1.0
     direction = height * axis + (1.0 - height.square()).clamp_min(0.0).sqrt() * across
     normal = torch.linalg.cross(axis, across)
-    normal = normal * torch.where((normal * (one + two)).sum(dim=1, keepdim=True) > 0.0, -1.0, 1.0)
+    normal = normal * torch.where((normal * (first + second)).sum(dim=1, keepdim=True) > 0.0, -1.0, 1.0)
     return ends, numbers[:, 1], direction, normal, 4.0 * float(measure.sum()) / len(numbers)
 
 
@@ -245,12 +228,11 @@ def _folds(places: Tensor, corners: Tensor) -> tuple[Tensor, Tensor, Tensor, Ten
     proper = (number <= 2) & ((places[ends[:, 1]] - places[ends[:, 0]]).norm(dim=1) > 0.0)
     ends, axis = ends[proper], _unit_edges(places, ends[proper])
 
-    def perpendicular(corner: Tensor) -> Tensor:
-        vector = places[corner] - places[ends[:, 0]]
+    def perpendicular(entry: Tensor) -> Tensor:
+        vector = places[across[order[entry[proper]]]] - places[ends[:, 0]]
         return torch.nn.functional.normalize(vector - (vector * axis).sum(dim=1, keepdim=True) * axis, dim=1)
 
-    one, two = (perpendicular(across[order[at[proper]]]) for at in (last - number + 1, last))
-    return ends, one, two, number[proper] == 1
+    return ends, perpendicular(last - number + 1), perpendicular(last), number[proper] == 1
 
 
 def _unit_edges(places: Tensor, ends: Tensor) -> Tensor:

@@ -73,17 +73,9 @@ def read_camera(sensor: Any) -> Camera:
 
 @dataclass(frozen=True)
 class TriMesh:
-    """A mesh, for Dr.Jit and for torch.
-
-    Attributes:
-        shape: Mitsuba's pointer.
-        positions: flat Dr.Jit array, with gradients enabled if the mesh moves.
-        normals: the same for the vertex normals.
-        faces: flat Dr.Jit array.
-        smooth: shading normals are interpolated.
-        corners: (F, 3) int64.
-        places: (V, 3) float64.
-    """
+    """A mesh, for Dr.Jit and for torch: Mitsuba's pointer, flat Dr.Jit arrays, positions and vertex normals with
+    gradients enabled if it moves; whether shading normals are interpolated; corners (F, 3) int64 and places (V, 3)
+    float64."""
 
     shape: Any
     positions: Any
@@ -120,22 +112,22 @@ def moving_mesh(scene: Any, parameters: Any, key: str, vertices: Tensor, normals
 
 def still_meshes(scene: Any, parameters: Any, moving: Sequence[str]) -> list[TriMesh]:
     """Meshes that stand still but may hide a moving one, or shade it. A single rectangle is left out."""
-    found = []
+    meshes = []
     for shape in scene.shapes():
         if shape.is_mesh() and shape.face_count() > 2 and shape.id() not in moving:
             places = parameters[f"{shape.id()}.{POSITIONS}"].torch().reshape(-1, 3).clone()
-            found.append(_mesh(shape, parameters[f"{shape.id()}.{FACES}"], places, torch.zeros_like(places)))
-    return found
+            meshes.append(_mesh(shape, parameters[f"{shape.id()}.{FACES}"], places, torch.zeros_like(places)))
+    return meshes
 
 
 @dataclass(frozen=True)
 class FilmView:
-    """What the three terms share: `weights` is the cotangent with a border of zeros, flat."""
+    """What the three terms share: `weights` is the cotangent with a border of zeros, flat; `meshes` are those that
+    move."""
 
     scene: Any
     camera: Camera
     meshes: Sequence[TriMesh]
-    still: Sequence[TriMesh]
     weights: Any
     max_depth: int
 
@@ -159,13 +151,13 @@ class FilmView:
         u, v = hit.prim_uv
         for mesh in self.meshes:
             on = hit.is_valid() & (hit.shape == mesh.shape)
-            corner = dr.gather(mi.Point3u, mesh.faces, hit.prim_index, on)
-            a, b, c = (dr.gather(mi.Point3f, mesh.positions, one, on) for one in corner)
+            corners = dr.gather(mi.Point3u, mesh.faces, hit.prim_index, on)
+            a, b, c = (dr.gather(mi.Point3f, mesh.positions, corner, on) for corner in corners)
             normal = mi.Normal3f(dr.cross(b - a, c - a))
             place = dr.select(on, dr.fma(b - a, u, dr.fma(c - a, v, a)), place)
             facet = dr.select(on, normal, facet)
             if mesh.smooth:
-                a, b, c = (dr.gather(mi.Normal3f, mesh.normals, one, on) for one in corner)
+                a, b, c = (dr.gather(mi.Normal3f, mesh.normals, corner, on) for corner in corners)
                 normal = dr.fma(b - a, u, dr.fma(c - a, v, a))
             bent, moves = dr.select(on, normal, bent), moves | on
         return place, facet, bent, moves
@@ -200,7 +192,7 @@ class _Sampler:
 
 
 def shared_sampler(stream: int, count: int, index: Any) -> Any:
-    """One of `count` streams of numbers for every lane; lanes of the same index draw the same numbers."""
+    """One of `count` streams of numbers for every lane; lanes of the same index draw the same."""
     base = mi.PCG32(count, mi.UInt64(stream))
     sampler = _Sampler()
     sampler.rng.state = dr.gather(mi.UInt64, base.state, index)
@@ -246,12 +238,8 @@ def film_places(camera: Camera, places: Tensor) -> Tensor:
 
 
 def gradient_of(value: Any) -> Tensor:
-    found: Tensor = dr.grad(value).torch().reshape(-1, 3).cpu().clone()
-    return found
-
-
-def padded(cotangent: Tensor) -> Tensor:
-    return torch.nn.functional.pad(cotangent.detach(), (0, 0, 1, 1, 1, 1))
+    gradient: Tensor = dr.grad(value).torch().reshape(-1, 3).cpu().clone()
+    return gradient
 
 
 def is_rough(cotangent: Tensor) -> bool:

@@ -16,6 +16,7 @@ from advsearch.scene.assets import Doubles, Floats, Mesh
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.mitsuba_backend.variant import Plugin, mi
 from advsearch.scene.parts import BASE_COLOR, MeshPart
+from advsearch.scene.raster import doubled_normals
 
 POSITIONS, NORMALS, TEXCOORDS, FACES = "vertex_positions", "vertex_normals", "vertex_texcoords", "faces"
 """Names of a mesh's parameters: flat arrays of 3, 3 and 2 numbers a vertex, and 3 indices a face."""
@@ -38,12 +39,8 @@ where the value is set later, but not where a file has it."""
 
 
 def principled(part: MeshPart, extra: Plugin | None = None) -> Plugin:
-    """A two-sided principled BSDF with the base colour as a bilinear texture of linear reflectance.
-
-    Args:
-        part: the mesh whose surface it is, with cut-outs and normal map. A clearcoat of 0 leaves the lobe out.
-        extra: further entries of the plugin's dictionary.
-    """
+    """The surface of a mesh, with cut-outs and normal map: a two-sided principled BSDF with the base colour as a
+    bilinear texture of linear reflectance, and some extra entries. A clearcoat of 0 leaves the lobe out."""
     material = part.material
     surface: Plugin = {
         "type": "principled",
@@ -55,12 +52,12 @@ def principled(part: MeshPart, extra: Plugin | None = None) -> Plugin:
     }
     if material.clearcoat > 0.0:
         surface["clearcoat"] = rendered("clearcoat", material.clearcoat)
-    found: Plugin = {"type": "twosided", "bsdf": surface}
+    bsdf: Plugin = {"type": "twosided", "bsdf": surface}
     if part.normal_map is not None:
-        found = {"type": "normalmap", "normalmap": texture(part.normal_map), "bsdf": found}
+        bsdf = {"type": "normalmap", "normalmap": texture(part.normal_map), "bsdf": bsdf}
     if part.opacity is not None:
-        found = {"type": "mask", "opacity": texture(part.opacity[:, :, None]), "bsdf": found}
-    return found
+        bsdf = {"type": "mask", "opacity": texture(part.opacity[:, :, None]), "bsdf": bsdf}
+    return bsdf
 
 
 def rendered(name: str, value: float) -> float:
@@ -87,8 +84,7 @@ def sampling_weights(parts: Iterable[MeshPart]) -> dict[str, float]:
     for part in parts:
         if part.emission is not None:
             corners = (part.mesh.vertices.astype(np.float64) @ part.to_world[:3, :3].T)[part.mesh.faces]
-            doubled = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-            powers[part.name] = float(part.emission.mean() * np.linalg.norm(doubled, axis=1).sum())
+            powers[part.name] = float(part.emission.mean() * np.linalg.norm(doubled_normals(corners), axis=1).sum())
     total = max(sum(powers.values()), 1e-30)  # of faces without area it is 0
     return {name: (1.0 - LEAST) * power / total + LEAST / len(powers) for name, power in powers.items()}
 
@@ -109,22 +105,21 @@ def texture(linear: Floats) -> Plugin:
     return {"type": "bitmap", "bitmap": bitmap, "raw": True, "filter_type": "bilinear"}
 
 
+def with_inner(plugin: Mapping[str, object], change: Callable[[Mapping[str, object]], object]) -> Plugin:
+    """Return a plugin whose inner plugins are changed."""
+    return {key: change(entry) if isinstance(entry, Mapping) else entry for key, entry in plugin.items()}
+
+
 def own_surface(surface: Mapping[str, object], fill: Callable[[Mapping[str, object]], object]) -> Plugin:
-    """Return a surface in Mitsuba's words with its base colour in its place.
+    """Return a surface in Mitsuba's words, which has `BASE_COLOR` as a type, with its base colour in that place: what
+    `fill` makes of how the texture is looked up."""
 
-    Args:
-        surface: with `BASE_COLOR` as the type of that place.
-        fill: from how the texture is looked up to what comes there.
-    """
+    def filled(plugin: Mapping[str, object]) -> object:
+        if plugin.get("type") == BASE_COLOR:
+            return fill({key: entry for key, entry in plugin.items() if key != "type"})
+        return with_inner(plugin, filled)
 
-    def filled(value: object) -> object:
-        if not isinstance(value, Mapping):
-            return value
-        if value.get("type") == BASE_COLOR:
-            return fill({key: one for key, one in value.items() if key != "type"})
-        return {key: filled(one) for key, one in value.items()}
-
-    return loadable({key: filled(one) for key, one in surface.items()})
+    return loadable(with_inner(surface, filled))
 
 
 def base_texture(base_color: Floats, options: Mapping[str, object]) -> Plugin:
@@ -134,13 +129,8 @@ def base_texture(base_color: Floats, options: Mapping[str, object]) -> Plugin:
 
 
 def repeating(uv: Tensor, options: Mapping[str, object], size: tuple[int, int]) -> Tensor:
-    """Return where a texture that repeats and is interpolated shows what one with these options does.
-
-    Args:
-        uv: (n, 2) float32 texture coordinates, as Mitsuba has them.
-        options: as of `base_texture`.
-        size: height and width of the texture in texels.
-    """
+    """Return where a texture of a size (rows, columns) that repeats and is interpolated shows what one with these
+    options, as of `base_texture`, does at texture coordinates (n, 2) float32, as Mitsuba has them."""
     if "to_uv" in options:
         matrix = torch.as_tensor(np.asarray(options["to_uv"]), dtype=uv.dtype)
         uv = uv @ matrix[:2, :2].T + matrix[:2, -1]
@@ -166,18 +156,11 @@ def mitsuba_mesh(name: str, mesh: Mesh, to_world: Doubles, bsdf: Plugin, light: 
     properties["bsdf"] = mi.load_dict(bsdf, optimize=False)  # which makes equal numbers one: both would change
     if light is not None:
         properties["emitter"] = mi.load_dict(light, optimize=False)
-    result = mi.Mesh(
-        name,
-        vertex_count=len(vertices),
-        face_count=len(mesh.faces),
-        has_vertex_normals=True,
-        has_vertex_texcoords=True,
-        props=properties,
-    )
+    counts = {"vertex_count": len(vertices), "face_count": len(mesh.faces)}
+    result = mi.Mesh(name, **counts, has_vertex_normals=True, has_vertex_texcoords=True, props=properties)
     parameters = mi.traverse(result)
-    parameters[POSITIONS] = mi.Float(vertices.astype(np.float32).ravel())
-    parameters[NORMALS] = mi.Float(normals.astype(np.float32).ravel())
-    parameters[TEXCOORDS] = mi.Float(uvs.astype(np.float32).ravel())
+    for key, values in ((POSITIONS, vertices), (NORMALS, normals), (TEXCOORDS, uvs)):
+        parameters[key] = mi.Float(values.astype(np.float32).ravel())
     parameters[FACES] = mi.UInt32(mesh.faces.astype(np.uint32).ravel())
     parameters.update()
     for key, values in mesh.attributes.items():
@@ -197,10 +180,10 @@ def loadable(plugin: Mapping[str, object]) -> Plugin:
             return transform(value) if transform else mi.Bitmap(np.ascontiguousarray(value, dtype=np.float32))
         return value
 
-    found = {key: made(value) for key, value in plugin.items()}
-    if found.get("type") == "principled":
-        found |= {name: least for name, (dark, least) in DARK.items() if found.get(name) == dark}
-    return found
+    entries = {key: made(value) for key, value in plugin.items()}
+    if entries.get("type") == "principled":
+        entries |= {name: least for name, (dark, least) in DARK.items() if entries.get(name) == dark}
+    return entries
 
 
 def plain(plugin: Mapping[str, object]) -> Plugin:
@@ -210,9 +193,6 @@ def plain(plugin: Mapping[str, object]) -> Plugin:
         if isinstance(value, Mapping):
             return plain(value)
         matrix = getattr(value, "matrix", None)
-        if matrix is None:
-            return value
-        side = len(matrix)
-        return np.array(matrix, dtype=np.float64).reshape(side, side)
+        return value if matrix is None else np.array(matrix, dtype=np.float64).reshape(len(matrix), len(matrix))
 
     return {key: made(value) for key, value in plugin.items()}

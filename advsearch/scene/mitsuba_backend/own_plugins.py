@@ -77,9 +77,9 @@ class HazePath(common.RBIntegrator):  # type: ignore[misc]
         δL = mi.Spectrum(δL if δL is not None else 0)
         β = mi.Spectrum(1)
         active = mi.Bool(active)
-        last = dr.zeros(mi.Interaction3f)
-        last_pdf = mi.Float(1)
-        last_delta = mi.Bool(True)
+        prev = dr.zeros(mi.Interaction3f)
+        prev_pdf = mi.Float(1)
+        prev_delta = mi.Bool(True)
 
         longest = self.max_depth + MOST_SCATTERINGS
         while dr.hint(active, max_iterations=longest, label=f"Haze path ({mode.name})"):
@@ -109,59 +109,59 @@ class HazePath(common.RBIntegrator):  # type: ignore[misc]
             here.wavelengths = ray.wavelengths
 
             # ---- emission of the surface or of the outside ----------------------------------------------------------
-            shining = at_surface
+            active_e = at_surface
             if dr.hint(self.hide_emitters, mode="scalar"):
-                shining = at_surface & ~(first & ~si.is_valid())
-            seen = mi.DirectionSample3f(scene, si, last)
-            share = common.mis_weight(last_pdf, scene.pdf_emitter_direction(last, seen, shining & ~last_delta))
+                active_e = at_surface & ~(first & ~si.is_valid())
+            ds = mi.DirectionSample3f(scene, si, prev)
+            mis = common.mis_weight(prev_pdf, scene.pdf_emitter_direction(prev, ds, active_e & ~prev_delta))
             with dr.resume_grad(when=not primal):
-                Le = β * share * seen.emitter.eval(si, shining)
+                Le = β * mis * ds.emitter.eval(si, active_e)
 
             # ---- light that emitters send here, through the haze ----------------------------------------------------
             may_bounce = si.is_valid() & (bounces + 1 < self.max_depth)
             may_scatter = scatterings < MOST_SCATTERINGS
-            going_on = active & ((scattered & may_scatter) | (~scattered & may_bounce))
-            at_surface &= going_on
+            active_next = active & ((scattered & may_scatter) | (~scattered & may_bounce))
+            at_surface &= active_next
             bsdf = si.bsdf(ray)
-            lit = going_on & (scattered | mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth))
-            to_light, emitted = scene.sample_emitter_direction(here, sampler.next_2d(), True, lit)
-            lit &= to_light.pdf != 0.0
-            outside = mi.has_flag(to_light.emitter.flags(), mi.EmitterFlags.Infinite)
-            _, hazy = self.stretch(here.p, to_light.d, dr.select(outside, dr.inf, to_light.dist))
+            active_em = active_next & (scattered | mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth))
+            ds_em, em_weight = scene.sample_emitter_direction(here, sampler.next_2d(), True, active_em)
+            active_em &= ds_em.pdf != 0.0
+            outside = mi.has_flag(ds_em.emitter.flags(), mi.EmitterFlags.Infinite)
+            _, hazy = self.stretch(here.p, ds_em.d, dr.select(outside, dr.inf, ds_em.dist))
             with dr.resume_grad(when=not primal):
                 if dr.hint(not primal, mode="scalar"):
-                    attached = scene.eval_emitter_direction(here, to_light, lit)
-                    emitted = dr.replace_grad(emitted, attached * dr.select(lit, dr.rcp(to_light.pdf), 0.0))
-                value, pdf = bsdf.eval_pdf(context, si, si.to_local(to_light.d), lit & at_surface)
-                value = dr.select(scattered, PHASE, value)
-                pdf = dr.select(scattered, PHASE, pdf)
-                share = dr.select(to_light.delta, 1.0, common.mis_weight(to_light.pdf, pdf))
-                Lr_dir = dr.select(lit, β * share * value * emitted * dr.exp(-extinction * hazy), 0.0)
+                    attached = scene.eval_emitter_direction(here, ds_em, active_em)
+                    em_weight = dr.replace_grad(em_weight, attached * dr.select(active_em, dr.rcp(ds_em.pdf), 0.0))
+                bsdf_value_em, bsdf_pdf_em = bsdf.eval_pdf(context, si, si.to_local(ds_em.d), active_em & at_surface)
+                bsdf_value_em = dr.select(scattered, PHASE, bsdf_value_em)
+                bsdf_pdf_em = dr.select(scattered, PHASE, bsdf_pdf_em)
+                mis = dr.select(ds_em.delta, 1.0, common.mis_weight(ds_em.pdf, bsdf_pdf_em))
+                Lr_dir = dr.select(active_em, β * mis * bsdf_value_em * em_weight * dr.exp(-extinction * hazy), 0.0)
 
             # ---- the direction to go on -----------------------------------------------------------------------------
-            bounce, bounce_weight = bsdf.sample(context, si, sampler.next_1d(), sampler.next_2d(), at_surface)
+            bsdf_sample, bsdf_weight = bsdf.sample(context, si, sampler.next_1d(), sampler.next_2d(), at_surface)
             anywhere = mi.warp.square_to_uniform_sphere(sampler.next_2d())
-            towards = dr.select(scattered, anywhere, si.to_world(bounce.wo))
+            towards = dr.select(scattered, anywhere, si.to_world(bsdf_sample.wo))
             L = (L + Le + Lr_dir) if primal else (L - Le - Lr_dir)
-            β = dr.select(scattered, β, β * bounce_weight)
-            going_on &= dr.max(β) != 0.0
+            β = dr.select(scattered, β, β * bsdf_weight)
+            active_next &= dr.max(β) != 0.0
 
             # ---- derivatives ----------------------------------------------------------------------------------------
             if dr.hint(not primal, mode="scalar"):
                 with dr.resume_grad():
-                    reflected = bsdf.eval(context, si, bounce.wo, going_on & at_surface)
+                    reflected = bsdf.eval(context, si, bsdf_sample.wo, active_next & at_surface)
                     further = dr.select(at_surface, L * dr.relative_grad(reflected), L)
                     Lo = (Le + Lr_dir + further) * dr.relative_grad(weight)
                     if dr.hint(dr.grad_enabled(Lo), mode="scalar"):
                         dr.backward_from(δL * Lo)
 
             ray = here.spawn_ray(towards)
-            last = here
-            last_pdf = dr.select(scattered, PHASE, bounce.pdf)
-            last_delta = ~scattered & mi.has_flag(bounce.sampled_type, mi.BSDFFlags.Delta)
+            prev = here
+            prev_pdf = dr.select(scattered, PHASE, bsdf_sample.pdf)
+            prev_delta = ~scattered & mi.has_flag(bsdf_sample.sampled_type, mi.BSDFFlags.Delta)
             scatterings[scattered] += 1
             bounces[~scattered & si.is_valid()] += 1
-            active = going_on
+            active = active_next
 
         return (L if primal else δL, bounces + scatterings != 0, [], L)
 
@@ -177,19 +177,19 @@ class Guides(mi.SamplingIntegrator):  # type: ignore[misc]
     def sample(self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: Any = True) -> Any:
         """See `SamplingIntegrator.sample`; light passes through a surface with its probability."""
         going = mi.Bool(active)
-        way = mi.Ray3f(ray)
+        ray = mi.Ray3f(ray)
         covered, albedo, normal = mi.Bool(False), mi.Spectrum(0.0), mi.Normal3f(0.0)
         while going:
-            hit = scene.ray_intersect(way, going)
-            going &= hit.is_valid()
-            bsdf = hit.bsdf()
-            clear = dr.max(bsdf.eval_null_transmission(hit, going))
+            si = scene.ray_intersect(ray, going)
+            going &= si.is_valid()
+            bsdf = si.bsdf()
+            clear = dr.max(bsdf.eval_null_transmission(si, going))
             passes = going & (sampler.next_1d(going) < clear)
             seen = going & ~passes
-            albedo[seen] = bsdf.eval_diffuse_reflectance(hit, seen)
-            normal[seen] = hit.sh_frame.n
+            albedo[seen] = bsdf.eval_diffuse_reflectance(si, seen)
+            normal[seen] = si.sh_frame.n
             covered |= seen
-            way = hit.spawn_ray(way.d)
+            ray = si.spawn_ray(ray.d)
             going = passes
         return albedo, covered, [*albedo, *normal]
 
@@ -264,24 +264,29 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
     def sample_ray_differential(self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True) -> Any:
         """See `mi.Sensor.sample_ray_differential`; where the lens sees nothing, a ray of weight 0 that hits nothing."""
         ahead, inside = self._looked_up(sample2)
-        weight = mi.Float(1.0)
+        passed = mi.Float(1.0)
         if self._drops is not None:
-            ahead, weight = self._through_drops(ahead, sample3)
-        return self._leaving(ahead, dr.select(inside, weight, 0.0), time)
-
-    def without_drops(self, time: Any, place: Any) -> tuple[Any, Any]:
-        """`sample_ray` where no drop is before the camera: what is true of a picture is so of the scene."""
-        ahead, inside = self._looked_up(place)
-        ray, weight = self._leaving(ahead, dr.select(inside, mi.Float(1.0), 0.0), time)
-        return mi.Ray3f(ray), weight
-
-    def _leaving(self, ahead: Any, weight: Any, time: Any) -> tuple[Any, Any]:
+            ahead, passed = self._through_drops(ahead, sample3)
+        weight = dr.select(inside, passed, 0.0)
         ray = dr.zeros(mi.RayDifferential3f)  # all of it, or it would be ragged for derivatives
         ray.time = time
         ray.o = self.pose @ mi.Point3f(self._near * ahead)
         ray.d = self.pose @ mi.Vector3f(ahead)
         ray.maxt = dr.select(weight > 0.0, mi.Float(self._far), 0.0)
         return ray, mi.Spectrum(weight)
+
+    def sample_ray(self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True) -> Any:
+        """See `mi.Sensor.sample_ray`."""
+        ray, weight = self.sample_ray_differential(time, sample1, sample2, sample3, active)
+        return mi.Ray3f(ray), weight
+
+    def without_drops(self, time: Any, place: Any) -> tuple[Any, Any]:
+        """`sample_ray` where no drop is before the camera: what is true of a picture is so of the scene."""
+        drops, self._drops = self._drops, None
+        try:
+            return self.sample_ray(time, 0.5, place, mi.Point2f(0.5))
+        finally:
+            self._drops = drops
 
     def _through_drops(self, ahead: Any, sample: Any) -> tuple[Any, Any]:
         """Directions behind the sheet, and the light that passes: see `advsearch.scene.raindrops`."""
@@ -311,11 +316,6 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
         weight = dr.select(wet, dr.select(lost, 0.0, passed), 1.0)
         return dr.select(wet & ~lost, dr.normalize(outer), ahead), weight
 
-    def sample_ray(self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True) -> Any:
-        """See `mi.Sensor.sample_ray`."""
-        ray, weight = self.sample_ray_differential(time, sample1, sample2, sample3, active)
-        return mi.Ray3f(ray), weight
-
     def to_string(self) -> str:
         """See `mi.Object.to_string`."""
         return f"ModelledCamera[{self._model.kind}]"
@@ -325,9 +325,7 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
         across, down = (torch.linspace(0.0, 1.0, cells + 1, dtype=torch.float64) for cells in (wide, tall))
         places = torch.stack(torch.meshgrid(across, down, indexing="xy"), dim=-1).reshape(-1, 2)
         with torch.no_grad():
-            directions, inside = self._model.with_numbers(self.lens.torch().cpu()).rays(places)
-        directions = directions * torch.tensor([-1.0, -1.0, 1.0])  # Mitsuba's x is to the left and its y up
-        table = torch.cat([directions, inside[:, None]], dim=-1).to(torch.float32)
+            table = self._model.with_numbers(self.lens.torch().cpu()).table(places)
         self.rays = mi.Float(table.reshape(-1).contiguous())
         dr.eval(self.rays)
 
@@ -343,8 +341,8 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
             dr.lerp(dr.gather(mi.Vector4f, self.rays, at), dr.gather(mi.Vector4f, self.rays, at + 1), right)
             for at in (first, first + (wide + 1))
         )
-        found = dr.lerp(upper, lower, down)
-        return dr.normalize(mi.Vector3f(found.x, found.y, found.z)), found.w > 0.0
+        ray = dr.lerp(upper, lower, down)
+        return dr.normalize(mi.Vector3f(ray.x, ray.y, ray.z)), ray.w > 0.0
 
 
 mi.register_sensor("advsearch_camera", ModelledCamera)

@@ -22,20 +22,7 @@ from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.geometry import camera_to_world
 from advsearch.scene.grounds import paved
-from advsearch.scene.mitsuba_backend.meshes import (
-    NORMALS,
-    POSITIONS,
-    RENDERED,
-    base_texture,
-    emitter,
-    loadable,
-    matt,
-    mitsuba_mesh,
-    own_surface,
-    principled,
-    texture,
-    textured_emission,
-)
+from advsearch.scene.mitsuba_backend import meshes
 from advsearch.scene.mitsuba_backend.variant import Plugin, dr, fewer_warnings, mi, population
 from advsearch.scene.parts import (
     BallLamp,
@@ -78,8 +65,8 @@ def point(value: Any) -> Any:
 
 def transform(value: Any) -> Any:
     """A 4 x 4 matrix, row by row."""
-    found = _entries(value, 16)
-    return mi.Transform4f(mi.Matrix4f([found[4 * row : 4 * row + 4] for row in range(4)]))
+    entries = _entries(value, 16)
+    return mi.Transform4f(mi.Matrix4f([entries[4 * row : 4 * row + 4] for row in range(4)]))
 
 
 def as_torch(value: Any) -> Tensor:
@@ -87,10 +74,8 @@ def as_torch(value: Any) -> Tensor:
     if isinstance(value, (mi.Color3f, mi.Point3f)):  # Dr.Jit's own conversion gives a colour six entries
         return torch.cat([as_torch(component) for component in value])
     value = getattr(value, "matrix", value)
-    if hasattr(value, "torch"):
-        tensor: Tensor = value.torch()
-        return tensor.clone()
-    return torch.tensor(np.array(value, dtype=np.float32))
+    tensor: Tensor = value.torch() if hasattr(value, "torch") else torch.tensor(np.array(value, dtype=np.float32))
+    return tensor.clone()
 
 
 def _entries(value: Any, count: int) -> list[Any]:
@@ -125,43 +110,35 @@ class SceneInput:
         return value.clamp(*self.within) if self.within else value
 
 
-def key_of(parameters: Any, one: SceneInput) -> str | None:
+def key_of(parameters: Any, scene_input: SceneInput) -> str | None:
     """Return the parameter that an input means, or None if the scene has none such.
 
     Raises:
         RuntimeError: there are several.
     """
-    before, star, after = one.key.partition("*")
-    found = [
-        key
+    before, star, after = scene_input.key.partition("*")
+    keys = [
+        str(key)
         for key in parameters.keys()
-        if (key.startswith(before) and key.endswith(after) if star else key == one.key)
-        and (one.owner is None or parameters.properties[key][2] is one.owner)
+        if (key.startswith(before) and key.endswith(after) if star else key == scene_input.key)
+        and (scene_input.owner is None or parameters.properties[key][2] is scene_input.owner)
     ]
-    if len(found) > 1:
-        raise RuntimeError(f"expected one Mitsuba parameter {one.key}, found {found}")
-    return str(found[0]) if found else None
+    if len(keys) > 1:
+        raise RuntimeError(f"expected one Mitsuba parameter {scene_input.key}, found {keys}")
+    return keys[0] if keys else None
 
 
-SURFACE_KEYS = {"roughness": "roughness.value", "metallic": "metallic.value", "clearcoat": "clearcoat.value"} | {
-    "specular": "specular"
-}
+SURFACE_KEYS = {name: f"{name}.value" for name in ("roughness", "metallic", "clearcoat")} | {"specular": "specular"}
 """Where the principled surface has its numbers."""
-ABSENT = {"type": "uniform", "value": 0.0}
-IDLE_LOBES: Plugin = {name: ABSENT for name in ("clearcoat", "sheen")}
+IDLE_LOBES: Plugin = {name: {"type": "uniform", "value": 0.0} for name in ("clearcoat", "sheen")}
 """Entries of the principled surface that give it lobes of strength 0."""
 
 
 @dataclass(frozen=True)
 class Translation:
-    """A part inside Mitsuba.
-
-    Attributes:
-        plugins: entries of the scene's dictionary (plugin dictionaries or objects) by name. A name that the scene has
-            already ("environment") is replaced.
-        inputs: what may be set; the base value of each is whatever `plugins` made.
-        integrator: entries that replace those of the path integrator's dictionary (another type, for a medium).
-    """
+    """A part inside Mitsuba: entries of the scene's dictionary by name, of which one that the scene has already
+    ("environment") is replaced; what may be set, with base values that `plugins` made; and entries that replace those
+    of the path integrator's dictionary (another type, for a medium)."""
 
     plugins: Plugin
     inputs: tuple[SceneInput, ...] = ()
@@ -176,84 +153,73 @@ def translation(part: ScenePart) -> Translation:
 
 @translation.register
 def mesh_translation(part: MeshPart, lobes: Plugin | None = None) -> Translation:
-    """A mesh.
-
-    Args:
-        part: the mesh.
-        lobes: further entries of the principled plugin's dictionary, such as `IDLE_LOBES`.
-    """
+    """A mesh; `lobes` are further entries of the principled plugin, such as `IDLE_LOBES`."""
     name, count = part.name, len(part.mesh.vertices)
-    inputs: tuple[SceneInput, ...] = (
-        SceneInput(f"{name}.vertices", f"{name}.{POSITIONS}", flat, shape=(count, 3)),
-        SceneInput(f"{name}.normals", f"{name}.{NORMALS}", flat, shape=(count, 3)),
-    )
+    inputs = [
+        SceneInput(f"{name}.vertices", f"{name}.{meshes.POSITIONS}", flat, shape=(count, 3)),
+        SceneInput(f"{name}.normals", f"{name}.{meshes.NORMALS}", flat, shape=(count, 3)),
+    ]
     if part.surface is None:
-        surface = principled(part, lobes)
-        inputs += (SceneInput(f"{name}.base_color", f"{name}.*.base_color.data", interior=True),)
-        inputs += tuple(
-            SceneInput(f"{name}.{one}", f"{name}.*.{key}", number, True, (1,), within=RENDERED.get(one))
-            for one, key in SURFACE_KEYS.items()
-        )
+        surface = meshes.principled(part, lobes)
+        inputs.append(SceneInput(f"{name}.base_color", f"{name}.*.base_color.data", interior=True))
+        inputs += [
+            SceneInput(f"{name}.{what}", f"{name}.*.{key}", number, True, (1,), within=meshes.RENDERED.get(what))
+            for what, key in SURFACE_KEYS.items()
+        ]
     else:
-        textures = []
 
         def fill(options: Mapping[str, object]) -> object:
-            textures.append(mi.load_dict(base_texture(part.base_color, options), optimize=False))
-            return textures[-1]
+            made = mi.load_dict(meshes.base_texture(part.base_color, options), optimize=False)
+            inputs.append(SceneInput(f"{name}.base_color", f"{name}.*.data", interior=True, owner=made))
+            return made
 
-        surface = own_surface(part.surface, fill)
-        inputs += tuple(
-            SceneInput(f"{name}.base_color", f"{name}.*.data", interior=True, owner=one) for one in textures
-        )
-    if part.emission is not None:
-        inputs += (_radiance(part),)
-    return Translation({name: mitsuba_mesh(name, part.mesh, part.to_world, surface, emitter(part))}, inputs)
+        surface = meshes.own_surface(part.surface, fill)
+    if meshes.textured_emission(part):
+        inputs.append(SceneInput(f"{name}.radiance", f"{name}.emitter.radiance.data", interior=True))
+    elif part.emission is not None:
+        inputs.append(_light(name, "radiance", "emitter.radiance"))
+    return Translation(
+        {name: meshes.mitsuba_mesh(name, part.mesh, part.to_world, surface, meshes.emitter(part))}, tuple(inputs)
+    )
 
 
-def _radiance(part: MeshPart) -> SceneInput:
-    name, place = f"{part.name}.radiance", f"{part.name}.emitter.radiance"
-    if textured_emission(part):
-        return SceneInput(name, f"{place}.data", interior=True)
-    return SceneInput(name, f"{place}.value", color, interior=True, shape=(3,))
+def _light(name: str, what: str, key: str) -> SceneInput:
+    """The colour of a light."""
+    return SceneInput(f"{name}.{what}", f"{name}.{key}.value", color, True, (3,))
+
+
+def _pose(name: str, what: str) -> SceneInput:
+    return SceneInput(f"{name}.{what}", f"{name}.to_world", transform, shape=(4, 4))
 
 
 @translation.register
 def _plugin(part: PluginPart) -> Translation:
-    return Translation({part.name: loadable(part.plugin)}, (), {"type": "prbvolpath"} if part.volumetric else {})
+    return Translation({part.name: meshes.loadable(part.plugin)}, (), {"type": "prbvolpath"} if part.volumetric else {})
 
 
 @translation.register
 def _numbers(part: PluginNumbers) -> Translation:
-    inputs = [
-        SceneInput(
-            one.input,
-            one.key,
-            plain_number if one.plain else color if len(one.values) == 3 else number,
-            "adjoint" in one.valid,
-            (len(one.values),),
-            within=RENDERED.get(next((name for name, key in SURFACE_KEYS.items() if one.key.endswith(f".{key}")), "")),
-        )
-        for one in part.numbers
-        if one.input.startswith(f"{part.name}.")
-    ]
+    inputs = []
+    for own in part.numbers:
+        if own.input.startswith(f"{part.name}."):
+            write = plain_number if own.plain else color if len(own.values) == 3 else number
+            surface = next((name for name, key in SURFACE_KEYS.items() if own.key.endswith(f".{key}")), "")
+            exact, shape = "adjoint" in own.valid, (len(own.values),)
+            inputs.append(SceneInput(own.input, own.key, write, exact, shape, within=meshes.RENDERED.get(surface)))
     return Translation({}, tuple(inputs))
 
 
 @translation.register
 def _point(part: PointLamp) -> Translation:
     name = part.name
-    inputs = (
-        SceneInput(f"{name}.position", f"{name}.position", point, shape=(3,)),
-        SceneInput(f"{name}.intensity", f"{name}.intensity.value", color, interior=True, shape=(3,)),
-    )
     lamp = {"type": "point", "position": list(part.position), "intensity": _rgb(part.intensity)}
-    return Translation({name: lamp}, inputs)
+    position = SceneInput(f"{name}.position", f"{name}.position", point, shape=(3,))
+    return Translation({name: lamp}, (position, _light(name, "intensity", "intensity")))
 
 
 @translation.register
 def _spot(part: SpotLamp) -> Translation:
-    name, (cutoff, beam) = part.name, part.cone
-    inputs = (SceneInput(f"{name}.intensity", f"{name}.intensity.value", color, interior=True, shape=(3,)),)
+    cutoff, beam = part.cone
     lamp = {
         "type": "spot",
         "to_world": mi.ScalarTransform4f(part.to_world),
@@ -261,36 +227,29 @@ def _spot(part: SpotLamp) -> Translation:
         "cutoff_angle": cutoff,
         "beam_width": beam,
     }
-    return Translation({name: lamp}, inputs)
+    return Translation({part.name: lamp}, (_light(part.name, "intensity", "intensity"),))
 
 
 @translation.register
 def _ball(part: BallLamp) -> Translation:
-    name = part.name
     ball = {
         "type": "sphere",
         "to_world": mi.ScalarTransform4f().translate(list(part.place)).scale(part.radius),
         "bsdf": {"type": "null"},
         "emitter": {"type": "area", "radiance": _rgb(part.radiance)},
     }
-    inputs = (
-        SceneInput(f"{name}.ball", f"{name}.to_world", transform, shape=(4, 4)),
-        SceneInput(f"{name}.radiance", f"{name}.emitter.radiance.value", color, interior=True, shape=(3,)),
-    )
-    return Translation({name: ball}, inputs)
+    inputs = _pose(part.name, "ball"), _light(part.name, "radiance", "emitter.radiance")
+    return Translation({part.name: ball}, inputs)
 
 
 @translation.register
 def _projector(part: ProjectorPart) -> Translation:
     """Mitsuba's texture times pi is the irradiance at distance 1, so that it is a white screen's radiance."""
     name = part.name
-    inputs = (
-        SceneInput(f"{name}.pose", f"{name}.to_world", transform, shape=(4, 4)),
-        SceneInput(f"{name}.pattern", f"{name}.irradiance.data", interior=True),
-    )
     picture = {"type": "bitmap", "bitmap": mi.Bitmap(np.zeros((*part.sides, 3), np.float32)), "raw": True}
     projector = {"type": "projector", "fov": part.fov, "fov_axis": "x", "irradiance": {**picture, "wrap_mode": "clamp"}}
-    return Translation({name: projector}, inputs)
+    pattern = SceneInput(f"{name}.pattern", f"{name}.irradiance.data", interior=True)
+    return Translation({name: projector}, (_pose(name, "pose"), pattern))
 
 
 @translation.register
@@ -305,12 +264,10 @@ def _beam(part: BeamLamp) -> Translation:
         "to_world": mi.ScalarTransform4f(part.to_world),
         "fov": 90.0,
         "fov_axis": "x",
-        "irradiance": {**texture(picture), "wrap_mode": "clamp"},
+        "irradiance": {**meshes.texture(picture), "wrap_mode": "clamp"},
         "sampling_weight": part.weight,
     }
-    return Translation(
-        {part.name: lamp}, (SceneInput(f"{part.name}.to_world", f"{part.name}.to_world", transform, shape=(4, 4)),)
-    )
+    return Translation({part.name: lamp}, (_pose(part.name, "to_world"),))
 
 
 @translation.register
@@ -331,14 +288,11 @@ def _rgb(value: Sequence[float]) -> Plugin:
 
 
 def leave_dark_lamps_out(plugins: Plugin, parts: Sequence[ScenePart]) -> None:
-    """Take no samples towards lamps that emit nothing.
+    """Change Mitsuba's dictionary of a scene with some parts so that no samples are taken towards lamps that emit
+    nothing.
 
     A path that arrives at one by chance still counts, with all of the weight, so that nothing is biased should it be
     lit after all.
-
-    Args:
-        plugins: Mitsuba's dictionary of the scene; changed.
-        parts: of the scene.
     """
     for part in parts:
         if isinstance(part, Lamp) and part.dark:
@@ -353,9 +307,26 @@ GROUND_INPUT = SceneInput("ground.reflectance", f"{GROUND}.*.reflectance.data", 
 
 def scene_dict(description: SceneDescription, resolution: tuple[int, int], filter: str, sampler: str) -> Plugin:
     """Mitsuba's dictionary of a scene: its camera, its environment and the ground; objects come as parts."""
+    height, width = resolution
     place = mi.ScalarTransform4f
     number = description.number
-    scene: Plugin = {"type": "scene", "camera": _camera(description, resolution, filter, sampler)}
+    film = {
+        "type": "hdrfilm",
+        "width": width,
+        "height": height,
+        "pixel_format": "rgba" if description.backdrop else "rgb",
+        "component_format": "float32",
+        "rfilter": {"type": filter},
+    }
+    camera: Plugin = {
+        **_lens(description),
+        "near_clip": 0.01,
+        "far_clip": 1e5,
+        "to_world": place(camera_to_world(description, width / height)),
+        "film": film,
+        "sampler": {"type": sampler},
+    }
+    scene: Plugin = {"type": "scene", "camera": camera}
     if description.environment is not None:
         scene["environment"] = {
             "type": "envmap",
@@ -365,16 +336,13 @@ def scene_dict(description: SceneDescription, resolution: tuple[int, int], filte
         }
     photograph = description.photograph
     if photograph is not None:
-        scene[GROUND] = mitsuba_mesh(GROUND, photograph.mesh, np.eye(4), matt(photograph.base.numpy()))
+        scene[GROUND] = meshes.mitsuba_mesh(GROUND, photograph.mesh, np.eye(4), meshes.matt(photograph.base.numpy()))
     elif number("ground.size") > 0.0 and not paved(description):
-        reflectance = srgb_to_linear(np.array(description.ground_color, np.float32)).tolist()
+        reflectance = _rgb(srgb_to_linear(np.array(description.ground_color, np.float32)).tolist())
         scene[GROUND] = {
             "type": "rectangle",
             "to_world": place().scale(number("ground.size") / 2.0),
-            "bsdf": {
-                "type": "twosided",
-                "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": reflectance}},
-            },
+            "bsdf": {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": reflectance}},
         }
     return scene
 
@@ -393,51 +361,39 @@ def refusing(description: SceneDescription) -> Iterator[None]:
     except (RuntimeError, TypeError, ValueError) as error:
         if not own and not any(isinstance(part, PluginPart) for part in description.parts):
             raise
-        said = " ".join(str(error).split())
-        raise InputError(f"{description.object_name}: Mitsuba refuses the scene: {said}; change it there") from error
-
-
-def _camera(description: SceneDescription, resolution: tuple[int, int], filter: str, sampler: str) -> Plugin:
-    height, width = resolution
-    camera: Plugin = {
-        **_lens(description),
-        "near_clip": 0.01,
-        "far_clip": 1e5,
-        "to_world": mi.ScalarTransform4f(camera_to_world(description, width / height)),
-        "film": {
-            "type": "hdrfilm",
-            "width": width,
-            "height": height,
-            "pixel_format": "rgba" if description.backdrop else "rgb",
-            "component_format": "float32",
-            "rfilter": {"type": filter},
-        },
-        "sampler": {"type": sampler},
-    }
-    return camera
+        reason = " ".join(str(error).split())
+        raise InputError(f"{description.object_name}: Mitsuba refuses the scene: {reason}; change it there") from error
 
 
 def _lens(description: SceneDescription) -> Plugin:
     """The plugin of a camera, with what is before its place and its film."""
-    model = description.camera_model
-    if model is not None:
-        if description.backdrop and description.number("camera.drops") > 0.0:
-            raise InputError("background: raindrops have no plain background behind them; leave one of the two out")
-        if description.backdrop and (model.black > 0.0 or not model.name):  # a searched lens may fold
-            raise InputError(
-                "background: it would show where the camera's lens sees nothing as well; leave the plain background "
-                "out, or take a lens that fills the picture"
-            )
-        camera: Plugin = {"type": "advsearch_camera", "kind": model.kind, "reach": model.reach, **model.values}
-        if description.number("camera.drops") > 0.0:
-            half = math.radians(description.number("camera.fov")) / 2.0
-            camera |= {name: description.number(f"camera.{name}") for name in ("drops", "drop_size", "drop_seed")}
-            camera["drop_tangent"] = max(model.tangents) if model.name else math.tan(half)
-        return camera
-    pinhole: Plugin = {"type": "perspective", "fov": description.number("camera.fov"), "fov_axis": "larger"}
-    if description.thin_lens:
-        pinhole |= {"type": "thinlens", "aperture_radius": 1e-4, "focus_distance": 1.0}
-    return pinhole
+    model, drops = description.camera_model, description.number("camera.drops")
+    if model is None:
+        pinhole: Plugin = {"type": "perspective", "fov": description.number("camera.fov"), "fov_axis": "larger"}
+        thin = {"type": "thinlens", "aperture_radius": 1e-4, "focus_distance": 1.0}
+        return pinhole | thin if description.thin_lens else pinhole
+    if description.backdrop and drops > 0.0:
+        raise InputError("background: raindrops have no plain background behind them; leave one of the two out")
+    if description.backdrop and (model.black > 0.0 or not model.name):  # a searched lens may fold
+        raise InputError(
+            "background: it would show where the camera's lens sees nothing as well; leave the plain background out, "
+            "or take a lens that fills the picture"
+        )
+    camera: Plugin = {"type": "advsearch_camera", "kind": model.kind, "reach": model.reach, **model.values}
+    if drops > 0.0:
+        camera |= {name: description.number(f"camera.{name}") for name in ("drops", "drop_size", "drop_seed")}
+        half = math.radians(description.number("camera.fov")) / 2.0
+        camera["drop_tangent"] = max(model.tangents) if model.name else math.tan(half)
+    return camera
+
+
+CAMERA_NUMBERS = {
+    "shift_x": "principal_point_offset_x",
+    "shift_y": "principal_point_offset_y",
+    "aperture": "aperture_radius",
+    "focus": "focus_distance",
+}
+"""What Mitsuba calls numbers of the camera, by the names of our inputs."""
 
 
 def camera_inputs(resolution: tuple[int, int]) -> tuple[SceneInput, ...]:
@@ -449,13 +405,10 @@ def camera_inputs(resolution: tuple[int, int]) -> tuple[SceneInput, ...]:
         return mi.Float(2.0 * dr.rad2deg(dr.atan(dr.tan(half) * min(1.0, width / height))))
 
     return (
-        SceneInput("camera.to_world", "camera.to_world", transform, shape=(4, 4)),
+        _pose("camera", "to_world"),
         SceneInput("camera.fov", "camera.x_fov", along_width, shape=(1,)),
-        SceneInput("camera.shift_x", "camera.principal_point_offset_x", number, shape=(1,)),
-        SceneInput("camera.shift_y", "camera.principal_point_offset_y", number, shape=(1,)),
-        SceneInput("camera.aperture", "camera.aperture_radius", number, shape=(1,)),
         SceneInput("camera.lens", "camera.lens", shape=(len(NUMBERS),)),
-        SceneInput("camera.focus", "camera.focus_distance", number, shape=(1,)),
+        *(SceneInput(f"camera.{name}", f"camera.{key}", number, shape=(1,)) for name, key in CAMERA_NUMBERS.items()),
     )
 
 
@@ -470,7 +423,6 @@ def sunsky_tables() -> tuple[Tensor, Tensor, Tensor]:
     path = Path(str(mi.__file__)).parent / "data" / "sunsky" / "sunsky_datasets.bin"
     with contextlib.redirect_stdout(io.StringIO()):  # the reader prints what it loads
         tables = mi.tensor_io.read(str(path))
-    shape, level, sun = (
-        torch.from_numpy(tables[name]).float() for name in ("sky_params_rgb", "sky_rad_rgb", "sun_rad_rgb")
-    )
+    names = ("sky_params_rgb", "sky_rad_rgb", "sun_rad_rgb")
+    shape, level, sun = (torch.from_numpy(tables[name]).float() for name in names)
     return shape, level, sun

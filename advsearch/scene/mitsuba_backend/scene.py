@@ -8,7 +8,7 @@ no configuration is ever applied on top of another.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
@@ -22,23 +22,10 @@ from advsearch.scene.assembly import Assembly
 from advsearch.scene.description import OBJECT, SceneDescription
 from advsearch.scene.formation import EVERYTHING, SAMPLER, next_count
 from advsearch.scene.grounds import enclosed
+from advsearch.scene.mitsuba_backend import parts
 from advsearch.scene.mitsuba_backend.meshes import NORMALS, POSITIONS, repeating, sampling_weights, textured_emission
-from advsearch.scene.mitsuba_backend.parts import (
-    GROUND_INPUT,
-    IDLE_LOBES,
-    SceneInput,
-    as_torch,
-    camera_inputs,
-    key_of,
-    leave_dark_lamps_out,
-    mesh_translation,
-    plain_number,
-    refusing,
-    scene_dict,
-    translation,
-)
 from advsearch.scene.mitsuba_backend.transport import Paths, collect, first_hits
-from advsearch.scene.mitsuba_backend.variant import Plugin, dr, media_in, mi, one_at_a_time, population, recorded
+from advsearch.scene.mitsuba_backend.variant import Plugin, Recordings, dr, media_in, mi, one_at_a_time, population
 from advsearch.scene.parts import BASE_COLOR as BASE_COLOR_PLACE
 from advsearch.scene.parts import PATTERN, LampGlass, plugins_in
 from advsearch.scene.surfaces import Surfaces
@@ -55,7 +42,7 @@ SHADOW_SPP = 4
 BASE_COLOR = "object.base_color"
 """Input: (h, w, 3) linear reflectance of the object, row 0 at v = 1 (top of the image)."""
 
-ENVIRONMENT_INPUT = SceneInput("environment.padded", "environment.data", interior=True)
+ENVIRONMENT_INPUT = parts.SceneInput("environment.padded", "environment.data", interior=True)
 """(H, W + 2, 3): Mitsuba keeps a copy of the last column before the first, and of the first after the last."""
 
 
@@ -72,12 +59,11 @@ class MitsubaScene:
         interior: those that the interior adjoint differentiates correctly.
 
     Args:
-        description: what to build.
         resolution: (height, width) in pixels.
         filter: reconstruction filter, "box" or "gaussian".
         leave_out: names from `advsearch.scene.formation.ITEMS`; less than everything only to measure what it brings.
         max_depth: longest light path in segments.
-        sampler: Mitsuba's name of the sampler; some round sample counts up, see `scene.samplers`.
+        sampler: Mitsuba's name of the sampler; some round sample counts up, see `formation.next_count`.
         integrator: Mitsuba's name of the path integrator of primal renders, where there is no medium.
     """
 
@@ -118,18 +104,17 @@ class MitsubaScene:
             if description.cut_out:
                 self._guides = {"type": "advsearch_guides"}
             self.volumetric = any(part.volumetric for part in description.parts)
-            plugins = scene_dict(description, resolution, filter, sampler)
+            plugins = parts.scene_dict(description, resolution, filter, sampler)
             self._path: Plugin = {"type": integrator}
-            with refusing(description):
-                translated = [
-                    mesh_translation(description.meshes[OBJECT], None if "lobes" in leave_out else IDLE_LOBES)
-                ]
-                translated += [translation(description.placed(part)) for part in description.parts]
-                for one in translated:
-                    plugins |= one.plugins
-                    self._path |= one.integrator
+            with parts.refusing(description):
+                lobes = None if "lobes" in leave_out else parts.IDLE_LOBES
+                translated = [parts.mesh_translation(description.meshes[OBJECT], lobes)]
+                translated += [parts.translation(description.placed(part)) for part in description.parts]
+                for part in translated:
+                    plugins |= part.plugins
+                    self._path |= part.integrator
                 if "emitters" in leave_out:
-                    leave_dark_lamps_out(plugins, description.parts)
+                    parts.leave_dark_lamps_out(plugins, description.parts)
                 self._scene = mi.load_dict(plugins, optimize=False)
             self._sensor = self._scene.sensors()[0]
             self.parameters = mi.traverse(self._scene)
@@ -137,17 +122,16 @@ class MitsubaScene:
                 self.parameters[f"{name}.emitter.sampling_weight"] = weight
             self.parameters.update()
             self._integrators: dict[tuple[str, int], Any] = {}
-            parts = [one for part in translated for one in part.inputs]
-            declared = [*camera_inputs(resolution), ENVIRONMENT_INPUT, GROUND_INPUT, *parts]
-            self.declared = {one.name: (key, one) for one in declared if (key := key_of(self.parameters, one))}
+            of_parts = [declared for part in translated for declared in part.inputs]
+            inputs = [*parts.camera_inputs(resolution), ENVIRONMENT_INPUT, parts.GROUND_INPUT, *of_parts]
+            self.declared = {own.name: (key, own) for own in inputs if (key := parts.key_of(self.parameters, own))}
             self.names = frozenset(self.declared)
-            self.interior = frozenset(name for name, (_, one) in self.declared.items() if one.interior)
+            self.interior = frozenset(name for name, (_, takes) in self.declared.items() if takes.interior)
             self._buffers = frozenset(n for n, (key, _) in self.declared.items() if key.endswith((POSITIONS, NORMALS)))
-            self._literals = frozenset(n for n, (_, one) in self.declared.items() if one.write is plain_number)
+            self._literals = frozenset(n for n, (_, own) in self.declared.items() if own.write is parts.plain_number)
             self._base: dict[str, Any] = {}
             self._applied: dict[str, Tensor] = {}
-            self._recorded: dict[tuple[str, int, int], Callable[..., Any]] = {}
-            self._recorded_at = (0, 0)
+            self._recorded = Recordings()
             media = media_in(self._scene) if self.volumetric else ()
             population.add(self, self._scene, self._integrators, self.parameters, media=media)
             self._every: dict[str, Tensor] = {}
@@ -180,10 +164,10 @@ class MitsubaScene:
 
     def base(self, name: str) -> Tensor:
         """Return the base value of an input, as a fresh torch tensor of the input's shape."""
-        key, one = self.declared[name]
+        key, takes = self.declared[name]
         self._set({})
-        value = as_torch(self.parameters[key])
-        return value if one.shape is None else value.reshape(one.shape)
+        value = parts.as_torch(self.parameters[key])
+        return value if takes.shape is None else value.reshape(takes.shape)
 
     def pictures(self, inputs: Mapping[str, Tensor], seeds: Mapping[str, int], spp: int) -> list[Tensor]:
         """Render pictures of one configuration with `spp` independent samples a pixel each.
@@ -213,18 +197,11 @@ class MitsubaScene:
             if population.unused:
                 population.bury()
             spp = next_count(self.sampler, spp)
-            integrators = [self._integrators.get((what, self._depth)) or self._integrator(what) for what in seeds]
-            now = (population.changes, dr.thread_count())  # a recording crashes in another thread pool
-            if self._recorded_at != now:
-                self._recorded.clear()
-                self._recorded_at = now
+            integrators = [self._integrator(what) for what in seeds]
             media = population.media() if self.volumetric else []
             pictures: list[Tensor] = []
             for (what, seed), integrator in zip(seeds.items(), integrators, strict=True):
-                key = what, spp, self._depth
-                if self._freeze and key not in self._recorded:
-                    self._recorded[key] = recorded(render, media)
-                function: Callable[..., Any] = self._recorded.get(key, render)
+                function = self._recorded.of((what, spp, self._depth), render, media) if self._freeze else render
                 image = function(self._scene, self._sensor, integrator, dr.opaque(mi.UInt32, seed)).torch().clone()
                 if what == "guides":
                     image = image[..., -6:]
@@ -249,7 +226,7 @@ class MitsubaScene:
 
     def stand(self, inputs: Mapping[str, Tensor]) -> None:
         """Set the vertices and normals that these inputs have, if others are set; everything else may be anything."""
-        wanted, now = ({n: one[n] for n in one if n in self._buffers} for one in (inputs, self._applied))
+        wanted, now = ({n: some[n] for n in some if n in self._buffers} for some in (inputs, self._applied))
         if wanted.keys() != now.keys() or not all(torch.equal(wanted[n].float(), now[n]) for n in wanted):
             self.held(inputs)
 
@@ -258,13 +235,13 @@ class MitsubaScene:
         with one_at_a_time:
             self._set(inputs)
             height, width = self.resolution
-            found = first_hits(self._scene, self._sensor, (height * fineness, width * fineness))
-            for one in self.made[0].parts:
-                if isinstance(one, LampGlass):  # it belongs to what carries it
-                    there, mesh = found.seen(one.name), found.names.index(one.carrier) + 1
-                    found.face[there] = torch.from_numpy(one.lies_on)[found.face[there]]
-                    found.id[there] = mesh
-            return found
+            hits = first_hits(self._scene, self._sensor, (height * fineness, width * fineness))
+            for part in self.made[0].parts:
+                if isinstance(part, LampGlass):  # it belongs to what carries it
+                    glass = hits.seen(part.name)
+                    hits.face[glass] = torch.from_numpy(part.lies_on)[hits.face[glass]]
+                    hits.id[glass] = hits.names.index(part.carrier) + 1
+            return hits
 
     def adjoint(
         self,
@@ -305,18 +282,16 @@ class MitsubaScene:
             level = mi.log_level()
             try:
                 for name in (*sorted(beside - set(wanted)), *wanted):
-                    key, one = self.declared[name]
+                    key, takes = self.declared[name]
                     own = self.parameters[key]
                     held[key] = type(own)(own)
-                    value = one.rendered(inputs[name]) if name in inputs else as_torch(own)
-                    tracked[name] = mi.TensorXf(value)
+                    tracked[name] = mi.TensorXf(takes.rendered(inputs[name]) if name in inputs else parts.as_torch(own))
                     dr.enable_grad(tracked[name])
-                    self.parameters[key] = one.write(tracked[name]) if one.write else tracked[name]
+                    self.parameters[key] = takes.write(tracked[name]) if takes.write else tracked[name]
                 self.parameters.update()
                 spp, arriving = next_count(self.sampler, spp), mi.TensorXf(shown)
                 mi.set_log_level(mi.LogLevel.Error)  # it warns at every call of a film that samples beyond its border
-                integrator = self._integrators.get((method, self._depth)) or self._integrator(method)
-                integrator.render_backward(
+                self._integrator(method).render_backward(
                     self._scene, self.parameters, arriving, sensor=self._sensor, seed=seed, spp=spp
                 )
                 for name in wanted:
@@ -331,15 +306,9 @@ class MitsubaScene:
     def material_adjoint(
         self, inputs: Mapping[str, Tensor], cotangent: Tensor, seed: int, spp: int, *, meshes: Collection[str]
     ) -> dict[str, Tensor]:
-        """Return the gradient with respect to the vertices and normals of some meshes, by the material form.
-
-        Args:
-            inputs: as in `radiance`; has `NAME.vertices` and `NAME.normals` of each mesh.
-            cotangent: (H, W, 3) float32.
-            seed: as in `adjoint`.
-            spp: samples a pixel of the interior term.
-            meshes: names of the meshes.
-        """
+        """Return the gradient with respect to the vertices and normals of some meshes, by the material form. The inputs
+        have `NAME.vertices` and `NAME.normals` of each, `spp` are the samples of the interior term; the others as of
+        `adjoint`."""
         with one_at_a_time:
             # few scenes search a material
             from advsearch.scene.mitsuba_backend.material_adjoint import material_adjoint
@@ -360,19 +329,12 @@ class MitsubaScene:
                 shadow_spp=SHADOW_SPP,
             )
             population.changes += 1  # the first call loads integrators of its own
-            found = {f"{name}.vertices": one for name, one in zip(names, by_vertices, strict=True)}
-            return found | {f"{name}.normals": one for name, one in zip(names, by_normals, strict=True)}
+            gradients = dict(zip((f"{name}.vertices" for name in names), by_vertices, strict=True))
+            return gradients | dict(zip((f"{name}.normals" for name in names), by_normals, strict=True))
 
     def transport(self, inputs: Mapping[str, Tensor], name: str, seed: int, spp: int) -> Paths:
-        """Return what the vertices of light paths add to their pixels for a unit more of a base colour, or of a
-        projector's pattern, and the picture of these paths.
-
-        Args:
-            inputs: as in `radiance`.
-            name: an input that is one of these.
-            seed: number of the noise.
-            spp: samples a pixel.
-        """
+        """Return what the vertices of light paths add to their pixels for a unit more of an input that is a base
+        colour, or a projector's pattern, and the picture of these paths; the others as of `pictures`."""
         with one_at_a_time:
             self._set(inputs)
             key, spp = self.declared[name][0], next_count(self.sampler, spp)
@@ -380,32 +342,22 @@ class MitsubaScene:
             noise.set_samples_per_wavefront(spp)
             noise.seed(dr.opaque(mi.UInt32, seed), self.resolution[0] * self.resolution[1] * spp)
             part = name.partition(".")[0]
-            projector = next(
-                (one for one in self._scene.emitters() if one.id() == part and name.endswith(PATTERN)), None
-            )
-            found = collect(
-                self._scene,
-                self.parameters,
-                key,
-                noise,
-                self.resolution,
-                depth=self._depth,
-                spp=spp,
-                projector=projector,
-            )
-            if projector is not None:  # its picture ends at the border, where lookups of a matrix go on
-                half = 0.5 / torch.tensor(self.parameters[key].shape[1::-1])
-                return replace(
-                    found, vertices=[replace(one, uv=one.uv.clamp(half, 1.0 - half)) for one in found.vertices]
-                )
-            surface = self.made[0].meshes[part].surface
-            if surface is None:
-                return found
-            options = next(one for one in plugins_in(surface) if one["type"] == BASE_COLOR_PLACE)
-            size = tuple(self.parameters[key].shape[:2])
-            return replace(
-                found, vertices=[replace(one, uv=repeating(one.uv, options, size)) for one in found.vertices]
-            )
+            emitters = {emitter.id(): emitter for emitter in self._scene.emitters()}
+            projector = emitters.get(part) if name.endswith(PATTERN) else None
+            paths = collect(self._scene, self.parameters, key, noise, self.resolution, self._depth, spp, projector)
+            size, surface = self.parameters[key].shape[:2], None if projector else self.made[0].meshes[part].surface
+            if projector is None and surface is None:
+                return paths
+
+            def looked_up(uv: Tensor) -> Tensor:
+                """Where lookups of a matrix, which repeat at the border, find what is shown at texture coordinates."""
+                if surface is None:  # a projector's picture ends at the border
+                    half = 0.5 / torch.tensor(size[::-1])
+                    return uv.clamp(half, 1.0 - half)
+                options = next(plugin for plugin in plugins_in(surface) if plugin["type"] == BASE_COLOR_PLACE)
+                return repeating(uv, options, size)
+
+            return replace(paths, vertices=[replace(some, uv=looked_up(some.uv)) for some in paths.vertices])
 
     # ---- inside -----------------------------------------------------------------------------------------------------
 
@@ -433,23 +385,23 @@ class MitsubaScene:
                 wanted[name] = value
         population.changes += not self._literals.isdisjoint(wanted)
         for name, fresh in wanted.items():
-            key, one = self.declared[name]
+            key, takes = self.declared[name]
             current = self.parameters[key]
-            if fresh is not None and one.shape is not None and fresh.numel() != math.prod(one.shape):
-                raise InputError(f"{name}: expected shape {one.shape}, got {tuple(fresh.shape)}, from what sets it")
+            if fresh is not None and takes.shape is not None and fresh.numel() != math.prod(takes.shape):
+                raise InputError(f"{name}: expected shape {takes.shape}, got {tuple(fresh.shape)}, from what sets it")
             if name not in self._base:
                 self._base[name] = type(current)(current.torch().clone() if name in self._buffers else current)
-            given = type(current)(self._base[name]) if fresh is None else mi.TensorXf(fresh)
-            if fresh is not None and one.write:
-                given = one.write(given)
+            value = type(current)(self._base[name]) if fresh is None else mi.TensorXf(fresh)
+            if fresh is not None and takes.write:
+                value = takes.write(value)
             if name in self._buffers:
                 place = current.torch().data_ptr()
-                dr.scatter(current, given, dr.arange(mi.UInt32, len(current)))
+                dr.scatter(current, value, dr.arange(mi.UInt32, len(current)))
                 dr.eval(current)
                 population.changes += current.torch().data_ptr() != place  # Dr.Jit copies what has a second owner
                 self.parameters.set_dirty(key)
             else:
-                self.parameters[key] = given
+                self.parameters[key] = value
             if fresh is None:
                 del self._applied[name]
             else:
@@ -462,16 +414,12 @@ class MitsubaScene:
         key = method, self._depth
         if key not in self._integrators:
             path = {"type": "prb", "max_depth": self._depth, "rr_depth": self.roulette, **self._path}
+            projective = {"type": "prb_projective", "max_depth": self._depth, "rr_depth": NO_ROULETTE}
             recipes: dict[str, Plugin] = {
                 "path": path,
                 "hidden": {**path, "hide_emitters": True},
                 "guides": self._guides,
-                "boundary": {
-                    "type": "prb_projective",
-                    "max_depth": self._depth,
-                    "rr_depth": NO_ROULETTE,
-                    "guiding": "none",
-                },
+                "boundary": {**projective, "guiding": "none"},
             }
             self._integrators[key] = mi.load_dict(recipes[method])
             population.changes += 1

@@ -7,22 +7,22 @@ Lengths are in object sizes, so that everything is moved and scaled with the obj
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.scene.assets import Doubles, Floats, Mesh, ObjectAsset, UpAxis, normalised
+from advsearch.scene.assets import Floats, Mesh, ObjectAsset, UpAxis, normalised
 from advsearch.scene.importing.files import clean, safe_name, shown
 from advsearch.scene.importing.geometry import assemble, join
 from advsearch.scene.importing.parts import BRIGHTEST, ImportedPart, ImportedSurface
 from advsearch.scene.importing.scenes import TAKEN, ImportedScene
 from advsearch.scene.importing.texture import textured
-from advsearch.scene.mitsuba_backend.meshes import plain
+from advsearch.scene.mitsuba_backend.meshes import plain, with_inner
 from advsearch.scene.mitsuba_backend.shape_surfaces import ShapeSurface, constant, surface_of
-from advsearch.scene.mitsuba_backend.shapes import MESHES, OF_A_SHAPE, ShapeMesh, haze_in, mesh_of
+from advsearch.scene.mitsuba_backend.shapes import MESHES, OF_A_SHAPE, ShapeMesh, haze_in, mesh_of, pose_of
 from advsearch.scene.mitsuba_backend.variant import Plugin
 from advsearch.scene.mitsuba_backend.xml_files import read_scene, trusted
 from advsearch.scene.parts import MediumPart, PlacedCamera, PluginPart, ScenePart, plugins_in
@@ -65,17 +65,16 @@ def read_tree(scene: Path | Mapping[str, object]) -> tuple[Plugin, list[str]]:
     notes: list[str] = []
     if isinstance(scene, Path):
         tree = trusted(scene, read_scene(scene), notes)
-        _check_numbers(tree, str(scene))
-        return tree, notes
-    if scene.get("type") != "scene":
+    elif scene.get("type") == "scene":
+        tree = plain(scene)
+        notes = [
+            f"scene: {name} is left out: expected a plugin's dictionary, got {type(entry).__name__}"
+            for name, entry in scene.items()
+            if name != "type" and not isinstance(entry, Mapping)
+        ]
+    else:
         raise InputError(f"scene: expected a dictionary of type 'scene', got {scene.get('type')!r}")
-    notes += [
-        f"scene: {name} is left out: expected a plugin's dictionary, got {type(one).__name__}"
-        for name, one in scene.items()
-        if name != "type" and not isinstance(one, Mapping)
-    ]
-    tree = plain(scene)
-    _check_numbers(tree, "scene")
+    _check_numbers(tree, str(scene) if isinstance(scene, Path) else "scene")
     return tree, notes
 
 
@@ -102,14 +101,8 @@ def _check_numbers(plugin: Mapping[str, object], where: str) -> None:
 
 @dataclass(frozen=True)
 class PluginContents:
-    """What is in a Mitsuba scene, by id.
-
-    Attributes:
-        objects: shapes that can be the object.
-        kept: the rest, which stays as it is: its plugin's name.
-        lights: what shines.
-        cameras: sensors that can be looked through.
-    """
+    """What is in a Mitsuba scene, by id: shapes that can be the object; of the rest, which stays as it is, its plugin's
+    name; what shines; and sensors that can be looked through."""
 
     objects: tuple[str, ...]
     kept: Mapping[str, str]
@@ -124,16 +117,13 @@ def contents(path: Path) -> PluginContents:
         FileFormatError: as for `read_tree`.
     """
     named = dict(_plugins(read_tree(path)[0]))
-    kinds = {name: str(one["type"]) for name, one in named.items()}
+    kinds = {name: str(plugin["type"]) for name, plugin in named.items()}
     objects = tuple(name for name, kind in kinds.items() if kind in MESHES and named[name].get("bsdf") != NOTHING)
     cameras = tuple(name for name, kind in kinds.items() if kind in CAMERAS)
-    others = {
-        name: kind
-        for name, kind in kinds.items()
-        if name not in (*objects, *cameras) and kind not in INTEGRATORS | SENSORS
-    }
-    lights = tuple(name for name, one in named.items() if _shines(one))
-    return PluginContents(objects, others, lights, tuple(map(_free, cameras)))
+    known, unkept = {*objects, *cameras}, INTEGRATORS | SENSORS
+    kept = {name: kind for name, kind in kinds.items() if name not in known and kind not in unkept}
+    lights = tuple(name for name, plugin in named.items() if _shines(plugin))
+    return PluginContents(objects, kept, lights, tuple(map(_free, cameras)))
 
 
 def _free(name: str) -> str:
@@ -145,25 +135,18 @@ def _shines(plugin: Mapping[str, object]) -> bool:
     return any(inner.get("type") in LIGHTS for inner in plugins_in(plugin))
 
 
-def _meant(wanted: str, ids: Sequence[str]) -> str:
-    """Return the id that is meant by a name; the name itself where that is none, or several."""
-    alike = [one for one in ids if _letters(one) == _letters(wanted)]
-    return alike[0] if wanted not in ids and len(alike) == 1 else wanted
-
-
 def _letters(name: str) -> str:
     return "".join(sign for sign in name.casefold() if sign.isalnum())
 
 
 def import_plugins(scene: Path | Mapping[str, object], wanted: str) -> ImportedScene:
-    """Read a Mitsuba scene.
+    """Read a Mitsuba scene, an XML file or a dictionary as Mitsuba's loader takes it.
 
     The shape becomes a mesh with its own kind of surface, whose base colour, where it has one, becomes a texture.
     Everything else stays as it is, under its own name. Perspective sensors become cameras. Integrator, sampler and film
     are those of the house. What is left out is among the object's warnings.
 
     Args:
-        scene: an XML file, or a dictionary as Mitsuba's loader takes it.
         wanted: id of the shape that is the object; where there is none, the only one that differs in nothing but case
             and signs ("largebox" means "large-box", as Mitsuba's own writer calls it).
 
@@ -174,22 +157,27 @@ def import_plugins(scene: Path | Mapping[str, object], wanted: str) -> ImportedS
     """
     tree, notes = read_tree(scene)
     where = scene.name if isinstance(scene, Path) else "scene"
-    ids = [name for name, one in _plugins(tree) if one["type"] in SHAPES]
-    wanted = _meant(wanted, ids)
+    named = dict(_plugins(tree))
+    ids = [name for name, plugin in named.items() if plugin["type"] in SHAPES]
+    alike = [name for name in ids if _letters(name) == _letters(wanted)]
+    if wanted not in ids and len(alike) == 1:
+        wanted = alike[0]
     if wanted not in ids:
         raise UnknownNameError(f"shape of {where}", wanted, ids)
-    named = dict(_plugins(tree))
     if len(named) > MOST_PARTS:
         raise InputError(f"{where}: expected at most {MOST_PARTS} plugins at the top, got {len(named)}; join meshes")
     shape = named[wanted]
-    surface, found = surface_of(_bsdf(shape, named)), mesh_of(shape, wanted)
-    frame = _Frame(found.mesh, wanted, z_up=_is_z_up(named))
+    surface, triangles = surface_of(_bsdf(shape, named)), mesh_of(shape, wanted)
+    placed = [plugin for plugin in named.values() if plugin["type"] in SENSORS and "to_world" in plugin]
+    upper = abs(pose_of(placed[0])[:3, 1]) if placed else np.array([0.0, 1.0, 0.0])  # of the first camera's side
+    frame = _ObjectFrame(triangles.mesh, wanted, z_up=bool(upper[2] > upper[1]))
     haze, used = haze_in(named, frame.matrix) or (None, frozenset[str]())
     light = _light(shape)
     left_out = _left_out(tree, shape, hazy=haze is not None, lit=light is not None)
-    notes += [f"{where}: {one}" for one in (*left_out, *surface.notes, *_without(surface.plugin, found.mesh))]
+    missing = _missing_attributes(surface.plugin, triangles.mesh)
+    notes += [f"{where}: {clause}" for clause in (*left_out, *surface.notes, *missing)]
     source = scene if isinstance(scene, Path) else Path("scene.xml")
-    mesh, base_color = _painted(frame.turned(found), surface, str(shape["type"]), where)
+    mesh, base_color = _painted(frame.turned(triangles), surface, str(shape["type"]), where)
     made = ObjectAsset(
         name=f"{safe_name(source)}-{clean(wanted)}",
         mesh=normalised(mesh),
@@ -203,33 +191,29 @@ def import_plugins(scene: Path | Mapping[str, object], wanted: str) -> ImportedS
     )
     around: list[ScenePart] = [] if haze is None else [haze]
     cameras: dict[str, PlacedCamera] = {}
-    for name, one in named.items():
-        if name == wanted or name in used or one["type"] in INTEGRATORS:
-            continue
-        free = _free(name)
-        if one["type"] in SENSORS:
-            if one["type"] in CAMERAS:
-                cameras[free] = _camera(one, frame)
-            continue
-        kept = _renamed(frame.moved(one))
-        holds = MediumPart if any(inner.get("type") in MEDIA for inner in plugins_in(kept)) else PluginPart
-        around.append(holds(free, kept, _shines(kept)))
+    for name, plugin in named.items():
+        if plugin["type"] in CAMERAS:
+            cameras[_free(name)] = _camera(plugin, frame)
+        elif name != wanted and name not in used and plugin["type"] not in INTEGRATORS | SENSORS:
+            kept = _renamed(frame.moved(plugin))
+            holds = MediumPart if any(inner.get("type") in MEDIA for inner in plugins_in(kept)) else PluginPart
+            around.append(holds(_free(name), kept, _shines(kept)))
     return ImportedScene(made, tuple(around), cameras)
 
 
-def _painted(found: ShapeMesh, surface: ShapeSurface, kind: str, where: str) -> tuple[Mesh, Floats]:
+def _painted(shape: ShapeMesh, surface: ShapeSurface, kind: str, where: str) -> tuple[Mesh, Floats]:
     """Return a shape's mesh with texture coordinates for its base colour, and that.
 
     Where anything is looked up by the mesh's own, or by its attributes, they stay. A shape of one colour gets new ones
     where its own do not tell its places apart, as on a cube.
     """
-    mesh = found.mesh
+    mesh = shape.mesh
     if surface.picture or surface.bound:
         down = mesh.uvs * (1.0, -1.0) + (0.0, 1.0)
         down = down @ surface.to_uv[:2, :2].T + surface.to_uv[:2, 2]
         return replace(mesh, uvs=(down * (1.0, -1.0) + (0.0, 1.0)).astype(np.float32)), surface.base_color
-    own = found.uv and kind not in ("cube", "sphere", "cylinder", "disk")
-    vertices, normals, uvs = (one.astype(np.float64) for one in (mesh.vertices, mesh.normals, mesh.uvs))
+    own = shape.uv and kind not in ("cube", "sphere", "cylinder", "disk")
+    vertices, normals, uvs = (values.astype(np.float64) for values in (mesh.vertices, mesh.normals, mesh.uvs))
     color = ImportedSurface(color=surface.base_color[0, 0])
     part = ImportedPart(vertices, mesh.faces.astype(np.int64), normals, uvs if own else None, None, color)
     soup, maps, _ = textured(join([part], where, y_up=False), [color])
@@ -243,10 +227,10 @@ def _plugins(tree: Mapping[str, object]) -> Iterator[tuple[str, Mapping[str, obj
 
 def _renamed(plugin: Mapping[str, object]) -> Plugin:
     """A plugin whose references have the names that the house left free."""
-    found = {key: _renamed(value) if isinstance(value, Mapping) else value for key, value in plugin.items()}
-    if found["type"] == "ref" and found["id"] in TAKEN:
-        found["id"] = f"{found['id']}-2"
-    return found
+    entries = with_inner(plugin, _renamed)
+    if entries["type"] == "ref" and entries["id"] in TAKEN:
+        entries["id"] = f"{entries['id']}-2"
+    return entries
 
 
 def _bsdf(shape: Mapping[str, object], named: Mapping[str, Mapping[str, object]]) -> Mapping[str, object]:
@@ -264,7 +248,7 @@ def _bsdf(shape: Mapping[str, object], named: Mapping[str, Mapping[str, object]]
             if name not in named or depth > len(named):
                 raise UnknownNameError("material of the scene", name, list(named))
             return whole(named[name], depth + 1)
-        return {key: whole(one, depth) if isinstance(one, Mapping) else one for key, one in plugin.items()}
+        return with_inner(plugin, lambda inner: whole(inner, depth))
 
     for inner in shape.values():
         if isinstance(inner, Mapping) and inner["type"] not in LIGHTS | MEDIA:
@@ -282,12 +266,13 @@ def _light(shape: Mapping[str, object]) -> Floats | None:
     return None
 
 
-def _without(surface: Mapping[str, object], mesh: Mesh) -> Iterator[str]:
+def _missing_attributes(surface: Mapping[str, object], mesh: Mesh) -> Iterator[str]:
     """Sentences about attributes that a surface shows and the mesh has not."""
-    for one in plugins_in(surface):
-        if one["type"] == "mesh_attribute" and one.get("name") not in mesh.attributes:
+    for plugin in plugins_in(surface):
+        name = plugin.get("name")
+        if plugin["type"] == "mesh_attribute" and name not in mesh.attributes:
             there = ", ".join(sorted(mesh.attributes)) or "none"
-            yield f"the mesh has no attribute {shown(str(one.get('name')))} (it has {there}), so that is black"
+            yield f"the mesh has no attribute {shown(str(name))} (it has {there}), so that is black"
 
 
 def _left_out(tree: Mapping[str, object], shape: Mapping[str, object], *, hazy: bool, lit: bool) -> Iterator[str]:
@@ -307,14 +292,14 @@ def _left_out(tree: Mapping[str, object], shape: Mapping[str, object], *, hazy: 
             depth = plugin.get("max_depth", -1)
             if isinstance(depth, int) and 0 <= depth < 6:
                 yield f"the integrator's max_depth of {depth} is left out: light takes all paths of up to 6 segments"
-        if kind in SENSORS and any(
-            isinstance(film, Mapping) and any(str(key).startswith("crop") for key in film) for film in plugin.values()
-        ):
-            yield f"the crop of the film of {name} is left out: the whole picture is seen"
-        if kind in SENSORS and "medium" in plugin and not hazy:
-            yield f"the sensor {name} sees nothing of its medium up to the first surface"
-        if kind in SENSORS and any("principal_point" in key for key in plugin):
-            yield f"the sensor {name} looks along its middle: its principal point is left out"
+        if kind in SENSORS:
+            films = [inner for inner in plugin.values() if isinstance(inner, Mapping)]
+            if any(str(key).startswith("crop") for film in films for key in film):
+                yield f"the crop of the film of {name} is left out: the whole picture is seen"
+            if "medium" in plugin and not hazy:
+                yield f"the sensor {name} sees nothing of its medium up to the first surface"
+            if any("principal_point" in key for key in plugin):
+                yield f"the sensor {name} looks along its middle: its principal point is left out"
     for key, inner in shape.items():
         if not isinstance(inner, Mapping) and key not in OF_A_SHAPE:
             yield f"the object's {shown(key)} is left out: a {shape['type']} has none"
@@ -324,16 +309,7 @@ def _left_out(tree: Mapping[str, object], shape: Mapping[str, object], *, hazy: 
             yield "the medium in the object is left out"
 
 
-def _is_z_up(named: Mapping[str, Mapping[str, object]]) -> bool:
-    """Whether the first camera's upper side points along z, and not along y as is usual."""
-    for one in named.values():
-        if one["type"] in SENSORS and "to_world" in one:
-            above = np.asarray(one["to_world"], dtype=np.float64)[:3, 1]
-            return bool(abs(above[2]) > abs(above[1]))
-    return False
-
-
-class _Frame:
+class _ObjectFrame:
     """From the scene's coordinates to the object's: z up, standing on z = 0, a largest extent of 1."""
 
     def __init__(self, mesh: Mesh, name: str, *, z_up: bool) -> None:
@@ -348,48 +324,44 @@ class _Frame:
         move[:3, 3] = (-(low[0] + high[0]) / 2, -(low[1] + high[1]) / 2, -low[2])
         self.matrix = np.diag([1.0 / self.size] * 3 + [1.0]) @ move @ turn
 
-    def turned(self, found: ShapeMesh) -> ShapeMesh:
+    def turned(self, shape: ShapeMesh) -> ShapeMesh:
         """Return a mesh with z up."""
         turn = self.turn.astype(np.float32)
-        mesh = replace(found.mesh, vertices=found.mesh.vertices @ turn.T, normals=found.mesh.normals @ turn.T)
-        return replace(found, mesh=mesh)
+        mesh = replace(shape.mesh, vertices=shape.mesh.vertices @ turn.T, normals=shape.mesh.normals @ turn.T)
+        return replace(shape, mesh=mesh)
 
     def moved(self, plugin: Mapping[str, object]) -> Plugin:
         """Return a plugin at the top of a scene in its place."""
         kind, entries = plugin["type"], dict(plugin)
         if kind == "merge":
-            return {key: self.moved(one) if isinstance(one, Mapping) else one for key, one in entries.items()}
+            return with_inner(entries, self.moved)
         if kind in SHAPES - {"shapegroup", "merge"}:
-            entries["to_world"] = self.matrix @ _matrix(plugin)
+            entries["to_world"] = self.matrix @ pose_of(plugin)
         elif kind in ("constant", "envmap", "sunsky", "timed_sunsky", "directional"):
             turn = np.eye(4)
             turn[:3, :3] = self.turn
             if "direction" in entries:
                 entries["direction"] = (self.turn @ np.asarray(entries["direction"], dtype=np.float64)).tolist()
             elif kind != "constant":
-                entries["to_world"] = turn @ _matrix(plugin)
+                entries["to_world"] = turn @ pose_of(plugin)
         elif kind in ("point", "spot", "projector"):
             if "position" in entries:
                 place = np.asarray(entries["position"], dtype=np.float64)
                 entries["position"] = (self.matrix[:3, :3] @ place + self.matrix[:3, 3]).tolist()
             else:
-                entries["to_world"] = self.matrix @ _matrix(plugin)
+                entries["to_world"] = self.matrix @ pose_of(plugin)
             power = "irradiance" if kind == "projector" else "intensity"
             entries[power] = _times(entries.get(power, 1.0), self.size**-2, str(kind))
-        return {key: self._inside(value) if isinstance(value, Mapping) else value for key, value in entries.items()}
+        return with_inner(entries, self._inside)
 
     def _inside(self, plugin: Mapping[str, object]) -> Plugin:
         """Return a plugin within another: media and volumes are scaled."""
-        found = dict(plugin)
+        entries = dict(plugin)
         if plugin["type"] in MEDIA:
-            found["scale"] = float(np.asarray(found.get("scale", 1.0))) * self.size
+            entries["scale"] = float(np.asarray(entries.get("scale", 1.0))) * self.size
         if plugin["type"] in ("gridvolume", "constvolume"):
-            found["to_world"] = self.matrix @ _matrix(plugin)
-        return {key: self._inside(value) if isinstance(value, Mapping) else value for key, value in found.items()}
-
-
-def _matrix(plugin: Mapping[str, object]) -> Doubles:
-    return np.asarray(plugin.get("to_world", np.eye(4)), dtype=np.float64)
+            entries["to_world"] = self.matrix @ pose_of(plugin)
+        return with_inner(entries, self._inside)
 
 
 def _times(value: object, factor: float, kind: str) -> object:
@@ -397,24 +369,25 @@ def _times(value: object, factor: float, kind: str) -> object:
     if isinstance(value, (int, float)):
         return float(value) * factor
     if isinstance(value, Mapping):
-        inner = value.get("value")
-        if value["type"] in ("rgb", "uniform", "srgb", "spectrum") and isinstance(inner, (int, float)):
+        light, inner = value["type"], value.get("value")
+        if light in ("rgb", "uniform", "srgb", "spectrum") and isinstance(inner, (int, float)):
             return {**value, "value": float(inner) * factor}
-        if value["type"] == "rgb" and inner is not None:
+        if light == "rgb" and inner is not None:
             return {**value, "value": (np.asarray(inner, dtype=np.float64) * factor).tolist()}
-        if value["type"] == "spectrum" and isinstance(inner, (list, tuple)):
+        if light == "spectrum" and isinstance(inner, (list, tuple)):
             return {**value, "value": [(length, amount * factor) for length, amount in inner]}
-        if value["type"] in ("d65", "blackbody"):
+        if light in ("d65", "blackbody"):
             return {**value, "scale": float(np.asarray(value.get("scale", 1.0))) * factor}
-        if value["type"] == "bitmap" and isinstance(value.get("bitmap"), np.ndarray):
+        if light == "bitmap" and isinstance(value.get("bitmap"), np.ndarray):
             return {**value, "bitmap": np.asarray(value["bitmap"]) * np.float32(factor)}
     raise InputError(f"{kind} light: expected a power as a number, rgb or spectrum; change it in the scene")
 
 
-def _camera(sensor: Mapping[str, object], frame: _Frame) -> PlacedCamera:
-    matrix = frame.matrix @ _matrix(sensor)
+def _camera(sensor: Mapping[str, object], frame: _ObjectFrame) -> PlacedCamera:
+    matrix = frame.matrix @ pose_of(sensor)
     matrix[:3, :3] /= np.maximum(np.linalg.norm(matrix[:3, :3], axis=0), 1e-12)
-    film = next((one for one in sensor.values() if isinstance(one, Mapping) and "film" in str(one["type"])), {})
+    inner = [entry for entry in sensor.values() if isinstance(entry, Mapping)]
+    film = next((plugin for plugin in inner if "film" in str(plugin["type"])), {})
     width, height = (float(np.asarray(film.get(side, other))) for side, other in (("width", 768), ("height", 576)))
     if not min(width, height) >= 1.0:
         raise InputError(f"camera: expected a film of at least 1 x 1 pixels, got {width:g} x {height:g}")
@@ -435,9 +408,9 @@ def millimetres(text: str) -> float:
         InputError: there is none.
     """
     try:
-        found = float(text.removesuffix("mm"))
+        length = float(text.removesuffix("mm"))
     except ValueError:
-        found = 0.0
-    if not found > 0.0:
+        length = 0.0
+    if not length > 0.0:
         raise InputError(f"focal_length: expected millimetres, such as 50mm, got {text!r}")
-    return found
+    return length

@@ -9,6 +9,7 @@ import numpy as np
 
 from advsearch.scene.assets import Doubles, Floats
 from advsearch.scene.color import linear_to_srgb
+from advsearch.scene.mitsuba_backend.meshes import with_inner
 from advsearch.scene.mitsuba_backend.variant import Plugin, mi
 from advsearch.scene.parts import BASE_COLOR, plugins_in
 
@@ -82,21 +83,25 @@ def surface_of(bsdf: Mapping[str, object]) -> ShapeSurface:
         color = None if key is None or base is not None else _color(plugin.get(key, GREY))
         if key is not None and color is not None:
             base, plugin = color, {**plugin, key: {"type": BASE_COLOR, **color.options}}
-        return {name: without(value) if isinstance(value, Mapping) else value for name, value in plugin.items()}
+        return with_inner(plugin, without)
 
     surface = without(bsdf)
     color = base or _Color(np.full((PLAIN_SIZE, PLAIN_SIZE, 3), GREY, np.float32), {})
     notes, plugins = [], list(plugins_in(surface))
-    if not any(one["type"] == BASE_COLOR for one in plugins):
-        kinds = sorted({str(one["type"]) for one in plugins} & {"mesh_attribute", "volume"})
+    types = {str(plugin["type"]) for plugin in plugins}
+    if BASE_COLOR not in types:
+        kinds = sorted(types & {"mesh_attribute", "volume"})
         why = f"its colour is a {kinds[0]}" if kinds else f"a {surface['type']} has none"
         notes.append(f"it has no base colour that can be searched ({why}): not for texture, patch and material")
     if not (color.linear.min() >= 0.0 and color.linear.max() <= 1.0 + 1e-4):
         notes.append("its base colour is cut to reflectances from 0 to 1")
     picture = color.linear.shape[:2] != (PLAIN_SIZE, PLAIN_SIZE) or bool(np.ptp(color.linear, axis=(0, 1)).any())
-    bound = any(one["type"] in BOUND or ANISOTROPIC & set(one) for one in plugins)
+    bound = any(plugin["type"] in BOUND or ANISOTROPIC & set(plugin) for plugin in plugins)
     to_uv = np.eye(3) if color.to_uv is None else uv_matrix(color.to_uv)
-    if not _folds(surface, to_uv):
+    # The mesh's texture coordinates can be transformed where that can be undone, and the tangents along u stay
+    tangents = types & {"normalmap", "hair"} or any(ANISOTROPIC & set(plugin) for plugin in plugins)
+    stays = not tangents or (to_uv[1, 0] == 0.0 and to_uv[0, 0] > 0.0)
+    if not (abs(np.linalg.det(to_uv)) > 1e-12 and stays):
         surface, to_uv = _with_transform(surface, to_uv, BASE_COLOR), np.eye(3)
     elif not np.array_equal(to_uv, np.eye(3)):
         surface = _with_transform(surface, np.asarray(np.linalg.inv(to_uv), np.float64), *PLACED)
@@ -104,24 +109,14 @@ def surface_of(bsdf: Mapping[str, object]) -> ShapeSurface:
     return ShapeSurface(surface, base_color, picture, to_uv, bound, tuple(notes))
 
 
-def _folds(surface: Mapping[str, object], to_uv: Doubles) -> bool:
-    """Whether the mesh's texture coordinates can be transformed: it can be undone, and the tangents along u stay."""
-    if not abs(np.linalg.det(to_uv)) > 1e-12:
-        return False
-    tangents = any(one["type"] in ("normalmap", "hair") or ANISOTROPIC & set(one) for one in plugins_in(surface))
-    return not tangents or (to_uv[1, 0] == 0.0 and to_uv[0, 0] > 0.0)
-
-
 def _with_transform(plugin: Mapping[str, object], before: Doubles, *kinds: str) -> Plugin:
     """Return a plugin whose textures of some kinds take texture coordinates after a transform (3, 3) as well."""
-    found = {
-        key: _with_transform(one, before, *kinds) if isinstance(one, Mapping) else one for key, one in plugin.items()
-    }
-    if found["type"] in kinds:
+    moved = with_inner(plugin, lambda inner: _with_transform(inner, before, *kinds))
+    if moved["type"] in kinds:
         whole = np.eye(4)
         whole[np.ix_((0, 1, 3), (0, 1, 3))] = uv_matrix(plugin.get("to_uv", np.eye(3))) @ before
-        found["to_uv"] = whole
-    return found
+        moved["to_uv"] = whole
+    return moved
 
 
 def uv_matrix(value: object) -> Doubles:
@@ -147,7 +142,7 @@ def _color(value: object) -> _Color | None:
     picture = _pixels(value) if value["type"] == "bitmap" else None
     if picture is None:
         return None
-    options = {key: one for key, one in value.items() if key not in OF_THE_PICTURE}
+    options = {key: entry for key, entry in value.items() if key not in OF_THE_PICTURE}
     sharp = options.get("filter_type") == "nearest"
     return _Color(_repeated(picture) if sharp else picture, options, value.get("to_uv"))
 
@@ -173,8 +168,7 @@ def _pixels(value: Mapping[str, object]) -> Floats | None:
         return None  # Mitsuba says why, once it is asked for the scene
     if value.get("raw"):
         bitmap.set_srgb_gamma(False)
-    found = bitmap.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, False)
-    return np.array(found, dtype=np.float32)
+    return np.array(bitmap.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, False), dtype=np.float32)
 
 
 def constant(value: object) -> Floats | None:

@@ -18,22 +18,9 @@ from torch.nn import functional
 
 from advsearch.scene.assets import Floats
 from advsearch.scene.camera_model import CameraModel
+from advsearch.scene.mitsuba_backend import texel_rays
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
-from advsearch.scene.mitsuba_backend.texel_rays import (
-    ANGLES,
-    SHIFT,
-    TABLES,
-    Lobes,
-    TexelGrid,
-    grid_place,
-    layers_of,
-    map_place,
-    on_grids,
-    passed,
-    stopped,
-    to_map,
-)
-from advsearch.scene.mitsuba_backend.variant import dr, mi, one_at_a_time, population, recorded
+from advsearch.scene.mitsuba_backend.variant import Recordings, dr, mi, one_at_a_time
 
 SHARP, WIDE = 0.15, 0.4
 """Spreads of gloss between which what one ray meets on the ground gives way to what surrounds the object."""
@@ -48,15 +35,14 @@ LEAST = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Lit:
-    """The light of one moment, as `Views` looks it up; flat arrays of Dr.Jit.
+    """The light of one moment, as `Views` looks it up; flat arrays of Dr.Jit, three numbers each, and rows and columns
+    of the maps.
 
     Attributes:
         texels: radiance that leaves each texel of all grids, and in the end that of the ground far off; of a
-            photographed ground, the share of the photograph that it shows. Three numbers each.
-        sky: the environment's map, three numbers each.
-        sky_shape: its rows and columns, the copied columns at both ends among them.
-        blurred: what surrounds the object, the ground too, blurred by each of `widths`, three numbers each.
-        blurred_shape: their rows and columns.
+            photographed ground, the share of the photograph that it shows.
+        sky: the environment's map, with the copied columns at both ends.
+        blurred: what surrounds the object, the ground too, blurred by each of `widths`.
     """
 
     texels: Any
@@ -72,16 +58,11 @@ class Lit:
 
 
 def lit_arrays(texels: Tensor, padded: Tensor, blurred: Tensor) -> Lit:
-    """Return light for look-ups, in memory of its own.
-
-    Args:
-        texels: (cells of all grids, 3).
-        padded: (H, W + 2, 3).
-        blurred: (widths, h, w, 3).
-    """
-    arrays = [mi.Float(functional.pad(one, (0, 1)).numpy().ravel()) for one in (texels, padded, blurred)]
-    shapes = [(one.shape[-3], one.shape[-2]) for one in (padded, blurred)]
-    return Lit(arrays[0], arrays[1], shapes[0], arrays[2], shapes[1])
+    """Return light for look-ups, in memory of its own: of the texels (cells of all grids, 3), the environment (H, W +
+    2, 3), and its blurred maps (widths, h, w, 3)."""
+    flat = [mi.Float(functional.pad(values, (0, 1)).numpy().ravel()) for values in (texels, padded, blurred)]
+    shapes = [(values.shape[-3], values.shape[-2]) for values in (padded, blurred)]
+    return Lit(flat[0], flat[1], shapes[0], flat[2], shapes[1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,11 +72,10 @@ class Seen:
     Attributes:
         rest: (n, H, W, 3) radiance but for what the searched texture reflects diffusely.
         covered: (n, H, W, 1) share of each pixel that shows surfaces.
-        sample: (k,) int64, the rays that see the searched texture, ascending; `RAYS` a pixel, row by row. One that
-            goes through cut-outs sees it several times.
-        uv: (k, 2) where; as Mitsuba has them.
-        weight: (k,) the diffuse share over pi, and over the rays of a pixel.
-        back: (k,) bool, whether it is seen from behind.
+        sample: (k,) int64, the rays that see the searched texture, ascending; `RAYS` a pixel, row by row. One that goes
+            through cut-outs sees it several times.
+        uv, weight, back: where, (k, 2) as Mitsuba has them; (k,) the diffuse share over pi, and over the rays of a
+            pixel; and (k,) whether it is seen from behind.
     """
 
     rest: Tensor
@@ -111,8 +91,7 @@ class Views:
 
     Args:
         scene: whose cameras and shapes these are; the inputs that it is asked with have to be set in it.
-        grids: of all surfaces that take part, that of the searched texture first.
-        lobes: of each.
+        grids, lobes: of all surfaces that take part, those of the searched texture first.
         widths: root mean square angles of the blurred maps, each twice the one before, radians.
         photographed: height of the camera of a photographed ground; None where the ground is none.
         model: the lens of all cameras; None for pinholes, which each have a field of view of their own.
@@ -122,52 +101,46 @@ class Views:
     def __init__(
         self,
         scene: MitsubaScene,
-        grids: Sequence[TexelGrid],
-        lobes: Sequence[Lobes],
+        grids: Sequence[texel_rays.TexelGrid],
+        lobes: Sequence[texel_rays.Lobes],
         widths: Sequence[float],
         photographed: float | None,
         model: CameraModel | None,
         middle: Floats,
     ) -> None:
-        self._middle = [float(one) for one in middle]
         self._scene, self._grids, self._widths, self._photographed = scene, tuple(grids), tuple(widths), photographed
-        tables = [np.concatenate([getattr(one, name) for name in TABLES]) for one in lobes]
+        self._middle = middle.tolist()
+        tables = [np.concatenate([getattr(surface, name) for name in texel_rays.TABLES]) for surface in lobes]
         self._tables = np.concatenate(tables).astype(np.float32)
-        self._lens = None if model is None else _through(model, *scene.resolution)
-        self._recorded: dict[tuple[Any, ...], Any] = {}
-        self._recorded_at = (0, 0)
+        self._lens: Floats | None = None
+        if model is not None:  # where the rays of each pixel go through it
+            height, width = scene.resolution
+            row, column, ray = np.meshgrid(np.arange(height), np.arange(width), np.arange(RAYS), indexing="ij")
+            across, down = np.array(PATTERN)[ray.ravel()].T
+            places = np.stack([(column.ravel() + across) / width, (row.ravel() + down) / height], axis=1)
+            self._lens = model.table(torch.from_numpy(places)).numpy().ravel()
+        self._recorded = Recordings()
 
     def __call__(self, cameras: Sequence[Mapping[str, Tensor]], lit: Lit) -> Callable[[], Seen]:
-        """Begin to look at a lit scene. What is returned waits until Dr.Jit has done all that was asked, and says
-        what is seen; until then the processor may do other things.
-
-        Args:
-            cameras: the inputs of each: `camera.to_world` (4, 4), and of a pinhole `camera.fov`, `camera.shift_x` and
-                `camera.shift_y` (1,).
-            lit: what it looks like.
-        """
+        """Begin to look at a lit scene through cameras, by the inputs of each: `camera.to_world` (4, 4), and of a
+        pinhole `camera.fov`, `camera.shift_x` and `camera.shift_y` (1,). What is returned waits until Dr.Jit has done
+        all that was asked, and says what is seen; until then the processor may do other things."""
         with one_at_a_time:
             height, width = self._scene.resolution
             count = len(cameras)
-            rows = np.stack([_camera(one, height, width) for one in cameras]).astype(np.float32)
-            now = (population.changes, dr.thread_count())
-            if self._recorded_at != now:
-                self._recorded.clear()
-                self._recorded_at = now
-            key = count, lit.sky_shape, lit.blurred_shape
-            if key not in self._recorded:
+            rows = np.stack([_camera(inputs, height, width) for inputs in cameras]).astype(np.float32)
 
-                def look(held: Any, lane: Any, tables: Any, given: Any, lens: Any, *arrays: Any) -> Any:
-                    there = Lit(arrays[0], arrays[1], lit.sky_shape, arrays[2], lit.blurred_shape)
-                    return self._look(held, lane, tables, given, lens, there)
+            def look(held: Any, lane: Any, tables: Any, cameras: Any, lens: Any, *arrays: Any) -> Any:
+                there = Lit(arrays[0], arrays[1], lit.sky_shape, arrays[2], lit.blurred_shape)
+                return self._look(held, lane, tables, cameras, lens, there)
 
-                self._recorded[key] = recorded(look, [])
+            recording = self._recorded.of((count, lit.sky_shape, lit.blurred_shape), look, [])
             lens = np.zeros(1, np.float32) if self._lens is None else self._lens
-            arrays = [mi.Float(one) for one in (self._tables, rows.ravel(), lens)]
+            arrays = [mi.Float(values) for values in (self._tables, rows.ravel(), lens)]
             lane = dr.arange(mi.UInt32, count * height * width * RAYS)
             dr.eval(lane)  # a recording takes its size from what it is given, the size of the scene's map else
-            found = self._recorded[key](self._scene._scene, lane, *arrays, lit.texels, lit.sky, lit.blurred)
-        return lambda: _seen(found, (count, height, width))
+            channels = recording(self._scene._scene, lane, *arrays, lit.texels, lit.sky, lit.blurred)
+        return lambda: _seen(channels, (count, height, width))
 
     def _look(self, held: Any, lane: Any, tables: Any, cameras: Any, lens: Any, lit: Lit) -> list[Any]:
         """The kernel: radiance but for the searched texture, coverage, and where and how much each ray sees of it."""
@@ -189,15 +162,15 @@ class Views:
         ray, wanted = mi.Ray3f(mi.Point3f(*camera[9:12]), d), mi.RayFlags.UV | mi.RayFlags.ShadingFrame
 
         # Through cut-outs, layer by layer; of each, what light passes is left for those behind it
-        layers, texture = layers_of(self._scene), []
+        layers, texture = texel_rays.layers_of(self._scene), []
         radiance, covered, left = mi.Color3f(0.0), mi.Float(0.0), mi.Float(1.0)
         for layer in range(layers + 1):
             si = held.ray_intersect(ray, wanted, layer == 0, active)
             valid = active & si.is_valid()
-            share = left * (1.0 - passed(si, valid)) if layer < layers else left
+            share = left * (1.0 - texel_rays.passed(si, valid)) if layer < layers else left
             shown, diffuse, side = self._shaded(held, si, valid, d, tables, lit)
             radiance += dr.select(valid, share * shown, 0.0)
-            radiance += dr.select(active & ~si.is_valid(), left * _sky(lit, d, to_map(self._scene)), 0.0)
+            radiance += dr.select(active & ~si.is_valid(), left * _sky(lit, d, texel_rays.to_map(self._scene)), 0.0)
             covered += dr.select(valid, share / RAYS, 0.0)
             texture += [si.uv.x, si.uv.y, side * share * diffuse / (math.pi * RAYS)]
             left, active = left - share, valid & (left - share > LEAST)
@@ -209,20 +182,21 @@ class Views:
     def _shaded(self, held: Any, si: Any, valid: Any, d: Any, tables: Any, lit: Lit) -> tuple[Any, Any, Any]:
         """What a ray in direction d hit: its radiance, but for what the searched texture reflects diffusely; its
         diffuse share; and 1 on the front of the searched texture, -1 on its back, 0 elsewhere."""
-        to_local, layers = to_map(self._scene), layers_of(self._scene)
-        on = [at & valid for at in on_grids(held, self._grids, si, d)]
+        to_local, layers = texel_rays.to_map(self._scene), texel_rays.layers_of(self._scene)
+        on = [at & valid for at in texel_rays.on_grids(held, self._grids, si, d)]
         n = dr.select(dr.dot(si.sh_frame.n, d) > 0.0, -si.sh_frame.n, si.sh_frame.n)  # towards the viewer
         cosine = -dr.dot(n, d)
 
         # The tables of the surface, between their two entries next to the angle
         table = mi.UInt32(0)
         for number, at in enumerate(on):
-            table = dr.select(at, mi.UInt32(number * len(TABLES) * ANGLES), table)
-        place = dr.clip(cosine * ANGLES - 0.5, 0.0, ANGLES - 1.0)
-        low = dr.minimum(mi.UInt32(place), ANGLES - 2)
+            table = dr.select(at, mi.UInt32(number * len(texel_rays.TABLES) * texel_rays.ANGLES), table)
+        place = dr.clip(cosine * texel_rays.ANGLES - 0.5, 0.0, texel_rays.ANGLES - 1.0)
+        low = dr.minimum(mi.UInt32(place), texel_rays.ANGLES - 2)
         between, entries = place - mi.Float(low), []
-        for number in range(len(TABLES)):
-            first, second = (dr.gather(mi.Float, tables, table + (number * ANGLES + k) + low) for k in (0, 1))
+        for number in range(len(texel_rays.TABLES)):
+            entry = table + number * texel_rays.ANGLES + low
+            first, second = dr.gather(mi.Float, tables, entry), dr.gather(mi.Float, tables, entry + 1)
             entries.append(first + between * (second - first))
         diffuse, gloss, up, along, core, tail = entries
 
@@ -237,9 +211,12 @@ class Views:
         glossy = valid & (gloss > 1e-4)
         beside = dr.normalize(d + n * cosine + 1e-8)
         wo = dr.normalize(n * up + beside * along)
-        si_wo = stopped(held, mi.Ray3f(si.p + n * SHIFT, wo), layers, active=glossy)
-        on_wo = on_grids(held, self._grids, si_wo, wo)
-        seen_in = self._from_middle(si.p, wo)
+        si_wo = texel_rays.stopped(held, mi.Ray3f(si.p + n * texel_rays.SHIFT, wo), layers, active=glossy)
+        on_wo = texel_rays.on_grids(held, self._grids, si_wo, wo)
+        seen_in = wo  # or the direction in which the middle of the object sees the ground that is seen from here
+        if any(grid.warp is not None for grid in self._grids):
+            far = si.p.z / dr.maximum(-wo.z, 1e-3)
+            seen_in = dr.select(wo.z < -1e-3, dr.normalize(si.p + wo * far - mi.Point3f(*self._middle)), wo)
         blurred = 0.5 * sum(_blurred(lit, seen_in, to_local, spread, self._widths) for spread in (core, tail))
         texel = self._texel(si_wo, on_wo, lit)
 
@@ -256,13 +233,6 @@ class Views:
         radiance += dr.select(glossy, gloss * reflected, 0.0)
         return radiance, diffuse, side
 
-    def _from_middle(self, place: Any, d: Any) -> Any:
-        """The direction in which the middle of the object sees the ground that a place sees in a direction."""
-        if all(grid.warp is None for grid in self._grids):
-            return d
-        far = place.z / dr.maximum(-d.z, 1e-3)
-        return dr.select(d.z < -1e-3, dr.normalize(place + d * far - mi.Point3f(*self._middle)), d)
-
     def _shown(self, si: Any, on: Sequence[Any], lit: Lit, to_local: Any) -> Any:
         """Diffuse radiance of what was hit: that of a photographed ground is a share of its photograph."""
         radiance = self._texel(si, on, lit)
@@ -278,7 +248,7 @@ class Views:
         first, rows, columns = mi.UInt32(0), mi.UInt32(1), mi.UInt32(1)
         y, x, known = mi.Float(0.0), mi.Float(0.0), mi.Bool(False)
         for grid, at in zip(self._grids, on, strict=True):
-            down, across = grid_place(grid, si.p, si.uv)
+            down, across = texel_rays.grid_place(grid, si.p, si.uv)
             y, x, known = dr.select(at, down, y), dr.select(at, across, x), known | at
             first = dr.select(at, mi.UInt32(grid.first), first)
             rows = dr.select(at, mi.UInt32(grid.shape[0]), rows)
@@ -294,38 +264,21 @@ def _camera(inputs: Mapping[str, Tensor], height: int, width: int) -> Floats:
     """The 16 numbers of a camera: its axes to the left, up and forward, its place, half its extent, its middle."""
     matrix = inputs["camera.to_world"].detach().double().numpy()
     half = math.tan(math.radians(float(inputs["camera.fov"])) / 2.0) if "camera.fov" in inputs else 0.0
-    longer = max(height, width)
-    shift = [float(inputs[name]) if name in inputs else 0.0 for name in ("camera.shift_x", "camera.shift_y")]
-    extent = [half * width / longer, half * height / longer]
-    middle = [1.0 - 2.0 * shift[0], 1.0 - 2.0 * shift[1]]
+    extent = [half * side / max(height, width) for side in (width, height)]
+    middle = [1.0 - 2.0 * float(inputs.get(f"camera.shift_{axis}", 0.0)) for axis in "xy"]
     return np.concatenate([matrix[:3, :3].T.ravel(), matrix[:3, 3], extent, middle])
 
 
-def _through(model: CameraModel, height: int, width: int) -> Floats:
-    """Where the rays of each pixel go through a lens, flat: to the left, up, forward, and over 0 where it sees."""
-    row, column, ray = np.meshgrid(np.arange(height), np.arange(width), np.arange(RAYS), indexing="ij")
-    across, down = np.array(PATTERN)[ray.ravel()].T
-    places = np.stack([(column.ravel() + across) / width, (row.ravel() + down) / height], axis=1)
-    directions, inside = model.rays(torch.from_numpy(places))
-    found = torch.cat([directions * torch.tensor([-1.0, -1.0, 1.0]), inside[:, None]], dim=1)
-    return found.float().numpy().ravel()
-
-
-def _seen(found: Sequence[Any], size: tuple[int, int, int]) -> Seen:
+def _seen(channels: Sequence[Any], size: tuple[int, int, int]) -> Seen:
     """What the kernel has found, in memory of torch's own; `size` in cameras, rows and columns."""
     with one_at_a_time:
-        rest, covered, (u, v, weight) = (
-            found[:3],
-            found[3],
-            (
-                np.stack([one.numpy() for one in found[k::3]], axis=1).ravel()  # all layers of a ray, ray by ray
-                for k in (4, 5, 6)
-            ),
-        )
+        # of three channels a layer, all layers of a ray, ray by ray
+        u, v, weight = (np.stack([layer.numpy() for layer in channels[k::3]], axis=1).ravel() for k in (4, 5, 6))
         (met,) = np.nonzero(weight)
+        rest = np.stack([channel.numpy() for channel in channels[:3]], axis=-1)
         return Seen(
-            rest=torch.from_numpy(np.stack([one.numpy() for one in rest], axis=-1)).reshape(*size, 3),
-            covered=torch.from_numpy(covered.numpy().copy()).reshape(*size, 1),
+            rest=torch.from_numpy(rest).reshape(*size, 3),
+            covered=torch.from_numpy(channels[3].numpy().copy()).reshape(*size, 1),
             sample=torch.from_numpy(met // (len(weight) // (math.prod(size) * RAYS))),
             uv=torch.from_numpy(np.stack([u[met], v[met]], axis=1)),
             weight=torch.from_numpy(np.abs(weight[met])),
@@ -338,20 +291,16 @@ def _bilinear(values: Any, first: Any, rows: Any, columns: Any, y: Any, x: Any, 
     y = dr.clip(y, 0.0, mi.Float(rows) - 1.0)
     upper, share = mi.UInt32(y), y - dr.floor(y)
     lower = dr.minimum(upper + 1, rows - 1)
-    if wraps:
-        x = dr.select(x < 0.0, x + mi.Float(columns), x)
-    else:
-        x = dr.clip(x, 0.0, mi.Float(columns) - 1.0)
+    x = dr.select(x < 0.0, x + mi.Float(columns), x) if wraps else dr.clip(x, 0.0, mi.Float(columns) - 1.0)
     left, across = mi.UInt32(x), x - dr.floor(x)
     right = (left + 1) % columns if wraps else dr.minimum(left + 1, columns - 1)
     left = left % columns if wraps else left
 
-    def at(row: Any, column: Any) -> Any:
-        return _gathered(values, first + row * columns + column)
+    def along(row: Any) -> Any:
+        begin = first + row * columns
+        return _gathered(values, begin + left) * (1.0 - across) + _gathered(values, begin + right) * across
 
-    above = at(upper, left) * (1.0 - across) + at(upper, right) * across
-    below = at(lower, left) * (1.0 - across) + at(lower, right) * across
-    return above * (1.0 - share) + below * share
+    return along(upper) * (1.0 - share) + along(lower) * share
 
 
 def _gathered(values: Any, number: Any) -> Any:
@@ -362,7 +311,7 @@ def _gathered(values: Any, number: Any) -> Any:
 def _sky(lit: Lit, way: Any, to_local: Any) -> Any:
     """The environment in a direction, as Mitsuba has it: rows from pole to pole, columns with a copy at both ends."""
     rows, columns = lit.sky_shape
-    across, down = map_place(way, to_local)
+    across, down = texel_rays.map_place(way, to_local)
     x, y = across * (columns - 2) + 0.5, down * (rows - 1)
     return _bilinear(lit.sky, mi.UInt32(0), mi.UInt32(rows), mi.UInt32(columns), y, x)
 
@@ -372,11 +321,10 @@ def _blurred(lit: Lit, way: Any, to_local: Any, spread: Any, widths: Sequence[fl
     rows, columns = lit.blurred_shape
     level = dr.clip(dr.log2(dr.maximum(spread, 1e-4) / widths[0]), 0.0, len(widths) - 1.0)
     low = dr.minimum(mi.UInt32(level), max(0, len(widths) - 2))
-    share = level - mi.Float(low)
-    across, down = map_place(way, to_local)
+    across, down = texel_rays.map_place(way, to_local)
     y, x = down * rows - 0.5, across * columns - 0.5
-    one, other = (
+    narrow, wide = (
         _bilinear(lit.blurred, (low + k) * (rows * columns), mi.UInt32(rows), mi.UInt32(columns), y, x, wraps=True)
         for k in (0, 1)
     )
-    return one + share * (other - one)
+    return narrow + (level - mi.Float(low)) * (wide - narrow)

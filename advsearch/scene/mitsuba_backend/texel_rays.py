@@ -35,11 +35,9 @@ FROM_BEHIND = 0.02
 
 @dataclass(frozen=True)
 class TexelGrid:
-    """The texels over one surface.
+    """The texels over one surface, of a shape in Mitsuba's scene; `first` is their first number among all grids.
 
     Attributes:
-        name: of the shape in Mitsuba's scene.
-        first: number of its first texel among those of all grids.
         shape: rows and columns.
         warp: None where it lies over texture coordinates; else (middle x, middle y, scale, rate) of a level plane whose
             cells are small about its middle: coordinate = middle + scale sinh(rate s), s in [-1, 1].
@@ -74,15 +72,13 @@ def gather(
         scene: with its inputs set.
         grids: of all surfaces.
         cells: rows and columns of the cells of the environment.
-        places: (n, 3) where texels lie.
-        normals: (n, 3) unit shading normals.
-        rays: of each texel; the same well-spread points for all, shifted by chance.
-        seed: number of the shifts.
+        places, normals: (n, 3) where texels lie, and unit shading normals.
+        rays: of each texel; the same well-spread points for all, shifted by chance, of which `seed` is the number.
     """
     held, to_local, layers = scene._scene, to_map(scene), layers_of(scene)
     count, texels = len(places), grids[-1].first + grids[-1].count
     steps = (np.arange(1, rays + 1)[:, None] * np.array([0.7548776662466927, 0.5698402909980532])) % 1.0
-    points = mi.Point2f(mi.Float(steps[:, 0].astype(np.float32)), mi.Float(steps[:, 1].astype(np.float32)))
+    points = _points(mi.Point2f, steps)
     shifts = np.random.default_rng(seed).random((count, 2), dtype=np.float32)
     seen_by_rays = np.empty((count, rays), dtype=np.int32)
     for begin in range(0, count, max(1, PASS // rays)):
@@ -91,11 +87,10 @@ def gather(
         texel, number = lane // rays, lane % rays
 
         # The same points for every texel, each shifted around the square by chance; over the cosine
-        shift = dr.gather(mi.Point2f, _points(mi.Point2f, shifts[some]), texel)
+        shift = _points(mi.Point2f, shifts[some], texel)
         square = dr.gather(mi.Point2f, points, number) + shift
         square -= dr.floor(square)
-        normal = dr.gather(mi.Normal3f, _points(mi.Normal3f, normals[some]), texel)
-        place = dr.gather(mi.Point3f, _points(mi.Point3f, places[some]), texel)
+        normal, place = _points(mi.Normal3f, normals[some], texel), _points(mi.Point3f, places[some], texel)
         way = mi.Frame3f(normal).to_world(mi.warp.square_to_cosine_hemisphere(square))
         si = stopped(held, mi.Ray3f(place + normal * SHIFT, way), layers, _chance(layers, len(lane), (seed, begin)))
 
@@ -114,38 +109,24 @@ def gather(
 
 
 def towards(scene: MitsubaScene, places: Floats, normals: Floats, ways: Floats) -> Floats:
-    """Return how much of what comes from directions texels receive: (n, k) cosines; 0 where something is in between.
-
-    Args:
-        scene: with its inputs set.
-        places, normals: (n, 3), as of `gather`.
-        ways: (k, 3) unit directions, in the axes of the environment's map.
-    """
+    """Return how much of what comes from unit directions (k, 3), in the axes of the environment's map, texels receive:
+    (n, k) cosines; 0 where something is in between. The others as of `gather`."""
     world = (ways @ np.array(to_map(scene))).astype(np.float32)  # the transpose turns back
     lane = dr.arange(mi.UInt32, len(places) * len(world))
     texel, number = lane // len(world), lane % len(world)
-    place = dr.gather(mi.Point3f, _points(mi.Point3f, places), texel)
-    normal = dr.gather(mi.Normal3f, _points(mi.Normal3f, normals), texel)
-    way = dr.gather(mi.Vector3f, _points(mi.Vector3f, world), number)
+    place, normal = _points(mi.Point3f, places, texel), _points(mi.Normal3f, normals, texel)
+    way = _points(mi.Vector3f, world, number)
     cosine = dr.dot(normal, way)
     above = cosine > 0.0
     ray = mi.Ray3f(place + normal * SHIFT, way)
-    found: Floats = (
-        dr.select(above, cosine * _passing(scene._scene, ray, layers_of(scene), above), 0.0)
-        .numpy()
-        .reshape(len(places), len(world))
-    )
-    return found
+    received = dr.select(above, cosine * _passing(scene._scene, ray, layers_of(scene), above), 0.0)
+    cosines: Floats = received.numpy().reshape(len(places), len(world))
+    return cosines
 
 
 def seen_from_behind(scene: MitsubaScene, name: str, places: Floats) -> bool:
-    """Whether backs of a shape's faces are seen from outside, as through an open window.
-
-    Args:
-        scene: with its inputs set.
-        name: of the shape.
-        places: (n, 3) on it.
-    """
+    """Whether backs of the faces of a shape, with places (n, 3) on it, are seen from outside, as through an open
+    window."""
     generator = np.random.default_rng(0)
     ways = generator.standard_normal((PASS >> 7, 3))
     ways /= np.linalg.norm(ways, axis=1, keepdims=True)
@@ -170,15 +151,8 @@ def layers_of(scene: MitsubaScene) -> int:
 
 
 def stopped(held: Any, ray: Any, layers: int, chance: Any = 0.5, active: Any = True) -> Any:
-    """Return the first hits of rays that light does not pass.
-
-    Args:
-        held: Mitsuba's scene.
-        ray: of each lane.
-        layers: see `layers_of`.
-        chance: in [0, 1]; a ray goes on as long as the share of light that passes all it has met is larger.
-        active: which lanes count.
-    """
+    """Return the first hits of rays in Mitsuba's scene that light does not pass. A ray goes on through cut-outs, up to
+    `layers`, as long as the share of light that passes all it has met is larger than its chance in [0, 1]."""
     si = held.ray_intersect(ray, mi.RayFlags.UV, False, active)
     share = mi.Float(1.0)
     for _ in range(layers):
@@ -208,9 +182,7 @@ def _passing(held: Any, ray: Any, layers: int, active: Any) -> Any:
 
 def _chance(layers: int, count: int, seed: tuple[int, ...]) -> Any:
     """A number in [0, 1] for each ray."""
-    if not layers:
-        return 0.5
-    return mi.Float(np.random.default_rng([*seed, 1]).random(count, dtype=np.float32))
+    return mi.Float(np.random.default_rng([*seed, 1]).random(count, dtype=np.float32)) if layers else 0.5
 
 
 # ---- places ---------------------------------------------------------------------------------------------------------
@@ -218,12 +190,9 @@ def _chance(layers: int, count: int, seed: tuple[int, ...]) -> Any:
 
 def on_grids(held: Any, grids: Sequence[TexelGrid], si: Any, way: Any) -> list[Any]:
     """Whether hits of rays in a direction lie on each grid."""
-    front, shapes = dr.dot(si.n, way) < 0.0, {one.id(): one for one in held.shapes()}
-    found = []
-    for grid in grids:
-        on = si.is_valid() & (si.shape == mi.ShapePtr(shapes[grid.name]))
-        found.append(on & (front if grid.side > 0 else ~front) if grid.side else on)
-    return found
+    front, shapes = dr.dot(si.n, way) < 0.0, {shape.id(): shape for shape in held.shapes()}
+    sides = {0: True, 1: front, -1: ~front}
+    return [si.is_valid() & (si.shape == mi.ShapePtr(shapes[grid.name])) & sides[grid.side] for grid in grids]
 
 
 def to_map(scene: MitsubaScene) -> Any:
@@ -244,20 +213,21 @@ def grid_place(grid: TexelGrid, place: Any, uv: Any) -> tuple[Any, Any]:
     if grid.warp is None:
         return uv.y - dr.floor(uv.y), uv.x - dr.floor(uv.x)
     middle_x, middle_y, scale, rate = grid.warp
-    shares = []
-    for along, middle in ((place.y, middle_y), (place.x, middle_x)):
-        far = (along - middle) / scale
-        shares.append(dr.clip(0.5 + dr.asinh(far) / (2.0 * rate), 0.0, 1.0))
-    return shares[0], shares[1]
+
+    def share(far: Any) -> Any:
+        return dr.clip(0.5 + dr.asinh(far) / (2.0 * rate), 0.0, 1.0)
+
+    return share((place.y - middle_y) / scale), share((place.x - middle_x) / scale)
 
 
 def _cell(share: Any, count: int) -> Any:
     return mi.Int32(dr.minimum(share * count, count - 1.0))
 
 
-def _points(kind: Any, values: Floats) -> Any:
-    """Rows of numbers as Dr.Jit's points, vectors or normals."""
-    return kind(*(mi.Float(np.ascontiguousarray(values[:, k], dtype=np.float32)) for k in range(values.shape[1])))
+def _points(kind: Any, values: Floats | Doubles, index: Any = None) -> Any:
+    """Rows of numbers as Dr.Jit's points, vectors or normals; of an index, one for each lane."""
+    points = kind(*(mi.Float(np.ascontiguousarray(column, dtype=np.float32)) for column in values.T))
+    return points if index is None else dr.gather(kind, points, index)
 
 
 ANGLES = 32
@@ -289,8 +259,8 @@ class Lobes:
     @classmethod
     def matt(cls) -> Lobes:
         """Those of a diffuse surface."""
-        one, none = np.ones(ANGLES, dtype=np.float32), np.zeros(ANGLES, dtype=np.float32)
-        return cls(one, none, one, none, none, none)
+        whole, none = np.ones(ANGLES, dtype=np.float32), np.zeros(ANGLES, dtype=np.float32)
+        return cls(whole, none, whole, none, none, none)
 
     @property
     def mean_shares(self) -> tuple[float, float]:
@@ -310,9 +280,9 @@ def measured(
         towards = mi.Vector3f(dr.sqrt(1.0 - cosine * cosine), 0.0, cosine)
         noise = mi.load_dict({"type": "independent"})
         noise.seed(0, ANGLES * LOBE_SAMPLES)
-        one, two = noise.next_1d(), noise.next_2d()
-        even = mi.warp.square_to_cosine_hemisphere(two)
-        found = []
+        sample1, sample2 = noise.next_1d(), noise.next_2d()
+        even = mi.warp.square_to_cosine_hemisphere(sample2)
+        sampled = []
         for level in (0.5, 0.0):
             changed = {key: torch.full_like(scene.base(key), level)} if key in scene.names else {}
             held = scene.held({**inputs, **changed})
@@ -324,14 +294,14 @@ def measured(
             opaque = dr.maximum(1.0 - passed(si, True), 1e-3)  # of cut-outs, what stops light
             value = bsdf.eval(mi.BSDFContext(), si, even) / opaque
             if level:
-                found.append(dr.mean(value))
+                sampled.append(dr.mean(value))
                 continue
-            bsdf_sample, bsdf_weight = bsdf.sample(mi.BSDFContext(), si, one, two)
+            bsdf_sample, bsdf_weight = bsdf.sample(mi.BSDFContext(), si, sample1, sample2)
             back = dr.select((bsdf_sample.pdf > 0.0) & (bsdf_sample.wo.z > 0.0), dr.mean(bsdf_weight) / opaque, 0.0)
             back = dr.select(dr.isfinite(back), back, 0.0)
-            found += [dr.mean(value), back, bsdf_sample.wo.x, bsdf_sample.wo.z]
-    lit, dark = (_rows(one.numpy()) / _rows(even.z.numpy() / math.pi) for one in found[:2])
-    weight, x, z = (_rows(one.numpy()) for one in found[2:])
+            sampled += [dr.mean(value), back, bsdf_sample.wo.x, bsdf_sample.wo.z]
+    lit, dark = (_rows(value.numpy()) / _rows(even.z.numpy() / math.pi) for value in sampled[:2])
+    weight, x, z = (_rows(value.numpy()) for value in sampled[2:])
     share = weight.mean(axis=1)
     mean = np.stack([(weight * x).mean(axis=1), (weight * z).mean(axis=1)])
     length = np.linalg.norm(mean, axis=0)
@@ -346,7 +316,7 @@ def measured(
 def _spreads(weight: Doubles, apart: Doubles) -> tuple[Doubles, Doubles]:
     """Root mean squares (k,) of the nearer and of the farther half of weighted samples (k, n), by squares of angles."""
     order = np.argsort(apart, axis=1)
-    weight, apart = (np.take_along_axis(one, order, axis=1) for one in (weight, apart))
+    weight, apart = (np.take_along_axis(values, order, axis=1) for values in (weight, apart))
     total = weight.sum(axis=1, keepdims=True)
     near = np.clip(0.5 * total - (weight.cumsum(axis=1) - weight), 0.0, weight)
     half = np.maximum(0.5 * total[:, 0], 1e-12)

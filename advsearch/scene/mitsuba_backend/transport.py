@@ -63,8 +63,7 @@ class Paths:
         radiance: (H, W, 3) float32, with the same noise as the weights; the environment is in it.
         coverage: (H, W, 1), the share of each pixel that shows surfaces.
         background: (H, W, 3), what of the radiance is the environment as the camera sees it.
-        albedo: (H, W, 3), reflectance in [0, 1] of the first hit that light does not pass, as `guides` has it.
-        normal: (H, W, 3), shading normal there.
+        albedo, normal: (H, W, 3), reflectance in [0, 1] and shading normal of the first hit that light does not pass.
         vertices: by their place in the path.
     """
 
@@ -80,7 +79,7 @@ def mean_of(passes: Sequence[Paths]) -> Paths:
     """Return the mean pictures of passes with as many samples each; it has no vertices."""
 
     def mean(name: str) -> Tensor:
-        return torch.stack([getattr(one, name) for one in passes]).mean(dim=0)
+        return torch.stack([getattr(paths, name) for paths in passes]).mean(dim=0)
 
     return Paths(mean("radiance"), mean("coverage"), mean("background"), mean("albedo"), mean("normal"), [])
 
@@ -91,22 +90,19 @@ def collect(
     key: str,
     noise: Any,
     size: tuple[int, int],
-    *,
     depth: int,
     spp: int,
-    projector: Any = None,
+    projector: Any,
 ) -> Paths:
-    """Trace one pass. It is not recorded: Dr.Jit 1.5.0 crashes when it replays so long a kernel.
+    """Trace one pass, of paths of at most `depth` segments. It is not recorded: Dr.Jit 1.5.0 crashes when it replays so
+    long a kernel.
 
     Args:
-        scene: Mitsuba's, with its camera.
-        parameters: of the scene.
+        scene, parameters: Mitsuba's, with its camera.
         key: Mitsuba's name of the texture, (h, w, 3).
-        projector: the emitter whose picture the texture is; None where it is a base colour.
-        noise: the sampler, seeded.
+        noise: the sampler, seeded, with `spp` samples a pixel.
         size: height and width in pixels.
-        depth: segments of the longest path.
-        spp: samples a pixel, those of the sampler.
+        projector: the emitter whose picture the texture is; None where it is a base colour.
     """
     height, width = size
     sensor = scene.sensors()[0]
@@ -115,7 +111,7 @@ def collect(
     place = (corner + noise.next_2d()) / mi.Point2f(width, height)
     aperture = noise.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
     ray, weight = sensor.sample_ray(0.0, 0.5, place, aperture)
-    first, bounces = _traced(scene, ray, weight, noise, depth)
+    first, emitted, bounces = _traced(scene, ray, weight, noise, depth)
 
     # The same BSDFs once more, now that the base colour is larger by `STEP`: their differences are the derivatives. Or
     # the light of the projector alone, now that it throws white
@@ -135,30 +131,26 @@ def collect(
     # base colour's
     L = mi.Spectrum(0.0)
     vertices = list[tuple[Any, Any, Any]]()
-    for bounce, (slope_em, slope_bsdf) in zip(reversed(bounces), reversed(slopes), strict=True):
-        incoming = bounce.emitted_next + L
+    for bounce, emitted_next, (slope_em, slope_bsdf) in zip(bounces[::-1], emitted[:0:-1], slopes[::-1], strict=True):
+        incoming = emitted_next + L
         weight = bounce.throughput * (slope_em * bounce.em_weight + slope_bsdf * incoming)
         vertices.append((mi.Point2f(bounce.si.uv), weight, bounce.sharp))
         L = bounce.bsdf_value_em * bounce.em_weight + bounce.bsdf_weight * incoming
     vertices.reverse()
     if projector is not None:
-        vertices = [
-            (uv, bounce.throughput * light, bounce.sharp) for bounce, (uv, light) in zip(bounces, lit, strict=True)
-        ]
+        vertices = [(uv, b.throughput * light, b.sharp) for b, (uv, light) in zip(bounces, lit, strict=True)]
     L = dr.select(dr.isfinite(L), L, 0.0)
 
     every = dr.full(mi.Bool, True, height * width * spp)
-    channels = [*(L + first.emitted), first.coverage, *first.background, *first.albedo, *first.normal]
+    channels = [*(L + emitted[0]), first.coverage, *first.background, *first.albedo, *first.normal]
     taking_part = [every & dr.any(weight != 0.0) & dr.all(dr.isfinite(weight)) for _, weight, _ in vertices]
     dr.eval(channels, vertices, taking_part)  # one kernel for the whole path
     means = [dr.block_sum(channel, spp) / spp for channel in channels]
     dr.eval(means)
-    picture = torch.stack([one.torch() for one in means], dim=1).reshape(*size, -1)
-    radiance, coverage, background, albedo, normal = (
-        one.contiguous() for one in torch.split(picture, [3, 1, 3, 3, 3], dim=-1)
-    )
+    picture = torch.stack([mean.torch() for mean in means], dim=1).reshape(*size, -1)
+    pictures = (part.contiguous() for part in torch.split(picture, [3, 1, 3, 3, 3], dim=-1))
     kept = [_kept(*vertex, taken, spp) for vertex, taken in zip(vertices, taking_part, strict=True)]
-    return Paths(radiance, coverage, background, albedo, normal, kept)
+    return Paths(*pictures, vertices=kept)
 
 
 def _kept(uv: Any, weight: Any, sharp: Any, taking_part: Any, spp: int) -> Vertices:
@@ -172,15 +164,14 @@ def _kept(uv: Any, weight: Any, sharp: Any, taking_part: Any, spp: int) -> Verti
     dr.eval(uv, weight, pixel, sharp)
     places = torch.stack([uv.x.torch(), uv.y.torch()], dim=1)
     return Vertices(
-        pixel.torch().long(), places, torch.stack([one.torch() for one in weight], dim=1), sharp.torch().bool()
+        pixel.torch().long(), places, torch.stack([channel.torch() for channel in weight], dim=1), sharp.torch().bool()
     )
 
 
 @dataclass
 class FirstHit:
-    """What the camera sees: light that it sees directly (`emitted`), and by sample the pictures of `Paths`."""
+    """What the camera sees, by sample: the pictures of `Paths`."""
 
-    emitted: Any
     coverage: Any
     background: Any
     albedo: Any
@@ -192,7 +183,7 @@ class FirstHit:
         self.normal = dr.select(where, si.sh_frame.n, self.normal)
 
 
-@dataclass
+@dataclass(frozen=True)
 class Bounce:
     """One vertex of all paths.
 
@@ -202,10 +193,9 @@ class Bounce:
         sharp: no vertex before it scatters light.
         wo_em, active_em: direction to the light that was sampled, and in which lanes there is one.
         em_weight: radiance from there over the density, with its weight beside BSDF sampling.
-        wo, active_bsdf, pdf: direction of the path, in which lanes it has a density, and which.
+        bsdf_sample, active_bsdf: the path's direction, and in which lanes it has a density.
         bsdf_value_em, bsdf_value: the BSDF times the cosine for both directions.
         bsdf_weight: the latter over its density: the throughput of the vertex.
-        emitted_next: radiance that the next vertex of the path emits, weighted.
     """
 
     si: Any
@@ -216,12 +206,10 @@ class Bounce:
     active_em: Any
     em_weight: Any
     bsdf_value_em: Any
-    wo: Any
+    bsdf_sample: Any
     active_bsdf: Any
-    pdf: Any
     bsdf_value: Any
     bsdf_weight: Any
-    emitted_next: Any
 
     def slopes(self) -> tuple[Any, Any]:
         """The derivatives of both values by the base colour, which is larger by `STEP` now; the second over the
@@ -229,9 +217,9 @@ class Bounce:
         context = mi.BSDFContext()
         value = self.bsdf.eval(context, self.si, self.wo_em, self.active_em)
         slope_em = _slope(value, self.bsdf_value_em, self.active_em)
-        value = self.bsdf.eval(context, self.si, self.wo, self.active_bsdf)
+        value = self.bsdf.eval(context, self.si, self.bsdf_sample.wo, self.active_bsdf)
         slope = _slope(value, self.bsdf_value, self.active_bsdf)
-        return slope_em, slope / dr.select(self.active_bsdf, self.pdf, 1.0)
+        return slope_em, slope / dr.select(self.active_bsdf, self.bsdf_sample.pdf, 1.0)
 
     def lit_by(self, scene: Any, projector: Any) -> tuple[Any, Any]:
         """Where in its picture the vertex sees a projector, and what of that light leaves it along the path."""
@@ -243,8 +231,9 @@ class Bounce:
         return mi.Point2f(ds.uv), dr.select(seen, value * light, 0.0)
 
 
-def _traced(scene: Any, ray: Any, weight: Any, noise: Any, depth: int) -> tuple[FirstHit, list[Bounce]]:
-    """Trace paths; return what the camera sees, and the vertices, the first one first. Rays of weight 0 see nothing."""
+def _traced(scene: Any, ray: Any, weight: Any, noise: Any, depth: int) -> tuple[FirstHit, list[Any], list[Bounce]]:
+    """Trace paths; return what the camera sees, and from the first vertex on what each emits and, but for the last, how
+    it reflects light. Rays of weight 0 see nothing."""
     context, count = mi.BSDFContext(), dr.width(ray.o)
     active = dr.any(weight > 0.0) & dr.full(mi.Bool, True, count)
     sharp = dr.full(mi.Bool, True, count)  # no vertex so far scatters light
@@ -254,8 +243,7 @@ def _traced(scene: Any, ray: Any, weight: Any, noise: Any, depth: int) -> tuple[
 
     # Of the vertex before: the camera counts as one that reflects in one direction alone
     prev_si, prev_pdf, prev_delta = dr.zeros(mi.SurfaceInteraction3f), mi.Float(1.0), mi.Bool(True)
-    first: FirstHit | None = None
-    bounces: list[Bounce] = []
+    emitted, bounces = list[Any](), list[Bounce]()
     for segment in range(depth):
         si = scene.ray_intersect(ray, active)
 
@@ -263,21 +251,14 @@ def _traced(scene: Any, ray: Any, weight: Any, noise: Any, depth: int) -> tuple[
         ds = mi.DirectionSample3f(scene, si, prev_si)
         em_pdf = scene.pdf_emitter_direction(prev_si, ds, active & ~prev_delta)
         mis = dr.select(prev_delta, 1.0, _mis_weight(prev_pdf, em_pdf))
-        emitted = dr.select(active, mis * si.emitter(scene, active).eval(si, active), 0.0)
-        if bounces:
-            bounces[-1].emitted_next = emitted
+        emitted.append(dr.select(active, mis * si.emitter(scene, active).eval(si, active), 0.0))
 
         # ---- what the camera sees first; through cut-outs it sees what is behind them
         bsdf = si.bsdf(ray)
-        if first is None:
+        if segment == 0:
             covered, black = si.is_valid(), dr.zeros(mi.Color3f, count)
-            first = FirstHit(
-                emitted=emitted,
-                coverage=dr.select(covered, mi.Float(1.0), 0.0),
-                background=dr.select(covered, 0.0, emitted),
-                albedo=black,
-                normal=mi.Normal3f(black),
-            )
+            coverage, background = dr.select(covered, mi.Float(1.0), 0.0), dr.select(covered, 0.0, emitted[0])
+            first = FirstHit(coverage, background, albedo=black, normal=mi.Normal3f(black))
             if not cut_outs:
                 first.stops(si, bsdf, covered)
         active &= si.is_valid() & mi.Bool(segment + 1 < depth)
@@ -296,29 +277,15 @@ def _traced(scene: Any, ray: Any, weight: Any, noise: Any, depth: int) -> tuple[
         bsdf_sample, bsdf_weight = bsdf.sample(context, si, noise.next_1d(active), noise.next_2d(active), active)
         active_next = active & (bsdf_sample.pdf > 0.0)
         delta = mi.has_flag(bsdf_sample.sampled_type, mi.BSDFFlags.Delta)
+        active_bsdf = active_next & ~delta  # a mirror's value has no derivative that could be evaluated
         if cut_outs:
             through = active_next & mi.has_flag(bsdf_sample.sampled_type, mi.BSDFFlags.Null)
             first.stops(si, bsdf, straight & active & ~through)
             straight &= through
         bsdf_weight = dr.select(active_next, bsdf_weight, 0.0)
-        bounces.append(
-            Bounce(
-                si=si,
-                bsdf=bsdf,
-                throughput=throughput,
-                sharp=sharp,
-                wo_em=wo_em,
-                active_em=active_em,
-                em_weight=em_weight,
-                bsdf_value_em=bsdf_value_em,
-                wo=bsdf_sample.wo,
-                active_bsdf=active_next & ~delta,  # a mirror's value has no derivative that could be evaluated
-                pdf=bsdf_sample.pdf,
-                bsdf_value=bsdf_weight * bsdf_sample.pdf,
-                bsdf_weight=bsdf_weight,
-                emitted_next=mi.Spectrum(0.0),
-            )
-        )
+        light = wo_em, active_em, em_weight, bsdf_value_em
+        onward = bsdf_sample, active_bsdf, bsdf_weight * bsdf_sample.pdf, bsdf_weight
+        bounces.append(Bounce(si, bsdf, throughput, sharp, *light, *onward))
 
         # ---- on to the next vertex
         throughput = throughput * bsdf_weight
@@ -326,8 +293,7 @@ def _traced(scene: Any, ray: Any, weight: Any, noise: Any, depth: int) -> tuple[
         sharp = sharp & delta
         prev_si, prev_pdf, prev_delta = si, bsdf_sample.pdf, delta
         ray = si.spawn_ray(si.to_world(bsdf_sample.wo))
-    assert first is not None
-    return first, bounces
+    return first, emitted, bounces
 
 
 def _slope(after: Any, before: Any, active: Any) -> Any:
@@ -343,15 +309,11 @@ def _mis_weight(pdf_a: Any, pdf_b: Any) -> Any:
 
 
 def first_hits(scene: Any, sensor: Any, resolution: tuple[int, int]) -> Surfaces:
-    """Return the surface that the camera sees first through the middle of each pixel, without noise.
+    """Return the surface that the camera sees first through the middle of each pixel, of a resolution (height, width)
+    that need not be the camera's own, without noise.
 
     A thin lens is looked through at its middle. What lets more than half of the light pass and does not shine towards
     the camera, as a lamp that is off or a hole in a leaf, is not seen; haze is no shape.
-
-    Args:
-        scene: Mitsuba's.
-        sensor: Mitsuba's camera.
-        resolution: (height, width) in pixels, which need not be the camera's own.
     """
     height, width = resolution
     count = height * width
@@ -387,13 +349,17 @@ def first_hits(scene: Any, sensor: Any, resolution: tuple[int, int]) -> Surfaces
         normal[seen] = mi.Normal3f(si.sh_frame.n)
         uv[seen] = mi.Point2f(si.uv.x, 1.0 - si.uv.y)  # Mitsuba's rows of a texture begin at the top
         ray, active = si.spawn_ray(ray.d), passes
-    size = (height, width)
+
+    def picture(value: Any) -> Tensor:
+        made: Tensor = value.torch().reshape(height, width).cpu()
+        return made
+
     return Surfaces(
         names=tuple(shape.id() for shape in shapes),
-        id=number.torch().reshape(size).long().cpu(),
-        depth=depth.torch().reshape(size).cpu(),
-        z_depth=z_depth.torch().reshape(size).cpu(),
-        normal=torch.stack([one.torch().reshape(size).cpu() for one in normal], dim=-1),
-        uv=torch.stack([one.torch().reshape(size).cpu() for one in uv], dim=-1),
-        face=face.torch().reshape(size).long().cpu(),
+        id=picture(number).long(),
+        depth=picture(depth),
+        z_depth=picture(z_depth),
+        normal=torch.stack([picture(axis) for axis in normal], dim=-1),
+        uv=torch.stack([picture(axis) for axis in uv], dim=-1),
+        face=picture(face).long(),
     )

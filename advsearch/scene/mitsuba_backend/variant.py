@@ -4,6 +4,7 @@ scenes live inside it."""
 from __future__ import annotations
 
 import gc
+import itertools
 import sys
 import threading
 import weakref
@@ -41,7 +42,12 @@ def mitsuba() -> ModuleType:
         mitsuba.set_variant(VARIANT)
         first = True
     if first:
-        _settle(mitsuba)
+        import drjit  # not before libLLVM is chosen
+
+        mitsuba.set_log_level(mitsuba.LogLevel.Warn)
+        drjit.set_log_level(drjit.LogLevel.Warn)
+        threads.apply_to_drjit()
+        gc.freeze()  # every change of the scenes calls the collector: what is imported by now would take it 0.2 s
     return mitsuba
 
 
@@ -91,29 +97,31 @@ def recorded(render: Callable[..., Any], media: list[Any]) -> Callable[..., Any]
     return function
 
 
-def _settle(module: ModuleType) -> None:
-    """Only warnings are logged, Dr.Jit's pool gets the size that `advsearch.threads` chose, and Python's garbage
-    collector, which every change of the scenes calls, passes over what has been imported by now: 0.2 s each time."""
-    # not before libLLVM is chosen
-    import drjit
+class Recordings(dict[Any, Callable[..., Any]]):
+    """What has been recorded, by what it is; all of it goes where the population, or Dr.Jit's pool of threads, has
+    changed since: it would crash."""
 
-    module.set_log_level(module.LogLevel.Warn)
-    drjit.set_log_level(drjit.LogLevel.Warn)
-    threads.apply_to_drjit()
-    gc.freeze()
+    _made_at = (0, 0)
+
+    def of(self, what: Any, render: Callable[..., Any], media: list[Any]) -> Callable[..., Any]:
+        """Return the recording of something, or the function that will make it; arguments as of `recorded`."""
+        now = (population.changes, dr.thread_count())
+        if self._made_at != now:
+            self.clear()
+            self._made_at = now
+        if what not in self:
+            self[what] = recorded(render, media)
+        return self[what]
 
 
 class Population:
-    """The scenes inside Mitsuba that this process holds, and when they may go.
+    """The scenes inside Mitsuba that this process holds, and when they may go; `changes` counts how often it has
+    changed, `unused` has the numbers of what has lost its owner.
 
     A recorded kernel refers to the objects of all scenes that lived when it was recorded, and Dr.Jit leaves undefined
     what happens when it is replayed after one was added or removed. So every change of the population makes every
     recording stale, and a scene that nobody uses any more is kept until no render is under way: Python's garbage
     collector may strike in the middle of one.
-
-    Attributes:
-        changes: how often it has changed.
-        unused: the numbers of what has lost its owner.
     """
 
     def __init__(self) -> None:
@@ -144,13 +152,13 @@ class Population:
     def media(self) -> list[Any]:
         """Return the media of all scenes: what calls one of them is recorded with all that there are, and Dr.Jit 1.5.0
         finds no others than those of the scene that is rendered."""
-        return [*self._loose, *(one for some in self._media.values() for one in some)]
+        return [*self._loose, *itertools.chain.from_iterable(self._media.values())]
 
 
 def media_in(scene: Any) -> tuple[Any, ...]:
     """Return the media in the shapes of Mitsuba's scene."""
-    both = ((shape.interior_medium(), shape.exterior_medium()) for shape in scene.shapes())
-    return tuple(one for pair in both for one in pair if one is not None)
+    sides = [side for shape in scene.shapes() for side in (shape.interior_medium(), shape.exterior_medium())]
+    return tuple(medium for medium in sides if medium is not None)
 
 
 population = Population()

@@ -19,24 +19,13 @@ import torch
 from torch import Tensor
 
 from advsearch.errors import InputError
+from advsearch.scene import parts
 from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.description import OBJECT, SceneDescription
 from advsearch.scene.mitsuba_backend.meshes import base_texture, emitter, loadable, matt, own_surface, principled
-from advsearch.scene.mitsuba_backend.parts import GROUND, scene_dict, translation
+from advsearch.scene.mitsuba_backend.parts import CAMERA_NUMBERS, GROUND, scene_dict, translation
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.mitsuba_backend.variant import VARIANT, Plugin, mi
-from advsearch.scene.parts import (
-    BallLamp,
-    BeamLamp,
-    HazePart,
-    MeshPart,
-    PluginNumbers,
-    PluginPart,
-    PointLamp,
-    ProjectorPart,
-    ScenePart,
-    SpotLamp,
-)
 
 NAME = "scene.xml"
 
@@ -45,27 +34,15 @@ SCATTERINGS = 3
 """Segments that paths in haze have beyond those between surfaces: stock Mitsuba counts both alike."""
 BAKED = ("filename", "to_world", "flip_tex_coords")
 """Entries of a mesh from a file that are in the mesh that is written."""
-CAMERA = {
-    "to_world": "to_world",
-    "fov": "fov",
-    "shift_x": "principal_point_offset_x",
-    "shift_y": "principal_point_offset_y",
-    "aperture": "aperture_radius",
-    "focus": "focus_distance",
-}
+CAMERA = {"to_world": "to_world", "fov": "fov", **CAMERA_NUMBERS}
 
 
 def write_scene(
     scene: MitsubaScene, inputs: Mapping[str, Tensor], path: Path, note: str, *, hide: bool = False
 ) -> None:
-    """Write a scene as XML that stock Mitsuba loads, with meshes and pictures beside it.
-
-    Args:
-        scene: what to write.
-        inputs: as in `MitsubaScene.radiance`.
-        path: of the XML file, in a folder that is there.
-        note: for a comment at the beginning.
-        hide: as in `MitsubaScene.radiance`.
+    """Write a scene with its inputs set, and the visible environment hidden or not, as of `MitsubaScene.radiance`, as
+    XML that stock Mitsuba loads, into a folder that is there, with meshes and pictures beside it, and a note as a
+    comment.
 
     Raises:
         InputError: something in it is no part of stock Mitsuba.
@@ -78,7 +55,7 @@ def write_scene(
     base = scene_dict(description, scene.resolution, filter, scene.sampler)
     plugins = described(base, description, inputs, integrator)
     meshes = {shape.id(): shape for shape in scene.held(inputs).shapes() if shape.is_mesh()}
-    write_xml(path, plugins, {name: one for name, one in meshes.items() if name in plugins}, note)
+    write_xml(path, plugins, {name: mesh for name, mesh in meshes.items() if name in plugins}, note)
 
 
 def described(base: Plugin, description: SceneDescription, inputs: Mapping[str, Tensor], integrator: Plugin) -> Plugin:
@@ -86,7 +63,6 @@ def described(base: Plugin, description: SceneDescription, inputs: Mapping[str, 
 
     Args:
         base: of `scene_dict`; changed.
-        description: of the scene.
         inputs: those of `MitsubaScene`, that differ from the base values.
         integrator: the path integrator's dictionary.
 
@@ -106,21 +82,20 @@ def described(base: Plugin, description: SceneDescription, inputs: Mapping[str, 
         base_color = description.photograph.base.numpy()
         scene[GROUND] = {"type": "ply", "bsdf": matt(left.pop("ground.reflectance", base_color))}
     for part in (description.meshes[OBJECT], *description.parts):
-        if isinstance(part, HazePart):
+        if isinstance(part, parts.HazePart):
             _put_haze(scene, part, left)
-        elif not isinstance(part, PluginNumbers):
+        elif not isinstance(part, parts.PluginNumbers):
             scene[part.name] = _part(description.placed(part), left)
-    for part in description.parts:
-        if isinstance(part, PluginNumbers):
-            for one in part.numbers:
-                if one.input in left and _put(scene, one.key.split("."), left[one.input].tolist()):
-                    del left[one.input]
+    numbered = [part for part in description.parts if isinstance(part, parts.PluginNumbers)]
+    for number in (number for part in numbered for number in part.numbers):
+        if number.input in left and _put(scene, number.key.split("."), left[number.input].tolist()):
+            del left[number.input]
     if left:
         raise InputError(f"out: stock Mitsuba has nothing for {', '.join(sorted(left))}; export another run")
     return scene
 
 
-def _put_haze(scene: Plugin, haze: HazePart, left: Plugin) -> None:
+def _put_haze(scene: Plugin, haze: parts.HazePart, left: Plugin) -> None:
     """Fill a ball and the camera in it with haze, unless its density is 0; takes its inputs from what is left."""
     density = left.pop(f"{haze.name}.density", np.array([haze.density])).tolist()
     albedo = left.pop(f"{haze.name}.albedo", np.array(haze.albedo)).tolist()
@@ -149,16 +124,16 @@ def _put(plugin: Plugin, key: list[str], values: list[float]) -> bool:
     return True
 
 
-def _part(part: ScenePart, left: Plugin) -> Plugin:
+def _part(part: parts.ScenePart, left: Plugin) -> Plugin:
     """A part's dictionary; takes its inputs from what is left."""
     inputs = {name.partition(".")[2]: left.pop(name) for name in sorted(left) if name.startswith(f"{part.name}.")}
-    if isinstance(part, MeshPart):
+    if isinstance(part, parts.MeshPart):
         inputs.pop("vertices", None), inputs.pop("normals", None)  # the mesh that is written has them
         color = inputs.pop("base_color", None)
         numbers = {name: float(inputs.pop(name)[0]) for name in MATERIAL if name in inputs and part.surface is None}
         part = replace(part, material=replace(part.material, **numbers))
         if color is not None:
-            part = replace(part, base_color=_display(color))
+            part = replace(part, base_color=linear_to_srgb(torch.from_numpy(color)).numpy())
         surface = principled(part)
         if part.surface is not None:
             base_color = part.base_color
@@ -168,21 +143,20 @@ def _part(part: ScenePart, left: Plugin) -> Plugin:
             part = replace(part, emission=radiance.reshape(-1, *radiance.shape[-2:] if radiance.ndim > 1 else (1, 3)))
         light = emitter(part)
         plugin: Plugin = {"type": "ply", "bsdf": surface, **({"emitter": light} if light else {})}
-    elif isinstance(part, (PointLamp, SpotLamp)):
-        plugin = translation(replace(part, **_triples(inputs))).plugins[part.name]
-    elif isinstance(part, BallLamp):
+    elif isinstance(part, (parts.PointLamp, parts.SpotLamp, parts.BallLamp)):
         ball = inputs.pop("ball", None)
-        plugin = translation(replace(part, **_triples(inputs))).plugins[part.name]
+        triples = {name: tuple(map(float, inputs.pop(name))) for name in list(inputs)}
+        plugin = translation(replace(part, **triples)).plugins[part.name]
         if ball is not None:
             plugin["to_world"] = mi.ScalarTransform4f(ball)
-    elif isinstance(part, ProjectorPart):
+    elif isinstance(part, parts.ProjectorPart):
         plugin = translation(part).plugins[part.name]
         plugin["to_world"] = mi.ScalarTransform4f(inputs.pop("pose"))
         plugin["irradiance"] |= {"bitmap": mi.Bitmap(inputs.pop("pattern"))}
-    elif isinstance(part, BeamLamp):
+    elif isinstance(part, parts.BeamLamp):
         pose = inputs.pop("to_world", part.to_world)
         plugin = translation(replace(part, to_world=pose)).plugins[part.name]
-    elif isinstance(part, PluginPart):
+    elif isinstance(part, parts.PluginPart):
         plugin = loadable(part.plugin)
     else:
         raise InputError(f"out: stock Mitsuba has nothing for {part.name}; export a run without it")
@@ -190,43 +164,31 @@ def _part(part: ScenePart, left: Plugin) -> Plugin:
     return plugin
 
 
-def _triples(given: Plugin) -> Plugin:
-    """Take all colours and places out of what is given, as the fields of a lamp."""
-    return {name: tuple(map(float, given.pop(name))) for name in list(given)}
-
-
-def _display(linear: Any) -> Any:
-    return linear_to_srgb(torch.from_numpy(linear)).numpy()
-
-
 def write_xml(path: Path, scene: Plugin, meshes: Mapping[str, Any], note: str) -> None:
-    """Write a scene's dictionary by Mitsuba's own writer, and beside it what it needs, in files whose names begin with
-    its own.
-
-    Args:
-        path: of the XML file, in a folder that is there.
-        scene: of `described`.
-        meshes: Mitsuba's, by the names of the scene's entries of the type "ply".
-        note: for a comment at the beginning.
-    """
+    """Write a scene's dictionary, of `described`, by Mitsuba's own writer into a folder that is there, and beside it
+    what it needs, in files whose names begin with its own: Mitsuba's meshes, by the names of the entries of the type
+    "ply", and pictures. The note is a comment at the beginning."""
 
     taken = set[Path]()
 
     def beside(name: str, suffix: str) -> Path:
         """A file beside the scene that is not taken yet."""
-        found = path.with_name(f"{path.stem}-{name}{suffix}")
-        while found in taken:
-            found = found.with_stem(f"{found.stem}-2")
-        taken.add(found)
-        return found
+        free = path.with_name(f"{path.stem}-{name}{suffix}")
+        while free in taken:
+            free = free.with_stem(f"{free.stem}-2")
+        taken.add(free)
+        return free
 
     def filed(name: str, plugin: Mapping[str, Any]) -> Plugin:
         """The plugin with its pictures, and the files that it names, beside the scene."""
         copied: Plugin = {}
         for key, entry in plugin.items():
             if isinstance(entry, mi.Bitmap):
-                key, file = "filename", beside(name, ".exr")
-                _write_picture(file, np.array(entry, dtype=np.float32))
+                key, file, values = "filename", beside(name, ".exr"), np.array(entry, dtype=np.float32)
+                grey = values.ndim < 3 or values.shape[2] == 1
+                channels = {"Y": values.reshape(values.shape[:2])} if grey else {"RGBA"[: values.shape[2]]: values}
+                with OpenEXR.File({}, channels) as picture:  # Mitsuba's waits forever where Dr.Jit has one thread
+                    picture.write(str(file))
                 entry = file.name
             elif isinstance(entry, Mapping):
                 entry = filed(f"{name}-{key}", entry)
@@ -251,15 +213,7 @@ def write_xml(path: Path, scene: Plugin, meshes: Mapping[str, Any], note: str) -
     except (RuntimeError, TypeError) as error:
         raise InputError(f"out: XML of Mitsuba cannot say the scene: {error}; export another run") from error
     root = ElementTree.fromstring(text)
-    for one in root.findall("*[@type]"):  # Mitsuba calls parameters by ids, and writes those that are referred to only
-        one.set("id", one.attrib.pop("name"))
+    for entry in root.findall("*[@type]"):  # Mitsuba calls parameters by ids, and writes only those referred to
+        entry.set("id", entry.attrib.pop("name"))
     text = ElementTree.tostring(root, encoding="unicode")
     path.write_text(f"<!-- {note.replace('--', '- -')} -->\n{text}\n", "utf-8")
-
-
-def _write_picture(path: Path, values: np.ndarray) -> None:
-    """Write an EXR; Mitsuba's own writer waits forever where Dr.Jit has one thread."""
-    channels = values.shape[2] if values.ndim == 3 else 1
-    by_name = {"Y": values.reshape(values.shape[:2])} if channels == 1 else {"RGBA"[:channels]: values}
-    with OpenEXR.File({}, by_name) as picture:
-        picture.write(str(path))

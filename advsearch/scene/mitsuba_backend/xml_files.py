@@ -22,13 +22,13 @@ import numpy as np
 from advsearch import files
 from advsearch.errors import FileFormatError
 from advsearch.files import note_opened
-from advsearch.scene.assets import Floats
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.environments import SUFFIXES as RADIANCE
 from advsearch.scene.environments import import_environment, read_light
 from advsearch.scene.importing.files import References, damaged, looks_like, read_bytes, shown
 from advsearch.scene.importing.objects import read_parts
 from advsearch.scene.importing.pictures import TEXTURE_LIMIT, banded_average, read_picture
+from advsearch.scene.mitsuba_backend.meshes import with_inner
 from advsearch.scene.mitsuba_backend.variant import VARIANT, Plugin, fewer_warnings, mi
 
 SUFFIX = ".xml"
@@ -46,11 +46,8 @@ _PLACE = re.compile(r"^\[.*?\] Error while loading string \(line (\d+), col \d+\
 
 
 def read_scene(path: Path, parameters: Mapping[str, str] | None = None) -> Plugin:
-    """Return the dictionary of a scene file: plugins with their `type`, numbers, texts, transforms (4, 4).
-
-    Args:
-        path: of the file.
-        parameters: values for its `$names`, over its own defaults.
+    """Return the dictionary of a scene file: plugins with their `type`, numbers, texts, transforms (4, 4); some values
+    for its `$names` go over its own defaults.
 
     Raises:
         FileFormatError: it is missing, damaged, too large, or no Mitsuba scene.
@@ -100,7 +97,7 @@ class _Text:
         def refuse(*_: object) -> None:
             raise FileFormatError(f"{self.path}: declares a document type or entities, which no scene needs; remove it")
 
-        def start(tag: str, given: dict[str, str]) -> None:
+        def start(tag: str, attributes: dict[str, str]) -> None:
             nonlocal depth
             if not self.elements:
                 self.above = parser.CurrentLineNumber - 1
@@ -111,7 +108,7 @@ class _Text:
             if tag in ("alias", "path"):
                 where = f"{self.path}: line {parser.CurrentLineNumber}"
                 raise FileFormatError(f"{where}: <{tag}> is not read; write the scene without it")
-            tree.start(tag, given)
+            tree.start(tag, attributes)
 
         def end(tag: str) -> None:
             nonlocal depth
@@ -141,21 +138,21 @@ class _Text:
     def fill(self, element: ElementTree.Element) -> None:
         """Put the values of `$names`, and what other files hold, into an element."""
         inner: list[ElementTree.Element] = []
-        for one in element:
-            for key, text in one.items():
-                one.set(key, self.filled(text))
-            if one.tag == "default":
-                self.values.setdefault(one.get("name", ""), one.get("value", ""))
-            if one.tag != "include":
-                self.fill(one)
-                inner.append(one)
+        for child in element:
+            for key, text in child.items():
+                child.set(key, self.filled(text))
+            if child.tag == "default":
+                self.values.setdefault(child.get("name", ""), child.get("value", ""))
+            if child.tag != "include":
+                self.fill(child)
+                inner.append(child)
                 continue
-            root = self.other(one.get("filename", ""))
-            whole = ElementTree.Element("scene") if root.tag != "scene" else root
-            if root is not whole:
-                whole.append(root)
-            self.fill(whole)
-            inner += list(whole)
+            included = self.other(child.get("filename", ""))
+            if included.tag != "scene":
+                alone, included = included, ElementTree.Element("scene")
+                included.append(alone)
+            self.fill(included)
+            inner += list(included)
         element[:] = inner
 
     def other(self, name: str) -> ElementTree.Element:
@@ -171,16 +168,16 @@ class _Text:
 
     def filled(self, text: str) -> str:
         """Return a text with the values of its `$names`."""
-        found = ""
+        whole = ""
         for at, part in enumerate(re.split(r"\$(\w+)", text)):
             if at % 2 and part not in self.values:
                 named = shown(part, quoted=False)
                 raise FileFormatError(f"{self.path}: ${named} has no value: no <default> has that name")
-            found += self.values[part] if at % 2 else part
-            if at and len(found) > LONGEST:  # a <default> may name others twice, and so on
+            whole += self.values[part] if at % 2 else part
+            if at and len(whole) > LONGEST:  # a <default> may name others twice, and so on
                 most = f"expected at most {LONGEST:,} letters, got more"
                 raise FileFormatError(f"{self.path}: {shown(text)}: {most}; write the value out")
-        return found
+        return whole
 
 
 def _plugin(path: Path, state: Any, number: int, referred: set[str]) -> Plugin:
@@ -262,12 +259,8 @@ STOCK = frozenset(
 
 
 def trusted(path: Path, scene: Mapping[str, object], notes: list[str]) -> Plugin:
-    """Return a file's dictionary with pictures read, and with the full names of meshes that were read once.
-
-    Args:
-        path: of the file.
-        scene: its dictionary.
-        notes: warnings about pictures are put here.
+    """Return a file's dictionary with pictures read, about which warnings are put into `notes`, and with the full names
+    of meshes that were read once.
 
     Raises:
         FileFormatError: a plugin that Mitsuba does not bring, or a file that is missing, outside the folder of `path`,
@@ -282,34 +275,39 @@ def trusted(path: Path, scene: Mapping[str, object], notes: list[str]) -> Plugin
             reason = references.refused.get(next(reversed(references.refused)), "is missing")
             raise FileFormatError(f"{path}: {kind} needs {shown(str(name))}, which {reason}") from None
         for candidate in (str(name), os.path.basename(str(name))):
-            found = Path(os.path.realpath(os.path.join(path.parent, candidate)))
-            if found.is_file() and found.is_relative_to(os.path.realpath(path.parent)):
-                note_opened(found)
-                return found
+            file = Path(os.path.realpath(os.path.join(path.parent, candidate)))
+            if file.is_file() and file.is_relative_to(os.path.realpath(path.parent)):
+                note_opened(file)
+                return file
         raise FileFormatError(f"{path}: {kind} needs {shown(str(name))}; write its name as it is in the folder")
 
     def mesh(plugin: Plugin) -> Plugin:
-        found = file_of("a shape", plugin["filename"])
-        if found.suffix.lower() != f".{plugin['type']}":
-            raise FileFormatError(f"{path}: expected a .{plugin['type']} file, got {shown(found.name)}; rename it")
-        read_parts(found, found.read_bytes())
-        return {**plugin, "filename": str(found)}
+        file = file_of("a shape", plugin["filename"])
+        if file.suffix.lower() != f".{plugin['type']}":
+            raise FileFormatError(f"{path}: expected a .{plugin['type']} file, got {shown(file.name)}; rename it")
+        read_parts(file, file.read_bytes())
+        return {**plugin, "filename": str(file)}
 
     def bitmap(plugin: Plugin) -> Plugin:
-        found = file_of("a texture", plugin.pop("filename"))
-        if found.suffix.lower() in RADIANCE:
-            return {**plugin, "bitmap": _texture(found, notes), "raw": True}
-        raw = bool(plugin.get("raw"))
-        picture = read_picture(found, raw=raw)
-        return {**plugin, "bitmap": picture if raw else srgb_to_linear(picture), "raw": True}
+        file = file_of("a texture", plugin.pop("filename"))
+        if file.suffix.lower() not in RADIANCE:
+            raw = bool(plugin.get("raw"))
+            picture = read_picture(file, raw=raw)
+            return {**plugin, "bitmap": picture if raw else srgb_to_linear(picture), "raw": True}
+        light = read_light(file, "texture")
+        notes.extend(f"{file.name}: {note}" for note in light.notes)
+        scale = min(1.0, TEXTURE_LIMIT / max(light.size))
+        small = max(1, round(light.size[0] * scale)), max(1, round(light.size[1] * scale))
+        linear = light.band(0, light.size[0]) if scale == 1.0 else banded_average(light.band, light.size, small)
+        return {**plugin, "bitmap": linear, "raw": True}
 
     def envmap(plugin: Plugin) -> Plugin:
-        found = file_of("a light", plugin.pop("filename"))
-        if found.suffix.lower() in RADIANCE:
-            environment = import_environment(found)
-            notes.extend(environment.warnings)
-            return {**plugin, "bitmap": environment.radiance}
-        return {**plugin, "bitmap": np.asarray(srgb_to_linear(read_picture(found)), np.float32)}
+        file = file_of("a light", plugin.pop("filename"))
+        if file.suffix.lower() not in RADIANCE:
+            return {**plugin, "bitmap": np.asarray(srgb_to_linear(read_picture(file)), np.float32)}
+        environment = import_environment(file)
+        notes.extend(environment.warnings)
+        return {**plugin, "bitmap": environment.radiance}
 
     readers: dict[str, Callable[[Plugin], Plugin]] = {"obj": mesh, "ply": mesh, "bitmap": bitmap, "envmap": envmap}
 
@@ -321,7 +319,7 @@ def trusted(path: Path, scene: Mapping[str, object], notes: list[str]) -> Plugin
             )
         if not re.fullmatch(r"\w*", str(plugin.get("material", ""))):
             raise FileFormatError(f"{path}: {shown(str(plugin['material']))} is no name of a material")
-        entries = {key: checked(value) if isinstance(value, Mapping) else value for key, value in plugin.items()}
+        entries = with_inner(plugin, checked)
         if kind in readers and "filename" not in entries:  # without one Mitsuba's bitmap ends the process
             raise FileFormatError(f"{path}: expected a filename in each {kind}, got none; name the file")
         if "filename" in entries:
@@ -335,14 +333,3 @@ def trusted(path: Path, scene: Mapping[str, object], notes: list[str]) -> Plugin
         return entries
 
     return checked(scene)
-
-
-def _texture(file: Path, notes: list[str]) -> Floats:
-    """The linear values (H, W, 3) of an .hdr or .exr picture, averaged down as other textures are."""
-    picture = read_light(file, "texture")
-    notes.extend(f"{file.name}: {note}" for note in picture.notes)
-    height, width = picture.size
-    scale = min(1.0, TEXTURE_LIMIT / max(height, width))
-    if scale == 1.0:
-        return picture.band(0, height)
-    return banded_average(picture.band, picture.size, (max(1, round(height * scale)), max(1, round(width * scale))))

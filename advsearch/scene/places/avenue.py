@@ -2,7 +2,7 @@
 
 The avenue is 300 m long and runs along x. The object stands at the origin, in the lane of those who drive towards +x.
 At both ends it meets another street, whose houses close the view; beyond them lies a plain to the horizon. What stands
-where is a `Plan`; `crossing.py` and `car_park.py` are made of the same parts.
+where is a `Place`; `crossing.py` and `car_park.py` are made of the same parts.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from advsearch.scene.assets import Doubles, Floats, Material
 from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.parts import MeshPart
 from advsearch.scene.places import paint, road
-from advsearch.scene.places.houses import Row
-from advsearch.scene.places.quads import FRONT, SHOWN, Frame, Quads
+from advsearch.scene.places.houses import Fronts
+from advsearch.scene.places.quads import FRONT, SHOWN, Quads, Wall
 
 END, CROSSING, FAR = 150.0, 12.0, 4000.0
 """Where the street ends, how wide the one is that it meets, and how far the plain goes."""
-KERB, KERB_WIDE = 0.12, 0.16
+KERB = 0.12
 TREES = (-118.0, -97.0, -76.0, -55.0, -34.0, -15.0, 22.0, 43.0, 64.0, 85.0, 106.0, 127.0)
 """x of the trees on the right; those on the left stand 9 m on."""
 POSTS = tuple(range(-135, 150, 30))
@@ -58,38 +58,30 @@ class Tree(NamedTuple):
     side: int = 0
 
 
-class Plan(NamedTuple):
+class Place(NamedTuple):
     """What stands where.
 
     Attributes:
         ground: makes road and pavements.
         fronts: of houses: walls, from where to where along them, seeds.
-        trees: on the pavement.
         posts: (x, y) of the foot of each lamp post, and y of its lamp.
         more: makes further meshes, from the metres of one object size.
     """
 
     ground: Callable[[], Quads]
-    fronts: tuple[tuple[Frame, float, float, int], ...]
+    fronts: tuple[tuple[Wall, float, float, int], ...]
     trees: tuple[Tree, ...]
     posts: tuple[tuple[float, float, float], ...]
     more: Callable[[float], tuple[MeshPart, ...]] = lambda metres: ()
 
 
-def avenue(metres: float, candelas: float | None, *, wet: bool, dark: bool, snow: bool = False) -> tuple[MeshPart, ...]:
-    """Return the meshes of the street; arguments as of `built`."""
-    return built(AVENUE, metres, candelas, wet=wet, dark=dark, snow=snow)
-
-
 @lru_cache(maxsize=4)
 def built(
-    plan: Plan, metres: float, candelas: float | None, *, wet: bool, dark: bool, snow: bool = False
+    plan: Place, metres: float, candelas: float | None, *, wet: bool, dark: bool, snow: bool = False
 ) -> tuple[MeshPart, ...]:
-    """Return the meshes of a place.
+    """Return the meshes of a place, with lengths in the metres of one object size.
 
     Args:
-        plan: what stands where.
-        metres: of one object size, the scene's unit of length.
         candelas: luminance of a radiance of 1, cd/m2; None where the light has no unit.
         wet: whether the road is dark and reflects.
         dark: whether lamps and windows shine.
@@ -97,7 +89,11 @@ def built(
     """
     rows, ground = _houses(plan.fronts), road.WET if wet else road.DRY
     grey, white = np.full((2, 2, 3), 0.25, np.float32), np.full((2, 2, 3), 0.9, np.float32)
-    fallen = Quads()
+    tone = 1.0 + 0.25 * paint._clouds(128, 128, 32, 400) + 0.2 * paint._grain(128, 128, 401)
+    grass = linear_to_srgb(np.clip(paint.tint((0.075, 0.095, 0.045)) * tone[..., None], 0.0, 1.0))
+    fallen, plain = Quads(), Quads()
+    corners = FAR * np.array([(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)])
+    plain.level((-FAR, FAR), (-FAR, FAR), -0.05, corners / 50.0)
     walls, trees, posts = (
         quads.swept(fallen) if snow else quads for quads in (rows.walls, _trees(plan.trees), _posts(plan.posts))
     )
@@ -110,10 +106,10 @@ def built(
         ("trees", trees, _leaves(), LEAF),
         ("posts", posts, grey, IRON),
         ("street-lamps", _lamps(plan.posts), white, PANE),
-        ("plain", _plain(), white if snow else _grass(), WALL),
+        ("plain", plain, white if snow else grass, WALL),
         *((("snow", fallen, white, WALL),) if snow else ()),
     )
-    shine = {name: one[None, None] / np.float32(candelas) for name, one in LIT.items()} if dark and candelas else {}
+    shine = {name: cd[None, None] / np.float32(candelas) for name, cd in LIT.items()} if dark and candelas else {}
     return (
         *(
             MeshPart(name, quads.mesh(metres), base, finish, emission=shine.get(name), laid=True)
@@ -124,15 +120,13 @@ def built(
 
 
 @lru_cache(maxsize=8)
-def _display(texture: object, *arguments: bool) -> Floats:
-    """A painted texture as display-referred multiples of 1/255."""
-    shown = linear_to_srgb(np.asarray(texture(*arguments), np.float32))  # type: ignore[operator]
-    return np.asarray(np.round(shown * np.float32(255.0)) / np.float32(255.0), np.float32)
+def _display(texture: Callable[..., Floats], *arguments: bool) -> Floats:
+    return road.shown(texture(*arguments))
 
 
 @lru_cache(maxsize=2)
-def _houses(fronts: tuple[tuple[Frame, float, float, int], ...]) -> Row:
-    row = Row()
+def _houses(fronts: tuple[tuple[Wall, float, float, int], ...]) -> Fronts:
+    row = Fronts()
     for frame, begin, end, seed in fronts:
         row.build(frame, begin, end, seed)
     return row
@@ -140,12 +134,14 @@ def _houses(fronts: tuple[tuple[Frame, float, float, int], ...]) -> Row:
 
 def level(quads: Quads, x: Sequence[float], y: Sequence[float], z: float, v: tuple[float, float] | None = None) -> None:
     """Add a level rectangle of ground; `v` are the y whose ground it shows, its own unless given."""
-    (x0, x1), (y0, y1), (low, high) = sorted(x), sorted(y), paint.FRONTS
-    shown = np.array(v or (y0, y1))
-    rows = (shown - low) / (high - low)
-    corners = np.array([[(x0, y0, z), (x1, y0, z), (x1, y1, z), (x0, y1, z)]])
+    (x0, x1), (y0, y1) = sorted(x), sorted(y)
     u = np.array([x0, x1, x1, x0]) / paint.GROUND_PERIOD
-    quads.add(corners, np.stack([u, rows[[0, 0, 1, 1]]], axis=-1)[None])
+    quads.level((x0, x1), (y0, y1), z, np.stack([u, _shown(*(v or (y0, y1)))[[0, 0, 1, 1]]], axis=-1))
+
+
+def _shown(*y: float) -> Doubles:
+    """Texture coordinates of the ground at y."""
+    return (np.array(y) - paint.FRONTS[0]) / (paint.FRONTS[1] - paint.FRONTS[0])
 
 
 ASPHALT = (2.4, 5.2)
@@ -155,21 +151,18 @@ ASPHALT = (2.4, 5.2)
 def asphalt(quads: Quads, x: tuple[float, float], y: tuple[float, float]) -> None:
     """Add a road without markings, in strips that show different parts of it."""
     count = max(1, round((y[1] - y[0]) / (ASPHALT[1] - ASPHALT[0])))
-    edges = np.linspace(*y, count + 1)
-    for number, (y0, y1) in enumerate(pairwise(edges)):
-        rows = (np.array(ASPHALT)[:: -1 if number % 2 else 1] - paint.FRONTS[0]) / (paint.FRONTS[1] - paint.FRONTS[0])
+    for number, edges in enumerate(pairwise(np.linspace(*y, count + 1))):
+        rows = _shown(*ASPHALT[:: -1 if number % 2 else 1])
         u = (np.array([x[0], x[1], x[1], x[0]]) + 7.3 * number) / paint.GROUND_PERIOD
-        corners = np.array([[(x[0], y0, 0.0), (x[1], y0, 0.0), (x[1], y1, 0.0), (x[0], y1, 0.0)]])
-        quads.add(corners, np.stack([u, rows[[0, 0, 1, 1]]], axis=-1)[None])
+        quads.level(x, edges, 0.0, np.stack([u, rows[[0, 0, 1, 1]]], axis=-1))
 
 
 def painted(quads: Quads, x: tuple[float, float], y: tuple[float, float]) -> None:
     """Add a rectangle of white paint on a road: it shows the line along the kerb."""
-    line = (road.KERBS[0] + 0.45 + np.array([-0.04, 0.04]) - paint.FRONTS[0]) / (paint.FRONTS[1] - paint.FRONTS[0])
-    corners = np.array([[(x[0], y[0]), (x[1], y[0]), (x[1], y[1]), (x[0], y[1])]])
-    along = (corners - corners[:, :1]).sum(axis=-1) / paint.GROUND_PERIOD + x[0] + y[0]
-    height = np.full((1, 4, 1), 0.004)
-    quads.add(np.concatenate([corners, height], axis=-1), np.stack([along, line[[0, 0, 1, 1]][None]], axis=-1))
+    line = _shown(road.KERBS[0] + 0.45 - 0.04, road.KERBS[0] + 0.45 + 0.04)
+    corners = np.array([(x[0], y[0]), (x[1], y[0]), (x[1], y[1]), (x[0], y[1])])
+    along = (corners - corners[:1]).sum(axis=-1) / paint.GROUND_PERIOD + x[0] + y[0]
+    quads.level(x, y, 0.004, np.stack([along, line[[0, 0, 1, 1]]], axis=-1))
 
 
 def street(quads: Quads, begin: float, end: float, *, marked: bool = True) -> None:
@@ -200,18 +193,6 @@ def _ground() -> Quads:
     street(quads, -END, END)
     closed(quads)
     return quads
-
-
-def _plain() -> Quads:
-    quads = Quads()
-    corners = FAR * np.array([[(-1.0, -1.0, 0.0), (1.0, -1.0, 0.0), (1.0, 1.0, 0.0), (-1.0, 1.0, 0.0)]])
-    quads.add(corners - [0.0, 0.0, 0.05], corners[..., :2] / 50.0)
-    return quads
-
-
-def _grass() -> Floats:
-    tone = 1.0 + 0.25 * paint._clouds(128, 128, 32, 400) + 0.2 * paint._grain(128, 128, 401)
-    return linear_to_srgb(np.clip(paint.tint((0.075, 0.095, 0.045)) * tone[..., None], 0.0, 1.0))
 
 
 # ---- trees ----------------------------------------------------------------------------------------------------------
@@ -305,11 +286,11 @@ def _posts(posts: Sequence[tuple[float, float, float]]) -> Quads:
         limb(quads, foot, foot + np.array([0.0, 0.0, 1.1]), 0.11, 0.1, 10)
         limb(quads, foot + np.array([0.0, 0.0, 1.0]), top, 0.07, 0.045, 10)
         limb(quads, top - [0.0, 0.0, 0.06], np.array([x, y, top[2] + 0.02]), 0.04, 0.03, 8)
-        head = Frame((x, y, z), (0.0, -1.0 if at < y else 1.0, 0.0))
+        head = Wall((x, y, z), (0.0, -1.0 if at < y else 1.0, 0.0))
         half, wide = LAMP_SIZE[0] / 2 + 0.06, LAMP_SIZE[1] / 2 + 0.05
         box = np.array([[-wide, wide, -half - 0.1, half, 0.004, 0.12]])
         quads.boxes(head, box, np.zeros((1, 4)), SHOWN)
-        back = Frame((x, y, z), tuple(-np.array(head.out)))
+        back = Wall((x, y, z), tuple(-np.array(head.out)))
         quads.boxes(back, np.array([[-wide, wide, 0.0, half + 0.1, 0.004, 0.12]]), np.zeros((1, 4)), (FRONT,))
     return quads
 
@@ -335,19 +316,17 @@ def posts_along(xs: Sequence[float] = POSTS) -> tuple[tuple[float, float, float]
     return tuple((x, POST_AT[n % 2], POST_AT[n % 2] + reach[n % 2]) for n, x in enumerate(xs))
 
 
-def ends() -> tuple[tuple[Frame, float, float, int], ...]:
+def ends() -> tuple[tuple[Wall, float, float, int], ...]:
     """Return the houses that close a street along x at either end."""
     away = END + CROSSING + 4.0
     return (
-        (Frame((away, 0.0, KERB), (-1.0, 0.0, 0.0)), -62.0, 62.0, 3),
-        (Frame((-away, 0.0, KERB), (1.0, 0.0, 0.0)), -62.0, 62.0, 4),
+        (Wall((away, 0.0, KERB), (-1.0, 0.0, 0.0)), -62.0, 62.0, 3),
+        (Wall((-away, 0.0, KERB), (1.0, 0.0, 0.0)), -62.0, 62.0, 4),
     )
 
 
 RIGHT, LEFT = (
-    Frame((0.0, paint.FRONTS[0], KERB), (0.0, 1.0, 0.0)), Frame((0.0, paint.FRONTS[1], KERB), (0.0, -1.0, 0.0)),
+    Wall((0.0, paint.FRONTS[0], KERB), (0.0, 1.0, 0.0)), Wall((0.0, paint.FRONTS[1], KERB), (0.0, -1.0, 0.0)),
 )  # fmt: skip
 """Walls on either side of a street along x; along the right one x falls."""
-AVENUE = Plan(
-    _ground, ((RIGHT, -END, END, 1), (LEFT, -END, END, 2), *ends()), trees_along(), posts_along()
-)  # fmt: skip
+AVENUE = Place(_ground, ((RIGHT, -END, END, 1), (LEFT, -END, END, 2), *ends()), trees_along(), posts_along())

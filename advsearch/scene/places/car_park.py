@@ -7,22 +7,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from advsearch.scene.parts import MeshPart
-from advsearch.scene.places.avenue import KERB, Plan, Tree, asphalt, built, level, painted
-from advsearch.scene.places.quads import FRONT, TOP, Frame, Quads
+from advsearch.scene.places.avenue import KERB, Place, Tree, asphalt, level, painted
+from advsearch.scene.places.quads import FRONT, TOP, Quads, Wall
 
-DEEP, WIDE, LANE, BAYS = 5.0, 2.5, 6.0, 17
-"""Of a bay and of a lane, and how many bays are beside each other."""
+DEEP, WIDE, BAYS = 5.0, 2.5, 17
+"""Of a bay, and how many are beside each other."""
 ROWS = (-18.5, -7.5, -2.5, 8.5, 13.5, 24.5)
 """Where rows begin in x: two back to back, then a lane, and so on."""
 LINE = 0.1
 (BEGIN, END), HALF, WALK = (-20.0, 31.0), 24.0, 7.0
 """From and to in x, half of what it is in y, and how wide the pavement around it is."""
-
-
-def car_park(metres: float, candelas: float | None, *, wet: bool, dark: bool) -> tuple[MeshPart, ...]:
-    """Return the meshes of the car park; arguments as of `avenue.built`."""
-    return built(CAR_PARK, metres, candelas, wet=wet, dark=dark)
 
 
 def _ground() -> Quads:
@@ -41,25 +35,21 @@ def _ground() -> Quads:
     around = [(BEGIN, HALF, END - BEGIN, (0.0, -1.0)), (END, -HALF, END - BEGIN, (0.0, 1.0))]
     around += [(BEGIN, -HALF, 2.0 * HALF, (1.0, 0.0)), (END, HALF, 2.0 * HALF, (-1.0, 0.0))]
     for x, y, long, (out_x, out_y) in around:  # kerbs
-        frame = Frame((x, y, 0.0), (out_x, out_y, 0.0))
+        frame = Wall((x, y, 0.0), (out_x, out_y, 0.0))
         shown = np.array([[0.0, long / 24.0, 0.345, 0.348]])
         quads.boxes(frame, np.array([[0.0, long, 0.0, 0.16, 0.0, KERB]]), shown, (FRONT, TOP))
     return quads
 
 
-def _fronts() -> tuple[tuple[Frame, float, float, int], ...]:
-    middle, out = (BEGIN + END) / 2.0, HALF + WALK
-    return (
-        (Frame((middle, out, KERB), (0.0, -1.0, 0.0)), -40.0, 40.0, 21),
-        (Frame((middle, -out, KERB), (0.0, 1.0, 0.0)), -40.0, 40.0, 22),
-        (Frame((BEGIN - WALK, 0.0, KERB), (1.0, 0.0, 0.0)), -40.0, 40.0, 23),
-        (Frame((END + WALK, 0.0, KERB), (-1.0, 0.0, 0.0)), -40.0, 40.0, 24),
-    )
-
-
-CAR_PARK = Plan(
+MIDDLE, OUT = (BEGIN + END) / 2.0, HALF + WALK
+CAR_PARK = Place(
     _ground,
-    _fronts(),
+    (
+        (Wall((MIDDLE, OUT, KERB), (0.0, -1.0, 0.0)), -40.0, 40.0, 21),
+        (Wall((MIDDLE, -OUT, KERB), (0.0, 1.0, 0.0)), -40.0, 40.0, 22),
+        (Wall((BEGIN - WALK, 0.0, KERB), (1.0, 0.0, 0.0)), -40.0, 40.0, 23),
+        (Wall((END + WALK, 0.0, KERB), (-1.0, 0.0, 0.0)), -40.0, 40.0, 24),
+    ),
     tuple(
         Tree(x, sign * (HALF + 1.8), number, side)
         for side, sign in enumerate((-1.0, 1.0))

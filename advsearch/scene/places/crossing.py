@@ -13,10 +13,10 @@ from advsearch.scene.geometry import rotation
 from advsearch.scene.library import load_object
 from advsearch.scene.parts import MeshPart, mesh_part
 from advsearch.scene.places import avenue, paint, road
-from advsearch.scene.places.avenue import END, KERB, Plan, Tree, asphalt, painted, street
+from advsearch.scene.places.avenue import END, KERB, Place, Tree, asphalt, painted, street
 from advsearch.scene.places.houses import DEPTH
 from advsearch.scene.places.paint import BAY, FRONTS
-from advsearch.scene.places.quads import Frame, Quads
+from advsearch.scene.places.quads import Quads, Wall
 
 AHEAD = 14.0
 """x of the middle of the other street, which is as wide."""
@@ -32,11 +32,6 @@ STRIPE = 0.5
 SIGN = (4.4, -2.95)
 SIGN_LOW = 1.5
 """Of the bundled stop sign's lower end over the pavement, on a post."""
-
-
-def crossing(metres: float, candelas: float | None, *, wet: bool, dark: bool) -> tuple[MeshPart, ...]:
-    """Return the meshes of the crossing; arguments as of `avenue.built`."""
-    return avenue.built(CROSSING, metres, candelas, wet=wet, dark=dark)
 
 
 def _ground() -> Quads:
@@ -88,7 +83,7 @@ def _sign(metres: float) -> tuple[MeshPart, ...]:
     return replace(sign, laid=True), MeshPart("sign-post", post.mesh(metres), grey, avenue.IRON, laid=True)
 
 
-def _fronts() -> tuple[tuple[Frame, float, float, int], ...]:
+def _fronts() -> tuple[tuple[Wall, float, float, int], ...]:
     """Rows that begin and end with whole houses at the corners."""
 
     def row(length: float) -> float:
@@ -96,15 +91,15 @@ def _fronts() -> tuple[tuple[Frame, float, float, int], ...]:
 
     long, west, east = row(END - EAST), row(END + WEST), row(SIDE_END - FRONTS[1] - DEPTH)
     (low, high), side = FRONTS, row(SIDE_END + FRONTS[0] - DEPTH)
-    right, left = Frame((0.0, low, KERB), (0.0, 1.0, 0.0)), Frame((0.0, high, KERB), (0.0, -1.0, 0.0))
-    facing_east, facing_west = Frame((WEST, 0.0, KERB), (1.0, 0.0, 0.0)), Frame((EAST, 0.0, KERB), (-1.0, 0.0, 0.0))
+    right, left = Wall((0.0, low, KERB), (0.0, 1.0, 0.0)), Wall((0.0, high, KERB), (0.0, -1.0, 0.0))
+    facing_east, facing_west = Wall((WEST, 0.0, KERB), (1.0, 0.0, 0.0)), Wall((EAST, 0.0, KERB), (-1.0, 0.0, 0.0))
     return (
         (right, -WEST, -WEST + west, 1), (right, -EAST - long, -EAST, 6),
         (left, WEST - west, WEST, 2), (left, EAST, EAST + long, 7),
         (facing_east, high + DEPTH, high + DEPTH + east, 8), (facing_east, low - DEPTH - side, low - DEPTH, 9),
         (facing_west, -high - DEPTH - east, -high - DEPTH, 10), (facing_west, DEPTH - low, DEPTH - low + side, 11),
-        (Frame((AHEAD, SIDE_END - 2.0, KERB), (0.0, -1.0, 0.0)), -20.0, 20.0, 12),
-        (Frame((AHEAD, 2.0 - SIDE_END, KERB), (0.0, 1.0, 0.0)), -20.0, 20.0, 13),
+        (Wall((AHEAD, SIDE_END - 2.0, KERB), (0.0, -1.0, 0.0)), -20.0, 20.0, 12),
+        (Wall((AHEAD, 2.0 - SIDE_END, KERB), (0.0, 1.0, 0.0)), -20.0, 20.0, 13),
         *avenue.ends(),
     )  # fmt: skip
 
@@ -114,13 +109,13 @@ def _clear(x: float) -> bool:
     return not WEST - 1.0 < x < EAST + 1.0
 
 
-CROSSING = Plan(
+CROSSING = Place(
     _ground,
     _fronts(),
     (
-        *(one for one in avenue.trees_along() if _clear(one.x)),
+        *(tree for tree in avenue.trees_along() if _clear(tree.x)),
         *(Tree((NEAR - 2.1, FAR + 2.1)[n % 2], y, n) for n, y in enumerate((24.0, 33.0, 42.0, -19.0, -28.0, -37.0))),
     ),
-    (*(one for one in avenue.posts_along() if _clear(one[0])), *avenue.posts_along((30.0, -1.0))),
+    (*(post for post in avenue.posts_along() if _clear(post[0])), *avenue.posts_along((30.0, -1.0))),
     _sign,
 )

@@ -25,7 +25,7 @@ from advsearch.scene.places.paint import (
     trim_rows,
     wall_row,
 )  # fmt: skip
-from advsearch.scene.places.quads import BOTTOM, FRONT, SIDES, TOP, Frame, Quads
+from advsearch.scene.places.quads import FRONT, SHOWN, SIDES, TOP, Quads, Wall
 
 DEPTH = 11.0
 REVEAL, SHOP_REVEAL = 0.17, 0.32
@@ -37,20 +37,16 @@ LIT = 0.3
 
 
 @dataclass(eq=False)
-class Row:
-    """Fronts in a row, collected before they are built.
-
-    Attributes:
-        walls: masonry, frames and roofs.
-        dark, lit, shops: panes of dwellings without and with light behind them by night, and of shops.
-    """
+class Fronts:
+    """Fronts in a row, collected before they are built: masonry, frames and roofs; and panes of dwellings without
+    (`dark`) and with light behind them by night, and of shops."""
 
     walls: Quads = field(default_factory=Quads)
     dark: Quads = field(default_factory=Quads)
     lit: Quads = field(default_factory=Quads)
     shops: Quads = field(default_factory=Quads)
 
-    def build(self, frame: Frame, begin: float, end: float, seed: int) -> None:
+    def build(self, frame: Wall, begin: float, end: float, seed: int) -> None:
         """Build houses from `begin` to `end` along a wall, the last of them as wide as fits."""
         rng = np.random.Generator(np.random.PCG64(seed))
         before = -1
@@ -61,7 +57,7 @@ class Row:
             self._house(frame, begin, bays, int(rng.integers(3, 6)), kind, rng)
             begin, before = begin + bays * BAY, kind
 
-    def _house(self, frame: Frame, at: float, bays: int, floors: int, kind: int, rng: np.random.Generator) -> None:
+    def _house(self, frame: Wall, at: float, bays: int, floors: int, kind: int, rng: np.random.Generator) -> None:
         wide, high = bays * BAY, GROUND_FLOOR + FLOOR * (floors - 1) + ATTIC
         shop, door = bool(rng.random() < 0.55), int(rng.integers(bays))
         trim, paint = int(rng.choice([STONE, WHITE, GREY])), int(rng.choice([WHITE, WHITE, DARK, GREEN]))
@@ -90,42 +86,24 @@ class Row:
         is_shop = (np.arange(len(holes)) < bays) & ~is_door & shop
         self._windows(frame, holes[~is_door], deep[~is_door], is_shop[~is_door], paint, rng)
         self._door(frame, holes[door], int(rng.choice([GREEN, RED, 5, DARK, WHITE])), trim)
-        upper = holes[bays:]
-        sills = np.column_stack(
-            [
-                upper[:, 0] - 0.1,
-                upper[:, 1] + 0.1,
-                0 * upper[:, 0],
-                0 * upper[:, 0] + 0.13,
-                upper[:, 2] - 0.09,
-                upper[:, 2],
-            ]
-        )
-        heads = np.column_stack(
-            [
-                upper[:, 0] - 0.14,
-                upper[:, 1] + 0.14,
-                0 * upper[:, 0],
-                0 * upper[:, 0] + 0.05,
-                upper[:, 3],
-                upper[:, 3] + 0.2,
-            ]
-        )
+        left, right, low, upper = holes[bays:].T
+        zero = 0.0 * left
+        sills = np.column_stack([left - 0.1, right + 0.1, zero, zero + 0.13, low - 0.09, low])
+        heads = np.column_stack([left - 0.14, right + 0.14, zero, zero + 0.05, upper, upper + 0.2])
         self._trim(frame, np.concatenate([sills, heads]), trim)
-        right, mould = at + wide, [(0.16, 3.72, 3.95), (0.09, 3.60, 3.72)]
+        end, mould = at + wide, [(0.16, 3.72, 3.95), (0.09, 3.60, 3.72)]
         mould += [(0.22, high - 0.50, high - 0.36), (0.34, high - 0.36, high - 0.2), (0.46, high - 0.2, high)]
-        self._trim(frame, np.array([(at, right, 0.0, out, low, top) for out, low, top in mould]), trim)
-        self._trim(frame, np.array([(at, right, 0.0, 0.06, 0.0, 0.35)]), GREY, faces=(FRONT, TOP))
+        self._trim(frame, np.array([(at, end, 0.0, out, base, top) for out, base, top in mould]), trim)
+        self._trim(frame, np.array([(at, end, 0.0, 0.06, 0.0, 0.35)]), GREY, faces=(FRONT, TOP))
         if shop:
-            first = at + BAY * (door + 1) if door < bays / 2 else at
-            last = right if door < bays / 2 else at + BAY * door
+            first, last = (at + BAY * (door + 1), end) if door < bays / 2 else (at, at + BAY * door)
             if last - first > 1.0:
                 self._trim(frame, np.array([(first + 0.2, last - 0.2, 0.0, 0.14, 3.02, 3.52)]), sign)
                 if rng.random() < 0.5:
                     self._awning(frame, first + 0.25, last - 0.25, int(rng.integers(RED, len(TRIMS))))
-        self._roof(frame, at, right, high, kind, rng)
+        self._roof(frame, at, end, high, kind, rng)
 
-    def _masonry(self, frame: Frame, cells: Doubles, holes: Doubles, deep: Doubles, kind: int) -> None:
+    def _masonry(self, frame: Wall, cells: Doubles, holes: Doubles, deep: Doubles, kind: int) -> None:
         left, right, low, high = cells.T
         in_left, in_right, in_low, in_high = holes.T
         around = np.concatenate(
@@ -135,21 +113,21 @@ class Row:
             ]
         )  # fmt: skip
         around = around[around[:, 3] - around[:, 2] > 1e-6]
-        self.walls.wall(frame, around, 0.0, _of_wall(around, kind))
+        self.walls.wall(frame, around, 0.0, np.column_stack([around[:, :2] / PERIOD, wall_row(kind, around[:, 2:])]))
         zero, u = 0.0 * in_left, np.stack([in_left, in_left + deep], 1) / PERIOD
         for at, turn in ((in_left, 1), (in_right, -1)):  # the reveals
             out, up = np.stack([zero, zero, -deep, -deep], 1), np.stack([in_low, in_high, in_high, in_low], 1)
-            corners = frame.world(at[:, None] + 0.0 * out, out, up)
+            corners = frame.world(at[:, None], out, up)
             uvs = np.stack([u[:, [0, 0, 1, 1]], wall_row(kind, up)], axis=-1)
             self.walls.add(corners[:, ::-turn], uvs[:, ::-turn])
         for at, turn in ((in_low, 1), (in_high, -1)):
             out, along = np.stack([zero, zero, -deep, -deep], 1), np.stack([in_left, in_right, in_right, in_left], 1)
-            corners = frame.world(along, out, at[:, None] + 0.0 * out)
+            corners = frame.world(along, out, at[:, None])
             uvs = np.stack([along / PERIOD, wall_row(kind, at[:, None] + 0.3 * out)], axis=-1)
             self.walls.add(corners[:, ::turn], uvs[:, ::turn])
 
     def _windows(
-        self, frame: Frame, holes: Doubles, deep: Doubles, shop: Bools, paint: int, rng: np.random.Generator
+        self, frame: Wall, holes: Doubles, deep: Doubles, shop: Bools, paint: int, rng: np.random.Generator
     ) -> None:
         kinds = np.where(shop, rng.integers(PANES // 2, PANES, len(holes)), rng.integers(0, PANES // 2, len(holes)))
         uvs = np.column_stack([kinds / PANES + 0.004, (kinds + 1) / PANES - 0.004, 0 * kinds + 0.01, 0 * kinds + 0.99])
@@ -165,10 +143,10 @@ class Row:
             (left, right, high - bar, high), (middle - bar / 2, middle + bar / 2, low, high),
             (left, right, across - bar / 2.5, across + bar / 2.5),
         ]  # fmt: skip
-        rows = np.concatenate([np.column_stack([one[0], one[1], -deep, 0.045 - deep, one[2], one[3]]) for one in bars])
-        self._trim(frame, rows, paint, faces=(FRONT,))
+        rows = [np.column_stack([x0, x1, -deep, 0.045 - deep, z0, z1]) for x0, x1, z0, z1 in bars]
+        self._trim(frame, np.concatenate(rows), paint, faces=(FRONT,))
 
-    def _door(self, frame: Frame, hole: Doubles, paint: int, trim: int) -> None:
+    def _door(self, frame: Wall, hole: Doubles, paint: int, trim: int) -> None:
         left, right, low, high = hole
         back = 0.01 - SHOP_REVEAL
         boxes = [(left, right, back - 0.05, back, low, high)]
@@ -179,11 +157,11 @@ class Row:
         around = [(left - 0.16, left, 0.0, 0.07, low, high + 0.16), (right, right + 0.16, 0.0, 0.07, low, high + 0.16)]
         around += [
             (left - 0.24, right + 0.24, 0.0, 0.2, high + 0.16, high + 0.32),
-            (left, right, 0.0, 0.07, high, high + 0.16),
-        ]
-        self._trim(frame, np.array([*around, (left - 0.2, right + 0.2, 0.0, 0.34, low, low + 0.13)]), trim)
+            (left, right, 0.0, 0.07, high, high + 0.16), (left - 0.2, right + 0.2, 0.0, 0.34, low, low + 0.13),
+        ]  # fmt: skip
+        self._trim(frame, np.array(around), trim)
 
-    def _awning(self, frame: Frame, left: float, right: float, kind: int) -> None:
+    def _awning(self, frame: Wall, left: float, right: float, kind: int) -> None:
         along, out = np.array([[left, right, right, left]]), np.array([[1.15, 1.15, 0.14, 0.14]])
         up = np.array([[2.45, 2.45, 2.98, 2.98]])
         low, high = trim_rows(kind, 0.5)
@@ -193,42 +171,26 @@ class Row:
         self.walls.add(corners[:, ::-1] - [0.0, 0.0, 0.01], uvs)
         self._trim(frame, np.array([(left, right, 1.14, 1.15, 2.25, 2.45)]), kind, faces=(FRONT,))
 
-    def _roof(self, frame: Frame, left: float, right: float, high: float, kind: int, rng: np.random.Generator) -> None:
+    def _roof(self, frame: Wall, left: float, right: float, high: float, kind: int, rng: np.random.Generator) -> None:
         ridge = high + float(rng.uniform(2.0, 3.4))
         low, top = tile_rows(5.0)
-        for sign in (0, 1):
-            along = np.array([[left, right, right, left]])
-            edge, middle = (0.46, -DEPTH / 2.0) if sign == 0 else (-DEPTH, -DEPTH / 2.0)
-            out, up = np.array([[edge, edge, middle, middle]]), np.array([[high, high, ridge, ridge]])
-            uvs = np.stack([along / PERIOD, np.array([[low, low, top, top]])], axis=-1)
-            turn = 1 if sign == 0 else -1
+        along, up = np.array([[left, right, right, left]]), np.array([[high, high, ridge, ridge]])
+        uvs = np.stack([along / PERIOD, np.array([[low, low, top, top]])], axis=-1)
+        for edge, turn in ((0.46, 1), (-DEPTH, -1)):
+            out = np.array([[edge, edge, -DEPTH / 2.0, -DEPTH / 2.0]])
             self.walls.add(frame.world(along, out, up)[:, ::turn], uvs[:, ::turn])
         for at, turn in ((left, -1), (right, 1)):  # gables, down to the ground
             out = np.array([[0.0, -DEPTH, -DEPTH, 0.0], [0.0, -DEPTH, -DEPTH / 2.0, 0.0]])
             up = np.array([[0.0, 0.0, high, high], [high, high, ridge, high]])
             uvs = np.stack([-out / PERIOD, wall_row(kind, np.minimum(0.4 * up + GROUND_FLOOR, 16.9))], axis=-1)
-            self.walls.add(frame.world(at + 0.0 * out, out, up)[:, ::turn], uvs[:, ::turn])
-        back = np.array([[right, left, left, right]])
-        up = np.array([[0.0, 0.0, high, high]])
+            self.walls.add(frame.world(np.array(at), out, up)[:, ::turn], uvs[:, ::turn])
+        back, up = np.array([[right, left, left, right]]), np.array([[0.0, 0.0, high, high]])
         uvs = np.stack([back / PERIOD, wall_row(kind, 0.7 * up + GROUND_FLOOR)], axis=-1)
-        self.walls.add(frame.world(back, 0.0 * back - DEPTH, up), uvs)
+        self.walls.add(frame.world(back, np.array(-DEPTH), up), uvs)
         for place in rng.uniform(left + 1.0, right - 1.0, 2):
-            self._trim(
-                frame,
-                np.array([(place - 0.45, place + 0.45, -6.2, -5.4, ridge - 0.6, ridge + 1.1)]),
-                RED,
-                (FRONT, SIDES, TOP),
-            )
+            chimney = (place - 0.45, place + 0.45, -6.2, -5.4, ridge - 0.6, ridge + 1.1)
+            self._trim(frame, np.array([chimney]), RED, (FRONT, SIDES, TOP))
 
-    def _trim(
-        self, frame: Frame, rows: Doubles, kind: int, faces: tuple[str, ...] = (FRONT, SIDES, TOP, BOTTOM)
-    ) -> None:
+    def _trim(self, frame: Wall, rows: Doubles, kind: int, faces: tuple[str, ...] = SHOWN) -> None:
         low, high = trim_rows(kind, rows[:, 5] - rows[:, 4])
-        self.walls.boxes(
-            frame, rows, np.column_stack([rows[:, 0] / PERIOD, rows[:, 1] / PERIOD, low + 0.0 * high, high]), faces
-        )
-
-
-def _of_wall(rows: Doubles, kind: int) -> Doubles:
-    """Texture coordinates of rectangles of a front."""
-    return np.column_stack([rows[:, :2] / PERIOD, wall_row(kind, rows[:, 2:])])
+        self.walls.boxes(frame, rows, np.column_stack([rows[:, :2] / PERIOD, low + 0.0 * high, high]), faces)

@@ -64,11 +64,15 @@ def tint(color: Color | Doubles) -> Floats:
 @lru_cache(maxsize=1)
 def walls() -> Floats:
     """Paint fronts, trims and roofs: (h, w, 3) linear reflectance, row 0 at v = 1."""
-    strips = [_front(*one, seed) for seed, one in enumerate(WALLS)]
+    strips = [_front(*wall, seed) for seed, wall in enumerate(WALLS)]
     rows = round(TRIM / TEXEL)
     grain = _grain(rows * len(TRIMS), COLUMNS, 40)
     strips += [tint(color) * (1.0 + 0.22 * grain[rows * k : rows * (k + 1), :, None]) for k, color in enumerate(TRIMS)]
-    strips.append(_roof())
+    rows = round(TILES / TEXEL)
+    x, z = _places(rows, COLUMNS)
+    _, tone = _courses(x, z, 0.26, 0.3, 0.0, 77)
+    shade = (1.0 + 0.25 * tone) * np.where(z % 0.3 < 0.05, 0.55, 1.0) * (1.0 + 0.15 * _clouds(rows, COLUMNS, 30, 78))
+    strips.append(np.asarray(tint((0.19, 0.095, 0.065)) * shade[..., None], np.float32))
     return np.clip(np.concatenate(strips), 0.005, 0.9)[::-1]
 
 
@@ -97,14 +101,6 @@ def _front(laid: str, upper: Color, lower: Color, seed: int) -> Floats:
     splash = np.exp(-z / 0.35)
     worn = (1.0 - 0.30 * streaks) * (1.0 - 0.35 * splash) * (1.0 + 0.07 * cloud) * (1.0 + 0.10 * grain)
     return np.asarray(color * worn[..., None], np.float32)
-
-
-def _roof() -> Floats:
-    rows = round(TILES / TEXEL)
-    x, z = _places(rows, COLUMNS)
-    _, tone = _courses(x, z, 0.26, 0.3, 0.0, 77)
-    shade = (1.0 + 0.25 * tone) * np.where(z % 0.3 < 0.05, 0.55, 1.0) * (1.0 + 0.15 * _clouds(rows, COLUMNS, 30, 78))
-    return np.asarray(tint((0.19, 0.095, 0.065)) * shade[..., None], np.float32)
 
 
 def _courses(x: Floats, z: Floats, long: float, high: float, joint: float, seed: int) -> tuple[Doubles, Floats]:
@@ -167,7 +163,7 @@ def road(wet: bool, snow: bool = False) -> Floats:
     y = FRONTS[1] - (np.arange(rows) + 0.5) * GROUND_TEXEL
     fine, cloud = _grain(rows, columns, 300), _clouds(rows, columns, 40, 301)
     grain = 0.13 * fine + 0.10 * cloud
-    flat = [np.broadcast_to(one, (rows, columns)).ravel() for one in (x[None], y[:, None])]
+    flat = [np.broadcast_to(axis, (rows, columns)).ravel() for axis in (x[None], y[:, None])]
     dry = reflectance(flat[0], flat[1], grain.astype(np.float64).ravel())
     color = dry.reshape(rows, columns, 3).astype(np.float32)
     wide, high = x[None].astype(np.float32), y[:, None].astype(np.float32)

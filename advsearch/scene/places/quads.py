@@ -17,13 +17,9 @@ SLOPE = 0.35
 
 
 @dataclass(frozen=True)
-class Frame:
-    """A wall's own coordinates: along it, out of it, and up, in metres.
-
-    Attributes:
-        origin: (3,) where all three are 0.
-        out: (3,) unit vector, level, that the wall faces.
-    """
+class Wall:
+    """A wall's own coordinates: along it, out of it, and up, in metres from its origin (3,); `out` (3,) is the level
+    unit vector that it faces."""
 
     origin: tuple[float, float, float]
     out: tuple[float, float, float]
@@ -52,51 +48,42 @@ class Quads:
         self.uvs.append(np.broadcast_to(uvs, (*corners.shape[:2], 2)))
         self.normals.append(np.zeros_like(corners) if normals is None else normals)
 
-    def wall(self, frame: Frame, rows: Doubles, out: Doubles | float, uvs: Doubles) -> None:
-        """Add upright rectangles.
+    def level(self, x: tuple[float, float], y: tuple[float, float], z: float, uvs: Doubles, up: int = 1) -> None:
+        """Add a level rectangle, which faces up, or down where `up` is -1; texture coordinates (4, 2) of its corners,
+        counter-clockwise from the least x and y."""
+        corners = np.array([[(x[0], y[0], z), (x[1], y[0], z), (x[1], y[1], z), (x[0], y[1], z)]])
+        self.add(corners[:, ::up], uvs[None, ::up])
 
-        Args:
-            frame: of the wall.
-            rows: (N, 4) left, right, low and high.
-            out: (N,) how far out of the wall.
-            uvs: (N, 4) texture coordinates: left, right, low, high.
-        """
-        left, right, low, high = rows.T
-        along, up = np.stack([left, right, right, left], axis=1), np.stack([low, low, high, high], axis=1)
-        self.add(frame.world(along, np.reshape(out, (-1, 1)) + 0.0 * along, up), _around(uvs))
+    def wall(self, frame: Wall, rows: Doubles, out: Doubles | float, uvs: Doubles) -> None:
+        """Add upright rectangles (N, 4) at a wall: left, right, low and high, so far out of it (N,), with texture
+        coordinates (N, 4) of the same order."""
+        along, up = np.moveaxis(_around(rows), -1, 0)
+        self.add(frame.world(along, np.reshape(out, (-1, 1)), up), _around(uvs))
 
-    def boxes(self, frame: Frame, rows: Doubles, uvs: Doubles, faces: Sequence[str] = SHOWN) -> None:
-        """Add boxes.
-
-        Args:
-            frame: of the wall that they stand at.
-            rows: (N, 6) left, right, back, front, low, high.
-            uvs: (N, 4) as of `wall`, for the front; the other faces show a part of it.
-            faces: those that are there.
-        """
-        left, right, back, front, low, high = rows.T
+    def boxes(self, frame: Wall, rows: Doubles, uvs: Doubles, faces: Sequence[str] = SHOWN) -> None:
+        """Add boxes (N, 6) at a wall: left, right, back, front, low, high, with texture coordinates (N, 4) as of `wall`
+        for the front, of which the other faces show a part; only some faces are there."""
+        left, right, _, front, low, high = rows.T
         shown = _around(uvs)
         if FRONT in faces:
             self.wall(frame, rows[:, [0, 1, 4, 5]], front, uvs)
+        along, out = np.moveaxis(_around(rows[:, [0, 1, 3, 2]]), -1, 0)
         for face, up, turn in ((TOP, high, 1), (BOTTOM, low, -1)):
             if face in faces:
-                along, out = np.stack([left, right, right, left], 1), np.stack([front, front, back, back], 1)
-                placed = frame.world(along, out, up[:, None] + 0.0 * along)
-                self.add(placed[:, ::turn], shown[:, ::turn])
-        if SIDES in faces:
-            for at, turn in ((left, -1), (right, 1)):
-                out, up = np.stack([front, back, back, front], 1), np.stack([low, low, high, high], 1)
-                placed = frame.world(at[:, None] + 0.0 * out, out, up)
-                narrow = shown * [0.15, 1.0] + shown[:, :1] * [0.85, 0.0]
-                self.add(placed[:, ::turn], narrow[:, ::turn])
+                self.add(frame.world(along, out, up[:, None])[:, ::turn], shown[:, ::turn])
+        out, up = np.moveaxis(_around(rows[:, [3, 2, 4, 5]]), -1, 0)
+        narrow = shown * [0.15, 1.0] + shown[:, :1] * [0.85, 0.0]
+        for side, turn in ((left, -1), (right, 1)):
+            if SIDES in faces:
+                self.add(frame.world(side[:, None], out, up)[:, ::turn], narrow[:, ::turn])
 
     def swept(self, fallen: Quads) -> Quads:
         """Return those that do not face up, and add the others, which snow lies on, to `fallen`."""
         bare = Quads()
         for corners, uvs, normals in zip(self.corners, self.uvs, self.normals, strict=True):
             across = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
-            told: Bools = np.asarray(normals.any(axis=(1, 2)))
-            faced = np.where(told[:, None], normals.mean(axis=1), across)
+            shaded: Bools = np.asarray(normals.any(axis=(1, 2)))
+            faced = np.where(shaded[:, None], normals.mean(axis=1), across)
             lies = faced[:, 2] > SLOPE * np.linalg.norm(faced, axis=1)
             bare.add(corners[~lies], uvs[~lies], normals[~lies])
             fallen.add(corners[lies], 0.0 * uvs[lies] + 0.5, normals[lies])
@@ -120,4 +107,4 @@ class Quads:
 def _around(uvs: Doubles) -> Doubles:
     """(N, 4, 2) the corners of rectangles (N, 4) of texture coordinates: left, right, low, high."""
     left, right, low, high = np.atleast_2d(uvs).T
-    return np.stack([np.stack(one, axis=1) for one in ((left, low), (right, low), (right, high), (left, high))], axis=1)
+    return np.stack([np.stack([left, right, right, left], axis=1), np.stack([low, low, high, high], axis=1)], axis=-1)

@@ -36,13 +36,8 @@ WETNESS = 0.45
 
 
 def reflectance(x: Doubles, y: Doubles, grain: Doubles | None = None) -> Doubles:
-    """Return the linear reflectance (N, 3) of the ground at places (N,).
-
-    Args:
-        x: along the road.
-        y: across it.
-        grain: (N,) about 0, what makes asphalt uneven.
-    """
+    """Return the linear reflectance (N, 3) of the ground at x along the road and y across it (N,); `grain` about 0 (N,)
+    is what makes asphalt uneven."""
     grain = np.zeros_like(x) if grain is None else grain
     wheels = np.exp(-(((np.abs(y) - 0.75) / 0.3) ** 2)) + np.exp(-(((np.abs(y - 3.5) - 0.75) / 0.3) ** 2))
     value = 0.085 * (1.0 - 0.12 * wheels) * (1.0 + grain)
@@ -55,18 +50,14 @@ def reflectance(x: Doubles, y: Doubles, grain: Doubles | None = None) -> Doubles
     joint = (np.minimum(x % 0.6, (y + 10.0) % 0.4) < 0.016)[:, None]
     slabs = (0.3 * (1.0 + 0.35 * grain))[:, None] * np.array([1.0, 0.97, 0.92]) * np.where(joint, 0.6, 1.0)
     kerb = (0.38 * (1.0 + 0.3 * grain))[:, None] * np.where((x % 1.0 < 0.02)[:, None], 0.6, np.ones(3))
-    found: Doubles = np.where((off > 0.0)[:, None], np.where((off > 0.16)[:, None], slabs, kerb), color)
-    return np.where((np.abs(off) < 0.012)[:, None], 0.05, found)
+    shade: Doubles = np.where((off > 0.0)[:, None], np.where((off > 0.16)[:, None], slabs, kerb), color)
+    return np.where((np.abs(off) < 0.012)[:, None], 0.05, shade)
 
 
 @lru_cache(maxsize=4)
 def road(wet: bool, metres: float) -> MeshPart:
-    """Return the road.
-
-    Args:
-        wet: whether it is dark and reflects.
-        metres: of one object size, the scene's unit of length.
-    """
+    """Return the road, dark and reflecting where it is wet; `metres` are those of one object size, the scene's unit of
+    length."""
     corners = np.array([[-1.0, EDGES[0]], [1.0, EDGES[0]], [1.0, EDGES[1]], [-1.0, EDGES[1]]])
     places = corners * np.array([LENGTH / 2, 1.0])
     uvs = np.stack([places[:, 0] / PERIOD, (places[:, 1] - EDGES[0]) / (EDGES[1] - EDGES[0])], axis=1)
@@ -87,9 +78,12 @@ def _texture(wet: bool) -> Floats:
     grain = 0.9 * (_blurred(fine, 1) - 0.5) + 0.8 * (_blurred(fine, 12) - 0.5)
     x, y = np.meshgrid((np.arange(width) + 0.5) * TEXEL, EDGES[1] - (np.arange(height) + 0.5) * TEXEL)
     linear = reflectance(x.ravel(), y.ravel(), grain.ravel()).reshape(height, width, 3) * (WETNESS if wet else 1.0)
-    levels = np.round(linear_to_srgb(np.round(linear, 5).astype(np.float32)) * 255.0)
-    shown: Floats = np.asarray(levels, np.float32) / np.float32(255.0)
-    return shown
+    return shown(np.round(linear, 5).astype(np.float32))
+
+
+def shown(linear: Floats) -> Floats:
+    """Return linear values as display-referred multiples of 1/255."""
+    return np.asarray(np.round(linear_to_srgb(linear) * np.float32(255.0)) / np.float32(255.0), np.float32)
 
 
 def _blurred(values: Doubles, reach: int) -> Doubles:

@@ -12,11 +12,10 @@ from itertools import pairwise
 import numpy as np
 
 from advsearch.scene.assets import Doubles, Floats, Material
-from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.parts import MeshPart
 from advsearch.scene.places.paint import _clouds, _grain, tint
-from advsearch.scene.places.quads import FRONT, SHOWN, Frame, Quads
-from advsearch.scene.places.road import FLOOR
+from advsearch.scene.places.quads import FRONT, SHOWN, Quads, Wall
+from advsearch.scene.places.road import FLOOR, shown
 
 LOW, HIGH = (-1.75, -2.0, -0.75), (2.6, 1.9, 1.85)
 """Corners of the room."""
@@ -36,7 +35,7 @@ USUAL = 1000.0
 STRIP, TEXEL, COLUMNS = 0.5, 0.0125, 96
 """How high each strip of the texture is, how large a texel, and how many there are along a strip of 1.2 m."""
 LONG = TEXEL * COLUMNS
-PLANKS, PLASTER, OAK, WHITE, SOCKET = range(5)
+PLANKS, PLASTER, OAK, WHITE = range(4)
 COLORS = (
     (0.20, 0.115, 0.062), (0.62, 0.58, 0.51), (0.34, 0.19, 0.095), (0.66, 0.65, 0.62), (0.09, 0.09, 0.09),
     (0.32, 0.05, 0.04), (0.05, 0.11, 0.24), (0.07, 0.17, 0.10), (0.42, 0.30, 0.09), (0.50, 0.46, 0.38),
@@ -54,13 +53,19 @@ def room(metres: float, candelas: float | None, *, wet: bool, dark: bool) -> tup
     lamp = np.array((1.0, 0.82, 0.56), np.float32) * np.float32(SHADE if dark else 0.0) / unit
     outside = _outside() * np.float32(NIGHT if dark else DAY) / unit
     black, white = np.full((2, 2, 3), 0.02, np.float32), np.full((2, 2, 3), 0.8, np.float32)
+    ground, pane, ceiling = Quads(), Quads(), Quads()
+    _flat(ground, (LOW[0], HIGH[0]), (LOW[1], HIGH[1]), LOW[2], PLANKS)
+    _flat(ground, *TABLE, 0.0, OAK)
+    wall = Wall((0.0, HIGH[1] + REVEAL, 0.0), (0.0, -1.0, 0.0))
+    pane.wall(wall, np.array([[*WINDOW[0], *WINDOW[1]]]), 0.0, np.array([[0.0, 1.0, 0.0, 1.0]]))
+    _flat(ceiling, (0.3 - LAMP, 0.3 + LAMP), (-LAMP, LAMP), HIGH[2] - 0.06, WHITE, -1)
     made = (
-        (FLOOR, _ground(), texture, VARNISH, None),
+        (FLOOR, ground, texture, VARNISH, None),
         ("walls", _walls(), texture, MATT, None),
         ("furniture", _furniture(), texture, VARNISH, None),
         ("books", _books(), texture, MATT, None),
-        ("window", _pane(), black, VARNISH, outside),
-        ("lamp", _lamp(), white, MATT, lamp[None, None] if dark else None),
+        ("window", pane, black, VARNISH, outside),
+        ("lamp", ceiling, white, MATT, lamp[None, None] if dark else None),
     )
     return tuple(
         MeshPart(name, quads.mesh(metres), base, finish, emission=shine, laid=True)
@@ -86,8 +91,7 @@ def _texture() -> Floats:
             joint = (np.arange(rows) % 10 == 0)[:, None] | np.isin(halves, (0, COLUMNS // 2))
             tone = np.where(joint, 0.55 * tone, tone)
         strips.append(tint(color) * tone[..., None])
-    shown = linear_to_srgb(np.clip(np.concatenate(strips), 0.004, 0.9).astype(np.float32)[::-1])
-    return np.asarray(np.round(shown * np.float32(255.0)) / np.float32(255.0), np.float32)
+    return shown(np.clip(np.concatenate(strips), 0.004, 0.9).astype(np.float32)[::-1])
 
 
 def _outside() -> Floats:
@@ -110,28 +114,20 @@ def _rows(strip: int, low: Doubles | float, high: Doubles | float) -> tuple[Doub
 
 def _block(quads: Quads, x: tuple[float, float], y: tuple[float, float], z: tuple[float, float], strip: int) -> None:
     """Add a box with all its faces."""
-    low, high = _rows(strip, *z)
-    for out, rows in ((-1.0, (*x, -y[1], -y[0], *z)), (1.0, (-x[1], -x[0], y[0], y[1], *z))):
-        box = np.array([rows])
-        uvs = np.array([[rows[0] / LONG, rows[1] / LONG, float(low), float(high)]])
-        quads.boxes(Frame((0.0, 0.0, 0.0), (0.0, out, 0.0)), box, uvs, SHOWN if out < 0.0 else (FRONT,))
+    low, high = map(float, _rows(strip, *z))
+    for out, row in ((-1.0, (*x, -y[1], -y[0], *z)), (1.0, (-x[1], -x[0], y[0], y[1], *z))):
+        uvs = np.array([[row[0] / LONG, row[1] / LONG, low, high]])
+        faces = SHOWN if out < 0.0 else (FRONT,)
+        quads.boxes(Wall((0.0, 0.0, 0.0), (0.0, out, 0.0)), np.array([row]), uvs, faces)
 
 
 def _flat(quads: Quads, x: tuple[float, float], y: tuple[float, float], z: float, strip: int, up: int = 1) -> None:
     """Add a level rectangle that faces up or down, in stripes along y that show the strip over and over."""
     edges = np.linspace(*x, max(1, round((x[1] - x[0]) / (STRIP - 0.1))) + 1)
     for x0, x1 in pairwise(edges):
-        corners = np.array([[(x0, y[0], z), (x1, y[0], z), (x1, y[1], z), (x0, y[1], z)]])
         low, high = _rows(strip, x0, x1)
         along, across = np.array([y[0], y[0], y[1], y[1]]) / LONG + x0, np.array([low, high, high, low])
-        quads.add(corners[:, ::up], np.stack([along, across], axis=-1)[None, ::up])
-
-
-def _ground() -> Quads:
-    quads = Quads()
-    _flat(quads, (LOW[0], HIGH[0]), (LOW[1], HIGH[1]), LOW[2], PLANKS)
-    _flat(quads, *TABLE, 0.0, OAK)
-    return quads
+        quads.level((x0, x1), y, z, np.stack([along, across], axis=-1), up)
 
 
 def _walls() -> Quads:
@@ -139,29 +135,22 @@ def _walls() -> Quads:
     _flat(quads, (LOW[0], HIGH[0]), (LOW[1], HIGH[1]), HIGH[2], WHITE, -1)
     (left, right), (sill, head) = WINDOW
 
-    def wall(
-        frame: Frame, rows: list[tuple[float, float, float, float]], strip: int = PLASTER, out: float = 0.0
-    ) -> None:
-        given = np.array(rows)
-        uvs = np.column_stack([given[:, 0] / LONG, given[:, 1] / LONG, *_rows(strip, given[:, 2], given[:, 3])])
-        quads.wall(frame, given, out, uvs)
+    def wall(frame: Wall, *rows: tuple[float, float, float, float]) -> None:
+        places = np.array(rows)
+        uvs = np.column_stack([places[:, :2] / LONG, *_rows(PLASTER, places[:, 2], places[:, 3])])
+        quads.wall(frame, places, 0.0, uvs)
 
     heights = (LOW[2], HIGH[2])
     sides = (
-        (Frame((LOW[0], 0.0, 0.0), (1.0, 0.0, 0.0)), LOW[1], HIGH[1]),
-        (Frame((HIGH[0], 0.0, 0.0), (-1.0, 0.0, 0.0)), -HIGH[1], -LOW[1]),
-        (Frame((0.0, LOW[1], 0.0), (0.0, 1.0, 0.0)), -HIGH[0], -LOW[0]),
+        (Wall((LOW[0], 0.0, 0.0), (1.0, 0.0, 0.0)), LOW[1], HIGH[1]),
+        (Wall((HIGH[0], 0.0, 0.0), (-1.0, 0.0, 0.0)), -HIGH[1], -LOW[1]),
+        (Wall((0.0, LOW[1], 0.0), (0.0, 1.0, 0.0)), -HIGH[0], -LOW[0]),
     )
     for frame, begin, end in sides:
-        wall(frame, [(begin, end, *heights)])
-    lit = Frame((0.0, HIGH[1], 0.0), (0.0, -1.0, 0.0))
-    wall(
-        lit,
-        [
-            (LOW[0], left, *heights), (right, HIGH[0], *heights), (left, right, LOW[2], sill),
-            (left, right, head, HIGH[2]),
-        ],
-    )  # fmt: skip
+        wall(frame, (begin, end, *heights))
+    lit = Wall((0.0, HIGH[1], 0.0), (0.0, -1.0, 0.0))
+    wall(lit, (LOW[0], left, *heights), (right, HIGH[0], *heights))
+    wall(lit, (left, right, LOW[2], sill), (left, right, head, HIGH[2]))
     for frame, begin, end in (*sides, (lit, LOW[0], HIGH[0])):  # skirting boards
         uvs = np.array([[begin / LONG, end / LONG, *map(float, _rows(WHITE, 0.0, 0.09))]])
         quads.boxes(frame, np.array([[begin, end, 0.0, 0.015, LOW[2], LOW[2] + 0.09]]), uvs)
@@ -206,17 +195,4 @@ def _books() -> Quads:
                 wide, high, deep = rng.uniform(0.018, 0.05), rng.uniform(0.19, 0.30), rng.uniform(0.15, 0.23)
                 _block(quads, (front - 0.03 - deep, front - 0.03), (y, y + wide), (z, z + high), int(rng.choice(BOOKS)))
                 y += wide + 0.002
-    return quads
-
-
-def _pane() -> Quads:
-    quads, ((left, right), (low, high)) = Quads(), WINDOW
-    frame = Frame((0.0, HIGH[1] + REVEAL, 0.0), (0.0, -1.0, 0.0))
-    quads.wall(frame, np.array([[left, right, low, high]]), 0.0, np.array([[0.0, 1.0, 0.0, 1.0]]))
-    return quads
-
-
-def _lamp() -> Quads:
-    quads, z = Quads(), HIGH[2] - 0.06
-    _flat(quads, (0.3 - LAMP, 0.3 + LAMP), (-LAMP, LAMP), z, WHITE, -1)
     return quads

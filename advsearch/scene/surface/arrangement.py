@@ -31,36 +31,13 @@ from advsearch.scene.mitsuba_backend.texel_rays import Ints, Lobes, gather, meas
 from advsearch.scene.predictor import LinearMap
 from advsearch.scene.raster import rasterised
 from advsearch.scene.renderer import Renderer
-from advsearch.scene.surface.texels import (
-    BLURRED,
-    CELLS,
-    SIDE,
-    WIDTHS,
-    Texels,
-    between,
-    blurred,
-    directions,
-    irradiance,
-    looked_up,
-    on_ground,
-    on_mesh,
-    seen_of,
-    sky_of,
-    smoothed,
-    together,
-)
+from advsearch.scene.surface import texels
 from advsearch.scene.transport.matrix import bilinear
 
 
 class SurfaceView:
-    """What one camera sees: `rest`, and a sparse matrix from the fine grid, front and back, to the pixels.
-
-    Args:
-        seen: by several cameras.
-        number: of this one.
-        shape: rows and columns of the fine grid.
-        sides: 2 where the back of the surface has light of its own.
-    """
+    """What one of several cameras sees: `rest`, and a sparse matrix from the fine grid, front and (where it has light
+    of its own, 2 sides) back, to the pixels."""
 
     def __init__(self, seen: Seen, number: int, shape: tuple[int, int], sides: int = 1) -> None:
         self.rest, self.covered = seen.rest[number], seen.covered[number]
@@ -73,9 +50,8 @@ class SurfaceView:
         weights = shares * seen.weight[begin:end].numpy()[:, None]
         starts = np.searchsorted(pixel.numpy(), np.arange(height * width + 1)) * 4
         size = height * width, sides * shape[0] * shape[1]
-        self.matrix = scipy.sparse.csr_matrix(
-            (weights.ravel(), columns.ravel(), starts.astype(np.int32)), size, copy=False
-        )
+        entries = weights.ravel(), columns.ravel(), starts.astype(np.int32)
+        self.matrix = scipy.sparse.csr_matrix(entries, size, copy=False)
 
     def radiance(self, reflected: Tensor) -> Tensor:
         """Return (H, W, 3) for what the fine grid reflects (sides x cells, 3); differentiable in it."""
@@ -88,10 +64,13 @@ def product(matrix: scipy.sparse.csr_matrix, columns: Tensor) -> Tensor:
     def times(of: scipy.sparse.csr_matrix, values: Tensor) -> Tensor:
         return torch.from_numpy(of @ values.numpy())
 
-    found: Tensor = LinearMap.apply(partial(times, matrix), partial(times, matrix.T), columns)  # type: ignore[no-untyped-call]
-    return found
+    both_ways = partial(times, matrix), partial(times, matrix.T)
+    rows: Tensor = LinearMap.apply(*both_ways, columns)  # type: ignore[no-untyped-call]
+    return rows
 
 
+SIDE = 160
+"""Texels a side over the searched object."""
 GATHERED = 256
 """Rays from each texel that say what it sees."""
 BURIED = 0.3
@@ -110,12 +89,8 @@ FREE = CAMERAS | ON_PICTURE | {MAP, COLOR, "ground.reflectance"}
 
 @dataclass(frozen=True, eq=False)
 class Light:
-    """Light on the surfaces.
-
-    Attributes:
-        on_object: (cells of the fine grid, 3) irradiance; of the front and then of the back where that has its own.
-        lit: the rest, for look-ups.
-    """
+    """Light on the surfaces: (cells of the fine grid, 3) irradiance of the object's front, and then of its back where
+    that has its own; and the rest, for look-ups."""
 
     on_object: Tensor
     lit: Lit
@@ -131,47 +106,49 @@ class Light:
 
 
 class Arrangement:
-    """Object and surroundings as they stand, and what they see of each other and of the environment.
-
-    Args:
-        renderer: of the scene.
-        inputs: the scene's own, assembled, but for what may change.
-        texture: rows and columns of the base colour.
-        seed: number of the noise of the rays.
-    """
+    """Object and surroundings as they stand, and what they see of each other and of the environment. The inputs are the
+    scene's own, assembled, but for what may change; the texture's size is that of the base colour, the seed that of the
+    rays."""
 
     def __init__(self, renderer: Renderer, inputs: Mapping[str, Tensor], texture: tuple[int, int], seed: int) -> None:
         scene = renderer.scene
-        self._scene, self.inputs = scene, {name: one for name, one in inputs.items() if name not in ON_PICTURE}
+        self._scene, self.inputs = scene, {name: inputs[name] for name in inputs if name not in ON_PICTURE}
         scene.held(self.inputs)
         description = scene.made[0]
-        vertices, normals = (self._value(f"{OBJECT}.{what}").reshape(-1, 3).numpy() for what in ("vertices", "normals"))
-        mesh = description.meshes[OBJECT].mesh
-        charts = rasterised(mesh, SIDE)
-        some = [on_mesh(OBJECT, charts, vertices, normals)]
+        names = (f"{OBJECT}.vertices", f"{OBJECT}.normals")
+        shape = [self.inputs[name] if name in self.inputs else scene.base(name) for name in names]
+        vertices, normals = (values.reshape(-1, 3).numpy() for values in shape)
+        charts = rasterised(description.meshes[OBJECT].mesh, SIDE)
+        some = [texels.on_mesh(OBJECT, charts, vertices, normals)]
         if seen_from_behind(scene, OBJECT, some[0].places):
-            some = [on_mesh(OBJECT, charts, vertices, side * normals, side) for side in (1, -1)]
+            some = [texels.on_mesh(OBJECT, charts, vertices, side * normals, side) for side in (1, -1)]
         self.sides = len(some)
         middle = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
         photograph = description.photograph
         if description.number("ground.size") > 0.0:
             reach = math.inf if photograph is not None else description.number("ground.size") / 2.0
-            some.append(on_ground(GROUND, 0.0, reach, (float(middle[0]), float(middle[1]))))
+            some.append(texels.on_ground(GROUND, 0.0, reach, (float(middle[0]), float(middle[1]))))
         self._has_ground = len(some) > self.sides
-        self.texels: Texels = together(some)
+        self.texels: texels.LitTexels = texels.together(some)
         factor = max(1, math.ceil(FINE / min(texture)))
         self.fine = texture[0] * factor, texture[1] * factor
-        self._finer = None if factor == 1 else self._enlarging(texture)
+        self._finer: scipy.sparse.csr_matrix | None = None  # from the texels of a small texture to the fine grid
+        if factor > 1:
+            rows, columns = self.fine
+            y, x = np.meshgrid((np.arange(rows) + 0.5) / rows, (np.arange(columns) + 0.5) / columns, indexing="ij")
+            of_texel, shares = bilinear(np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float32), texture)
+            entries = shares.ravel(), of_texel.ravel(), np.arange(rows * columns + 1, dtype=np.int32) * 4
+            self._finer = scipy.sparse.csr_matrix(entries, (rows * columns, texture[0] * texture[1]))
         places, facing = self.texels.places, self.texels.normals
-        seen = gather(scene, self.texels.grids, CELLS, places, facing, GATHERED, seed)
-        self._sees = seen_of(seen, self.texels.of_cell, len(places))
+        seen = gather(scene, self.texels.grids, texels.CELLS, places, facing, GATHERED, seed)
+        self._sees = texels.seen_of(seen, self.texels.of_cell, len(places))
         self._between = [
-            between(some[side], charts, self.fine, vertices, (1 - 2 * side) * normals, self._buried(seen, side))
+            texels.between(some[side], charts, self.fine, vertices, (1 - 2 * side) * normals, self._buried(seen, side))
             for side in range(self.sides)
         ]
         if self._has_ground:
             above = np.asarray((seen[self.texels.of(self.sides)] >= len(self.texels.of_cell)).any(axis=1))
-            self._smooth = smoothed(some[-1], above)
+            self._smooth = texels.smoothed(some[-1], above)
         self.lobes = [self._measured()] * self.sides + [Lobes.matt()] * (len(some) - self.sides)
         self._photographed = None if photograph is None else description.capture_height
         self.to_map = torch.tensor(to_map(scene), dtype=torch.float32)
@@ -179,10 +156,7 @@ class Arrangement:
         model = description.camera_model
         if model is not None and "camera.lens" in self.inputs:
             model = model.with_numbers(self.inputs["camera.lens"])
-        self._views = Views(scene, self.texels.grids, self.lobes, WIDTHS, self._photographed, model, middle)
-
-    def _value(self, name: str) -> Tensor:
-        return self.inputs[name] if name in self.inputs else self._scene.base(name)
+        self._views = Views(scene, self.texels.grids, self.lobes, texels.WIDTHS, self._photographed, model, middle)
 
     def _buried(self, seen: Ints, side: int) -> Bools:
         """Which texels of a side of the object lie inside of something: they see nothing but backs, or much of them
@@ -201,28 +175,18 @@ class Arrangement:
         if opacity is not None:
             rows, columns = self.texels.grids[0].shape
             row, column = np.divmod(self.texels.cells[here], columns)
-            found = opacity[row * opacity.shape[0] // rows, column * opacity.shape[1] // columns]
-            every = every[found >= found.max()]
+            opaque = opacity[row * opacity.shape[0] // rows, column * opacity.shape[1] // columns]
+            every = every[opaque >= opaque.max()]
         at = every[len(every) // 2]
         return measured(self._scene, self.inputs, self.texels.grids[0], self.texels.places[at], self.texels.normals[at])
-
-    def _enlarging(self, texture: tuple[int, int]) -> scipy.sparse.csr_matrix:
-        """From the texels of a small texture to the fine grid."""
-        rows, columns = self.fine
-        y, x = np.meshgrid((np.arange(rows) + 0.5) / rows, (np.arange(columns) + 0.5) / columns, indexing="ij")
-        places, shares = bilinear(np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float32), texture)
-        starts = np.arange(rows * columns + 1, dtype=np.int32) * 4
-        return scipy.sparse.csr_matrix(
-            (shares.ravel(), places.ravel(), starts), (rows * columns, texture[0] * texture[1])
-        )
 
     def _seen_below(self, middle: np.ndarray) -> tuple[Tensor, Tensor]:
         """Which cells of the blurred maps (h, w) the ground hides, seen from the object's middle, and the directions
         (h, w, 3) in the map's axes in which its photograph has what is seen there."""
-        ways = directions(BLURRED)
+        ways = texels.directions(texels.BLURRED)
         world = ways @ self.to_map
         if not self._has_ground:
-            return torch.zeros(BLURRED, dtype=torch.bool), ways
+            return torch.zeros(texels.BLURRED, dtype=torch.bool), ways
         far = float(middle[2]) / (-world[..., 2]).clamp_min(1e-6)
         places = torch.from_numpy(middle).float() + world * far[..., None]
         reach = self._scene.made[0].number("ground.size") / 2.0 if self._photographed is None else math.inf
@@ -233,7 +197,7 @@ class Arrangement:
     @property
     def entries(self) -> int:
         """Of all matrices, for one colour channel."""
-        return sum(int(one.values().numel()) for one in (*self._sees, *self._between))
+        return sum(int(matrix.values().numel()) for matrix in (*self._sees, *self._between))
 
     @property
     def bytes(self) -> int:
@@ -242,16 +206,12 @@ class Arrangement:
 
     def look(self, cameras: Sequence[Mapping[str, Tensor]], light: Light) -> Callable[[], Seen]:
         """Begin to look through cameras under a light; see `Views`."""
-        self._stand()
+        self._scene.stand(self.inputs)
         return self._views(cameras, light.lit)
 
     def view(self, seen: Seen, number: int) -> SurfaceView:
         """Return what one of several cameras sees."""
         return SurfaceView(seen, number, self.fine, self.sides)
-
-    def _stand(self) -> None:
-        """Put object and surroundings back where they stand, if something has moved them since."""
-        self._scene.stand(self.inputs)
 
     def finer(self, color: Tensor) -> Tensor:
         """Return a base colour (h, w, 3) on the fine grid, (cells, 3); differentiable."""
@@ -261,14 +221,14 @@ class Arrangement:
     def light(self, padded: Tensor, color: Tensor) -> Light:
         """Return the light of an environment (H, W + 2, 3) where the object has a base colour (h, w, 3)."""
         with torch.no_grad():
-            sky = sky_of(padded)
+            sky = texels.sky_of(padded)
             direct = None
             if len(sky.hot[0]):
-                self._stand()
-                found = towards(self._scene, self.texels.places, self.texels.normals, sky.hot[0].numpy())
-                direct = torch.from_numpy(found)
+                self._scene.stand(self.inputs)
+                cosines = towards(self._scene, self.texels.places, self.texels.normals, sky.hot[0].numpy())
+                direct = torch.from_numpy(cosines)
             reflectance = self._reflectance(color, padded)
-            arriving = irradiance(self._sees, sky, direct, reflectance, BOUNCES)
+            arriving = texels.irradiance(self._sees, sky, direct, reflectance, BOUNCES)
             leaving = reflectance * arriving / math.pi
             shown, unhidden = sky.map, torch.ones(1, 3)
             if self._has_ground:
@@ -281,25 +241,25 @@ class Arrangement:
                 unhidden = rim.mean(dim=0, keepdim=True).clamp_min(1e-9)
                 seen = unhidden
                 if self._photographed is not None:
-                    seen = unhidden * looked_up(padded, below.reshape(-1, 3)).reshape(*BLURRED, 3)
+                    seen = unhidden * texels.looked_up(padded, below.reshape(-1, 3)).reshape(*texels.BLURRED, 3)
                 shown = torch.where(hidden[..., None], seen, shown)
-            on_object = torch.cat([one @ arriving[self.texels.of(side)] for side, one in enumerate(self._between)])
+            on_object = torch.cat([fine @ arriving[self.texels.of(side)] for side, fine in enumerate(self._between)])
             cells = torch.cat([leaving[torch.from_numpy(self.texels.of_cell)], unhidden])
-            return Light(on_object, lit_arrays(cells, padded, blurred(shown)))
+            return Light(on_object, lit_arrays(cells, padded, texels.blurred(shown)))
 
     def _reflectance(self, color: Tensor, padded: Tensor) -> Tensor:
         """(n, 3) of each texel, the gloss counted as if it were diffuse."""
         rows, columns = self.texels.grids[0].shape
         fine = self.finer(color).reshape(*self.fine, 3).permute(2, 0, 1)[None]
         pooled = functional.adaptive_avg_pool2d(fine, (rows, columns))[0].permute(1, 2, 0).reshape(-1, 3)
-        found = [pooled[torch.from_numpy(self.texels.cells[self.texels.of(0)])]] * self.sides
+        colors = [pooled[torch.from_numpy(self.texels.cells[self.texels.of(0)])]] * self.sides
         if self._has_ground:
             ground = self.texels.places[self.texels.of(self.sides)]
             if self._photographed is None:
-                found.append(srgb_to_linear(torch.tensor(self._scene.made[0].ground_color)).expand(len(ground), 3))
+                colors.append(srgb_to_linear(torch.tensor(self._scene.made[0].ground_color)).expand(len(ground), 3))
             else:
                 below = torch.from_numpy(ground) - torch.tensor([0.0, 0.0, self._photographed])
-                shown = looked_up(padded, below @ self.to_map.T)
-                found.append((shown * math.pi / unshadowed(padded[:, 1:-1]).clamp_min(1e-12)).clamp_max(WHITE))
-        shares = [torch.tensor(one.mean_shares) for one in self.lobes]
-        return torch.cat([one * share[0] + share[1] for one, share in zip(found, shares, strict=True)])
+                shown = texels.looked_up(padded, below @ self.to_map.T)
+                colors.append((shown * math.pi / unshadowed(padded[:, 1:-1]).clamp_min(1e-12)).clamp_max(WHITE))
+        shares = [torch.tensor(surface.mean_shares) for surface in self.lobes]
+        return torch.cat([color * share[0] + share[1] for color, share in zip(colors, shares, strict=True)])

@@ -16,7 +16,7 @@ from torch import Tensor
 from advsearch.files import scaled
 from advsearch.scene.description import OBJECT
 from advsearch.scene.mitsuba_backend.surface import RAYS
-from advsearch.scene.predictor import MOST_BYTES, NOISE, Predictor, differs
+from advsearch.scene.predictor import BETWEEN, MOST_BYTES, NOISE, Predictor, differs
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.surface.arrangement import CAMERAS, COLOR, FREE, MAP, Arrangement, Light, SurfaceView
 
@@ -128,7 +128,7 @@ class SurfaceRenderer(Predictor):
     def bytes(self) -> int:
         if self.fixed is not None:  # of its own: the rest is shared
             return self.fixed.bytes
-        return self.arrangement.bytes + sum(one.bytes for one in self.lights_kept.values())
+        return self.arrangement.bytes + sum(light.bytes for light in self.lights_kept.values())
 
     @property
     def lights(self) -> int:
@@ -155,30 +155,26 @@ class SurfaceRenderer(Predictor):
     def looks(self, inputs: Sequence[Mapping[str, Tensor]]) -> Iterator[Look]:
         """Look through the cameras of scene inputs; those under one environment in one launch, while the last launch's
         are made use of."""
-        lights = [self.kept_light(one) if self.fixed is None else (self.fixed, 1.0) for one in inputs]
+        lights = [self.kept_light(each) if self.fixed is None else (self.fixed, 1.0) for each in inputs]
         groups: dict[Light, list[int]] = {}
-        for number, (one, _) in enumerate(lights):
-            groups.setdefault(one, []).append(number)
-        cameras = [{name: one.get(name, self._base[name]) for name in CAMERAS if name in self._base} for one in inputs]
-        looks = (self.arrangement.look([cameras[number] for number in some], lit) for lit, some in groups.items())
+        for number, (light, _) in enumerate(lights):
+            groups.setdefault(light, []).append(number)
+        names = CAMERAS & self._base.keys()
+        cameras = [{name: each.get(name, self._base[name]) for name in names} for each in inputs]
+        looks = (self.arrangement.look([cameras[number] for number in some], light) for light, some in groups.items())
         begun = next(looks)
-        for lit, numbers in groups.items():
+        for light, numbers in groups.items():
             seen = begun()
             begun = next(looks, begun)
             for place, number in enumerate(numbers):
-                yield Look(number, self.arrangement.view(seen, place), lit, lights[number][1])
+                yield Look(number, self.arrangement.view(seen, place), light, lights[number][1])
 
     def shown(
         self, looks: Iterable[Look], inputs: Sequence[Mapping[str, Tensor]], color: Tensor, wholes: Sequence[Tensor]
     ) -> Tensor:
-        """Return the pictures (n, H, W, 3) sRGB of what cameras see; differentiable in the base colour.
-
-        Args:
-            looks: see `calibrates`.
-            inputs: of the scene, for each; their base colour does not count.
-            color: (h, w, 3) base colour.
-            wholes: (d,) configurations of the space, for what controls do to the finished picture.
-        """
+        """Return the pictures (n, H, W, 3) sRGB of what cameras see (`looks`) of a base colour (h, w, 3),
+        differentiable in that; by the inputs of the scene for each, whose base colour does not count, and the
+        configurations (d,), for what controls do to the finished picture."""
         fine, reflected, pictures = self.arrangement.finer(color), dict[Light, Tensor](), dict[int, Tensor]()
         for look in looks:
             if look.light not in reflected:
@@ -189,31 +185,22 @@ class SurfaceRenderer(Predictor):
 
     def pictures(self, us: Sequence[Tensor]) -> list[Tensor]:
         """Return pictures of configurations that differ in camera and environment alone, many in one launch."""
-        found = list[Tensor]()
+        pictures = list[Tensor]()
         with torch.no_grad():
             for begin in range(0, len(us), self.at_once):
                 some = us[begin : begin + self.at_once]
                 inputs = [self.inputs(u) for u in some]
-                found += self.shown(self.looks(inputs), inputs, self.there, some)
-        return found
+                pictures += self.shown(self.looks(inputs), inputs, self.there, some)
+        return pictures
 
     def radiance(self, inputs: Mapping[str, Tensor]) -> Tensor:
         (look,) = self.looks([inputs])
         return look.view.radiance(look.light.reflected(self.arrangement.finer(self.color(inputs)))) * look.factor
 
 
-PLACES = (0.02, 0.29, 0.61, 0.97)
-"""Places in the range of what varies that are checked for what they change."""
-
-
 def why_not(renderer: Renderer, varying: Collection[str]) -> str | None:
     """Why light on surfaces cannot predict the pictures of a renderer's space, in words; None if it may: how far it is
-    off is then for measurement.
-
-    Args:
-        renderer: which traces.
-        varying: names of the controls that vary; the others are searched, and may change base colours alone.
-    """
+    off is then for measurement. Some controls vary; the others are searched, and may change base colours alone."""
     reason = why_not_kept(renderer)
     if reason is not None:
         return reason
@@ -244,14 +231,14 @@ def why_not_kept(renderer: Renderer) -> str | None:
 
 def varied(renderer: Renderer, varying: Collection[str]) -> frozenset[str]:
     """The scene inputs that some controls, or groups of coordinates, change; by their names."""
-    found: set[str] = set()
+    changed: set[str] = set()
     with torch.no_grad():
         start = renderer.scene.assembly(renderer.space.inputs(renderer.start))
-        for value in PLACES:
+        for value in BETWEEN:
             u = renderer.start.clone()
             for group in renderer.space.groups:
                 if group.control in varying or group.name in varying:
                     u[group.coordinates] = value
             there = renderer.scene.assembly(renderer.space.inputs(u))
-            found |= {name for name in start.keys() | there.keys() if differs(start.get(name), there.get(name))}
-    return frozenset(found)
+            changed |= {name for name in start.keys() | there.keys() if differs(start.get(name), there.get(name))}
+    return frozenset(changed)

@@ -26,8 +26,6 @@ from advsearch.scene.mitsuba_backend.texel_rays import TexelGrid
 from advsearch.scene.raster import BORDER, Charts, rasterised
 from advsearch.scene.transport.matrix import by_rows
 
-SIDE = 160
-"""Texels a side over the searched object."""
 GROUND = 112
 """Texels a side over the ground."""
 NEAR = 12.0
@@ -46,7 +44,7 @@ BINOMIAL = (1, 4, 6, 4, 1)
 
 
 @dataclass(frozen=True, eq=False)
-class Texels:
+class LitTexels:
     """Where light is kept: those cells of all grids that lie on a surface.
 
     Attributes:
@@ -69,33 +67,27 @@ class Texels:
         return slice(self.begin[number], self.begin[number + 1])
 
 
-def together(some: Sequence[Texels]) -> Texels:
+def together(some: Sequence[LitTexels]) -> LitTexels:
     """Return the texels of several surfaces as one."""
-    first = np.cumsum([0] + [len(one.places) for one in some])
-    cells = np.cumsum([0] + [one.grids[0].count for one in some])
-    return Texels(
-        grids=tuple(replace(one.grids[0], first=int(cell)) for one, cell in zip(some, cells[:-1], strict=True)),
-        places=np.concatenate([one.places for one in some]),
-        normals=np.concatenate([one.normals for one in some]),
-        cells=np.concatenate([one.cells + cell for one, cell in zip(some, cells[:-1], strict=True)]),
-        of_cell=np.concatenate([one.of_cell + begin for one, begin in zip(some, first[:-1], strict=True)]),
-        begin=tuple(int(one) for one in first),
+    first = np.cumsum([0] + [len(each.places) for each in some])
+    cells = np.cumsum([0] + [each.grids[0].count for each in some])
+    return LitTexels(
+        grids=tuple(replace(each.grids[0], first=int(cell)) for each, cell in zip(some, cells[:-1], strict=True)),
+        places=np.concatenate([each.places for each in some]),
+        normals=np.concatenate([each.normals for each in some]),
+        cells=np.concatenate([each.cells + cell for each, cell in zip(some, cells[:-1], strict=True)]),
+        of_cell=np.concatenate([each.of_cell + begin for each, begin in zip(some, first[:-1], strict=True)]),
+        begin=tuple(int(each) for each in first),
     )
 
 
-def on_mesh(name: str, charts: Charts, vertices: Floats, normals: Floats, side: int = 0) -> Texels:
-    """Return the texels over a mesh.
-
-    Args:
-        name: of the shape.
-        charts: its texture coordinates, rasterised.
-        vertices, normals: (V, 3) in world space.
-        side: of its faces, as `TexelGrid` has it.
-    """
+def on_mesh(name: str, charts: Charts, vertices: Floats, normals: Floats, side: int = 0) -> LitTexels:
+    """Return the texels over a mesh with vertices and normals (V, 3) in world space and rasterised texture coordinates;
+    the side of its faces as `TexelGrid` has it."""
     place, normal = _surface(charts, vertices, normals)
     number = np.cumsum(charts.covered.ravel()) - 1
     rows, columns = np.nonzero(charts.covered)
-    return Texels(
+    return LitTexels(
         grids=(TexelGrid(name, 0, charts.covered.shape, None, side),),
         places=place[rows, columns],
         normals=normal[rows, columns],
@@ -105,17 +97,14 @@ def on_mesh(name: str, charts: Charts, vertices: Floats, normals: Floats, side: 
     )
 
 
-def on_ground(name: str, height: float, reach: float, middle: tuple[float, float]) -> Texels:
-    """Return the texels over a level plane, small under the object and large far off.
-
-    Args:
-        name: of the shape.
-        height: of the plane.
-        reach: half its side.
-        middle: x and y of the object.
-    """
+def on_ground(name: str, height: float, reach: float, middle: tuple[float, float]) -> LitTexels:
+    """Return the texels over a level plane at a height, with half its side as `reach`: small under the object's middle
+    (x, y), and large far off."""
     reach = min(reach, NEAR)
-    rate = _rate(reach / (FINEST * GROUND / 2.0))
+    ratio, rate, high = reach / (FINEST * GROUND / 2.0), 1e-3, 20.0
+    for _ in range(60):  # bisect for sinh(rate) / rate = ratio; the rate stays small where that is 1 or less
+        half = 0.5 * (rate + high)
+        rate, high = (half, high) if math.sinh(half) / half < ratio else (rate, half)
     scale = reach / math.sinh(rate)
     share = (np.arange(GROUND) + 0.5) * 2.0 / GROUND - 1.0
     along = scale * np.sinh(rate * share)
@@ -124,11 +113,11 @@ def on_ground(name: str, height: float, reach: float, middle: tuple[float, float
     up = np.broadcast_to(np.array([0.0, 0.0, 1.0], dtype=np.float32), places.shape).copy()
     grid = TexelGrid(name, 0, (GROUND, GROUND), (middle[0], middle[1], scale, rate))
     every = np.arange(GROUND * GROUND)
-    return Texels((grid,), places, up, every, every, (0, GROUND * GROUND))
+    return LitTexels((grid,), places, up, every, every, (0, GROUND * GROUND))
 
 
 def between(
-    texels: Texels,
+    texels: LitTexels,
     charts: Charts,
     shape: tuple[int, int],
     vertices: Floats,
@@ -141,8 +130,7 @@ def between(
     space, and facing the same way.
 
     Args:
-        texels: of the mesh alone, or with this mesh first.
-        charts: as they were rasterised for its texels.
+        texels: of the mesh alone, or with this mesh first; `charts` as they were rasterised for these.
         shape: rows and columns of the finer grid.
         vertices, normals: (V, 3) in world space.
         buried: (n,) texels that lie inside of something, whose darkness does not count outside.
@@ -181,15 +169,11 @@ def between(
     return by_rows(scipy.sparse.coo_matrix((weight[taken].astype(np.float32), (cell, chosen[taken])), size).tocsr())
 
 
-def smoothed(ground: Texels, lit: Bools) -> Tensor:
+def smoothed(ground: LitTexels, lit: Bools) -> Tensor:
     """Return the matrix (cells x texels of a ground) that smooths its light, by the binomial of 5 x 5 texels.
 
-    Those that see nothing of the sky lie under something. What is next to it takes no part of their darkness, which a
-    look-up beside the edge would mix in.
-
-    Args:
-        ground: its texels alone.
-        lit: (n,) which of them see the sky; none of them is the same as all.
+    Those that see nothing of the sky (not `lit`, (n,); none is the same as all) lie under something. What is next to it
+    takes no part of their darkness, which a look-up beside the edge would mix in.
     """
     side = ground.grids[0].shape[0]
     inside = (lit if lit.any() else ~lit).reshape(side, side)
@@ -226,17 +210,8 @@ def _nearest(covered: Bools) -> Ints:
     from scipy import ndimage
 
     rows, columns = ndimage.distance_transform_edt(~covered, return_distances=False, return_indices=True)
-    found: Ints = (rows * covered.shape[1] + columns).ravel()
-    return found
-
-
-def _rate(ratio: float) -> float:
-    """The rate for which sinh(rate) / rate is a ratio, by bisection; small where that is 1 or less."""
-    low, high = 1e-3, 20.0
-    for _ in range(60):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if math.sinh(middle) / middle < ratio else (low, middle)
-    return low
+    nearest: Ints = (rows * covered.shape[1] + columns).ravel()
+    return nearest
 
 
 CELLS = (32, 64)
@@ -259,14 +234,12 @@ LUMINANCE = torch.tensor([0.2126, 0.7152, 0.0722])
 
 @dataclass(frozen=True, eq=False)
 class SkyLight:
-    """An environment, cut for look-ups.
+    """An environment (H, W + 2, 3), as the scene takes it, cut for look-ups.
 
     Attributes:
-        padded: (H, W + 2, 3), as the scene takes it.
         cells: (rows x columns, 3) mean radiance of each of `CELLS`, without what is hot.
         map: `BLURRED`, (h, w, 3).
-        hot: (k, 3) unit directions in the map's own axes towards what is hot, and (k, 3) radiance times solid angle
-            of each.
+        hot: (k, 3) unit directions in the map's own axes towards what is hot, and (k, 3) radiance times solid angle.
     """
 
     padded: Tensor
@@ -308,7 +281,7 @@ def _hot(radiance: Tensor, power: Tensor) -> tuple[Tensor, Tensor]:
     number = torch.arange(HOT_RAYS, dtype=torch.float64)
     even = [(number * step % HOT_RAYS + 0.5) / HOT_RAYS for step in SPREAD]
     down, beside = (
-        torch.where(one < 0.5, (2.0 * one).sqrt() - 1.0, 1.0 - (2.0 - 2.0 * one).sqrt()) for one in even
+        torch.where(part < 0.5, (2.0 * part).sqrt() - 1.0, 1.0 - (2.0 - 2.0 * part).sqrt()) for part in even
     )  # with a tent's density in [-1, 1]
     polar = ((row + down) * (math.pi / (rows - 1))).clamp(0.0, math.pi)
     across = (column + 0.5 + beside) * (2.0 * math.pi / columns)
@@ -333,7 +306,7 @@ def blurred(radiance: Tensor) -> Tensor:
     rows, columns = radiance.shape[:2]
     polar = (torch.arange(rows) + 0.5) * math.pi / rows
     frequency = torch.arange(columns // 2 + 1)
-    found = []
+    maps = []
     for width in WIDTHS:
         sigma = width / math.sqrt(2.0)
         apart = (polar[:, None] - polar[None, :]).square() / (2.0 * sigma**2)
@@ -341,8 +314,8 @@ def blurred(radiance: Tensor) -> Tensor:
         down = down / down.sum(dim=1, keepdim=True)
         across = torch.exp(-0.5 * (frequency[None, :] * sigma / polar.sin()[:, None]).square())
         spectrum = torch.fft.rfft((down @ radiance.reshape(rows, -1)).reshape(rows, columns, 3), dim=1)
-        found.append(torch.fft.irfft(spectrum * across[..., None], n=columns, dim=1))
-    return torch.stack(found).clamp_min(0.0)
+        maps.append(torch.fft.irfft(spectrum * across[..., None], n=columns, dim=1))
+    return torch.stack(maps).clamp_min(0.0)
 
 
 def directions(size: tuple[int, int]) -> Tensor:
@@ -356,39 +329,34 @@ def directions(size: tuple[int, int]) -> Tensor:
 def irradiance(
     seen: tuple[Tensor, Tensor], sky: SkyLight, direct: Tensor | None, reflectance: Tensor, bounces: int
 ) -> Tensor:
-    """Return the irradiance (n, 3) of texels.
+    """Return the irradiance (n, 3) of texels with some reflectance (n, 3), after so many bounces from texel to texel.
 
     Args:
         seen: what they see: of the sky (n, cells) and of each other (n, n), sparse, times the cosine and pi.
-        sky: the environment.
         direct: (n, k) cosines towards what is hot where it is visible; None where nothing is.
-        reflectance: (n, 3) of the texels.
-        bounces: how often light goes from texel to texel.
     """
     of_sky, of_each_other = seen
     first = of_sky @ sky.cells
     if direct is not None:
         first = first + direct @ sky.hot[1]
-    found = first
+    arriving = first
     for _ in range(bounces):
-        found = first + of_each_other @ (reflectance * found / math.pi)
-    return found
+        arriving = first + of_each_other @ (reflectance * arriving / math.pi)
+    return arriving
 
 
 def seen_of(columns: npt.NDArray[np.int32], of_cell: Ints, texels: int) -> tuple[Tensor, Tensor]:
     """Return the sparse matrices of `irradiance` from what rays met, as `gather` has it."""
     count, rays = columns.shape
-    row = np.repeat(np.arange(count), rays)
-    flat = columns.ravel()
-    found = []
+    row, flat = np.repeat(np.arange(count), rays), columns.ravel()
     of_sky, of_texel = flat >= len(of_cell), (flat >= 0) & (flat < len(of_cell))
-    for taken, column, width in (
-        (of_sky, flat[of_sky] - len(of_cell), CELLS[0] * CELLS[1]),
-        (of_texel, of_cell[flat[of_texel]], texels),
-    ):
+
+    def matrix(taken: Bools, column: Ints, width: int) -> Tensor:
         values = np.full(len(column), math.pi / rays, dtype=np.float32)
-        found.append(by_rows(scipy.sparse.coo_matrix((values, (row[taken], column)), (count, width)).tocsr()))
-    return found[0], found[1]
+        return by_rows(scipy.sparse.coo_matrix((values, (row[taken], column)), (count, width)).tocsr())
+
+    sky = matrix(of_sky, flat[of_sky] - len(of_cell), CELLS[0] * CELLS[1])
+    return sky, matrix(of_texel, of_cell[flat[of_texel]], texels)
 
 
 def looked_up(padded: Tensor, ways: Tensor) -> Tensor:

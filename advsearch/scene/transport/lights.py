@@ -24,7 +24,7 @@ from advsearch.scene.assembly import ON_PICTURE
 from advsearch.scene.geometry import real_harmonics
 from advsearch.scene.gradients import Group
 from advsearch.scene.parts import PATTERN, PluginPart
-from advsearch.scene.predictor import NOISE, Predictor, differs
+from advsearch.scene.predictor import BETWEEN, NOISE, Predictor, differs
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.transport.matrix import SPP, LinearRenderer, Tick, linear_inputs, passes
 
@@ -38,8 +38,6 @@ PROBED = 64
 TINY = 1e-30
 FEW = 4
 """Every so many rows and columns of a map are looked at first."""
-BETWEEN = (0.02, 0.29, 0.61, 0.97)
-"""Places in the range of a continuous parameter at which its effect on the inputs is looked up."""
 
 Inputs = Mapping[str, Tensor]
 
@@ -64,8 +62,8 @@ class Lighting:
     Attributes:
         groups: by `control.parameter`, the inputs that it changes; none where only the finished picture changes.
         harmonic: those that add spherical harmonics to the environment.
-        bright: of the other ones that change a map, their coordinates and what these are where it is brightest: a
-            basis map must not be black in a channel.
+        bright: of the others that change a map, their coordinates and what these are where it is brightest: a basis map
+            must not be black in a channel.
     """
 
     groups: Mapping[str, frozenset[str]]
@@ -75,14 +73,14 @@ class Lighting:
     @property
     def moved(self) -> frozenset[str]:
         """The inputs that are light and move."""
-        return frozenset(name for names in self.groups.values() for name in names) - ON_PICTURE
+        return frozenset().union(*self.groups.values()) - ON_PICTURE
 
     def at_its_brightest(self, u: Tensor) -> Tensor:
         """Return a configuration with as much light of the environment as there can be."""
-        found = u.detach().clone()
+        lit = u.detach().clone()
         for coordinates, values in self.bright:
-            found[coordinates] = values
-        return found
+            lit[coordinates] = values
+        return lit
 
 
 def lighting(renderer: Renderer) -> Lighting:
@@ -169,31 +167,28 @@ def _harmonic_maps(like: Tensor) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class Span:
-    """Basis maps of an environment, and how a map is put together from them.
-
-    Attributes:
-        maps: (k, H, W, 3), all at least zero.
-    """
+    """Basis maps of an environment (k, H, W, 3), all at least zero, and how a map is put together from them."""
 
     maps: Tensor
 
     def weights(self, lit: Tensor) -> Tensor:
         """Return (k, 3): the weights with which the maps come nearest to (H, W, 3); differentiable."""
         flat = lit.permute(2, 0, 1).reshape(3, -1, 1)
-        if len(self.maps) == 1:  # it is a multiple of the one map, which one texel of each channel tells
-            return (flat[..., 0].gather(1, self._brightest) / self.maps[0].amax(dim=(0, 1))[:, None].clamp_min(TINY)).T
-        found: Tensor = (self._inverse @ flat)[..., 0].T
-        return found
+        if len(self.maps) == 1:  # it is a multiple of the one map, which the brightest texel of each channel tells
+            brightest, most = self._brightest
+            return (flat[..., 0].gather(1, brightest) / most.clamp_min(TINY)).T
+        weights: Tensor = (self._inverse @ flat)[..., 0].T
+        return weights
 
     def map(self, weights: Tensor) -> Tensor:
         """Return the map (H, W, 3) of weights (k, 3)."""
-        found: Tensor = torch.einsum("khwc,kc->hwc", self.maps, weights)
-        return found
+        return torch.einsum("khwc,kc->hwc", self.maps, weights)
 
     @cached_property
-    def _brightest(self) -> Tensor:
-        """(3, 1): the brightest texel of the first map in each channel."""
-        return self.maps[0].reshape(-1, 3).argmax(dim=0)[:, None]
+    def _brightest(self) -> tuple[Tensor, Tensor]:
+        """The brightest texel of the first map in each channel (3, 1), and how bright it is."""
+        flat = self.maps[0].reshape(-1, 3)
+        return flat.argmax(dim=0)[:, None], flat.amax(dim=0)[:, None]
 
     @cached_property
     def _inverse(self) -> Tensor:
@@ -202,37 +197,25 @@ class Span:
         sine = torch.sin((torch.arange(height) + 0.5) * torch.pi / height)[:, None].expand(height, width).reshape(-1)
         columns = self.maps.permute(3, 0, 1, 2).reshape(3, count, -1).double()
         weighted = columns * sine
-        found: Tensor = torch.linalg.pinv(weighted @ columns.transpose(1, 2)) @ weighted
-        return found.float()
+        return (torch.linalg.pinv(weighted @ columns.transpose(1, 2)) @ weighted).float()
 
 
 # ---- pictures -------------------------------------------------------------------------------------------------------
 
 
 class Lights:
-    """The lights of a scene of which some move, each as what it is alone.
-
-    Args:
-        renderer: of the scene.
-        lighting: what moves.
-        inputs: of a configuration: its map is the environment's first basis map.
-
-    Attributes:
-        alone: the inputs of each light; all others are dark there.
-    """
+    """The lights of a scene of which some move, each as what it is alone: `alone` has the inputs of each, and all
+    others are dark there. The map of the inputs that it is made with is the environment's first basis map."""
 
     def __init__(self, renderer: Renderer, lighting: Lighting, inputs: Inputs) -> None:
         patterns = {name for name in renderer.scene.names if name.endswith(PATTERN)}  # light that stands still here
         every = light_inputs(renderer) | patterns
         own = {name: inputs[name] if name in inputs else renderer.scene.base(name) for name in sorted(every)}
-        dark = {name: torch.zeros_like(value) for name, value in own.items()}
-        still = {
-            name: value
-            for name, value in own.items()
-            if name in patterns or (name not in lighting.moved and bool((value > 0.0).any()))
-        }
-        self._lamps = sorted(lighting.moved & every - {ENVIRONMENT})
-        lit = ENVIRONMENT in lighting.moved
+        dark, moved = {name: torch.zeros_like(value) for name, value in own.items()}, lighting.moved
+        shining = {name for name, value in own.items() if name not in moved and bool((value > 0.0).any())}
+        still = {name: value for name, value in own.items() if name in patterns | shining}
+        self._lamps = sorted(moved & every - {ENVIRONMENT})
+        lit = ENVIRONMENT in moved
         self._still = bool(still) or not (self._lamps or lit)
         self.alone: list[Inputs] = [{**dark, **still}] if self._still else []
         self.alone += [{**dark, name: torch.ones(3)} for name in self._lamps]
@@ -245,29 +228,23 @@ class Lights:
                 whole = (there > 0.0) | (start <= 0.0 if start.shape == there.shape else torch.zeros_like(there).bool())
                 maps = torch.cat([maps, _harmonic_maps(there) * whole.to(torch.float32)])
             self._span = Span(maps)
-            self.alone += [{**dark, ENVIRONMENT: one} for one in maps]
+            self.alone += [{**dark, ENVIRONMENT: basis} for basis in maps]
 
     def weights(self, inputs: Inputs) -> Tensor:
         """Return how much of each light there is in a configuration, (lights, 3); differentiable."""
-        found = [torch.ones(1, 3)] if self._still else []
-        found += [inputs[name].reshape(1, 3) for name in self._lamps]
+        weights = [torch.ones(1, 3)] if self._still else []
+        weights += [inputs[name].reshape(1, 3) for name in self._lamps]
         if self._span is not None:
-            found.append(self._span.weights(inputs[ENVIRONMENT]))
-        return torch.cat(found)
+            weights.append(self._span.weights(inputs[ENVIRONMENT]))
+        return torch.cat(weights)
 
 
 class BasisRenderer(Predictor):
     """Puts pictures together from one basis picture a light.
 
     Where base colours are searched too, each light has matrices of its own, so that radiance is bilinear in both: to
-    first order in the base colours, under any light.
-
-    Args:
-        traced: the renderer that traces paths.
-        u: where base colours are linearised; what does not move is as it is there.
-        seed: number of the noise.
-        tick: told of samples a pixel as they are traced, `samples_to_collect` in all.
-        moving: what moves; None looks.
+    first order in the base colours, under any light. Arguments as of `LinearRenderer`; what does not move is as it is
+    at u, and `moving` is what moves; None looks.
     """
 
     def __init__(
@@ -286,18 +263,11 @@ class BasisRenderer(Predictor):
             self._lights = Lights(traced, moving, brightest)
             linear = traced.scene.assembly(traced.space.inputs(u)).keys() & linear_inputs(traced)
             elsewhere = {name for name in linear if not name.endswith(PATTERN)}  # projectors are in the first alone
-            self._of_each = [
-                LinearRenderer(
-                    traced,
-                    u,
-                    seeds.stream(seed, "light", number),
-                    tick,
-                    names=elsewhere if number else linear,
-                    light=alone,
-                )
-                for number, alone in enumerate(self._lights.alone)
-            ]
-        self.non_finite = sum(one.non_finite for one in self._of_each)
+            self._of_each: list[LinearRenderer] = []
+            for number, alone in enumerate(self._lights.alone):
+                noise, names = seeds.stream(seed, "light", number), elsewhere if number else linear
+                self._of_each.append(LinearRenderer(traced, u, noise, tick, names=names, light=alone))
+        self.non_finite = sum(light.non_finite for light in self._of_each)
 
     @property
     def lights(self) -> int:
@@ -306,14 +276,14 @@ class BasisRenderer(Predictor):
 
     @property
     def entries(self) -> int:
-        return sum(one.entries for one in self._of_each)
+        return sum(light.entries for light in self._of_each)
 
     @property
     def bytes(self) -> int:
-        return sum(one.bytes for one in self._of_each)
+        return sum(light.bytes for light in self._of_each)
 
     def radiance(self, inputs: Inputs) -> Tensor:
-        pictures = [one.radiance(inputs) for one in self._of_each]
+        pictures = [light.radiance(inputs) for light in self._of_each]
         radiance = torch.einsum("lc,lhwc->hwc", self._lights.weights(inputs), torch.stack(pictures)[..., :3])
         return torch.cat([radiance, pictures[0][..., 3:]], dim=-1)
 
@@ -323,12 +293,8 @@ HAZE = "there is haze"
 
 
 def why_not(renderer: Renderer, varying: Collection[str] = ()) -> str | None:
-    """Why pictures of a renderer's space cannot be predicted, in words; None if they can.
-
-    Args:
-        varying: names of controls that stand still for each matrix, whatever they change. Beside them light may not
-            move.
-    """
+    """Why pictures of a renderer's space cannot be predicted, in words; None if they can. Controls that vary stand
+    still for each matrix, whatever they change; beside them light may not move."""
     plan, linear = renderer.plan, linear_inputs(renderer)
     searched = [group for group in plan.groups if group.control not in varying]
     lit = {} if varying else lighting(renderer).groups

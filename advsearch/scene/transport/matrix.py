@@ -45,12 +45,8 @@ COARSE = 8
 
 
 class Halves:
-    """A picture in 16 bits a number, in multiples of its mean, so that it may be as bright as it likes.
-
-    Args:
-        picture: any shape.
-        small: unpack it each time it is asked for; otherwise once, where each step of a search asks.
-    """
+    """A picture, of any shape, in 16 bits a number, in multiples of its mean, so that it may be as bright as it likes;
+    if `small` it is unpacked each time it is asked for, otherwise once, where each step of a search asks."""
 
     def __init__(self, picture: Tensor, small: bool = True) -> None:
         mean = float(picture.abs().mean()) if picture.numel() else 0.0
@@ -64,13 +60,9 @@ class Halves:
 
 
 class ColouredRows:
-    """A sparse matrix for three colour channels whose rows are shares times a colour; filled by `add`, then finished.
-
-    Args:
-        rows, columns: its size.
-        small: keep it in 16 bits a share, and as many a column where there are no more than 65,536; it is unpacked for
-            each product.
-    """
+    """A sparse matrix (rows, columns) for three colour channels whose rows are shares times a colour; filled by `add`,
+    then finished. If `small`, it is kept in 16 bits a share, and as many a column where there are no more than 65,536,
+    and unpacked for each product."""
 
     def __init__(self, rows: int, columns: int, small: bool) -> None:
         self._shape, self._small = (rows, columns), small
@@ -95,14 +87,8 @@ class ColouredRows:
         return small if self._small else small + 10 * self.entries + 12 * self._shape[0] + 4 * self._shape[1]
 
     def add(self, rows: Ints, columns: Ints, shares: Floats, weights: Floats) -> None:
-        """Add entries.
-
-        Args:
-            rows: (n,), ascending.
-            columns: (n, k) that take part in each, several of which may be the same.
-            shares: (n, k), how much each of them has of it.
-            weights: (n, 3).
-        """
+        """Add entries in rows (n,), ascending: the columns (n, k) that take part in each, several of which may be the
+        same, with shares (n, k), and weights (n, 3)."""
         if not len(rows):
             return
         begin = np.searchsorted(rows, np.arange(self._shape[0] + 1)) * columns.shape[1]
@@ -150,22 +136,15 @@ class ColouredRows:
 
 
 class TextureTransport:
-    """From a change of a base colour to the change of radiance, and back. Filled by `add`, then finished.
-
-    Args:
-        picture: height and width in pixels.
-        texture: height and width in texels.
-        small: keep it in as little memory as there is room for one of many matrices.
-    """
+    """From a change of a base colour (height and width in texels) to the change of radiance (in pixels), and back.
+    Filled by `add`, then finished; if `small`, in as little memory as there is room for one of many matrices."""
 
     def __init__(self, picture: tuple[int, int], texture: tuple[int, int], *, small: bool = False) -> None:
         self._picture, self._texture = picture, texture
         self._cells = (-(-texture[0] // COARSE), -(-texture[1] // COARSE))
         # texels of each cell along one side, of which the last one may have fewer
-        tall, wide = (
-            (texels - COARSE * torch.arange(cells)).clamp(max=COARSE).to(torch.float32)
-            for texels, cells in zip(texture, self._cells, strict=True)
-        )
+        sides = zip(texture, self._cells, strict=True)
+        tall, wide = ((texels - COARSE * torch.arange(cells)).clamp(max=COARSE).float() for texels, cells in sides)
         self._in_cell = (tall[:, None] * wide[None, :])[:, :, None]
         pixels = picture[0] * picture[1]
         self._first = ColouredRows(pixels, texture[0] * texture[1], small)
@@ -181,13 +160,13 @@ class TextureTransport:
 
     def add(self, vertices: Sequence[Vertices], share: float) -> None:
         """Add a pass of paths, vertices by their place in the path; it counts as this share of the samples."""
+        rows, columns = self._cells
         for vertex in vertices:
-            seen = vertex.only(vertex.sharp)
+            seen, scattered = vertex.only(vertex.sharp), vertex.only(~vertex.sharp)
             texels, shares = bilinear(seen.uv.numpy(), self._texture)
             weights = seen.weight.numpy() * np.float32(share)
             self._first.add(seen.pixel.numpy(), texels.astype(np.int64), shares, weights)
-            scattered = vertex.only(~vertex.sharp)
-            uv, (rows, columns) = scattered.uv.numpy() % 1.0, self._cells
+            uv = scattered.uv.numpy() % 1.0
             column = np.floor(uv[:, 0] * columns).astype(np.int64).clip(0, columns - 1)
             row = np.floor(uv[:, 1] * rows).astype(np.int64).clip(0, rows - 1)
             cell = (row * columns + column)[:, None]
@@ -195,19 +174,15 @@ class TextureTransport:
             self._later.add(scattered.pixel.numpy(), cell, np.ones_like(cell, dtype=np.float32), weights)
 
     def finish(self, smooth: Smooth | None = None) -> None:
-        """End the collecting.
-
-        Args:
-            smooth: takes the noise out of a picture: what a change of all texels by one does to the picture is one.
-                None leaves the colours of the rows as they were sampled.
-        """
+        """End the collecting. `smooth` takes the noise out of a picture: what a change of all texels by one does to the
+        picture is one. None leaves the colours of the rows as they were sampled."""
         self._first.finish(self._picture, smooth)
         self._later.finish(self._picture, smooth)
 
     def __call__(self, change: Tensor) -> Tensor:
         """Return the change of radiance (H, W, 3) for a change of the base colour (h, w, 3); differentiable."""
-        found: Tensor = LinearMap.apply(self.times, self.transposed_times, change)  # type: ignore[no-untyped-call]
-        return found
+        radiance: Tensor = LinearMap.apply(self.times, self.transposed_times, change)  # type: ignore[no-untyped-call]
+        return radiance
 
     def times(self, change: Tensor) -> Tensor:
         """Return J times (h, w, 3), as (H, W, 3)."""
@@ -239,16 +214,16 @@ def by_rows(matrix: scipy.sparse.csr_matrix) -> Tensor:
 def bilinear(uv: Floats, texture: tuple[int, int]) -> tuple[npt.NDArray[np.int32], Floats]:
     """The four texels (n, 4) of the bilinear lookup at texture coordinates (n, 2), which repeats at the border, by
     their places in the flat texture; and their shares (n, 4)."""
+
+    def both(at: Floats, count: int) -> tuple[list[npt.NDArray[np.int32]], list[Floats]]:
+        """The texels on either side, along one axis, and their shares."""
+        first, share = np.floor(at).astype(np.int32), (at - np.floor(at)).astype(np.float32)
+        return [first % count, (first + 1) % count], [1.0 - share, share]
+
     height, width = texture
-    x, y = uv[:, 0] * width - 0.5, uv[:, 1] * height - 0.5
-    left, low = np.floor(x), np.floor(y)
-    right_share, high_share = (x - left).astype(np.float32), (y - low).astype(np.float32)
-    across = [left.astype(np.int32) % width, (left.astype(np.int32) + 1) % width]
-    down = [low.astype(np.int32) % height, (low.astype(np.int32) + 1) % height]
+    (across, wide), (down, tall) = both(uv[:, 0] * width - 0.5, width), both(uv[:, 1] * height - 0.5, height)
     columns = np.stack([row * width + column for row in down for column in across], axis=1)
-    beside, above = [1.0 - right_share, right_share], [1.0 - high_share, high_share]
-    shares: Floats = np.stack([tall * wide for tall in above for wide in beside], axis=1)
-    return columns, shares
+    return columns, np.stack([high * broad for high in tall for broad in wide], axis=1)
 
 
 SPP = 128
@@ -279,7 +254,6 @@ class Linearised:
         there: the inputs where it was linearised.
         applied: the inputs that belong to the picture, not to the scene.
         base: the picture there, linear radiance, and coverage where there is a backdrop.
-        non_finite: values that were not finite and were set to zero.
     """
 
     transports: Mapping[str, TextureTransport]
@@ -326,21 +300,16 @@ class LinearRenderer(Predictor):
         if collected is None:
             with torch.no_grad():
                 collected = _collected(traced.like(), u, seed, tick, spp, quick, names, light)
-        self.collected, self.non_finite = collected, collected.non_finite
-
-    @property
-    def there(self) -> dict[str, Tensor]:
-        """The inputs where it was linearised."""
-        return self.collected.there
+        self.collected, self.non_finite, self.there = collected, collected.non_finite, collected.there
 
     @property
     def entries(self) -> int:
-        return sum(one.entries for one in self.collected.transports.values())
+        return sum(transport.entries for transport in self.collected.transports.values())
 
     @property
     def bytes(self) -> int:
         height, width = self.traced.formation.resolution
-        return sum(one.bytes for one in self.collected.transports.values()) + 8 * height * width
+        return sum(transport.bytes for transport in self.collected.transports.values()) + 8 * height * width
 
     def let_go(self, space: InputSpace) -> None:
         """Let go of the scene, which only tracing takes; the pictures stay, and `space` is the same without a scene."""
@@ -376,17 +345,21 @@ def _collected(
     inputs = renderer.scene.assembly(renderer.space.inputs(u))
     applied = {name: value for name, value in inputs.items() if name in ON_PICTURE}
     traced = {name: value for name, value in inputs.items() if name not in ON_PICTURE} | dict(light)
-    linear = [name for name in traced if name in (linear_inputs(renderer) if names is None else names)]
-    there = {name: traced[name].clone() for name in linear}
+    linear = linear_inputs(renderer) if names is None else names
+    there = {name: value.clone() for name, value in traced.items() if name in linear}
     transports = {
         name: TextureTransport((height, width), (value.shape[0], value.shape[1]), small=quick)
         for name, value in there.items()
     }
     hide = "backdrop.color" in applied
+
+    def finished(base: Tensor) -> Linearised:
+        return Linearised(transports, there, applied, Halves(base, small=quick), renderer.non_finite - before)
+
     if not transports:
         base = renderer.rendered(traced, seed, spp, hide)
         tick(spp)
-        return Linearised(transports, there, applied, Halves(base, small=quick), renderer.non_finite - before)
+        return finished(base)
     samples, count = passes(renderer, spp)
     traces: list[Paths] = []
     for name, transport in transports.items():
@@ -394,7 +367,7 @@ def _collected(
             noise = seeds.stream(seed, f"transport {name}", number)
             paths = renderer.scene.transport(traced, name, noise, samples)
             transport.add(paths.vertices, 1.0 / count)
-            if sum(one.bytes for one in transports.values()) + 8 * height * width > scaled(MOST_BYTES):
+            if sum(kept.bytes for kept in transports.values()) + 8 * height * width > scaled(MOST_BYTES):
                 raise TransportTooLargeError(f"{TOO_LARGE} {scaled(MOST_BYTES) / 2**30:g} GiB")
             traces.append(replace(paths, vertices=[]))
             tick(samples)
@@ -411,8 +384,7 @@ def _collected(
 
     for transport in transports.values():
         transport.finish(smooth)
-    base = torch.cat([clean, seen.coverage], dim=-1) if hide else clean
-    return Linearised(transports, there, applied, Halves(base, small=quick), renderer.non_finite - before)
+    return finished(torch.cat([clean, seen.coverage], dim=-1) if hide else clean)
 
 
 def linear_inputs(renderer: Renderer) -> frozenset[str]:

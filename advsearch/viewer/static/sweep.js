@@ -615,8 +615,8 @@
       const values = Array.from(counts.all, (all, k) => (state.measure === "count" ? all : state.measure === "margin" ? (counts.margins[k] ? counts.margin[k] / counts.margins[k] : null) : counts.judged[k] ? counts.right[k] / counts.judged[k] : null));
       const finite = values.filter((value) => value !== null);
       const [low, high] = state.measure === "accuracy" ? [0, 1] : finite.length ? [Math.min(...finite), Math.max(...finite)] : [0, 1];
-      // The darkest colour is the worst: the smallest accuracy, the largest margin.
-      const shade = (value) => (state.measure === "margin" ? 1 - (value - low) / (high - low || 1) : (value - low) / (high - low || 1));
+      // The darkest colour is the worst: the smallest accuracy, the smallest margin.
+      const shade = (value) => (value - low) / (high - low || 1);
       const area = across.labels.length * up.labels.length, stop = [...(state.cell || [0, 0, 0])];
       this.cells = { across, up, by };
       clearTimeout(this.waits);
@@ -710,7 +710,7 @@
 
     legend(low, high, shade) {
       const steps = Array.from({ length: 9 }, (_, k) => low + ((high - low) * k) / 8);
-      const unit = { accuracy: "accuracy in %", margin: "mean margin; above 0: wrong", count: "configurations" }[this.state.measure];
+      const unit = { accuracy: "accuracy in %", margin: "mean margin; below 0: wrong", count: "configurations" }[this.state.measure];
       const text = (value) => (this.state.measure === "accuracy" ? percentNumber(value) : short(Number(value.toPrecision(2))));
       this.parts.legend.replaceChildren(make("span", {}, unit), ...steps.map((value, k) => make("span", { class: "swatch", style: colour(shade(value)) }, k % 4 ? "" : text(value))));
     }
@@ -758,7 +758,7 @@
       const state = this.state, { across, up, by } = this.cells;
       const { right, margin, source } = this.table.columns, kept = this.kept, found = [];
       let all = 0;
-      const sign = state.order === "worst" ? 1 : -1, sorted = state.order.startsWith(BY) && this.table.parameters.find((one) => BY + one.name === state.order);
+      const sign = state.order === "best" ? 1 : -1, sorted = state.order.startsWith(BY) && this.table.parameters.find((one) => BY + one.name === state.order);
       const better = (a, b) => sign * (value(a) - value(b)) || b - a;
       const numbers = sorted ? sorted.data : margin;
       const value = (k) => (numbers[k] === numbers[k] ? numbers[k] : -sign * Infinity);

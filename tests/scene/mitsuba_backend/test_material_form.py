@@ -219,4 +219,4 @@ def test_the_same_seed_gives_the_same_gradient_and_another_one_another() -> None
 
 def test_the_limits_are_stated_with_what_they_cost() -> None:
     assert LIMITS
-    assert all(limit.what and limit.measured for limit in LIMITS)
+    assert all(limit and measured for limit, measured in LIMITS.items())
