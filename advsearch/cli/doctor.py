@@ -24,7 +24,7 @@ from pathlib import Path
 
 from advsearch import __version__, threads
 from advsearch.cli import output
-from advsearch.cli.commands import Command
+from advsearch.cli.commands import PlainCommand
 from advsearch.errors import AdvsearchError
 from advsearch.registry import OWN_FOLDER
 from advsearch.scene.mitsuba_backend import llvm
@@ -262,4 +262,4 @@ def _print_table(parts: list[Component], good: bool) -> None:
     console.print("Everything that is necessary works." if good else "[red]Something necessary does not work.[/]")
 
 
-DOCTOR = Command(_doctor, (output.add_flags,))
+DOCTOR = PlainCommand(_doctor, (output.add_flags,))

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from advsearch.cli import output
-from advsearch.cli.commands import Command, argument
+from advsearch.cli.commands import PlainCommand, argument
 from advsearch.cli.output import at_work, output_errors
 from advsearch.described import rounded
 from advsearch.errors import InputError, UnknownNameError
@@ -191,7 +191,7 @@ def _table(args: argparse.Namespace, out: Path | None, by_name: str) -> int:
     return output.say(args.json, facts, text, sys.stderr)
 
 
-EXPORT = Command(
+EXPORT = PlainCommand(
     _export,
     (
         argument("run", metavar="RUN", help="a run's name or folder"),

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from advsearch.cli import commands, output
-from advsearch.cli.commands import Command, QuestionCommand, argument
+from advsearch.cli.commands import PlainCommand, QuestionCommand, argument
 from advsearch.cli.flags import add_settings
 from advsearch.cli.output import at_work, raw
 from advsearch.errors import InputError, UnknownNameError
@@ -248,7 +248,7 @@ def _set_usage(parser: argparse.ArgumentParser) -> None:
     parser.usage = "advsearch show [--json] RUN [--picture] | control NAME | policy NAME | task NAME | recipe NAME"
 
 
-SHOW = Command(
+SHOW = PlainCommand(
     _show,
     (
         _set_usage,
@@ -344,7 +344,7 @@ def first_doc_line(entry: Any) -> str:
     return (inspect.getdoc(documented) or "").partition("\n")[0]
 
 
-LIST = Command(
+LIST = PlainCommand(
     _list,
     (argument("kind", nargs="?", default="all", choices=[*REGISTRIES, "all"], help="default: all"), output.add_flags),
 )
@@ -384,7 +384,7 @@ def class_names(model: str, labels: str | None) -> tuple[str, ...]:
     return loaded.labels
 
 
-LABELS = Command(
+LABELS = PlainCommand(
     _labels,
     (
         argument("word", metavar="WORD", nargs="?", help="what the names should be like; all without it"),

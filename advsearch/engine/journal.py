@@ -29,7 +29,7 @@ from advsearch.engine.problem import Prepared, Problem
 from advsearch.engine.record import LOST, judged, judgement_of, trial_row
 from advsearch.errors import ClusterError, InputError
 from advsearch.models import Model
-from advsearch.models.address import Asked
+from advsearch.models.address import AskedModel
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row, Told
 from advsearch.scene.formation import levels_of
@@ -137,7 +137,7 @@ def check_made_of(
     several = [one.module.models if isinstance(one.module, Ensemble) else (one,) for one in models]
     networks = [one for some in several for one in some]
     for one in networks:
-        if isinstance(one.module, Asked):
+        if isinstance(one.module, AskedModel):
             one.module.keep_in(run.store)
     now: dict[str, Any] = {f"model {one.name}": {"weights": weights_digest(one)} for one in networks}
     now |= {name: _function(one) for name, one in (functions or {}).items() if one is not None}
