@@ -82,7 +82,6 @@ def _mesh_file(file: str, inside: Contents) -> Understood:
 
 
 def _slow(whole: ObjectAsset) -> list[str]:
-    """Return what of an object makes searches slower, and why."""
     features = {"what it lets light through": whole.opacity, "its normal map": whole.normal_map}
     features["its emission"] = whole.emission
     slow = [name for name, feature in features.items() if feature is not None]

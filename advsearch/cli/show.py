@@ -35,7 +35,6 @@ if TYPE_CHECKING:
 
 
 def _show(args: argparse.Namespace) -> int:
-    """Print the result of a run, a control's parameters, or the options of a policy or a task."""
     if args.picture and (args.json or len(args.what) > 1):
         raise InputError("--picture: draws the pictures of one run, after its text; give one run, and leave --json out")
     match args.what:
@@ -104,7 +103,6 @@ def _photos_text(table: PhotoAgreement) -> str:
 
 
 def _show_unfinished(run: Listed, as_json: bool) -> int:
-    """Say what a run is, how far it has come and how to go on."""
     go_on = output.go_on_command(run.path) if run.begun and run.state == "stopped" else None
     what = run.command
     if run.object:

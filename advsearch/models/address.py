@@ -274,7 +274,6 @@ class Line:
         return count
 
     def _together(self, bodies: Sequence[bytes]) -> list[dict[str, Any] | Exception]:
-        """What is answered to each, or why nothing is."""
 
         def sent(body: bytes) -> dict[str, Any] | Exception:
             try:

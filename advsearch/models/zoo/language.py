@@ -204,7 +204,6 @@ def _tokens(
 
 
 def _say_what_begins_another(tokens: Sequence[Sequence[int]], names: Sequence[str], name: str) -> None:
-    """Warn of a name whose tokens begin another's: its likelihood is that of both."""
     for (first, short), (second, long) in permutations(enumerate(tokens), 2):
         if list(long[: len(short)]) == list(short):
             warn(

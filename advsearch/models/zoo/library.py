@@ -289,7 +289,7 @@ class Loaded:
         """Return what is done to pictures, of the size in a part of the network's ``config`` if no other is known."""
         side = getattr(config, "image_size", None)
         sides = (side, side) if isinstance(side, int) else tuple(side or ())
-        return Processing(**{**({"input_size": sides} if sides else {}), **self.described})  # type: ignore[typeddict-item]
+        return Processing(**{**({"input_size": sides} if sides else {}), **self.described})
 
     def source(self, ask: Ask, *, boxes: bool = False, **fields: Any) -> Source:
         """Return the source of the network as `Adapted` asks it, given pictures as it wants them; `fields` go to
