@@ -40,11 +40,11 @@ def posed(part: MeshPart, inputs: Mapping[str, Tensor]) -> Shape:
     own = {key.removeprefix(begin): value.detach().cpu() for key, value in inputs.items() if key.startswith(begin)}
     places = dict(zip(("vertices", "normals"), MovingMesh(part.mesh, part.to_world).place(None, None), strict=True))
     rows = {name: own.get(name, flat).reshape(-1, 3).to(torch.float32).numpy() for name, flat in places.items()}
-    color = part.base_color
+    mesh, color = replace(part.mesh, vertices=rows["vertices"], normals=rows["normals"]), part.base_color
     if "base_color" in own:
         color = linear_to_srgb(own["base_color"].clamp(0.0, 1.0)).numpy()
     material = replace(part.material, **{key: float(own[key]) for key in vars(part.material) if key in own})
-    return replace(part, mesh=replace(part.mesh, **rows), base_color=color, material=material, to_world=np.eye(4))
+    return replace(part, mesh=mesh, base_color=color, material=material, to_world=np.eye(4))
 
 
 def glb(meshes: Sequence[Shape]) -> bytes:
@@ -142,7 +142,8 @@ def _y_up(vectors: Floats) -> Floats:
 
 
 def _levels(color: Floats) -> Levels:
-    return np.uint8(np.clip(color, 0.0, 1.0) * 255.0 + 0.5)
+    levels: Levels = np.uint8(np.clip(color, 0.0, 1.0) * 255.0 + 0.5)
+    return levels
 
 
 def _cut_out_png(color: Levels, opacity: Levels) -> bytes:

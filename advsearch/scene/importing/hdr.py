@@ -137,8 +137,8 @@ def _chosen(
     name, header, held = min(layers, key=rank)
     others = ", ".join(shown(layer) for layer, _, _ in layers[:20] if layer != name)
     taken = f"of its layers {shown(name)} is taken; left out: " if name else "layers are left out: "
-    wanted = ("R", "G", "B") if "R" in held else ("Y", "RY", "BY")
-    return header, {key: held[key] for key in wanted if key in held}, [taken + others] if others else []
+    keys = ("R", "G", "B") if "R" in held else ("Y", "RY", "BY")
+    return header, {key: held[key] for key in keys if key in held}, [taken + others] if others else []
 
 
 def _colored(planes: Mapping[str, Plane], size: tuple[int, ...]) -> dict[str, Plane]:

@@ -231,7 +231,7 @@ def read_ply(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
     surfaces = [*reader.textures(names, plain=tint is None), ImportedSurface()]
     parts = []
     mapped = np.full((len(at), 3), -1) if uvs is None else uvs.index
-    for chosen in alike(number, (mapped >= 0).all(axis=1)):
+    for chosen in alike(number, np.asarray((mapped >= 0).all(axis=1))):
         surface, colors = surfaces[number[chosen[0]]], None if tint is None else tint[chosen]
         if colors is not None and surface.texture is not None:
             if colors.min() < 1.0:
