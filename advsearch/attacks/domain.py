@@ -21,7 +21,7 @@ TOLERANCE = 2e-6
 
 @dataclass(frozen=True)
 class Block:
-    """One contiguous slice of u and how far it may go.
+    """One contiguous slice of u and how far it may go. InputError: a value is outside what is said here.
 
     Attributes:
         size: number of elements, at least 1.
@@ -34,9 +34,6 @@ class Block:
         options: over 0 for a discrete choice among so many: u means option floor(u * options). Such a block has
             size 1, norm "box" and the whole unit interval; it has no direction that is uphill.
         reach: length of one whole step in a "box", over 0; None for half the diagonal of the bounds.
-
-    Raises:
-        InputError: a value is outside what is said here.
     """
 
     size: int

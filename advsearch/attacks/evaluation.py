@@ -122,11 +122,7 @@ class Evaluation:
 
     @property
     def said(self) -> Judgement:
-        """What the task says.
-
-        Raises:
-            RuntimeError: there is no task, or something else was wanted.
-        """
+        """What the task says; a RuntimeError where there is no task, or something else was wanted."""
         if self.judgement is None:
             raise RuntimeError("this evaluation has no judgement")
         return self.judgement

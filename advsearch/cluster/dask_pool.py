@@ -13,10 +13,11 @@ import time
 from collections.abc import Callable, Collection, Iterator, Mapping
 from concurrent.futures import Future
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from queue import SimpleQueue
-from typing import Any, NamedTuple
+from typing import Any
 
 from advsearch import threads
 from advsearch.cluster import Executor, Pool, SchedulerGoneError, Work, WorkerDiedError
@@ -46,7 +47,8 @@ CONFIG = {
 NO_WORKER = ("NoValidWorkerError", "NoWorkerError")  # that end a call whose worker is not there
 
 
-class Site(NamedTuple):
+@dataclass(frozen=True)
+class Site:
     """Where workers are, in a user's words: the address of a scheduler that runs, or what starts a cluster and with how
     many workers (None: as it starts); and keywords of Dask's `Security`."""
 

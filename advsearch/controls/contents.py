@@ -282,10 +282,8 @@ class ContentsControl(NumberControl):
                 bounds[name] = (spec.low, spec.high)
         least, most = sum(low for low, _ in bounds.values()), sum(high for _, high in bounds.values())
         if least > 1.0 + TOTAL or (len(bounds) == len(INGREDIENTS) and most < 1.0 - TOTAL):
-            got = ", ".join(
-                f"{name} {low:g}" + (f" to {high:g}" if low < high else "")
-                for name, (low, high) in sorted(bounds.items(), key=lambda item: INGREDIENTS.index(item[0]))
-            )
+            ends = {name: dict.fromkeys(f"{end:g}" for end in bounds[name]) for name in INGREDIENTS if name in bounds}
+            got = ", ".join(f"{name} {' to '.join(pair)}" for name, pair in ends.items())
             raise InputError(
                 f"`controls` {self.name}: expected proportions of water, milk and coffee that add up to 1, got {got}; "
                 "change one of them or leave one out"
@@ -307,9 +305,11 @@ class ContentsControl(NumberControl):
 
     def proportions(self, cuts: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Cut the stick: coordinates in [0, 1] by ingredient to shares that add up to one; differentiable."""
-        return self._in_turn(
-            cuts[INGREDIENTS[0]].device, lambda name, low, high: low + (high - low).clamp_min(0.0) * cuts[name]
-        )
+
+        def cut_off(name: str, low: Tensor, high: Tensor) -> Tensor:
+            return low + (high - low).clamp_min(0.0) * cuts[name]
+
+        return self._in_turn(cuts[INGREDIENTS[0]].device, cut_off)
 
     def cuts(self, shares: Mapping[str, float]) -> dict[str, float]:
         """Return the coordinates whose shares are nearest to some, one ingredient after the other."""

@@ -193,8 +193,6 @@ class OcclusionControl(NumberControl):
         sizes = {"true_size": placed.size, "true_distance": placed.distance}
         return hidden | {name: measure(value, "object sizes") for name, value in sizes.items()}
 
-    # ---- inside -----------------------------------------------------------------------------------------------------
-
     def _candidates(self) -> tuple[str, ...]:
         """Every occluder that can be chosen; each is a part of the scene."""
         if self.chosen["object"] is not None:

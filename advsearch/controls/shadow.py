@@ -103,8 +103,6 @@ class ShadowControl(NumberControl):
         far = self._distance(values, so_far)
         return {"true_distance": measure(0.0 if far is None else far, "object sizes, 0 where it is put away")}
 
-    # ---- inside -----------------------------------------------------------------------------------------------------
-
     def _pose(self, values: Values, far: float) -> Tensor:
         right, up, outwards = torch.from_numpy(self._axes(values)).to(values["x"])
         turn = torch.deg2rad(values["turn"])

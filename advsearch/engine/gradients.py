@@ -347,12 +347,12 @@ def attempts(group: Group) -> list[tuple[str, float]]:
     """
     forced, steps = "forced" in group.reason, {group.step}
     tries = [(name, 1.0) for name in ([group.estimator] if forced else compared(group.valid, group.size))]
-    wide = next((name for name in ("differences", "secant") if (name, 1.0) in tries), None)
-    for factor in () if wide is None else FACTORS[1:]:
+    wide = [name for name in ("differences", "secant") if (name, 1.0) in tries][:1]
+    for factor in FACTORS[1:]:
         step = min(factor * group.step, STEP_RANGE[1])
         if step not in steps:
             steps.add(step)
-            tries.append((wide, factor))
+            tries += [(name, factor) for name in wide]
     return tries
 
 

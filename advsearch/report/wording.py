@@ -11,7 +11,7 @@ from advsearch.described import NOT_A_NUMBER
 from advsearch.settings import split_names
 
 if TYPE_CHECKING:
-    from advsearch.runs.results import ConditionRow, Formation, Interval, SharedWork, VerifiedRate
+    from advsearch.runs.results import ConditionRow, ControlGroup, Formation, Interval, SharedWork, VerifiedRate
 
 
 CLASSIFICATION, DETECTION, SEGMENTATION = "classification", "detection", "segmentation"
@@ -281,9 +281,12 @@ def rate_text(rated: VerifiedRate) -> str:
     return f"{rate}, and {nothing}" if nothing else rate
 
 
-def no_numbers(count: int) -> str:
-    """Return what a table adds to a rate where outputs are not numbers."""
-    return f", {count} not a number" if count else ""
+def rated_cells(rated: VerifiedRate | ControlGroup) -> list[str]:
+    """Return a rate and its interval, for a table: ``["20/20", "83-100 %"]``; of outputs that are not numbers, how
+    many."""
+    number = rated.successes if hasattr(rated, "successes") else rated.correct
+    nothing = f", {rated.not_a_number} not a number" if rated.not_a_number else ""
+    return [f"{number}/{rated.trials}{nothing}", interval_text(rated.interval)]
 
 
 def tally(what: str, number: int, trials: int, not_a_number: int = 0) -> str:

@@ -73,11 +73,8 @@ OF_A_SCENE = frozenset(
 
 def read_camera(spec: str) -> CameraModel:
     """Read a camera's model from a file; of several cameras in it that which is named, as in ``camchain.yaml#cam1`` and
-    ``cameras.txt#3``.
-
-    Raises FileFormatError: the file is missing, is none of these kinds, has a model that is not one of ours, numbers
-    that no camera has, or an entry that makes another picture and is not read.
-    """
+    ``cameras.txt#3``. Raises FileFormatError: the file is missing, is none of these kinds, has a model that is not one
+    of ours, numbers that no camera has, or an entry that makes another picture and is not read."""
     path, _, which = spec.partition("#")
     ending = Path(path).suffix.lower()
     if ending in CAMERAS and Path(path).is_file():
@@ -143,7 +140,6 @@ def read_json(path: str, text: str) -> Any:
 
 
 def _xml(path: str, text: str) -> dict[str, Any]:
-    """What OpenCV writes as XML, in the form of its YAML."""
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise FileFormatError(f"{path}: declares a document type or entities, which no camera needs; remove it")
     try:
@@ -164,7 +160,6 @@ def _xml(path: str, text: str) -> dict[str, Any]:
 
 
 def _chosen(path: str, which: str, cameras: Mapping[str, Any]) -> Any:
-    """The camera that is asked for, or the only one."""
     names = list(map(str, cameras))
     listed = ", ".join(names[:8]) + (", ..." if len(names) > 8 else "")
     first = f"{path}#{names[0]}"
@@ -250,16 +245,14 @@ def _of_kalibr(spec: str, entries: Entries, beside: Sequence[str] = ()) -> Camer
     names = ("k1", "k2", "k3", "k4") if kind == FISHEYE else ("k1", "k2", "p1", "p2")
     width, height = entries.numbers("resolution", entries.there("resolution"), (2,))
     numbers = _distortion(entries, names, (0, 4))
-    _check_none(path, entries.get("distortionmodel"), numbers)
     numbers |= zip(("fx", "fy", "cx", "cy"), focal, strict=True)
     return with_told(made(spec, kind, (height, width), _from_corner(numbers)), [*beside, *entries.told()])
 
 
 def _of_opencv(spec: str, entries: Entries) -> CameraModel:
-    """OpenCV's files and ROS."""
     path = entries.path
     keys = ("distortionmodel", "cameramodel", "modeltype")
-    kinds = {_kind(path, one) for key in keys if (one := entries.get(key)) is not None}
+    kinds = {_kind(path, model) for key in keys if (model := entries.get(key)) is not None}
     kind = FISHEYE if not nothing(entries.get("fisheyemodel")) else next(iter(kinds), BROWN_CONRADY)
     if len(kinds) > 1:
         raise FileFormatError(f"{path}: expected one model, got a camera_model beside another distortion_model")
@@ -276,7 +269,6 @@ def _of_opencv(spec: str, entries: Entries) -> CameraModel:
     size, fisheye = _size(entries), kind == FISHEYE
     unread = _check_roi(entries, size)
     numbers = _distortion(entries, COEFFICIENTS[:4] if fisheye else IN_OPENCV, (0, 4) if fisheye else LENGTHS)
-    _check_none(path, entries.get("distortionmodel"), numbers)
     if numbers.pop("tauX", 0.0) or numbers.pop("tauY", 0.0):
         raise FileFormatError(
             f"{path}: expected no tilt of the sensor (tauX, tauY), got one; calibrate without CALIB_TILTED_MODEL"
@@ -306,16 +298,16 @@ def _from_corner(numbers: dict[str, float]) -> dict[str, float]:
 
 def _distortion(entries: Entries, names: Sequence[str], counts: Sequence[int]) -> dict[str, float]:
     """The coefficients of a list, or where there is none, those that have entries of their own."""
-    given = entries.get(*DISTORTION)
-    if nothing(given) and not isinstance(given, Mapping):
-        return _coefficients(entries, names)
-    return dict(zip(names, entries.numbers("distortion_coefficients", given, counts), strict=False))
-
-
-def _check_none(path: str, model: object, coefficients: Mapping[str, float]) -> None:
-    """Refuse coefficients beside a model that says that there are none."""
+    listed = entries.get(*DISTORTION)
+    if nothing(listed) and not isinstance(listed, Mapping):
+        coefficients = _coefficients(entries, names)
+    else:
+        coefficients = dict(zip(names, entries.numbers("distortion_coefficients", listed, counts), strict=False))
+    model = entries.get("distortionmodel")
     if isinstance(model, str) and model.strip().lower() == "none" and any(coefficients.values()):
-        raise FileFormatError(f"{path}: expected no distortion, as its distortion_model is none, got coefficients")
+        what = "expected no distortion, as its distortion_model is none"
+        raise FileFormatError(f"{entries.path}: {what}, got coefficients")
+    return coefficients
 
 
 def _matrix(entries: Entries) -> list[float]:

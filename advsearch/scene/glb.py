@@ -73,7 +73,6 @@ def web_glb(adversarial: Sequence[Shape], clean: Sequence[Shape], camera: Double
 
 
 def _described(made: GlbBuffer, meshes: Sequence[Shape], picture: Callable[[Levels], bytes]) -> dict[str, Any]:
-    """Return the header of a file with some meshes in one scene, and put their bytes into the buffer."""
     header: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": "advsearch"},
         "scene": 0,
@@ -116,7 +115,6 @@ def _described(made: GlbBuffer, meshes: Sequence[Shape], picture: Callable[[Leve
 
 
 def _texture(header: dict[str, Any], made: GlbBuffer, picture: bytes) -> dict[str, int]:
-    """Add a picture to the buffer and the header, and return the use of its texture."""
     header["images"].append({"mimeType": mime_type(picture), "bufferView": made.view(picture)})
     header["textures"].append({"source": len(header["textures"]), "sampler": 0})
     return {"index": len(header["textures"]) - 1}

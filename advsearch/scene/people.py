@@ -86,12 +86,8 @@ STRAIGHT = {
 
 
 class Person:
-    """A dressed body, as `scenes/person.py` has sewn it: a `MeshRig`.
-
-    Attributes:
-        size: its largest extent in metres at its defaults.
-        data: the arrays of body.npz.
-    """
+    """A dressed body, as `scenes/person.py` has sewn it: a `MeshRig`, whose largest extent at its defaults is `size`
+    metres, of the arrays of body.npz."""
 
     parameters = PARAMETERS
     clips = ()
@@ -252,4 +248,5 @@ def least_turn(begin: Tensor, end: Tensor) -> Tensor:
     x, y, z = torch.linalg.cross(a, b)
     zero = torch.zeros_like(x)
     skew = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
-    return torch.eye(3).to(a) + skew + skew @ skew / (1.0 + a @ b)
+    rotation: Tensor = torch.eye(3).to(a) + skew + skew @ skew / (1.0 + a @ b)
+    return rotation

@@ -76,12 +76,10 @@ class Mount:
 
 
 def read_rig(spec: str) -> tuple[Mount, ...]:
-    """Read the cameras of a rig; empty where a file has one camera, or one of its cameras is named (``#cam1``).
-
-    Of a transforms.json, frames are named by their number, the first one first: ``transforms.json#0,4,8``. Of an
-    images.txt all images are cameras, or those named by their IMAGE_ID: ``images.txt#3,7``. Raises FileFormatError:
-    more than `MOST_CAMERAS`, numbers that no camera has, or models of different kinds.
-    """
+    """Read the cameras of a rig; empty where a file has one camera, or one of its cameras is named (``#cam1``). Of a
+    transforms.json, frames are named by their number, the first one first: ``transforms.json#0,4,8``. Of an images.txt
+    all images are cameras, or those named by their IMAGE_ID: ``images.txt#3,7``. Raises FileFormatError: more than
+    `MOST_CAMERAS`, numbers that no camera has, or models of different kinds."""
     path, _, which = spec.partition("#")
     if Path(path).name == COLMAPS:
         return _of_colmap(path, which)

@@ -137,7 +137,7 @@ class SkeletonRig:
         """Return the seconds of a clip."""
         if clip is None:
             return {}
-        return {"seconds": {"value": float(self._seconds(self._clip(clip), values)), "unit": "s"}}
+        return {"seconds": {"value": float(self._playing(clip, values)[1]), "unit": "s"}}
 
     # ---- where the vertices are --------------------------------------------------------------------------------------
 
@@ -158,8 +158,8 @@ class SkeletonRig:
         number = {name: value.double() for name, value in values.items()}
         here, weights = self._places.to(some.device), dict[int, Tensor]()
         if clip is not None:
-            playing = self._clip(clip)
-            here, weights = self._played(playing, self._seconds(playing, number).to(some.device))
+            playing, seconds = self._playing(clip, number)
+            here, weights = self._played(playing, seconds.to(some.device))
         here = self._turned(here, number)
         matrices = (self._world(here)[self._nodes.to(some.device)] @ self._inverse.to(some.device))[:, :3]
         points, shares = self._morphed(number, weights, some.device), self._weights.to(some.device)
@@ -168,12 +168,9 @@ class SkeletonRig:
         assert isinstance(moves, Tensor)
         return torch.einsum("vij,vj->vi", moves[:, :, :3], points) + moves[:, :, 3]
 
-    def _clip(self, name: str) -> Clip:
-        return next(clip for clip in self.skeleton.clips if clip.name == name)
-
-    def _seconds(self, clip: Clip, values: Mapping[str, Tensor]) -> Tensor:
-        time = values.get(TIME.name, torch.zeros(())).double()
-        return clip.begin + (clip.end - clip.begin) * time
+    def _playing(self, name: str, values: Mapping[str, Tensor]) -> tuple[Clip, Tensor]:
+        clip = next(clip for clip in self.skeleton.clips if clip.name == name)
+        return clip, clip.begin + (clip.end - clip.begin) * values.get(TIME.name, torch.zeros(())).double()
 
     def _played(self, clip: Clip, seconds: Tensor) -> tuple[Tensor, dict[int, Tensor]]:
         """Places (N, 4, 4) of all nodes at a time of a clip, and weights of morph targets by node."""

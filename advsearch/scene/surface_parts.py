@@ -31,10 +31,8 @@ _SMOOTHING = 10  # rounds of averaging normals, so that noise does not fray the 
 
 def unwrapped(soup: Soup, apart: Ints | None = None) -> Soup:
     """Return the soup with UVs from xatlas: charts that do not overlap, inside the unit square; deterministic. Faces
-    with different numbers in `apart` (F,) get charts of their own.
-
-    The faces of a mesh in very many pieces become triangles of one size, side by side in a grid.
-    """
+    with different numbers in `apart` (F,) get charts of their own. The faces of a mesh in very many pieces become
+    triangles of one size, side by side in a grid."""
     patch = _patches(soup)
     if apart is not None:
         patch = np.unique(patch * (int(apart.max()) + 1) + apart, return_inverse=True)[1].reshape(-1)

@@ -64,17 +64,15 @@ def setting(
     """
     notes: dict[str, Any] = {"group": group, "expects": expects, "unit": unit, "otherwise": otherwise, "flag": flag}
     notes |= {"metavar": metavar, "form": form, "switched": switched, "power": power}
-    declared: Any = {"default": default, "description": description, **notes, **constraints}
-    alias = constraints.pop("alias", None)
+    extra: Any = {"notes": notes, "others": {"default": default, "description": description, **constraints}}
     make = {"default_factory": default} if callable(default) else {"default": default}
-    extra = {**notes, "declared": declared}
-    return Field(**make, description=description, json_schema_extra=extra, alias=alias, **constraints)
+    return Field(**make, description=description, json_schema_extra=extra, **constraints)
 
 
 def setting_as_in(config: type[Config], field: str, **changes: Any) -> Any:
     """Return a setting as another command declares it, but for some of the arguments of `setting`."""
     extra: Any = config.model_fields[field].json_schema_extra
-    return setting(**{**extra["declared"], **changes})
+    return setting(**{**extra["notes"], **extra["others"], **changes})
 
 
 class Clash(NamedTuple):
@@ -125,7 +123,7 @@ def settings(config: type[Config]) -> tuple[Setting, ...]:
         if field in config.without:
             continue
         extra: Any = info.json_schema_extra
-        notes: Any = {name: note for name, note in extra.items() if name != "declared"}
+        notes = {**extra["notes"]}
         notes["flag"] = notes["flag"] or "--" + field.replace("_", "-")
         notes["expects"] = notes["expects"] or _expected(info)
         notes["metavar"] = notes["metavar"] or field.rpartition("_")[2].upper()

@@ -185,17 +185,10 @@ NAMED = ("policy", "task")  # the settings that are a name, or a `name` with opt
 
 
 def read_yaml(path: str | Path, above: tuple[Path, ...] = ()) -> dict[str, object]:
-    """Return the mapping in the YAML file at `path`, laid over the files that its `base` names.
-
-    A base is a file, or a list of files of which a later one goes over an earlier one; mappings are merged.
-
-    Args:
-        path: the file.
-        above: the files that have named this one as their base.
-
-    Raises:
-        FileFormatError: the file is missing, empty, not text, not YAML or not a mapping with names as keys.
-    """
+    """Return the mapping in the YAML file at `path`, laid over the files that its `base` names; `above` are those that
+    have named it as theirs. A base is a file, or a list of files of which a later one goes over an earlier one;
+    mappings are merged. Raises FileFormatError: the file is missing, empty, not text, not YAML or not a mapping with
+    names as keys."""
     try:
         data = parse_yaml(read_text(Path(path), "a YAML file", LARGEST))
     except OSError as error:

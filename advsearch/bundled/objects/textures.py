@@ -80,15 +80,6 @@ def noise(points: Array) -> Array:
     return near + (far - near) * fx
 
 
-def fbm(points: Array, octaves: int = 2) -> Array:
-    """Sum of octaves of `noise`, each half as strong and twice as fine; (N,) values in [0, 1], mean about 0.5."""
-    total, weight = np.zeros(len(points)), 0.0
-    for octave in range(octaves):
-        total += noise(points * 2.0**octave + 5.3 * octave) * 0.5**octave
-        weight += 0.5**octave
-    return total / weight
-
-
 def mix(a: Array, b: Array, weight: Array) -> Array:
     """Blend colours (3,) or (N, 3) by (N,) weights: 0 gives a, 1 gives b."""
     return a + (b - a) * weight[:, None]
@@ -116,7 +107,9 @@ def solid(t: Texels, color: Color | str) -> Array:
 @painter
 def mottled(t: Texels, a: Color, b: Color, scale: float, offset: Array, contrast: float = 2.0) -> Array:
     """Clouds of two colours, `scale` wide."""
-    return mix(a, b, np.clip((fbm(t.xyz / scale + offset) - 0.5) * contrast + 0.5, 0.0, 1.0))
+    at = t.xyz / scale + offset
+    clouds = (noise(at) + noise(at * 2.0 + 5.3) * 0.5) / 1.5
+    return mix(a, b, np.clip((clouds - 0.5) * contrast + 0.5, 0.0, 1.0))
 
 
 def clouded(color: Color, factor: float, scale: float, offset: Array, contrast: float = 2.0) -> Paint:

@@ -30,7 +30,8 @@ def find_ambient(verifier: Verifier, u: Tensor) -> None:
     the same seeds, which nothing else has. What comes of it is in `verifier.findings`.
     """
     problem, findings = verifier.problem, verifier.findings
-    own = ambient_of(problem)
+    projectors = [bound for bound in problem.searched_space.controls if isinstance(bound, ProjectorControl)]
+    own = projectors[0].ambient if projectors else None  # and None where they are searched too
     if own is None or findings.verification is None:
         return
     tried = findings.ambient
@@ -64,12 +65,6 @@ def find_ambient(verifier: Verifier, u: Tensor) -> None:
         good, bad = (between, bad) if holds(between) else (good, between)
 
 
-def ambient_of(problem: Problem) -> float | None:
-    """Return the lux beside the first projector that is searched; None without, or where they are searched too."""
-    projectors = [bound for bound in problem.searched_space.controls if isinstance(bound, ProjectorControl)]
-    return projectors[0].ambient if projectors else None
-
-
 def problems_by_name(problem: Problem) -> Callable[[str], Problem]:
     """Return what gives a worker the problem of a query by its name: that of the run, or the same in other light."""
     lit = lru_cache(maxsize=2)(partial(in_light, problem))
@@ -78,7 +73,9 @@ def problems_by_name(problem: Problem) -> Callable[[str], Problem]:
 
 def in_light(problem: Problem, times: float) -> Problem:
     """Return the same problem in so many times the ambient light."""
-    brighter = [one.in_light(times) if isinstance(one, ProjectorControl) else one for one in problem.space.controls]
-    space, renderer = replace(problem.space, controls=tuple(brighter)), problem.renderer.like()
+    controls = [
+        bound.in_light(times) if isinstance(bound, ProjectorControl) else bound for bound in problem.space.controls
+    ]
+    space, renderer = replace(problem.space, controls=tuple(controls)), problem.renderer.like()
     renderer.space = space
     return replace(problem, space=space, renderer=renderer)

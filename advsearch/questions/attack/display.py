@@ -39,10 +39,10 @@ from advsearch.report.wording import (
     count,
     interval_text,
     margin_text,
-    no_numbers,
     number_text,
     percent,
     prediction_cells,
+    rated_cells,
     short_name,
     tally,
 )
@@ -300,17 +300,13 @@ def _claims_of_curve(result: CurveResult) -> Iterator[Claim]:
 
 def _shown_matrix(result: MatrixResult) -> ShownResult:
     """The matrix, with a row for the clean scene; the stronger a cell's colour, the more successes."""
-
-    def rate(number: int, rated: VerifiedRate | ControlGroup) -> str:
-        return f"{number}/{rated.trials}{no_numbers(rated.not_a_number)}, {interval_text(rated.interval)}"
-
     marks = {"found": " *", "already wrong": " (wrong already)"}
     heads = ["attacked on", "ending", *(f"tested on {short_name(tried.model)}" for tried in result.tested)]
-    right = [f"right {rate(tried.clean.correct, tried.clean)}" for tried in result.tested]
+    right = [f"right {', '.join(rated_cells(tried.clean))}" for tried in result.tested]
     rows = [["clean scene", "", *right]] if right else []
     before, shares = len(rows), dict[tuple[int, int], float]()
     for up, row in enumerate(result.table, before):
-        cells = [rate(cell.verified.successes, cell.verified) + marks.get(cell.ending, "") for cell in row.tested]
+        cells = [", ".join(rated_cells(cell.verified)) + marks.get(cell.ending, "") for cell in row.tested]
         rows.append([short_name(row.attacked), row.ending, *cells])
         shares |= {(up, across): cell.verified.rate for across, cell in enumerate(row.tested, 2)}
     spp = f", {result.tested[0].spp} samples per pixel" if result.tested else ""

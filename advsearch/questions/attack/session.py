@@ -96,6 +96,9 @@ def attack(
             f"policy: expected a name, a mapping with a `name` and options, or an instance, got {told(policy)}"
         )
     scene = _scene(scene, object, settings)
+    fixed: dict[str, float | str] = scene.description.given_values
+    if settings.get("exposure"):  # the option says it
+        fixed.pop("camera.exposure", None)
     described = {
         **scene_as_settings(scene),
         "model": ",".join(map(model_name, several(model))),
@@ -104,7 +107,7 @@ def attack(
         "task": as_setting(task) if isinstance(task, Task) else task,
         "objective": _own_name(objective) if callable(objective) else objective,
         "policy": as_setting(policy) if isinstance(policy, Policy) else policy,
-        "set": _set_by(scene, settings.get("exposure")),
+        "set": fixed,
         "metrics": metrics_as_settings(metrics or {}),
     }
     config = AttackConfig(**{**described, **options, "run": None if run is None else str(run)})
@@ -164,11 +167,3 @@ def _scene(scene: Scene | str | Path | Mapping[str, Any], object: str | None, se
     if isinstance(scene, Mapping):
         raise InputError("object: which shape of the scene is it? Give its id")
     return load_scene(scene, config.environment, **more)
-
-
-def _set_by(scene: Scene, exposure: float | None) -> dict[str, float | str]:
-    """The parameters of the scene that were fixed, but for the exposure where an option says it."""
-    fixed = scene.description.given_values
-    if exposure:
-        fixed.pop("camera.exposure", None)
-    return fixed

@@ -143,7 +143,10 @@ class DetectorCourse(Course):
         own: Sequence[Example] = (), loss: Loss | None = None,
     ) -> None:  # fmt: skip
         super().__init__(work, student, optimiser, own)
-        self.loss = loss or own_loss
+        self.loss = loss or self.usual_loss()
+
+    def usual_loss(self) -> Loss:
+        return own_loss
 
     def draw(self, title: str, split: str, places: range) -> list[Example]:
         """Return pictures of scenes as they are, then for each control the worst that a search finds, wrong or not."""

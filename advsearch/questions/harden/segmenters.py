@@ -11,10 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from advsearch.models.reference import Trainable
 from advsearch.questions.harden.detectors import DetectorCourse, Example, Loss, Target, written
-from advsearch.questions.harden.rounds import MakeOptimiser
-from advsearch.questions.harden.scenes import SceneWork
 from advsearch.runs.images import write_png
 from advsearch.tasks import make_task
 from advsearch.tasks.segmentation import Segmentation
@@ -24,11 +21,9 @@ class SegmenterCourse(DetectorCourse):
     """A picture teaches that the object's pixels are of its class, and all others of that which the model gave them
     before it was trained: what they are is not known, and they are to stay."""
 
-    def __init__(
-        self, work: SceneWork, student: Trainable, optimiser: MakeOptimiser | None = None, loss: Loss | None = None
-    ) -> None:
-        task: Any = make_task(work.config.task)
-        super().__init__(work, student, optimiser, (), loss or partial(pixel_loss, task))
+    def usual_loss(self) -> Loss:
+        task: Any = make_task(self.config.task)
+        return partial(pixel_loss, task)
 
     def shown(self, item: Example, mirrored: bool) -> tuple[Tensor, Target]:
         """Return the network's input, and "classes" (h, w) int64 and "object" (h, w) at the size of its output."""

@@ -160,10 +160,5 @@ def _rates(row: ReplayRow) -> list[str]:
     clean, rated = row.clean, row.verified
     if clean is None or rated is None:
         return ["", "", "", "", f"{NOT_DONE}: {row.reason}"]
-    return [
-        f"{clean.correct}/{clean.trials}{wording.no_numbers(clean.not_a_number)}",
-        wording.interval_text(clean.interval),
-        f"{rated.successes}/{rated.trials}{wording.no_numbers(rated.not_a_number)}",
-        wording.interval_text(rated.interval),
-        {"found": "holds", "already wrong": "clean is wrong too"}.get(row.ending, "does not hold"),
-    ]
+    verdict = {"found": "holds", "already wrong": "clean is wrong too"}.get(row.ending, "does not hold")
+    return [*wording.rated_cells(clean), *wording.rated_cells(rated), verdict]

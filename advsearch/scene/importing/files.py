@@ -270,7 +270,6 @@ class References:
         return reason
 
     def _content(self, name: str) -> bytes:
-        """Return the content of a file in the folder."""
         path = os.path.realpath(os.path.join(self._folder, name))
         if os.path.commonpath((path, self._folder)) != self._folder:
             raise FileFormatError(OUTSIDE if os.path.lexists(path) else MISSING)

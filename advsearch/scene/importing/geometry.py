@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 
 from advsearch.errors import InputError
 from advsearch.scene.assets import Bools, Doubles, Ints, Mesh, face_vectors
+from advsearch.scene.importing.files import Notes
 from advsearch.scene.importing.parts import ImportedPart
 
 UPRIGHT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # from y up to z up
@@ -100,20 +101,16 @@ def extent_of(parts: Sequence[ImportedPart]) -> float:
     return float((high / 2 - low / 2).max()) * 2
 
 
-def repaired(soup: Soup, source: str) -> tuple[Soup, list[str]]:
+def repaired(soup: Soup, source: str, notes: Notes) -> Soup:
     """Return a soup, as `join` gives it, without faces without area, its winding consistent and outward, every normal
-    of unit length and on the front of its face; and the warnings. Raises InputError, with the name of the file: no face
-    has an area."""
-    notes = []
+    of unit length and on the front of its face. Raises InputError, with the name of the file: no face has an area."""
     flat = np.linalg.norm(soup.face_vectors(), axis=1) <= FLAT
     if flat.all():
         raise InputError(f"{source}: expected faces with an area, got {len(flat)} without; export it again")
     if flat.any():
-        notes.append(f"{int(flat.sum())} faces without area were removed")
+        notes.say(f"{int(flat.sum())} faces without area were removed")
         soup = soup.only(~flat)
-    soup, winding = _wound(soup)
-    soup, shading = _shaded(soup)
-    return soup, notes + winding + shading
+    return _shaded(_wound(soup, notes), notes)
 
 
 def assemble(soup: Soup) -> tuple[Mesh, Ints | None]:
@@ -137,21 +134,20 @@ def assemble(soup: Soup) -> tuple[Mesh, Ints | None]:
 # --- winding ----------------------------------------
 
 
-def _wound(soup: Soup) -> tuple[Soup, list[str]]:
+def _wound(soup: Soup, notes: Notes) -> Soup:
     """Turn faces over until neighbours agree and closed shells, and sheets with normals, face outwards."""
     left, right, same_way = neighbours(soup.faces)
     turn, shell, twisted = _agreement(np.linalg.norm(soup.face_vectors(), axis=1), left, right, same_way)
-    notes = []
     if turn.any():
-        notes.append(f"{int(turn.sum())} faces wound against their neighbours were turned over")
+        notes.say(f"{int(turn.sum())} faces wound against their neighbours were turned over")
     if twisted:
-        notes.append("has a one-sided surface (a Moebius strip), so some faces show their backs")
+        notes.say("has a one-sided surface (a Moebius strip), so some faces show their backs")
     soup = soup.reversed(turn)
     paired = np.bincount(shell[neighbours(soup.faces)[0] // 3], minlength=int(shell.max()) + 1) * 2
     inside_out = _inside_out(soup, shell, np.equal(paired, 3 * np.bincount(shell)))
     if inside_out.any():
-        notes.append(f"{int(inside_out[shell].sum())} faces were inside out and have been turned over")
-    return soup.reversed(inside_out[shell]), notes
+        notes.say(f"{int(inside_out[shell].sum())} faces were inside out and have been turned over")
+    return soup.reversed(inside_out[shell])
 
 
 def neighbours(faces: Ints) -> tuple[Ints, Ints, Bools]:
@@ -170,14 +166,10 @@ def neighbours(faces: Ints) -> tuple[Ints, Ints, Bools]:
 
 
 def _agreement(area: Doubles, left: Ints, right: Ints, same_way: Bools) -> tuple[Bools, Ints, bool]:
-    """Decide which faces to turn over so that neighbours agree, keeping the way of most of each shell's area.
-
-    Every face stands for two nodes of a graph, "as it is" and "turned"; neighbours that agree are linked like to like,
-    others crosswise. A shell is orientable when the two nodes of its faces fall into two components.
-
-    Returns:
-        turn (F,) bool, the shell that each face belongs to (F,) int64, and whether some shell is one-sided.
-    """
+    """Return which faces (F,) to turn over so that neighbours agree, keeping the way of most of each shell's area; the
+    shell that each belongs to (F,); and whether some shell is one-sided. Every face stands for two nodes of a graph,
+    "as it is" and "turned"; neighbours that agree are linked like to like, others crosswise. A shell is orientable when
+    the two nodes of its faces fall into two components."""
     f, g, count = left // 3, right // 3, len(area)
     a = np.concatenate([2 * f, 2 * f + 1])
     b = np.concatenate([2 * g + same_way, 2 * g + 1 - same_way])
@@ -190,12 +182,9 @@ def _agreement(area: Doubles, left: Ints, right: Ints, same_way: Bools) -> tuple
 
 
 def _inside_out(soup: Soup, shell: Ints, closed: Bools) -> Bools:
-    """Return, for each shell, whether it must be turned over.
-
-    A closed shell, all of whose edges belong to exactly two faces of it, must when its signed volume is negative,
-    unless it lies within another closed shell (then it is the wall of a hollow) and the file's normals do not object.
-    An open sheet must when the file's normals point away from its front.
-    """
+    """Return, for each shell, whether it must be turned over: a closed shell, all of whose edges belong to exactly two
+    faces of it, when its signed volume is negative, unless it lies within another closed shell (then it is the wall of
+    a hollow) and the file's normals do not object; an open sheet when the file's normals point away from its front."""
     count, vectors = len(closed), soup.face_vectors()
     corners = soup.points[soup.faces]
     sums = [np.bincount(shell, weights=place) for place in corners.mean(axis=1).T]
@@ -217,39 +206,34 @@ def _inside_out(soup: Soup, shell: Ints, closed: Bools) -> Bools:
 # --- normals ----------------------------------------
 
 
-def _shaded(soup: Soup) -> tuple[Soup, list[str]]:
+def _shaded(soup: Soup, notes: Notes) -> Soup:
     """Keep the file's normals where they are sound, and compute the others."""
     vectors = soup.face_vectors()
     area = np.linalg.norm(vectors, axis=1)
     known = np.isfinite(soup.normals).all(axis=2)
     front = (soup.normals * vectors[:, None]).sum(axis=2) > 0.0
-    notes, normals = [], soup.normals
+    normals = soup.normals
     if known.any():
         weight = np.where(known, area[:, None], 0.0)
         share = float((weight * front).sum() / weight.sum())
         if share < 1.0 - TRUSTED:
-            notes.append("its normals pointed inwards and were turned around")
+            notes.say("its normals pointed inwards and were turned around")
             normals, front = -normals, known & ~front
         elif share < TRUSTED:
-            notes.append("its normals contradict its faces and were computed anew")
+            notes.say("its normals contradict its faces and were computed anew")
             front = np.zeros_like(front)
     if not front.all():
         made = smooth_normals(soup)
         if soup.flat is not None:
             made = np.where(soup.flat[:, None, None], unit_vectors(vectors)[:, None], made)
         normals = np.where((known & front)[:, :, None], normals, made)
-    return replace(soup, normals=normals), notes
+    return replace(soup, normals=normals)
 
 
 def smooth_normals(soup: Soup) -> Doubles:
-    """Compute corner normals, smooth except across creases.
-
-    At each point, the faces that can be reached from one another over edges with less than the crease angle share one
-    normal: the mean of their normals weighted by their angles at that point (Thuermer and Wuethrich 1998).
-
-    Returns:
-        (F, 3, 3) float64 unit normals.
-    """
+    """Return unit normals of corners (F, 3, 3), smooth except across creases. At each point, the faces that can be
+    reached from one another over edges with less than the crease angle share one normal: the mean of their normals
+    weighted by their angles at that point (Thuermer and Wuethrich 1998)."""
     unit = unit_vectors(soup.face_vectors())
     left, right, same_way = neighbours(soup.faces)
     gentle = (unit[left // 3] * unit[right // 3]).sum(axis=1) >= np.cos(np.radians(CREASE_DEGREES))

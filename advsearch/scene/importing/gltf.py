@@ -88,7 +88,6 @@ def binary_chunk(data: bytes) -> bytes | None:
 
 
 def _json_chunk(path: Path, data: bytes) -> bytes:
-    """Return the first chunk of a .glb file."""
     if not data.startswith(b"glTF") or len(data) < 20:
         got = "the first few bytes of one" if data.startswith(b"glTF") else looks_like(data)
         raise damaged(path, "a binary glTF file", got)
@@ -147,7 +146,6 @@ def _needs(path: Path, names: Iterable[str]) -> FileFormatError:
 
 
 def _unread_extensions(entry: BaseModel) -> list[str]:
-    """Return the extensions of an entry that are not understood."""
     held = (entry.model_extra or {}).get("extensions")
     return sorted(name for name in held if name not in READ) if isinstance(held, dict) else []
 
@@ -193,7 +191,6 @@ def _numbers(held: Any) -> Iterator[int]:
 
 
 def _check_primitive(path: Path, header: Header, primitive: Primitive) -> None:
-    """Refuse attributes that are not what their names say, or of different lengths."""
     held = {name: header.accessors[index] for name, index in primitive.attributes.items()}
     coordinates = "TEXCOORD_0" if primitive.material is None else header.materials[primitive.material].attribute
     kinds_of = {"POSITION": ("VEC3",), "NORMAL": ("VEC3",), "COLOR_0": ("VEC3", "VEC4"), coordinates: ("VEC2",)}

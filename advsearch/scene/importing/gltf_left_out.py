@@ -13,7 +13,6 @@ from advsearch.scene.importing.files import Notes, shown
 from advsearch.scene.importing.gltf import READ
 from advsearch.scene.importing.gltf_entries import CUT_OUTS, Header
 from advsearch.scene.importing.usd import GENERATOR
-from advsearch.scene.skeleton import Skeleton
 
 _OPAQUE = " lets light pass through surfaces with {name}; here they are opaque"
 EXTENSIONS = {
@@ -60,13 +59,6 @@ def left_out(header: Header, notes: Notes) -> None:
     for sentence in _counts(kinds):
         notes.say(sentence)
     _note_unread(header, notes)
-
-
-def moves(skeleton: Skeleton) -> str:
-    """Say what of a file moves, and how."""
-    names = [clip.name for clip in skeleton.clips]
-    clips = f", and plays {', '.join(names[:5])}{', ...' if len(names) > 5 else ''}" if names else ""
-    return f" is shown at rest: the control body moves it{clips}"
 
 
 WORDS = {

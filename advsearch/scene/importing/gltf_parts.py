@@ -19,7 +19,7 @@ from advsearch.scene.importing import gltf_entries, gltf_skeleton
 from advsearch.scene.importing.files import Notes, check_faces, damaged
 from advsearch.scene.importing.gltf import GltfFile
 from advsearch.scene.importing.gltf_entries import CUT_OUTS, MaterialEntry, Primitive, Sampler, TextureUse
-from advsearch.scene.importing.gltf_left_out import counted, left_out, moves
+from advsearch.scene.importing.gltf_left_out import counted, left_out
 from advsearch.scene.importing.parts import (
     ImportedPart,
     ImportedSurface,
@@ -218,8 +218,10 @@ def read_gltf(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
         if meshes:
             notes.say(counted(len(meshes), words))
     surfaces, finished = GltfSurfaces(file, notes), dict[tuple[int, int], ImportedPart]()
-    for material in dict.fromkeys(piece.material for piece in with_faces.values()):
-        group = {key: piece.part for key, piece in with_faces.items() if piece.material == material}
+    groups = dict[int | None, dict[tuple[int, int], ImportedPart]]()
+    for key, piece in with_faces.items():
+        groups.setdefault(piece.material, {})[key] = piece.part
+    for material, group in groups.items():
         surface, fit = surfaces.surface(material, list(group.values()))
         for key, part in group.items():
             uvs = None if part.uvs is None else fit(part.uvs) * [1.0, -1.0] + [0.0, 1.0]
@@ -231,16 +233,14 @@ def read_gltf(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
         skins[number] = np.array(joints), inverse, np.stack([everywhere[joint] for joint in joints]) @ inverse
     skeleton = gltf_skeleton.skeleton_of(file, moving)
     if skeleton is not None:
-        notes.say(moves(skeleton))
+        names = [clip.name for clip in skeleton.clips]
+        clips = f", and plays {', '.join(names[:5])}{', ...' if len(names) > 5 else ''}" if names else ""
+        notes.say(f" is shown at rest: the control body moves it{clips}")
 
     def in_place(key: tuple[int, int], node: int, pose: Doubles) -> ImportedPart:
         skin, piece, part = header.nodes[node].skin, with_faces[key], finished[key]
-        count = (len(part.vertices), 1)
-        by, nodes, inverse = (
-            gltf_skeleton.Bound(np.zeros(count, np.int64), np.ones(count)),
-            np.array([node]),
-            np.eye(4)[None],
-        )
+        joints, nodes, inverse = (np.zeros((len(part.vertices), 1), np.int64), np.array([node]), np.eye(4)[None])
+        by = gltf_skeleton.Bound(joints, np.ones(joints.shape))  # a node of its own, unless there is a skin
         if skin is not None and piece.bound is not None:
             by, (nodes, inverse, matrices) = piece.bound, skins[skin]
         if skeleton is not None:

@@ -222,10 +222,8 @@ def read_radiance(path: Path, data: bytes) -> tuple[Bytes, Floats, list[str]]:
 
 
 def _scale(head: bytes) -> tuple[Floats, list[str]]:
-    """Return the factors (3,) that undo what a header says the colours were multiplied by, and clauses.
-
-    EXPOSURE lines are not undone, as nowhere else: the exposure of pictures is metered.
-    """
+    """Return the factors (3,) that undo what a header says the colours were multiplied by, and clauses; but not
+    EXPOSURE lines, as nowhere else: the exposure of pictures is metered."""
     scale, notes = np.ones(3), list[str]()
     for text in re.findall(rb"^COLORCORR=(.*)$", head, re.MULTILINE)[:100]:
         numbers = np.array(list(map(float, re.findall(_NUMBER, text)[:4])))
@@ -248,7 +246,6 @@ def linear(pixels: Bytes) -> Floats:
 
 
 def _scanlines(path: Path, body: bytes, height: int, width: int) -> Bytes:
-    """Decode the scanlines, each in whichever of the three encodings it uses, to (height, width, 4) bytes."""
     result = np.empty((height, width, 4), np.uint8)
     position, mark = 0, bytes([2, 2, width >> 8 & 0xFF, width & 0xFF])
     for row in range(height):

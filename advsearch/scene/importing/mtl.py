@@ -62,32 +62,10 @@ class MapUse:
 
     name: str  # of the picture, as the file has it
     options: dict[str, str]  # its options by their names, in lower case, as (name, value)
-
-    @property
-    def scale(self) -> Pair:
-        """How often the picture repeats over a unit of u and of v (``-s``)."""
-        return self._numbers("s", 1.0, 1.0)
-
-    @property
-    def offset(self) -> Pair:
-        """What is added to scaled texture coordinates (``-o``)."""
-        return self._numbers("o", 0.0, 0.0)
-
-    @property
-    def range(self) -> Pair:
-        """What is added to the picture's values, and their factor before (``-mm``)."""
-        return self._numbers("mm", 0.0, 1.0)
-
-    @property
-    def bump(self) -> float:
-        """The factor of a normal map's x and y (``-bm``)."""
-        return self._numbers("bm", 1.0, 1.0)[0]
-
-    def _numbers(self, option: str, first: float, second: float) -> Pair:
-        """What an option says; `first` and `second` where it says too little or nothing that can be computed with."""
-        words = self.options.get(option, "").split()
-        u, v = (float(words[k]) if k < len(words) else otherwise for k, otherwise in enumerate((first, second)))
-        return (u, v) if abs(u) < 1e6 and abs(v) < 1e6 else (first, second)
+    scale: Pair = (1.0, 1.0)  # how often the picture repeats over a unit of u and of v (``-s``)
+    offset: Pair = (0.0, 0.0)  # what is added to scaled texture coordinates (``-o``)
+    range: Pair = (0.0, 1.0)  # what is added to the picture's values, and their factor before (``-mm``)
+    bump: float = 1.0  # the factor of a normal map's x and y (``-bm``)
 
 
 def parsed(text: str, file: str) -> tuple[list[MtlMaterial], list[str]]:
@@ -116,17 +94,26 @@ def without_comment(text: str) -> str:
 
 
 def map_of(rest: str) -> MapUse | None:
-    """Return what a statement says that names a picture; None where it names none.
-
-    Options may stand before the name and after it. The name may have blanks.
-    """
+    """Return what a statement says that names a picture, with options before the name and after it, which may have
+    blanks; None where it names none."""
     options: dict[str, str] = {}
     for match in _OPTION.finditer(rest):
         options.update({key: match[f"{key}_"] for key in _OPTIONS if match[key] is not None})
     name = " ".join(_OPTION.sub("", rest).split())
     while unknown := _UNKNOWN.match(name):
         options[unknown[1].lower()], name = "", name[unknown.end() :]
-    return MapUse(name, options) if name else None
+    if not name:
+        return None
+    usual = {"s": (1.0, 1.0), "o": (0.0, 0.0), "mm": (0.0, 1.0), "bm": (1.0, 1.0)}
+    scale, offset, values, (bump, _) = (_pair(options.get(key, ""), pair) for key, pair in usual.items())
+    return MapUse(name, options, scale, offset, values, bump)
+
+
+def _pair(text: str, otherwise: Pair) -> Pair:
+    """What an option says, or what holds otherwise, where it says too little or nothing that can be computed with."""
+    words = text.split()[:2]
+    u, v = (*map(float, words), *otherwise[len(words) :])
+    return (u, v) if abs(u) < 1e6 and abs(v) < 1e6 else otherwise
 
 
 def color_of(rest: str) -> Floats | None:

@@ -113,7 +113,6 @@ class MtlReader:
         return []
 
     def _look_of(self, material: mtl.MtlMaterial, square: int, name: str) -> Painted:
-        """Read all statements of a material."""
         if not any(known == id(material) for known, _ in self._painted):
             self._list(material)
         uses = {key: use for key in (*PLACED, "map_pr", "map_pm") if (use := self._use(material, key)) is not None}
@@ -298,11 +297,8 @@ def _channel(picture: Floats, use: mtl.MapUse) -> Floats:
 
 
 def libraries_of(rests: Sequence[str], references: References) -> list[str]:
-    """Return the names of material files that ``mtllib`` lines hold.
-
-    A line may name several, and a name may have blanks: a line that is the name of a file is that, else each name ends
-    in ``.mtl``, else in a blank.
-    """
+    """Return the names of material files that ``mtllib`` lines hold. A line may name several, and a name may have
+    blanks: a line that is the name of a file is that, else each name ends in ``.mtl``, else in a blank."""
     names: list[str] = []
     for rest in rests:
         plain = mtl.without_comment(rest)

@@ -168,23 +168,25 @@ def object_of(parts: list[ImportedPart], notes: list[str], file: Path, name: str
     only."""
     seen = visible(parts)
     clear = ", ".join(dict.fromkeys(shown(part.surface.name or "a part") for part in parts if part not in seen))
-    cleared = [f"all light passes through {clear} (opacity 0): left out; give it an opacity to see it"] if clear else []
+    more = Notes(file.name)
+    if clear:
+        more.say(f"all light passes through {clear} (opacity 0): left out; give it an opacity to see it")
     parts, gltf_file = seen, file.suffix.lower() in GLTF
     known = up or ("y" if gltf_file else None)
     soup = join(parts, str(file), y_up=known == "y")
     axis = guess_up(soup.points[np.unique(soup.faces)], file.name) if known is None else UpAxis(known)
     if known is None and axis.axis == "y":
         soup = join(parts, str(file), y_up=True)
-    soup, repairs = repaired(soup, str(file))
     surfaces = [part.surface for part in parts]
-    soup, maps, bakes = textured(soup, surfaces)
+    soup, maps = textured(repaired(soup, str(file), more), surfaces, more)
     opacity = np.ascontiguousarray(maps.color[:, :, 3]) if maps.color.shape[2] == 4 else None
     if opacity is not None and not opacity.any():
-        opacity, bakes = None, [*bakes, "it is transparent all over; it is shown opaque"]
-    material, blends = _material(soup, surfaces)
-    warnings = [*notes, *(f"{file.name}: {note}" for note in cleared + repairs + bakes + blends)]
-    if (more := len(warnings) - MOST_WARNINGS) > 0:
-        warnings = [*warnings[:MOST_WARNINGS], f"{file.name}: {more:,} more warnings are left out"]
+        opacity = None
+        more.say("it is transparent all over; it is shown opaque")
+    material = _material(soup, surfaces, more)
+    warnings = [*notes, *more]
+    if (rest := len(warnings) - MOST_WARNINGS) > 0:
+        warnings = [*warnings[:MOST_WARNINGS], f"{file.name}: {rest:,} more warnings are left out"]
     extent = extent_of(parts) * float(np.ptp(soup.points[soup.faces].reshape(-1, 3), axis=0).max())
     return ObjectAsset(
         name=name,
@@ -231,16 +233,17 @@ def _let_out(emission: Floats | None, opacity: Floats | None) -> Floats | None:
     return radiance if radiance.any() else None
 
 
-def _material(soup: Soup, surfaces: list[ImportedSurface]) -> tuple[Material, list[str]]:
-    """Return the mean of the parts' roughness and metallic, weighted by area, and a warning where they differ."""
+def _material(soup: Soup, surfaces: list[ImportedSurface], notes: Notes) -> Material:
+    """Return the mean of the parts' roughness and metallic, weighted by area, and note where they differ."""
     area = np.bincount(soup.part, weights=np.linalg.norm(soup.face_vectors(), axis=1), minlength=len(surfaces))
     looks = [Material().with_values(vars(surface), "") for surface in surfaces]
     values = np.array([[look.roughness, look.metallic] for look in looks])
-    same = bool((values[area > 0] == values[area > 0][0]).all())
-    roughness, metallic = values[area > 0][0] if same else (values * area[:, None]).sum(axis=0) / area.sum()
-    means = f"{roughness:.2g} and {metallic:.2g}"
-    notes = [] if same else [f"the roughness and metallic of its materials are replaced by their means ({means})"]
-    return Material(roughness=float(roughness), metallic=float(metallic)), notes
+    roughness, metallic = values[area > 0][0]
+    if not (values[area > 0] == values[area > 0][0]).all():
+        roughness, metallic = (values * area[:, None]).sum(axis=0) / area.sum()
+        means = f"{roughness:.2g} and {metallic:.2g}"
+        notes.say(f"the roughness and metallic of its materials are replaced by their means ({means})")
+    return Material(roughness=float(roughness), metallic=float(metallic))
 
 
 TOUCHING = 0.02

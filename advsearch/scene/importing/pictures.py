@@ -174,7 +174,6 @@ class FilePictures:
         self.notes.say(words.replace("{name}", shown(name)).replace("{why}", why))
 
     def _decoded(self, content: Callable[[], bytes], kind: Kind, name: str) -> Floats | str:
-        """Decode a picture, or say why not."""
         try:
             image = Image.open(io.BytesIO(content()), formats=FORMATS)
         except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):

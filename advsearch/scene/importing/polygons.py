@@ -22,16 +22,14 @@ def cut_up(points: Doubles, counts: Ints, notes: Notes) -> tuple[Ints, Ints]:
 
 
 def triangulated(points: Doubles, counts: Ints) -> tuple[Ints, Ints, int]:
-    """Cut polygons up into triangles.
+    """Cut polygons up into triangles: return their corners (T, 3), as indices into `points`, in the order of the
+    polygons; the polygon of each (T,); and of how many polygons some triangles may lie outside: they cross themselves,
+    or were too much work.
 
     Where the triangles from a polygon's first corner all face as the polygon does (it is convex, mostly), these are
     taken. Otherwise ears are cut off (Meisters 1975) in the plane that the polygon lies in on average (Newell). Points
     (C, 3) are those of the corners of all polygons, one polygon after the other, and may be NaN; counts (P,) are of
     each one's corners, and those of fewer than 3 become no triangle.
-
-    Returns:
-        (T, 3) corners of the triangles, as indices into `points`, in the order of the polygons; (T,) the polygon of
-        each; and of how many polygons some triangles may lie outside: they cross themselves, or were too much work.
     """
     starts = np.cumsum(counts) - counts
     kinds, group = np.unique(counts, return_inverse=True)
@@ -80,12 +78,8 @@ def _doubled_areas(a: Doubles, b: Doubles, c: Doubles) -> Doubles:
 
 def _ears(flat: Doubles, budget: int) -> tuple[Ints, int, int]:
     """Cut the ears off polygons (P, n, 2) with the same number of corners, as `_flattened` gives them, all at once,
-    each in turns of its own, with so many comparisons at most.
-
-    Returns:
-        (P, n - 2, 3) corners of the triangles; how many polygons with an area had no ear at some time, or were left
-        over; and the comparisons that were made.
-    """
+    each in turns of its own, with so many comparisons at most. Return the corners of the triangles (P, n - 2, 3); how
+    many polygons with an area had no ear at some time, or were left over; and the comparisons that were made."""
     count, corners = flat.shape[:2]
     after = np.tile(np.roll(np.arange(corners), -1), (count, 1))
     before = np.tile(np.roll(np.arange(corners), 1), (count, 1))

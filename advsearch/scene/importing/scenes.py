@@ -202,7 +202,6 @@ def _frame(parts: Sequence[ImportedPart]) -> FileFrame:
 
 
 def _named(path: Path, header: Header, name: str, with_mesh: set[int]) -> int:
-    """The number of the node of that name which has a mesh, or one below it."""
     labels = {index: header.label(index) for index in sorted(with_above(header.parents, with_mesh))}
     found = [index for index, label in labels.items() if name in (label, f"node {index}")]
     if not found:
@@ -214,11 +213,9 @@ def _named(path: Path, header: Header, name: str, with_mesh: set[int]) -> int:
 
 
 def _unit_of_light(header: Header, both: bool) -> tuple[float, str | None]:
-    """How many candela are one unit of radiance times the file's area, and what is said of it.
-
-    Alone, lamps are in watts, as exporters have them. Beside surfaces that emit light, of which one nit is one unit,
-    what a candela is decides how bright they are to each other.
-    """
+    """How many candela are one unit of radiance times the file's area, and what is said of it. Alone, lamps are in
+    watts, as exporters have them. Beside surfaces that emit light, of which one nit is one unit, what a candela is
+    decides how bright they are to each other."""
     if header.asset.generator == GENERATOR:
         return 1.0, None  # a light of USD emits radiance as its surfaces do
     if not both:

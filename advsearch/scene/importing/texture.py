@@ -15,6 +15,7 @@ from scipy.ndimage import distance_transform_edt
 
 from advsearch.scene.assets import Bools, Doubles, Floats, Ints
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
+from advsearch.scene.importing.files import Notes
 from advsearch.scene.importing.geometry import Soup, connected, unit_vectors
 from advsearch.scene.importing.parts import FLAT, NEUTRAL, ImportedSurface, texels_of
 from advsearch.scene.importing.pictures import TEXTURE_LIMIT
@@ -43,9 +44,9 @@ class SurfaceMaps:
     emission: Floats | None = None  # (H", W", 3) linear radiance; (1, 1, 3) where it is the same everywhere
 
 
-def textured(soup: Soup, surfaces: Sequence[ImportedSurface]) -> tuple[Soup, SurfaceMaps, list[str]]:
-    """Return a repaired soup with UVs in [0, 1] on every corner, the maps that fit them and the surface of each part,
-    and the warnings."""
+def textured(soup: Soup, surfaces: Sequence[ImportedSurface], notes: Notes) -> tuple[Soup, SurfaceMaps]:
+    """Return a repaired soup with UVs in [0, 1] on every corner, and the maps that fit them and the surface of each
+    part."""
     used = list({id(surfaces[number]): surfaces[number] for number in np.unique(soup.part)}.values())
     first, uniform = used[0], all(surface.same_maps(used[0]) for surface in used)
     one_factor = bool((soup.colors == soup.colors[0, 0]).all())
@@ -53,7 +54,7 @@ def textured(soup: Soup, surfaces: Sequence[ImportedSurface]) -> tuple[Soup, Sur
     if colored and not first.pictures:
         kept = _usable(soup, soup.uvs) and not _overlap(soup.uvs, material)
         soup = replace(soup, uvs=np.clip(soup.uvs, 0.0, 1.0)) if kept else unwrapped(soup, material)
-        return soup, SurfaceMaps(_of_one_color(soup, first), None, first.emission), []
+        return soup, SurfaceMaps(_of_one_color(soup, first), None, first.emission)
     if colored and (first.texture is None or soup.colors.min() == 1.0) and np.isfinite(soup.uvs).all():
         uvs, pictures = _windowed(_into_unit_square(soup), first.pictures, first.texture)
         twice = _usable(soup, uvs) and _lit_twice(uvs, first, pictures)
@@ -63,14 +64,15 @@ def textured(soup: Soup, surfaces: Sequence[ImportedSurface]) -> tuple[Soup, Sur
             uvs, maps = np.clip(uvs, 0.0, 1.0), SurfaceMaps(color, kept_maps.normal_map, kept_maps.emission)
             if maps.normals is not None:
                 uvs, maps = unmirrored(uvs, mirrored(soup, uvs), maps, maps.normals)
-            return replace(soup, uvs=uvs), maps, []
+            return replace(soup, uvs=uvs), maps
     fresh = unwrapped(soup, material)
     maps = baked(fresh.uvs, soup, surfaces)
     shared = "several faces share a texture that emits light; it was unwrapped anew and its texture resampled"
     size, why = len(maps.color), shared if twice else _why(soup, used, uniform, one_factor)
     times = _texels(soup, surfaces) / (size * size * _FILLED)
     fewer = "" if times < _FINER else f", {times:.0f} times fewer than its pictures have there"
-    return fresh, maps, [f"{why} ({size} x {size} texels{fewer})"]
+    notes.say(f"{why} ({size} x {size} texels{fewer})")
+    return fresh, maps
 
 
 def by_material(soup: Soup, surfaces: Sequence[ImportedSurface]) -> tuple[list[str], Ints]:
@@ -113,7 +115,6 @@ def _in_texels(uvs: Doubles, shape: tuple[int, int]) -> Doubles:
 
 
 def _why(soup: Soup, used: Sequence[ImportedSurface], uniform: bool, one_factor: bool) -> str:
-    """Return the sentence that says why the object was unwrapped anew."""
     if not uniform:
         count = len({surface.name or id(surface) for surface in used})
         what = f"the colours of its {count} materials" if count > 1 else "the pictures of its material"
@@ -163,13 +164,8 @@ def _into_unit_square(soup: Soup) -> Doubles:
 
 
 def _windowed(uvs: Doubles, pictures: Sequence[Floats], colors: Floats | None) -> tuple[Doubles, Sequence[Floats]]:
-    """Cut pictures to the window that UVs span where they overstep the unit square a little or use a corner of it.
-
-    The layout of the charts stays. Windows larger than `_WINDOW` textures are left alone: there the textures repeat.
-
-    Returns:
-        The UVs and the pictures, unchanged or all made to fit the window.
-    """
+    """Cut pictures to the window that UVs span where they overstep the unit square a little or use a corner of it; the
+    layout of the charts stays. Windows larger than `_WINDOW` textures are left alone: there the textures repeat."""
     texel = np.max([1.0 / np.array(picture.shape[1::-1]) for picture in pictures], axis=0)
     low, high = uvs.min(axis=(0, 1)) - texel, uvs.max(axis=(0, 1)) + texel
     size = high - low
@@ -192,11 +188,8 @@ def _windowed(uvs: Doubles, pictures: Sequence[Floats], colors: Floats | None) -
 
 def baked(uvs: Doubles, soup: Soup, surfaces: Sequence[ImportedSurface]) -> SurfaceMaps:
     """Paint the colours and the normals of a soup, with the file's UVs (NaN where it has none), and of the surface of
-    each part into maps (N, N, ...) for new UVs (F, 3, 2) in [0, 1] without overlaps.
-
-    They have room for the texels that the object shows. Texels outside every chart repeat the nearest one inside, so
-    that filtering finds no seam.
-    """
+    each part into maps (N, N, ...) for new UVs (F, 3, 2) in [0, 1] without overlaps, with room for the texels that the
+    object shows. Texels outside every chart repeat the nearest one inside, so that filtering finds no seam."""
     size, texels = BAKED_SIZE, _texels(soup, surfaces)
     while size < TEXTURE_LIMIT and size * size * _FILLED < texels:
         size *= 2
@@ -245,7 +238,6 @@ def _looked_up(surface: ImportedSurface, at: Doubles, soup: Soup, surfaces: Sequ
 
 
 def _texels(soup: Soup, surfaces: Sequence[ImportedSurface]) -> float:
-    """Return how many texels of its pictures the object shows."""
     texels, areas = 0.0, np.nan_to_num(np.abs(doubled_areas(soup.uvs)) / 2.0)
     for number, area in enumerate(np.bincount(soup.part, areas)):
         sizes = (picture.shape[0] * picture.shape[1] for picture in surfaces[number].pictures)

@@ -229,7 +229,6 @@ class Conversion:
         self.left[what] += 1
 
     def _fill(self, prim: Any, node: dict[str, Any]) -> None:
-        """Give a node what its prim shows, if it is seen."""
         imageable = UsdGeom.Imageable(prim)
         shows = prim.IsA(UsdGeom.Mesh) or prim.IsA(UsdGeom.Camera) or prim.HasAPI(UsdLux.LightAPI)
         if not shows:

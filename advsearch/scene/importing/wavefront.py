@@ -148,11 +148,9 @@ def _in_effect(changes: list[tuple[int, str]], rows: Ints) -> tuple[list[str], I
 
 
 def _colors(lines: Lines, table: Doubles, notes: Notes) -> Doubles | None:
-    """Return the linear colour (V, 3) of every vertex; neutral grey where a file with colours has none.
-
-    A vertex is three coordinates, then perhaps a weight, or a colour, or a colour and its opacity; or ZBrush has put
-    colours into comments.
-    """
+    """Return the linear colour (V, 3) of every vertex; neutral grey where a file with colours has none. A vertex is
+    three coordinates, then perhaps a weight, or a colour, or a colour and its opacity; or ZBrush has put colours into
+    comments."""
     if (np.isfinite(table[:, 3]) & np.isnan(table[:, 4]) & (table[:, 3] != 1.0)).any():
         notes.has("weights of vertices, the fourth number of", "v")
     given: Doubles | None = table[:, 3:6]
@@ -331,7 +329,6 @@ class Lines:
         return rows, data
 
     def _words(self, rows: Ints) -> Iterator[tuple[int, list[str]]]:
-        """Yield the number and the words of lines of numbers."""
         for row in rows:
             line = text_of(self.text[self.starts[row] : self.ends[row]])
             yield int(row) + 1, line.partition("#")[0].split()[1:]

@@ -15,7 +15,7 @@ import numpy as np
 
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.assets import Floats, Mesh, ObjectAsset, UpAxis, normalised
-from advsearch.scene.importing.files import clean, safe_name, shown
+from advsearch.scene.importing.files import Notes, clean, safe_name, shown
 from advsearch.scene.importing.geometry import assemble, join
 from advsearch.scene.importing.parts import BRIGHTEST, ImportedPart, ImportedSurface
 from advsearch.scene.importing.scenes import TAKEN, ImportedScene
@@ -216,7 +216,7 @@ def _painted(shape: ShapeMesh, surface: ShapeSurface, kind: str, where: str) -> 
     vertices, normals, uvs = (values.astype(np.float64) for values in (mesh.vertices, mesh.normals, mesh.uvs))
     color = ImportedSurface(color=surface.base_color[0, 0])
     part = ImportedPart(vertices, mesh.faces.astype(np.int64), normals, uvs if own else None, None, color)
-    soup, maps, _ = textured(join([part], where, y_up=False), [color])
+    soup, maps = textured(join([part], where, y_up=False), [color], Notes(where))
     return assemble(soup)[0], maps.color
 
 
