@@ -63,8 +63,8 @@ def read_joined(value: Any, setting: str, otherwise: str) -> Any:
         return read_named(value, setting, otherwise)
     read = [read_named(part.strip() if isinstance(part, str) else part, setting, otherwise) for part in parts]
     mappings = [part if isinstance(part, Mapping) else {"name": part} for part in read]
-    names = [part.get("name") for part in mappings]
-    if not all(isinstance(name, str) and name for name in names):
+    names = [name for part in mappings if isinstance(name := part.get("name"), str) and name]
+    if len(names) < len(read):
         return value
     options = {part["name"]: {k: v for k, v in part.items() if k != "name"} for part in mappings if len(part) > 1}
     last = options.get(names[-1], {})
@@ -248,7 +248,6 @@ class SceneConfig(Config):
 
     @model_validator(mode="after")
     def _one_of_each(self) -> SceneConfig:
-        """Refuse several objects, environments or models where one is looked at."""
         for name in ("object", "environment", "model"):
             names, tasks = split_names(getattr(self, name) or ""), self.task_name.split(JOINED)
             if name == "model" and len(tasks) > 1:
@@ -363,7 +362,6 @@ class SceneConfig(Config):
     @field_validator("estimators", mode="before", check_fields=False)
     @classmethod
     def _estimators_from_name(cls, value: Any) -> Any:
-        """Accept ``differences`` for all controls."""
         return {"*": value} if isinstance(value, str) else value
 
     @field_validator("resolution", mode="before")

@@ -182,7 +182,6 @@ class Scenes:
 
 
 def _index(name: str, labels: Sequence[str]) -> int | None:
-    """The class of a name; None where there is none."""
     try:
         return find_label_set(name, labels).indices[0]
     except InputError:

@@ -53,7 +53,7 @@ def things_as_text(things: object) -> str | None:
         raise InputError(
             f"things: expected a text such as 'car@12,3.5', a mapping or a list of these, got {things!r:.80}"
         )
-    text = ";".join(_thing_as_text(thing) if isinstance(thing, Mapping) else thing for thing in listed)
+    text = ";".join(_thing_as_text(thing) if isinstance(thing, Mapping) else str(thing) for thing in listed)
     named = []
     for part in filter(None, map(str.strip, text.split(";"))):
         what, at, rest = part.rpartition("@")
@@ -105,7 +105,6 @@ def default_of(option: Field[Any]) -> Any:
 
 
 def _expected(kind: str, value: object) -> str | None:
-    """What a value of a type should be, if it is not."""
     number = isinstance(value, (int, float)) and not isinstance(value, bool) and not abs(value) > MOST
     return {
         "float": None if number else f"a finite number from {-MOST} to {MOST}",

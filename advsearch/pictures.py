@@ -114,7 +114,6 @@ def steps_of(image: Image.Image, *, alpha: bool) -> npt.NDArray[np.uint8]:
 
 
 def _scans(image: Image.Image) -> int:
-    """Return how many scans of an opened JPEG are still to be decoded."""
     file = getattr(image, "fp", None)
     if file is None:
         return 0

@@ -275,7 +275,7 @@ def _moved(condition: RuleCondition, table: pd.DataFrame) -> Iterator[RuleCondit
             yield replace(condition, high=at)
 
 
-class Split(NamedTuple):
+class TreeColumn(NamedTuple):
     """What a column of the trees' data is of: all values of a factor; the name that it is 1 of; or, of an angle that
     goes round, where its zero is."""
 
@@ -297,19 +297,19 @@ def _candidates(table: pd.DataFrame, least: int, seed: int) -> Iterator[RuleCond
     trees_of, forests = (import_library(f"sklearn.{part}") for part in ("tree", "ensemble"))
     one_tree, forest = trees_of.DecisionTreeClassifier, forests.RandomForestClassifier
     columns: list[npt.NDArray[np.float64]] = []
-    splits: list[Split] = []
+    splits: list[TreeColumn] = []
     for factor, unit in table.attrs["units"].items():
         column, whole = table[factor], RuleCondition(factor, unit)
         if column.dtype != "category":
             columns.append(values := column.to_numpy())
-            splits.append(Split(whole))
+            splits.append(TreeColumn(whole))
             if unit == "degrees" and np.ptp(values) >= AROUND:
                 columns += [(values - zero) % turn for turn, zero in ARCS]
-                splits += [Split(replace(whole, turn=turn), zero=zero) for turn, zero in ARCS]
+                splits += [TreeColumn(replace(whole, turn=turn), zero=zero) for turn, zero in ARCS]
             continue
         names = column.cat.categories.tolist()
         columns += [(column == name).to_numpy(np.float64) for name in names]
-        splits += [Split(replace(whole, options=frozenset(names)), name) for name in names]
+        splits += [TreeColumn(replace(whole, options=frozenset(names)), name) for name in names]
     data, right = np.stack(columns, axis=1), table["correct"].to_numpy()
     shape = {"max_depth": DEPTH, "min_samples_leaf": least}
     alone = one_tree(**shape, random_state=seed % 2**32)
@@ -331,9 +331,9 @@ def _candidates(table: pd.DataFrame, least: int, seed: int) -> Iterator[RuleCond
                     yield conditions
 
 
-def _nodes(tree: Any, splits: list[Split]) -> Iterator[dict[Split, RuleCondition]]:
+def _nodes(tree: Any, splits: list[TreeColumn]) -> Iterator[dict[TreeColumn, RuleCondition]]:
     """What holds at each node of a tree, by what its columns are of."""
-    open_nodes: list[tuple[int, dict[Split, RuleCondition]]] = [(0, {})]
+    open_nodes: list[tuple[int, dict[TreeColumn, RuleCondition]]] = [(0, {})]
     while open_nodes:
         node, conditions = open_nodes.pop()
         yield conditions

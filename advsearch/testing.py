@@ -145,7 +145,6 @@ def _asserted(
     seed: int,
     run: str | Path | None,
 ) -> SuiteResult:
-    """Try a suite of one claim, and raise what its verdict says."""
     __tracebackhide__ = True
     # late: torch takes long to import
     from advsearch.engine import loading

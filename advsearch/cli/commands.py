@@ -1,8 +1,8 @@
 """The commands: what the help lists, and what carries each out.
 
 A question's command is made of it (`advsearch.question.question`), or a module with `HELP` (one line) and a
-`QuestionCommand` or `Command` called `COMMAND`. It imports what is heavy inside functions, so that `advsearch --help`
-answers at once. Other commands are a `Command` in this package, which is imported when it is asked for.
+`QuestionCommand` or `PlainCommand` called `COMMAND`. It imports what is heavy inside functions, so that `advsearch
+--help` answers at once. Other commands are a `PlainCommand` in this package, which is imported when it is asked for.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def argument(*names: str, **options: Any) -> Argument:
 
 
 @dataclass(frozen=True)
-class Command:
+class PlainCommand:
     """A command that asks no question.
 
     Attributes:
@@ -79,7 +79,7 @@ class QuestionCommand:
         place: how that setting is given without its flag.
         brought: returns the settings that the `run.yaml` of the run that it is about brings, by what was typed.
         listed: where the function is that returns what it may be about, with a line about each, which `list` prints.
-        more, examples: as of `Command`.
+        more, examples: as of `PlainCommand`.
     """
 
     name: str
@@ -197,7 +197,7 @@ GROUPS = {
     },
 }
 """Each command, in the groups and the order in which the help shows them: empty for a question, which is found by its
-name; for another command its module, the `Command` in it and what it does. A question that `question`
+name; for another command its module, the `PlainCommand` in it and what it does. A question that `question`
 makes needs no line here: the help shows it behind the others that ask."""
 
 for _name in set(made_questions()).difference(*GROUPS.values()):
@@ -207,7 +207,7 @@ COMMANDS = {name: place for group in GROUPS.values() for name, place in group.it
 
 
 def command_named(name: str) -> Any:
-    """Return the `QuestionCommand` or `Command` of a name."""
+    """Return the `QuestionCommand` or `PlainCommand` of a name."""
     if COMMANDS[name]:
         place, _, attribute = COMMANDS[name].partition(" ")[0].partition(":")
         return getattr(importlib.import_module(place), attribute)

@@ -6,7 +6,7 @@ import argparse
 from typing import Any
 
 from advsearch.cli import output
-from advsearch.cli.commands import COMMANDS, Command, argument
+from advsearch.cli.commands import COMMANDS, PlainCommand, argument
 from advsearch.cli.main import add_command, without_commands
 from advsearch.cli.show import REGISTRIES, list_names
 from advsearch.errors import InputError
@@ -59,7 +59,7 @@ def _names_or_files(flag: str, names: list[str]) -> dict[str, Any]:
     }
 
 
-COMPLETION = Command(
+COMPLETION = PlainCommand(
     _completion,
     (
         argument("shell", choices=["bash", "zsh", "tcsh"], help="the shell that the script is for"),

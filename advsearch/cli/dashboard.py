@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from advsearch.cli import output
-from advsearch.cli.commands import Command, argument
+from advsearch.cli.commands import PlainCommand, argument
 from advsearch.errors import InputError
 from advsearch.questions.sweep.page import write_bundle
 from advsearch.runs.directory import find_run
@@ -73,7 +73,7 @@ class _LoadedLater:
         return self._loaded.agreement(run)
 
 
-DASHBOARD = Command(
+DASHBOARD = PlainCommand(
     _dashboard,
     (
         argument("runs", nargs="*", metavar="RUN", help="names or folders of runs (default: all in runs/)"),
@@ -103,7 +103,7 @@ def _view(args: argparse.Namespace) -> int:
     return output.say(args.json, {"command": "view", "runs": list(map(str, folders)), "out": str(out)}, str(out))
 
 
-VIEW = Command(
+VIEW = PlainCommand(
     _view,
     (
         argument("runs", nargs="+", metavar="RUN", help="a run's name or folder; several sweeps with --bundle"),

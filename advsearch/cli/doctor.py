@@ -24,7 +24,7 @@ from pathlib import Path
 
 from advsearch import __version__, threads
 from advsearch.cli import output
-from advsearch.cli.commands import Command
+from advsearch.cli.commands import PlainCommand
 from advsearch.errors import AdvsearchError
 from advsearch.registry import OWN_FOLDER
 from advsearch.scene.mitsuba_backend import llvm
@@ -230,7 +230,6 @@ def check_hardware() -> Component:
 
 
 def _ending(status: int | None, errors: str) -> str:
-    """How the other process ended, in one line."""
     if status is None:
         return f"the trial took longer than {SECONDS_ALLOWED} s"
     if status == 0:
@@ -241,7 +240,6 @@ def _ending(status: int | None, errors: str) -> str:
 
 
 def _print_table(parts: list[Component], good: bool) -> None:
-    """Print the parts as a table, and below it what has to be done."""
     # late: what is missing is told without it, too
     from rich.console import Console
     from rich.markup import escape
@@ -262,4 +260,4 @@ def _print_table(parts: list[Component], good: bool) -> None:
     console.print("Everything that is necessary works." if good else "[red]Something necessary does not work.[/]")
 
 
-DOCTOR = Command(_doctor, (output.add_flags,))
+DOCTOR = PlainCommand(_doctor, (output.add_flags,))

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from advsearch.cli import output
-from advsearch.cli.commands import Command, argument
+from advsearch.cli.commands import PlainCommand, argument
 from advsearch.cli.output import at_work, output_errors
 from advsearch.described import rounded
 from advsearch.errors import InputError, UnknownNameError
@@ -80,14 +80,11 @@ def _print(args: argparse.Namespace, out: Path) -> Written:
         known = real_size(args.run) if args.size is None else args.size
         longest = USUAL_SIZE if known is None else known
         pieces = printable(args.run, longest)
-        options = {
-            "paper": (args.paper or "a4").lower(),
-            "profile": None if args.icc is None else Path(args.icc),
-            "most": MOST_SHEETS if args.sheets is None else args.sheets,
-        }
+        profile = None if args.icc is None else Path(args.icc)
         title = f"{Path(args.run).name}, object of {rounded(longest)} mm"
         with placed_by("out"), replacing(out) as part:
-            pages = write_sheets(part, pieces, title, last=chart_page, **options)
+            paper, most = (args.paper or "a4").lower(), MOST_SHEETS if args.sheets is None else args.sheets
+            pages = write_sheets(part, pieces, title, paper=paper, profile=profile, most=most, last=chart_page)
     sizes = [{"name": piece.name, "width_mm": piece.size[0], "height_mm": piece.size[1]} for piece in pieces]
     text = f"{pages} pages in {out}; print them at 100 % and measure the square on the first"
     if known is None:
@@ -191,7 +188,7 @@ def _table(args: argparse.Namespace, out: Path | None, by_name: str) -> int:
     return output.say(args.json, facts, text, sys.stderr)
 
 
-EXPORT = Command(
+EXPORT = PlainCommand(
     _export,
     (
         argument("run", metavar="RUN", help="a run's name or folder"),

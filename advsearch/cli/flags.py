@@ -94,7 +94,6 @@ def config_of_file(command: str, file: str | Path, changes: Mapping[str, object]
 
 
 def _inside(scene: str) -> str:
-    """Return the names of what can be the object in a scene file, as a message lists them."""
     from advsearch.scene.importing.files import shown  # late: another thing has this name here
 
     # late, so that --help answers at once

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import advsearch
 from advsearch.cli import output
-from advsearch.cli.commands import Command, argument
+from advsearch.cli.commands import PlainCommand, argument
 from advsearch.cli.output import at_work
 from advsearch.errors import InputError
 from advsearch.files import MESHES, either
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from advsearch.scene.importing.scenes import Contents
 
 VIEWS, SIDE = 4, 192  # views of the picture, and the side of each in pixels
-Told = tuple[dict[str, Any], list[str]]  # what is understood of a file, as JSON and in lines
+Understood = tuple[dict[str, Any], list[str]]  # what is understood of a file, as JSON and in lines
 
 
 def _import(args: argparse.Namespace) -> int:
@@ -40,7 +40,7 @@ def _import(args: argparse.Namespace) -> int:
     return output.say(args.json, facts, "\n".join(lines))
 
 
-def _mesh_file(file: str, inside: Contents) -> Told:
+def _mesh_file(file: str, inside: Contents) -> Understood:
     whole, nodes, rig = inside.object, inside.nodes, inside.object.mesh.rig
     materials = {name: len(faces) for name, faces in whole.mesh.materials.items()}
     width, height = whole.base_color.shape[1::-1]
@@ -82,7 +82,6 @@ def _mesh_file(file: str, inside: Contents) -> Told:
 
 
 def _slow(whole: ObjectAsset) -> list[str]:
-    """Return what of an object makes searches slower, and why."""
     features = {"what it lets light through": whole.opacity, "its normal map": whole.normal_map}
     features["its emission"] = whole.emission
     slow = [name for name, feature in features.items() if feature is not None]
@@ -92,7 +91,7 @@ def _slow(whole: ObjectAsset) -> list[str]:
     ]
 
 
-def _mitsuba_file(file: str, out: Path | None) -> Told:
+def _mitsuba_file(file: str, out: Path | None) -> Understood:
     """Read and picture, as its first camera sees it, a Mitsuba scene."""
     from advsearch.scene.mitsuba_backend.scene_files import contents  # late: another thing has this name here
 
@@ -117,7 +116,7 @@ def _mitsuba_file(file: str, out: Path | None) -> Told:
     return {**listed, "kept": kept, "warnings": list(warnings)}, lines
 
 
-IMPORT = Command(
+IMPORT = PlainCommand(
     _import,
     (
         argument("file", metavar="FILE", help=f"a {either(MESHES)} file, or an .xml file of Mitsuba"),
@@ -146,7 +145,7 @@ def _describe(parser: argparse.ArgumentParser) -> None:
     )
 
 
-IMPORT_3DB = Command(
+IMPORT_3DB = PlainCommand(
     _import_threedb,
     (
         _describe,

@@ -64,7 +64,6 @@ def _interruptible(words: list[str]) -> int:
 
 
 def _status(words: list[str]) -> int:
-    """Run one command, print what went wrong, and return the exit status."""
     try:
         status = _run_and_tell(words)
         if status != INTERRUPTED and INTERRUPTS.count:  # whatever has swallowed one: it was asked to stop
@@ -79,7 +78,6 @@ def _status(words: list[str]) -> int:
 
 
 def _run_and_tell(words: list[str]) -> int:
-    """Run one command and return the exit status; what the input is to blame for is printed."""
     try:
         status = _run(words)
         sys.stdout.flush()

@@ -191,7 +191,6 @@ def go_on_command(run: str | Path) -> str:
 
 
 def _code_in(file: Path) -> Sequence[str]:
-    """The Python code that a run.yaml names."""
     # late, so that --help answers at once
     from advsearch.cli.flags import command_in, config_of_file
     from advsearch.config import SceneConfig

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from advsearch.cli import commands, output
-from advsearch.cli.commands import Command, argument
+from advsearch.cli.commands import PlainCommand, argument
 from advsearch.cli.flags import command_in, config_of_file
 from advsearch.cli.show import show_run
 from advsearch.errors import InputError
@@ -54,7 +54,7 @@ def run_file(
     return int(command.carry_out(config, as_json=args.json, quiet=args.quiet, resumed=resumed))
 
 
-RUN = Command(
+RUN = PlainCommand(
     _run,
     (
         argument("file", metavar="FILE", help="YAML with settings and values, such as a run's run.yaml"),
@@ -86,7 +86,7 @@ def _resume(args: argparse.Namespace) -> int:
     return run_file(path / CONFIG, changes, args, resumed=path)
 
 
-RESUME = Command(
+RESUME = PlainCommand(
     _resume,
     (
         argument("run", metavar="RUN", help="a run's name or folder"),
@@ -128,7 +128,7 @@ def _runs(args: argparse.Namespace) -> int:
     return 0
 
 
-RUNS = Command(
+RUNS = PlainCommand(
     _runs,
     (argument("folder", nargs="?", metavar="FOLDER", help="where to look (default: runs)"), output.add_flags),
 )

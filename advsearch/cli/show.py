@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from advsearch.cli import commands, output
-from advsearch.cli.commands import Command, QuestionCommand, argument
+from advsearch.cli.commands import PlainCommand, QuestionCommand, argument
 from advsearch.cli.flags import add_settings
 from advsearch.cli.output import at_work, raw
 from advsearch.errors import InputError, UnknownNameError
@@ -35,7 +35,6 @@ if TYPE_CHECKING:
 
 
 def _show(args: argparse.Namespace) -> int:
-    """Print the result of a run, a control's parameters, or the options of a policy or a task."""
     if args.picture and (args.json or len(args.what) > 1):
         raise InputError("--picture: draws the pictures of one run, after its text; give one run, and leave --json out")
     match args.what:
@@ -104,7 +103,6 @@ def _photos_text(table: PhotoAgreement) -> str:
 
 
 def _show_unfinished(run: Listed, as_json: bool) -> int:
-    """Say what a run is, how far it has come and how to go on."""
     go_on = output.go_on_command(run.path) if run.begun and run.state == "stopped" else None
     what = run.command
     if run.object:
@@ -248,7 +246,7 @@ def _set_usage(parser: argparse.ArgumentParser) -> None:
     parser.usage = "advsearch show [--json] RUN [--picture] | control NAME | policy NAME | task NAME | recipe NAME"
 
 
-SHOW = Command(
+SHOW = PlainCommand(
     _show,
     (
         _set_usage,
@@ -344,7 +342,7 @@ def first_doc_line(entry: Any) -> str:
     return (inspect.getdoc(documented) or "").partition("\n")[0]
 
 
-LIST = Command(
+LIST = PlainCommand(
     _list,
     (argument("kind", nargs="?", default="all", choices=[*REGISTRIES, "all"], help="default: all"), output.add_flags),
 )
@@ -384,7 +382,7 @@ def class_names(model: str, labels: str | None) -> tuple[str, ...]:
     return loaded.labels
 
 
-LABELS = Command(
+LABELS = PlainCommand(
     _labels,
     (
         argument("word", metavar="WORD", nargs="?", help="what the names should be like; all without it"),

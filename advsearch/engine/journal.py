@@ -29,7 +29,7 @@ from advsearch.engine.problem import Prepared, Problem
 from advsearch.engine.record import LOST, judged, judgement_of, trial_row
 from advsearch.errors import ClusterError, InputError
 from advsearch.models import Model
-from advsearch.models.address import Asked
+from advsearch.models.address import AskedModel
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row, Told
 from advsearch.scene.formation import levels_of
@@ -131,7 +131,7 @@ def check_made_of(
     now: dict[str, Any] = {}
     for model in models:
         for network in model.module.models if isinstance(model.module, Ensemble) else (model,):
-            if isinstance(network.module, Asked):
+            if isinstance(network.module, AskedModel):
                 network.module.keep_in(run.store)
             now[f"model {network.name}"] = {"weights": weights_digest(network)}
     now |= {name: _function(function) for name, function in (functions or {}).items() if function is not None}

@@ -19,6 +19,7 @@ import ssl
 import time
 import urllib.error
 import urllib.request
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -68,7 +69,7 @@ REFUSED = "(refused)"  # the words of a model that declines to answer
 Levels: TypeAlias = npt.NDArray[np.uint8]  # A picture (H, W, 3) as a file has it
 
 
-class Store(Protocol):
+class Notes(Protocol):
     """What a run keeps notes in."""
 
     def noted(self, key: str) -> Any:
@@ -157,7 +158,7 @@ def _finished(spec: str, address: SplitResult, purpose: Purpose) -> Model:
         raise InputError(f"model {spec}: expected the name of the chat's model behind a #: {spec}#NAME")
     question = purpose.one_prompt(name) or (QUESTION if free else "")
     line = Line(urlunsplit(address._replace(fragment="")), name, limits_of(purpose.ask), spec)
-    asked = Asked(line, address.fragment if chat else "", question, purpose.tokens, purpose.times if free else 1)
+    asked = AskedModel(line, address.fragment if chat else "", question, purpose.tokens, purpose.times if free else 1)
     if not free:
         asked.names = purpose.names or tuple(asked.scores(np.full((SIDE, SIDE, 3), 128, np.uint8)))
         if len(asked.names) < 2:
@@ -173,30 +174,20 @@ def _finished(spec: str, address: SplitResult, purpose: Purpose) -> Model:
 
 
 @dataclass
-class Spent:
-    """What a run has spent on a model: calls, and tokens in and out."""
-
-    calls: int = 0
-    tokens_in: int = 0
-    tokens_out: int = 0
-
-
-@dataclass
 class Line:
-    """Sends requests to one address, within the limits of a run; `spent` counts those of its earlier lives too."""
+    """Sends requests to one address, within the limits of a run; `spent` counts calls, and tokens in and out, those of
+    its earlier lives too."""
 
     url: str
     name: str
     limits: Mapping[str, float]
     spec: str
-    spent: Spent = field(default_factory=Spent)
-    store: Store | None = None
+    spent: Counter[str] = field(default_factory=Counter)
+    store: Notes | None = None
 
-    def keep_in(self, store: Store) -> None:
+    def keep_in(self, store: Notes) -> None:
         """Keep what is spent in a run from here on, and go on counting where the run stopped."""
-        before = Spent(**(store.noted(self._note) or {}))
-        now = self.spent
-        self.spent = Spent(*(getattr(before, part) + getattr(now, part) for part in vars(now)))
+        self.spent += Counter(store.noted(self._note) or {})
         self.store = store
 
     @property
@@ -205,15 +196,15 @@ class Line:
 
     def _keep(self) -> None:
         if self.store is not None:
-            self.store.set_note(self._note, json.dumps(vars(self.spent)))
+            self.store.set_note(self._note, json.dumps(self.spent))
 
     @property
     def _so_far(self) -> dict[str, float]:
         """What has been spent, by the name of its limit; money in the unit of the prices."""
         limits, spent = self.limits, self.spent
-        by_token = limits["per_million_in"] * spent.tokens_in + limits["per_million_out"] * spent.tokens_out
-        money = limits["per_call"] * spent.calls + by_token / 1e6
-        return {"calls": spent.calls, "tokens": spent.tokens_in + spent.tokens_out, "money": money}
+        by_token = limits["per_million_in"] * spent["tokens_in"] + limits["per_million_out"] * spent["tokens_out"]
+        money = limits["per_call"] * spent["calls"] + by_token / 1e6
+        return {"calls": spent["calls"], "tokens": spent["tokens_in"] + spent["tokens_out"], "money": money}
 
     @property
     def sentence(self) -> str:
@@ -261,7 +252,7 @@ class Line:
                 if isinstance(answer, ModelError):
                     failed.append(str(answer))
                     continue
-                why, later, asked_to = self._failure(answer, first=self.spent.calls <= len(wave))
+                why, later, asked_to = self._failure(answer, first=self.spent["calls"] <= len(wave))
                 if not later or tries == 1:
                     failed.append(f"model {self.name}: {why} ({self.url})")
                 again.append((place, tries - 1, max(wait, asked_to)))
@@ -275,7 +266,7 @@ class Line:
         """Count calls before they are made, as many as the limits allow, and return how many these are."""
         count = 0
         while count < most and not (over := self._over):
-            self.spent.calls += 1
+            self.spent["calls"] += 1
             count += 1
         if not count:
             raise ModelError(over)
@@ -283,7 +274,6 @@ class Line:
         return count
 
     def _together(self, bodies: Sequence[bytes]) -> list[dict[str, Any] | Exception]:
-        """What is answered to each, or why nothing is."""
 
         def sent(body: bytes) -> dict[str, Any] | Exception:
             try:
@@ -367,8 +357,7 @@ class Line:
         numbers = [usage.get(name) for name in ("prompt_tokens", "completion_tokens")]
         tokens = [n for n in numbers if isinstance(n, int) and not isinstance(n, bool) and n >= 0]
         if len(tokens) == 2:
-            self.spent.tokens_in += tokens[0]
-            self.spent.tokens_out += tokens[1]
+            self.spent.update(tokens_in=tokens[0], tokens_out=tokens[1])
             self._keep()
         elif self.limits["tokens"] < LIMITS["tokens"] or self._priced_by_token:
             raise self.wrong("`usage` with prompt_tokens and completion_tokens, as `ask` counts tokens", "none")
@@ -389,7 +378,7 @@ def _text(answer: Mapping[str, Any]) -> str:
     return str(max(scores, key=scores.get) if scores else answer["text"])
 
 
-class Asked:
+class AskedModel:
     """Answers pictures (N, 3, H, W) in [0, 1], rounded to 8 bits: logits (N, names), or without names what is said of
     each picture (`advsearch.tasks.answers.Texts`). The same picture is not sent twice in a run, also if it goes on.
 
@@ -406,7 +395,7 @@ class Asked:
         self.names: tuple[str, ...] = ()
         self._known: dict[str, dict[str, Any]] = {}
 
-    def keep_in(self, store: Store) -> None:
+    def keep_in(self, store: Notes) -> None:
         """Keep answers in a run from here on; those that it has are not asked for again."""
         self.line.keep_in(store)
 

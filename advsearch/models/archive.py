@@ -169,7 +169,6 @@ def _version(archive: Archive) -> int:
 
 
 def _code_problem(content: bytes) -> str:
-    """Return what source code does that a network has no use for, or nothing."""
     try:
         text = content.decode("utf-8")
     except UnicodeDecodeError:

@@ -121,7 +121,7 @@ def _arguments(node: ast.Call, power: int) -> tuple[list[ast.expr], int]:
     if keys:
         raise ValueError("keywords")
     if name in POWERS and len(node.args) == 2:
-        return _powered(*node.args, power)
+        return _powered(node.args[0], node.args[1], power)
     if name not in FUNCTIONS or len(node.args) > 16:
         raise ValueError(f"a call of {ast.unparse(node.func)[:40]!r}")
     return node.args, power
@@ -213,7 +213,6 @@ def rewritten(archive: Archive) -> io.BytesIO:
 
 
 def _copy_tensors(archive: Archive, writer: Any, folder: str, config: str) -> None:
-    """Copy the tensors that a table of contents names, and the table."""
     content = archive.read_json(config)
     table = content.get("config") if isinstance(content, dict) else None
     if not isinstance(table, dict) or not all(isinstance(entry, dict) for entry in table.values()):
@@ -267,7 +266,6 @@ def _checked_object(path: Path, value: JsonObject, key: str) -> JsonObject:
 
 
 def _problem(value: Any, key: str) -> str:
-    """Return what is wrong with a number or text under `key`, or nothing."""
     if isinstance(value, str):
         return _TEXTS.get(key, _identifier_problem if key in _IDENTIFIERS else _plain_problem)(value)
     if key == "expr_str":

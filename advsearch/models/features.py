@@ -58,7 +58,8 @@ class Features:
         """
         images = checked_images(images)
         batches = images.split(self.model.batch_limits[1])
-        return joined([self.read(self.model.prepared(b))[: len(b)].float() for b in batches]).to(images.device)
+        features: Tensor = joined([self.read(self.model.prepared(b))[: len(b)].float() for b in batches])
+        return features.to(images.device)
 
 
 def features_of(model: Model) -> Features:
@@ -115,7 +116,7 @@ def _of_modules(network: Any, x: Tensor, only: nn.Module | None) -> list[_Call]:
     calls: list[_Call] = []
     if not isinstance(network, nn.Module) or isinstance(network, torch.jit.ScriptModule):
         return calls
-    names = {layer: name for name, layer in network.named_modules() if isinstance(layer, LAYERS)}
+    names: dict[nn.Module, str] = {layer: name for name, layer in network.named_modules() if isinstance(layer, LAYERS)}
 
     def keep(layer: nn.Module, args: tuple[Tensor, ...], kwargs: dict[str, Tensor], output: Tensor) -> None:
         input = args[0] if args else kwargs["input"]
@@ -139,9 +140,9 @@ def _of_graph(network: Any, x: Tensor, only: fx.Node | None) -> list[_Call]:
             value = super().run_node(n)
             if n.op == "call_function" and n.target in OPERATORS and only in (None, n) and isinstance(value, Tensor):
                 source = n.args[OPERATORS[n.target]]
-                weights = not isinstance(source, fx.Node) or source.op == "get_attr"
+                input = self.env[source] if isinstance(source, fx.Node) and source.op != "get_attr" else None
                 axis = -1 if n.target in CHANNELS_LAST else 1
-                calls.append(_Call(n, f"the operator {n.name}", None if weights else self.env[source], value, axis))
+                calls.append(_Call(n, f"the operator {n.name}", input, value, axis))
             return value
 
     if isinstance(network, fx.GraphModule):

@@ -95,7 +95,6 @@ def _kind(archive: Archive) -> str:
 
 
 def _not_an_archive(path: Path, head: bytes) -> str:
-    """Return what a file that is not a zip archive seems to be, and what to do."""
     if head[8:9] == b"{" and int.from_bytes(head[:8], "little") < 1 << 30:
         return (
             "safetensors hold weights but no network; name what builds it: "
@@ -163,7 +162,6 @@ def _batch_limits(program: torch.export.ExportedProgram, batch: int | torch.SymI
 
 
 def _damaged(path: Path, kind: str) -> AbstractContextManager[None]:
-    """Turn whatever a loader raises into a FileFormatError that names the file."""
     what = (
         f"model file {path}: cannot be read as {kind} with torch {torch.__version__}; damaged, made by another "
         "version, or in need of unpickling, which is never done"

@@ -298,7 +298,6 @@ def _checked(names: Sequence[Any], kind: type[InputError], where: str) -> tuple[
 
 
 def _problem(names: Sequence[Any]) -> str:
-    """Return what is wrong with a list of names, or nothing."""
     if not names:
         return "expected label names, got an empty list"
     for index, name in enumerate(names):

@@ -376,7 +376,6 @@ def mend_batch_norms(output: Any) -> None:
 
 
 def _laid_out(strides: tuple[int, ...], gradients: tuple[Tensor | None, ...]) -> tuple[Tensor | None, ...]:
-    """Return gradients with the strides for the first of them."""
     first, *others = gradients
     if first is None or first.stride() == strides:
         return gradients

@@ -239,7 +239,6 @@ def _same(model: Model, a: Tensor, b: Tensor) -> bool:
 
 
 def _batch_limits(model: Model, pair: Tensor, rows: Tensor | None) -> tuple[int, int]:
-    """Return the batch limits, lowered to one image at a time if the network does not take two."""
     low, high = model.batch_limits
     if isinstance(model.module, AllAtOnce):  # which takes the pictures of a rig together
         return max(low, model.module.cameras), max(low, high - high % model.module.cameras)

@@ -72,6 +72,6 @@ def test_nothing_heavy_is_imported_to_tell_it() -> None:
 
 def test_names_that_are_read_from_files_are_those_of_the_registries() -> None:
     assert sorted(own_names("control")) == sorted(OWN)
-    assert sorted(own_names("policy")) == sorted(POLICIES._own)
-    assert sorted(own_names("task")) == sorted(TASKS._own)
+    assert sorted(own_names("policy")) == sorted(POLICIES.own)
+    assert sorted(own_names("task")) == sorted(TASKS.own)
     assert LABEL_SETS == SETS

@@ -457,7 +457,7 @@ def test_an_objective_of_ones_own_stands_beside_the_score_of_every_trial(
     run = tmp_path / "run"
     result = advsearch.attack(scene, victim(level + 0.03), objective=brightness(1.0), run=run, average=2, **SMALL)
     for row in result.rows():
-        assert row.score == -row.margin, "of classification without a target"
+        assert row.margin is not None and row.score == -row.margin, "of classification without a target"
         assert row.objective is not None and 0.0 < row.objective < 1.0, row.kind
     tried = result.summary.tried_objective
     control = [row.objective for row in result.rows("control") if row.objective is not None]

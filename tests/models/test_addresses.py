@@ -24,7 +24,7 @@ import advsearch
 from advsearch.cli.main import main
 from advsearch.errors import InputError, ModelError
 from advsearch.models import address
-from advsearch.models.address import KEY, Asked, checked, is_local
+from advsearch.models.address import KEY, AskedModel, checked, is_local
 from advsearch.registry import nothing_allowed
 from advsearch.tasks import make_task
 
@@ -445,5 +445,5 @@ def test_the_module_shows_what_it_spends(server: Server) -> None:
     server.say = chat("mug")
     model = advsearch.load_model(server.chat, task="answer", ask={"per_call": 0.5})
     model(torch.zeros((2, 8, 8, 3)))
-    assert isinstance(model.module, Asked)
+    assert isinstance(model.module, AskedModel)
     assert model.module.line.sentence == "The model tiny was asked 1 times, 110 tokens, 0.5 of money."

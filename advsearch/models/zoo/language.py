@@ -24,7 +24,7 @@ from advsearch.errors import InputError, ModelError
 from advsearch.models.model import warn
 from advsearch.models.probe import foreign
 from advsearch.models.source import Purpose, Source, source_of
-from advsearch.models.zoo.library import Loaded, Measured, measured, nearly
+from advsearch.models.zoo.library import Loaded, Processing, measured, nearly
 from advsearch.models.zoo.zero_shot import spoken
 
 QUESTION = "What is this? Answer with its name only."  # what is asked where nothing else is said
@@ -76,7 +76,7 @@ def _asked(loaded: Loaded, processor: Any, purpose: Purpose) -> Source:
     with foreign(f"model {loaded.spec}: is a {kind}, which can't be asked about a picture as LLaVA can"):
         text = _written(processor, question)
         pixels, described = _pictures(loaded, processor, text)
-        reader = _Reader(loaded.network, partial(_inputs, processor, text), pixels)
+        reader = _Speaker(loaded.network, partial(_inputs, processor, text), pixels)
         side = described.get("input_size", (SIDE, SIDE))
         prompt = reader.prompt(side)["input_ids"][0].tolist()
         tokens = _tokens(processor, text, prompt, names or (CHECKED,), side)
@@ -129,13 +129,13 @@ def _inputs(processor: Any, text: str, picture: Any, **options: Any) -> dict[str
 Pixels = Callable[[Tensor], Tensor]
 
 
-def _pictures(loaded: Loaded, processor: Any, text: str) -> tuple[Pixels, Measured]:
+def _pictures(loaded: Loaded, processor: Any, text: str) -> tuple[Pixels, Processing]:
     """Return what makes ``pixel_values`` of a picture (3, H, W), and what `Preprocessing` does before. An affine map is
     measured and left to that. What cuts a picture into patches or tiles is called itself, which is differentiable where
     the processor works with torchvision."""
     side = getattr(getattr(loaded.network.config, "vision_config", None), "image_size", None) or SIDE
     side = (int(side[0]), int(side[1])) if isinstance(side, (list, tuple)) else (int(side), int(side))
-    described = Measured()
+    described = Processing()
     with suppress(ModelError):  # it is called then
         described = measured(lambda **given: processor(text=[text], **given), loaded.spec)
     if "mean" in described:
@@ -147,7 +147,7 @@ def _pictures(loaded: Loaded, processor: Any, text: str) -> tuple[Pixels, Measur
             "torchvision only, which is not installed: pip install 'advsearch[torchvision]'"
         )
     else:
-        described, pixels = Measured(input_size=side), partial(_called, processor, text)
+        described, pixels = Processing(input_size=side), partial(_called, processor, text)
     _check_pixels(loaded, processor, text, pixels, described)
     return pixels, described
 
@@ -156,7 +156,7 @@ def _called(processor: Any, text: str, image: Tensor) -> Tensor:
     return _inputs(processor, text, image.float(), do_rescale=False)["pixel_values"]
 
 
-def _check_pixels(loaded: Loaded, processor: Any, text: str, pixels: Pixels, described: Measured) -> None:
+def _check_pixels(loaded: Loaded, processor: Any, text: str, pixels: Pixels, described: Processing) -> None:
     """Raise a ModelError where a picture of slopes arrives otherwise than from 8-bit values by the processor."""
     height, width = described["input_size"]
     down, across = torch.linspace(0, 200, height)[:, None], torch.linspace(0, 200, width)
@@ -204,7 +204,6 @@ def _tokens(
 
 
 def _say_what_begins_another(tokens: Sequence[Sequence[int]], names: Sequence[str], name: str) -> None:
-    """Warn of a name whose tokens begin another's: its likelihood is that of both."""
     for (first, short), (second, long) in permutations(enumerate(tokens), 2):
         if list(long[: len(short)]) == list(short):
             warn(
@@ -217,7 +216,7 @@ def _say_what_begins_another(tokens: Sequence[Sequence[int]], names: Sequence[st
 # ---- the network ----------------------------------------------------------------------------------------------------
 
 
-class _Reader(nn.Module):
+class _Speaker(nn.Module):
     """A network that reads a picture and a prompt, and goes on."""
 
     def __init__(self, network: nn.Module, inputs: Callable[..., dict[str, Tensor]], pixels: Pixels) -> None:
@@ -266,7 +265,7 @@ class _Named(nn.Module):
     prompt are read once. What begins a name (all of its tokens but the last) is read after it, once for all names that
     begin so, and all such beginnings at once: names of one token need nothing more."""
 
-    def __init__(self, reader: _Reader, tokens: Sequence[Sequence[int]]) -> None:
+    def __init__(self, reader: _Speaker, tokens: Sequence[Sequence[int]]) -> None:
         super().__init__()
         self.reader, self.tokens = reader, [list(name) for name in tokens]
         begun = {tuple(name[:-1]) for name in tokens if len(name) > 1}
@@ -297,7 +296,7 @@ class _Named(nn.Module):
 class _Free(nn.Module):
     """What is said of each picture, `advsearch.tasks.answers.Utterance`: the likeliest token after the other."""
 
-    def __init__(self, reader: _Reader, tokenizer: Any, ends: frozenset[int], most: int) -> None:
+    def __init__(self, reader: _Speaker, tokenizer: Any, ends: frozenset[int], most: int) -> None:
         super().__init__()
         self.reader, self.tokenizer, self.ends, self.most = reader, tokenizer, ends, most
 

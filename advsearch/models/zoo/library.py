@@ -123,7 +123,7 @@ ROUNDING = 1e-4  # what scores that are worked out of a network's parts may be o
 FILES = ("preprocessor_config.json", "processor_config.json")  # where a repository keeps its processor
 
 
-class Measured(TypedDict, total=False):
+class Processing(TypedDict, total=False):
     """Fields of `advsearch.models.source.Source`."""
 
     input_size: tuple[int, int]
@@ -146,7 +146,7 @@ def cached_file(transformers: Any, name: str, file: str, where: Mapping[str, Any
     return path
 
 
-def measured(processor: Any, spec: str) -> Measured:
+def measured(processor: Any, spec: str) -> Processing:
     """Return size, mean, standard deviation and order of channels such that ours is what a processor of transformers
     does.
 
@@ -160,7 +160,7 @@ def measured(processor: Any, spec: str) -> Measured:
         return _processed(processor, np.full((side, side, 3), colour, np.uint8), spec)
 
     black = shown((0, 0, 0))
-    size = Measured()
+    size = Processing()
     if black.shape == shown((0, 0, 0), SIDES[1]).shape:  # and not just as large as what it was shown
         size["input_size"] = (black.shape[1], black.shape[2])
     offset = black.mean(axis=(1, 2))
@@ -175,7 +175,7 @@ def measured(processor: Any, spec: str) -> Measured:
     diagonal = [name for name, gain in orders.items() if np.abs(gain - np.diag(np.diag(gain))).max() <= tolerance]
     if len(diagonal) != 1 or (gain := np.diag(orders[diagonal[0]])).min() <= 0.0:
         return _called(processor, spec, size, "mixes the channels of a picture, or turns it into its negative")
-    return Measured(mean=_triple(-offset / gain), std=_triple(1.0 / gain), channels=diagonal[0], **size)
+    return Processing(mean=_triple(-offset / gain), std=_triple(1.0 / gain), channels=diagonal[0], **size)
 
 
 def _processed(processor: Any, picture: Any, spec: str) -> Array:
@@ -187,7 +187,7 @@ def _processed(processor: Any, picture: Any, spec: str) -> Array:
     return picked
 
 
-def _called(processor: Any, spec: str, size: Measured, what: str) -> Measured:
+def _called(processor: Any, spec: str, size: Processing, what: str) -> Processing:
     """Return the size that was found, with the processor to be called on a picture of it."""
     height, width = size.get("input_size", (SIDES[0], SIDES[0]))
     ends = [_processed(processor, np.full((SIDES[0], SIDES[0], 3), level, np.uint8), spec) for level in (0, 255)]
@@ -208,7 +208,7 @@ def _called(processor: Any, spec: str, size: Measured, what: str) -> Measured:
     off = np.abs(seen.detach().double().numpy() - expected).max() if seen.shape == (1, *expected.shape) else np.inf
     if not reaches or not off <= TOLERANCE * np.ptp(expected):
         raise _other(spec, processor, f"{what}, and rounds or does otherwise where a gradient goes through it")
-    return Measured(processor=call, **size)
+    return Processing(processor=call, **size)
 
 
 def _process(processor: Any, images: Tensor) -> Tensor:
@@ -268,14 +268,14 @@ class Loaded:
     part: Callable[[str], Any]
 
     @cached_property
-    def described(self) -> Measured:
+    def described(self) -> Processing:
         """What is done to pictures. Raises ModelError as `measured`; warns where there is no image processor."""
         if self.processor is None:
             warn(
                 f"model {self.spec} comes without an image processor: pictures are given as they are, RGB in [0, 1]. "
                 "Say `mean`, `std` and `input_size` of load_model if it wants them otherwise"
             )
-            return Measured()
+            return Processing()
         return measured(self.processor, self.spec)
 
     @property
@@ -285,18 +285,18 @@ class Loaded:
         names = tuple(str(labels[key]) for key in sorted(labels, key=int))
         return () if all(re.fullmatch(r"LABEL_\d+", name) for name in names) else names
 
-    def sized(self, config: Any) -> Measured:
+    def sized(self, config: Any) -> Processing:
         """Return what is done to pictures, of the size in a part of the network's ``config`` if no other is known."""
         side = getattr(config, "image_size", None)
         sides = (side, side) if isinstance(side, int) else tuple(side or ())
-        return Measured(**{**({"input_size": sides} if sides else {}), **self.described})  # type: ignore[typeddict-item]
+        return Processing(**{**({"input_size": sides} if sides else {}), **self.described})
 
     def source(self, ask: Ask, *, boxes: bool = False, **fields: Any) -> Source:
         """Return the source of the network as `Adapted` asks it, given pictures as it wants them; `fields` go to
         `Source`."""
         return source_of(Adapted(self.network, ask, boxes=boxes), self.name, **{**self.described, **fields})
 
-    def when_named(self, named: Callable[[Any, Any, str, Measured, Purpose], Source]) -> Source:
+    def when_named(self, named: Callable[[Any, Any, str, Processing, Purpose], Source]) -> Source:
         """Return the source of a network that reads texts, which is built when the user's names are there: of the
         network, its tokenizer, its name, what is done to pictures, and the purpose."""
         tokenizer = self.part("AutoTokenizer")

@@ -89,7 +89,6 @@ def _features(network: Any, images: Tensor) -> Any:
 
 
 def _labels(timm: Any, module: Any) -> tuple[str, ...] | None:
-    """Return the names of the classes that the weights were trained on; None where timm does not tell."""
     names = module.pretrained_cfg.get("label_names")
     subset = timm.data.infer_imagenet_subset(module)
     if not names and subset:

@@ -104,7 +104,6 @@ def of_network(network: nn.Module) -> Source | None:
 
 
 def _part(transformers: Any, spec: str, name: str, where: Mapping[str, Any], loader: str) -> Any:
-    """Return another part of a repository or a folder, see `Loaded.part`."""
     with reading(spec, "Give a repository, or a folder, in which it is beside the network"):
         return getattr(transformers, loader).from_pretrained(name, trust_remote_code=False, **where)
 
@@ -125,7 +124,6 @@ def _kind(architecture: str, network: Any, spec: str) -> Family:
 
 
 def _config(transformers: Any, name: str, spec: str, where: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return what is in the config.json of a repository or a folder."""
     has = partial(cached_file, transformers, name, where=where)
     try:
         if not has("config.json") and has("open_clip_config.json"):

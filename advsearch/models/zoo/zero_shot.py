@@ -19,7 +19,7 @@ from advsearch.models.labels import patterns
 from advsearch.models.model import warn
 from advsearch.models.probe import foreign
 from advsearch.models.source import Purpose, Source, sharing_copy, source_of
-from advsearch.models.zoo.library import Adapted, Ask, Loaded, Measured, in_pixels, nearly
+from advsearch.models.zoo.library import Adapted, Ask, Loaded, Processing, in_pixels, nearly
 
 TEXTS = 64  # texts that are embedded at once
 
@@ -45,7 +45,7 @@ def check_takes_pictures(network: Any, spec: str) -> None:
         )
 
 
-def _named(network: Any, tokenizer: Any, name: str, described: Measured, purpose: Purpose) -> Source:
+def _named(network: Any, tokenizer: Any, name: str, described: Processing, purpose: Purpose) -> Source:
     names = purpose.named(name, "compares a picture with texts", "classification")
     prompts = patterns(purpose.prompts)
     if len(names) < 2:
@@ -126,7 +126,7 @@ class _Compared(nn.Module):
         return scores
 
 
-def _check(network: Any, compared: _Compared, tokenizer: Any, text: str, described: Measured, name: str) -> None:
+def _check(network: Any, compared: _Compared, tokenizer: Any, text: str, described: Processing, name: str) -> None:
     """Raise a ModelError where the network itself gives a picture of noise and a text another score."""
     shape = (1, 3, *described.get("input_size", (224, 224)))
     noise = torch.rand(shape, generator=torch.Generator().manual_seed(0)).to(network.device, network.dtype)
@@ -169,7 +169,7 @@ def detector_source(loaded: Loaded) -> Source:
     return loaded.when_named(_detector)
 
 
-def _detector(network: Any, tokenizer: Any, name: str, described: Measured, purpose: Purpose) -> Source:
+def _detector(network: Any, tokenizer: Any, name: str, described: Processing, purpose: Purpose) -> Source:
     names = purpose.named(name, "finds what it is told to", "detection")
     with foreign(f"model {name}: cannot read the names of `labels`"), torch.no_grad():
         network = sharing_copy(network).eval()

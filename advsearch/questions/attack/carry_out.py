@@ -36,7 +36,7 @@ from advsearch.engine.transport import CleanMatrix, reason_against
 from advsearch.errors import InputError
 from advsearch.files import JsonObject
 from advsearch.models import Model
-from advsearch.models.address import Asked
+from advsearch.models.address import AskedModel
 from advsearch.options import as_setting
 from advsearch.progress import NullProgress, Progress
 from advsearch.questions.attack.ambient import problems_by_name
@@ -117,7 +117,7 @@ def carry_out(job: AttackParts, progress: Progress, resumed: str | Path | None =
                     f"{count(problem.draws, 'condition')}; `steps` and `draws` change that."
                 )
             findings = Attack(journal, job.config, policy, stages, clean=job.clean).carry_out()
-        if isinstance(problem.model.module, Asked):
+        if isinstance(problem.model.module, AskedModel):
             warnings.append(problem.model.module.line.sentence)
         named = job.objective if isinstance(job.objective, str) else job.config.objective
         result = summarise(job.config, named, findings, journal, stages, warnings)
@@ -135,7 +135,7 @@ def _policy(job: AttackParts, problem: Problem) -> Policy[Any]:
     """Where a model lets no gradient through, `auto` climbs by differences; behind an address it climbs nowhere."""
     config, norms = job.config, {block.norm for block in problem.domain.blocks}
     policy = make_policy(job.policy, **config.policy_options) if isinstance(job.policy, str) else job.policy
-    if isinstance(problem.model.module, Asked):
+    if isinstance(problem.model.module, AskedModel):
         if policy.name == "auto":
             policy = WithoutAscent() if norms == {"box"} else make_policy("nes")
         elif policy.uses_gradient:

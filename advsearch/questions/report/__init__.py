@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from advsearch.cli import output
-from advsearch.cli.commands import Command
+from advsearch.cli.commands import PlainCommand
 from advsearch.errors import InputError
 
 HELP = "write what runs show, and no more than that, for a model card or a safety case"
@@ -144,4 +144,4 @@ def _is_at(value: object, text: str | None) -> bool:
         return False
 
 
-COMMAND = Command(run, (add_arguments,), MORE, EXAMPLES)
+COMMAND = PlainCommand(run, (add_arguments,), MORE, EXAMPLES)
