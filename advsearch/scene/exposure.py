@@ -60,9 +60,15 @@ def metered_gain(scene: SceneDescription) -> float:
     """
     default = {name: value for name, value in resolve({}).items() if name.startswith(MOVED)}
     scene = replace(scene, values={**scene.values, **default}, aspect=1.0, camera=ORBIT_CAMERA, camera_model=None)
-    normals = visible_normals(scene)
-    metered = float(irradiance(scene, normals if len(normals) else np.array([[0.0, 0.0, 1.0]])).mean())
+    seen = visible_irradiance(scene)
+    metered = float(irradiance(scene, np.array([[0.0, 0.0, 1.0]])).mean()) if seen is None else seen
     return METERED_WHITE * math.pi / (WHITE * metered) if metered > 0.0 else 1.0
+
+
+def visible_irradiance(scene: SceneDescription) -> float | None:
+    """Return the mean irradiance (mean channel) on what the camera sees of the object; None if it sees nothing."""
+    normals = visible_normals(scene)
+    return float(irradiance(scene, normals).mean()) if len(normals) else None
 
 
 def irradiance(scene: SceneDescription, normals: Doubles) -> Doubles:
